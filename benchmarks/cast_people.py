@@ -21,16 +21,15 @@ from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_file import load_rig
 from bodyscan.simulation.body import load_subject
-from bodyscan.simulation.files import scale_rig, times_of_person
+from bodyscan.simulation.files import describe_camera, scale_rig, times_of_person
 from bodyscan.simulation.lamps import Lamps, laser_light
 from bodyscan.simulation.layout import TruePair
-from bodyscan.simulation.living import LivingBody, bring_to_life
+from bodyscan.simulation.living import LivingBody, animate
 from bodyscan.simulation.presets import settings_for
 from bodyscan.simulation.projector import MirrorProjector
 from bodyscan.simulation.scene import Hits, Scene
 from bodyscan.simulation.settings import Pace
 from bodyscan.simulation.simulate import CALIBRATION, PERSON_SHOT, true_pairs
-from bodyscan.simulation.truth import describe_camera
 
 PROJECT = Path(__file__).parents[1]
 SCALE = 0.45
@@ -92,7 +91,7 @@ def cast_person(
     person = replace(settings.person, size=size * settings.person.size, subdivisions=1)
     pairs = true_pairs(rig, settings, seed)
     still = load_subject(PROJECT / "data" / "subjects" / f"{subject}.ply", person, rng)
-    body = bring_to_life(still, person, rng)
+    body = animate(still, person, rng)
     turn = np.array([0.0, 0.0, np.radians(STANCE_DEG) * rng.standard_normal()])
     shift = STANCE_MM * rng.standard_normal(3) * [1.0, 1.0, 0.0]
     stance = RigidTransform.from_rotation_vector(turn, shift)
@@ -149,7 +148,7 @@ def _seen(pair: TruePair, rays: Array, scan: CastScan, ms: float) -> tuple[Array
     """Depths (N,) of rays (N, 3), NaN where nothing is lit, and normals (N, 3)."""
     surface = replace(scan.body.surface(ms), vertices=scan.vertices(ms))
     surface = replace(surface, normals=scan.stance.rotate(np.asarray(surface.normals)))
-    scene = Scene([surface.moved(pair.rig_from_camera.inverse())])
+    scene = Scene([surface.transform(pair.rig_from_camera.inverse())])
     hits: Hits = scene.cast(rays.astype(np.float32))
     lit = laser_light(scene, hits, pair.projector, Lamps(1.0, 0.0, 1.0, 1.0)).weight > 0.0
     normals = hits.normals.astype(np.float64)

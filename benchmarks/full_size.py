@@ -19,7 +19,7 @@ from bodyscan.evaluation.comparison import fit_to_surface
 from bodyscan.evaluation.surface import signed_distances
 from bodyscan.fusion.storage import load_scan
 from bodyscan.geometry.robust import rms
-from bodyscan.simulation.living import body_of
+from bodyscan.simulation.living import load_moving_body
 
 PROJECT = Path(__file__).parents[1]
 WORKSPACE = PROJECT / "bench" / "three-pole-12"
@@ -75,7 +75,7 @@ def _stood(rig: str, folder: str, subject: str) -> str:
 
 
 def _by_parts(workspace: Path) -> str:
-    stored, body = load_scan(workspace / "scan"), body_of(workspace / "truth")
+    stored, body = load_scan(workspace / "scan"), load_moving_body(workspace / "truth")
     assert body
     surface = body.vertices(stored.facts["person"]["moment_ms"]), np.asarray(body.rest.triangles)
     points = fit_to_surface(stored.cloud.points, *surface).apply(stored.cloud.points)

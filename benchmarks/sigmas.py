@@ -15,18 +15,19 @@ from bodyscan.boards.board_layout import corner_points
 from bodyscan.evaluation.spheres import centre_distances
 from bodyscan.geometry.camera_fields import from_fields
 from bodyscan.geometry.robust import rms
-from bodyscan.laboratory.chapter import apparatus
-from bodyscan.laboratory.chapter.calibrating import calibrate_ours
-from bodyscan.laboratory.chapter.captures import TARGET, take_captures
-from bodyscan.laboratory.chapter.measuring import (
+from bodyscan.laboratory import apparatus
+from bodyscan.laboratory.approaches import calibrate_by_reference_plane
+from bodyscan.laboratory.calibrating import calibrate_ours
+from bodyscan.laboratory.chapter_captures import TARGET, take_captures
+from bodyscan.laboratory.measuring import (
     ApproachAccuracy,
+    PointSigma,
     measure_artefacts,
+    point_sigma,
     true_approach,
 )
-from bodyscan.laboratory.chapter.point_sigma import PointSigma, point_sigma
-from bodyscan.laboratory.rivals.targets import by_reference_plane
 from bodyscan.progress import THREADS
-from bodyscan.simulation.truth import describe_camera
+from bodyscan.simulation.files import describe_camera
 
 SEEDS = range(10)
 """Of units: what is unknown of one is common to all its points, so that five gave 0.6 for 0.9."""
@@ -86,7 +87,9 @@ def _unit(boards: int, real_light: bool, seed: int) -> UnitErrors:
     settings = apparatus.real_settings() if real_light else apparatus.ideal_settings()
     setup = apparatus.chapter_setup(settings, seed)
     captures = take_captures(setup, boards=boards, stage_stops=0)
-    ours, covariance, *_ = calibrate_ours(captures, *by_reference_plane(TARGET, captures.boards))
+    ours, covariance, *_ = calibrate_ours(
+        captures, *calibrate_by_reference_plane(TARGET, captures.boards)
+    )
     true = from_fields(describe_camera(apparatus.CAMERA)).parameters
     off = (ours.camera.parameters - true) / np.sqrt(np.diag(covariance))
     print_ppm = centre_distances(setup.board.corners, corner_points(apparatus.BOARD)).scale_ppm

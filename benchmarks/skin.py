@@ -30,7 +30,7 @@ from bodyscan.mesh.regions import DARK_CLOTH, HAIR, NAMES, SKIN, shares
 from bodyscan.mesh.topology import vertex_normals
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.settings import ScanSettings
-from bodyscan.simulation.clothing import grows_hair, wears_shorts
+from bodyscan.simulation.body import mask_hair, mask_shorts
 from bodyscan.workflows.evaluate import Truth, load_truth
 from bodyscan.workflows.fuse_range_images import fuse
 from bodyscan.workflows.range_images import reconstruct_range_images
@@ -134,8 +134,8 @@ def _light_row(name: str, case: Case) -> str:
 
 def _region_rows(name: str, case: Case) -> list[str]:
     (vertices, faces), off = _surface(case.truth), _errors(case)
-    true = np.where(wears_shorts(vertices), DARK_CLOTH, SKIN)
-    true[grows_hair(vertices)] = HAIR
+    true = np.where(mask_shorts(vertices), DARK_CLOTH, SKIN)
+    true[mask_hair(vertices)] = HAIR
     laid = _laid(case)
     of_points = true[cKDTree(vertices).query(laid)[1]]
     seen = _seen_by_two(vertices, faces, case.truth.facts["pairs"])

@@ -112,11 +112,11 @@ def evaluate(
     ],
 ) -> None:
     """Compare the calibration and scan of a simulated workspace with the truth beside it."""
-    from bodyscan.simulation.living import body_of
+    from bodyscan.simulation.living import load_moving_body
     from bodyscan.workflows.evaluate import evaluate_workspace
 
     with output.stages() as progress, step(progress, "comparing"):
-        body = body_of(workspace / "truth")
+        body = load_moving_body(workspace / "truth")
         text = evaluate_workspace(workspace, None if body is None else body.vertices)
     output.say(*text.splitlines())
 
@@ -217,8 +217,8 @@ def reproduce(
     ] = 3,
 ) -> None:
     """Simulate the chapter's own set-up: Tables 1 and 2, Fig. 6 and 7, and all rival models."""
-    from bodyscan.laboratory.chapter.text import figure_names, text_name
     from bodyscan.laboratory.reproduce import reproduce as run
+    from bodyscan.laboratory.text import figure_names, text_name
 
     require_writable(out)
     with output.stages() as progress:

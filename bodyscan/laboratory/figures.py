@@ -39,24 +39,24 @@ def draw_projector(
     """Fig. 6: baselines, projection angles and tilts against the stripe's number for each model and
     the truth; and the distribution of the boundary points' distances from their planes."""
     figure, axes = plt.subplots(2, 2, figsize=(10.0, 7.5), constrained_layout=True)
-    baseline, angle, tilt, spread = axes.ravel()
+    baseline, angle, tilt, residual_axis = axes.ravel()
     for axis, part, label in (
         (baseline, 0, "baseline, mm"),
         (angle, 1, "projection angle, degrees"),
         (tilt, 2, "tilt angle, degrees"),
     ):
-        values = _explicit(true, direction)[part]
+        values = _baseline_angle_tilt(true, direction)[part]
         axis.plot(true.s, values, color=INK, linewidth=3.0, alpha=0.35, label=true.name)
         for colour, curve in zip(COLOURS, curves, strict=False):
-            own = _explicit(curve, direction)[part]
-            axis.plot(curve.s, own, ".", color=colour, markersize=2.5, label=curve.name)
+            values_of_model = _baseline_angle_tilt(curve, direction)[part]
+            axis.plot(curve.s, values_of_model, ".", color=colour, markersize=2.5, label=curve.name)
         room = 0.6 * float(np.ptp(values)) + 1e-3
         if part != 1:
             axis.set_ylim(values.min() - room, values.max() + room)
         axis.set_xlabel("light stripe number")
         axis.set_ylabel(label)
     baseline.legend(frameon=False, markerscale=4.0)
-    _distribution(spread, residuals_mm)
+    _distribution(residual_axis, residuals_mm)
     for axis in axes.ravel():
         _plain(axis)
     return _save(figure, path)
@@ -64,11 +64,11 @@ def draw_projector(
 
 @dataclass(frozen=True, eq=False)
 class RangeData:
-    """normals: (H, W, 3). off_mm: (H, W) mm, distance from the truth."""
+    """normals: (H, W, 3). error_mm: (H, W) mm, distance from the truth."""
 
     name: str
     normals: Array
-    off_mm: Array
+    error_mm: Array
 
 
 def draw_range_data(data: Sequence[RangeData], path: Path) -> Path:
@@ -77,22 +77,22 @@ def draw_range_data(data: Sequence[RangeData], path: Path) -> Path:
     figure, axes = plt.subplots(
         2, len(data), figsize=(4.2 * len(data), 6.6), constrained_layout=True, squeeze=False
     )
-    for shown, below, one in zip(axes[0], axes[1], data, strict=True):
+    for upper, lower, one in zip(axes[0], axes[1], data, strict=True):
         light = np.array([-0.4, -0.4, -0.83])
         grey = np.clip(np.nan_to_num(one.normals @ light, nan=0.0), 0.0, 1.0)
-        shown.imshow(grey, cmap="gray", vmin=0.0, vmax=1.0)
-        shown.set_title(one.name)
-        limit = round_up(max(float(np.nanpercentile(np.abs(one.off_mm), 95)), 1e-6))
+        upper.imshow(grey, cmap="gray", vmin=0.0, vmax=1.0)
+        upper.set_title(one.name)
+        limit = round_up(max(float(np.nanpercentile(np.abs(one.error_mm), 95)), 1e-6))
         colours = matplotlib.colormaps["RdBu_r"].with_extremes(bad="#dddddd")
-        picture = below.imshow(one.off_mm, cmap=colours, vmin=-limit, vmax=limit)
-        figure.colorbar(picture, ax=below, shrink=0.8, label="off by, mm")
-        for axis in (shown, below):
+        picture = lower.imshow(one.error_mm, cmap=colours, vmin=-limit, vmax=limit)
+        figure.colorbar(picture, ax=lower, shrink=0.8, label="off by, mm")
+        for axis in (upper, lower):
             axis.set_xticks([])
             axis.set_yticks([])
     return _save(figure, path)
 
 
-def _explicit(curve: PlaneCurve, direction: Axis) -> tuple[Array, Array, Array]:
+def _baseline_angle_tilt(curve: PlaneCurve, direction: Axis) -> tuple[Array, Array, Array]:
     length, angle, tilt = baseline_angle_tilt(curve.planes, direction)
     return length, np.degrees(angle), np.degrees(tilt)
 

@@ -10,24 +10,24 @@ import numpy as np
 
 from bodyscan.files.atomic import write_text
 from bodyscan.geometry.transforms import rigid_fit
-from bodyscan.laboratory.chapter import apparatus
-from bodyscan.laboratory.chapter.calibrating import Calibrations, calibrate_all, sigma_trial
-from bodyscan.laboratory.chapter.captures import ChapterCaptures, take_captures
-from bodyscan.laboratory.chapter.measuring import (
+from bodyscan.laboratory import apparatus
+from bodyscan.laboratory.approaches import Approach
+from bodyscan.laboratory.calibrating import Calibrations, calibrate_all, sigma_trial
+from bodyscan.laboratory.chapter_captures import ChapterCaptures, take_captures
+from bodyscan.laboratory.measuring import (
     ApproachAccuracy,
     measure_artefacts,
     noise_bound,
+    point_sigma,
     points_of,
     true_approach,
 )
-from bodyscan.laboratory.chapter.point_sigma import point_sigma
-from bodyscan.laboratory.chapter.text import (
+from bodyscan.laboratory.text import (
     Reproduction,
     figure_names,
     reproduction_text,
     text_name,
 )
-from bodyscan.laboratory.rivals.approaches import Approach
 from bodyscan.progress import Progress, silent
 from bodyscan.reconstruction.triangulation import grid_normals
 
@@ -78,10 +78,10 @@ def _measure_all(
     real_light: bool,
     progress: Progress,
 ) -> Reproduction:
-    shown = [*calibrated.approaches, true_approach(captures.setup)]
+    compared = [*calibrated.approaches, true_approach(captures.setup)]
     groups: list[tuple[Sequence[Approach], bool]] = [
-        (shown, True),
-        (shown, False),
+        (compared, True),
+        (compared, False),
         (calibrated.by_stage, False),
         (calibrated.by_reference, False),
     ]
@@ -106,7 +106,9 @@ def _measure_all(
         by_reference=results[3],
         noise=noise_bound(captures),
         # Of the approaches whose sheets know their covariance.
-        sigmas=tuple(point_sigma(one, captures) for one in shown if one.name in ("(iii)", "ours")),
+        sigmas=tuple(
+            point_sigma(one, captures) for one in compared if one.name in ("(iii)", "ours")
+        ),
     )
 
 

@@ -1,4 +1,4 @@
-"""The acceptance test's artefacts, placed in a simulated rig and measured place by place."""
+"""The acceptance test's artefacts, put into a simulated rig and measured pose by pose."""
 
 from __future__ import annotations
 
@@ -39,13 +39,12 @@ def simulate_readings(
     workspace: Path,
     file: AcceptanceFile,
     repeats: int,
-    places: int | None,
+    max_poses: int | None,
     progress: Progress = silent,
 ) -> Readings:
-    """Measure `repeats` shots of the spheres and one of the plate at each of the first `places`
-    places.
+    """Measure `repeats` shots of the spheres and one of the plate in each of the first `max_poses`.
 
-    The images of a place are measured and deleted before the next one's are made.
+    The images of a pose are measured and deleted before the next one's are made.
     """
     world = artefact.open_workspace(workspace)
     centres, volume = np.array(file.spheres.centres_mm), calibration.rig.volume
@@ -53,44 +52,54 @@ def simulate_readings(
     flat = artefact.plate_surface(*file.plate.size_mm)
     of_spheres = [
         (name, at, balls, repeats, read_spheres)
-        for name, at in spheres_at(volume, centres)[:places]
+        for name, at in spheres_at(volume, centres)[:max_poses]
     ]
-    of_plates = [(name, at, flat, 1, read_plates) for name, at in plates_at(volume)[:places]]
+    of_plates = [(name, at, flat, 1, read_plates) for name, at in plates_at(volume)[:max_poses]]
     total = Readings()
     for number, (name, at, surfaces, shots, read) in enumerate([*of_spheres, *of_plates]):
         with TemporaryDirectory(prefix="bodyscan-") as folder:
-            place = Path(folder) / f"place-{number + 1}"
+            out = Path(folder) / f"pose-{number + 1}"
             taken = artefact.capture_artefact(
-                world, surfaces, at, place, shots=shots, number=number, progress=progress
+                world,
+                surfaces,
+                at,
+                out,
+                shots=shots,
+                number=number,
+                progress=progress,
             )
             total += read(calibration, open_scan(calibration.rig, taken), name, file, progress)
     return total
 
 
 def spheres_at(volume: Volume, centres: Array) -> list[tuple[str, RigidTransform]]:
-    """`rig_from_artefact` of each place for centres (N, 3),
-    whose first axis points along the bar."""
+    """List names and `rig_from_artefact` of a bar of spheres with centres (N, 3)."""
     middle = centres.mean(axis=0)
-    return [(name, _placed(volume, share, way, middle)) for name, share, way in SPHERES]
+    return [
+        (name, _pose_in_volume(volume, share, direction, middle))
+        for name, share, direction in SPHERES
+    ]
 
 
 def plates_at(volume: Volume) -> list[tuple[str, RigidTransform]]:
-    """`rig_from_artefact` of each place for a plate in the plane x = 0 about the origin."""
-    return [(name, _placed(volume, share, way, np.zeros(3))) for name, share, way in PLATES]
+    """List names and `rig_from_artefact` of a plate in the plane x = 0 about the origin."""
+    return [
+        (name, _pose_in_volume(volume, share, direction, np.zeros(3)))
+        for name, share, direction in PLATES
+    ]
 
 
-def _placed(
+def _pose_in_volume(
     volume: Volume,
     share: tuple[float, float, float],
-    way: tuple[float, float, float],
+    direction: tuple[float, float, float],
     middle: Array,
 ) -> RigidTransform:
-    """A pose with the artefact's x axis along `way`, its y axis level, and its `middle` at
-    `share`."""
-    x = np.array(way) / np.linalg.norm(way)
-    beside = np.cross([0.0, 0.0, 1.0], x)
-    y = beside / np.linalg.norm(beside) if np.linalg.norm(beside) > 1e-9 else np.array([0.0, 1, 0])
+    """Put an artefact's `middle` at `share` of the volume, x along `direction`, y level."""
+    x = np.array(direction) / np.linalg.norm(direction)
+    level = np.cross([0.0, 0.0, 1.0], x)
+    y = level / np.linalg.norm(level) if np.linalg.norm(level) > 1e-9 else np.array([0.0, 1, 0])
     rotation = np.stack([x, y, np.cross(x, y)], axis=1)
     height = volume.bottom_mm + share[2] * (volume.top_mm - volume.bottom_mm)
-    place = np.array([share[0] * volume.radius_mm, share[1] * volume.radius_mm, height])
-    return RigidTransform(rotation, place - rotation @ middle)
+    target = np.array([share[0] * volume.radius_mm, share[1] * volume.radius_mm, height])
+    return RigidTransform(rotation, target - rotation @ middle)

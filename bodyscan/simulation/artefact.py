@@ -17,13 +17,12 @@ from bodyscan.progress import Progress, map_threads, silent
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_file import load_rig
 from bodyscan.simulation import files
-from bodyscan.simulation.layout import TruePair
+from bodyscan.simulation.layout import TruePair, build_room
 from bodyscan.simulation.presets import settings_of
-from bodyscan.simulation.room import build_room
+from bodyscan.simulation.rays import View
 from bodyscan.simulation.scene import Surface, grid_surface
 from bodyscan.simulation.settings import SimulationSettings
 from bodyscan.simulation.simulate import Task, render_task, sensor_of, true_pairs
-from bodyscan.simulation.view import View
 
 ALBEDO = 0.7
 RINGS = 200
@@ -49,7 +48,7 @@ def open_workspace(workspace: Path) -> SimulatedRig:
     try:
         truth = json.loads((workspace / "truth" / "truth.json").read_text("utf-8"))
         settings, seed = settings_of(truth["settings"]), int(truth["seed"])
-        placings = {name: pair["rig_from_camera"] for name, pair in truth["pairs"].items()}
+        stored_poses = {name: pair["rig_from_camera"] for name, pair in truth["pairs"].items()}
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise BadInput(
             f"is not a simulated workspace ({type(error).__name__}: {error})",
@@ -59,7 +58,7 @@ def open_workspace(workspace: Path) -> SimulatedRig:
     rig = load_rig(workspace / "rig.yaml")
     pairs = true_pairs(rig, settings, seed)
     for name, pair in pairs.items():
-        if not np.allclose(pair.rig_from_camera.matrix, placings.get(name, np.nan), atol=1e-6):
+        if not np.allclose(pair.rig_from_camera.matrix, stored_poses.get(name, np.nan), atol=1e-6):
             raise BadInput(
                 f"pair {name} stands elsewhere than its truth says",
                 where=str(workspace),
@@ -110,7 +109,7 @@ def capture_artefact(
 
     def work(pair: TruePair) -> None:
         rays = np.random.default_rng([simulated.seed, _RAYS, order[pair.name]])
-        view = View.of(pair.camera, settings.optics, rays)
+        view = View.from_camera(pair.camera, settings.optics, rays)
         fixed = sensor_of(pair.camera, settings, simulated.seed, order[pair.name])
         for k, name in enumerate(names):
             seed = [simulated.seed, _NOISE, order[pair.name], number, k]

@@ -15,9 +15,6 @@ from bodyscan.rig.board import Board
 from bodyscan.simulation.scene import Surface, grid_surface, grid_triangles
 from bodyscan.simulation.settings import BoardMaking
 
-_STEPS = 4
-"""Mesh cells per square, if the board is not flat."""
-
 
 @dataclass(frozen=True, eq=False)
 class BoardPrint:
@@ -32,19 +29,19 @@ class BoardPrint:
     inner_mm: float
     cells: Floats
 
-    def albedo(self, places: Floats) -> Floats:
-        """Albedo (N,) at places (N, 2) mm on the print, from the first square's outer corner."""
+    def albedo(self, positions: Floats) -> Floats:
+        """Albedo (N,) at positions (N, 2) mm on the print, from the first square's outer corner."""
         rows, columns, modules, _ = self.cells.shape
-        column, i = self._cell(places[:, 0], columns, modules)
-        row, j = self._cell(places[:, 1], rows, modules)
+        column, i = self._cell(positions[:, 0], columns, modules)
+        row, j = self._cell(positions[:, 1], rows, modules)
         return self.cells[row, column, j, i]
 
     def _cell(
-        self, place: Floats, squares: int, modules: int
+        self, position: Floats, squares: int, modules: int
     ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """The number of the square along one side, and of the module inside it."""
-        number = np.floor(place / np.float32(self.square_mm))
-        inside = place - number * np.float32(self.square_mm)
+        number = np.floor(position / np.float32(self.square_mm))
+        inside = position - number * np.float32(self.square_mm)
         start = (self.square_mm - self.inner_mm) / 2.0
         module = np.floor((inside - np.float32(start)) * np.float32((modules - 2) / self.inner_mm))
         return (
@@ -71,8 +68,8 @@ def board_print(board: Board, face: int, making: BoardMaking) -> BoardPrint:
 
 def _dark_squares(board: Board) -> Mask:
     row, column = np.indices((board.rows, board.columns))
-    turned = board.kind == "charuco" and board.legacy_layout and board.rows % 2 == 0
-    return (row + column) % 2 == (1 if turned else 0)
+    swapped = board.kind == "charuco" and board.legacy_layout and board.rows % 2 == 0
+    return (row + column) % 2 == (1 if swapped else 0)
 
 
 def _markers(board: Board, face: int, count: int) -> Mask:
@@ -112,16 +109,16 @@ def make_board(board: Board, making: BoardMaking, rng: np.random.Generator) -> M
     sheet = _draw_sheet(making, rng)
     for face in range(board.faces):
         error = _print_error(board, making, rng)
-        places = _places(board, flat=sheet.flat and making.print_error_mm == 0)
-        vertices = _on_sheet(places.reshape(-1, 2), board, face, error, sheet)
-        triangles = grid_triangles(places.shape[1] - 1, places.shape[0] - 1)
+        positions = _mesh_positions(board, flat=sheet.flat and making.print_error_mm == 0)
+        vertices = _on_sheet(positions.reshape(-1, 2), board, face, error, sheet)
+        triangles = grid_triangles(positions.shape[1] - 1, positions.shape[0] - 1)
         printed = board_print(board, face, making)
         surfaces.append(
             Surface(
                 vertices,
                 triangles,
                 printed=printed,
-                places=places.reshape(-1, 2),
+                print_xy=positions.reshape(-1, 2),
                 open_to_light=True,
             )
         )
@@ -132,12 +129,12 @@ def make_board(board: Board, making: BoardMaking, rng: np.random.Generator) -> M
     return MadeBoard(tuple(surfaces), np.concatenate(corners))
 
 
-def _places(board: Board, flat: bool) -> Array:
-    """Mesh vertices on the print, (rows, columns, 2) mm, including the margin."""
+def _mesh_positions(board: Board, flat: bool) -> Array:
+    """Mesh vertices on the print, (rows, columns, 2) mm, margin included; 4 cells a square."""
 
     def line(squares: int) -> Array:
         size = squares * board.square_mm
-        inner = np.linspace(0.0, size, squares * _STEPS + 1)[1:-1]
+        inner = np.linspace(0.0, size, squares * 4 + 1)[1:-1]
         edges = [-board.margin_mm, 0.0] if board.margin_mm > 0 else [0.0]
         ends = [size, size + board.margin_mm] if board.margin_mm > 0 else [size]
         whole = np.concatenate([edges, inner, ends])
@@ -161,7 +158,7 @@ class _Sheet:
         return not any((self.bowl, self.across, self.down, self.twist))
 
     def height(self, across: Array, down: Array) -> Array:
-        """Height towards the front, at places from -1/2 to 1/2 along each side."""
+        """Height towards the front, at positions from -1/2 to 1/2 along each side."""
         bowl = self.bowl * (1.0 - 2.0 * (across**2 + down**2))
         if not any((self.across, self.down, self.twist)):
             return bowl
@@ -179,13 +176,12 @@ def _draw_sheet(making: BoardMaking, rng: np.random.Generator) -> _Sheet:
     return _Sheet(making.bow_mm, grown * shape.across, grown * shape.down, grown * shape.twist)
 
 
-def _on_sheet(places: Array, board: Board, face: int, error: Array, sheet: _Sheet) -> Array:
-    """Map places on the print (N, 2) to the board frame (N,
-    3): printing error, turning over, bow."""
+def _on_sheet(positions: Array, board: Board, face: int, error: Array, sheet: _Sheet) -> Array:
+    """Map positions on the print (N, 2) to the board frame (N, 3): print error, flip, bow."""
     square = board.square_mm
-    grid = np.clip(places / square, 0.0, [board.columns, board.rows])[:, ::-1].T
-    moved = places + np.stack([map_coordinates(e, grid, order=1) for e in error], axis=1)
-    x, y = moved[:, 0], moved[:, 1]
+    grid = np.clip(positions / square, 0.0, [board.columns, board.rows])[:, ::-1].T
+    printed = positions + np.stack([map_coordinates(e, grid, order=1) for e in error], axis=1)
+    x, y = printed[:, 0], printed[:, 1]
     if face == 1:
         x = board.columns * square - x
     across, down = x / (board.columns * square) - 0.5, y / (board.rows * square) - 0.5

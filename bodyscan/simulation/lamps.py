@@ -1,17 +1,20 @@
-"""How brightly the projector and the room light a surface."""
+"""Light on surfaces: the projector's, the room's, and what skin does with it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Any
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from bodyscan.arrays import Floats
-from bodyscan.simulation.gray import PAD
+from bodyscan.arrays import Array, Floats
+from bodyscan.simulation.patterns import PAD
 from bodyscan.simulation.projector import Projector
 from bodyscan.simulation.scene import Hits, Scene, dot
 from bodyscan.simulation.settings import Skin
-from bodyscan.simulation.skin import came_in_at, highlight
 
 
 @dataclass(frozen=True)
@@ -22,7 +25,7 @@ class Lamps:
     ambient_grey: grey level that the room's own light gives a white surface.
     focus_mm: distance at which the projector and the camera are focused.
     window_grey: grey level that a large window gives a white surface that faces it.
-    window_way: (3,) unit, direction to the window, camera frame.
+    window_direction: (3,) unit, direction to the window, camera frame.
     skin: what skin does with light.
     """
 
@@ -31,7 +34,7 @@ class Lamps:
     reach_mm: float
     focus_mm: float
     window_grey: float = 0.0
-    window_way: tuple[float, float, float] = (0.0, 0.0, -1.0)
+    window_direction: tuple[float, float, float] = (0.0, 0.0, -1.0)
     skin: Skin = field(default_factory=Skin)
 
 
@@ -41,10 +44,10 @@ def room_light(hits: Hits, lamps: Lamps) -> Floats:
     if lamps.window_grey <= 0:
         return light
     # The side that the camera sees; a window half the sky wide lights around the edge.
-    towards = np.asarray(lamps.window_way, np.float32)
+    towards = np.asarray(lamps.window_direction, np.float32)
     length = np.sqrt(np.maximum(dot(hits.normals, hits.normals), np.float32(1e-12)))
-    seen = -np.sign(dot(hits.normals, hits.points))
-    cosine = seen * (hits.normals @ towards) / length
+    side = -np.sign(dot(hits.normals, hits.points))
+    cosine = side * (hits.normals @ towards) / length
     facing = np.float32(0.5) * (np.float32(1.0) + cosine)
     facing = np.where(np.isfinite(hits.depth), facing, np.float32(0.0)).astype(np.float32)
     return np.asarray(light + np.float32(lamps.window_grey) * facing, np.float32)
@@ -64,13 +67,8 @@ class LaserLight:
     gloss: Floats | None
 
 
-def laser_light(
-    scene: Scene, hits: Hits, projector: Projector, lamps: Lamps, *, seen: bool = True
-) -> LaserLight:
-    """Light by cosine, 1/r^2 and shadow.
-
-    seen: only where the light falls on the side that the camera sees.
-    """
+def laser_light(scene: Scene, hits: Hits, projector: Projector, lamps: Lamps) -> LaserLight:
+    """Light the hits by cosine, 1/r^2 and shadow, on the side that the camera sees."""
     s = projector.stripe(hits.points)
     reached = np.isfinite(hits.depth) & (s > -PAD) & (s < projector.stripes + PAD)
     chosen = np.flatnonzero(reached)
@@ -81,7 +79,7 @@ def laser_light(
     cosine = np.abs(height) / np.sqrt(square * dot(normals, normals))
     shadow = scene.is_shadowed(points, towards, hits.surface[chosen])
     bright = np.float32(lamps.laser_grey * lamps.reach_mm**2) * cosine / square
-    reaches = (front | (not seen)) & ~shadow
+    reaches = front & ~shadow
     weight = np.zeros(len(s), np.float32)
     weight[chosen] = bright * reaches * hits.albedo[chosen]
 
@@ -92,9 +90,62 @@ def laser_light(
         full = np.float32(lamps.laser_grey * lamps.reach_mm**2) / square[covered]
         gloss = np.zeros(len(s), np.float32)
         gloss[chosen[covered]] = full * mirrored * reaches[covered]
-    if covered.size and lamps.skin.oblique_mm > 0:
-        aside = lamps.skin.oblique_mm
-        entry = came_in_at(points[covered], towards[covered], normals[covered], aside)
-        s = s.copy()
-        s[chosen[covered]] = projector.stripe(entry)
     return LaserLight(weight, s, gloss)
+
+
+Reals = NDArray[Any]
+
+
+def shape_mm(skin: Skin) -> float:
+    """Burley's d, from the mean free path at the surface and its albedo (Christensen and Burley
+    2015, Approximate Reflectance Profiles, Eq. 5)."""
+    return skin.spread_mm / (1.9 - skin.albedo + 3.5 * (skin.albedo - 0.8) ** 2)
+
+
+def spread_light(light: Floats, share: Floats, depth: Floats, alpha: float, skin: Skin) -> Floats:
+    """Light (H, W) as it leaves: what enters skin comes out around there, and only from skin.
+
+    share: (H, W) of each pixel that is skin.
+    depth: (H, W) mm.
+    alpha: focal length, px.
+    """
+    lit = share > 0
+    if skin.spread_mm <= 0 or not lit.any():
+        return light
+    near, far = np.percentile(depth[lit], [2.0, 98.0])
+    distances = np.linspace(near, max(far, near + 1.0), 3)
+    level = np.clip((depth - near) / (distances[1] - near), 0.0, 2.0)
+    outgoing = np.zeros_like(light)
+    for step, distance in enumerate(distances):
+        weight = np.maximum(1.0 - np.abs(level - step), 0.0).astype(np.float32)
+        kernel = _profile_kernel(round(shape_mm(skin) * alpha / float(distance), 3))
+        out = cv2.filter2D(light * share, -1, kernel, borderType=cv2.BORDER_REFLECT_101)
+        whole = cv2.filter2D(share, -1, kernel, borderType=cv2.BORDER_REFLECT_101)
+        outgoing += weight * np.divide(out, whole, out=np.zeros_like(out), where=whole > 1e-6)
+    enters = share * np.float32(1.0 - skin.stays)
+    return light * (1.0 - enters) + outgoing * enters
+
+
+@lru_cache(maxsize=64)
+def _profile_kernel(shape_px: float) -> Floats:
+    """Burley's profile (exp(-r / d) + exp(-r / 3 d)) / (8 pi d r), (k, k), normalised to sum 1."""
+    half = max(1, int(np.ceil(18.0 * shape_px)))  # 1/500 of the light lies beyond
+    size, fine_steps = 2 * half + 1, 9  # the profile is steep in the middle
+    fine = (np.arange(size * fine_steps) + 0.5) / fine_steps - size / 2.0
+    r = np.hypot(*np.meshgrid(fine, fine))
+    r = np.maximum(r, 0.25 / fine_steps)  # the middle point is a cell, not a pole
+    profile: Array = (np.exp(-r / shape_px) + np.exp(-r / (3.0 * shape_px))) / r
+    kernel = profile.reshape(size, fine_steps, size, fine_steps).sum(axis=(1, 3))
+    return np.asarray(kernel / kernel.sum(), np.float32)
+
+
+def highlight(points: Reals, towards: Reals, normals: Reals, skin: Skin) -> Floats:
+    """Brightness (N,) of the gloss at points, camera at the origin, relative to a white matt
+    surface that faces the light (Blinn 1977)."""
+    view = -points / np.linalg.norm(points, axis=1, keepdims=True)
+    light = towards / np.linalg.norm(towards, axis=1, keepdims=True)
+    half = view + light
+    half = half / np.maximum(np.linalg.norm(half, axis=1, keepdims=True), 1e-12)
+    unit = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    cosine = np.abs(np.sum(half * unit, axis=1))
+    return np.asarray(skin.gloss * cosine**skin.gloss_power, np.float32)

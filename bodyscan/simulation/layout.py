@@ -1,8 +1,8 @@
-"""The rig as it was really built: nominal poses with the errors of hands and tape measures."""
+"""The rig and the room as built: nominal poses with the errors of hands and tape measures."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,12 +14,10 @@ from bodyscan.rig.pair import NominalPose, Pair
 from bodyscan.rig.rig import Rig
 from bodyscan.simulation.lens import TrueCamera
 from bodyscan.simulation.projector import MirrorProjector, PinholeProjector
-from bodyscan.simulation.settings import Optics, Projection, SimulationSettings
+from bodyscan.simulation.scene import Surface, grid_surface
+from bodyscan.simulation.settings import Optics, Projection, Room, SimulationSettings
 
 AnyProjector = MirrorProjector | PinholeProjector
-
-_UP = np.array([0.0, 0.0, 1.0])
-_LAMP_STRIPES = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,22 +61,22 @@ def _build(
             remedy="Add nominal: {position_mm: [x, y, z], look_at_mm: [x, y, z]} to the rig file.",
         )
     optics = settings.optics
-    reach = float(np.linalg.norm(np.subtract(*_ends(pair.nominal))))
+    reach = float(np.linalg.norm(np.subtract(*_endpoints(pair.nominal))))
     camera = draw_camera(pair.camera.width, pair.camera.height, optics, rng)
-    nominal = rig_from_view(pair.nominal)
-    placed = _perturbed(nominal, optics, reach, rng)
-    rig_from_camera = nominal if fixed else placed
+    nominal = rig_from_nominal(pair.nominal)
+    perturbed = _perturb(nominal, optics, reach, rng)
+    rig_from_camera = nominal if fixed else perturbed
     horizontal = pair.projector is None or pair.projector.direction == "horizontal"
-    placing = pair.projector_nominal or _beside(nominal, reach, horizontal)
-    rig_from_projector = _perturbed(rig_from_view(placing), optics, reach, rng)
-    stripes = pair.projector.stripes if pair.projector else _LAMP_STRIPES
+    nominal_pose = pair.projector_nominal or _default_projector(nominal, reach, horizontal)
+    rig_from_projector = _perturb(rig_from_nominal(nominal_pose), optics, reach, rng)
+    stripes = pair.projector.stripes if pair.projector else 2
     builder = build_mirror if settings.projection.kind == "mirror" else build_pinhole
     depths = reach * np.linspace(settings.projection.near, settings.projection.far, 5)
     projector = builder(
         rig_from_camera.inverse() @ rig_from_projector,
         stripes,
         horizontal,
-        seen_points(camera, depths),
+        sample_view_volume(camera, depths),
         settings.projection,
         rng,
     )
@@ -104,23 +102,23 @@ def draw_camera(width: int, height: int, optics: Optics, rng: np.random.Generato
     return TrueCamera(alpha, beta, gamma, u0, v0, k1, k2, width, height, p1, p2, k3)
 
 
-def rig_from_view(placing: NominalPose) -> RigidTransform:
+def rig_from_nominal(nominal_pose: NominalPose) -> RigidTransform:
     """Pose of a device that looks along its z axis, y down, upright in the rig."""
-    position, target = _ends(placing)
+    position, target = _endpoints(nominal_pose)
     forward = target - position
     forward = forward / np.linalg.norm(forward)
-    right = np.cross(forward, _UP)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
     if np.linalg.norm(right) < 1e-6:  # straight up or down: the image's top is towards x
         right = np.cross([-1.0, 0.0, 0.0], forward)
     right = right / np.linalg.norm(right)
     return RigidTransform(np.stack([right, np.cross(forward, right), forward], axis=1), position)
 
 
-def _ends(placing: NominalPose) -> tuple[Array, Array]:
-    return np.array(placing.position_mm, float), np.array(placing.look_at_mm, float)
+def _endpoints(nominal_pose: NominalPose) -> tuple[Array, Array]:
+    return np.array(nominal_pose.position_mm, float), np.array(nominal_pose.look_at_mm, float)
 
 
-def _beside(nominal: RigidTransform, reach: float, horizontal: bool) -> NominalPose:
+def _default_projector(nominal: RigidTransform, reach: float, horizontal: bool) -> NominalPose:
     """Pose of a projector that has none in the rig file: above the camera, or to its right."""
     axis = -nominal.rotation[:, 1] if horizontal else nominal.rotation[:, 0]
     position = nominal.translation + 0.22 * reach * axis
@@ -128,18 +126,20 @@ def _beside(nominal: RigidTransform, reach: float, horizontal: bool) -> NominalP
     return NominalPose(position_mm=tuple(position.tolist()), look_at_mm=tuple(target.tolist()))
 
 
-def _perturbed(
+def _perturb(
     rig_from_device: RigidTransform, optics: Optics, reach: float, rng: np.random.Generator
 ) -> RigidTransform:
-    """A pose with manual placing errors; smaller if everything is nearer than in a body scanner."""
+    """Perturb a pose by errors of placing by hand; smaller ones in a rig smaller than 1.3 m."""
     turn = np.radians(optics.angle_deg) * rng.standard_normal(3)
     shift = optics.position_mm * min(1.0, reach / 1300.0) * rng.standard_normal(3)
-    turned = RigidTransform.from_rotation_vector(turn, np.zeros(3)).rotation
-    return RigidTransform(rig_from_device.rotation @ turned, rig_from_device.translation + shift)
+    rotation_error = RigidTransform.from_rotation_vector(turn, np.zeros(3)).rotation
+    return RigidTransform(
+        rig_from_device.rotation @ rotation_error, rig_from_device.translation + shift
+    )
 
 
-def seen_points(camera: TrueCamera, depths: Sequence[float] | Array) -> Array:
-    """Points (N, 3) at some depths, all over the camera's field of view including its corners."""
+def sample_view_volume(camera: TrueCamera, depths: Sequence[float] | Array) -> Array:
+    """Sample points (N, 3) at some depths over the field of view, corners included."""
     u, v = np.linspace(-0.5, camera.width - 0.5, 9), np.linspace(-0.5, camera.height - 0.5, 9)
     grid = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
     return (camera.directions(grid)[:, None, :] * np.reshape(depths, (-1, 1))).reshape(-1, 3)
@@ -149,11 +149,11 @@ def build_mirror(
     camera_from_projector: RigidTransform,
     stripes: int,
     horizontal: bool,
-    seen: Array,
+    points: Array,
     projection: Projection,
     rng: np.random.Generator,
 ) -> MirrorProjector:
-    """A laser and mirror in the projector's position, sweeping over all points seen.
+    """A laser and mirror in the projector's position, sweeping over all points.
 
     The laser's apex lies at a right angle to the outgoing direction; stripes run along the mirror's
     axis.
@@ -172,14 +172,14 @@ def build_mirror(
     sheet = np.cos(tilt) * upright / np.linalg.norm(upright) + np.sin(tilt) * axis
     sheet = sheet - (sheet @ aim) * aim
     zero = (out + back) / np.sqrt(2.0)
-    wide = MirrorProjector(
+    full = MirrorProjector(
         stripes, axis, centre, zero, offset, laser, sheet / np.linalg.norm(sheet), aim, 0.0, 1.0
     )
-    theta = wide.angle(seen)
-    fan = float(1.05 * np.abs(wide.across(seen, theta)).max())
-    first, last = _sweep(seen, theta, horizontal, projection.margin)
+    theta = full.angle(points)
+    fan = float(1.05 * np.abs(full.fan_tangent(points, theta)).max())
+    first, last = _sweep(points, theta, horizontal, projection.margin)
     return replace(
-        wide,
+        full,
         first_angle=first,
         sweep_angle=last - first,
         fan=fan,
@@ -191,7 +191,7 @@ def build_pinhole(
     camera_from_projector: RigidTransform,
     stripes: int,
     horizontal: bool,
-    seen: Array,
+    points: Array,
     projection: Projection,
     rng: np.random.Generator,
 ) -> PinholeProjector:
@@ -201,18 +201,29 @@ def build_pinhole(
     k1 = projection.k1 * (1.0 + 0.2 * rng.standard_normal())
     k2 = projection.k2 * (1.0 + 0.2 * rng.standard_normal())
     centre = camera_from_projector.translation
-    wide = PinholeProjector(stripes, rows, centre, 0.0, 1.0, 1e9, k1, k2)
-    along, across = wide.slide(seen)
-    first, last = _sweep(seen, across, horizontal, projection.margin)
+    full = PinholeProjector(stripes, rows, centre, 0.0, 1.0, 1e9, k1, k2)
+    along, across = full.slide(points)
+    first, last = _sweep(points, across, horizontal, projection.margin)
     half = float(1.05 * np.abs(along).max())
     bow = projection.smile_stripes
-    return replace(wide, first=first, last=last, half=half, smile_stripes=bow)
+    return replace(full, first=first, last=last, half=half, smile_stripes=bow)
 
 
-def _sweep(seen: Array, values: Array, horizontal: bool, margin: float) -> tuple[float, float]:
-    """First and last value of a sweep over values (N,) at points seen (N, 3), in the order down the
-    image or to its right."""
+def _sweep(points: Array, values: Array, horizontal: bool, margin: float) -> tuple[float, float]:
+    """Compute a sweep's first and last value over values (N,) at points (N, 3), in the order down
+    the image or to its right."""
     low, high = float(values.min()), float(values.max())
     low, high = low - margin * (high - low), high + margin * (high - low)
-    image = seen[:, 1 if horizontal else 0] / seen[:, 2]
+    image = points[:, 1 if horizontal else 0] / points[:, 2]
     return (low, high) if np.corrcoef(image, values)[0, 1] > 0 else (high, low)
+
+
+def build_room(pairs: Iterable[TruePair], room: Room) -> tuple[Surface, ...]:
+    """Floor at z = 0 and four walls, in the rig frame."""
+    positions = np.stack([pair.rig_from_camera.translation for pair in pairs])
+    half = max(room.wall_mm, 2.0 * float(np.linalg.norm(positions[:, :2], axis=1).max()))
+    x, y = np.array([2.0 * half, 0.0, 0.0]), np.array([0.0, 2.0 * half, 0.0])
+    up, corner = np.array([0.0, 0.0, 3.0 * half]), np.array([-half, -half, 0.0])
+    walls = [(corner, x, up), (corner, y, up), (corner + y, x, up), (corner + x, y, up)]
+    floor = grid_surface(corner, x, y, albedo=room.floor, encloses=True)
+    return (floor, *(grid_surface(*wall, albedo=room.wall, encloses=True) for wall in walls))

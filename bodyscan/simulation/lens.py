@@ -13,10 +13,6 @@ import numpy as np
 from bodyscan.arrays import Array, Floats
 from bodyscan.compiled import compiled
 
-_TABLE = 1 << 15
-_NEWTON = 6
-"""Newton steps: a lens bends by a tenth, and each step squares the remaining error."""
-
 
 @dataclass(frozen=True)
 class TrueCamera:
@@ -43,9 +39,9 @@ class TrueCamera:
 
         Eq. 3 and 4 as they stand: the ideal point is pushed away from [u0, v0].
         """
-        if self._off_centre:
+        if self._has_brown_terms:
             lens = (self.k1, self.k2, self.k3, self.p1, self.p2)
-            x, y = bend(points[..., 0] / points[..., 2], points[..., 1] / points[..., 2], *lens)
+            x, y = distort(points[..., 0] / points[..., 2], points[..., 1] / points[..., 2], *lens)
             u = self.alpha * x + self.gamma * y + self.u0
             return np.stack([u, self.beta * y + self.v0], axis=-1)
         x, y = points[..., 0] / points[..., 2], points[..., 1] / points[..., 2]
@@ -63,28 +59,28 @@ class TrueCamera:
         """
         y = (pixels[..., 1] - self.v0) / self.beta
         x = (pixels[..., 0] - self.u0 - self.gamma * y) / self.alpha
-        if self._off_centre:
-            ideal = self._unbent(np.stack([x, y], axis=-1))
+        if self._has_brown_terms:
+            ideal = self._undistort(np.stack([x, y], axis=-1))
             return np.concatenate([ideal, np.ones_like(ideal[..., :1])], axis=-1)
         real = np.hypot(x, y)
-        ideal = np.linspace(0.0, 1.5 * max(float(real.max(initial=0.0)), 0.1), _TABLE)
+        ideal = np.linspace(0.0, 1.5 * max(float(real.max(initial=0.0)), 0.1), 1 << 15)
         table = ideal * (1.0 + self.k1 * ideal**2 + self.k2 * ideal**4)
         folds = np.flatnonzero(np.diff(table) <= 0)
-        end = int(folds[0]) + 1 if folds.size else _TABLE
+        end = int(folds[0]) + 1 if folds.size else len(table)
         if table[end - 1] < real.max(initial=0.0):
             raise ValueError("the lens folds the image over: no ray belongs to its corners")
-        grown = np.interp(real, table[:end], ideal[:end])
-        ratio = np.divide(grown, real, out=np.ones_like(real), where=real > 0)
+        scale = np.interp(real, table[:end], ideal[:end])
+        ratio = np.divide(scale, real, out=np.ones_like(real), where=real > 0)
         return np.stack([x * ratio, y * ratio, np.ones_like(x)], axis=-1)
 
     @property
-    def _off_centre(self) -> bool:
+    def _has_brown_terms(self) -> bool:
         return bool(self.p1 or self.p2 or self.k3)
 
-    def _unbent(self, real: Array) -> Array:
+    def _undistort(self, real: Array) -> Array:
         """The ideal points that the lens maps to `real` (..., 2)."""
         ideal = real.reshape(-1, 2).copy()
-        if not unbend(ideal, np.array([self.k1, self.k2, self.k3, self.p1, self.p2])):
+        if not undistort_points(ideal, np.array([self.k1, self.k2, self.k3, self.p1, self.p2])):
             raise ValueError("the lens folds the image over: no ray belongs to its corners")
         return ideal.reshape(real.shape)
 
@@ -95,50 +91,52 @@ class TrueCamera:
         return np.stack([u, v], axis=-1)
 
 
-def bend(x: Any, y: Any, k1: float, k2: float, k3: float, p1: float, p2: float) -> tuple[Any, Any]:
+def distort(
+    x: Any, y: Any, k1: float, k2: float, k3: float, p1: float, p2: float
+) -> tuple[Any, Any]:
     """Normalised coordinates, numbers or arrays, after the lens (Brown 1966)."""
     square = x * x + y * y
-    grown = 1.0 + square * (k1 + square * (k2 + square * k3))
+    scale = 1.0 + square * (k1 + square * (k2 + square * k3))
     aside = 2.0 * p1 * x * y + p2 * (square + 2.0 * (x * x))
     down = p1 * (square + 2.0 * (y * y)) + 2.0 * p2 * x * y
-    return x * grown + aside, y * grown + down
+    return x * scale + aside, y * scale + down
 
 
-_bend = compiled(bend)
+_distort = compiled(distort)
 
 
 @compiled
-def unbend(places: Array, lens: Array) -> bool:
-    """Replace places (N, 2) by what the lens (k1, k2, k3, p1, p2) maps to them.
+def undistort_points(points: Array, lens: Array) -> bool:
+    """Replace points (N, 2) by what the lens (k1, k2, k3, p1, p2) maps to them.
 
-    By Newton's method with numerical slopes. Returns False, with places undefined, if the lens
+    By Newton's method with numerical slopes. Returns False, with points undefined, if the lens
     folds the image over.
     """
     k1, k2, k3, p1, p2 = lens
     step = 1e-6
-    for i in range(len(places)):
-        u, v = places[i]
+    for i in range(len(points)):
+        u, v = points[i]
         x, y = u, v
-        for _ in range(_NEWTON):
-            bent_x, bent_y = _bend(x, y, k1, k2, k3, p1, p2)
-            right_x, right_y = _bend(x + step, y, k1, k2, k3, p1, p2)
-            below_x, below_y = _bend(x, y + step, k1, k2, k3, p1, p2)
-            xx, yx = (right_x - bent_x) / step, (right_y - bent_y) / step
-            xy, yy = (below_x - bent_x) / step, (below_y - bent_y) / step
+        for _ in range(6):  # distortion is some 0.1, and each step squares the error
+            image_x, image_y = _distort(x, y, k1, k2, k3, p1, p2)
+            right_x, right_y = _distort(x + step, y, k1, k2, k3, p1, p2)
+            below_x, below_y = _distort(x, y + step, k1, k2, k3, p1, p2)
+            xx, yx = (right_x - image_x) / step, (right_y - image_y) / step
+            xy, yy = (below_x - image_x) / step, (below_y - image_y) / step
             size = xx * yy - yx * xy
             if size <= 0:
                 return False
-            short_x, short_y = u - bent_x, v - bent_y
+            short_x, short_y = u - image_x, v - image_y
             x, y = (
                 x + (short_x * yy - short_y * xy) / size,
                 y + (short_y * xx - short_x * yx) / size,
             )
-        places[i, 0], places[i, 1] = x, y
+        points[i, 0], points[i, 1] = x, y
     return True
 
 
 def sample_offsets(count: int) -> Array:
-    """count^2 places inside a pixel, (count^2, 2) in [0, 1): no two share a column or a row.
+    """count^2 positions inside a pixel, (count^2, 2) in [0, 1): no two share a column or a row.
 
     A square grid would resolve an edge along a row of pixels in only `count` steps.
     """

@@ -38,7 +38,7 @@ BELLY_LATE = 0.6
 
 
 @dataclass(frozen=True, eq=False)
-class Wander:
+class RandomSignal:
     """A smooth random function of time with several components: sums of cosines.
 
     hz: (K,).
@@ -55,7 +55,9 @@ class Wander:
         return np.sum(self.sizes * np.cos(turns + self.phases), axis=0)
 
 
-def draw_wander(rms: float, components: int, rng: np.random.Generator, *, speed: bool) -> Wander:
+def draw_signal(
+    rms: float, components: int, rng: np.random.Generator, *, speed: bool
+) -> RandomSignal:
     """Draw a function whose components together, or with `speed` their changes per second, are
     `rms`.
 
@@ -65,7 +67,7 @@ def draw_wander(rms: float, components: int, rng: np.random.Generator, *, speed:
     sizes = rng.standard_normal((WAVES, components)) / hz[:, None] ** 1.5
     rate = 2.0 * np.pi * hz[:, None] if speed else 1.0
     sizes = sizes * (rms / np.sqrt(0.5 * np.sum((sizes * rate) ** 2)))
-    return Wander(hz, sizes, rng.uniform(0.0, 2.0 * np.pi, (WAVES, components)))
+    return RandomSignal(hz, sizes, rng.uniform(0.0, 2.0 * np.pi, (WAVES, components)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,9 +81,9 @@ class Joint:
 
     weights: Array
     pivot: Array
-    turn: Wander
+    turn: RandomSignal
 
-    def carry(self, vertices: Array, ms: float) -> Array:
+    def rotate(self, vertices: Array, ms: float) -> Array:
         """Vertices (N, 3) after its rotation."""
         moved = self.motion(ms).apply(vertices)
         return vertices + self.weights[:, None] * (moved - vertices)
@@ -113,13 +115,13 @@ class LivingBody:
 
     rest: at mean breath, upright.
     limbs: both arms, then the head, relative to the trunk.
-    swells: (N, 3, 2) motion of each vertex with chest and belly, per mm of breath.
+    breath_modes: (N, 3, 2) motion of each vertex with chest and belly, per mm of breath.
     ankles: the whole body's sway.
     """
 
     rest: Surface
     limbs: tuple[Joint, ...]
-    swells: Array
+    breath_modes: Array
     breath: Breath
     ankles: Joint
 
@@ -132,25 +134,25 @@ class LivingBody:
     def vertices(self, ms: float, *, breathing: bool = True) -> Array:
         """Vertices (N, 3) mm, rig frame, at a time since the scan
         began; without breathing, at mean breath."""
-        placed = self.rest.vertices
+        moved = self.rest.vertices
         for limb in self.limbs:
-            placed = limb.carry(placed, ms)
+            moved = limb.rotate(moved, ms)
         if breathing:
-            placed = placed + self.swells @ self.breath.at(ms)
-        return self.ankles.carry(placed, ms)
+            moved = moved + self.breath_modes @ self.breath.at(ms)
+        return self.ankles.rotate(moved, ms)
 
     def surface(self, ms: float, *, breathing: bool = True) -> Surface:
         """The skin at that time. Normals are those at rest:
         nothing rotates more than a degree or so."""
         return replace(self.rest, vertices=self.vertices(ms, breathing=breathing))
 
-    def farthest(self, from_ms: float, moments_ms: Iterable[float]) -> float:
+    def max_displacement(self, from_ms: float, moments_ms: Iterable[float]) -> float:
         """Largest distance, mm, of any vertex at some moments from where it is at another."""
         start = self.vertices(from_ms)
         away = [np.linalg.norm(self.vertices(ms) - start, axis=1).max() for ms in moments_ms]
         return float(max(away))
 
-    def swayed(self, ms: float, since_ms: float) -> RigidTransform:
+    def trunk_motion(self, ms: float, since_ms: float) -> RigidTransform:
         """The trunk's motion between two moments, rig frame."""
         return self.ankles.motion(ms) @ self.ankles.motion(since_ms).inverse()
 
@@ -160,24 +162,24 @@ def moves(person: Person) -> bool:
     return any((person.sway_mm_s, person.breath_mm, person.arms_deg, person.head_deg))
 
 
-def bring_to_life(still: Surface, person: Person, rng: np.random.Generator) -> LivingBody:
+def animate(still: Surface, person: Person, rng: np.random.Generator) -> LivingBody:
     """A living person whose mean pose is `still`."""
     vertices = still.vertices
     height = float(vertices[:, 2].max())
     z = vertices[:, 2] / height
     arms = [_arm_weights(still, side, height) for side in (-1.0, 1.0)]
-    head = _rising(z, NECK, CHIN) * (1.0 - arms[0]) * (1.0 - arms[1])
-    limbs = [(own, np.radians(person.arms_deg)) for own in arms]
+    head = _smoothstep(z, NECK, CHIN) * (1.0 - arms[0]) * (1.0 - arms[1])
+    limbs = [(weights, np.radians(person.arms_deg)) for weights in arms]
     limbs += [(head, np.radians(person.head_deg))]
     joints = tuple(
-        Joint(own, _border(vertices, own), draw_wander(rms, 3, rng, speed=False))
-        for own, rms in limbs
+        Joint(weights, _border(vertices, weights), draw_signal(rms, 3, rng, speed=False))
+        for weights, rms in limbs
     )
     # Leaning forward is a rotation about y, leaning left one about -x; there is none about z.
     pivot = np.array([0.0, 0.0, ANKLE * height])
-    lean = draw_wander(person.sway_mm_s / (height - pivot[2]), 2, rng, speed=True)
+    lean = draw_signal(person.sway_mm_s / (height - pivot[2]), 2, rng, speed=True)
     flat = np.zeros((WAVES, 1))
-    sway = Wander(lean.hz, np.hstack([lean.sizes, flat]), np.hstack([lean.phases, flat]))
+    sway = RandomSignal(lean.hz, np.hstack([lean.sizes, flat]), np.hstack([lean.phases, flat]))
     start = float(rng.uniform(0.0, 2.0 * np.pi))
     breath = Breath(
         person.breath_mm,
@@ -185,22 +187,24 @@ def bring_to_life(still: Surface, person: Person, rng: np.random.Generator) -> L
         (start, start - BELLY_LATE),
     )
     trunk = (1.0 - arms[0]) * (1.0 - arms[1])
-    swells = _swells(vertices, trunk, height)
-    return LivingBody(still, joints, swells, breath, Joint(_rising(z, FOOT, ANKLE), pivot, sway))
+    breath_modes = _breath_modes(vertices, trunk, height)
+    return LivingBody(
+        still, joints, breath_modes, breath, Joint(_smoothstep(z, FOOT, ANKLE), pivot, sway)
+    )
 
 
-def _rising(values: Array, low: float, high: float) -> Array:
+def _smoothstep(values: Array, low: float, high: float) -> Array:
     """0 below, 1 above, smooth between."""
     t = np.clip((values - low) / (high - low), 0.0, 1.0)
     return t * t * (3.0 - 2.0 * t)
 
 
 def _arm_weights(still: Surface, side: float, height: float) -> Array:
-    """Weights (N,), 1 on the arm that reaches farthest to
+    """Weights (N,), 1 on the arm that reaches max_displacement to
     positive y (side 1) or negative y (-1)."""
     fingertip = int(np.argmax(side * still.vertices[:, 1]))
     along = dijkstra(_edges(still), indices=[fingertip], limit=0.6 * height)[0]
-    return 1.0 - _rising(along / height, ELBOW_SIDE, SHOULDER)
+    return 1.0 - _smoothstep(along / height, ELBOW_SIDE, SHOULDER)
 
 
 def _edges(surface: Surface) -> csr_matrix:
@@ -217,34 +221,35 @@ def _border(vertices: Array, weights: Array) -> Array:
     return vertices[(weights > 0.3) & (weights < 0.7)].mean(axis=0)
 
 
-def _swells(vertices: Array, trunk: Array, height: float) -> Array:
-    """Motion (N, 3, 2) with chest and belly, per mm by which the farthest vertex of each stands
+def _breath_modes(vertices: Array, trunk: Array, height: float) -> Array:
+    """Motion (N, 3, 2) with chest and belly, per mm by which the max_displacement vertex of each stands
     out: the front forward, the sides outward, the back not at all."""
     heights = np.array([CHEST, BELLY]) * height
-    spread = BREATHING * height
-    rises = np.exp(-0.5 * ((vertices[:, 2:] - heights) / spread) ** 2)
+    sigma = BREATHING * height
+    rises = np.exp(-0.5 * ((vertices[:, 2:] - heights) / sigma) ** 2)
     level = np.linspace(heights.min(), heights.max(), 50)[:, None]
-    rises = rises / np.exp(-0.5 * ((level - heights) / spread) ** 2).sum(axis=1).max()
+    rises = rises / np.exp(-0.5 * ((level - heights) / sigma) ** 2).sum(axis=1).max()
     inside = (trunk > 0.99) & (rises.sum(axis=1) > 0.1)
     back, front = np.percentile(vertices[inside, 0], [2.0, 98.0])
     wide = np.percentile(np.abs(vertices[inside, 1]), 98.0)
-    forward = _rising((vertices[:, 0] - back) / (front - back), 0.3, 1.0)
+    forward = _smoothstep((vertices[:, 0] - back) / (front - back), 0.3, 1.0)
     outward = SIDEWAYS * np.clip(vertices[:, 1] / wide, -1.5, 1.5)
-    ways = np.stack([forward, outward, np.zeros(len(vertices))], axis=1) * trunk[:, None]
-    return ways[:, :, None] * rises[:, None, :]
+    directions = np.stack([forward, outward, np.zeros(len(vertices))], axis=1) * trunk[:, None]
+    return directions[:, :, None] * rises[:, None, :]
 
 
 def describe_motion(body: LivingBody, moment_ms: float) -> dict[str, Any]:
     """For truth.json: which moment the truth's surface shows, and the parameters of the motion."""
 
-    def wander(one: Wander) -> dict[str, Any]:
+    def signal_fields(one: RandomSignal) -> dict[str, Any]:
         return {"hz": one.hz, "sizes": one.sizes, "phases": one.phases}
 
     return {
         "moment_ms": moment_ms,
         "breath": asdict(body.breath),
         "joints": [
-            {"pivot": joint.pivot, **wander(joint.turn)} for joint in (*body.limbs, body.ankles)
+            {"pivot": joint.pivot, **signal_fields(joint.turn)}
+            for joint in (*body.limbs, body.ankles)
         ],
     }
 
@@ -258,7 +263,7 @@ def save_body(body: LivingBody, path: Path) -> None:
             vertices=body.rest.vertices,
             triangles=body.rest.triangles.astype(np.int32),
             weights=np.array(weights, np.float32),
-            swells=body.swells.astype(np.float32),
+            swells=body.breath_modes.astype(np.float32),
         )
 
 
@@ -268,19 +273,21 @@ def load_body(motion: dict[str, Any], path: Path) -> LivingBody:
     with np.load(path) as stored:
         kept = {name: stored[name] for name in stored.files}
     joints = [
-        Joint(own.astype(float), np.array(one["pivot"]), _wander(one))
-        for one, own in zip(motion["joints"], kept["weights"], strict=True)
+        Joint(weights.astype(float), np.array(one["pivot"]), _signal_from_fields(one))
+        for one, weights in zip(motion["joints"], kept["weights"], strict=True)
     ]
     breath = Breath(**{**motion["breath"], "phases": tuple(motion["breath"]["phases"])})
     rest = Surface(kept["vertices"], kept["triangles"].astype(np.int64))
-    return LivingBody(rest, tuple(joints[:-1]), kept["swells"].astype(float), breath, joints[-1])
+    return LivingBody(
+        rest, tuple(joints[:-1]), kept["breath_modes"].astype(float), breath, joints[-1]
+    )
 
 
-def _wander(fields: dict[str, Any]) -> Wander:
-    return Wander(*(np.array(fields[name], float) for name in ("hz", "sizes", "phases")))
+def _signal_from_fields(fields: dict[str, Any]) -> RandomSignal:
+    return RandomSignal(*(np.array(fields[name], float) for name in ("hz", "sizes", "phases")))
 
 
-def body_of(truth: Path) -> LivingBody | None:
+def load_moving_body(truth: Path) -> LivingBody | None:
     """The body in a workspace's folder `truth`; None if the subject did not move, or is
     unreadable."""
     try:

@@ -1,4 +1,4 @@
-"""The light of every image of every code, for the simulator alone: its own formulas.
+"""The light of every image of every stripe code, by the simulator's own formulas.
 
 Only names, numbers and counts are taken from the codes' descriptions, never their `intensity`: a
 mistake in that would be repeated here, and cancel out when the images are decoded.
@@ -6,19 +6,118 @@ mistake in that would be repeated here, and cancel out when the images are decod
 
 from __future__ import annotations
 
-import numpy as np
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
 
-from bodyscan.arrays import Array
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import oaconvolve
+
+from bodyscan.arrays import Array, Bytes, Floats, Mask
 from bodyscan.errors import BadInput
 from bodyscan.rig.frame_names import FrameNames
 from bodyscan.rig.rig import Rig
-from bodyscan.simulation.gray import bit_count, code_bits
 from bodyscan.stripes.codes.gray import INVERSE, PATTERN, Binary, Gray
 from bodyscan.stripes.codes.light_section import STRIPE, LightSection
 from bodyscan.stripes.codes.phase_shift import PHASE, PhaseShift
-from bodyscan.stripes.codes.stripe_index import StripeIndex
+from bodyscan.stripes.codes.stripe_index import INDEX, StripeIndex
 from bodyscan.stripes.stripe_code import ImageKind, StripeCode
 from bodyscan.stripes.wave import Wave
+
+PAD = 4
+"""Stripes by which a table of light extends beyond the sweep."""
+
+FINE = 128
+"""Entries of a table of light per stripe."""
+
+
+def bit_count(stripes: int) -> int:
+    """Number of patterns needed to tell the stripes apart."""
+    return int(np.ceil(np.log2(stripes)))
+
+
+def code_bits(stripes: int, first: int = 0) -> Mask:
+    """Whether stripe i is lit in pattern k, (bits, stripes), 0 the most significant.
+
+    first: the number of stripe 0.
+    """
+    index = np.arange(first, first + stripes)
+    code = index ^ (index >> 1)
+    positions = np.arange(bit_count(first + stripes))[::-1]
+    return (code >> positions[:, None] & 1).astype(bool)
+
+
+@dataclass(frozen=True, eq=False)
+class LightTable:
+    """Light as a function of the stripe coordinate, one row for each of several blurs.
+
+    values: (blurs, entries) float32 in 0..1.
+    """
+
+    values: Floats
+
+    def at(self, index: NDArray[np.int32]) -> Floats:
+        """Light at entries from `table_index`."""
+        return self.values.ravel().take(index)
+
+
+def table_index(
+    s: NDArray[np.floating], stripes: int, blur: NDArray[np.integer] | None = None
+) -> NDArray[np.int32]:
+    """Table entry of a stripe coordinate (NaN: outside the sweep), in the row of its blur if
+    several."""
+    entries = (stripes + 2 * PAD) * FINE
+    position = np.nan_to_num((s + PAD) * FINE, nan=0.0, posinf=0.0, neginf=0.0)
+    index = np.clip(position, 0, entries - 1).astype(np.int32)
+    return index if blur is None else (index + blur * entries).astype(np.int32)
+
+
+def light_table(
+    lit: NDArray[Any],
+    blurs: Array,
+    jitter: Array | None = None,
+    parts: int = 1,
+) -> LightTable:
+    """Light of one frame: the lit stripes, blurred by Gaussians.
+
+    lit: (S,), or (S * parts,) if light changes inside stripes.
+    blurs: (B,) standard deviations in stripes.
+    jitter: (S + 1,) displacement of each boundary, in stripes.
+    """
+    stripes = len(lit) // parts
+    boundaries = np.arange(stripes + 1, dtype=float)
+    if jitter is not None:
+        boundaries = np.maximum.accumulate(boundaries + jitter)
+    if parts > 1:
+        within = np.arange(stripes * parts + 1) / parts
+        boundaries = np.interp(within, np.arange(stripes + 1.0), boundaries)
+    energy = np.concatenate([[0.0], np.cumsum(lit * np.diff(boundaries))])
+    edges = np.arange((stripes + 2 * PAD) * FINE + 1) / FINE - PAD
+    sharp = np.diff(np.interp(edges, boundaries, energy)) * FINE
+    return LightTable(_blur_light(sharp.astype(np.float32), tuple(blurs.tolist())))
+
+
+def _blur_light(values: Floats, blurs: tuple[float, ...]) -> Floats:
+    """Values (N,) blurred by each blur, (B, N); block-wise Fourier transforms are ten times
+    quicker."""
+    if max(blurs) <= 0:
+        return np.repeat(values[None], len(blurs), axis=0)
+    padded = np.pad(values, PAD * FINE, mode="edge")
+    return np.asarray(oaconvolve(padded[None], _kernels(blurs), mode="valid", axes=1), np.float32)
+
+
+@lru_cache(maxsize=8)
+def _kernels(blurs: tuple[float, ...]) -> Floats:
+    """Gaussians (B, k) with these standard deviations in stripes, cut at four of them or at PAD."""
+    position = np.arange(-PAD * FINE, PAD * FINE + 1) / FINE
+    reached = np.minimum(4.0 * np.array(blurs), PAD)[:, None]
+    sigma = np.maximum(blurs, 1e-3 / FINE)[:, None]
+    bells = np.exp(-0.5 * (position / sigma) ** 2) * (
+        np.abs(position) <= np.maximum(reached, 0.5 / FINE)
+    )
+    return np.asarray(bells / bells.sum(axis=1, keepdims=True), np.float32)
+
 
 PARTS = 16
 """Values of light per stripe, if light changes inside stripes."""
@@ -56,19 +155,19 @@ def refuse_unknown_frames(rig: Rig) -> None:
 
 
 def projected_patterns(code: StripeCode, frames: FrameNames) -> dict[str, Array]:
-    """Light (stripes * k,), 0 to 1, at evenly spaced places of the sweep, by name of the image.
+    """Light (stripes * k,), 0 to 1, at evenly spaced positions of the sweep, by name of the image.
 
     For a stripe-index rig, what its instrument projects: Gray code (see `instrument`).
     """
     if isinstance(code, LightSection):
-        return _named(frames, STRIPE, np.eye(code.stripes))
+        return _name_images(frames, STRIPE, np.eye(code.stripes))
     if isinstance(code, PhaseShift):
-        place = (np.arange(code.stripes * PARTS) + 0.5) / PARTS
-        waves = np.concatenate([_wave_images(wave, place) for wave in code.waves])
-        phases = _named(frames, PHASE, waves)
+        position = (np.arange(code.stripes * PARTS) + 0.5) / PARTS
+        waves = np.concatenate([_wave_images(wave, position) for wave in code.waves])
+        phases = _name_images(frames, PHASE, waves)
         if not code.needs_gray:
             return phases
-        halves = np.floor(2.0 * place / code.waves[0].period).astype(int)
+        halves = np.floor(2.0 * position / code.waves[0].period).astype(int)
         bits = code_bits(int(halves[-1]) + 1)[:, halves].astype(float)
         return _bit_images(frames, bits, code.inverses) | phases
     if isinstance(code, Binary):
@@ -80,20 +179,47 @@ def projected_patterns(code: StripeCode, frames: FrameNames) -> dict[str, Array]
     return _bit_images(frames, code_bits(code.stripes, first).astype(float), inverses)
 
 
-def _wave_images(wave: Wave, place: Array) -> Array:
+def _wave_images(wave: Wave, position: Array) -> Array:
     """Images (steps, N): at each step the wave is shifted by
     a part of its period, forward or back."""
     step = wave.period / wave.steps * (1.0 if wave.shift == "forward" else -1.0)
     crest = wave.origin - wave.start * wave.period / (2.0 * np.pi)
     return np.stack(
-        [np.cos(np.pi * (place - crest - k * step) / wave.period) ** 2 for k in range(wave.steps)]
+        [
+            np.cos(np.pi * (position - crest - k * step) / wave.period) ** 2
+            for k in range(wave.steps)
+        ]
     )
 
 
 def _bit_images(frames: FrameNames, bits: Array, inverses: bool) -> dict[str, Array]:
-    inverse = _named(frames, INVERSE, 1.0 - bits) if inverses else {}
-    return _named(frames, PATTERN, bits) | inverse
+    inverse = _name_images(frames, INVERSE, 1.0 - bits) if inverses else {}
+    return _name_images(frames, PATTERN, bits) | inverse
 
 
-def _named(frames: FrameNames, kind: ImageKind, images: Array) -> dict[str, Array]:
+def _name_images(frames: FrameNames, kind: ImageKind, images: Array) -> dict[str, Array]:
     return dict(zip(frames.of_kind(kind, len(images)), images, strict=True))
+
+
+def instrument_images(
+    images: dict[str, Bytes], code: StripeCode, frames: FrameNames
+) -> dict[str, Bytes]:
+    """The lit image and the stripe-index image, from what its camera saw of its Gray code.
+
+    images: by the names of `patterns.projected_patterns`, with lit and a dark one named "".
+    """
+    lit_name = frames.lit or "lit"
+    lit, dark = images[lit_name], images[""]
+    coded = [name for name in images if name not in (lit_name, "")]
+    bits = bit_count(code.stripes)
+    words = sum(
+        (images[pattern] > images[inverse]).astype(int) << (bits - 1 - bit)
+        for bit, (pattern, inverse) in enumerate(zip(coded[:bits], coded[bits:], strict=True))
+    )
+    number = np.zeros(2**bits, np.uint8)
+    number[(1 << np.arange(bits)[::-1]) @ code_bits(code.stripes)] = np.arange(code.stripes) + 1
+    index = number[words]
+    index[lit.astype(int) - dark < 12] = 0  # grey levels: too dark for a stripe
+    index[lit == 255] = 255  # saturated
+    (name,) = frames.of_kind(INDEX, 1)
+    return {lit_name: lit, name: index}

@@ -50,29 +50,13 @@ class Merits:
     """What poses contribute.
 
     offered: (poses, merits) bool.
-    worth: (merits,) of each time a merit is had, up to `needed` times; it fades quickly from there.
+    worth: (merits,) of each time a merit is gained, up to `needed` times; it fades quickly from there.
     needed: (merits,).
     """
 
     offered: Mask
     worth: Array
     needed: Array
-
-
-STRIPES_WITHIN_DEG, LIT_WITHIN_DEG = 50.0, 70.0
-"""Angles from straight ahead up to which a face is seen well enough for stripes, and at all."""
-STRIPES_INSIDE, LIT_INSIDE = 0.5, 0.25
-"""Shares of a board that must be in the image for either."""
-GRAZING_DEG = 12.0
-"""From this angle above the floor on, a pair captures the board that lies there."""
-
-_CELLS = (6, 8)  # rows and columns of image cells that boards should cover
-_CANDIDATES = 3000  # poses, of which the best are chosen
-_NEAR, _FAR = 0.73, 1.12  # working distances at which boards are held
-_ASIDE = 0.22  # working distances off the axis, at most
-_TILT_DEG = 35.0  # of a board against the direction to the camera, at most
-_OFF_FLOOR_MM = 5.0
-_FADE = 0.35  # how quickly a merit loses its worth once it is had often enough
 
 
 def default_shots(pairs: int) -> int:
@@ -94,26 +78,26 @@ def plan_boards(
     names = (name for i in range(10_000) if (name := f"b{i + 1:02d}") not in taken)
     poses = _candidates(board, list(pairs.values()), rng)
     sights = {name: look(pair, poses, board) for name, pair in pairs.items()}
-    for pose in _chosen(_merits(sights, pairs, board), shots):
-        stripes, lit = _takes(board, sights, pairs, pose)
+    for pose in _choose_poses(_merits(sights, pairs, board), shots):
+        stripes, lit = _pairs_of_shot(board, sights, pairs, pose)
         plan.append(BoardShot(next(names), board.name, poses[pose], stripes, lit))
     return plan
 
 
 def look(pair: TruePair, poses: Sequence[RigidTransform], board: Board) -> Sight:
     """What a pair sees of the board in each pose (rig_from_board)."""
-    points = _grid(board)
+    points = _board_grid(board)
     turns = np.stack([pose.rotation for pose in poses])
     shifts = np.stack([pose.translation for pose in poses])
     camera_from_rig = pair.rig_from_camera.inverse()
-    seen = camera_from_rig.apply(points @ turns.transpose(0, 2, 1) + shifts[:, None])
-    middle = seen.mean(axis=1)
+    in_camera = camera_from_rig.apply(points @ turns.transpose(0, 2, 1) + shifts[:, None])
+    middle = in_camera.mean(axis=1)
     normal = camera_from_rig.rotate(turns[:, :, 2])
     cosine = np.einsum("ij,ij->i", normal, middle) / np.linalg.norm(middle, axis=1)
-    depth = np.maximum(seen[..., 2], 1.0)
+    depth = np.maximum(in_camera[..., 2], 1.0)
     camera = pair.camera
-    pixel = camera.image(np.concatenate([seen[..., :2], depth[..., None]], axis=-1))
-    within = (seen[..., 2] > 0.2 * pair.reach_mm) & np.all(
+    pixel = camera.image(np.concatenate([in_camera[..., :2], depth[..., None]], axis=-1))
+    within = (in_camera[..., 2] > 0.2 * pair.reach_mm) & np.all(
         (pixel > 4.0) & (pixel < np.array([camera.width, camera.height]) - 5.0), axis=-1
     )
     facing = normal * np.sign(cosine)[:, None]
@@ -122,13 +106,15 @@ def look(pair: TruePair, poses: Sequence[RigidTransform], board: Board) -> Sight
         np.degrees(np.arccos(np.clip(np.abs(cosine), 0.0, 1.0))),
         cosine < 0,
         within.mean(axis=1),
-        _covered(pixel, within, middle[:, 2] > 0.93 * pair.reach_mm, camera.width, camera.height),
+        _cover_cells(
+            pixel, within, middle[:, 2] > 0.93 * pair.reach_mm, camera.width, camera.height
+        ),
         np.floor((lean + np.pi) / (2.0 * np.pi) * 8.0).astype(np.int64) % 8,
     )
 
 
-def _covered(pixel: Array, within: Mask, far: Mask, width: int, height: int) -> Mask:
-    rows, columns = _CELLS
+def _cover_cells(pixel: Array, within: Mask, far: Mask, width: int, height: int) -> Mask:
+    rows, columns = 6, 8  # image cells that boards should cover
     row = np.clip(pixel[..., 1] * rows / height, 0, rows - 1).astype(int)
     column = np.clip(pixel[..., 0] * columns / width, 0, columns - 1).astype(int)
     cell = (far[:, None] * rows + row) * columns + column
@@ -138,36 +124,36 @@ def _covered(pixel: Array, within: Mask, far: Mask, width: int, height: int) -> 
     return covered
 
 
-def _grid(board: Board) -> Array:
-    width, height, _ = _extent(board)
+def _board_grid(board: Board) -> Array:
+    width, height, _ = _board_extent(board)
     x, y = np.meshgrid(np.linspace(0.0, width, 15), np.linspace(0.0, height, 13))
     return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
 
 
-def _can(board: Board, sight: Sight, stripes: bool) -> Mask:
+def _mask_visible(board: Board, sight: Sight, stripes: bool) -> Mask:
     """Poses (N,) in which a pair takes stripes (or at least the lit image).
 
     A plain board is found only if it is seen whole; a board's back only if it is printed.
     """
     whole = board.kind == "checkerboard"
-    share = 1.0 if whole else (STRIPES_INSIDE if stripes else LIT_INSIDE)
-    within = STRIPES_WITHIN_DEG if stripes else LIT_WITHIN_DEG
+    share = 1.0 if whole else (0.5 if stripes else 0.25)
+    max_angle_deg = 50.0 if stripes else 70.0
     printed = ~sight.back if board.faces == 1 else np.ones_like(sight.back)
-    return (sight.inside >= share) & (sight.angle_deg <= within) & printed
+    return (sight.inside >= share) & (sight.angle_deg <= max_angle_deg) & printed
 
 
-def _takes(
+def _pairs_of_shot(
     board: Board, sights: Mapping[str, Sight], pairs: Mapping[str, TruePair], pose: int
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     stripes = tuple(
         name
         for name, sight in sights.items()
-        if _can(board, sight, True)[pose] and pairs[name].has_stripes
+        if _mask_visible(board, sight, True)[pose] and pairs[name].has_stripes
     )
     lit = tuple(
         name
         for name, sight in sights.items()
-        if _can(board, sight, False)[pose] and name not in stripes
+        if _mask_visible(board, sight, False)[pose] and name not in stripes
     )
     return stripes, lit
 
@@ -181,8 +167,8 @@ def _floor_shot(rig: Rig, pairs: Mapping[str, TruePair]) -> BoardShot:
     lit = []
     for name, pair in pairs.items():
         sight = look(pair, [pose], board)
-        seen = sight.inside[0] >= LIT_INSIDE and (board.faces == 2 or not sight.back[0])
-        if seen and sight.angle_deg[0] <= 90.0 - GRAZING_DEG:
+        visible = sight.inside[0] >= 0.25 and (board.faces == 2 or not sight.back[0])
+        if visible and sight.angle_deg[0] <= 78.0:
             lit.append(name)
     return BoardShot(str(frame.shot), board.name, pose, (), tuple(lit))
 
@@ -192,69 +178,69 @@ def _candidates(
 ) -> list[RigidTransform]:
     """Poses near the middle of what pairs look at, facing them or turned between two poles."""
     poses: list[RigidTransform] = []
-    count = -(-_CANDIDATES // len(pairs))
+    count = -(-3000 // len(pairs))
     for pair in pairs:
         camera, reach = pair.camera, pair.reach_mm
         pixels = rng.uniform(0.05, 0.95, (count, 2)) * [camera.width, camera.height]
-        middles = camera.directions(pixels) * reach * rng.uniform(_NEAR, _FAR, (count, 1))
-        middles[:, 0] = np.clip(middles[:, 0], -_ASIDE * reach, _ASIDE * reach)
+        middles = camera.directions(pixels) * reach * rng.uniform(0.73, 1.12, (count, 1))
+        middles[:, 0] = np.clip(middles[:, 0], -0.22 * reach, 0.22 * reach)
         poses += [
             pair.rig_from_camera @ _draw_pose(board, middle, len(pairs) > 1, rng)
             for middle in middles
         ]
-    return [_off_floor(pose, board) for pose in poses]
+    return [_lift_above_floor(pose, board) for pose in poses]
 
 
-def _off_floor(rig_from_board: RigidTransform, board: Board) -> RigidTransform:
+def _lift_above_floor(rig_from_board: RigidTransform, board: Board) -> RigidTransform:
     """The pose, raised if necessary so that the board just clears the floor."""
     margin = np.array([[-1.0, -1.0, 0.0], [1.0, 1.0, 0.0]]) * board.margin_mm
-    low, high = margin + [[0.0, 0.0, 0.0], [1.0, 1.0, 0.0]] * _extent(board)
+    low, high = margin + [[0.0, 0.0, 0.0], [1.0, 1.0, 0.0]] * _board_extent(board)
     x, y = np.meshgrid([low[0], high[0]], [low[1], high[1]])
     corners = np.stack([x.ravel(), y.ravel(), np.zeros(4)], axis=1)
-    short = _OFF_FLOOR_MM + board.thickness_mm - rig_from_board.apply(corners)[:, 2].min()
+    short = 5.0 + board.thickness_mm - rig_from_board.apply(corners)[:, 2].min()
     lift = np.array([0.0, 0.0, max(short, 0.0)])
     return RigidTransform(rig_from_board.rotation, rig_from_board.translation + lift)
 
 
-def _extent(board: Board) -> Array:
+def _board_extent(board: Board) -> Array:
     """Width and height of the checkered area, and 0, (3,) mm."""
     return np.array([board.columns, board.rows, 0.0]) * board.square_mm
 
 
 def _draw_pose(
-    board: Board, middle: Array, turned: bool, rng: np.random.Generator
+    board: Board, middle: Array, turn_away: bool, rng: np.random.Generator
 ) -> RigidTransform:
     """A pose of a board with its middle there, its facing and its rotation drawn at random.
 
-    turned: two poses in five face away from the camera, towards other poles.
+    turn_away: two poses in five face away from the camera, towards other poles.
     """
-    tilt, way = np.radians(rng.uniform(0.0, _TILT_DEG)), rng.uniform(0.0, 2.0 * np.pi)
+    tilt, azimuth = np.radians(rng.uniform(0.0, 35.0)), rng.uniform(0.0, 2.0 * np.pi)
     yaw = 0.0
-    if turned and rng.random() < 0.4:
+    if turn_away and rng.random() < 0.4:
         yaw, tilt = np.radians(rng.choice([-60.0, -30.0, 30.0, 60.0])), 0.4 * tilt
     roll = rng.choice([0.0, 0.5 * np.pi]) + rng.normal(0.0, 0.15)
     over = np.pi if board.faces == 2 and rng.random() < 0.35 else 0.0
-    lean = _rotation(tilt * np.array([np.cos(way), np.sin(way), 0.0]))
+    lean = _rotation(tilt * np.array([np.cos(azimuth), np.sin(azimuth), 0.0]))
     turn = _rotation([0, yaw, 0]) @ lean @ _rotation([0, 0, roll]) @ _rotation([0, over, 0])
-    return RigidTransform(turn, middle - turn @ _extent(board) / 2.0)
+    return RigidTransform(turn, middle - turn @ _board_extent(board) / 2.0)
 
 
 def _rotation(vector: ArrayLike) -> Array:
     return RigidTransform.from_rotation_vector(vector, np.zeros(3)).rotation
 
 
-def _chosen(merits: Merits, shots: int) -> list[int]:
+def _choose_poses(merits: Merits, shots: int) -> list[int]:
     """Choose greedily the poses that add most to what is not yet covered and linked."""
     free = np.ones(len(merits.offered), bool)
-    had = np.zeros(len(merits.worth))
+    counts = np.zeros(len(merits.worth))
     offered = merits.offered.astype(np.float32)
     chosen: list[int] = []
     for _ in range(min(shots, len(free))):
-        spare = np.maximum(had - merits.needed + 1.0, 0.0)
-        gain = offered @ (merits.worth * _FADE**spare).astype(np.float32)
+        spare = np.maximum(counts - merits.needed + 1.0, 0.0)
+        gain = offered @ (merits.worth * 0.35**spare).astype(np.float32)
         best = int(np.argmax(np.where(free, gain, -1.0)))
         free[best] = False
-        had += offered[best]
+        counts += offered[best]
         chosen.append(best)
     return chosen
 
@@ -263,18 +249,18 @@ def _merits(sights: Mapping[str, Sight], pairs: Mapping[str, TruePair], board: B
     """Every cell of every image three times, near and far; tilts to all sides; six boards per pair;
     two pairs on one face of a board, or on both, three times."""
     parts: list[tuple[Mask, float, float]] = []
-    striped = {n: _can(board, s, True) & pairs[n].has_stripes for n, s in sights.items()}
-    seen = {name: _can(board, sight, False) for name, sight in sights.items()}
+    striped = {n: _mask_visible(board, s, True) & pairs[n].has_stripes for n, s in sights.items()}
+    lit_visible = {name: _mask_visible(board, sight, False) for name, sight in sights.items()}
     for name, sight in sights.items():
         split = sight.cells & striped[name][:, None]
         near, far = np.split(split, 2, axis=1)
-        leans = (sight.lean[:, None] == np.arange(8)) & (seen[name] & (sight.angle_deg > 15))[
-            :, None
-        ]
+        leans = (sight.lean[:, None] == np.arange(8)) & (
+            lit_visible[name] & (sight.angle_deg > 15)
+        )[:, None]
         parts += [(near | far, 3.0, 3.0), (split, 0.7, 1.0), (leans, 3.0, 1.0)]
         parts += [(striped[name][:, None], 5.0, 6.0)]
     for first, second in combinations(sights, 2):
-        both = seen[first] & seen[second]
+        both = lit_visible[first] & lit_visible[second]
         same = sights[first].back == sights[second].back
         parts += [((both & same)[:, None], 3.0, 3.0), ((both & ~same)[:, None], 2.0, 3.0)]
     sizes = [part.shape[1] for part, _, _ in parts]

@@ -140,8 +140,8 @@ def settings_for(
     values["person"] |= {"sway_mm": sway_mm, **SUBJECTS[subject]}
     values["skin"] |= LOOKS[look]
     if preset == WORKSHOP:
-        for part, own in _WORKSHOP.items():
-            values[part] |= own
+        for part, changed in _WORKSHOP.items():
+            values[part] |= changed
         values["projection"] |= _WORKSHOP_LIGHT[projector]
     return with_changes(settings_of(values), changes)
 
@@ -177,9 +177,9 @@ def settings_of(values: Mapping[str, Any]) -> SimulationSettings:
     Raises BadInput for a value that a setting cannot have.
     """
     known = {field.name for field in fields(SimulationSettings)}
-    own = {name: part for name, part in values.items() if name in known}
+    changed = {name: part for name, part in values.items() if name in known}
     try:
-        return TypeAdapter(SimulationSettings).validate_python(own)
+        return TypeAdapter(SimulationSettings).validate_python(changed)
     except ValidationError as refused:
         first = refused.errors(include_url=False)[0]
         where = ".".join(str(part) for part in first["loc"][:2])

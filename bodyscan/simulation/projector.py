@@ -67,7 +67,7 @@ class MirrorProjector:
         """
         zero, side = self._normals
         m1, m2, m3 = (float(self.sheet @ v) for v in (zero, side, self.axis))
-        q1, q2, q3 = (_along(points, v, self.centre) for v in (zero, side, self.axis))
+        q1, q2, q3 = (_project(points, v, self.centre) for v in (zero, side, self.axis))
         constant = q3 * m3 + float(self.sheet @ (self.centre - self.laser))
         a, b = q1 * m1 - q2 * m2, q1 * m2 + q2 * m1
         radius, phase = np.hypot(a, b), np.arctan2(b, a)
@@ -76,18 +76,18 @@ class MirrorProjector:
         for _ in range(4 if points.dtype == np.float32 else 12):
             lever = 2.0 * self.offset_mm * (m1 * np.cos(theta) + m2 * np.sin(theta))
             ratio = np.clip((constant + lever) / radius, -1.0, 1.0)
-            theta = 0.5 * _wrapped(phase - branch * np.arccos(ratio))
+            theta = 0.5 * _wrap_angle(phase - branch * np.arccos(ratio))
         return theta
 
     def stripe(self, points: Reals) -> Reals:
         theta = self.angle(points)
         s = (theta - self.first_angle) * (self.stripes / self.sweep_angle)
-        across = self.across(points, theta) / self.fan
+        fan_tangent = self.fan_tangent(points, theta) / self.fan
         if self.smile_stripes:
-            s = s + self.smile_stripes * across**2
-        return np.where(np.abs(across) <= 1.0, s, np.nan).astype(points.dtype)
+            s = s + self.smile_stripes * fan_tangent**2
+        return np.where(np.abs(fan_tangent) <= 1.0, s, np.nan).astype(points.dtype)
 
-    def across(self, points: Reals, theta: Reals) -> Reals:
+    def fan_tangent(self, points: Reals, theta: Reals) -> Reals:
         """Tangent of the angle, inside the fan, between a point's ray and the middle ray.
 
         It is computed after the point is mirrored back to the laser's side: (P' - laser) against
@@ -96,12 +96,14 @@ class MirrorProjector:
         cos, sin = np.cos(theta), np.sin(theta)
         zero, side = self._normals
         edge = np.cross(self.sheet, self.aim)
-        height = cos * _along(points, zero, self.centre) + sin * _along(points, side, self.centre)
+        height = cos * _project(points, zero, self.centre) + sin * _project(
+            points, side, self.centre
+        )
         height = height - self.offset_mm
 
-        def mirrored(way: Array) -> Reals:
-            tilt = cos * float(zero @ way) + sin * float(side @ way)
-            return _along(points, way, self.laser) - 2.0 * height * tilt
+        def mirrored(axis: Array) -> Reals:
+            tilt = cos * float(zero @ axis) + sin * float(side @ axis)
+            return _project(points, axis, self.laser) - 2.0 * height * tilt
 
         forward = mirrored(self.aim)
         lit = (forward > 0) & (height > 0)
@@ -156,7 +158,7 @@ class PinholeProjector:
 
     def slide(self, points: Reals) -> tuple[Reals, Reals]:
         """Slide coordinates (along, across) of points; NaN behind the projector."""
-        x, y, z = (_along(points, row, self.centre) for row in self.rotation)
+        x, y, z = (_project(points, row, self.centre) for row in self.rotation)
         front = np.where(z > 0, z, np.nan).astype(points.dtype)
         x, y = x / front, y / front
         square = x**2 + y**2
@@ -173,13 +175,13 @@ class PinholeProjector:
         return np.broadcast_to(self.centre.astype(s.dtype), (*s.shape, 3))
 
 
-def _along(points: Reals, vector: Array, origin: Array) -> Reals:
+def _project(points: Reals, vector: Array, origin: Array) -> Reals:
     """Distance of points (..., 3) from the origin along a vector."""
     x, y, z = (points[..., i] * float(vector[i]) for i in range(3))
     return x + y + z - float(vector @ origin)
 
 
-def _wrapped(angle: Reals) -> Reals:
+def _wrap_angle(angle: Reals) -> Reals:
     """Angles brought to (-pi, pi]."""
     turn = angle.dtype.type(2.0 * np.pi)
     return angle - turn * np.round(angle / turn)

@@ -12,23 +12,16 @@ from numpy.typing import NDArray
 
 from bodyscan.arrays import Array, Floats, Mask
 from bodyscan.rig.frame_names import FrameNames
-from bodyscan.simulation.flicker import Brightness
-from bodyscan.simulation.gray import LightTable, light_table, table_index
-from bodyscan.simulation.inter_reflection import LitFacets, light_facets
-from bodyscan.simulation.lamps import Lamps, laser_light
+from bodyscan.simulation.lamps import Lamps, laser_light, spread_light
 from bodyscan.simulation.lens import TrueCamera
-from bodyscan.simulation.patterns import projected_patterns
+from bodyscan.simulation.patterns import LightTable, light_table, projected_patterns, table_index
 from bodyscan.simulation.projector import Projector
-from bodyscan.simulation.ray_ends import ends_of_rays, least, mean_light
+from bodyscan.simulation.rays import Band, View, ends_of_rays, mean_light, min_over_samples
 from bodyscan.simulation.scene import Scene
-from bodyscan.simulation.sensor import add_speckle, blur, blurs_of, off_focus, shade
-from bodyscan.simulation.settings import InterReflection, Projection
-from bodyscan.simulation.skin import spread_light
-from bodyscan.simulation.view import Band, View
+from bodyscan.simulation.sensor import Brightness, add_speckle, blur, blurs_of, defocus, shade
+from bodyscan.simulation.settings import Projection
 from bodyscan.stripes.codes.gray import Gray
 from bodyscan.stripes.stripe_code import StripeCode
-
-_DEFOCUS_STEPS = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +30,7 @@ class Moving:
 
     surfaces: how many move, the first of the scene's.
     at: the scene when a frame of that name is taken.
-    reach_mm: how far anything moves from its place in the scene in which everything else is seen.
+    reach_mm: largest displacement from the scene that is rendered once for all frames.
     """
 
     surfaces: int
@@ -68,7 +61,6 @@ def render_pair(
     frames: FrameNames | None = None,
     code: StripeCode | None = None,
     sequence: bool = True,
-    inter_reflection: InterReflection | None = None,
     moving: Moving | None = None,
     flicker: Mapping[str, Brightness] | None = None,
     empty: EmptyRoom | None = None,
@@ -82,8 +74,8 @@ def render_pair(
         image of a stripe-index rig, which its instrument keeps to itself, is named "".
     moving: pixels near it are cast anew for every frame; its shadows on what is still do not move.
     flicker: of frames that differ in brightness (its gain is left to `sensor.expose`).
-    empty: the room formed by the scene's last surfaces, seen by the same view in the same light
-        before anything stood in it: only what else changes is cast then; the images are the same.
+    empty: the room formed by the scene's last surfaces, rendered in the same view and light
+        without anything in it: only what differs is cast; the images are the same.
 
     `sensor.expose` turns the result into 8-bit images.
     """
@@ -93,28 +85,26 @@ def render_pair(
     dark = frames.dark if code.uses_dark else None if code.is_projected else ""
     unlit = () if dark is None or not sequence else (dark,)
     source = _Source(projector, lamps, projection)
-    every = _rays(scene, view, source) if empty is None else empty.with_what_stands_in(scene)
-    seen = _see(every, view, source, lit, unlit, moving.surfaces if moving else 0)
+    every = _rays(scene, view, source) if empty is None else empty.recast_changes(scene)
+    images = _render_still(every, view, source, lit, unlit, moving.surfaces if moving else 0)
     if moving is not None:
-        _see_again(seen, view, source, lit, moving)
-    if inter_reflection is not None and inter_reflection.facet_mm > 0:
-        between = _Between.of(scene, source, lit, inter_reflection)
-        between.add_to(seen, scene, view)
+        _rerender_moving(images, view, source, lit, moving)
     for name in lit:
-        light = seen.laser[name]
-        light = spread_light(light, seen.skin, seen.depth, view.camera.alpha, lamps.skin)
-        seen.laser[name] = light + seen.gloss[name] if name in seen.gloss else light
+        light = images.laser[name]
+        light = spread_light(light, images.skin, images.depth, view.camera.alpha, lamps.skin)
+        images.laser[name] = light + images.gloss[name] if name in images.gloss else light
     for name, now in (flicker or {}).items():
-        if name in seen.laser:
-            seen.laser[name] *= np.float32(now.laser)
-            seen.ambient[name] = seen.ambient[name] * np.float32(now.room)
+        if name in images.laser:
+            images.laser[name] *= np.float32(now.laser)
+            images.ambient[name] = images.ambient[name] * np.float32(now.room)
     shading = shade(view.camera, view.optics)
-    blurs = blurs_of(view.optics, off_focus(seen.depth, lamps.focus_mm))
+    blurs = blurs_of(view.optics, defocus(images.depth, lamps.focus_mm))
     return {
         name: blur(
-            (add_speckle(light, projection.speckle, rng) + seen.ambient[name]) * shading, blurs
+            (add_speckle(light, projection.speckle, rng) + images.ambient[name]) * shading,
+            blurs,
         )
-        for name, light in seen.laser.items()
+        for name, light in images.laser.items()
     }
 
 
@@ -128,16 +118,15 @@ class _Source:
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
+class _LightImages:
     """What a camera sees before its lens blurs it: grey levels (H, W).
 
     laser, ambient: by frame, of the projector's light and of the room's.
-    depth: (H, W) mm, the least in each pixel.
+    depth: (H, W) mm, minimum over each pixel's samples.
     near: (H, W) where something that moves shows.
     gloss: by frame, the part of the projector's light that skin mirrors; empty if nothing is
         glossy.
     skin: (H, W) the share that is skin.
-    albedo: (H, W), the mean.
     """
 
     laser: dict[str, Floats]
@@ -146,52 +135,56 @@ class _Seen:
     near: Mask
     gloss: dict[str, Floats]
     skin: Floats
-    albedo: Floats
 
 
-def _see(
+def _render_still(
     every: Iterator[tuple[Band, _LitRays]],
     view: View,
     source: _Source,
     lit: Mapping[str, LightTable],
     unlit: tuple[str, ...],
     moving_surfaces: int,
-) -> _Seen:
-    """See every frame of a scene that stands still, whose
-    first surfaces will move. every: its bands."""
+) -> _LightImages:
+    """Render every frame of a still scene from its bands; its first surfaces will move."""
     shape = (view.camera.height, view.camera.width)
     laser = {name: np.zeros(shape, np.float32) for name in (*lit, *unlit)}
-    ambient, albedo, depth = (np.zeros(shape, np.float32) for _ in range(3))
+    ambient, depth = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
     near, skin = np.zeros(shape, bool), np.zeros(shape, np.float32)
     glossy = lit if source.lamps.skin.gloss > 0 else {}
     gloss = {name: np.zeros(shape, np.float32) for name in glossy}
     for band, rays in every:
-        place = band.place
+        slices = band.slices
         for name, table in lit.items():
-            laser[name][place] = rays.light(table)
-        ambient[place], albedo[place], depth[place] = rays.ambient, rays.albedo, rays.depth
-        near[place], skin[place] = rays.surface < moving_surfaces, rays.skin
+            laser[name][slices] = rays.light(table)
+        ambient[slices], depth[slices] = rays.ambient, rays.depth
+        near[slices], skin[slices] = rays.surface < moving_surfaces, rays.skin
         for name in gloss:
-            gloss[name][place] = rays.mirrored(lit[name])
-    return _Seen(laser, dict.fromkeys(laser, ambient), depth, near, gloss, skin, albedo)
+            gloss[name][slices] = rays.gloss_light(lit[name])
+    return _LightImages(laser, dict.fromkeys(laser, ambient), depth, near, gloss, skin)
 
 
-def _see_again(
-    seen: _Seen, view: View, source: _Source, lit: Mapping[str, LightTable], moving: Moving
+def _rerender_moving(
+    images: _LightImages,
+    view: View,
+    source: _Source,
+    lit: Mapping[str, LightTable],
+    moving: Moving,
 ) -> None:
     """Update what moves, and what it covers and uncovers, for the moment of each frame."""
-    near = _reached(seen.near, seen.depth, moving.reach_mm, view.camera)
-    bands = list(view.around(near))
-    for name in seen.laser:
+    near = _dilate(images.near, images.depth, moving.reach_mm, view.camera)
+    bands = list(view.bands_around(near))
+    for name in images.laser:
         scene = moving.at(name)
-        seen.ambient[name] = seen.ambient[name].copy()
+        images.ambient[name] = images.ambient[name].copy()
         for band in bands:
-            rays, chosen = _LitRays.of(scene, band, source), near[band.place]
-            np.copyto(seen.ambient[name][band.place], rays.ambient, where=chosen)
+            rays, chosen = _LitRays.cast(scene, band, source), near[band.slices]
+            np.copyto(images.ambient[name][band.slices], rays.ambient, where=chosen)
             if name in lit:
-                np.copyto(seen.laser[name][band.place], rays.light(lit[name]), where=chosen)
-            if name in seen.gloss:
-                np.copyto(seen.gloss[name][band.place], rays.mirrored(lit[name]), where=chosen)
+                np.copyto(images.laser[name][band.slices], rays.light(lit[name]), where=chosen)
+            if name in images.gloss:
+                np.copyto(
+                    images.gloss[name][band.slices], rays.gloss_light(lit[name]), where=chosen
+                )
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,21 +194,20 @@ class _LitRays:
     weight, gloss: (R, C, K) grey level under full light, scattered and mirrored.
     index: (R, C, K) into a table of light.
     ambient: (R, C) grey level due to the room's own light.
-    albedo, skin: (R, C) means.
-    depth, surface: (R, C) the least.
+    skin: (R, C) mean.
+    depth, surface: (R, C) minimum over the samples.
     """
 
     weight: Floats
     gloss: Floats
     index: NDArray[np.int32]
     ambient: Floats
-    albedo: Floats
     skin: Floats
     depth: Floats
     surface: Floats
 
     @staticmethod
-    def of(scene: Scene, band: Band, source: _Source) -> _LitRays:
+    def cast(scene: Scene, band: Band, source: _Source) -> _LitRays:
         ends = ends_of_rays(scene, band, source.projector, source.lamps)
         blurs = _blur_rows(ends.depth, source.projection, source.lamps)
         return _LitRays(
@@ -223,17 +215,16 @@ class _LitRays:
             gloss=ends.gloss,
             index=table_index(ends.s, source.projector.stripes, blurs),
             ambient=(ends.room * ends.albedo).mean(axis=-1),
-            albedo=ends.albedo.mean(axis=-1),
             skin=ends.skin.mean(axis=-1),
-            depth=least(ends.depth),
-            surface=least(ends.surface),
+            depth=min_over_samples(ends.depth),
+            surface=min_over_samples(ends.surface),
         )
 
     def light(self, table: LightTable) -> Floats:
         """Grey level (R, C) of one frame."""
         return mean_light(self.weight, self.index, table.values.ravel())
 
-    def mirrored(self, table: LightTable) -> Floats:
+    def gloss_light(self, table: LightTable) -> Floats:
         """The part (R, C) of one frame that glossy skin mirrors."""
         return mean_light(self.gloss, self.index, table.values.ravel())
 
@@ -246,7 +237,7 @@ class _LitRays:
 
 
 def _rays(scene: Scene, view: View, source: _Source) -> Iterator[tuple[Band, _LitRays]]:
-    return ((band, _LitRays.of(scene, band, source)) for band in view.bands)
+    return ((band, _LitRays.cast(scene, band, source)) for band in view.bands)
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,13 +258,13 @@ class EmptyRoom:
     steps: tuple[float, ...]
 
     @staticmethod
-    def of(
+    def render(
         room: Scene, view: View, projector: Projector, lamps: Lamps, projection: Projection
     ) -> EmptyRoom:
         source = _Source(projector, lamps, projection)
         rays = [
-            replace(own, surface=np.full_like(own.surface, np.inf))
-            for _, own in _rays(room, view, source)
+            replace(lit_rays, surface=np.full_like(lit_rays.surface, np.inf))
+            for _, lit_rays in _rays(room, view, source)
         ]
         corners = [
             room.cast(band.corners.reshape(-1, 3)).points.reshape(band.corners.shape)
@@ -286,9 +277,8 @@ class EmptyRoom:
         ]
         return EmptyRoom(source, view, tuple(rays), tuple(corners), tuple(towards), tuple(steps))
 
-    def with_what_stands_in(self, scene: Scene) -> Iterator[tuple[Band, _LitRays]]:
-        """Each band's rays, cast anew between the columns
-        where something shows or casts a shadow."""
+    def recast_changes(self, scene: Scene) -> Iterator[tuple[Band, _LitRays]]:
+        """Yield each band's rays, cast anew in columns where something shows or casts a shadow."""
         known = (self.view.bands, self.rays, self.corners, self.towards, self.steps)
         for band, rays, ends, towards, step in zip(*known, strict=True):
             changed = scene.may_change(band.corners, ends, towards, step)
@@ -296,52 +286,20 @@ class EmptyRoom:
             if not columns.size:
                 yield band, rays
                 continue
-            part = band.between(
+            part = band.crop_columns(
                 max(int(columns[0]) - 1, 0), min(int(columns[-1]), band.columns.stop - 1)
             )
-            yield band, rays.with_columns(part.columns, _LitRays.of(scene, part, self.source))
+            yield band, rays.with_columns(part.columns, _LitRays.cast(scene, part, self.source))
 
 
-def _reached(near: Mask, depth: Floats, reach_mm: float, camera: TrueCamera) -> Mask:
-    """Pixels that something shown at `near` (H, W) may reach if it moves by `reach_mm`."""
+def _dilate(near: Mask, depth: Floats, reach_mm: float, camera: TrueCamera) -> Mask:
+    """Dilate a mask (H, W) by the pixels that a motion of `reach_mm` may cover."""
     if not near.any():
         return near
     pixels = int(np.ceil(reach_mm * camera.alpha / float(depth[near].min()))) + 2
     kernel = np.ones((2 * pixels + 1, 2 * pixels + 1), np.uint8)
     grown = np.asarray(cv2.dilate(near.astype(np.uint8), kernel), np.uint8)
     return grown.astype(bool)
-
-
-@dataclass(frozen=True, eq=False)
-class _Between:
-    """Light between surfaces. radiosity: (frames, facets) grey levels, in the order of `names`."""
-
-    names: tuple[str, ...]
-    facets: LitFacets
-    radiosity: Floats
-
-    @staticmethod
-    def of(
-        scene: Scene,
-        source: _Source,
-        tables: Mapping[str, LightTable],
-        chosen: InterReflection,
-    ) -> _Between:
-        facets = light_facets(scene, source.projector, source.lamps, chosen.facet_mm)
-        blur = _blur_rows(facets.samples.depth, source.projection, source.lamps)
-        index = table_index(facets.s, source.projector.stripes, blur)
-        light = np.stack([facets.radiosity(table.at(index)) for table in tables.values()])
-        return _Between(tuple(tables), facets, light)
-
-    def add_to(self, seen: _Seen, scene: Scene, view: View) -> None:
-        """Add its light to the pixels of every frame: it varies slowly, so one sample per pixel
-        suffices."""
-        for band in view.bands:
-            hits = scene.cast(band.rays[:, :, band.rays.shape[2] // 2].reshape(-1, 3))
-            found = self.facets.irradiance(hits, self.radiosity)
-            for name, light in zip(self.names, found, strict=True):
-                albedo = seen.albedo[band.place]
-                seen.laser[name][band.place] += albedo * light.reshape(albedo.shape)
 
 
 def pixel_truth(scene: Scene, camera: TrueCamera, projector: Projector) -> PixelTruth:
@@ -398,16 +356,15 @@ def _lights(code: StripeCode, frames: FrameNames, gamma: float) -> list[tuple[st
 
 
 def _blurs(projection: Projection) -> Array:
-    """Standard deviations in stripes, from the best focus to the worst."""
+    """Standard deviations in stripes, from the best focus to the worst, in 12 steps."""
     if projection.defocus_stripes <= 0:
         return np.array([projection.blur_stripes])
-    steps = np.linspace(0.0, projection.defocus_stripes, _DEFOCUS_STEPS)
+    steps = np.linspace(0.0, projection.defocus_stripes, 12)
     return np.hypot(projection.blur_stripes, steps)
 
 
 def _blur_rows(depth: Floats, projection: Projection, lamps: Lamps) -> NDArray[np.int32] | None:
-    """Which of `_blurs` applies at each depth, taken for the distance to the projector."""
+    """Look up which of `_blurs` applies at each depth, taken for the distance to the projector."""
     if projection.defocus_stripes <= 0:
         return None
-    off = off_focus(depth, lamps.focus_mm)
-    return np.rint(off * (_DEFOCUS_STEPS - 1)).astype(np.int32)
+    return np.rint(defocus(depth, lamps.focus_mm) * 11).astype(np.int32)

@@ -15,9 +15,6 @@ from bodyscan.geometry.transforms import RigidTransform
 
 Tensor = o3d.core.Tensor
 
-_THREADS = 2
-"""Open3D holds Python's lock while it casts, so Python's threads alone would take turns."""
-
 _LIFT_MM = 0.3
 """What is nearer than this to a surface casts no shadow on it."""
 
@@ -25,8 +22,8 @@ _LIFT_MM = 0.3
 class Print(Protocol):
     """Something printed on a surface."""
 
-    def albedo(self, places: Floats) -> Floats:
-        """Albedo (N,) at places (N, 2) on the print."""
+    def albedo(self, positions: Floats) -> Floats:
+        """Albedo (N,) at positions (N, 2) on the print."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +33,7 @@ class Surface:
     vertices: (N, 3) mm.
     triangles: (T, 3) int.
     albedo: one, or (N,) one for each vertex.
-    printed, places: a print, and where on it each vertex lies, (N, 2); it overrides the albedo.
+    printed, print_xy: a print, and each vertex's position on it, (N, 2); it overrides the albedo.
     normals: (N, 3) unit, if the surface is to be shaded smoothly.
     open_to_light: nothing can come between it and the projector, so shadows need not be tested.
     encloses: everything is on one side of it, so it casts no shadow.
@@ -47,14 +44,14 @@ class Surface:
     triangles: NDArray[np.integer]
     albedo: float | Array = 0.5
     printed: Print | None = None
-    places: Array | None = None
+    print_xy: Array | None = None
     normals: Array | None = None
     open_to_light: bool = False
     encloses: bool = False
     skin: Array | None = None
 
-    def moved(self, a_from_b: RigidTransform) -> Surface:
-        """The surface carried by a rigid transform."""
+    def transform(self, a_from_b: RigidTransform) -> Surface:
+        """Apply a rigid transform."""
         normals = None if self.normals is None else a_from_b.rotate(self.normals)
         return replace(self, vertices=a_from_b.apply(self.vertices), normals=normals)
 
@@ -68,7 +65,7 @@ class Hits:
     surface: (N,) number of the surface, one past the last if none.
     skin: (N,) as `Surface.skin`.
     facets: (N, 3) normals of the triangles, of any length.
-    places: (N, 2) on the surface's print, if it has one.
+    print_xy: (N, 2) position on the surface's print, if it has one.
     """
 
     depth: Floats
@@ -78,7 +75,7 @@ class Hits:
     surface: NDArray[np.uint32]
     skin: Floats
     facets: Floats
-    places: Floats
+    print_xy: Floats
 
 
 class Scene:
@@ -86,12 +83,13 @@ class Scene:
 
     def __init__(self, surfaces: Sequence[Surface]) -> None:
         self.surfaces = tuple(surfaces)
-        self._doubtful = np.array([not surface.open_to_light for surface in surfaces] + [False])
+        self._shadowable = np.array([not surface.open_to_light for surface in surfaces] + [False])
         standing = [surface for surface in surfaces if not surface.encloses]
-        self._ball = _ball(standing)
-        self._outline = _outline(standing)
-        self._rays = o3d.t.geometry.RaycastingScene(nthreads=_THREADS)
-        self._finish = [_Finish.of(surface) for surface in self.surfaces]
+        self._ball = _bounding_ball(standing)
+        self._slopes = _bounding_slopes(standing)
+        # Open3D holds Python's lock while it casts: threads of Python would take turns.
+        self._rays = o3d.t.geometry.RaycastingScene(nthreads=2)
+        self._finish = [_Finish.from_surface(surface) for surface in self.surfaces]
         for surface in self.surfaces:
             self._rays.add_triangles(
                 Tensor(surface.vertices.astype(np.float32)),
@@ -102,10 +100,10 @@ class Scene:
         """Cast rays from the origin along directions (N, 3) with z = 1."""
         rays = np.zeros((len(directions), 6), np.float32)
         rays[:, 3:] = directions
-        answer = self._rays.cast_rays(Tensor.from_numpy(rays), nthreads=_THREADS)
+        answer = self._rays.cast_rays(Tensor.from_numpy(rays), nthreads=2)
         found: dict[str, NDArray[Any]] = {key: value.numpy() for key, value in answer.items()}
         depth, facets = found["t_hit"], found["primitive_normals"]
-        normals, places = facets.copy(), np.zeros((len(depth), 2), np.float32)
+        normals, print_xy = facets.copy(), np.zeros((len(depth), 2), np.float32)
         surface = np.minimum(found["geometry_ids"], len(self.surfaces))
         albedo = np.array([finish.albedo for finish in self._finish] + [0.0], np.float32)[surface]
         skin = np.zeros_like(depth)
@@ -116,13 +114,13 @@ class Scene:
             triangles, uv = found["primitive_ids"][chosen], found["primitive_uvs"][chosen]
             albedo[chosen] = finish.albedo_at(triangles, uv)
             if finish.normals is not None:
-                normals[chosen] = _spread(finish.normals, triangles, uv)
+                normals[chosen] = _interpolate(finish.normals, triangles, uv)
             if finish.skin is not None:
-                skin[chosen] = _spread(finish.skin, triangles, uv)[:, 0]
-            if finish.places is not None:
-                places[chosen] = _spread(finish.places, triangles, uv)
+                skin[chosen] = _interpolate(finish.skin, triangles, uv)[:, 0]
+            if finish.print_xy is not None:
+                print_xy[chosen] = _interpolate(finish.print_xy, triangles, uv)
         points = directions * np.where(np.isfinite(depth), depth, np.float32(0.0))[:, None]
-        return Hits(depth, points, normals, albedo, surface, skin, facets, places)
+        return Hits(depth, points, normals, albedo, surface, skin, facets, print_xy)
 
     def print_on(self, surface: Floats, across: Floats, down: Floats, albedo: Floats) -> None:
         """Write the prints' albedo wherever the surface is a printed one."""
@@ -130,42 +128,6 @@ class Scene:
             if finish.printed is not None:
                 on = surface == number
                 albedo[on] = finish.printed.albedo(np.stack([across[on], down[on]], axis=1))
-
-    def places(self, number: int, triangles: NDArray[np.integer], uv: Floats) -> Hits:
-        """Places on one surface as if rays had met it there, given its triangles (N,) and
-        barycentric coordinates (N, 2) on them."""
-        surface, finish = self.surfaces[number], self._finish[number]
-        corners = surface.vertices[surface.triangles[triangles]]
-        first, sides = corners[:, 0], corners[:, 1:] - corners[:, :1]
-        points = first + np.einsum("nk,nkc->nc", uv, sides)
-        normals = facets = np.cross(sides[:, 0], sides[:, 1])
-        if finish.normals is not None:
-            normals = _spread(finish.normals, triangles, uv)
-        albedo = np.broadcast_to(finish.albedo_at(triangles, uv), len(points))
-        return Hits(
-            depth=points[:, 2].astype(np.float32),
-            points=points.astype(np.float32),
-            normals=normals.astype(np.float32),
-            albedo=albedo.astype(np.float32),
-            surface=np.full(len(points), number, np.uint32),
-            skin=np.zeros(len(points), np.float32),
-            facets=facets.astype(np.float32),
-            places=np.zeros((len(points), 2), np.float32),
-        )
-
-    def joined(self, starts: Floats, ends: Floats) -> Mask:
-        """Whether two places (N, 3) each on surfaces see each other, (N,)."""
-        way = ends - starts
-        reach = np.maximum(np.sqrt(dot(way, way)), np.float32(3.0 * _LIFT_MM))
-        lift = (np.float32(_LIFT_MM) / reach)[:, None] * way
-        rays = np.concatenate([starts + lift, way - 2.0 * lift], axis=1)
-        hidden = self._rays.test_occlusions(
-            Tensor.from_numpy(np.ascontiguousarray(rays, np.float32)),
-            tnear=0.0,
-            tfar=1.0,
-            nthreads=_THREADS,
-        )
-        return np.asarray(~hidden.numpy())
 
     def may_change(self, directions: Floats, ends: Floats, towards: Floats, step: float) -> Mask:
         """Where what stands here may show, or cast its shadow, in an empty room, (R, C).
@@ -175,7 +137,7 @@ class Scene:
             the light's source, NaN without light.
         step: largest distance between two of the rays, so that nothing between two is missed.
         """
-        (left, top), (right, bottom) = self._outline
+        (left, top), (right, bottom) = self._slopes
         x, y = directions[..., 0], directions[..., 1]
         shows = (x > left - step) & (x < right + step) & (y > top - step) & (y < bottom + step)
         middle, radius = self._ball
@@ -189,7 +151,7 @@ class Scene:
         """
         middle, radius = self._ball
         aside = _distance_squared(points, towards, middle)
-        chosen = np.flatnonzero(self._doubtful[surface] & (aside < radius**2))
+        chosen = np.flatnonzero(self._shadowable[surface] & (aside < radius**2))
         blocked = np.zeros(len(points), bool)
         if chosen.size:
             rays = np.empty((chosen.size, 6), np.float32)
@@ -197,13 +159,13 @@ class Scene:
             rays[:, 3:] = towards.take(chosen, axis=0)
             near = _LIFT_MM / float(np.abs(rays[:, 3:]).max())
             answer = self._rays.test_occlusions(
-                Tensor.from_numpy(rays), tnear=near, tfar=0.95, nthreads=_THREADS
+                Tensor.from_numpy(rays), tnear=near, tfar=0.95, nthreads=2
             )
             blocked[chosen] = answer.numpy()
         return blocked
 
 
-def _ball(surfaces: Iterable[Surface]) -> tuple[Array, float]:
+def _bounding_ball(surfaces: Iterable[Surface]) -> tuple[Array, float]:
     """A ball (middle, radius) around everything that can cast a shadow."""
     corners = [[one.vertices.min(axis=0), one.vertices.max(axis=0)] for one in surfaces]
     if not corners:
@@ -212,20 +174,20 @@ def _ball(surfaces: Iterable[Surface]) -> tuple[Array, float]:
     return (low + high) / 2.0, float(np.linalg.norm(high - low)) / 2.0
 
 
-def _outline(surfaces: Iterable[Surface]) -> tuple[Array, Array]:
+def _bounding_slopes(surfaces: Iterable[Surface]) -> tuple[Array, Array]:
     """The least and the greatest x / z and y / z of what stands there, (2,) each."""
     vertices = np.concatenate([np.zeros((0, 3)), *(one.vertices for one in surfaces)])
     if np.any(vertices[:, 2] <= 1.0):  # beside the camera: it may show anywhere
         return np.full(2, -np.inf), np.full(2, np.inf)
-    ways = vertices[:, :2] / vertices[:, 2:]
-    return ways.min(axis=0, initial=np.inf), ways.max(axis=0, initial=-np.inf)
+    slopes = vertices[:, :2] / vertices[:, 2:]
+    return slopes.min(axis=0, initial=np.inf), slopes.max(axis=0, initial=-np.inf)
 
 
-def _distance_squared(points: Floats, ways: Floats, middle: Array) -> Floats:
-    """Squared distance (N,) of one place from lines through points (N, 3) along ways (N, 3)."""
+def _distance_squared(points: Floats, directions: Floats, middle: Array) -> Floats:
+    """Compute the squared distance (N,) of one point from lines through points (N, 3)."""
     arm = points - middle.astype(np.float32)
-    along = dot(arm, ways)
-    return dot(arm, arm) - along**2 / dot(ways, ways)
+    along = dot(arm, directions)
+    return dot(arm, arm) - along**2 / dot(directions, directions)
 
 
 def dot(a: Floats, b: Floats) -> Floats:
@@ -240,13 +202,13 @@ class _Finish:
 
     albedo: float
     albedos: Floats | None
-    places: Floats | None
+    print_xy: Floats | None
     printed: Print | None
     normals: Floats | None
     skin: Floats | None
 
     @staticmethod
-    def of(surface: Surface) -> _Finish:
+    def from_surface(surface: Surface) -> _Finish:
         def corners(values: Array | None) -> Floats | None:
             if values is None:
                 return None
@@ -257,7 +219,7 @@ class _Finish:
         return _Finish(
             0.0 if isinstance(surface.albedo, np.ndarray) else float(surface.albedo),
             corners(varied[:, None] if varied is not None else None),
-            corners(surface.places) if surface.printed is not None else None,
+            corners(surface.print_xy) if surface.printed is not None else None,
             surface.printed,
             corners(surface.normals),
             corners(None if surface.skin is None else surface.skin[:, None]),
@@ -266,18 +228,18 @@ class _Finish:
     @property
     def plain(self) -> bool:
         """Whether nothing varies over the surface."""
-        varied = (self.albedos, self.places, self.normals, self.skin)
+        varied = (self.albedos, self.print_xy, self.normals, self.skin)
         return all(values is None for values in varied)
 
     def albedo_at(self, triangles: NDArray[np.integer], uv: Floats) -> Floats | float:
-        if self.printed is not None and self.places is not None:
-            return self.printed.albedo(_spread(self.places, triangles, uv))
+        if self.printed is not None and self.print_xy is not None:
+            return self.printed.albedo(_interpolate(self.print_xy, triangles, uv))
         if self.albedos is not None:
-            return _spread(self.albedos, triangles, uv)[:, 0]
+            return _interpolate(self.albedos, triangles, uv)[:, 0]
         return self.albedo
 
 
-def _spread(corners: Floats, triangles: NDArray[np.integer], uv: Floats) -> Floats:
+def _interpolate(corners: Floats, triangles: NDArray[np.integer], uv: Floats) -> Floats:
     """Values (N, k) at barycentric coordinates uv (N, 2) of the triangles that were hit."""
     picked = corners.take(triangles, axis=0)
     return picked[:, 0] + uv[:, :1] * picked[:, 1] + uv[:, 1:] * picked[:, 2]
@@ -286,12 +248,12 @@ def _spread(corners: Floats, triangles: NDArray[np.integer], uv: Floats) -> Floa
 def grid_surface(
     corner: Array, across: Array, down: Array, steps: tuple[int, int] = (1, 1), **more: Any
 ) -> Surface:
-    """A flat patch from a corner and its two sides (3,), cut in steps; places are (0..1, 0..1)."""
+    """A flat patch from a corner and its two sides (3,), cut in steps; print_xy are (0..1, 0..1)."""
     columns, rows = steps
     x, y = np.meshgrid(np.linspace(0, 1, columns + 1), np.linspace(0, 1, rows + 1))
-    places = np.stack([x.ravel(), y.ravel()], axis=1)
-    vertices = corner + places @ np.stack([across, down])
-    return Surface(vertices, grid_triangles(columns, rows), places=places, **more)
+    print_xy = np.stack([x.ravel(), y.ravel()], axis=1)
+    vertices = corner + print_xy @ np.stack([across, down])
+    return Surface(vertices, grid_triangles(columns, rows), print_xy=print_xy, **more)
 
 
 def grid_triangles(columns: int, rows: int) -> Indices:

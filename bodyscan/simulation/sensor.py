@@ -1,8 +1,8 @@
-"""From light to grey levels: the laser's speckle, the lens's blur and shade, the sensor's noise."""
+"""Lens blur and vignetting, flicker and speckle, and the sensor that makes grey levels of light."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -12,7 +12,41 @@ import numpy as np
 from bodyscan.arrays import Bytes, Floats
 from bodyscan.compiled import compiled
 from bodyscan.simulation.lens import TrueCamera
-from bodyscan.simulation.settings import Lighting, Noise, Optics
+from bodyscan.simulation.settings import Lighting, Noise, Optics, SimulationSettings
+
+
+@dataclass(frozen=True)
+class Brightness:
+    """Relative brightness of one frame, 1 if nothing flickers."""
+
+    laser: float = 1.0
+    room: float = 1.0
+    gain: float = 1.0
+
+
+def draw_flicker(
+    frames: Iterable[str], settings: SimulationSettings, rng: np.random.Generator
+) -> Mapping[str, Brightness]:
+    """Brightness by frame; the frames are in the order in which they are taken, at the person's
+    pace.
+
+    A lamp pulses; a frame sees its mean over the exposure, which is as long as the frame. None if
+    nothing flickers.
+    """
+    light, pace = settings.lighting, settings.pace.frame_ms / 1000.0
+    if not any((light.mains_depth, settings.projection.flicker, settings.noise.gain_flicker)):
+        return {}
+    depth = light.mains_depth * float(np.sinc(light.mains_hz * pace))
+    start = rng.uniform(0.0, 2.0 * np.pi)
+    return {
+        frame: Brightness(
+            1.0 + settings.projection.flicker * rng.standard_normal(),
+            1.0 + depth * np.cos(start + 2.0 * np.pi * light.mains_hz * pace * level),
+            1.0 + settings.noise.gain_flicker * rng.standard_normal(),
+        )
+        for level, frame in enumerate(frames)
+    }
+
 
 _FOCUS_STEPS = 5
 
@@ -73,8 +107,8 @@ def digitise(
     for v in range(image.shape[0]):
         for u in range(image.shape[1]):
             value = image[v, u]
-            spread = np.sqrt(max(value, low) / electrons + read)
-            noisy = np.rint(value + spread * draws[v, u])
+            sigma = np.sqrt(max(value, low) / electrons + read)
+            noisy = np.rint(value + sigma * draws[v, u])
             grey[v, u] = np.uint8(min(max(noisy, low), high))
 
 
@@ -97,7 +131,7 @@ def shade(camera: TrueCamera, optics: Optics) -> Floats | float:
     return (1.0 - optics.vignetting * (1.0 - cosine**4)).astype(np.float32)
 
 
-def off_focus(depth: Floats, focus_mm: float) -> Floats:
+def defocus(depth: Floats, focus_mm: float) -> Floats:
     """How far depths (mm, > 0) are out of focus: |focus / depth - 1|, proportional to the circle of
     confusion; 0 at focus_mm, 1 at half of it, and never more."""
     return np.minimum(np.abs(np.float32(focus_mm) / depth - 1.0), 1.0)
@@ -108,10 +142,10 @@ def blurs_of(optics: Optics, out_of_focus: Floats) -> list[tuple[float, Floats |
     the blur is wider where the scene is out of focus (0..1)."""
     if optics.defocus_px <= 0:
         return [(optics.blur_px, None)]
-    place = out_of_focus * (_FOCUS_STEPS - 1)
+    level = out_of_focus * (_FOCUS_STEPS - 1)
     blurs: list[tuple[float, Floats | None]] = []
     for step in range(_FOCUS_STEPS):
-        share = np.maximum(1.0 - np.abs(place - step), 0.0).astype(np.float32)
+        share = np.maximum(1.0 - np.abs(level - step), 0.0).astype(np.float32)
         wide = np.hypot(optics.blur_px, optics.defocus_px * step / (_FOCUS_STEPS - 1))
         if share.any():
             blurs.append((float(wide), share))

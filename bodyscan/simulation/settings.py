@@ -197,7 +197,6 @@ class Skin:
     spread_mm: light's mean free path under the skin; 0: none enters.
     stays: share that does not enter.
     albedo: of the path inside.
-    oblique_mm: light comes out farther along, by this times the tangent of the refracted angle.
     gloss: brightness of a highlight's middle, relative to white paper.
     gloss_power: the larger, the smaller the highlight.
     mottling: standard deviation of the albedo over millimetres, relative.
@@ -210,7 +209,6 @@ class Skin:
     spread_mm: float = 0.0
     stays: float = 0.07
     albedo: float = 0.62
-    oblique_mm: float = 0.0
     gloss: float = 0.0
     gloss_power: float = 40.0
     mottling: float = 0.0
@@ -248,17 +246,6 @@ class Room:
 
 
 @dataclass(frozen=True)
-class InterReflection:
-    """Laser light that surfaces cast on each other, one bounce (see `inter_reflection`).
-
-    facet_mm: size of the facets that emit it, a few times smaller than any hollow; 0: none. It
-        costs time: a form factor for each pixel and lit facet.
-    """
-
-    facet_mm: float = 0.0
-
-
-@dataclass(frozen=True)
 class SimulationSettings:
     """All settings of a simulated scanner."""
 
@@ -271,4 +258,3 @@ class SimulationSettings:
     skin: Skin = field(default_factory=Skin)
     pace: Pace = field(default_factory=Pace)
     room: Room = field(default_factory=Room)
-    inter_reflection: InterReflection = field(default_factory=InterReflection)

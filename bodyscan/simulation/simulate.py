@@ -17,21 +17,29 @@ from bodyscan.rig.rig_file import load_rig, write_rig
 from bodyscan.rig.templates import fill
 from bodyscan.simulation import body, files
 from bodyscan.simulation.board import make_board
-from bodyscan.simulation.flicker import Brightness, draw_flicker
-from bodyscan.simulation.instrument import instrument_images
+from bodyscan.simulation.files import Motion, Truth, describe
 from bodyscan.simulation.lamps import Lamps
-from bodyscan.simulation.layout import TruePair, build_pairs
+from bodyscan.simulation.layout import TruePair, build_pairs, build_room
 from bodyscan.simulation.lens import TrueCamera
-from bodyscan.simulation.living import LivingBody, bring_to_life, moves, save_body
-from bodyscan.simulation.patterns import refuse_unknown_code, refuse_unknown_frames
+from bodyscan.simulation.living import LivingBody, animate, moves, save_body
+from bodyscan.simulation.patterns import (
+    instrument_images,
+    refuse_unknown_code,
+    refuse_unknown_frames,
+)
 from bodyscan.simulation.plan import default_shots, plan_boards
+from bodyscan.simulation.rays import View
 from bodyscan.simulation.render import EmptyRoom, Moving, render_pair
-from bodyscan.simulation.room import build_room
 from bodyscan.simulation.scene import Scene, Surface
-from bodyscan.simulation.sensor import FixedPattern, expose, exposure, fixed_pattern
+from bodyscan.simulation.sensor import (
+    Brightness,
+    FixedPattern,
+    draw_flicker,
+    expose,
+    exposure,
+    fixed_pattern,
+)
 from bodyscan.simulation.settings import SimulationSettings
-from bodyscan.simulation.truth import Motion, Truth, describe
-from bodyscan.simulation.view import View
 
 CALIBRATION, PERSON = "captures/calibration", "captures/person"
 PERSON_SHOT = "s01"
@@ -134,9 +142,9 @@ def _decide(
     by_pair = dict(zip(pairs, sways, strict=True))
     motion = None
     if moves(settings.person):
-        living = bring_to_life(person, settings.person, stream(_LIFE))
+        living = animate(person, settings.person, stream(_LIFE))
         times = files.times_of_person(rig, PERSON_SHOT, settings.pace)
-        every = [ms for own in times.values() for ms in own.values()]
+        every = [ms for by_frame in times.values() for ms in by_frame.values()]
         motion = Motion(living, times, (min(every) + max(every)) / 2.0, by_pair)
         person = living.surface(motion.moment_ms)
         by_pair = {name: motion.trunk(name) for name in by_pair}
@@ -195,19 +203,19 @@ def _at_their_times(task: Task, motion: Motion, pair: str) -> Task:
 def _render_all(rig: Rig, truth: Truth, out: Path, workers: int, progress: Progress) -> None:
     """Render every image of every pair; each thread has one pair at a time."""
     tasks = {name: _tasks(truth, name) for name in truth.pairs}
-    tell = _counter("simulate", sum(map(len, tasks.values())), progress)
+    count_task = _counter("simulate", sum(map(len, tasks.values())), progress)
     room = build_room(truth.pairs.values(), truth.settings.room)
 
     def work(numbered: tuple[int, TruePair]) -> None:
         number, pair = numbered
         rays = np.random.default_rng([truth.seed, _RAYS, number])
-        view = View.of(pair.camera, truth.settings.optics, rays)
+        view = View.from_camera(pair.camera, truth.settings.optics, rays)
         fixed = sensor_of(pair.camera, truth.settings, truth.seed, number)
         empty = see_empty(pair, view, room, truth.settings)
         for task in tasks[pair.name]:
             noise = np.random.default_rng([truth.seed, _NOISE, number, task.number])
             render_task(rig, pair, view, room, task, truth.settings, out, noise, fixed, empty)
-            tell()
+            count_task()
 
     map_threads(work, enumerate(truth.pairs.values()), stage="simulate", workers=workers)
 
@@ -224,13 +232,13 @@ def _counter(stage: str, total: int, progress: Progress) -> Callable[[], None]:
     lock, done = Lock(), 0
     progress(stage, 0, total)
 
-    def tell() -> None:
+    def count_task() -> None:
         nonlocal done
         with lock:
             done += 1
             progress(stage, done, total)
 
-    return tell
+    return count_task
 
 
 def render_task(
@@ -265,7 +273,6 @@ def render_task(
         frames=rig.frames,
         code=code,
         sequence=task.sequence,
-        inter_reflection=settings.inter_reflection,
         moving=moving,
         flicker=flicker,
         empty=empty,
@@ -293,7 +300,7 @@ def _scenes(pair: TruePair, room: Sequence[Surface], task: Task) -> tuple[Scene,
     around, living = _around(pair, room), task.body
 
     def scene_with(surfaces: Sequence[Surface]) -> Scene:
-        return Scene([*(surface.moved(camera_from_surfaces) for surface in surfaces), *around])
+        return Scene([*(surface.transform(camera_from_surfaces) for surface in surfaces), *around])
 
     scene = scene_with(task.surfaces)
     if living is None:
@@ -314,18 +321,18 @@ def see_empty(
 ) -> EmptyRoom:
     """The room as a pair sees it before anything stands there."""
     scene, lamps = Scene(_around(pair, room)), _lamps(pair, settings)
-    return EmptyRoom.of(scene, view, pair.projector, lamps, settings.projection)
+    return EmptyRoom.render(scene, view, pair.projector, lamps, settings.projection)
 
 
 def _around(pair: TruePair, room: Sequence[Surface]) -> list[Surface]:
     """The room in the camera's frame."""
-    return [surface.moved(pair.rig_from_camera.inverse()) for surface in room]
+    return [surface.transform(pair.rig_from_camera.inverse()) for surface in room]
 
 
 def _lamps(pair: TruePair, settings: SimulationSettings) -> Lamps:
     light, reach = settings.lighting, pair.reach_mm
-    way = np.array(light.window_from) / np.linalg.norm(light.window_from)
-    window = pair.rig_from_camera.inverse().rotate(way)
+    direction = np.array(light.window_from) / np.linalg.norm(light.window_from)
+    window = pair.rig_from_camera.inverse().rotate(direction)
     return Lamps(
         light.laser_grey,
         light.ambient_grey,
@@ -341,4 +348,4 @@ def _reach(body: LivingBody, moments_ms: Sequence[float]) -> float:
     """Largest distance, mm, that anything moves meanwhile from its place at the middle of the time.
     Motion is smooth: a few moments suffice, with a margin."""
     first, last = min(moments_ms), max(moments_ms)
-    return 1.3 * body.farthest((first + last) / 2.0, np.linspace(first, last, 5))
+    return 1.3 * body.max_displacement((first + last) / 2.0, np.linspace(first, last, 5))

@@ -8,20 +8,20 @@ import pytest
 from bodyscan.boards.detection import find_boards
 from bodyscan.evaluation.sphere_search import find_spheres
 from bodyscan.geometry.light_planes import baseline_angle_tilt
-from bodyscan.laboratory.chapter import apparatus
-from bodyscan.laboratory.chapter.calibrating import Calibrations, calibrate_all, sigma_trial
-from bodyscan.laboratory.chapter.captures import ChapterCaptures, take_captures
-from bodyscan.laboratory.chapter.measuring import (
+from bodyscan.laboratory import apparatus
+from bodyscan.laboratory.calibrating import Calibrations, calibrate_all, sigma_trial
+from bodyscan.laboratory.chapter_captures import ChapterCaptures, take_captures
+from bodyscan.laboratory.measuring import (
     ApproachAccuracy,
     measure_artefacts,
     noise_bound,
+    point_sigma,
     points_of,
     true_approach,
     whole_stripes,
 )
-from bodyscan.laboratory.chapter.point_sigma import point_sigma
-from bodyscan.laboratory.chapter.text import Reproduction, figure_names, reproduction_text
 from bodyscan.laboratory.reproduce import draw
+from bodyscan.laboratory.text import Reproduction, figure_names, reproduction_text
 from bodyscan.reconstruction.triangulation import grid_normals
 
 
@@ -155,7 +155,7 @@ def test_table_1_is_recovered(calibrated: Calibrations) -> None:
 def test_sigmas_are_honest_over_many_seeds() -> None:
     trial = sigma_trial(50)
     # RMS of 50 normal draws is 1 +- 0.1.
-    assert np.all(np.abs(trial.spread - 1.0) < 0.3), trial.spread
+    assert np.all(np.abs(trial.rms - 1.0) < 0.3), trial.rms
     # 350 draws: 0.95 beyond three sigmas expected, 5 or more once in three hundred times.
     assert trial.beyond_three < 5
 

@@ -8,12 +8,12 @@ from mirror_points import MIRROR, STRIPES, TRUE_PLANES, mirror_points, systemati
 
 from bodyscan.arrays import Array
 from bodyscan.geometry.light_planes import LightPlanes, baseline_angle_tilt
-from bodyscan.laboratory.rivals.approaches import PROJECTORS
-from bodyscan.laboratory.rivals.baseline_models import (
+from bodyscan.laboratory.approaches import PROJECTORS
+from bodyscan.laboratory.rival_projectors import (
     fit_invariable_baseline,
+    fit_remapped_pinhole,
     fit_variable_baseline,
 )
-from bodyscan.laboratory.rivals.remapped_pinhole import fit_remapped_pinhole
 
 ANGLES = np.radians(np.linspace(2.0, 38.0, STRIPES + 1))
 BASELINES = np.linspace(165.0, 150.0, STRIPES + 1)

@@ -9,11 +9,11 @@ from table_one import CAMERA
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.laboratory.rivals.projection_matrix import (
+from bodyscan.laboratory.rival_cameras import (
+    calibrate_tsai,
     projection_matrix,
     split_projection_matrix,
 )
-from bodyscan.laboratory.rivals.tsai import calibrate_tsai
 
 MIDDLE = np.array([319.5, 239.5])
 GRID = np.stack(np.meshgrid(np.arange(20.0, 161, 20), np.arange(20.0, 121, 20)), -1).reshape(-1, 2)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bodyscan.simulation.gray import FINE, PAD, bit_count, code_bits, light_table, table_index
+from bodyscan.simulation.patterns import FINE, PAD, bit_count, code_bits, light_table, table_index
 
 NO_BLUR = np.array([0.0])
 

@@ -18,7 +18,7 @@ from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyMesh
 from bodyscan.simulation import SimulationSettings, settings_for, simulate
 from bodyscan.simulation.body import load_subject
-from bodyscan.simulation.living import LivingBody, bring_to_life, draw_wander, load_body, moves
+from bodyscan.simulation.living import LivingBody, animate, draw_signal, load_body, moves
 from bodyscan.simulation.presets import SUBJECTS
 from bodyscan.simulation.render import Moving, render_pair
 from bodyscan.simulation.scene import Scene
@@ -29,14 +29,14 @@ SUBJECT = PROJECT / "data" / "subjects" / "man_average.ply"
 STANDING = Person(subdivisions=0, **SUBJECTS["standing"])
 
 
-def body_of(person: Person, seed: int = 0) -> LivingBody:
+def load_moving_body(person: Person, seed: int = 0) -> LivingBody:
     rng = np.random.default_rng(seed)
-    return bring_to_life(load_subject(SUBJECT, person, rng), person, rng)
+    return animate(load_subject(SUBJECT, person, rng), person, rng)
 
 
 @pytest.fixture(scope="module")
 def living() -> LivingBody:
-    return body_of(STANDING)
+    return load_moving_body(STANDING)
 
 
 def speeds(places: Array, step_ms: float) -> Array:
@@ -47,17 +47,17 @@ def speeds(places: Array, step_ms: float) -> Array:
 
 def test_a_wander_moves_as_fast_as_it_is_told_to() -> None:
     for seed in range(5):
-        wander = draw_wander(7.0, 2, np.random.default_rng(seed), speed=True)
+        wander = draw_signal(7.0, 2, np.random.default_rng(seed), speed=True)
         path = np.array([wander.at(ms) for ms in np.arange(0, 600_000, 50.0)])
         # Ten minutes are ninety periods of the slowest wave.
         assert speeds(path[:, None], 50.0)[0] == pytest.approx(7.0, rel=0.05)
-        still = draw_wander(7.0, 2, np.random.default_rng(seed), speed=False)
+        still = draw_signal(7.0, 2, np.random.default_rng(seed), speed=False)
         path = np.array([still.at(ms) for ms in np.arange(0, 600_000, 50.0)])
         assert np.sqrt(np.mean(np.sum(path**2, axis=1))) == pytest.approx(7.0, rel=0.05)
 
 
 def test_sway_is_a_pole_on_its_ankles() -> None:
-    body = body_of(Person(subdivisions=0, sway_mm_s=7.0))
+    body = load_moving_body(Person(subdivisions=0, sway_mm_s=7.0))
     vertices = body.rest.vertices
     top, foot = int(np.argmax(vertices[:, 2])), int(np.argmin(vertices[:, 2]))
     middle = int(np.argmin(np.abs(vertices[:, 2] - 0.5 * vertices[top, 2])))
@@ -71,7 +71,7 @@ def test_sway_is_a_pole_on_its_ankles() -> None:
 
 
 def test_breath_comes_and_goes_on_chest_and_belly_alone() -> None:
-    body = body_of(Person(subdivisions=0, breath_mm=4.0))
+    body = load_moving_body(Person(subdivisions=0, breath_mm=4.0))
     moments = np.linspace(0.0, 1000.0 * body.breath.period_s, 60, endpoint=False)
     path = np.array([body.vertices(ms) for ms in moments])
     reach = np.ptp(path[..., 0], axis=0)
@@ -86,7 +86,7 @@ def test_breath_comes_and_goes_on_chest_and_belly_alone() -> None:
 
 
 def test_a_breath_moves_a_torso_girth_by_millimetres() -> None:
-    body = body_of(Person(subdivisions=0, breath_mm=4.0))
+    body = load_moving_body(Person(subdivisions=0, breath_mm=4.0))
     moments = np.linspace(0.0, 1000.0 * body.breath.period_s, 24, endpoint=False)
     chest = [body.breath.at(ms)[0] for ms in moments]
     breathed = [body.vertices(moments[int(k)]) for k in (np.argmax(chest), np.argmin(chest))]
@@ -103,7 +103,7 @@ def test_a_breath_moves_a_torso_girth_by_millimetres() -> None:
 
 
 def test_arms_turn_about_shoulders_and_the_head_about_the_neck() -> None:
-    body = body_of(Person(subdivisions=0, arms_deg=0.5, head_deg=0.3))
+    body = load_moving_body(Person(subdivisions=0, arms_deg=0.5, head_deg=0.3))
     vertices = body.rest.vertices
     hands = [int(np.argmin(vertices[:, 1])), int(np.argmax(vertices[:, 1]))]
     crown = int(np.argmax(vertices[:, 2]))
@@ -128,8 +128,8 @@ def test_it_is_smooth_in_time(living: LivingBody) -> None:
 
 
 def test_the_same_seed_is_the_same_motion(living: LivingBody) -> None:
-    assert np.array_equal(body_of(STANDING).vertices(123.0), living.vertices(123.0))
-    assert not np.array_equal(body_of(STANDING, 1).vertices(123.0), living.vertices(123.0))
+    assert np.array_equal(load_moving_body(STANDING).vertices(123.0), living.vertices(123.0))
+    assert not np.array_equal(load_moving_body(STANDING, 1).vertices(123.0), living.vertices(123.0))
 
 
 def test_only_a_mannequin_stands_still() -> None:
@@ -177,7 +177,7 @@ def test_what_moves_is_seen_where_it_is_when_each_frame_is_taken() -> None:
     rays = view()
 
     def scene(x: float) -> Scene:
-        return Scene([square.moved(RigidTransform(np.eye(3), np.array([x, 0.0, x]))), behind])
+        return Scene([square.transform(RigidTransform(np.eye(3), np.array([x, 0.0, x]))), behind])
 
     def render(at: float, moving: Moving | None = None) -> dict[str, Floats]:
         rng = np.random.default_rng(1)

@@ -90,9 +90,9 @@ def test_print_errors_have_the_size_asked_for(kind: str) -> None:
         errors.append(error)
         steps.append(np.diff(error, axis=0).std())
         mesh = made.surfaces[0]
-        assert mesh.places is not None
+        assert mesh.print_xy is not None
         for corner, place in ((0, [60, 60]), (400, [60 * (400 % 29 + 1), 60 * (400 // 29 + 1)])):
-            vertex = np.linalg.norm(mesh.places - place, axis=1).argmin()
+            vertex = np.linalg.norm(mesh.print_xy - place, axis=1).argmin()
             assert mesh.vertices[vertex] == pytest.approx(made.corners[corner], abs=1e-9)
     # six boards of six waves are few: within half
     assert np.std(errors) == pytest.approx(0.1, rel=0.5 if kind == "smooth" else 0.05)

@@ -9,9 +9,9 @@ from small_view import LAMPS, SHARP, projector, view, wall
 
 from bodyscan.arrays import Floats, Mask
 from bodyscan.rig.board import Board
-from bodyscan.simulation import ray_ends
+from bodyscan.simulation import rays
 from bodyscan.simulation.board import board_print
-from bodyscan.simulation.ray_ends import ends_of_rays, interpolate, least, mean_light
+from bodyscan.simulation.rays import ends_of_rays, interpolate, mean_light, min_over_samples
 from bodyscan.simulation.render import render_pair
 from bodyscan.simulation.scene import Scene, Surface, grid_surface
 from bodyscan.simulation.settings import BoardMaking, Projection
@@ -35,7 +35,7 @@ def furnished() -> Scene:
         slanting.vertices,
         slanting.triangles,
         printed=board_print(board, 0, BoardMaking()),
-        places=places,
+        print_xy=places,
     )
     return Scene([wall(1500.0), ball, sheet])
 
@@ -48,13 +48,13 @@ def test_images_are_as_if_every_ray_were_cast(monkeypatch: pytest.MonkeyPatch) -
         return render_pair(scene, view(SHARP), light, LAMPS, soft, np.random.default_rng(0))
 
     quick = rendered()
-    judged = ray_ends._even
+    judged = rays._mask_smooth
 
     def none_is_even(*about: object) -> Mask:
         evens.append(judged(*about))  # type: ignore[arg-type]  # handed on as it came
         return np.zeros_like(evens[-1])
 
-    monkeypatch.setattr(ray_ends, "_even", none_is_even)
+    monkeypatch.setattr(rays, "_mask_smooth", none_is_even)
     slow = rendered()
     # pixels are 5 to 8 mm wide here: the ball, of 120 mm, is nowhere flat enough, nor are rims
     assert np.mean(np.concatenate(evens)) > 0.7
@@ -96,4 +96,4 @@ def test_light_of_a_pixel_is_the_mean_over_its_samples() -> None:
     index = rng.integers(0, 50, weight.shape, dtype=np.int32)
     plain = (weight * table[index]).mean(axis=-1)
     assert mean_light(weight, index, table) == pytest.approx(plain, rel=1e-6)
-    assert np.array_equal(least(weight), weight.min(axis=-1))
+    assert np.array_equal(min_over_samples(weight), weight.min(axis=-1))

@@ -12,15 +12,15 @@ import pytest
 from small_view import CAMERA, CRISP, LAMPS, SHARP, STRIPES, projector, view, wall
 
 from bodyscan.arrays import Floats
-from bodyscan.simulation.gray import code_bits
 from bodyscan.simulation.layout import build_mirror, build_pinhole
 from bodyscan.simulation.lens import TrueCamera
+from bodyscan.simulation.patterns import code_bits
 from bodyscan.simulation.projector import MirrorProjector, PinholeProjector
+from bodyscan.simulation.rays import View
 from bodyscan.simulation.render import EmptyRoom, pixel_truth, render_pair
 from bodyscan.simulation.scene import Scene, Surface, grid_surface
 from bodyscan.simulation.sensor import blur, blurs_of, digitise, expose
 from bodyscan.simulation.settings import Noise, Optics, Projection
-from bodyscan.simulation.view import View
 
 BITS = 5
 
@@ -156,7 +156,7 @@ def test_an_edge_lies_where_it_is() -> None:
         np.array([place, -2000.0, 1000.0]), np.array([2000.0, 0, 0]), np.array([0, 4000.0, 0])
     )
     straight = TrueCamera(190.0, 190.0, 0.0, 80.0, 64.0, 0.0, 0.0, 160, 128)
-    sharp = View.of(straight, SHARP, np.random.default_rng(0))
+    sharp = View.from_camera(straight, SHARP, np.random.default_rng(0))
     images = render_pair(Scene([half]), sharp, projector(), LAMPS, CRISP, np.random.default_rng(0))
     covered = images["dark"] / images["dark"].max()
     edge = 160 - covered.sum(axis=1).mean() - 0.5
@@ -249,12 +249,12 @@ def test_a_room_once_seen_empty_changes_no_image() -> None:
         rng = np.random.default_rng(0)
         return render_pair(scene, rays, light, LAMPS, soft, rng, empty=empty)
 
-    empty = EmptyRoom.of(Scene([room]), rays, light, LAMPS, soft)
+    empty = EmptyRoom.render(Scene([room]), rays, light, LAMPS, soft)
     anew, known = images(None), images(empty)
     assert all(np.array_equal(anew[name], known[name]) for name in anew)
     bare = render_pair(Scene([room]), rays, light, LAMPS, soft, np.random.default_rng(0))
     changed = np.flatnonzero((bare["lit"] != anew["lit"]).any(axis=0))
-    ((_, cast),) = empty.with_what_stands_in(scene)
+    ((_, cast),) = empty.recast_changes(scene)
     recast = np.flatnonzero((cast.surface < np.inf).any(axis=0))
     assert 0 < changed[0] - recast[0] < 20
     assert changed[-1] <= recast[-1] < 159

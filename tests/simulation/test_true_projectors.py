@@ -108,7 +108,7 @@ def test_sweep_covers_what_the_camera_sees(
 
 def test_smile_bows_the_ends_only() -> None:
     straight, bowed = mirror(), mirror(smile_stripes=0.5)
-    across = np.abs(straight.across(SEEN, straight.angle(SEEN))) / straight.fan
+    across = np.abs(straight.fan_tangent(SEEN, straight.angle(SEEN))) / straight.fan
     assert bowed.stripe(SEEN) - straight.stripe(SEEN) == pytest.approx(0.5 * across**2)
 
 

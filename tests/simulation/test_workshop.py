@@ -14,11 +14,10 @@ from bodyscan.geometry.lenses.brown import Brown
 from bodyscan.rig.board import Board
 from bodyscan.simulation import SimulationSettings, settings_for
 from bodyscan.simulation.board import make_board
-from bodyscan.simulation.flicker import Brightness, draw_flicker
 from bodyscan.simulation.lens import TrueCamera
 from bodyscan.simulation.render import render_pair
 from bodyscan.simulation.scene import Scene
-from bodyscan.simulation.sensor import expose, fixed_pattern
+from bodyscan.simulation.sensor import Brightness, draw_flicker, expose, fixed_pattern
 from bodyscan.simulation.settings import BoardMaking, Lighting, Noise, Pace
 
 DECENTRED = TrueCamera(
@@ -123,8 +122,8 @@ def test_flicker_changes_one_frames_light_and_a_window_adds_its_own() -> None:
         flickered["bit01"], 1.1 * laser + 0.5 * plain["dark"], rtol=1e-5, atol=1e-4
     )
     np.testing.assert_array_equal(flickered["bit02"], plain["bit02"])
-    facing = replace(LAMPS, window_grey=20.0, window_way=(0.0, 0.0, -1.0))
-    aside = replace(LAMPS, window_grey=20.0, window_way=(1.0, 0.0, 0.0))
+    facing = replace(LAMPS, window_grey=20.0, window_direction=(0.0, 0.0, -1.0))
+    aside = replace(LAMPS, window_grey=20.0, window_direction=(1.0, 0.0, 0.0))
     for lamps, share in ((facing, 1.0), (aside, 0.5)):
         lit = render_pair(scene, rays, source, lamps, CRISP, np.random.default_rng(0))
         # The wall reflects half, and a window half round the side shines half as bright.

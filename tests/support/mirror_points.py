@@ -13,8 +13,8 @@ from bodyscan.calibration.boundary_points import BoundaryPoints, boundary_points
 from bodyscan.geometry.camera_fields import from_fields
 from bodyscan.geometry.light_planes import LightPlanes
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.laboratory.chapter import apparatus
-from bodyscan.simulation.truth import describe_camera
+from bodyscan.laboratory import apparatus
+from bodyscan.simulation.files import describe_camera
 
 LENS = from_fields(describe_camera(apparatus.CAMERA))
 MIRROR = apparatus.chapter_setup(apparatus.ideal_settings(1)).projector

@@ -12,9 +12,9 @@ from bodyscan.simulation.lamps import Lamps
 from bodyscan.simulation.layout import build_mirror
 from bodyscan.simulation.lens import TrueCamera
 from bodyscan.simulation.projector import MirrorProjector
+from bodyscan.simulation.rays import View
 from bodyscan.simulation.scene import Surface, grid_surface
 from bodyscan.simulation.settings import Optics, Projection
-from bodyscan.simulation.view import View
 
 CAMERA = TrueCamera(190.0, 190.6, -0.1, 81.0, 62.5, -0.1, 0.05, 160, 128)
 SHARP = Optics(blur_px=0.0)
@@ -39,4 +39,4 @@ def wall(z: float, size: float = 3000.0, **more: Any) -> Surface:
 
 
 def view(optics: Optics = SHARP) -> View:
-    return View.of(CAMERA, optics, np.random.default_rng(0))
+    return View.from_camera(CAMERA, optics, np.random.default_rng(0))

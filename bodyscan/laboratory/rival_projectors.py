@@ -1,22 +1,24 @@
-"""Projectors by their baseline (section 1): stripes perpendicular to it, each with its own angle.
+"""Rival models of the projector, fitted to stripe boundaries at known points.
 
 By Eq. 7-9 a light plane is x - tan(tilt) y - tan(angle) z + l = 0, and by Eq. 14 it measures
 z = l / (tan(angle) - x/z + tan(tilt) y/z). The invariable baseline (Matsuki and Ueda 1989, Sansoni
 et al. 2000) has one l for all stripes, the variable one (Hattori and Sato 1996, Reid 1996) an l for
 each. Both assume stripes perpendicular to the baseline: one tilt for all of them, 0 if the baseline
-is assumed to be the camera's own axis.
+is assumed to be the camera's per_stripe axis. The pinhole is a 2 x 4 matrix (Bolles et al. 1981).
 """
 
 from __future__ import annotations
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.calibration.boundary_points import BoundaryPoints
+from bodyscan.calibration.pinhole_projector import fit_pinhole
 from bodyscan.geometry.light_planes import Axis, LightPlanes
 from bodyscan.geometry.robust import cauchy_weights, spread
 
-FEWEST_POINTS = 12
+MIN_POINTS = 12
 REWEIGHTINGS = 4
 CAUCHY_SIGMAS = 3.0
 
@@ -29,9 +31,9 @@ def fit_invariable_baseline(
     fit_tilt: estimate the baseline's direction in the image too; otherwise it is the camera's x
         axis (y for horizontal stripes).
 
-    Boundaries seen at fewer than 12 points get no plane.
+    Boundaries observed at fewer than 12 points get no plane.
     """
-    return _fit(data, stripes, direction, own_baseline=False, fit_tilt=fit_tilt)
+    return _fit(data, stripes, direction, variable=False, fit_tilt=fit_tilt)
 
 
 def fit_variable_baseline(
@@ -39,33 +41,33 @@ def fit_variable_baseline(
 ) -> LightPlanes:
     """A baseline and an angle for each stripe, and one tilt for all; see
     `fit_invariable_baseline`."""
-    return _fit(data, stripes, direction, own_baseline=True, fit_tilt=fit_tilt)
+    return _fit(data, stripes, direction, variable=True, fit_tilt=fit_tilt)
 
 
 def _fit(
-    data: BoundaryPoints, stripes: int, direction: Axis, *, own_baseline: bool, fit_tilt: bool
+    data: BoundaryPoints, stripes: int, direction: Axis, *, variable: bool, fit_tilt: bool
 ) -> LightPlanes:
     """Linear least squares for x = tan(tilt) y + tan(angle_i) z - l, weighted by how far an error
     of one pixel moves x; points that disagree lose their weight (Cauchy)."""
     x, y, z = _axes(data.points, direction)
     across = np.abs(_axes(data.per_pixel, direction)[0])
     one = np.ones_like(z)
-    own = np.stack([z, -one] if own_baseline else [z], axis=1)
-    shared = [] if own_baseline else [-one]
+    per_stripe = np.stack([z, -one] if variable else [z], axis=1)
+    shared = [] if variable else [-one]
     shared += [y] if fit_tilt else []
     common = np.stack(shared, axis=1) if shared else np.zeros((len(x), 0))
     sigma = np.maximum(across, 1e-6) * data.sigma_px
     robust = np.ones(len(x))
     for _ in range(REWEIGHTINGS):
         weights = robust / sigma**2
-        each, all_ = _solve(own, common, x, weights, data.index, stripes + 1)
-        residuals = x - np.sum(own * each[data.index], axis=1) - common @ all_
+        each, all_ = _solve(per_stripe, common, x, weights, data.index, stripes + 1)
+        residuals = x - np.sum(per_stripe * each[data.index], axis=1) - common @ all_
         scaled = residuals / sigma
         robust = cauchy_weights(scaled, 1, CAUCHY_SIGMAS * spread(scaled))
-    seen = np.bincount(data.index, minlength=stripes + 1) >= FEWEST_POINTS
-    baseline = each[:, 1] if own_baseline else np.full(stripes + 1, all_[0])
+    observed = np.bincount(data.index, minlength=stripes + 1) >= MIN_POINTS
+    baseline = each[:, 1] if variable else np.full(stripes + 1, all_[0])
     tilt = all_[-1] if fit_tilt else 0.0
-    return _planes(np.where(seen, each[:, 0], np.nan), baseline, float(tilt), direction)
+    return _planes(np.where(observed, each[:, 0], np.nan), baseline, float(tilt), direction)
 
 
 def _axes(vectors: Array, direction: Axis) -> tuple[Array, Array, Array]:
@@ -75,15 +77,15 @@ def _axes(vectors: Array, direction: Axis) -> tuple[Array, Array, Array]:
 
 
 def _solve(
-    own: Array, common: Array, right: Array, weights: Array, group: Indices, groups: int
+    per_stripe: Array, common: Array, right: Array, weights: Array, group: Indices, groups: int
 ) -> tuple[Array, Array]:
     """Least squares with K unknowns for each group and M common ones: (groups, K), (M,).
 
-    The groups' own unknowns are eliminated first (Schur complement), so that no large system is
+    The groups' per_stripe unknowns are eliminated first (Schur complement), so that no large system is
     solved.
     """
-    k = own.shape[1]
-    whole = np.column_stack([own, common, right])
+    k = per_stripe.shape[1]
+    whole = np.column_stack([per_stripe, common, right])
     size = whole.shape[1]
     gram = np.empty((groups, size, size))
     for i in range(size):
@@ -104,3 +106,42 @@ def _planes(slope: Array, baseline: Array, tilt: float, direction: Axis) -> Ligh
     planes = np.stack([first, second, -slope, baseline], axis=1)
     planes[~np.isfinite(slope)] = np.nan
     return LightPlanes.exact(planes, direction)
+
+
+POWERS = (3, 4, 5)
+"""The matrix itself has a scale, a shift and a perspective of the index: powers 0 to 2."""
+
+
+def fit_remapped_pinhole(points: Array, s: Array, stripes: int, direction: Axis) -> LightPlanes:
+    """Planes of the best 2 x 4 matrix and re-mapping of s (N,) at points (N, 3), camera frame.
+
+    Robust (Cauchy), started from the matrix alone.
+    """
+    start = fit_pinhole(points, s).matrix
+    middle, size = points.mean(axis=0), float(points.std())
+    # In units of the point cloud's size and of half the stripes, all unknowns are about 1.
+    scale = np.diag([size, size, size, 1.0])
+    scale[:3, 3] = middle
+    matrix = start @ scale
+    half = stripes / 2.0
+    matrix[0] = (matrix[0] - half * matrix[1]) / half
+    matrix /= np.linalg.norm(matrix[1])
+    whole = np.column_stack([(points - middle) / size, np.ones(len(points))])
+    index, powers = s / half - 1.0, _powers(s / half - 1.0)
+
+    def residuals(values: Array) -> Array:
+        above, below = whole @ values[:4], whole @ values[4:8]
+        return np.asarray(above / below - index - powers @ values[8:], np.float64)
+
+    flat = np.concatenate([matrix.ravel(), np.zeros(len(POWERS))])
+    noise = spread(residuals(flat))
+    solved = least_squares(residuals, flat, loss="cauchy", f_scale=noise, x_scale="jac").x
+    u = np.arange(stripes + 1.0) / half - 1.0
+    remapped = u + _powers(u) @ solved[8:]
+    rows = solved[:4] - remapped[:, None] * solved[4:8]
+    return LightPlanes.exact(rows @ np.linalg.inv(scale), direction)
+
+
+def _powers(u: Array) -> Array:
+    """Powers (N, 3) of the index u in [-1, 1]."""
+    return np.stack([u**power for power in POWERS], axis=-1)

@@ -1,4 +1,4 @@
-"""How well one approach measures the spheres and the flat plate."""
+"""Accuracy of an approach on spheres and plate, and how well its sigmas describe it."""
 
 from __future__ import annotations
 
@@ -18,11 +18,13 @@ from bodyscan.evaluation.spheres import (
 )
 from bodyscan.geometry.camera_fields import from_fields
 from bodyscan.geometry.light_planes import Axis, towards_camera
-from bodyscan.laboratory.chapter import apparatus
-from bodyscan.laboratory.chapter.apparatus import ChapterSetup
-from bodyscan.laboratory.chapter.captures import ChapterCaptures
-from bodyscan.laboratory.rivals.approaches import Approach
-from bodyscan.simulation.truth import describe_camera
+from bodyscan.geometry.ray_depths import intersect_rays
+from bodyscan.geometry.robust import rms
+from bodyscan.laboratory import apparatus
+from bodyscan.laboratory.apparatus import ChapterSetup
+from bodyscan.laboratory.approaches import Approach
+from bodyscan.laboratory.chapter_captures import ChapterCaptures, SceneCapture
+from bodyscan.simulation.files import describe_camera
 
 Stripes = NDArray[np.floating[Any]]
 BEST_SHARE = 0.9
@@ -83,10 +85,10 @@ def measure_artefacts(
     points, owner = points_of(approach, spheres_s, on_spheres), captures.owner[on_spheres]
     found, covered = [], []
     for number in range(len(apparatus.CENTRES)):
-        own = owner == number
-        measured = _drop_unknown(points[own])
+        pixels = owner == number
+        measured = _drop_unknown(points[pixels])
         found.append(measure_sphere(measured, apparatus.RADIUS_MM))
-        covered.append(len(measured) / int(own.sum()))
+        covered.append(len(measured) / int(pixels.sum()))
     centres = np.stack([sphere.given.centre for sphere in found])
     return ApproachAccuracy(
         approach.name,
@@ -102,7 +104,7 @@ def measure_artefacts(
 
 @dataclass(frozen=True, eq=False)
 class TrueSheets:
-    """The simulator's own light as exactly known sheets for triangulation, including smile."""
+    """The simulator's pixels light as exactly known sheets for triangulation, including smile."""
 
     setup: ChapterSetup
 
@@ -124,13 +126,13 @@ class TrueSheets:
         first = -planes[..., 3] / np.sum(planes[..., :3] * rays, axis=-1)
         light = self.setup.projector.stripe
         further = first + SECANT_MM
-        off = light(rays * first[..., None]) - s
+        residual = light(rays * first[..., None]) - s
         with np.errstate(invalid="ignore", divide="ignore"):
             for _ in range(SECANT_STEPS):
-                off_further = light(rays * further[..., None]) - s
-                change = off_further - off
-                step = np.where(change == 0.0, 0.0, off_further * (further - first) / change)
-                first, further, off = further, further - step, off_further
+                next_residual = light(rays * further[..., None]) - s
+                change = next_residual - residual
+                step = np.where(change == 0.0, 0.0, next_residual * (further - first) / change)
+                first, further, residual = further, further - step, next_residual
         return further
 
     def depth_per_stripe(self, rays: Array, s: Array, depth: Array | None = None) -> Array:
@@ -146,7 +148,7 @@ class TrueSheets:
 
 
 def true_approach(setup: ChapterSetup) -> Approach:
-    """The simulator's own camera and light, which no calibration can better."""
+    """The simulator's pixels camera and light, which no calibration can better."""
     return Approach(
         "true calibration", from_fields(describe_camera(apparatus.CAMERA)), TrueSheets(setup)
     )
@@ -167,16 +169,16 @@ class NoiseBound:
 
 def noise_bound(captures: ChapterCaptures) -> NoiseBound:
     truth = true_approach(captures.setup)
-    seen = captures.spheres
+    capture = captures.spheres
     everything, best = [], []
     for number, centre in enumerate(apparatus.CENTRES):
-        own = captures.owner == number
-        both = (points_of(truth, stripes.s, own) for stripes in (seen.stripes, seen.again))
+        pixels = captures.owner == number
+        both = (points_of(truth, stripes.s, pixels) for stripes in (capture.stripes, capture.again))
         distance = [np.linalg.norm(points - centre, axis=1) for points in both]
         half = 0.5 * (distance[0] - distance[1]) ** 2
-        sigma = seen.stripes.sigma[own]
+        sigma = capture.stripes.sigma[pixels]
         order = np.argsort(np.where(np.isfinite(half), sigma, np.inf))[
-            : int(BEST_SHARE * own.sum())
+            : int(BEST_SHARE * pixels.sum())
         ]
         everything.append(float(np.nanmean(half)))
         best.append(float(np.nanmean(half[order])))
@@ -185,3 +187,49 @@ def noise_bound(captures: ChapterCaptures) -> NoiseBound:
 
 def _drop_unknown(points: Array) -> Array:
     return points[np.isfinite(points[..., 2])]
+
+
+@dataclass(frozen=True)
+class PointSigma:
+    """Errors of depth over their sigma.
+
+    spheres, plate: root mean square on these (1 if the sigmas are right).
+    beyond_three: share of all errors beyond three sigmas (0.0027 if Gaussian).
+    median_mm: of the sigmas themselves.
+    """
+
+    name: str
+    spheres: float
+    plate: float
+    beyond_three: float
+    median_mm: float
+
+
+def point_sigma(approach: Approach, captures: ChapterCaptures) -> PointSigma:
+    """Compare sigmas, from decoding noise and the sheets'
+    covariance, with the true depth errors."""
+    parts = (
+        _depth_errors(approach, captures.spheres, captures.owner >= 0),
+        _depth_errors(approach, captures.plate, captures.on_plate),
+    )
+    spheres, plate = (error / sigma for error, sigma in parts)
+    every = np.concatenate([spheres, plate])
+    return PointSigma(
+        approach.name,
+        rms(spheres),
+        rms(plate),
+        float(np.mean(np.abs(every) > 3.0)),
+        float(np.median(np.concatenate([sigma for _, sigma in parts]))),
+    )
+
+
+def _depth_errors(approach: Approach, capture: SceneCapture, where: Mask) -> tuple[Array, Array]:
+    """Error of depth and its sigma, mm, of the measured pixels among `where` (H, W)."""
+    rows, columns = np.nonzero(where & np.isfinite(capture.stripes.s))
+    rays = approach.camera.rays(np.column_stack([columns, rows]).astype(float))
+    measured = intersect_rays(approach.sheets, rays, capture.stripes.s[rows, columns].astype(float))
+    decoding = measured.per_stripe * capture.stripes.sigma[rows, columns]
+    sigma = np.sqrt(decoding**2 + measured.variance_mm2)
+    error = measured.depth - capture.truth.depth[rows, columns]
+    known = np.isfinite(error) & np.isfinite(sigma)
+    return error[known], sigma[known]

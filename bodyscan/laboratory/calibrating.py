@@ -1,4 +1,4 @@
-"""The approaches of 4.2 and ours from the same images, and the honesty of Table 1's sigmas."""
+"""Calibrate every approach of section 4.2 and ours from the same images."""
 
 from __future__ import annotations
 
@@ -20,22 +20,20 @@ from bodyscan.calibration.light_sheets import fit_light_sheets
 from bodyscan.calibration.refinement_choice import REFINED_BINS, refine_where_better
 from bodyscan.calibration.striped_view import BIN_PX
 from bodyscan.geometry.camera_fields import from_fields
-from bodyscan.laboratory.chapter import apparatus
-from bodyscan.laboratory.chapter.captures import TARGET, ChapterCaptures
-from bodyscan.laboratory.rivals.approaches import (
+from bodyscan.laboratory import apparatus
+from bodyscan.laboratory.approaches import (
     Approach,
-    mended_pinhole_by_stage,
-    pinhole_by_stage,
-    planes_by_stage_camera,
-    rivals,
-)
-from bodyscan.laboratory.rivals.targets import (
     LocatedBoards,
-    by_reference_plane,
-    by_slide_stage,
-    locate,
+    calibrate_by_reference_plane,
+    calibrate_by_slide_stage,
+    fit_mended_pinhole,
+    fit_pinhole_approach,
+    fit_planes_approach,
+    fit_rivals,
+    locate_boundaries,
 )
-from bodyscan.simulation.truth import describe_camera
+from bodyscan.laboratory.chapter_captures import TARGET, ChapterCaptures
+from bodyscan.simulation.files import describe_camera
 
 CORNER_NOISE_PX = 0.012
 """Error, per axis, of corners found in the rendered images."""
@@ -67,17 +65,17 @@ class Calibrations:
 
 def calibrate_all(captures: ChapterCaptures) -> Calibrations:
     """Calibrate everything that is compared, from the same shots."""
-    reference, reference_boards = by_reference_plane(TARGET, captures.boards)
-    _, stage = by_slide_stage(TARGET, captures.stage, captures.readings)
-    _, skewed = by_slide_stage(TARGET, captures.stage, captures.readings, skewed=True)
+    reference, reference_boards = calibrate_by_reference_plane(TARGET, captures.boards)
+    _, stage = calibrate_by_slide_stage(TARGET, captures.stage, captures.readings)
+    _, skewed = calibrate_by_slide_stage(TARGET, captures.stage, captures.readings, skewed=True)
     projector = TARGET.projector
     planes = fit_light_planes(reference_boards.points, projector.stripes, projector.direction)
     ours, covariance, model, refinement = calibrate_ours(captures, reference, reference_boards)
     approaches = (
-        pinhole_by_stage(TARGET, captures.stage, captures.readings),
-        mended_pinhole_by_stage(TARGET, stage),
-        planes_by_stage_camera("(ii)", TARGET, stage, captures.boards),
-        planes_by_stage_camera("(ii) with skew", TARGET, skewed, captures.boards),
+        fit_pinhole_approach(TARGET, captures.stage, captures.readings),
+        fit_mended_pinhole(TARGET, stage),
+        fit_planes_approach("(ii)", TARGET, stage, captures.boards),
+        fit_planes_approach("(ii) with skew", TARGET, skewed, captures.boards),
         Approach("(iii)", reference_boards.camera, planes.planes),
         ours,
     )
@@ -89,8 +87,8 @@ def calibrate_all(captures: ChapterCaptures) -> Calibrations:
         model,
         refinement,
         approaches,
-        tuple(rivals(TARGET, stage)),
-        tuple(rivals(TARGET, reference_boards)),
+        tuple(fit_rivals(TARGET, stage)),
+        tuple(fit_rivals(TARGET, reference_boards)),
     )
 
 
@@ -100,7 +98,7 @@ def calibrate_ours(
     """Calibrate as `bodyscan calibrate-rig` does for a single pair: the light model that held-out
     boards choose, and a joint solve where they gain by it."""
     projector, board = TARGET.projector, TARGET.board
-    bins = locate(
+    bins = locate_boundaries(
         TARGET, captures.boards, boards.camera, boards.camera_from_board, bin_px=BIN_PX
     ).points
     data = subsample(bins, REFINED_BINS)
@@ -127,8 +125,8 @@ class SigmaTrial:
     errors: Array
 
     @property
-    def spread(self) -> Array:
-        """Root mean square (P,); 1 if the sigmas are honest."""
+    def rms(self) -> Array:
+        """Root mean square (P,); 1 if the sigmas are right."""
         return np.sqrt(np.mean(self.errors**2, axis=0))
 
     @property
@@ -140,14 +138,14 @@ class SigmaTrial:
 def sigma_trial(seeds: int, seed: int = 0) -> SigmaTrial:
     """Table 1's camera from the three poses, with `seeds` draws of corner noise."""
     corners = corner_points(TARGET.board)
-    places = apparatus.board_poses()
-    seen = [apparatus.CAMERA.image(place.apply(corners)) for place in places]
+    poses = apparatus.board_poses()
+    images = [apparatus.CAMERA.image(pose.apply(corners)) for pose in poses]
     true, errors = from_fields(describe_camera(apparatus.CAMERA)), []
     for number in range(seeds):
         rng = np.random.default_rng([seed, number])
         views = [
             PlanarView(f"s{k}", corners, pixels + rng.normal(0.0, CORNER_NOISE_PX, pixels.shape))
-            for k, pixels in enumerate(seen)
+            for k, pixels in enumerate(images)
         ]
         found = calibrate_camera(views, apparatus.CAMERA.width, apparatus.CAMERA.height)
         sigmas = np.sqrt(np.diag(found.covariance))

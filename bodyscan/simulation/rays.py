@@ -1,22 +1,94 @@
-"""Where a band's rays end, and what light does there.
+"""A camera's rays, and the light where they end.
 
-Most pixels see one smooth piece of one surface. There only the rays between pixels are cast, and
-what lies inside the pixel is interpolated: a tenth of the rays. Where corners differ, all are cast.
+Most pixels see one smooth piece of one surface. There only the rays through the pixels' corners are
+cast and the interior is interpolated: a tenth of the rays. Where corners differ, all are cast.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from bodyscan.arrays import Floats, Mask
+from bodyscan.arrays import Array, Floats, Mask
 from bodyscan.compiled import compiled
 from bodyscan.simulation.lamps import Lamps, laser_light, room_light
-from bodyscan.simulation.lens import sample_offsets
+from bodyscan.simulation.lens import TrueCamera, sample_directions, sample_offsets
 from bodyscan.simulation.projector import Projector
 from bodyscan.simulation.scene import Hits, Scene
-from bodyscan.simulation.view import Band
+from bodyscan.simulation.settings import Optics
+
+
+@dataclass(frozen=True, eq=False)
+class Band:
+    """Part of an image, R rows and C columns, and its rays, z = 1.
+
+    rays: (R, C, K, 3) through points inside pixels.
+    shift: (R, C, 2) by which these points are shifted from `lens.sample_offsets`.
+    corners: (R + 1, C + 1, 3) through the pixels' corners.
+    """
+
+    rows: slice
+    columns: slice
+    rays: Floats
+    shift: Floats
+    corners: Floats
+
+    @staticmethod
+    def from_rows(camera: TrueCamera, samples: int, rng: np.random.Generator, rows: slice) -> Band:
+        shift = rng.random((rows.stop - rows.start, camera.width, 2))
+        rays = sample_directions(camera, samples, shift, rows)
+        v, u = np.mgrid[rows.start : rows.stop + 1, 0 : camera.width + 1] - 0.5
+        corners: Array = camera.directions(np.stack([u, v], axis=-1).reshape(-1, 2))
+        return Band(
+            rows,
+            slice(0, camera.width),
+            rays.reshape(*shift.shape[:2], -1, 3),
+            shift.astype(np.float32),
+            corners.reshape(*u.shape, 3).astype(np.float32),
+        )
+
+    def crop_columns(self, first: int, last: int) -> Band:
+        """Crop to the columns from first to last, both included."""
+        cut = slice(first, last + 1)
+        return replace(
+            self,
+            columns=cut,
+            rays=self.rays[:, cut],
+            shift=self.shift[:, cut],
+            corners=self.corners[:, first : last + 2],
+        )
+
+    @property
+    def slices(self) -> tuple[slice, slice]:
+        """Its pixels in an image."""
+        return self.rows, self.columns
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A camera's rays, kept for all its shots; the bands cover its image."""
+
+    camera: TrueCamera
+    optics: Optics
+    bands: tuple[Band, ...]
+
+    @staticmethod
+    def from_camera(camera: TrueCamera, optics: Optics, rng: np.random.Generator) -> View:
+        """Draw the rays of each pixel; bands of 250,000 rays bound the memory."""
+        rows = max(1, 250_000 // (camera.width * optics.samples**2))
+        cuts = [slice(r, min(r + rows, camera.height)) for r in range(0, camera.height, rows)]
+        bands = (Band.from_rows(camera, optics.samples, rng, cut) for cut in cuts)
+        return View(camera, optics, tuple(bands))
+
+    def bands_around(self, chosen: Mask) -> Iterator[Band]:
+        """Yield the bands that contain chosen pixels (H, W), cropped to those columns."""
+        for band in self.bands:
+            columns = np.flatnonzero(chosen[band.rows].any(axis=0))
+            if columns.size:
+                yield band.crop_columns(int(columns[0]), int(columns[-1]))
+
 
 FLAT_MM = 0.04
 """How far a corner may be off the facet at the opposite one. Between them the surface is then
@@ -34,7 +106,7 @@ class RayEnds:
     albedo, skin: as in `Hits`.
     depth: mm.
     surface: its number.
-    across, down: place on a print.
+    across, down: slices on a print.
     """
 
     white: Floats
@@ -53,19 +125,21 @@ def ends_of_rays(scene: Scene, band: Band, projector: Projector, lamps: Lamps) -
     """Cast the band's rays, or interpolate them, and light their ends."""
     rows, columns, samples, _ = band.rays.shape
     hits = scene.cast(band.corners.reshape(-1, 3))
-    corners = _lit(scene, hits, projector, lamps).reshape(-1, rows + 1, columns + 1)
-    even = _even(hits, RayEnds(*corners))
+    corners = _light_fields(scene, hits, projector, lamps).reshape(-1, rows + 1, columns + 1)
+    even = _mask_smooth(hits, RayEnds(*corners))
     values = np.empty((len(fields(RayEnds)), rows, columns, samples), np.float32)
     offsets = sample_offsets(round(samples**0.5)).astype(np.float32)
     interpolate(corners, band.shift, offsets, even, values)
     cast = scene.cast(band.rays[~even].reshape(-1, 3))
-    values[:, ~even] = _lit(scene, cast, projector, lamps).reshape(len(values), -1, samples)
+    values[:, ~even] = _light_fields(scene, cast, projector, lamps).reshape(
+        len(values), -1, samples
+    )
     ends = RayEnds(*values)
     scene.print_on(ends.surface, ends.across, ends.down, ends.albedo)
     return ends
 
 
-def _lit(scene: Scene, hits: Hits, projector: Projector, lamps: Lamps) -> Floats:
+def _light_fields(scene: Scene, hits: Hits, projector: Projector, lamps: Lamps) -> Floats:
     """Fields (F, N) in the order of `RayEnds`."""
     white = replace(hits, albedo=np.ones_like(hits.albedo))
     light = laser_light(scene, white, projector, lamps)
@@ -80,12 +154,12 @@ def _lit(scene: Scene, hits: Hits, projector: Projector, lamps: Lamps) -> Floats
             hits.skin,
             hits.depth,
             hits.surface.astype(np.float32),
-            *hits.places.T,
+            *hits.print_xy.T,
         ]
     )
 
 
-def _even(hits: Hits, corners: RayEnds) -> Mask:
+def _mask_smooth(hits: Hits, corners: RayEnds) -> Mask:
     """Pixels (R, C) whose corners lie on one smooth piece of a surface, all lit or none."""
     shape = corners.depth.shape
     points, facets = hits.points.reshape(*shape, 3), hits.facets.reshape(*shape, 3)
@@ -100,9 +174,9 @@ def _even(hits: Hits, corners: RayEnds) -> Mask:
         (kind[first] == kind[second]) & (kind[first] == kind[third]) & (kind[first] == kind[fourth])
     )
     for one, other in ((first, second), (third, fourth)):
-        way = points[other] - points[one]
+        edge = points[other] - points[one]
         for facet in (facets[one], facets[other]):
-            even &= np.abs(np.einsum("rck,rck->rc", way, facet)) < FLAT_MM
+            even &= np.abs(np.einsum("rck,rck->rc", edge, facet)) < FLAT_MM
     return np.asarray(even)
 
 
@@ -124,9 +198,9 @@ def interpolate(
             for f in range(count):
                 start = corners[f, r, c]
                 right, below = corners[f, r, c + 1] - start, corners[f, r + 1, c] - start
-                bent = corners[f, r + 1, c + 1] - start - right - below
+                twist = corners[f, r + 1, c + 1] - start - right - below
                 for k in range(samples):
-                    values[f, r, c, k] = start + x[k] * right + y[k] * (below + x[k] * bent)
+                    values[f, r, c, k] = start + x[k] * right + y[k] * (below + x[k] * twist)
 
 
 @compiled
@@ -147,8 +221,8 @@ def mean_light(
 
 
 @compiled
-def least(samples: Floats) -> Floats:
-    """The least (R, C) of samples (R, C, K)."""
+def min_over_samples(samples: Floats) -> Floats:
+    """The min_over_samples (R, C) of samples (R, C, K)."""
     rows, columns, count = samples.shape
     result = np.empty((rows, columns), np.float32)
     for r in range(rows):

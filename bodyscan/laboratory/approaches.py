@@ -1,29 +1,40 @@
-"""Calibration of a pair with a reference plane held anywhere, or on a slide stage (4.2).
+"""The chapter's ways to calibrate a pair (4.2), all as a camera and light sheets.
 
-Both give a camera, and stripe boundaries at known places in its frame.
+With a reference plane held anywhere or on a slide stage: both give a camera, and stripe boundaries
+at known points in its frame, to which every model of the projector is fitted.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from bodyscan.arrays import Array
 from bodyscan.boards.view import BoardView
 from bodyscan.calibration.board_views import PlanarView, planar_view
-from bodyscan.calibration.boundary_points import BoundaryPoints, concatenate
+from bodyscan.calibration.boundary_points import BoundaryPoints, concatenate, subsample
 from bodyscan.calibration.camera import CameraCalibration, calibrate_camera, locate_board
+from bodyscan.calibration.light_planes import fit_light_planes
+from bodyscan.calibration.pinhole_projector import fit_pinhole
 from bodyscan.calibration.striped_view import boundaries_near, box_around, on_board
 from bodyscan.calibration.zhang import homography
 from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.light_planes import Axis, LightPlanes, LightSheets
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.laboratory.rivals.projection_matrix import (
+from bodyscan.laboratory.rival_cameras import (
+    TsaiCamera,
+    calibrate_tsai,
     projection_matrix,
     split_projection_matrix,
 )
-from bodyscan.laboratory.rivals.tsai import TsaiCamera, calibrate_tsai
+from bodyscan.laboratory.rival_projectors import (
+    fit_invariable_baseline,
+    fit_remapped_pinhole,
+    fit_variable_baseline,
+)
 from bodyscan.rig.board import Board
 from bodyscan.stripes.stripe_code import StripeCode
 from bodyscan.stripes.stripe_map import StripeMap
@@ -54,17 +65,17 @@ class LocatedBoards:
     points: BoundaryPoints
 
 
-def by_reference_plane(
+def calibrate_by_reference_plane(
     target: Target, shots: Sequence[StripedShot]
 ) -> tuple[CameraCalibration, LocatedBoards]:
     """The chapter's method (section 3): Zhang's camera, which also gives the boards' poses."""
     height, width = shots[0].stripes.s.shape
     views = [planar_view(shot.view, target.board) for shot in shots]
     found = calibrate_camera(views, width, height)
-    return found, locate(target, shots, found.camera, found.camera_from_board)
+    return found, locate_boundaries(target, shots, found.camera, found.camera_from_board)
 
 
-def by_slide_stage(
+def calibrate_by_slide_stage(
     target: Target, shots: Sequence[StripedShot], readings: Array, *, skewed: bool = False
 ) -> tuple[TsaiCamera, LocatedBoards]:
     """Tsai's camera, with a skew if wanted, from a board that slid along its normal.
@@ -76,13 +87,15 @@ def by_slide_stage(
     middle = np.array([(width - 1) / 2.0, (height - 1) / 2.0])
     tsai = calibrate_tsai(points, pixels, middle, skewed=skewed)
     poses = {
-        shot.view.shot: tsai.camera_from_points @ _slid(float(reading))
+        shot.view.shot: tsai.camera_from_points @ _stage_pose(float(reading))
         for shot, reading in zip(shots, readings, strict=True)
     }
-    return tsai, locate(target, shots, tsai.camera(width, height), poses)
+    return tsai, locate_boundaries(target, shots, tsai.camera(width, height), poses)
 
 
-def by_matrix(target: Target, shots: Sequence[StripedShot], readings: Array) -> LocatedBoards:
+def calibrate_by_matrix(
+    target: Target, shots: Sequence[StripedShot], readings: Array
+) -> LocatedBoards:
     """A 3 x 4 camera from the same stage, without a lens (Bolles et al. 1981).
 
     The stripes' positions are read off each board by its own homography, which has no lens either.
@@ -93,23 +106,23 @@ def by_matrix(target: Target, shots: Sequence[StripedShot], readings: Array) -> 
     camera, camera_from_stage = split_projection_matrix(matrix, width, height)
     poses, parts = {}, []
     for number, (shot, reading) in enumerate(zip(shots, readings, strict=True)):
-        pose = camera_from_stage @ _slid(float(reading))
+        pose = camera_from_stage @ _stage_pose(float(reading))
         poses[shot.view.shot] = pose
         view = planar_view(shot.view, target.board)
-        parts.append(_by_homography(target, shot, view, camera, pose, number))
+        parts.append(_locate_by_homography(target, shot, view, camera, pose, number))
     return LocatedBoards(camera, poses, concatenate(parts))
 
 
-def locate_again(target: Target, shots: Sequence[StripedShot], camera: Camera) -> LocatedBoards:
+def locate_boards(target: Target, shots: Sequence[StripedShot], camera: Camera) -> LocatedBoards:
     """Locate boards held anywhere with a camera that is already known."""
     poses = {
         shot.view.shot: locate_board(camera, planar_view(shot.view, target.board))[0]
         for shot in shots
     }
-    return locate(target, shots, camera, poses)
+    return locate_boundaries(target, shots, camera, poses)
 
 
-def locate(
+def locate_boundaries(
     target: Target,
     shots: Sequence[StripedShot],
     camera: Camera,
@@ -146,11 +159,11 @@ def stage_points(
     return np.concatenate(points), np.concatenate([view.pixels for view in views])
 
 
-def _slid(reading: float) -> RigidTransform:
+def _stage_pose(reading: float) -> RigidTransform:
     return RigidTransform.shift([0.0, 0.0, reading])
 
 
-def _by_homography(
+def _locate_by_homography(
     target: Target,
     shot: StripedShot,
     view: PlanarView,
@@ -181,3 +194,82 @@ def _by_homography(
         onto_plane(pixels + across) - onto_plane(pixels - across),
         everything.sigma_px,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class Approach:
+    """A calibrated pair as needed for triangulation, whatever the models."""
+
+    name: str
+    camera: Camera
+    sheets: LightSheets
+
+
+def fit_pinhole_approach(target: Target, shots: Sequence[StripedShot], readings: Array) -> Approach:
+    """Approach (i) of the chapter: a 3 x 4 and a 2 x 4 matrix from a slide stage, without a lens,
+    and with the index used as a place on the projector's slide."""
+    return _fit("(i)", calibrate_by_matrix(target, shots, readings), target, pinhole_planes)
+
+
+def fit_mended_pinhole(target: Target, stage: LocatedBoards) -> Approach:
+    """Approach (i) with what it lacks: Tsai's camera with its lens, and a re-mapped index."""
+    return _fit("(i) mended", stage, target, remapped_planes)
+
+
+def fit_planes_approach(
+    name: str, target: Target, stage: LocatedBoards, shots: Sequence[StripedShot]
+) -> Approach:
+    """Approach (ii): Tsai's camera from the slide stage, planes from the reference plane.
+
+    This follows the chapter's text, although its heading says `calibrated by slide stage`.
+    """
+    return _fit(name, locate_boards(target, shots, stage.camera), target, free_planes)
+
+
+Model = Callable[[BoundaryPoints, int, Axis], LightPlanes]
+
+
+def free_planes(points: BoundaryPoints, stripes: int, direction: Axis) -> LightPlanes:
+    """One free plane per stripe (Eq. 6)."""
+    return fit_light_planes(points, stripes, direction).planes
+
+
+MATRIX_POINTS = 20000
+"""This many points determine the few numbers of a matrix far better than the model fits."""
+
+
+def pinhole_planes(points: BoundaryPoints, stripes: int, direction: Axis) -> LightPlanes:
+    """Planes of the 2 x 4 matrix of Bolles et al. 1981."""
+    few = subsample(points, MATRIX_POINTS)
+    fitted = fit_pinhole(few.points, few.index.astype(float))
+    return fitted.planes(stripes, direction)
+
+
+def remapped_planes(points: BoundaryPoints, stripes: int, direction: Axis) -> LightPlanes:
+    """Planes of the 2 x 4 matrix with a re-mapped index."""
+    few = subsample(points, MATRIX_POINTS)
+    return fit_remapped_pinhole(few.points, few.index.astype(float), stripes, direction)
+
+
+PROJECTORS: dict[str, Model] = {
+    "2 x 4 matrix": pinhole_planes,
+    "2 x 4 matrix, index re-mapped": remapped_planes,
+    "invariable baseline": partial(fit_invariable_baseline, fit_tilt=False),
+    "invariable baseline, tilted": fit_invariable_baseline,
+    "variable baseline": partial(fit_variable_baseline, fit_tilt=False),
+    "variable baseline, tilted": fit_variable_baseline,
+    "free planes": free_planes,
+}
+"""Every model of the projector that the chapter names. `tilted`: the baseline's direction in the
+image is estimated too, instead of being assumed to be the camera's x axis."""
+
+
+def fit_rivals(target: Target, where: LocatedBoards) -> list[Approach]:
+    """Each model fitted to the same boundaries."""
+    return [_fit(name, where, target, model) for name, model in PROJECTORS.items()]
+
+
+def _fit(name: str, where: LocatedBoards, target: Target, model: Model) -> Approach:
+    projector = target.projector
+    sheets = model(where.points, projector.stripes, projector.direction)
+    return Approach(name, where.camera, sheets)

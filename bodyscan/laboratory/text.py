@@ -1,4 +1,4 @@
-"""The reproduced tables as text (Markdown, which reads well on a screen too)."""
+"""The reproduced tables as Markdown text."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bodyscan.laboratory.chapter import apparatus
-from bodyscan.laboratory.chapter.calibrating import Calibrations, SigmaTrial
-from bodyscan.laboratory.chapter.measuring import ApproachAccuracy, NoiseBound
-from bodyscan.laboratory.chapter.point_sigma import PointSigma
+from bodyscan.laboratory import apparatus
+from bodyscan.laboratory.calibrating import Calibrations, SigmaTrial
+from bodyscan.laboratory.measuring import ApproachAccuracy, NoiseBound, PointSigma
 
 CHAPTER_TABLE_2 = {
     "(i)": (0.41, 0.38, 0.26, 0.26, 0.31),
@@ -26,7 +25,7 @@ class Reproduction:
     whole, fine: the approaches and, last, the true calibration, from one whole stripe per pixel and
         from sub-pixel boundaries.
     by_stage, by_reference: every projector model, sub-pixel.
-    sigmas: how honest the points' own sigmas are.
+    sigmas: depth errors over the points' sigmas.
     """
 
     seed: int
@@ -47,7 +46,7 @@ def reproduction_text(found: Reproduction) -> str:
     parts = [
         _heading(found),
         _table_1(found),
-        _honesty(found.trial),
+        _sigma_table(found.trial),
         _table_2(found),
         _against_truth(found),
         _point_sigmas(found),
@@ -100,8 +99,8 @@ def _table_1(found: Reproduction) -> str:
     )
 
 
-def _honesty(trial: SigmaTrial) -> str:
-    rows = [["RMS of error / sigma", *(f"{value:.2f}" for value in trial.spread)]]
+def _sigma_table(trial: SigmaTrial) -> str:
+    rows = [["RMS of error / sigma", *(f"{value:.2f}" for value in trial.rms)]]
     return (
         f"Over {len(trial.errors)} draws of corner noise:\n\n"
         + _table(["", *trial.parameters], rows)
@@ -158,7 +157,7 @@ def _against_truth(found: Reproduction) -> str:
     return (
         "## What E does not see\n\n"
         + _table(_FIGURES, rows)
-        + "\n\nE says little of a calibration (compare the true one's with (iii)'s), these do. "
+        + "\n\nE hardly depends on the calibration (compare the true one's with (iii)'s), these do. "
         "`plate`: a flat plate of 160 x 120 mm as decoded, RMS from its own plane, and of that the "
         "smooth part; `systematic`: the same plate with every pixel's stripe coordinate known exactly, "
         "so that nothing but the calibration is left. `centres`: errors of the ten distances between "
@@ -181,7 +180,7 @@ def _point_sigmas(found: Reproduction) -> str:
         "## The points' own sigmas\n\n"
         + _table(["", "median sigma", "spheres", "plate", "beyond 3 sigmas"], rows)
         + "\n\n`spheres`, `plate`: root mean square of (depth less true depth) over sigma, every "
-        "measured pixel counted; 1 if sigmas are honest. A sigma is made of the decoder's and of the "
+        "measured pixel counted; 1 if sigmas are right. A sigma is made of the decoder's and of the "
         "sheets' covariance. Ours holds what is open of camera, boards' places, bend and print, "
         "which is most of it and common to all points, so that one run is one draw of it; (iii)'s only "
         "the noise of each plane's own boundaries."

@@ -1,9 +1,11 @@
-"""Tsai's camera calibration (1987) from points that are not in one plane.
+"""Rival cameras, from points that are not in one plane.
 
-Radial alignment: whatever the focal length, the depth and the radial distortion, a point's image
-lies on the ray from the image centre in the direction of its offset from the axis. That gives
-rotation and lateral translation linearly, then focal length and depth; finally all are refined
-together. The model has one coefficient, from real to ideal: ideal = real (1 + kappa r^2).
+Tsai (1987): by radial alignment, whatever the focal length, the depth and the radial distortion, a
+point's image lies on the ray from the image centre in the direction of its offset from the axis.
+That gives rotation and lateral translation linearly, then focal length and depth; finally all are
+refined. One coefficient leads from real to ideal: ideal = real (1 + kappa r^2).
+
+A 3 x 4 matrix without a lens (Bolles et al. 1981).
 """
 
 from __future__ import annotations
@@ -11,9 +13,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import rq
 from scipy.optimize import least_squares
 
 from bodyscan.arrays import Array
+from bodyscan.calibration.zhang import homogeneous
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.transforms import RigidTransform
@@ -75,8 +79,8 @@ def calibrate_tsai(
     refined.
     """
 
-    def misalignment(place: Array) -> Array:
-        return _solve_alignment(points, pixels - place)[1]
+    def misalignment(pose: Array) -> Array:
+        return _solve_alignment(points, pixels - pose)[1]
 
     found = least_squares(misalignment, centre).x
     rotation, across, aspect = _align(points, pixels - found)
@@ -90,13 +94,13 @@ def calibrate_tsai(
     solved = least_squares(_residuals, start, x_scale="jac", args=(points, pixels))
     values = solved.x
     rms = float(np.sqrt(2.0 * np.mean(solved.fun**2)))
-    place = RigidTransform.from_rotation_vector(values[:3], values[3:6])
+    pose = RigidTransform.from_rotation_vector(values[:3], values[3:6])
     return TsaiCamera(
         float(values[6]),
         float(values[7]),
         values[8:10],
         float(values[10]),
-        place,
+        pose,
         rms,
         float(values[11]) if skewed else 0.0,
     )
@@ -142,10 +146,69 @@ def _focal_and_depth(
 def _residuals(values: Array, points: Array, pixels: Array) -> Array:
     """Residuals (2 N,) px, in the ideal image."""
     focal, aspect, centre, kappa = values[6], values[7], values[8:10], values[10]
-    seen = RigidTransform.from_rotation_vector(values[:3], values[3:6]).apply(points)
+    in_camera = RigidTransform.from_rotation_vector(values[:3], values[3:6]).apply(points)
     scale = np.array([focal * aspect, focal])
     real = (pixels - centre) / scale
     if len(values) > 11:
         real[:, 0] -= values[11] / scale[0] * real[:, 1]
     ideal = real * (1.0 + kappa * np.sum(real**2, axis=1, keepdims=True))
-    return ((seen[:, :2] / seen[:, 2:] - ideal) * scale).ravel()
+    return ((in_camera[:, :2] / in_camera[:, 2:] - ideal) * scale).ravel()
+
+
+def projection_matrix(points: Array, pixels: Array) -> Array:
+    """Matrix (3, 4) with pixels ~ P X, from points (N, 3) mm not all in one plane and pixels (N,
+    2).
+
+    Direct linear transformation (Abdel-Aziz and Karara 1971) with Hartley's scaling.
+    """
+    space, image = _scaling(points), _scaling(pixels)
+    x = homogeneous(points) @ space.T
+    u, v = (homogeneous(pixels) @ image.T)[:, :2].T
+    zero = np.zeros_like(x)
+    rows = np.concatenate(
+        [
+            np.concatenate([x, zero, -u[:, None] * x], axis=1),
+            np.concatenate([zero, x, -v[:, None] * x], axis=1),
+        ]
+    )
+    _, vectors = np.linalg.eigh(rows.T @ rows)
+    matrix = np.linalg.inv(image) @ vectors[:, 0].reshape(3, 4) @ space
+    matrix /= np.linalg.norm(matrix[2, :3])
+    return matrix * np.sign(matrix[2] @ np.append(points.mean(axis=0), 1.0))
+
+
+def split_projection_matrix(
+    matrix: Array, width: int, height: int
+) -> tuple[Camera, RigidTransform]:
+    """The matrix as a camera without a lens, and its pose: camera, camera_from_points."""
+    inner, rotation = rq(matrix[:, :3])
+    sign = np.diag(np.sign(np.diag(inner)))
+    inner, rotation = inner @ sign, sign @ rotation
+    translation = np.linalg.solve(inner, matrix[:, 3])
+    if np.linalg.det(rotation) < 0.0:
+        rotation, translation = -rotation, -translation
+    inner = inner / inner[2, 2]
+    camera = Camera(
+        alpha=float(inner[0, 0]),
+        beta=float(inner[1, 1]),
+        gamma=float(inner[0, 1]),
+        u0=float(inner[0, 2]),
+        v0=float(inner[1, 2]),
+        lens=Radial(),
+        width=width,
+        height=height,
+    )
+    return camera, RigidTransform(
+        np.asarray(rotation, np.float64), np.asarray(translation, np.float64)
+    )
+
+
+def _scaling(points: Array) -> Array:
+    """Matrix (D + 1, D + 1) that scales points to mean 0 and a mean distance of sqrt(D)."""
+    size = points.shape[1]
+    mean = points.mean(axis=0)
+    scale = np.sqrt(size) / float(np.mean(np.linalg.norm(points - mean, axis=1)))
+    matrix = np.eye(size + 1)
+    matrix[:size] *= scale
+    matrix[:size, size] = -scale * mean
+    return matrix

@@ -16,9 +16,10 @@ from bodyscan.geometry.light_planes import towards_camera
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.rig.board import Board
 from bodyscan.simulation.board import MadeBoard, make_board
-from bodyscan.simulation.layout import build_mirror, seen_points
+from bodyscan.simulation.layout import build_mirror, sample_view_volume
 from bodyscan.simulation.lens import TrueCamera
 from bodyscan.simulation.projector import MirrorProjector
+from bodyscan.simulation.rays import View
 from bodyscan.simulation.settings import (
     BoardMaking,
     Noise,
@@ -26,7 +27,6 @@ from bodyscan.simulation.settings import (
     Projection,
     SimulationSettings,
 )
-from bodyscan.simulation.view import View
 from bodyscan.stripes.codes.gray import Gray
 
 CAMERA = TrueCamera(1061.71, 1064.09, -0.562002, 350.08, 286.547, -0.140279, -0.0916363, 640, 480)
@@ -130,7 +130,7 @@ def chapter_setup(settings: SimulationSettings, seed: int = 0) -> ChapterSetup:
         RigidTransform.from_rotation_vector(turn, PROJECTOR_AT),
         PROJECTOR.stripes,
         False,
-        seen_points(CAMERA, SWEPT_MM),
+        sample_view_volume(CAMERA, SWEPT_MM),
         settings.projection,
         np.random.default_rng(_PROJECTOR_SEED),
     )
@@ -138,7 +138,7 @@ def chapter_setup(settings: SimulationSettings, seed: int = 0) -> ChapterSetup:
         settings,
         projector,
         make_board(BOARD, settings.board, np.random.default_rng([seed, BOARD_MAKING])),
-        View.of(CAMERA, settings.optics, np.random.default_rng([seed, RAYS])),
+        View.from_camera(CAMERA, settings.optics, np.random.default_rng([seed, RAYS])),
         seed,
     )
 
@@ -151,7 +151,7 @@ def true_planes(setup: ChapterSetup) -> Array:
 def board_poses(count: int = BOARDS) -> list[RigidTransform]:
     """camera_from_board of the three poses, or of `count` poses."""
     middles, turns = (*BOARD_MIDDLES, *MORE_MIDDLES), (*BOARD_TURNS, *MORE_TURNS)
-    return [place_about(m, t) for m, t in zip(middles[:count], turns[:count], strict=True)]
+    return [pose_about(m, t) for m, t in zip(middles[:count], turns[:count], strict=True)]
 
 
 def stage_readings(count: int = len(STAGE_MM)) -> Array:
@@ -163,17 +163,17 @@ def stage_poses(readings: Array, seed: int) -> list[RigidTransform]:
     """camera_from_board at each stop: the stage slides along its board's own normal, and stops
     nearly where it should."""
     rng = np.random.default_rng([seed, STAGE])
-    stage = place_about(STAGE_MIDDLE, STAGE_TURN)
+    stage = pose_about(STAGE_MIDDLE, STAGE_TURN)
     stops = readings + STAGE_ERROR_MM * rng.standard_normal(len(readings))
     slides = [RigidTransform.shift([0.0, 0.0, stop]) for stop in stops]
     return [stage @ slide for slide in slides]
 
 
-def place_about(
-    place: Sequence[float], turn: Sequence[float], middle: Array | None = None
+def pose_about(
+    position: Sequence[float], turn: Sequence[float], middle: Array | None = None
 ) -> RigidTransform:
-    """camera_from_board with the board's middle at a place and rotated about it."""
+    """camera_from_board with the board's middle at a position and rotated about it."""
     if middle is None:
         middle = BOARD.square_mm / 2.0 * np.array([BOARD.columns, BOARD.rows, 0.0])
     rotation = RigidTransform.from_rotation_vector(turn, np.zeros(3)).rotation
-    return RigidTransform(rotation, np.asarray(place) - rotation @ middle)
+    return RigidTransform(rotation, np.asarray(position) - rotation @ middle)

@@ -1,0 +1,209 @@
+"""The chapter's scenes, and the images that its simulated camera takes of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import open3d as o3d
+
+from bodyscan.arrays import Array, Bytes, Indices, Mask
+from bodyscan.boards.detection import find_boards
+from bodyscan.errors import BoardNotFound
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.laboratory import apparatus
+from bodyscan.laboratory.apparatus import ChapterSetup
+from bodyscan.laboratory.approaches import StripedShot, Target
+from bodyscan.progress import Progress, silent
+from bodyscan.rig.frame_names import FrameNames
+from bodyscan.simulation.lamps import Lamps
+from bodyscan.simulation.render import PixelTruth, pixel_truth, render_pair
+from bodyscan.simulation.scene import Scene, Surface, grid_surface
+from bodyscan.simulation.sensor import expose
+from bodyscan.stripes.decoding import decode_stripes
+from bodyscan.stripes.stripe_map import StripeMap
+
+SPHERE_RINGS = 400
+"""Facets of a sphere are then less than 0.0005 mm inside it."""
+LAMP_GREY, AMBIENT_GREY = 255.0, 13.0
+WHITE, GROUND, WALL = 0.8, 0.5, 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class Exposure:
+    """What the camera took: the lit image, and the stripes decoded from the whole sequence."""
+
+    lit: Bytes
+    stripes: StripeMap
+
+
+def board_scene(setup: ChapterSetup, camera_from_board: RigidTransform) -> list[Surface]:
+    """The board, and a wall behind it."""
+    return [*(surface.transform(camera_from_board) for surface in setup.board.surfaces), _wall()]
+
+
+def sphere_scene() -> list[Surface]:
+    """Five white spheres on the ground, and a wall behind."""
+    mesh = o3d.geometry.TriangleMesh.create_sphere(apparatus.RADIUS_MM, resolution=SPHERE_RINGS)
+    arms = np.asarray(mesh.vertices)
+    ball = Surface(arms, np.asarray(mesh.triangles), WHITE, normals=arms / apparatus.RADIUS_MM)
+    spheres = [replace(ball, vertices=arms + centre) for centre in apparatus.CENTRES]
+    return [*spheres, _ground(), _wall()]
+
+
+def plate_scene() -> list[Surface]:
+    """A flat white plate, somewhat smaller than the board: no calibration reaches farther."""
+    pose = apparatus.pose_about(apparatus.PLATE_MIDDLE, apparatus.PLATE_TURN, middle=np.zeros(3))
+    width, height = apparatus.PLATE_MM
+    across, down = np.array([width, 0.0, 0.0]), np.array([0.0, height, 0.0])
+    plate = grid_surface(-0.5 * (across + down), across, down, albedo=WHITE)
+    return [replace(plate, open_to_light=True).transform(pose), _wall()]
+
+
+def expose_scene(
+    setup: ChapterSetup, surfaces: Sequence[Surface], number: int, times: int = 1
+) -> list[Exposure]:
+    """Render the sequence and decode its stripes; `number` selects the shot's noise.
+
+    times: how often the sensor's noise is drawn anew on the same light (jitter and speckle too).
+    """
+    rng = np.random.default_rng([setup.seed, apparatus.NOISE, number])
+    settings = setup.settings
+    lamps = Lamps(LAMP_GREY, AMBIENT_GREY, apparatus.DISTANCE_MM * 1.05, apparatus.DISTANCE_MM)
+    images = render_pair(
+        Scene(surfaces), setup.view, setup.projector, lamps, settings.projection, rng
+    )
+    return [
+        _read({name: expose(image, settings.noise, rng) for name, image in images.items()})
+        for _ in range(times)
+    ]
+
+
+def _read(frames: dict[str, Bytes]) -> Exposure:
+    code = apparatus.PROJECTOR
+    coded = np.stack([frames[name] for name in FrameNames().of_code(code)])
+    stripes = decode_stripes(code, frames["lit"], frames["dark"], coded)
+    return Exposure(frames["lit"], stripes)
+
+
+def _ground() -> Surface:
+    """The plane on which all five spheres lie."""
+    across, down = np.array([1.0, 0.0, 0.0]), apparatus.CENTRES[3] - apparatus.CENTRES[0]
+    down = (down - (down @ across) * across) / np.linalg.norm(down[1:])
+    below = apparatus.CENTRES[1] + apparatus.RADIUS_MM * np.cross(across, down)
+    return grid_surface(
+        below - 300.0 * (across + down), 600.0 * across, 600.0 * down, albedo=GROUND
+    )
+
+
+def _wall() -> Surface:
+    corner = np.array([-1500.0, -1500.0, 2.0 * apparatus.DISTANCE_MM])
+    across, down = np.array([3000.0, 0.0, 0.0]), np.array([0.0, 3000.0, 0.0])
+    return grid_surface(corner, across, down, albedo=WALL, encloses=True)
+
+
+TARGET = Target(apparatus.BOARD, apparatus.PROJECTOR)
+ON_SPHERE_MM = 0.02
+RIM_PX = 4
+WALL_MM = 600.0
+_BOARDS, _STAGE, _SPHERES, _PLATE = 0, 100, 200, 300
+
+
+@dataclass(frozen=True, eq=False)
+class SceneCapture:
+    """One scene: the lit image, its stripes, the same light
+    exposed a second time, and the truth."""
+
+    lit: Bytes
+    stripes: StripeMap
+    again: StripeMap
+    truth: PixelTruth
+
+
+@dataclass(frozen=True, eq=False)
+class ChapterCaptures:
+    """All captures.
+
+    boards: the three poses, or as many as were asked for.
+    stage, readings: a board on a slide stage, and its readings (mm).
+    owner: (H, W) number of the sphere that a pixel's centre sees and the projector lights, or -1.
+    on_plate: (H, W) pixels on the plate, clear of its rim.
+    """
+
+    setup: ChapterSetup
+    boards: tuple[StripedShot, ...]
+    stage: tuple[StripedShot, ...]
+    readings: Array
+    spheres: SceneCapture
+    plate: SceneCapture
+    owner: Indices
+    on_plate: Mask
+
+
+def take_captures(
+    setup: ChapterSetup,
+    *,
+    boards: int = apparatus.BOARDS,
+    stage_stops: int = 7,
+    progress: Progress = silent,
+) -> ChapterCaptures:
+    """Render, expose and decode everything. Raises BoardNotFound if a board is not found."""
+    readings = apparatus.stage_readings(stage_stops)
+    poses, stage = apparatus.board_poses(boards), apparatus.stage_poses(readings, setup.seed)
+    total = boards + len(stage) + 2
+    progress("rendering", 0, total)
+    shots = []
+    for number, pose in enumerate([*poses, *stage]):
+        of_stage = number - boards
+        stream = _STAGE + of_stage if of_stage >= 0 else _BOARDS + number
+        name = f"stage{of_stage + 1}" if of_stage >= 0 else f"board{number + 1}"
+        shots.append(_board_shot(setup, pose, name, stream))
+        progress("rendering", number + 1, total)
+    spheres = _expose(setup, sphere_scene(), _SPHERES)
+    progress("rendering", total - 1, total)
+    plate = _expose(setup, plate_scene(), _PLATE)
+    progress("rendering", total, total)
+    return ChapterCaptures(
+        setup,
+        tuple(shots[:boards]),
+        tuple(shots[boards:]),
+        readings,
+        spheres,
+        plate,
+        _label_spheres(setup, spheres.truth),
+        _mask_plate(plate.truth),
+    )
+
+
+def _board_shot(setup: ChapterSetup, pose: RigidTransform, shot: str, number: int) -> StripedShot:
+    (taken,) = expose_scene(setup, board_scene(setup, pose), number)
+    views = find_boards(taken.lit, [apparatus.BOARD], pair="chapter", shot=shot)
+    if not views:
+        raise BoardNotFound("the simulated board was not found", where=f"shot {shot}")
+    return StripedShot(views[0], taken.stripes)
+
+
+def _expose(setup: ChapterSetup, surfaces: Sequence[Surface], number: int) -> SceneCapture:
+    first, second = expose_scene(setup, surfaces, number, times=2)
+    truth = pixel_truth(Scene(surfaces), apparatus.CAMERA, setup.projector)
+    return SceneCapture(first.lit, first.stripes, second.stripes, truth)
+
+
+def _label_spheres(setup: ChapterSetup, truth: PixelTruth) -> Indices:
+    camera = setup.view.camera
+    points = camera.directions(camera.grid()) * truth.depth[..., None]
+    distances = np.abs(
+        np.linalg.norm(points[..., None, :] - apparatus.CENTRES, axis=-1) - apparatus.RADIUS_MM
+    )
+    distances = np.nan_to_num(distances, nan=np.inf)
+    nearest = np.argmin(distances, axis=-1)
+    on = (distances.min(axis=-1) < ON_SPHERE_MM) & np.isfinite(truth.s)
+    return np.where(on, nearest, -1).astype(np.int64)
+
+
+def _mask_plate(truth: PixelTruth) -> Mask:
+    near = (np.nan_to_num(truth.depth, nan=np.inf) < WALL_MM) & np.isfinite(truth.s)
+    window = np.ones((2 * RIM_PX + 1, 2 * RIM_PX + 1), np.uint8)
+    return cv2.erode(near.astype(np.uint8), window, borderValue=0) > 0

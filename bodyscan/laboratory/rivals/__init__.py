@@ -1,1 +1,0 @@
-"""The models with which the chapter is compared (1, 4.2), all as `Camera` and `LightSheets`."""
