@@ -60,7 +60,6 @@ BESIDE = (
     "bodyscan/captures/exposures.py",
     "bodyscan/captures/timing.py",
     "bodyscan/export/defacing.py",
-    "bodyscan/export/neck.py",
     "bodyscan/files/hashing.py",
     "bodyscan/report/calibration_verdict.py",
     "bodyscan/verdict.py",
@@ -68,7 +67,7 @@ BESIDE = (
     "bodyscan/workflows/check_rig.py",
 )
 """Mathematics and verdicts in rooms with another purpose."""
-FILES = ("__init__.py", "storage.py", "ply.py", "acceptance_file.py", "scene.py")
+FILES = ("__init__.py", "storage.py", "ply.py", "acceptance_file.py", "nearest_surface.py")
 """Neither mathematics nor verdicts: these files read, write or name things."""
 OPERATORS = re.compile(
     r"core/(ReplaceBinaryOperator_(Add_Sub|Sub_Add|Mul_Div|Div_Mul|Pow_Mul)"

@@ -26,7 +26,7 @@ from bodyscan.fusion.scan import Scan
 from bodyscan.geometry.camera_fields import from_fields
 from bodyscan.geometry.robust import rms, spread
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.mesh.regions import DARK_CLOTH, HAIR, NAMES, SKIN, shares
+from bodyscan.mesh.body import DARK_CLOTH, HAIR, REGION_NAMES, SKIN, compute_region_shares
 from bodyscan.mesh.topology import vertex_normals
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.settings import ScanSettings
@@ -151,13 +151,13 @@ def _region_rows(name: str, case: Case) -> list[str]:
         sigmas = spread(off[own] / case.scan.cloud.sigma_mm[own])
         figures = f"{precision:.4f} | {recall:.4f} | {100.0 * covered:.1f} %"
         figures += f" | {rms(off[own]):.3f} | {sigmas:.2f}"
-        rows.append(f"| {name} | {NAMES[kind]} | {figures} |")
+        rows.append(f"| {name} | {REGION_NAMES[kind]} | {figures} |")
     return rows
 
 
 def _shares(case: Case) -> str:
     assert case.scan.cloud.regions is not None
-    found = shares(case.scan.cloud.regions)
+    found = compute_region_shares(case.scan.cloud.regions)
     return ", ".join(f"{100.0 * part:.2f} % are {name}" for name, part in found.items())
 
 

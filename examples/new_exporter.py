@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 import bodyscan
-from bodyscan.export.body_format import BODY_FORMATS, BodyFormat
+from bodyscan.export.formats import BODY_FORMATS, BodyFormat
 from bodyscan.files.atomic import write_text
 
 

@@ -10,7 +10,7 @@ from rich.table import Table
 
 from bodyscan.fusion.scan import Scan
 from bodyscan.geometry.pose_covariance import position_sigma
-from bodyscan.mesh.regions import covered_shares
+from bodyscan.mesh.body import compute_cover_shares
 from bodyscan.registration.rig_calibration import RigCalibration
 
 
@@ -94,7 +94,7 @@ def scan_table(scan: Scan) -> Table:
     table.add_row("sigma of a point, median", f"{np.nanmedian(cloud.sigma_mm):.3f} mm")
     table.add_row("faces of the mesh", f"{len(surface.faces):,}")
     table.add_row("of its surface filled", f"{100.0 * surface.filled_share:.1f} %")
-    covered = covered_shares(cloud.regions)
+    covered = compute_cover_shares(cloud.regions)
     if covered:
         told = ", ".join(f"{name} {100.0 * share:.1f} %" for name, share in covered.items())
         table.add_row("of the points no skin", told)

@@ -15,7 +15,7 @@ from bodyscan.fusion.scan_facts import FILE_NAME
 from bodyscan.fusion.storage import load_scan
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyMesh
-from bodyscan.mesh.scene import centred_scene
+from bodyscan.mesh.nearest_surface import build_centred_scene
 
 SAMPLE = 30_000
 REACHES_MM = (40.0, 10.0, 3.0)
@@ -106,7 +106,7 @@ def _laid_on_faces(
     A corner's tangent plane lies outside a round surface. Of points all around the errors cancel;
     those of one pair would be drawn a few hundredths of a millimetre towards it.
     """
-    scene, centre = centred_scene(vertices, faces)
+    scene, centre = build_centred_scene(vertices, faces)
     found = RigidTransform.shift(-centre) @ start
     for _ in range(ROUNDS):
         placed = found.apply(points)

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.geometry.robust import rms
-from bodyscan.mesh.scene import centred_scene
+from bodyscan.mesh.nearest_surface import build_centred_scene
 from bodyscan.mesh.topology import directed_edges
 
 ON_EDGE = 1e-5  # of a barycentric coordinate, in float32
@@ -36,7 +36,7 @@ def signed_distances(points: Array, vertices: Array, faces: Indices) -> Array:
     The sign is that of the angle-weighted pseudo-normal at the nearest spot (Baerentzen and Aanaes
     2005).
     """
-    scene, centre = centred_scene(vertices, faces)
+    scene, centre = build_centred_scene(vertices, faces)
     centred = (points - centre).astype(np.float32)
     nearest = scene.compute_closest_points(o3d.core.Tensor(centred))
     offset = centred.astype(np.float64) - nearest["points"].numpy()

@@ -1,4 +1,4 @@
-"""One body in one file, with a JSON beside it that says what the file holds."""
+"""One body in one file, with a JSON beside it that describes it."""
 
 from __future__ import annotations
 
@@ -9,24 +9,25 @@ from typing import Any
 
 import numpy as np
 
-from bodyscan.export.body_format import BODY_FORMATS, BodyFormat
+from bodyscan.export.formats import BODY_FORMATS, BodyFormat
 from bodyscan.files.atomic import write_json
 from bodyscan.files.registry import unknown_format
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.mesh.body import BodyCloud, BodyMesh
-from bodyscan.mesh.regions import NAMES
-from bodyscan.mesh.slivers import without_slivers
+from bodyscan.mesh.body import REGION_NAMES, BodyCloud, BodyMesh
+from bodyscan.mesh.repair import collapse_slivers
 from bodyscan.mesh.topology import face_areas
 from bodyscan.version import __version__
 
 
 @dataclass(frozen=True)
 class Provenance:
-    """What a body was made from: the subject's pseudonym (if any) and the calibration.
+    """What a body was made from.
+
+    subject: its pseudonym, if any.
 
     defaced: the head was replaced by a plain one.
-    found: the scan's own findings (verdict, sway, pairs left out).
-    rig_from_body: the pose of the body's own frame, if the body is given in that.
+    found: the scan's findings (verdict, sway, pairs left out).
+    rig_from_body: the pose of the body frame, if the body is given in that.
     """
 
     subject: str | None
@@ -39,18 +40,18 @@ class Provenance:
 def write_body(path: Path, body: BodyCloud | BodyMesh, origin: Provenance) -> None:
     """Write `body` in the format that `path`'s suffix names, and `<path>.json` beside it.
 
-    A mesh is written without its faces of zero area. Raises BadInput for a suffix that is not one
-    of our formats, or one that cannot hold a cloud.
+    A mesh is written without its faces of zero area. Raises BadInput for a suffix that is not that
+    of a format, or of one that cannot hold a cloud.
     """
     path = Path(path)
-    format_ = _format_for(path, body)
+    format_ = _find_format(path, body)
     if isinstance(body, BodyMesh):
-        body = without_slivers(body)
+        body = collapse_slivers(body)
     format_.write(path, body)
-    write_json(path.with_name(f"{path.name}.json"), description(path.name, format_, body, origin))
+    write_json(path.with_name(f"{path.name}.json"), describe_body(path.name, format_, body, origin))
 
 
-def _format_for(path: Path, body: BodyCloud | BodyMesh) -> BodyFormat:
+def _find_format(path: Path, body: BodyCloud | BodyMesh) -> BodyFormat:
     kind = "cloud" if isinstance(body, BodyCloud) else "mesh"
     name = path.suffix.lower().removeprefix(".")
     able = [known for known in BODY_FORMATS.names() if kind in BODY_FORMATS.find(known).holds]
@@ -59,12 +60,12 @@ def _format_for(path: Path, body: BodyCloud | BodyMesh) -> BodyFormat:
     return BODY_FORMATS.find(name)
 
 
-def description(
+def describe_body(
     name: str, format_: BodyFormat, body: BodyCloud | BodyMesh, origin: Provenance
 ) -> dict[str, Any]:
     """Content of the JSON beside an exported file of that name."""
     in_body = origin.rig_from_body
-    said: dict[str, Any] = dict(origin.found) | {
+    info: dict[str, Any] = dict(origin.found) | {
         "file": name,
         "units": format_.unit,
         "axes": dict(zip("xyz", format_.axes, strict=True)),
@@ -78,22 +79,22 @@ def description(
         "kind": "cloud" if isinstance(body, BodyCloud) else "mesh",
     }
     if "regions" in format_.holds and body.regions is not None:
-        said["regions"] = list(NAMES)
+        info["regions"] = list(REGION_NAMES)
     if isinstance(body, BodyCloud):
-        return said | {"points": len(body.points), "sigma_mm": _middle(body.sigma_mm)}
+        return info | {"points": len(body.points), "sigma_mm": _median(body.sigma_mm)}
     areas = face_areas(body.vertices, body.faces)
-    return said | {
+    return info | {
         "vertices": len(body.vertices),
         "faces": len(body.faces),
         "filled_faces": int(np.count_nonzero(body.filled)),
         "area_mm2": float(areas.sum()),
         "filled_area_mm2": float(areas[body.filled].sum()),
         "coverage": float(areas[~body.filled].sum() / areas.sum()) if len(areas) else 0.0,
-        "sigma_mm": _middle(body.sigma_mm),
+        "sigma_mm": _median(body.sigma_mm),
     }
 
 
-def _middle(sigma_mm: np.ndarray[Any, Any]) -> float | None:
-    """The median; None if nothing was measured."""
+def _median(sigma_mm: np.ndarray[Any, Any]) -> float | None:
+    """Median of what was measured; None if nothing was."""
     known = sigma_mm[np.isfinite(sigma_mm)]
     return float(np.median(known)) if known.size else None

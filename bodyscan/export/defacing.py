@@ -1,40 +1,90 @@
-"""A body without a recognisable face: the head above the neck is replaced, not smoothed.
+"""Make a face unrecognisable: the head above the neck is replaced, not smoothed.
 
 Smoothing keeps the triangles of the head, and their density still hints at the face. So everything
-above the neck is removed, and a plain ellipsoid of usual proportions, for which only the height of
-the head is known, is put on the neck.
+above the neck is removed, and a plain ellipsoid of average proportions, for which only the height
+of the head is known, is put on the neck.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
 from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.errors import FailedWork
-from bodyscan.export.neck import REACH_MM, Neck
-from bodyscan.mesh.body import BodyMesh
-from bodyscan.mesh.regions import regions_at
+from bodyscan.mesh.body import BodyMesh, select_regions
+from bodyscan.mesh.slices import MeshSlicer, hull_perimeter
 from bodyscan.mesh.topology import (
     directed_edges,
     drop_unused_vertices,
-    face_components,
+    label_components,
     vertex_normals,
 )
 
-GREY = 150
-RINGS = 40
-# Shares of the height from neck to crown: half the head's length and breadth, where it is widest,
-# and where the neck's own shape ends.
-HALF_LENGTH, HALF_BREADTH, WIDEST, NECK_ENDS = 0.36, 0.28, 0.52, 0.45
-HARMONICS = 4  # of the neck's outline, from which the head continues
-ROUNDED_MM = 10.0  # the head's height is kept no more exactly than this
-_MENDINGS = 50
+REACH_MM = 160.0  # from the head's axis; arms and shoulders farther out do not count
+
+
+@dataclass(frozen=True, eq=False)
+class Neck:
+    """height_mm: of the neck above the floor (z). axis: (2,) x and y of the head. Rig frame, mm."""
+
+    height_mm: float
+    axis: Array
+
+
+def find_neck(vertices: Array, faces: Indices) -> Neck:
+    """Find the narrowest slice below the head of a standing body, vertices (V, 3), faces (F, 3).
+
+    A slice's size is the perimeter of its convex hull, within REACH_MM of the head's axis; the head
+    is what is highest above the body's middle, so that a raised hand is not mistaken for it. Raises
+    FailedWork if there is no such slice.
+    """
+    axis, top = _find_crown(vertices)
+    stature = top - float(vertices[:, 2].min())
+    # From crown to neck: 9 % of a tall adult's stature, 24 % of a small child's.
+    heights = np.arange(top - 0.24 * stature, top - 0.09 * stature, 4.0)
+    to_shoulders = 0.07 * stature
+    near = np.linalg.norm(vertices[:, :2] - axis, axis=1) < 2.0 * REACH_MM
+    near &= vertices[:, 2] > heights[0] - (to_shoulders + REACH_MM)
+    slicer = MeshSlicer(vertices, faces[near[faces].all(axis=1)])
+    girths = np.array([_girth(slicer, height, axis) for height in heights])
+    narrowest = int(np.argmin(girths)) if girths.size else 0
+    neck = float(girths[narrowest])
+    head = max(girths[narrowest:].max(), _girth(slicer, top - 0.06 * stature, axis))
+    shoulders = _girth(slicer, heights[narrowest] - to_shoulders, axis)
+    inside = 0 < narrowest < len(girths) - 1 and 180.0 < neck < 700.0
+    # Wrists of arms held overhead are narrow too, but have no head above and no shoulders below.
+    if not (inside and head > 400.0 and head > 1.1 * neck and shoulders > 1.5 * neck):
+        raise FailedWork(
+            "no neck was found, so the face cannot be removed",
+            remedy="look at the mesh: does the subject stand upright, arms not overhead?",
+        )
+    return Neck(float(heights[narrowest]), axis)
+
+
+def _girth(slicer: MeshSlicer, height: float, axis: Array) -> float:
+    """Hull perimeter, mm, of a slice's points near `axis` (x, y); infinite if there are too few."""
+    loops = slicer.slice(height)
+    points = np.concatenate([np.empty((0, 2)), *(loop.segments[:, 0] for loop in loops)])
+    points = points[np.linalg.norm(points - axis, axis=1) < REACH_MM]
+    return hull_perimeter(points) if len(points) > 3 else float("inf")
+
+
+def _find_crown(vertices: Array) -> tuple[Array, float]:
+    """The head's axis (x, y) and height: the top of what is above the trunk's middle."""
+    low, high = vertices[:, 2].min(), vertices[:, 2].max()
+    trunk = vertices[np.abs(vertices[:, 2] - (low + 0.55 * (high - low))) < 0.1 * (high - low)]
+    middle = np.median(trunk[:, :2], axis=0)
+    over = vertices[np.linalg.norm(vertices[:, :2] - middle, axis=1) < REACH_MM]
+    top = float(over[:, 2].max())
+    head = over[over[:, 2] > top - 100.0]
+    return np.median(head[:, :2], axis=0), top
 
 
 def deface(mesh: BodyMesh, neck: Neck) -> BodyMesh:
-    """`mesh` with a plain grey head, whose vertices have no sigma and whose faces are `filled`.
+    """Replace the head by a plain grey one, whose vertices have no sigma and whose faces are filled.
 
     Vertices and faces below the neck keep their order and every bit. A closed mesh stays closed; an
     open one (only what was measured) ends at the neck. Raises FailedWork if there is nothing above
@@ -43,20 +93,21 @@ def deface(mesh: BodyMesh, neck: Neck) -> BodyMesh:
     head = _head_faces(mesh, neck)
     closed = not len(_free_edges(mesh.faces))
     if closed:
-        head = _with_simple_rim(mesh.faces, head)
+        head = _simplify_rim(mesh.faces, head)
     crown_mm = float(mesh.vertices[mesh.faces[head]][..., 2].max())
-    crown_mm = neck.height_mm + ROUNDED_MM * round((crown_mm - neck.height_mm) / ROUNDED_MM)
+    # The head's height is kept to a centimetre only.
+    crown_mm = neck.height_mm + 10.0 * round((crown_mm - neck.height_mm) / 10.0)
     vertices, faces, used = drop_unused_vertices(mesh.vertices, mesh.faces[~head])
-    number_of = np.full(len(mesh.vertices), -1, np.int64)
-    number_of[used] = np.arange(len(used))
+    index = np.full(len(mesh.vertices), -1, np.int64)
+    index[used] = np.arange(len(used))
     # Free edges of the head run opposite to those of what was kept.
-    rims = _loops(number_of[_free_edges(mesh.faces[head])[:, ::-1]]) if closed else []
+    rims = _trace_loops(index[_free_edges(mesh.faces[head])[:, ::-1]]) if closed else []
     all_vertices, all_faces = [vertices], [faces]
     for number, rim in enumerate(sorted(rims, key=len, reverse=True)):
         start = sum(map(len, all_vertices))
         cap = vertices[rim].mean(axis=0)[None] if number else _dome(vertices[rim], crown_mm)
         all_vertices.append(cap)
-        all_faces.append(_stitched(rim, start, len(cap)))
+        all_faces.append(_stitch(rim, start, len(cap)))
     return _attach_attributes(
         mesh, head, used, np.concatenate(all_vertices), np.concatenate(all_faces)
     )
@@ -65,41 +116,41 @@ def deface(mesh: BodyMesh, neck: Neck) -> BodyMesh:
 def _attach_attributes(
     mesh: BodyMesh, head: Mask, used: Indices, vertices: Array, faces: Indices
 ) -> BodyMesh:
-    """The mesh with what was kept unchanged, and what was added grey, filled and without sigma."""
+    """The mesh with what is kept unchanged, and what is added grey, filled and without sigma."""
     added = len(vertices) - len(used)
     filled = mesh.filled[~head]
     return BodyMesh(
         vertices,
         faces,
         np.concatenate([mesh.normals[used], vertex_normals(vertices, faces)[len(used) :]]),
-        np.concatenate([mesh.colours[used], np.full((added, 3), GREY, np.uint8)]),
+        np.concatenate([mesh.colours[used], np.full((added, 3), 150, np.uint8)]),
         np.concatenate([mesh.sigma_mm[used], np.full(added, np.nan, np.float32)]),
         np.concatenate([filled, np.ones(len(faces) - len(filled), bool)]),
-        regions=regions_at(mesh.regions, np.concatenate([used, np.full(added, -1)])),
+        regions=select_regions(mesh.regions, np.concatenate([used, np.full(added, -1)])),
     )
 
 
 def _head_faces(mesh: BodyMesh, neck: Neck) -> Mask:
-    """Faces (F,) that reach above the neck, in pieces that come near the head's axis.
+    """Which faces (F,) reach above the neck, in components that come near the head's axis.
 
-    Hands held up beside the head are other pieces, and stay.
+    Hands held up beside the head are other components, and stay.
     """
     reaching = (mesh.vertices[mesh.faces][..., 2] > neck.height_mm).any(axis=1)
     faces = mesh.faces[reaching]
     if not len(faces):
-        raise FailedWork(f"nothing of the mesh stands above the neck, {neck.height_mm:.0f} mm")
-    pieces = face_components(faces, len(mesh.vertices))
+        raise FailedWork(f"the mesh has nothing above the neck at {neck.height_mm:.0f} mm")
+    labels = label_components(faces, len(mesh.vertices))
     away = np.linalg.norm(mesh.vertices[faces][..., :2] - neck.axis, axis=-1).min(axis=1)
-    nearest = np.full(pieces.max() + 1, np.inf)
-    np.minimum.at(nearest, pieces, away)
+    nearest = np.full(labels.max() + 1, np.inf)
+    np.minimum.at(nearest, labels, away)
     head = np.zeros(len(mesh.faces), bool)
-    head[reaching] = nearest[pieces] < REACH_MM / 2.0
+    head[reaching] = nearest[labels] < REACH_MM / 2.0
     return head
 
 
-def _with_simple_rim(faces: Indices, head: Mask) -> Mask:
-    """Remove faces from the head where its rim touches itself, until the rim is a simple line."""
-    for _ in range(_MENDINGS):
+def _simplify_rim(faces: Indices, head: Mask) -> Mask:
+    """Take faces out of the head where its rim touches itself, until it is a simple line."""
+    for _ in range(50):
         points, times = np.unique(_free_edges(faces[head])[:, 0], return_counts=True)
         if not (times > 1).any():
             return head
@@ -108,15 +159,15 @@ def _with_simple_rim(faces: Indices, head: Mask) -> Mask:
 
 
 def _free_edges(faces: Indices) -> Indices:
-    """Directed edges (E, 2) that no face runs along in the opposite direction."""
+    """Directed edges (E, 2) without a twin."""
     edges = directed_edges(faces)
     count = int(faces.max(initial=-1)) + 1
     twins = np.isin(edges[:, 0] * count + edges[:, 1], edges[:, 1] * count + edges[:, 0])
     return edges[~twins]
 
 
-def _loops(edges: Indices) -> list[Indices]:
-    """Closed lines of vertices; each point has exactly one successor."""
+def _trace_loops(edges: Indices) -> list[Indices]:
+    """Trace directed edges (E, 2), one from each vertex, to closed loops of vertices."""
     following = dict(edges.tolist())
     loops = []
     while following:
@@ -129,40 +180,40 @@ def _loops(edges: Indices) -> list[Indices]:
     return loops
 
 
-def _dome(rim: Array, crown_mm: float) -> Array:
-    """Rings over a rim (N, 3), from its shape to an
-    ellipsoid's, and the top: (RINGS * N + 1, 3)."""
+def _dome(rim: Array, crown_mm: float, rings: int = 40) -> Array:
+    """Rings over a rim (N, 3), from its shape to an ellipsoid's, and the top: (rings N + 1, 3)."""
+    # Shares of the height from neck to crown: half the head's length and breadth, where it is
+    # widest, and where the neck's shape ends.
+    half_length, half_breadth, widest, neck_end = 0.36, 0.28, 0.52, 0.45
     line = _smooth(rim)  # the rim itself zigzags from face to face
     centre = line[:, :2].mean(axis=0)
     arm, ahead = line[:, :2] - centre, np.roll(line, -1, axis=0)[:, :2] - line[:, :2]
     turns = np.sign((arm[:, 0] * ahead[:, 1] - arm[:, 1] * ahead[:, 0]).sum())
     angle = np.arctan2(arm[0, 1], arm[0, 0]) + turns * 2.0 * np.pi * np.arange(len(rim)) / len(rim)
     height = crown_mm - float(rim[:, 2].mean())
-    ellipse = height * np.stack([HALF_LENGTH * np.cos(angle), HALF_BREADTH * np.sin(angle)], axis=1)
-    half = RINGS // 2
-    rising = np.sin(np.linspace(0.0, np.pi / 2.0, RINGS - half + 1))[:-1]
-    part = np.concatenate(
-        [WIDEST * np.arange(1, half + 1) / (half + 1), WIDEST + (1 - WIDEST) * rising]
-    )
-    up = np.clip(part / NECK_ENDS, 0.0, 1.0)
+    ellipse = height * np.stack([half_length * np.cos(angle), half_breadth * np.sin(angle)], axis=1)
+    half = rings // 2
+    rising = np.sin(np.linspace(0.0, np.pi / 2.0, rings - half + 1))[:-1]
+    below = widest * np.arange(1, half + 1) / (half + 1)
+    level = np.concatenate([below, widest + (1 - widest) * rising])
+    up = np.clip(level / neck_end, 0.0, 1.0)
     blend = (up * up * (3.0 - 2.0 * up))[:, None, None]
-    narrowing = np.sqrt(1.0 - (np.maximum(part - WIDEST, 0.0) / (1.0 - WIDEST)) ** 2)
+    narrowing = np.sqrt(1.0 - (np.maximum(level - widest, 0.0) / (1.0 - widest)) ** 2)
     flat = (1.0 - blend) * arm + blend * narrowing[:, None, None] * ellipse
-    z = (1.0 - part[:, None]) * line[:, 2] + part[:, None] * crown_mm
-    rings = np.concatenate([centre + flat, z[..., None]], axis=-1)
-    return np.concatenate([rings.reshape(-1, 3), [[*centre, crown_mm]]])
+    z = (1.0 - level[:, None]) * line[:, 2] + level[:, None] * crown_mm
+    points = np.concatenate([centre + flat, z[..., None]], axis=-1)
+    return np.concatenate([points.reshape(-1, 3), [[*centre, crown_mm]]])
 
 
-def _smooth(line: Array) -> Array:
+def _smooth(line: Array, harmonics: int = 4) -> Array:
     """A closed line (N, 3) reduced to its first few harmonics."""
     waves = np.fft.rfft(line, axis=0)
-    waves[HARMONICS + 1 :] = 0.0
+    waves[harmonics + 1 :] = 0.0
     return np.fft.irfft(waves, len(line), axis=0)
 
 
-def _stitched(rim: Indices, start: int, count: int) -> Indices:
-    """Faces over a rim (in the kept faces' direction): rings
-    of vertices from `start`, then a top."""
+def _stitch(rim: Indices, start: int, count: int) -> Indices:
+    """Faces from a rim (in the kept faces' direction) over rings of vertices `start`... to a top."""
     size = len(rim)
     rings = [rim, *(start + np.arange(count - 1)).reshape(-1, size)]
     faces = []

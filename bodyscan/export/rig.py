@@ -27,68 +27,70 @@ def export_rig(
     and for a camera's lens that a format cannot express.
     """
     chosen = [RIG_FORMATS.find(name.strip().lower()) for name in dict.fromkeys(formats)]
-    cameras = cameras_of(calibration)
-    projectors = projectors_of(calibration)
+    cameras = collect_cameras(calibration)
+    projectors = fit_projectors(calibration)
     written = [_write(one, cameras, projectors.value, folder) for one in chosen]
     notes = [note for one in written for note in one.notes]
     return Outcome([one.value for one in written], (*projectors.notes, *notes))
 
 
-def cameras_of(calibration: RigCalibration) -> RigCameras:
-    """Camera and pose of every pair of a calibration."""
+def collect_cameras(calibration: RigCalibration) -> RigCameras:
+    """Camera and `rig_from_camera` of every pair of a calibration."""
     return {
         name: (pair.camera, calibration.rig_from_camera[name])
         for name, pair in calibration.pairs.items()
     }
 
 
-def projectors_of(calibration: RigCalibration) -> Outcome[RigCameras]:
-    """Every projector with a centre and a lens as a camera, and how far that is from the sheets
-    that were measured."""
-    found: dict[str, tuple[Camera, RigidTransform]] = {}
+def fit_projectors(calibration: RigCalibration) -> Outcome[RigCameras]:
+    """Fit a camera model to every projector with a centre and a lens; the notes give the misfits to
+    the measured light sheets."""
+    cameras: dict[str, tuple[Camera, RigidTransform]] = {}
     notes: list[str] = []
     for name, pair in calibration.pairs.items():
         if pair.sheets is None:
             continue
-        own = projector_name(name)
+        label = projector_name(name)
         try:
-            if own in calibration.pairs:
-                raise BadInput(f"a pair is called {own}, as it would be", remedy="rename that pair")
+            if label in calibration.pairs:
+                raise BadInput(f"another pair is named {label} already", remedy="rename that pair")
             fitted = fit_projector(pair.camera, pair.sheets, pair.crossing)
         except BadInput as error:
             notes.append(f"{name}: its projector is left out: {error}")
             continue
         rig_from_camera = calibration.rig_from_camera[name]
-        found[own] = fitted.camera, rig_from_camera @ fitted.projector_from_camera.inverse()
-        notes.append(f"{name}: {_described(pair, fitted)}")
-    written = [name for name in calibration.pairs if projector_name(name) in found]
-    return Outcome(found, (*notes, *_first_codes(calibration.rig, written)))
+        cameras[label] = fitted.camera, rig_from_camera @ fitted.projector_from_camera.inverse()
+        notes.append(f"{name}: {_describe_projector(pair, fitted)}")
+    written = [name for name in calibration.pairs if projector_name(name) in cameras]
+    return Outcome(cameras, (*notes, *_note_first_codes(calibration.rig, written)))
 
 
-def _first_codes(rig: Rig, written: Sequence[str]) -> Iterator[str]:
-    """A note that another first code would shift the images: nothing in a scan shows it."""
-    alike: dict[str, list[str]] = {}
+def _note_first_codes(rig: Rig, written: Sequence[str]) -> Iterator[str]:
+    """Note that another first code would shift the images: nothing in a scan shows it."""
+    pairs_with: dict[str, list[str]] = {}
     for name in written:
         code = rig.pair(name).projector
-        for way in code.directions if code else ():
-            if getattr(way, "first_code", None) != 0:
+        for direction in code.directions if code else ():
+            if getattr(direction, "first_code", None) != 0:
                 continue
-            codes = 1 << way.image_counts[PATTERN]
-            middle = (codes - way.stripes) // 2
+            codes = 1 << direction.image_counts[PATTERN]
+            middle = (codes - direction.stripes) // 2
             if middle > 1:
-                said = (
-                    f"the first of {way.stripes} {way.direction} stripes is taken to have code 0 of "
-                    f"{codes}; if it has another, such as {middle} where they lie in the middle, give "
-                    "`first_code` in the rig file: the written projector is off by as many pixels"
+                note = (
+                    f"the first of {direction.stripes} {direction.direction} stripes is taken to "
+                    f"have code 0 of {codes}; if it has another, such as {middle} where they lie in "
+                    "the middle, give `first_code` in the rig file: the written projector is off by "
+                    "as many pixels"
                 )
-                alike.setdefault(said, []).append(name)
-    for said, names in alike.items():
-        yield f"{', '.join(names)}: {said}"
+                pairs_with.setdefault(note, []).append(name)
+    for note, names in pairs_with.items():
+        yield f"{', '.join(names)}: {note}"
 
 
 def _write(
     form: RigFormat, cameras: RigCameras, projectors: RigCameras, folder: Path
 ) -> Outcome[Path]:
+    """Write one format, without the projectors whose lenses it cannot express."""
     path = folder / form.path
     kept = dict(projectors)
     notes: list[str] = []
@@ -104,17 +106,17 @@ def _write(
                 del kept[name]
 
 
-def _described(pair: PairCalibration, fitted: FittedProjector) -> str:
+def _describe_projector(pair: PairCalibration, fitted: FittedProjector) -> str:
     assert pair.sheets is not None
-    said = f"its projector is written as a camera, {projector_name(pair.name)}"
+    text = f"its projector is written as a camera, {projector_name(pair.name)}"
     if fitted.predicted_px:
-        said += (
+        text += (
             f", {fitted.misfit_px:.2g} of its pixels RMS off its sheets of light (noise explains "
             f"{fitted.predicted_px:.2g})"
         )
     if pair.crossing is None:
-        known, guessed = (
-            ("columns", "rows") if pair.sheets.direction == "vertical" else ("rows", "columns")
-        )
-        said += f"; its {known} are measured, its {guessed} are not: square pixels are written"
-    return said
+        across, along = "columns", "rows"
+        if pair.sheets.direction != "vertical":
+            across, along = along, across
+        text += f"; its {across} are measured, its {along} are not: square pixels are written"
+    return text

@@ -11,9 +11,9 @@ import numpy as np
 
 from bodyscan.errors import BadInput
 from bodyscan.export.body_file import Provenance, write_body
-from bodyscan.export.body_format import BODY_FORMATS
-from bodyscan.export.defacing import deface as without_face
-from bodyscan.export.neck import find_neck
+from bodyscan.export.defacing import deface as replace_head
+from bodyscan.export.defacing import find_neck
+from bodyscan.export.formats import BODY_FORMATS
 from bodyscan.files.model import did_you_mean
 from bodyscan.fusion.storage import StoredScan
 from bodyscan.geometry.transforms import RigidTransform
@@ -21,8 +21,6 @@ from bodyscan.measurement.body_frame import rig_from_body
 from bodyscan.mesh.body import BodyMesh
 from bodyscan.mesh.decimation import decimate
 from bodyscan.settings import ExportSettings
-
-FRAMES = ("rig", "body")
 
 VERSIONS: dict[str, tuple[str, Callable[[BodyMesh], BodyMesh]]] = {
     "full": ("body", lambda mesh: mesh),
@@ -40,7 +38,7 @@ def export_scan(
     deface: bool = False,
     frame: str = "rig",
 ) -> list[Path]:
-    """Write the mesh in each format (see `BODY_FORMATS`) and version; returns what was written.
+    """Write the mesh in each format (see `BODY_FORMATS`) and version; returns the paths.
 
     versions: full, light (50,000 faces), open (without filled faces). Each file has a JSON beside
         it.
@@ -52,7 +50,7 @@ def export_scan(
     names = [name.strip().lower().removeprefix(".") for name in formats]
     for name in names:
         BODY_FORMATS.find(name)
-    for name, known in [*((version, VERSIONS) for version in versions), (frame, FRAMES)]:
+    for name, known in [*((version, VERSIONS) for version in versions), (frame, ("rig", "body"))]:
         if name not in known:
             raise BadInput(
                 f"there is no {name!r} to export{did_you_mean(name, known)}",
@@ -69,8 +67,10 @@ def export_scan(
     neck = find_neck(scan.mesh.vertices, scan.mesh.faces) if deface else None
     written = []
     for version in versions:
-        stem, made = VERSIONS[version]
-        mesh = made(scan.mesh) if neck is None else without_face(made(scan.mesh), neck)
+        stem, convert = VERSIONS[version]
+        mesh = convert(scan.mesh)
+        if neck is not None:
+            mesh = replace_head(mesh, neck)
         if pose is not None:
             mesh = transform_mesh(mesh, pose.inverse())
         for name in names:
@@ -80,8 +80,7 @@ def export_scan(
 
 
 def scan_facts(facts: Mapping[str, Any]) -> dict[str, Any]:
-    """What an export repeats from scan.json: the verdict,
-    pairs left out, the subject's sway (mm)."""
+    """What an export repeats from scan.json: verdict, pairs left out, the subject's sway (mm)."""
     alignment = facts.get("alignment")
     return {
         "when": facts.get("when"),

@@ -22,8 +22,7 @@ from bodyscan.fusion.harmonic_filling import fill_harmonically
 from bodyscan.fusion.signed_distances import REACH_CELLS, splat
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud
-from bodyscan.mesh.bricks import SIDE, Bricks, bricks_of, dense_of
-from bodyscan.mesh.surface_nets import surface_nets
+from bodyscan.mesh.surface_nets import SIDE, Bricks, extract_surface, join_bricks, split_into_bricks
 from bodyscan.progress import map_threads
 from bodyscan.reconstruction.range_image import RangeImage
 
@@ -67,10 +66,10 @@ def likely_distances(
     """
     cell_mm = max(CELL_MM, finest_mm)
     bricks = _grid_around(cloud.points, cell_mm)
-    some = cloud.every(max(1, len(cloud.points) // ENOUGH_POINTS))
+    some = cloud.subsample(max(1, len(cloud.points) // ENOUGH_POINTS))
     reach_cells = max(REACH_MM / cell_mm, REACH_CELLS)
     splatted = splat(some, bricks, reach_cells)
-    values, weights = (dense_of(part, bricks.table.shape) for part in splatted)
+    values, weights = (join_bricks(part, bricks.table.shape) for part in splatted)
     reach = reach_cells * cell_mm
     fixed = weights > KNOWN_WEIGHT
     values = np.clip(values, -reach, reach)
@@ -128,7 +127,7 @@ def _grid_around(points: Array, cell_mm: float) -> Bricks:
     room = max(ROOM_MM, FEWEST_CELLS * cell_mm)
     origin = (np.floor((points.min(axis=0) - room) / cell_mm) - 0.5) * cell_mm
     shape = np.ceil(((points.max(axis=0) + room - origin) / cell_mm + 1.0) / SIDE).astype(int)
-    return Bricks.where(np.ones(shape, bool), origin, cell_mm)
+    return Bricks.from_mask(np.ones(shape, bool), origin, cell_mm)
 
 
 def _seen_through(
@@ -143,7 +142,7 @@ def _seen_through(
     free = np.zeros(guess.shape, bool)
     if not range_images:
         return free
-    vertices, faces = surface_nets(bricks, bricks_of(guess))
+    vertices, faces = extract_surface(bricks, split_into_bricks(guess))
     nearest = np.rint((vertices - bricks.origin) / bricks.cell_mm).astype(int)
     made_up = ~fixed[tuple(nearest.T)]
     surface = Guess.of(vertices, faces, made_up[faces].any(axis=1))
@@ -169,7 +168,7 @@ def crossed(distances: Distances, cell_mm: float, shape: tuple[int, ...]) -> Mas
 def interpolated(distances: Distances, bricks: Bricks) -> Floats:
     """Distances at the nodes of a finer grid with the same origin."""
     found = np.empty(bricks.shape, np.float32)
-    _interpolate(distances.values, bricks.cell_mm / distances.cell_mm, bricks.places, found)
+    _interpolate(distances.values, bricks.cell_mm / distances.cell_mm, bricks.indices, found)
     return found
 
 

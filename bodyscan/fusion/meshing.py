@@ -12,12 +12,10 @@ from bodyscan.fusion.hole_filling import crossed, interpolated, likely_distances
 from bodyscan.fusion.signed_distances import splat, touched
 from bodyscan.fusion.support import fit_to_points, support
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.mesh.body import BodyCloud, BodyMesh
-from bodyscan.mesh.bricks import SIDE, Bricks
-from bodyscan.mesh.regions import regions_at
-from bodyscan.mesh.repair import largest_piece
-from bodyscan.mesh.surface_nets import surface_nets
-from bodyscan.mesh.topology import closed_and_manifold, topology, vertex_normals
+from bodyscan.mesh.body import BodyCloud, BodyMesh, select_regions
+from bodyscan.mesh.repair import extract_largest_piece
+from bodyscan.mesh.surface_nets import SIDE, Bricks, extract_surface
+from bodyscan.mesh.topology import check_manifold, compute_topology, vertex_normals
 from bodyscan.progress import THREADS
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.settings import MeshSettings
@@ -65,13 +63,13 @@ def closed_surface(
     bricks, distances = signed_distances(
         cloud, settings.cell_mm, range_images, rig_from_camera or {}, workers=workers
     )
-    vertices, faces = surface_nets(bricks, distances)
+    vertices, faces = extract_surface(bricks, distances)
     if not len(faces):
         raise ScanFailed("no surface came out of the cloud: its points contradict each other")
     some = cloud.points[:: -(-len(cloud.points) // TELLING)]
-    vertices, faces = largest_piece(vertices, faces, some)
-    if not closed_and_manifold(faces, len(vertices))[1]:
-        found = topology(vertices, faces)
+    vertices, faces = extract_largest_piece(vertices, faces, some)
+    if not check_manifold(faces, len(vertices))[1]:
+        found = compute_topology(vertices, faces)
         raise ScanFailed(f"no closed surface came out of the cloud ({found})")
     return vertices, faces
 
@@ -93,7 +91,7 @@ def signed_distances(
     extent = likely.cell_mm * np.array(likely.values.shape)
     shape = tuple(np.ceil(extent / cell_mm / SIDE).astype(int))
     wanted = touched(cloud.points, likely.origin, cell_mm, shape)
-    bricks = Bricks.where(wanted | crossed(likely, cell_mm, shape), likely.origin, cell_mm)
+    bricks = Bricks.from_mask(wanted | crossed(likely, cell_mm, shape), likely.origin, cell_mm)
     measured, weight = splat(cloud, bricks)
     guessed = interpolated(likely, bricks)
     return bricks, (weight * measured + GUESS_WEIGHT * guessed) / (weight + GUESS_WEIGHT)
@@ -118,5 +116,5 @@ def attach_attributes(
         cloud.colours[around.nearest],
         sigma_mm,
         np.any(np.isnan(sigma_mm)[faces], axis=1),
-        regions=regions_at(cloud.regions, np.where(around.measured, around.nearest, -1)),
+        regions=select_regions(cloud.regions, np.where(around.measured, around.nearest, -1)),
     )

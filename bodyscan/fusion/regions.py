@@ -22,8 +22,7 @@ from bodyscan.fusion.roughness import Misfits, misfits
 from bodyscan.geometry.crop import crop_of
 from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.mesh.body import BodyCloud
-from bodyscan.mesh.regions import DARK_CLOTH, HAIR, SKIN, UNSURE
+from bodyscan.mesh.body import DARK_CLOTH, HAIR, SKIN, UNSURE, BodyCloud
 from bodyscan.progress import map_threads
 from bodyscan.reconstruction.range_image import RangeImage
 
@@ -51,7 +50,7 @@ HEAD_WIDE = 0.12  # of the stature: around the axis, for heads that lean forward
 class Regions:
     """Of N points.
 
-    numbers: (N,) uint8, each point's region in `mesh.regions.NAMES`.
+    numbers: (N,) uint8, each point's region in `REGION_NAMES`.
     relief_mm: (N,) float32, how far strands and locks of hair stand off a smooth surface, standard
         deviation; 0 elsewhere. Smoothing flattens it.
     """

@@ -22,8 +22,8 @@ from bodyscan.fusion.crown import Crown
 from bodyscan.fusion.seams import SeamReport, find_misfits
 from bodyscan.fusion.surface_check import SurfaceCheck
 from bodyscan.mesh.body import BodyCloud, BodyMesh
-from bodyscan.mesh.rings import rings
-from bodyscan.mesh.slices import height_ranges, loops_at
+from bodyscan.mesh.slices import MeshSlicer
+from bodyscan.mesh.topology import find_handles
 from bodyscan.optional import optional
 from bodyscan.reconstruction.two_ways import Agreement
 from bodyscan.registration.nominal_size import NominalSize, nominal_size
@@ -477,12 +477,11 @@ def _company(cloud: BodyCloud) -> Iterator[Finding]:
 def _limbs(mesh: BodyMesh) -> Iterator[Finding]:
     """More trunks, legs or arms side by side than one person has, and things beside the legs."""
     top = float(mesh.vertices[:, 2].max())
-    low, high = height_ranges(mesh.vertices, mesh.faces)
+    slicer = MeshSlicer(mesh.vertices, mesh.faces)
     doubled, many, beside = [], [], []
     for share in LEVELS:
         level = share * top
-        faces = mesh.faces[(low < level) & (high >= level)]
-        areas = np.array([loop.area_mm2 for loop in loops_at(mesh.vertices, faces, level)])
+        areas = np.array([loop.area_mm2 for loop in slicer.slice(level)])
         if not areas.size:
             continue
         bulky = int(np.sum(areas > BULKY * areas.max()))
@@ -553,7 +552,7 @@ def _omissions(cloud: BodyCloud, mesh: BodyMesh) -> Iterator[Finding]:
 
 def _contacts(mesh: BodyMesh) -> Iterator[Finding]:
     middle = 0.5 * (mesh.vertices[:, 1].min() + mesh.vertices[:, 1].max())
-    found = rings(mesh.vertices, mesh.faces)
+    found = find_handles(mesh.vertices, mesh.faces)
     if len(found) > MOST_RINGS:
         yield (
             "usable",

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from bodyscan.arrays import Array, Floats, Mask
 from bodyscan.compiled import compiled
 from bodyscan.mesh.body import BodyCloud
-from bodyscan.mesh.bricks import SIDE, Bricks
+from bodyscan.mesh.surface_nets import SIDE, Bricks
 
 REACH_CELLS = 1.3  # of a point: an edge that crosses the surface ends within one cell
 MOST_SIGMAS = 3.0  # largest ratio of a point's sigma to the median one, either way

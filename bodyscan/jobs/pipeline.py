@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from bodyscan.errors import BadInput
-from bodyscan.export.body_format import BODY_FORMATS
+from bodyscan.export.formats import BODY_FORMATS
 from bodyscan.files.model import Model, Name, Problem, alternatives, did_you_mean
 from bodyscan.files.model_file import apply_settings, load_model
 from bodyscan.interchange.rig_format import RIG_FORMATS

@@ -13,11 +13,9 @@ from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.measurement.body_frame import rig_from_body
 from bodyscan.measurement.head import HeadTop, estimate_head_top
 from bodyscan.measurement.outline import Range, holds_middle, outline
-from bodyscan.mesh.body import BodyMesh
-from bodyscan.mesh.regions import HAIR, NAMES, SKIN, UNSURE, shares
-from bodyscan.mesh.rings import LAYER_MM, rings
-from bodyscan.mesh.slices import Loop, loops_at
-from bodyscan.mesh.topology import face_areas, signed_volume
+from bodyscan.mesh.body import HAIR, REGION_NAMES, SKIN, UNSURE, BodyMesh, compute_region_shares
+from bodyscan.mesh.slices import Loop, slice_mesh
+from bodyscan.mesh.topology import LAYER_MM, face_areas, find_handles, signed_volume
 
 STEP_MM = 100.0
 SPECK_MM2 = 50.0  # less than a fingertip
@@ -63,7 +61,7 @@ class Girth:
     @property
     def measured_skin(self) -> float:
         """Share of girth_mm that was measured and is not hair."""
-        return self.measured - (self.regions[NAMES[HAIR]] if self.regions else 0.0)
+        return self.measured - (self.regions[REGION_NAMES[HAIR]] if self.regions else 0.0)
 
 
 @dataclass(frozen=True)
@@ -157,7 +155,7 @@ def measure(
         breathes,
         top,
         head,
-        None if kinds is None else shares(kinds, areas),
+        None if kinds is None else compute_region_shares(kinds, areas),
     )
 
 
@@ -165,8 +163,8 @@ def _crown_region(areas: Array, kinds: Bytes | None, crown: Mask) -> str | None:
     """The region that makes up more than half of the crown, or "unsure"."""
     if kinds is None or not crown.any():
         return None
-    found = shares(kinds[crown], areas[crown])
-    return next((name for name, share in found.items() if share > MOSTLY), NAMES[UNSURE])
+    found = compute_region_shares(kinds[crown], areas[crown])
+    return next((name for name, share in found.items() if share > MOSTLY), REGION_NAMES[UNSURE])
 
 
 def _head_top(vertices: Array, mesh: BodyMesh, stature: float, crown: str | None) -> HeadTop | None:
@@ -177,7 +175,7 @@ def _head_top(vertices: Array, mesh: BodyMesh, stature: float, crown: str | None
     if mesh.regions is None or crown is None:
         return None
     top = vertices[:, 2] > stature - CROWN_MM
-    if crown == NAMES[SKIN]:
+    if crown == REGION_NAMES[SKIN]:
         return HeadTop(stature, float(np.nanmedian(mesh.sigma_mm[top])))
     beside = np.linalg.norm(vertices[:, :2] - np.median(vertices[top, :2], axis=0), axis=1)
     skin = (mesh.regions == SKIN) & (beside < HEAD_MM) & (vertices[:, 2] > stature - FACE_MM)
@@ -229,7 +227,7 @@ class _Contact:
 
 def _contacts(vertices: Array, mesh: BodyMesh) -> list[_Contact]:
     found = []
-    for ring in rings(vertices, mesh.faces):
+    for ring in find_handles(vertices, mesh.faces):
         above = ring.low_mm + 1.5 * LAYER_MM
         loops = _loops(vertices, mesh, above)
         side = "left" if ring.y_mm > 0 else "right"
@@ -242,7 +240,7 @@ def _contacts(vertices: Array, mesh: BodyMesh) -> list[_Contact]:
 
 
 def _loops(vertices: Array, mesh: BodyMesh, height_mm: float) -> tuple[Loop, ...]:
-    loops = loops_at(vertices, mesh.faces, height_mm, mesh.filled, mesh.face_regions)
+    loops = slice_mesh(vertices, mesh.faces, height_mm, mesh.filled, mesh.face_regions)
     return tuple(loop for loop in loops if loop.area_mm2 > SPECK_MM2)
 
 

@@ -14,7 +14,7 @@ from itertools import combinations
 import numpy as np
 
 from bodyscan.arrays import Array
-from bodyscan.mesh.slices import SHORTEST_GAP_MM, Loop, Run, joined, runs_of
+from bodyscan.mesh.slices import Loop, Run, join_runs, split_runs
 
 LIMB = 2.0 / np.pi
 """Chord over arc of half a circle: a limb goes round by more, the trunk's own side by less."""
@@ -39,10 +39,10 @@ class Outline:
 
 def outline(loop: Loop) -> Outline:
     """The outline of a slice's loop, body frame."""
-    runs = runs_of(loop, SHORTEST_GAP_MM)
+    runs = split_runs(loop)
     kept = _trunk_alone(loop, runs) if holds_middle(loop.segments[..., 1]) else runs
-    own = joined(loop, kept) if len(kept) < len(runs) else loop
-    known = joined(loop, [run for run in kept if run.measured] or kept)
+    own = join_runs(loop, kept) if len(kept) < len(runs) else loop
+    known = join_runs(loop, [run for run in kept if run.measured] or kept)
     girths = own.girth_mm, known.girth_mm, loop.girth_mm
     tapes = own.tape_mm, known.tape_mm, loop.tape_mm
     return Outline(own, (min(girths), max(girths)), (min(tapes), max(tapes)))

@@ -1,4 +1,4 @@
-"""The body model: a cloud, and the closed mesh made from it, in the rig frame, mm."""
+"""The body model: a cloud, the closed mesh made from it, the regions of its surface; rig frame, mm."""
 
 from __future__ import annotations
 
@@ -7,10 +7,19 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bodyscan.arrays import Array, Bytes, Floats, Indices, Mask
-from bodyscan.mesh.regions import UNSURE, of_faces, regions_at, shares
-from bodyscan.mesh.topology import drop_unused_vertices, face_areas
+from bodyscan.mesh.topology import (
+    drop_unused_vertices,
+    face_areas,
+    face_normals,
+    label_components,
+)
+
+UNSURE, SKIN, HAIR, DARK_CLOTH = range(4)
+REGION_NAMES = ("unsure", "skin", "hair", "dark cloth")
+"""In the order of the numbers in files."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,7 +31,7 @@ class BodyCloud:
     sigma_mm: (N,) float32, standard deviation along the normal.
     colours: (N, 3) uint8, red, green, blue.
     pairs_seen: (N,) uint8, how many pairs measured it.
-    regions: (N,) uint8, index into `regions.NAMES`; None if unknown.
+    regions: (N,) uint8, index into `REGION_NAMES`; None if unknown.
     """
 
     points: Array
@@ -34,24 +43,21 @@ class BodyCloud:
 
     @property
     def region_shares(self) -> dict[str, float] | None:
-        """Of the points, how many are of each region."""
-        return None if self.regions is None else shares(self.regions)
+        """Share of the points in each region, by name."""
+        return None if self.regions is None else compute_region_shares(self.regions)
 
-    def every(self, step: int) -> BodyCloud:
+    def subsample(self, step: int) -> BodyCloud:
         """Every step-th point."""
         parts: dict[str, Any] = {part.name: getattr(self, part.name) for part in fields(self)}
-        some: dict[str, Any] = {
-            name: None if part is None else part[::step] for name, part in parts.items()
-        }
-        return BodyCloud(**some)
+        return replace(self, **{k: v[::step] for k, v in parts.items() if v is not None})
 
 
 @dataclass(frozen=True, eq=False)
 class BreathAt:
-    """How far vertices are from where they would be at mean breath.
+    """Displacements that bring vertices to mean breath.
 
-    mm: (V,) float32, how far inside that place, along the normal.
-    sigma_mm: (V,) float32, of that.
+    mm: (V,) float32, outwards along each vertex's normal.
+    sigma_mm: (V,) float32, their standard deviation.
     """
 
     mm: Floats
@@ -68,8 +74,8 @@ class BodyMesh:
     colours: (V, 3) uint8.
     sigma_mm: (V,) float32, NaN on filled vertices.
     filled: (F,) bool, faces that no pair measured and that were filled to close the mesh.
-    breath: how to bring the mesh to mean breath, for a person who was followed.
-    regions: (V,) uint8, as those of a cloud; unsure on filled vertices.
+    breath: brings the mesh to mean breath, for a person whose motion was estimated.
+    regions: (V,) uint8, as of a cloud; unsure on filled vertices.
     """
 
     vertices: Array
@@ -86,7 +92,9 @@ class BodyMesh:
         """Region (F,) uint8 of at least two of each face's corners; unsure where filled."""
         if self.regions is None:
             return None
-        return np.where(self.filled, np.uint8(UNSURE), of_faces(self.regions, self.faces))
+        return np.where(
+            self.filled, np.uint8(UNSURE), compute_face_regions(self.regions, self.faces)
+        )
 
     @cached_property
     def filled_share(self) -> float:
@@ -95,14 +103,14 @@ class BodyMesh:
         return float(area[self.filled].sum() / area.sum()) if area.any() else 0.0
 
     def at_mean_breath(self, sigmas: float = 0.0) -> BodyMesh:
-        """The body at mean breath; sigmas: everywhere this many standard deviations fuller."""
+        """The body at mean breath; sigmas: everywhere so many standard deviations larger."""
         if self.breath is None:
             return self
-        way = (self.breath.mm + sigmas * self.breath.sigma_mm).astype(np.float64)
-        return replace(self, vertices=self.vertices + way[:, None] * self.normals, breath=None)
+        step = (self.breath.mm + sigmas * self.breath.sigma_mm).astype(np.float64)
+        return replace(self, vertices=self.vertices + step[:, None] * self.normals, breath=None)
 
     def measured_part(self) -> BodyMesh:
-        """The open surface that is left without the filled faces."""
+        """The open surface without the filled faces."""
         vertices, faces, used = drop_unused_vertices(self.vertices, self.faces[~self.filled])
         return self.part(vertices, faces, used, np.zeros(len(faces), bool))
 
@@ -115,5 +123,77 @@ class BodyMesh:
             self.colours[used],
             self.sigma_mm[used],
             filled,
-            regions=regions_at(self.regions, used),
+            regions=select_regions(self.regions, used),
         )
+
+
+def compute_region_shares(regions: Bytes, sizes: Array | None = None) -> dict[str, float]:
+    """Share of each region, by name, in regions (N,), weighted by sizes (N,)."""
+    counts = np.bincount(regions, sizes, len(REGION_NAMES))
+    return dict(zip(REGION_NAMES, (counts / max(counts.sum(), 1e-12)).tolist(), strict=True))
+
+
+def compute_cover_shares(regions: Bytes | None) -> dict[str, float]:
+    """Shares, by name, of the regions that are not or may not be skin; empty if unknown.
+
+    Half a percent or less, a few moles and rims, is left out.
+    """
+    shares = {} if regions is None else compute_region_shares(regions)
+    return {k: part for k, part in shares.items() if k != REGION_NAMES[SKIN] and part > 0.005}
+
+
+def select_regions(regions: Bytes | None, indices: Indices) -> Bytes | None:
+    """Regions (M,) at indices (M,) into regions (N,), unsure where an index is -1; None if regions
+    are unknown."""
+    if regions is None:
+        return None
+    return np.where(indices >= 0, regions[indices], np.uint8(UNSURE))
+
+
+def compute_face_regions(regions: Bytes, faces: Indices) -> Bytes:
+    """Region (F,) of at least two corners of faces (F, 3), else unsure; regions: of vertices (V,)."""
+    a, b, c = regions[faces].T
+    return np.where((a == b) | (a == c), a, np.where(b == c, b, np.uint8(UNSURE)))
+
+
+DIRECTIONS = {
+    "front": (1.0, 0.0, 0.0),
+    "back": (-1.0, 0.0, 0.0),
+    "left": (0.0, 1.0, 0.0),
+    "right": (0.0, -1.0, 0.0),
+    "up": (0.0, 0.0, 1.0),
+    "down": (0.0, 0.0, -1.0),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class FilledPatch:
+    """A connected patch of filled faces.
+
+    area_mm2: of the faces. centre: (3,) mm, rig frame. facing: a key of DIRECTIONS.
+    """
+
+    area_mm2: float
+    centre: Array
+    facing: str
+
+
+def find_filled_patches(mesh: BodyMesh) -> list[FilledPatch]:
+    """Find all filled patches of a mesh, the largest first."""
+    filled = mesh.faces[mesh.filled]
+    if not len(filled):
+        return []
+    patch = label_components(filled, len(mesh.vertices))
+    area = face_areas(mesh.vertices, filled)
+    corners, normal = mesh.vertices[filled], face_normals(mesh.vertices, filled)
+    total = np.bincount(patch, area)
+    centre = _sum_by_patch(patch, corners.mean(axis=1) * area[:, None]) / total[:, None]
+    facing = _sum_by_patch(patch, normal) @ np.array(list(DIRECTIONS.values())).T
+    names = [list(DIRECTIONS)[k] for k in np.argmax(facing, axis=1)]
+    order = np.argsort(-total, kind="stable")
+    return [FilledPatch(float(total[k]), centre[k], names[k]) for k in order]
+
+
+def _sum_by_patch(patch: NDArray[np.int32], values: Array) -> Array:
+    """Sums (P, 3) of values (N, 3) by patch (N,)."""
+    return np.stack([np.bincount(patch, column) for column in values.T], axis=1)

@@ -1,7 +1,6 @@
-"""What hides what in an image: the nearest face, or the nearest point, at each pixel.
+"""Depth buffers: the nearest face, or the nearest point, at each pixel of an image.
 
-Two short loops instead of casting a ray for each pixel, for which Open3D would have to be imported:
-that takes longer than all pictures of a scan.
+Two short loops instead of Open3D's ray casting: importing Open3D takes longer than all pictures.
 """
 
 from __future__ import annotations
@@ -16,16 +15,16 @@ Numbers = NDArray[np.int32]
 
 
 @compiled
-def nearest_faces(places: Floats, faces: Indices, height: int, width: int) -> Numbers:
-    """Number of the nearest face (height, width), -1 where there is none.
+def nearest_faces(pixels: Floats, faces: Indices, height: int, width: int) -> Numbers:
+    """Index (height, width) of the nearest face at each pixel, -1 where there is none.
 
-    places: (V, 3) of vertices: column, row, depth; NaN for those that cannot be seen.
+    pixels: (V, 3) column, row, depth of vertices; NaN for those behind the camera.
     faces: (F, 3), flat; a face covers the pixels whose centres it contains.
     """
     number = np.full((height, width), -1, np.int32)
     depth = np.full((height, width), np.inf, np.float32)
     for f in range(len(faces)):
-        a, b, c = places[faces[f, 0]], places[faces[f, 1]], places[faces[f, 2]]
+        a, b, c = pixels[faces[f, 0]], pixels[faces[f, 1]], pixels[faces[f, 2]]
         area = (b[0] - a[0]) * (c[1] - a[1]) - (c[0] - a[0]) * (b[1] - a[1])
         if not abs(area) > 0.0:  # seen edge-on, or not at all
             continue
@@ -46,19 +45,19 @@ def nearest_faces(places: Floats, faces: Indices, height: int, width: int) -> Nu
 
 
 @compiled
-def nearest_points(places: Floats, size: int, height: int, width: int) -> Numbers:
-    """Number of the nearest point (height, width), -1 where there is none.
+def nearest_points(pixels: Floats, size: int, height: int, width: int) -> Numbers:
+    """Index (height, width) of the nearest point at each pixel, -1 where there is none.
 
-    places: (N, 3) column, row, depth.
+    pixels: (N, 3) column, row, depth.
     size: side of the square of pixels that a point covers around its own.
     """
     number = np.full((height, width), -1, np.int32)
     depth = np.full((height, width), np.inf, np.float32)
-    for n in range(len(places)):
-        left = int(np.floor(places[n, 0] + 0.5)) - size // 2
-        top = int(np.floor(places[n, 1] + 0.5)) - size // 2
+    for n in range(len(pixels)):
+        left = int(np.floor(pixels[n, 0] + 0.5)) - size // 2
+        top = int(np.floor(pixels[n, 1] + 0.5)) - size // 2
         for r in range(max(0, top), min(height, top + size)):
             for k in range(max(0, left), min(width, left + size)):
-                if places[n, 2] < depth[r, k]:
-                    number[r, k], depth[r, k] = n, places[n, 2]
+                if pixels[n, 2] < depth[r, k]:
+                    number[r, k], depth[r, k] = n, pixels[n, 2]
     return number

@@ -15,13 +15,11 @@ from bodyscan.arrays import Array, Bytes, Floats
 from bodyscan.errors import ResultError
 from bodyscan.files.atomic import atomic_replacement
 from bodyscan.files.regular import read_regular
-from bodyscan.mesh.body import BodyCloud, BodyMesh, BreathAt
-from bodyscan.mesh.regions import NAMES
+from bodyscan.mesh.body import REGION_NAMES, BodyCloud, BodyMesh, BreathAt
 
 Records = NDArray[np.void]
 
 END = b"end_header\n"
-HEADER_LIMIT = 4096
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,10 +55,10 @@ def _cloud(*, regions: bool) -> tuple[Element, ...]:
     return (_vertex(("pairs_seen", "u1", "uchar"), *([_REGION] if regions else [])),)
 
 
-def _mesh(*, breathes: bool, regions: bool) -> tuple[Element, ...]:
-    """breathes: with fields for mean breath. regions: with regions of vertices and faces."""
-    breath = [("breath_mm", "<f4", "float"), ("breath_sigma_mm", "<f4", "float")]
-    vertex = _vertex(*(breath if breathes else []), *([_REGION] if regions else []))
+def _mesh(*, breath: bool, regions: bool) -> tuple[Element, ...]:
+    """Elements of a mesh: with the displacement to mean breath, with regions."""
+    breath_fields = [("breath_mm", "<f4", "float"), ("breath_sigma_mm", "<f4", "float")]
+    vertex = _vertex(*(breath_fields if breath else []), *([_REGION] if regions else []))
     fields = [("count", "u1"), ("corners", "<i4", 3), ("filled", "u1")]
     properties = ["list uchar int vertex_indices", "uchar filled"]
     if regions:
@@ -69,16 +67,18 @@ def _mesh(*, breathes: bool, regions: bool) -> tuple[Element, ...]:
 
 
 def write_ply(path: Path, body: BodyCloud | BodyMesh) -> None:
-    """Write a cloud or a mesh in mm, rig frame. A mesh's faces carry a uchar `filled` (0 or 1);
-    points, vertices and faces carry a uchar `region` (index into `regions.NAMES`) if it is
-    known."""
+    """Write a cloud or a mesh in mm, rig frame.
+
+    A mesh's faces have a uchar `filled` (0 or 1); points, vertices and faces have a uchar `region`
+    (index into `REGION_NAMES`) if it is known.
+    """
     regions = body.regions is not None
     if isinstance(body, BodyCloud):
         elements = _cloud(regions=regions)
         records = [_vertex_records(elements[0], body, body.points)]
         records[0]["pairs_seen"] = body.pairs_seen
     else:
-        elements = _mesh(breathes=body.breath is not None, regions=regions)
+        elements = _mesh(breath=body.breath is not None, regions=regions)
         faces = np.empty(len(body.faces), elements[1].fields)
         faces["count"], faces["corners"], faces["filled"] = 3, body.faces, body.filled
         records = [_vertex_records(elements[0], body, body.vertices), faces]
@@ -90,9 +90,9 @@ def write_ply(path: Path, body: BodyCloud | BodyMesh) -> None:
     if regions:
         records[0]["region"] = body.regions
     with atomic_replacement(Path(path)) as temporary, temporary.open("wb") as stream:
-        stream.write(_header(elements, [len(some) for some in records]))
-        for some in records:
-            stream.write(some.data)
+        stream.write(_header(elements, [len(rows) for rows in records]))
+        for rows in records:
+            stream.write(rows.data)
 
 
 def read_ply_cloud(path: Path) -> BodyCloud:
@@ -106,7 +106,7 @@ def read_ply_cloud(path: Path) -> BodyCloud:
 def read_ply_mesh(path: Path) -> BodyMesh:
     """Read a mesh that `write_ply` wrote. Raises ResultError if the file is not one."""
     states = (False, True)
-    kinds = [_mesh(breathes=breathes, regions=regions) for breathes in states for regions in states]
+    kinds = [_mesh(breath=breath, regions=regions) for breath in states for regions in states]
     vertices, faces = _read(Path(path), kinds, "mesh")
     points, normals, sigma_mm, colours = _vertex_arrays(vertices)
     corners = faces["corners"].astype(np.int64)
@@ -120,12 +120,12 @@ def read_ply_mesh(path: Path) -> BodyMesh:
 
 
 def _regions(vertices: Records, path: Path) -> Bytes | None:
-    """Regions; None if the file is older than these."""
+    """Regions (V,), None in a file that was written before there were any."""
     if "region" not in (vertices.dtype.names or ()):
         return None
     regions: Bytes = vertices["region"].copy()
-    if regions.size and regions.max() >= len(NAMES):
-        raise ResultError(f"has a region {regions.max()}, which is none", where=str(path))
+    if regions.size and regions.max() >= len(REGION_NAMES):
+        raise ResultError(f"has an unknown region, {regions.max()}", where=str(path))
     return regions
 
 
@@ -160,15 +160,15 @@ def _header(elements: Sequence[Element], counts: Sequence[int]) -> bytes:
 
 
 def _read(path: Path, known: Sequence[Sequence[Element]], what: str) -> list[Records]:
-    """The records of a file that `write_ply` wrote with one of these sets of elements."""
+    """Records of each element of a file that `write_ply` wrote with one of the known layouts."""
     try:
         data = read_regular(path)
     except OSError as error:
         raise ResultError(f"cannot be read ({error.strerror})", where=str(path)) from error
-    end = data[:HEADER_LIMIT].find(END) + len(END)
-    lines = _meaning(data[:end])
+    end = data[:4096].find(END) + len(END)
+    lines = _strip_comments(data[:end])
     counts = [int(line.split()[-1]) for line in lines if re.fullmatch(rb"element \w+ \d+", line)]
-    elements = next((some for some in known if lines == _meaning(_header(some, counts))), ())
+    elements = next((one for one in known if lines == _strip_comments(_header(one, counts))), ())
     sizes = [n * element.fields.itemsize for n, element in zip(counts, elements, strict=False)]
     if not elements or len(data) != end + sum(sizes):
         raise ResultError(
@@ -183,6 +183,6 @@ def _read(path: Path, known: Sequence[Sequence[Element]], what: str) -> list[Rec
     return records
 
 
-def _meaning(header: bytes) -> list[bytes]:
+def _strip_comments(header: bytes) -> list[bytes]:
     """A header's lines without its comments."""
     return [line for line in header.splitlines() if not line.startswith(b"comment")]

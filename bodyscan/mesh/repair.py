@@ -1,17 +1,21 @@
-"""Turning a nearly closed triangle mesh into a closed manifold."""
+"""Repair triangle meshes: closed manifolds from nearly closed surfaces, no faces without area."""
 
 from __future__ import annotations
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from bodyscan.arrays import Array, Indices
-from bodyscan.mesh.half_edges import RIM, UNSOUND, corner_fans, twins
+from bodyscan.mesh.body import BodyMesh
 from bodyscan.mesh.topology import (
+    RIM,
+    UNSOUND,
+    connect,
+    directed_edges,
     drop_unused_vertices,
-    face_components,
+    find_twins,
+    label_components,
+    label_corner_fans,
     signed_volume,
     used_vertices,
 )
@@ -24,55 +28,65 @@ def close_mesh(vertices: Array, faces: Indices) -> tuple[Array, Indices]:
     separated, holes are closed with fans of triangles. An octree's surface has a few such places; a
     closed manifold is unchanged, except for the numbers of its vertices.
     """
-    twin = twins(faces, len(vertices))
+    twin = find_twins(faces, len(vertices))
     sound = (twin != UNSOUND).all(axis=1)
     if not sound.all():
         faces = faces[sound]
-        twin = twins(faces, len(vertices))
-    parted, count = corner_fans(twin)
-    places = np.empty((count, 3))
-    places[parted] = vertices[faces]
-    following = np.roll(parted, -1, axis=1)
-    return _fill_holes(
-        places, parted, np.stack([parted[twin == RIM], following[twin == RIM]], axis=-1)
-    )
+        twin = find_twins(faces, len(vertices))
+    corners, count = label_corner_fans(twin)
+    positions = np.empty((count, 3))
+    positions[corners] = vertices[faces]
+    ends = np.roll(corners, -1, axis=1)
+    rim = np.stack([corners[twin == RIM], ends[twin == RIM]], axis=-1)
+    return _fill_holes(positions, corners, rim)
 
 
 def _fill_holes(vertices: Array, faces: Indices, rim: Indices) -> tuple[Array, Indices]:
-    """Close every rim, given by edges (N, 2), with a vertex
-    at its middle and a triangle per edge."""
+    """Close every rim, given by edges (N, 2), by a fan of triangles about its mean."""
     if not len(rim):
         return vertices, faces
     corners, ends = np.unique(rim, return_inverse=True)
     ends = ends.reshape(-1, 2)
-    graph = coo_array((np.ones(len(rim), np.int8), tuple(ends.T)), shape=(len(corners),) * 2)
-    _, piece = connected_components(graph, directed=False)
-    hole = piece[ends[:, 0]]
+    hole = connect(ends, len(corners))[1][ends[:, 0]]
     size = np.bincount(hole)
-    middles = np.stack(
-        [np.bincount(hole, vertices[rim[:, 0], axis]) / size for axis in range(3)], axis=-1
-    )
+    means = np.stack([np.bincount(hole, x) / size for x in vertices[rim[:, 0]].T], axis=-1)
     fans = np.stack([rim[:, 1], rim[:, 0], len(vertices) + hole], axis=-1)
-    return np.concatenate([vertices, middles]), np.concatenate([faces, fans])
+    return np.concatenate([vertices, means]), np.concatenate([faces, fans])
 
 
-def largest_piece(
+def extract_largest_piece(
     vertices: Array, faces: Indices, points: Array | None = None
 ) -> tuple[Array, Indices]:
-    """The connected piece with the most faces, closed and oriented outwards.
+    """Vertices and faces of the connected component with the most faces, closed and outward.
 
-    points: (N, 3); choose the piece next to most of these instead: what closes the surface behind a
-        wall may have more faces than what was scanned before it.
+    points: (N, 3); choose the component nearest to most of these instead: what closes the surface
+        behind a wall may have more faces than what was scanned before it.
     """
     vertices, faces = close_mesh(vertices, faces)
-    labels = counted = face_components(faces, len(vertices))
+    labels = votes = label_components(faces, len(vertices))
     if points is not None and labels.any():
         of_vertex = np.empty(len(vertices), labels.dtype)
         of_vertex[faces] = labels[:, None]
         used = used_vertices(faces, len(vertices))
-        nearest = cKDTree(vertices[used]).query(points)[1]
-        counted = of_vertex[used[nearest]]
-    vertices, faces, _ = drop_unused_vertices(
-        vertices, faces[labels == np.argmax(np.bincount(counted))]
-    )
+        votes = of_vertex[used[cKDTree(vertices[used]).query(points)[1]]]
+    largest = faces[labels == np.argmax(np.bincount(votes))]
+    vertices, faces, _ = drop_unused_vertices(vertices, largest)
     return vertices, faces if signed_volume(vertices, faces) > 0 else faces[:, ::-1].copy()
+
+
+def collapse_slivers(mesh: BodyMesh) -> BodyMesh:
+    """Collapse every edge whose ends are one point in a text file; a closed mesh stays closed.
+
+    Faces without area trip up other programs. Four decimals of a millimetre are written, far below
+    any sigma.
+    """
+    written, edges = np.round(mesh.vertices, 4), directed_edges(mesh.faces)
+    edges = edges[(written[edges[:, 0]] == written[edges[:, 1]]).all(axis=1)]
+    if not len(edges):
+        return mesh
+    group = connect(edges, len(mesh.vertices))[1]
+    first = np.unique(group, return_index=True)[1]
+    faces = first[group][mesh.faces]
+    whole = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+    vertices, faces, used = drop_unused_vertices(mesh.vertices, faces[whole])
+    return mesh.part(vertices, faces, used, mesh.filled[whole])

@@ -1,71 +1,114 @@
 """Surface nets (Gibson 1998): the zero set of values on a sparse grid as a closed triangle mesh.
 
-A vertex lies in every cell that the surface passes through, at the mean of the places where the
-cell's edges cross zero; a quadrilateral joins the vertices of the four cells around each edge that
-crosses. If several sheets pass through a cell each gets its own vertex, so that surfaces that come
-close do not touch. A cell's face whose two corners inside are diagonally opposite would leave open
-which sheets meet there: of the two, the one nearer to the surface is first put outside.
+A vertex lies in every cell that the surface crosses, at the mean of the zero crossings on the
+cell's edges; a quadrilateral joins the vertices of the four cells around each edge with a crossing.
+If several sheets cross a cell each gets its own vertex, so that surfaces that come close do not
+touch. Where two diagonally opposite corners of a cell's face are inside, which sheets meet is
+ambiguous: of the two, the corner nearer to the surface is first put outside.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
+from dataclasses import dataclass
 from functools import cache
 from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.arrays import Array, Floats, Indices
+from bodyscan.arrays import Array, Floats, Indices, Mask
 from bodyscan.compiled import compiled
-from bodyscan.mesh.bricks import SIDE, Bricks
 
 Numbers = NDArray[np.int32]
 
-BARELY = 1e-3  # outside, as a share of how far the node was inside
+SIDE = 8  # nodes per side of a brick
 
 
-def surface_nets(bricks: Bricks, values: Floats) -> tuple[Array, Indices]:
-    """Vertices (V, 3) mm and outward faces (F, 3) of the surface where values cross zero, negative
-    inside.
+@dataclass(frozen=True, eq=False)
+class Bricks:
+    """A sparse grid: B bricks of SIDE^3 nodes, kept only where they are needed.
 
-    values: (bricks, SIDE, SIDE, SIDE) at the nodes. The surface is closed and manifold wherever all
+    Values at the nodes are arrays (B, SIDE, SIDE, SIDE).
+
+    table: (a, b, c) int32, the number of each brick, -1 where there is none.
+    indices: (B, 3) int32, index of each brick in the table.
+    origin: (3,) mm, the grid's first node.
+    cell_mm: distance from node to node.
+    """
+
+    table: Numbers
+    indices: Numbers
+    origin: Array
+    cell_mm: float
+
+    @staticmethod
+    def from_mask(wanted: Mask, origin: Array, cell_mm: float) -> Bricks:
+        """The wanted bricks (a, b, c) of a grid."""
+        indices = np.argwhere(wanted).astype(np.int32)
+        table = np.full(wanted.shape, -1, np.int32)
+        table[wanted] = np.arange(len(indices))
+        return Bricks(table, indices, origin, cell_mm)
+
+    @property
+    def shape(self) -> tuple[int, int, int, int]:
+        """Shape of an array of values."""
+        return len(self.indices), SIDE, SIDE, SIDE
+
+
+def split_into_bricks(dense: Floats) -> Floats:
+    """Values (a b c, SIDE, SIDE, SIDE) in bricks of a dense grid (SIDE a, SIDE b, SIDE c)."""
+    a, b, c = (size // SIDE for size in dense.shape)
+    split = dense.reshape(a, SIDE, b, SIDE, c, SIDE).transpose(0, 2, 4, 1, 3, 5)
+    return np.ascontiguousarray(split).reshape(-1, SIDE, SIDE, SIDE)
+
+
+def join_bricks(values: Floats, shape: tuple[int, ...]) -> Floats:
+    """The inverse of `split_into_bricks`: dense values of all a x b x c bricks, shape (a, b, c)."""
+    split = values.reshape(*shape, SIDE, SIDE, SIDE).transpose(0, 3, 1, 4, 2, 5)
+    return np.ascontiguousarray(split).reshape([SIDE * size for size in shape])
+
+
+def extract_surface(bricks: Bricks, values: Floats) -> tuple[Array, Indices]:
+    """Vertices (V, 3) mm and outward faces (F, 3) of the zero set of values, negative inside.
+
+    values: (B, SIDE, SIDE, SIDE) at the nodes. The surface is closed and manifold wherever all
         surrounding nodes are in bricks.
     """
     values = values.copy()
-    while _part_sheets(bricks.table, bricks.places, values):
+    while _resolve_ambiguous_faces(bricks.table, bricks.indices, values):
         pass  # terminates: nodes only ever leave the inside
-    parts, counts = sheets_of_cases()
-    cases, first, total = _number_vertices(bricks.table, bricks.places, values, counts)
-    vertices = _place_vertices(bricks.table, bricks.places, values, cases, first, parts, total)
-    faces = _join(bricks.table, bricks.places, cases, first, parts, vertices)
+    sheets, counts = tabulate_sheets()
+    cases, first, total = _number_vertices(bricks.table, bricks.indices, values, counts)
+    vertices = _compute_vertices(bricks.table, bricks.indices, values, cases, first, sheets, total)
+    faces = _make_faces(bricks.table, bricks.indices, cases, first, sheets, vertices)
     return bricks.origin + bricks.cell_mm * vertices, faces
 
 
 @cache
-def sheets_of_cases() -> tuple[NDArray[np.int8], NDArray[np.int8]]:
-    """For each of the 256 combinations of a cell's corners inside: the sheet (256, 12) that crosses
-    each edge, -1 for none; and the number of sheets (256,).
+def tabulate_sheets() -> tuple[NDArray[np.int8], NDArray[np.int8]]:
+    """For each of the 256 sets of a cell's corners inside: the sheet (256, 12) that crosses each
+    edge, -1 for none, and the number of sheets (256,).
 
     Corner x + 2 y + 4 z; edge 4 a + p + 2 q runs along axis a, at p and q on the two axes after it.
     """
-    parts, counts = np.full((256, 12), -1, np.int8), np.zeros(256, np.int8)
+    sheets, counts = np.full((256, 12), -1, np.int8), np.zeros(256, np.int8)
     for case in range(256):
-        beside = defaultdict[int, list[int]](list)
+        neighbours = defaultdict[int, list[int]](list)
         for axis, side in product(range(3), range(2)):
             for one, other in _links(case, axis, side):
-                beside[one].append(other)
-                beside[other].append(one)
-        for first in sorted(beside):
-            if parts[case, first] >= 0:
+                neighbours[one].append(other)
+                neighbours[other].append(one)
+        for first in sorted(neighbours):
+            if sheets[case, first] >= 0:
                 continue
             around = [first]
             while around:
                 edge = around.pop()
-                parts[case, edge] = counts[case]
-                around += [other for other in beside[edge] if parts[case, other] < 0]
+                sheets[case, edge] = counts[case]
+                around += [other for other in neighbours[edge] if sheets[case, other] < 0]
             counts[case] += 1
-    return parts, counts
+    return sheets, counts
 
 
 def _links(case: int, axis: int, side: int) -> list[tuple[int, int]]:
@@ -80,13 +123,12 @@ def _links(case: int, axis: int, side: int) -> list[tuple[int, int]]:
 
 
 @compiled
-def _gather(table: Numbers, place: Numbers, values: Floats, block: NDArray[np.float32]) -> None:
-    """Values at a brick's nodes and the next ones (SIDE + 1
-    per side), NaN where there is no brick."""
+def _gather(table: Numbers, index: Numbers, values: Floats, block: NDArray[np.float32]) -> None:
+    """Copy the values at a brick's nodes and the next ones (SIDE + 1 per side), NaN where none."""
     for i in range(SIDE + 1):
         for j in range(SIDE + 1):
             for k in range(SIDE + 1):
-                a, b, c = place[0] + i // SIDE, place[1] + j // SIDE, place[2] + k // SIDE
+                a, b, c = index[0] + i // SIDE, index[1] + j // SIDE, index[2] + k // SIDE
                 block[i, j, k] = np.nan
                 if a < table.shape[0] and b < table.shape[1] and c < table.shape[2]:
                     number = table[a, b, c]
@@ -95,15 +137,15 @@ def _gather(table: Numbers, place: Numbers, values: Floats, block: NDArray[np.fl
 
 
 @compiled
-def _part_sheets(table: Numbers, places: Numbers, values: Floats) -> int:
-    """Put one node just outside on each face whose corners alternate; returns how many."""
+def _resolve_ambiguous_faces(table: Numbers, indices: Numbers, values: Floats) -> int:
+    """Put one node just outside on each cell face whose corners alternate; returns how many."""
     block = np.empty((SIDE + 1, SIDE + 1, SIDE + 1), np.float32)
     steps = np.eye(3, dtype=np.int64)
     found = 0
     for brick in range(len(values)):
         if values[brick].min() >= 0.0 or values[brick].max() < 0.0:
             continue
-        _gather(table, places[brick], values, block)
+        _gather(table, indices[brick], values, block)
         for number in range(SIDE**3):
             i, j, k = number // SIDE**2, number // SIDE % SIDE, number % SIDE
             for axis in range(3):
@@ -120,24 +162,24 @@ def _part_sheets(table: Numbers, places: Numbers, values: Floats) -> int:
                 else:
                     p, q, value = (1, 0, two) if two > three else (0, 1, three)
                 x, y, z = i + p * b[0] + q * c[0], j + p * b[1] + q * c[1], k + p * b[2] + q * c[2]
-                block[x, y, z] = BARELY * -value
-                at = places[brick]
+                block[x, y, z] = -1e-3 * value  # outside, as a share of how far it was inside
+                at = indices[brick]
                 owner = table[at[0] + x // SIDE, at[1] + y // SIDE, at[2] + z // SIDE]
-                values[owner, x % SIDE, y % SIDE, z % SIDE] = BARELY * -value
+                values[owner, x % SIDE, y % SIDE, z % SIDE] = -1e-3 * value
                 found += 1
     return found
 
 
 @compiled
 def _number_vertices(
-    table: Numbers, places: Numbers, values: Floats, counts: NDArray[np.int8]
+    table: Numbers, indices: Numbers, values: Floats, counts: NDArray[np.int8]
 ) -> tuple[NDArray[np.uint8], Numbers, int]:
     """Case and number of the first vertex of each cell, and the number of vertices."""
     cases, first = np.zeros(values.shape, np.uint8), np.zeros(values.shape, np.int32)
     block = np.empty((SIDE + 1, SIDE + 1, SIDE + 1), np.float32)
     total = 0
     for brick in range(len(values)):
-        _gather(table, places[brick], values, block)
+        _gather(table, indices[brick], values, block)
         for i in range(SIDE):
             for j in range(SIDE):
                 for k in range(SIDE):
@@ -153,13 +195,13 @@ def _number_vertices(
 
 
 @compiled
-def _place_vertices(
+def _compute_vertices(
     table: Numbers,
-    places: Numbers,
+    indices: Numbers,
     values: Floats,
     cases: NDArray[np.uint8],
     first: Numbers,
-    parts: NDArray[np.int8],
+    sheets: NDArray[np.int8],
     total: int,
 ) -> Array:
     """Vertices (total, 3), in cells from the grid's first node."""
@@ -169,7 +211,7 @@ def _place_vertices(
     for brick in range(len(values)):
         if not cases[brick].any():
             continue
-        _gather(table, places[brick], values, block)
+        _gather(table, indices[brick], values, block)
         for i in range(SIDE):
             for j in range(SIDE):
                 for k in range(SIDE):
@@ -177,8 +219,8 @@ def _place_vertices(
                     if case == 0:
                         continue
                     for edge in range(12):
-                        part = parts[case, edge]
-                        if part < 0:
+                        sheet = sheets[case, edge]
+                        if sheet < 0:
                             continue
                         axis = edge // 4
                         low[0], low[1], low[2] = i, j, k
@@ -187,27 +229,27 @@ def _place_vertices(
                         high[0], high[1], high[2] = low[0], low[1], low[2]
                         high[axis] += 1
                         a, b = block[low[0], low[1], low[2]], block[high[0], high[1], high[2]]
-                        vertex = first[brick, i, j, k] + part
+                        vertex = first[brick, i, j, k] + sheet
                         for c in range(3):
-                            sums[vertex, c] += SIDE * places[brick, c] + low[c]
+                            sums[vertex, c] += SIDE * indices[brick, c] + low[c]
                         sums[vertex, axis] += a / (a - b)
                         crossings[vertex] += 1.0
     return sums / crossings.reshape(-1, 1)
 
 
 @compiled
-def _join(
+def _make_faces(
     table: Numbers,
-    places: Numbers,
+    indices: Numbers,
     cases: NDArray[np.uint8],
     first: Numbers,
-    parts: NDArray[np.int8],
+    sheets: NDArray[np.int8],
     vertices: Array,
 ) -> Indices:
     """Faces (F, 3): two for each edge that crosses zero, split along the shorter diagonal."""
     faces, count = np.empty((6 * len(vertices) + 64, 3), np.int64), 0
     corners, cell = np.empty(4, np.int64), np.empty(3, np.int64)
-    for brick in range(len(places)):
+    for brick in range(len(indices)):
         for number in range(SIDE**3):
             i, j, k = number // SIDE**2, number // SIDE % SIDE, number % SIDE
             case = cases[brick, i, j, k]
@@ -222,7 +264,7 @@ def _join(
                     cell[(axis + 1) % 3] -= p
                     cell[(axis + 2) % 3] -= q
                     corners[turn] = _vertex(
-                        table, places[brick], cell, cases, first, parts, 4 * axis + p + 2 * q
+                        table, indices[brick], cell, cases, first, sheets, 4 * axis + p + 2 * q
                     )
                     whole &= corners[turn] >= 0
                 if not whole or count + 2 > len(faces):
@@ -245,18 +287,17 @@ def _join(
 @compiled
 def _vertex(
     table: Numbers,
-    place: Numbers,
+    index: Numbers,
     cell: Indices,
     cases: NDArray[np.uint8],
     first: Numbers,
-    parts: NDArray[np.int8],
+    sheets: NDArray[np.int8],
     edge: int,
 ) -> int:
-    """The vertex of the sheet that crosses an edge of a cell, counted from a brick's first one; -1
-    if there is none."""
-    a, b, c = place[0] + cell[0] // SIDE, place[1] + cell[1] // SIDE, place[2] + cell[2] // SIDE
+    """The vertex of the sheet that crosses an edge of a cell, -1 if there is none."""
+    a, b, c = index[0] + cell[0] // SIDE, index[1] + cell[1] // SIDE, index[2] + cell[2] // SIDE
     if a < 0 or b < 0 or c < 0 or table[a, b, c] < 0:
         return -1
     brick, i, j, k = table[a, b, c], cell[0] % SIDE, cell[1] % SIDE, cell[2] % SIDE
-    part = parts[cases[brick, i, j, k], edge]
-    return first[brick, i, j, k] + part if part >= 0 else -1
+    sheet = sheets[cases[brick, i, j, k], edge]
+    return first[brick, i, j, k] + sheet if sheet >= 0 else -1

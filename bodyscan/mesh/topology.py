@@ -1,7 +1,7 @@
-"""Whether a triangle mesh is a closed, oriented, manifold surface, and its number of pieces.
+"""Edges, components and handles of triangle meshes, and whether one is a closed manifold.
 
 Linear in the number of faces (Open3D's is_watertight also looks for self-intersections and is
-quadratic).
+quadratic). Half-edge 3 f + k runs from corner k of face f to the next corner.
 """
 
 from __future__ import annotations
@@ -15,27 +15,104 @@ from scipy.sparse.csgraph import connected_components
 
 from bodyscan.arrays import Array, Floats, Indices
 from bodyscan.compiled import compiled
-from bodyscan.mesh.half_edges import corner_fans, twins
+
+RIM = -1  # no face on the other side
+UNSOUND = -2  # several faces run along the edge the same way, or it has no length
+
+
+def find_twins(faces: Indices, vertex_count: int) -> Indices:
+    """The opposite half-edge (F, 3) of each half-edge of faces (F, 3), or RIM or UNSOUND."""
+    return _twins(np.ascontiguousarray(faces, np.int64).ravel(), vertex_count).reshape(-1, 3)
+
+
+def label_corner_fans(twin: Indices) -> tuple[Indices, int]:
+    """Label (F, 3) each corner with its fan of faces around a vertex; also the number of fans.
+
+    twin: (F, 3), from `find_twins`. The corners of a fan are connected across edges that two faces
+    share in opposite directions.
+    """
+    labels, count = _fans(np.ascontiguousarray(twin).ravel())
+    return labels.reshape(-1, 3), int(count)
+
+
+@compiled
+def _twins(corners: Indices, vertex_count: int) -> Indices:
+    """Twins (3 F,) from the faces' corners (3 F,), by the half-edges that leave each vertex."""
+    size = len(corners)
+    start = np.zeros(vertex_count + 1, np.int64)
+    for vertex in corners:
+        start[vertex + 1] += 1
+    start = np.cumsum(start)
+    leaving, free = np.empty(size, np.int64), start.copy()
+    for edge in range(size):
+        leaving[free[corners[edge]]] = edge
+        free[corners[edge]] += 1
+    twin = np.full(size, -1, np.int64)
+    for edge in range(size):
+        a, b = corners[edge], corners[edge + 1 if edge % 3 < 2 else edge - 2]
+        along, against = 0, 0
+        for k in range(start[a], start[a + 1]):
+            other = leaving[k]
+            along += corners[other + 1 if other % 3 < 2 else other - 2] == b
+        for k in range(start[b], start[b + 1]):
+            other = leaving[k]
+            if corners[other + 1 if other % 3 < 2 else other - 2] == a:
+                against += 1
+                twin[edge] = other
+        if along > 1 or against > 1 or a == b:
+            twin[edge] = -2
+    return twin
+
+
+@compiled
+def _fans(twin: Indices) -> tuple[Indices, int]:
+    """Fans (3 F,) of the corners, numbered as found, by turning about each vertex."""
+    labels = np.full(len(twin), -1, np.int64)
+    count = 0
+    for first in range(len(twin)):
+        if labels[first] >= 0:
+            continue
+        corner = first
+        while corner >= 0 and labels[corner] < 0:
+            labels[corner] = count
+            corner = twin[corner - 1 if corner % 3 > 0 else corner + 2]
+        # At a rim, turn the other way from the first corner as well.
+        across = twin[first]
+        while across >= 0:
+            corner = across + 1 if across % 3 < 2 else across - 2
+            if labels[corner] >= 0:
+                break
+            labels[corner] = count
+            across = twin[corner]
+        count += 1
+    return labels, count
 
 
 @dataclass(frozen=True)
 class Topology:
-    """Properties of a mesh as a surface."""
+    """Properties of a mesh as a surface.
 
-    closed: bool  # every edge lies in exactly two faces, which run along it in opposite directions
-    manifold: bool  # closed, and the faces around every vertex form a single fan
+    closed: every edge lies in exactly two faces, which run along it in opposite directions.
+    manifold: closed, and the faces around every vertex form a single fan.
+    euler: V - E + F: 2 for a sphere, less 2 for each handle.
+    volume_mm3: signed; positive if the faces are oriented outwards.
+    """
+
+    closed: bool
+    manifold: bool
     components: int
-    euler: int  # 2 for a sphere, less 2 for each handle
-    volume_mm3: float  # signed; positive if the faces are oriented outwards
+    euler: int
+    volume_mm3: float
 
 
-def topology(vertices: Array, faces: Indices) -> Topology:
+def compute_topology(vertices: Array, faces: Indices) -> Topology:
     """Topology of a mesh with vertices (V, 3) and faces (F, 3); unused vertices do not count."""
-    used = used_vertices(faces, len(vertices))
-    count = len(vertices)
-    closed, manifold = closed_and_manifold(faces, count)
-    edge_count = 3 * len(faces) // 2 if closed else len(np.unique(_edge_keys(faces, count)))
-    labels = face_components(faces, count)
+    used, count = used_vertices(faces, len(vertices)), len(vertices)
+    closed, manifold = check_manifold(faces, count)
+    edge_count = 3 * len(faces) // 2
+    if not closed:
+        edge_count = len(np.unique(np.sort(directed_edges(faces), axis=1) @ [count, 1]))
+    labels = label_components(faces, count)
     return Topology(
         closed,
         manifold,
@@ -45,17 +122,11 @@ def topology(vertices: Array, faces: Indices) -> Topology:
     )
 
 
-def closed_and_manifold(faces: Indices, vertex_count: int) -> tuple[bool, bool]:
+def check_manifold(faces: Indices, vertex_count: int) -> tuple[bool, bool]:
     """The `closed` and `manifold` of `Topology` for faces (F, 3), without the rest."""
-    twin = twins(faces, vertex_count)
+    twin = find_twins(faces, vertex_count)
     closed = bool(faces.size) and bool((twin >= 0).all())
-    return closed, closed and corner_fans(twin)[1] == used_vertices(faces, vertex_count).size
-
-
-def _edge_keys(faces: Indices, vertex_count: int) -> Indices:
-    """A number (3 F,) for each edge, whichever way it runs."""
-    low, high = np.sort(directed_edges(faces), axis=1).T
-    return low * vertex_count + high
+    return closed, closed and label_corner_fans(twin)[1] == used_vertices(faces, vertex_count).size
 
 
 def directed_edges(faces: Indices) -> Indices:
@@ -63,17 +134,22 @@ def directed_edges(faces: Indices) -> Indices:
     return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
 
 
-def face_components(faces: Indices, vertex_count: int) -> NDArray[np.int32]:
-    """Number (F,) of the connected piece that each face belongs to."""
-    edges = directed_edges(faces)
-    graph = coo_array(
-        (np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])),
-        shape=(vertex_count, vertex_count),
-    )
-    count, labels = connected_components(graph, directed=False)
-    own = labels[faces[:, 0]]
-    number = np.cumsum(np.bincount(own, minlength=count) > 0, dtype=np.int32) - 1
-    return number[own]
+def connect(edges: Indices, count: int) -> tuple[int, NDArray[np.int32]]:
+    """Number of connected components of a graph, and the component (count,) of each node.
+
+    edges: (N, 2), pairs of nodes 0 to count - 1.
+    """
+    graph = coo_array((np.ones(len(edges), np.int8), tuple(edges.T)), shape=(count, count))
+    number, labels = connected_components(graph, directed=False)
+    return int(number), labels
+
+
+def label_components(faces: Indices, vertex_count: int) -> NDArray[np.int32]:
+    """Label (F,) each face with the number, from 0, of its connected component."""
+    count, labels = connect(directed_edges(faces), vertex_count)
+    label = labels[faces[:, 0]]
+    number = np.cumsum(np.bincount(label, minlength=count) > 0, dtype=np.int32) - 1
+    return number[label]
 
 
 def signed_volume(vertices: Array, faces: Indices) -> float:
@@ -89,37 +165,32 @@ def face_areas(vertices: Array, faces: Indices) -> Array:
 
 def face_normals(vertices: Array, faces: Indices) -> Array:
     """Normals (F, 3) of faces (F, 3), twice as long as their areas."""
-    found = np.empty((len(faces), 3))
-    _cross(np.ascontiguousarray(vertices, float), np.ascontiguousarray(faces, np.int64), found)
-    return found
+    normals = np.empty((len(faces), 3))
+    _cross(np.ascontiguousarray(vertices, float), np.ascontiguousarray(faces, np.int64), normals)
+    return normals
 
 
 @compiled
-def _cross(vertices: Array, faces: Indices, found: Array) -> None:
+def _cross(vertices: Array, faces: Indices, normals: Array) -> None:
     for f in range(len(faces)):
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
         for k in range(3):
             i, j = (k + 1) % 3, (k + 2) % 3
-            found[f, k] = (vertices[b, i] - vertices[a, i]) * (vertices[c, j] - vertices[a, j])
-            found[f, k] -= (vertices[b, j] - vertices[a, j]) * (vertices[c, i] - vertices[a, i])
+            normals[f, k] = (vertices[b, i] - vertices[a, i]) * (vertices[c, j] - vertices[a, j])
+            normals[f, k] -= (vertices[b, j] - vertices[a, j]) * (vertices[c, i] - vertices[a, i])
 
 
 def vertex_normals(vertices: Array, faces: Indices) -> Floats:
     """Unit normals (V, 3), the area-weighted mean of the faces around each vertex."""
     cross = face_normals(vertices, faces)
-    total = np.stack(
-        [
-            np.bincount(faces.ravel(), np.repeat(cross[:, k], 3), minlength=len(vertices))
-            for k in range(3)
-        ],
-        axis=-1,
-    )
+    corners, count = faces.ravel(), len(vertices)
+    total = np.stack([np.bincount(corners, np.repeat(n, 3), count) for n in cross.T], axis=-1)
     length = np.linalg.norm(total, axis=-1, keepdims=True)
     return (total / np.where(length > 0, length, 1.0)).astype(np.float32)
 
 
 def drop_unused_vertices(vertices: Array, faces: Indices) -> tuple[Array, Indices, Indices]:
-    """Vertices that faces use, the faces renumbered, and the old numbers of those vertices."""
+    """Vertices (U, 3) that faces use, the faces renumbered, and the old indices (U,) of those."""
     used = used_vertices(faces, len(vertices))
     number = np.full(len(vertices), -1, np.int64)
     number[used] = np.arange(used.size)
@@ -127,7 +198,60 @@ def drop_unused_vertices(vertices: Array, faces: Indices) -> tuple[Array, Indice
 
 
 def used_vertices(faces: Indices, count: int) -> Indices:
-    """Numbers of the vertices (of `count`) that faces use, ascending."""
+    """Indices of the vertices (of `count`) that faces use, ascending."""
     used = np.zeros(count, bool)
     used[faces] = True
     return np.flatnonzero(used)
+
+
+LAYER_MM = 20.0
+
+
+@dataclass(frozen=True)
+class Handle:
+    """A handle of the surface: its lowest and highest point, the y of its middle; mm."""
+
+    low_mm: float
+    high_mm: float
+    y_mm: float
+
+
+def find_handles(vertices: Array, faces: Indices, *, min_height_mm: float = 80.0) -> list[Handle]:
+    """Find the handles of a closed mesh that are upright and high enough, from the lowest up.
+
+    Parts of a body form one where they touch: a hand on the hip, one knee against the other. The
+    mesh is cut into layers; the components of all layers, linked where they meet, are a Reeb graph
+    (Reeb 1946) of the height. Without handles that graph is a tree; each cycle of it is a handle.
+    """
+    edges = directed_edges(faces)
+    edges = edges[edges[:, 0] < edges[:, 1]]
+    # An edge that skipped a layer would create a cycle where there is none.
+    layer_mm = max(LAYER_MM, float(np.abs(np.diff(vertices[edges, 2], axis=1)).max()))
+    layer = np.floor(vertices[:, 2] / layer_mm).astype(np.int64)
+    within = layer[edges[:, 0]] == layer[edges[:, 1]]
+    count, component = connect(edges[within], len(vertices))
+    height = np.zeros(count)
+    height[component] = layer_mm * (layer + 0.5)
+    y = np.bincount(component, vertices[:, 1], count) / np.bincount(component, minlength=count)
+    links = prune_branches(np.unique(component[edges[~within]], axis=0))
+    if not len(links):
+        return []
+    import networkx as nx  # takes a fifth of a second to load; few bodies have a handle
+
+    handles = []
+    for cycle in nx.minimum_cycle_basis(nx.Graph(links.tolist())):
+        heights = height[cycle]
+        if np.ptp(heights) >= min_height_mm:
+            low, high = float(heights.min()), float(heights.max())
+            handles.append(Handle(low, high, float(y[cycle].mean())))
+    return sorted(handles, key=lambda handle: (handle.low_mm, handle.y_mm))
+
+
+def prune_branches(links: Indices) -> Indices:
+    """The 2-core of a graph: its links (N, 2) without those to nodes that have no other link."""
+    links = np.unique(np.sort(links, axis=1), axis=0)
+    while True:
+        inside = (np.bincount(links.ravel())[links] > 1).all(axis=1)
+        if inside.all():
+            return links
+        links = links[inside]

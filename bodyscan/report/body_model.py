@@ -9,9 +9,8 @@ from scipy.spatial import cKDTree
 from bodyscan.arrays import Bytes, Mask
 from bodyscan.errors import ScanFailed
 from bodyscan.evaluation.comparison import Comparison
-from bodyscan.mesh.body import BodyCloud, BodyMesh
+from bodyscan.mesh.body import REGION_NAMES, BodyCloud, BodyMesh, compute_cover_shares
 from bodyscan.mesh.decimation import decimate
-from bodyscan.mesh.regions import NAMES, covered_shares
 from bodyscan.progress import THREADS
 from bodyscan.report.canvas import blue_white_red, turbo
 from bodyscan.report.model import Layer, Shape, css, ramp_legend
@@ -22,7 +21,7 @@ FACES = (50_000, 44_000, 38_000)
 UNKNOWN = (150, 150, 150)
 SKIN = (214, 210, 205)
 REGIONS = (UNKNOWN, SKIN, (120, 70, 30), (40, 70, 130))
-"""In the order of `mesh.regions.NAMES`: unsure (including filled), skin, hair, dark cloth."""
+"""In the order of `REGION_NAMES`: unsure (including filled), skin, hair, dark cloth."""
 PAIRS = (
     (70, 50, 125),
     (60, 100, 170),
@@ -77,9 +76,9 @@ def layers(
             "swatches": [(css(SKIN), "measured"), (css(tint), "filled to close the mesh")],
         }),
     ]  # fmt: skip
-    if covered_shares(small.regions) and small.regions is not None:
+    if compute_cover_shares(small.regions) and small.regions is not None:
         own = np.array(REGIONS, np.uint8)
-        swatches = [(css(colour), name) for colour, name in zip(REGIONS, NAMES, strict=True)]
+        swatches = [(css(colour), name) for colour, name in zip(REGIONS, REGION_NAMES, strict=True)]
         found.append(Layer("regions", own[small.regions], {"swatches": swatches}))
     if comparison is not None:
         found.append(_deviation(small, mesh, comparison, made_up, limit_mm))

@@ -10,7 +10,7 @@ from rich.table import Table
 
 from bodyscan.measurement.measurements import Measurements
 from bodyscan.measurement.outline import Range
-from bodyscan.mesh.regions import DARK_CLOTH, HAIR, NAMES, SKIN
+from bodyscan.mesh.body import DARK_CLOTH, HAIR, REGION_NAMES, SKIN
 from bodyscan.version import __version__
 
 MOSTLY = 0.5
@@ -24,10 +24,10 @@ def tables(measured: Measurements) -> Iterator[Table]:
     body = Table("", "", title="body", show_header=False)
     body.columns[1].justify = "right"
     guess = "" if measured.stature_measured >= MOSTLY else " (guessed: the crown was not measured)"
-    of = {NAMES[HAIR]: " (top of the hair)", NAMES[DARK_CLOTH]: " (of a cap or hood)"}
+    of = {REGION_NAMES[HAIR]: " (top of the hair)", REGION_NAMES[DARK_CLOTH]: " (of a cap or hood)"}
     which = of.get(measured.crown or "", guess)
     body.add_row("stature in pose", f"{measured.stature_mm:.1f} mm{which}")
-    if measured.head is not None and measured.crown != NAMES[SKIN]:
+    if measured.head is not None and measured.crown != REGION_NAMES[SKIN]:
         head = measured.head
         body.add_row("of the head", f"{head.height_mm:.0f} ± {head.sigma_mm:.0f} mm (estimate)")
     body.add_row("volume", f"{measured.volume_l:.2f} l")
@@ -69,7 +69,10 @@ def tables(measured: Measurements) -> Iterator[Table]:
 
 def _covered(regions: Mapping[str, float] | None) -> str:
     """What a girth crosses that is not skin, if that is more than a little."""
-    parts = ((name, (regions or {}).get(name, 0.0)) for name in (NAMES[HAIR], NAMES[DARK_CLOTH]))
+    parts = (
+        (name, (regions or {}).get(name, 0.0))
+        for name in (REGION_NAMES[HAIR], REGION_NAMES[DARK_CLOTH])
+    )
     return ", ".join(f"{name} {100.0 * part:.0f} %" for name, part in parts if part > 1.0 - LITTLE)
 
 

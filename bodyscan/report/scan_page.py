@@ -15,9 +15,8 @@ from bodyscan.evaluation.comparison import Comparison, compare_surfaces
 from bodyscan.fusion import scan_verdict as limits
 from bodyscan.fusion.scan_facts import read_facts, told_verdict
 from bodyscan.fusion.storage import StoredScan, load_scan
-from bodyscan.mesh.holes import holes
-from bodyscan.mesh.regions import covered_shares
-from bodyscan.mesh.topology import topology
+from bodyscan.mesh.body import compute_cover_shares, find_filled_patches
+from bodyscan.mesh.topology import compute_topology
 from bodyscan.registration.rig_calibration import FLOOR_AXES
 from bodyscan.report import charts
 from bodyscan.report.body_model import layers, light_mesh, shape_of
@@ -124,8 +123,8 @@ def _viewer(scan: StoredScan, shown: Comparison | None, limit: float) -> Viewer 
 def _numbers(scan: StoredScan) -> Numbers:
     facts, mesh = scan.facts, scan.mesh
     made_up = 100.0 * mesh.filled_share
-    largest = next((hole.area_mm2 / 100.0 for hole in holes(mesh)), 0.0)
-    shape = topology(mesh.vertices, mesh.faces)
+    largest = next((hole.area_mm2 / 100.0 for hole in find_filled_patches(mesh)), 0.0)
+    shape = compute_topology(mesh.vertices, mesh.faces)
     items = [
         Number("points", len(scan.cloud.points), "", "in the cloud, after pairs were merged"),
         Number("faces", len(mesh.faces), "", "triangles of the closed mesh"),
@@ -161,7 +160,7 @@ def _numbers(scan: StoredScan) -> Numbers:
             Number(
                 name, 100.0 * share, "% of points", "by brightness, roughness and place", digits=1
             )
-            for name, share in covered_shares(scan.cloud.regions).items()
+            for name, share in compute_cover_shares(scan.cloud.regions).items()
         ),
         Number("volume", shape.volume_mm3 / 1e6, "l", "inside the mesh", digits=2),
     ]
@@ -340,9 +339,9 @@ def _sway_picture(motion: Mapping[str, float]) -> Picture:
 
 
 def _holes(scan: StoredScan) -> Section:
-    found = [hole for hole in holes(scan.mesh) if hole.area_mm2 >= SMALL_HOLE_MM2]
+    found = [hole for hole in find_filled_patches(scan.mesh) if hole.area_mm2 >= SMALL_HOLE_MM2]
     rows = tuple(
-        (str(k), hole.area_mm2 / 100.0, hole.middle[2], hole.middle[0], hole.middle[1], hole.faces)
+        (str(k), hole.area_mm2 / 100.0, hole.centre[2], hole.centre[0], hole.centre[1], hole.facing)
         for k, hole in enumerate(found[:MOST_HOLES], start=1)
     )
     columns = (

@@ -23,7 +23,7 @@ from bodyscan.fusion.storage import StoredScan, load_scan
 from bodyscan.geometry.robust import rms, rms_length
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyMesh
-from bodyscan.mesh.topology import topology
+from bodyscan.mesh.topology import compute_topology
 from bodyscan.optional import optional
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.storage import load_calibration
@@ -210,7 +210,7 @@ def _cloud_lines(signed_mm: Array, sigma_mm: Floats) -> Iterator[str]:
 
 def _mesh_lines(signed_mm: Array, mesh: BodyMesh) -> Iterator[str]:
     yield f"  mesh, measured vertices {_figures(deviation(signed_mm))}"
-    shape = topology(mesh.vertices, mesh.faces)
+    shape = compute_topology(mesh.vertices, mesh.faces)
     yield (
         f"  mesh: {'closed' if shape.closed else 'open'}, "
         f"{'manifold' if shape.manifold else 'not manifold'}, {shape.components} piece(s), "

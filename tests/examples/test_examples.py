@@ -10,7 +10,7 @@ import open3d as o3d
 import pytest
 from made_scan import make_scan
 
-from bodyscan.export.body_format import BODY_FORMATS
+from bodyscan.export.formats import BODY_FORMATS
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 

@@ -1,4 +1,4 @@
-"""A shared export has no face; below the neck it is the same, bit for bit."""
+"""Necks are found, and a defaced export has no face; below the neck it is unchanged, bit for bit."""
 
 from __future__ import annotations
 
@@ -8,15 +8,16 @@ from pathlib import Path
 import numpy as np
 import open3d as o3d
 import pytest
+from made_bodies import arrays, together
+from small_bodies import points
 
 from bodyscan.errors import FailedWork
-from bodyscan.export.defacing import GREY, RINGS, deface
-from bodyscan.export.neck import Neck, find_neck
+from bodyscan.export.defacing import Neck, deface, find_neck
 from bodyscan.export.scan import export_scan
 from bodyscan.fusion.storage import StoredScan
-from bodyscan.mesh.body import BodyCloud, BodyMesh
+from bodyscan.mesh.body import BodyMesh
 from bodyscan.mesh.ply import read_ply_mesh
-from bodyscan.mesh.topology import topology, vertex_normals
+from bodyscan.mesh.topology import compute_topology, vertex_normals
 
 SUBJECT = Path(__file__).parents[2] / "data" / "subjects" / "woman_average.ply"
 
@@ -24,9 +25,8 @@ SUBJECT = Path(__file__).parents[2] / "data" / "subjects" / "woman_average.ply"
 @pytest.fixture(scope="module")
 def body() -> BodyMesh:
     """The free subject in the rig frame, 1633 mm tall; soles and a patch of the face not measured."""
-    read = o3d.io.read_triangle_mesh(str(SUBJECT))
-    vertices = np.asarray(read.vertices) * 1000.0 @ np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1.0]])
-    faces = np.asarray(read.triangles).astype(np.int64)
+    vertices, faces = arrays(o3d.io.read_triangle_mesh(str(SUBJECT)))
+    vertices = vertices * 1000.0 @ np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1.0]])
     rng = np.random.default_rng(3)
     sigma_mm = rng.uniform(0.01, 0.1, len(vertices)).astype(np.float32)
     sigma_mm[(vertices[:, 2] < 10.0) | (np.abs(vertices[:, 2] - 1550.0) < 15.0)] = np.nan
@@ -70,9 +70,9 @@ def test_below_the_neck_every_bit_stays_and_above_nothing_does(body: BodyMesh, n
     assert below(shared, neck.height_mm)[: len(kept)] == kept
     above = shared.vertices[:, 2] > neck.height_mm
     assert not set(np.array(records(shared), object)[above]) & set(records(body))
-    assert np.all(shared.colours[above] == GREY)
+    assert np.all(shared.colours[above] == 150)
     assert np.all(np.isnan(shared.sigma_mm[above]))
-    shape = topology(shared.vertices, shared.faces)
+    shape = compute_topology(shared.vertices, shared.faces)
     assert shape.closed
     assert shape.manifold
     assert shape.components == 1
@@ -101,7 +101,7 @@ def test_the_head_is_smooth_and_faces_outwards(body: BodyMesh, neck: Neck) -> No
     # turns little from step to step, as a round line of so many does.
     low = neck.height_mm - 30.0
     added = shared.vertices[np.isnan(shared.sigma_mm) & (shared.vertices[:, 2] > low)]
-    ring = added[: len(added) // RINGS]
+    ring = added[: len(added) // 40]  # of 40 rings
     step = np.roll(ring, -1, axis=0) - ring
     turn = np.linalg.norm(step - np.roll(step, 1, axis=0), axis=1)
     # 46 points: 2 pi / 46 of a step, 0.14; along the rim's zigzag nearly all of it.
@@ -110,17 +110,16 @@ def test_the_head_is_smooth_and_faces_outwards(body: BodyMesh, neck: Neck) -> No
 
 def test_raised_hands_stay(body: BodyMesh, neck: Neck) -> None:
     """A pillar beside the head, a separate piece above the neck, keeps every bit."""
-    box = o3d.geometry.TriangleMesh.create_box(40.0, 40.0, 900.0)
-    box.translate([0.0, 250.0, 900.0])
-    more = np.asarray(box.triangles).astype(np.int64) + len(body.vertices)
-    size = len(np.asarray(box.vertices))
+    pillar = o3d.geometry.TriangleMesh.create_box(40.0, 40.0, 900.0).translate([0.0, 250.0, 900.0])
+    vertices, faces = together((body.vertices, body.faces), arrays(pillar))
+    size, more = len(vertices) - len(body.vertices), len(faces) - len(body.faces)
     both = BodyMesh(
-        np.concatenate([body.vertices, np.asarray(box.vertices)]),
-        np.concatenate([body.faces, more]),
+        vertices,
+        faces,
         np.concatenate([body.normals, np.ones((size, 3), np.float32)]),
         np.concatenate([body.colours, np.full((size, 3), 7, np.uint8)]),
         np.concatenate([body.sigma_mm, np.full(size, 0.5, np.float32)]),
-        np.concatenate([body.filled, np.zeros(len(more), bool)]),
+        np.concatenate([body.filled, np.zeros(more, bool)]),
     )
     found = find_neck(both.vertices, both.faces)
     assert found.height_mm == neck.height_mm
@@ -136,37 +135,24 @@ def test_an_open_mesh_ends_at_the_neck(body: BodyMesh, neck: Neck) -> None:
 def test_arms_overhead_are_refused_and_not_taken_for_a_neck(body: BodyMesh) -> None:
     """Two cylinders of a forearm's girth over the head: their narrowest is no neck."""
     parts = [(body.vertices, body.faces)]
-    for side in (-60.0, 60.0):
-        arm = o3d.geometry.TriangleMesh.create_cylinder(35.0, 700.0, 30, 60).translate(
-            [0.0, side, 1900.0]
-        )
-        shape = np.asarray(arm.vertices)
+    for y in (-60.0, 60.0):
+        arm = o3d.geometry.TriangleMesh.create_cylinder(35.0, 700.0, 30, 60)
+        shape, faces = arrays(arm.translate([0.0, y, 1900.0]))
         shape[:, 0] *= 1.0 + 0.3 * np.abs(shape[:, 2] - 1950.0) / 350.0
-        parts.append((shape, np.asarray(arm.triangles).astype(np.int64)))
-    starts = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])
-    faces = [faces + start for (_, faces), start in zip(parts, starts, strict=False)]
+        parts.append((shape, faces))
     with pytest.raises(FailedWork, match="no neck"):
-        find_neck(np.concatenate([vertices for vertices, _ in parts]), np.concatenate(faces))
+        find_neck(*together(*parts))
 
 
 def test_no_neck_no_export(body: BodyMesh) -> None:
-    ball = o3d.geometry.TriangleMesh.create_sphere(500.0, 40)
     with pytest.raises(FailedWork, match="no neck"):
-        find_neck(np.asarray(ball.vertices), np.asarray(ball.triangles).astype(np.int64))
-    with pytest.raises(FailedWork, match="nothing of the mesh"):
+        find_neck(*arrays(o3d.geometry.TriangleMesh.create_sphere(500.0, 40)))
+    with pytest.raises(FailedWork, match="nothing above the neck"):
         deface(body, Neck(3000.0, np.zeros(2)))
 
 
-def test_exports_say_so(body: BodyMesh, tmp_path: Path) -> None:
-    none = np.zeros((0, 3))
-    empty = BodyCloud(
-        none,
-        none.astype(np.float32),
-        np.zeros(0, np.float32),
-        np.zeros((0, 3), np.uint8),
-        np.zeros(0, np.uint8),
-    )
-    scan = StoredScan(empty, body, {"subject": "s", "calibration_id": "c"})
+def test_exported_files_state_that_they_are_defaced(body: BodyMesh, tmp_path: Path) -> None:
+    scan = StoredScan(points(), body, {"subject": "s", "calibration_id": "c"})
     export_scan(scan, tmp_path, ["ply"], ["full", "light", "open"], deface=True)
     for name in ("body", "body-light", "body-open"):
         assert json.loads((tmp_path / f"{name}.ply.json").read_text())["defaced"] is True
@@ -174,3 +160,98 @@ def test_exports_say_so(body: BodyMesh, tmp_path: Path) -> None:
         assert not set(map(bytes, mesh.vertices[mesh.vertices[:, 2] > 1430.0])) & set(
             map(bytes, body.vertices)
         )
+
+
+SIDES, STEP_MM = 24, 4.0
+ROUND = SIDES / np.pi * np.sin(np.pi / SIDES)
+"""Girth of a polygon over that of the circle around it."""
+AXIS = np.array([30.0, -20.0])
+Profile = list[tuple[float, float]]
+"""(height, radius) mm, straight in between."""
+TALL_MM, NECK_MM = 1700.0, 1452.0
+"""At a height that is looked at: 4 mm steps from a quarter of the stature, nearly, below the top."""
+
+
+def revolve(profile: Profile) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and faces of the surface, a ring every 4 mm; open at both ends."""
+    height = np.arange(0.0, TALL_MM + 1.0, STEP_MM)
+    radius = np.interp(height, *np.array(profile).T)
+    angle = 2.0 * np.pi * np.arange(SIDES) / SIDES
+    flat = AXIS + radius[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    z = np.broadcast_to(height[:, None, None], (len(height), SIDES, 1))
+    ring, side = np.mgrid[: len(height) - 1, :SIDES]
+    a, b = SIDES * ring + side, SIDES * ring + (side + 1) % SIDES
+    faces = np.stack([[a, b, b + SIDES], [a, b + SIDES, a + SIDES]], axis=-1).reshape(3, -1).T
+    return np.concatenate([flat, z], axis=-1).reshape(-1, 3), faces
+
+
+def person(*, neck: float = 345.0, head: float = 500.0, shoulders: float = 940.0) -> Profile:
+    """By girths, mm.  Shoulders end 108 mm below the neck, and are looked at 119 mm below it."""
+    narrow, skull, wide = (girth_mm / (2.0 * np.pi * ROUND) for girth_mm in (neck, head, shoulders))
+    return [
+        (0.0, wide), (NECK_MM - 108.0, wide), (NECK_MM, narrow), (NECK_MM + 48.0, skull),
+        (TALL_MM, skull),
+    ]  # fmt: skip
+
+
+def find_neck_of(profile: Profile) -> Neck:
+    return find_neck(*revolve(profile))
+
+
+def test_the_neck_is_the_narrowest_slice_and_its_axis_that_of_the_head() -> None:
+    neck = find_neck_of(person())
+    assert neck.height_mm == pytest.approx(NECK_MM)
+    np.testing.assert_allclose(neck.axis, AXIS, atol=1e-6)  # the middle of rings
+
+
+@pytest.mark.parametrize(
+    ("widths", "is_one"),
+    [
+        ({"neck": 179.8}, False),
+        ({"neck": 180.2}, True),
+        ({"neck": 300.0, "head": 399.8}, False),
+        ({"neck": 300.0, "head": 400.2}, True),
+        # A head is a tenth wider than the neck.
+        ({"neck": 480.0, "head": 527.8}, False),
+        ({"neck": 480.0, "head": 528.2}, True),
+        # Shoulders are half as wide again.
+        ({"neck": 480.0, "head": 540.0, "shoulders": 719.0}, False),
+        ({"neck": 480.0, "head": 540.0, "shoulders": 721.0}, True),
+    ],
+)
+def test_a_neck_has_a_head_above_and_shoulders_below(
+    widths: dict[str, float], is_one: bool
+) -> None:
+    if is_one:
+        assert find_neck_of(person(**widths)).height_mm == pytest.approx(NECK_MM)
+        return
+    with pytest.raises(FailedWork, match="no neck was found"):
+        find_neck_of(person(**widths))
+
+
+def test_what_only_narrows_upwards_or_downwards_has_no_neck() -> None:
+    for profile in ([(0.0, 155.0), (TALL_MM, 70.0)], [(0.0, 70.0), (TALL_MM, 155.0)]):
+        with pytest.raises(FailedWork, match="stand upright"):
+            find_neck_of(profile)
+
+
+def test_what_is_farther_from_the_axis_than_a_head_reaches_does_not_count() -> None:
+    """A second trunk 400 mm aside, wider, whose narrowest slice is at another height."""
+    vertices, faces = revolve(person())
+    aside = vertices * [2.0, 2.0, 1.0] + [0.0, 500.0, 0.0]
+    both = np.concatenate([vertices, aside]), np.concatenate([faces, faces + len(vertices)])
+    assert find_neck(*both).height_mm == pytest.approx(NECK_MM)
+
+
+@pytest.mark.parametrize(
+    "profile",
+    [
+        # At 1290 mm, where the lowest slice is, and 1560, above the highest at 1544.
+        [(0.0, 150.0), (1180.0, 150.0), (1290.0, 55.0), (1380.0, 80.0), (TALL_MM, 80.0)],
+        [(0.0, 150.0), (1430.0, 150.0), (1560.0, 50.0), (1598.0, 90.0), (TALL_MM, 90.0)],
+    ],
+)
+def test_what_is_narrowest_where_trunks_or_heads_are_is_no_neck(profile: Profile) -> None:
+    """A quarter of the stature below the top, nearly, or a twelfth of it."""
+    with pytest.raises(FailedWork, match="no neck was found"):
+        find_neck_of(profile)

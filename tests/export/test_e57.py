@@ -17,15 +17,15 @@ from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.reconstruction.triangulation import grid_normals
 
 CAMERA = Camera(100.0, 100.0, 0.0, 20.0, 15.0, Radial(), 40, 30)
-PLACING = RigidTransform.from_rotation_vector([0.3, -1.1, 0.4], [650.0, -1120.0, 900.0])
+RIG_FROM_CAMERA = RigidTransform.from_rotation_vector([0.3, -1.1, 0.4], [650.0, -1120.0, 900.0])
 
 
-def image(pair: str, seen: bool = True) -> RangeImage:
+def image(pair: str, visible: bool = True) -> RangeImage:
     """A slanted plane about 1.3 m away, with a hole."""
     rays = CAMERA.pixel_rays()
     points = (rays * (1300.0 + 200.0 * rays[..., :1])).astype(np.float32)
     points[5:9, 10:20] = np.nan
-    if not seen:
+    if not visible:
         points[:] = np.nan
     sigma = np.where(np.isfinite(points[..., 0]), 0.1, np.nan).astype(np.float32)
     grey = np.arange(CAMERA.width * CAMERA.height).reshape(points.shape[:2]).astype(np.uint8)
@@ -36,14 +36,14 @@ def test_points_pose_and_colour_come_back(tmp_path: Path) -> None:
     pye57 = pytest.importorskip("pye57")
     path = tmp_path / "raw.e57"
     one = image("p1-1")
-    placings = {"p1-1": PLACING, "p1-2": RigidTransform.identity(), "p1-3": PLACING}
-    counts = write_e57(path, [one, image("p1-2"), image("p1-3", seen=False)], placings)
+    poses = {"p1-1": RIG_FROM_CAMERA, "p1-2": RigidTransform.identity(), "p1-3": RIG_FROM_CAMERA}
+    counts = write_e57(path, [one, image("p1-2"), image("p1-3", visible=False)], poses)
     assert counts == {"p1-1": 1160, "p1-2": 1160, "p1-3": 0}
     file = pye57.E57(str(path))
     assert file.scan_count == 2
     read = file.read_scan(0, colors=True, row_column=True, ignore_missing_fields=True)
     world = np.stack([read[f"cartesian{axis}"] for axis in "XYZ"], axis=-1)
-    expected = PLACING.apply(one.points[one.valid].astype(float)) / 1000.0
+    expected = RIG_FROM_CAMERA.apply(one.points[one.valid].astype(float)) / 1000.0
     np.testing.assert_allclose(world, expected, atol=1e-6)  # written as float32: 0.1 um at 1 m
     np.testing.assert_array_equal(read["colorGreen"], one.colours[one.valid])
     np.testing.assert_array_equal(

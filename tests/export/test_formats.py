@@ -17,9 +17,8 @@ from small_bodies import ball, points
 
 from bodyscan.errors import BadInput
 from bodyscan.export.body_file import Provenance, write_body
-from bodyscan.export.decimal_text import format_decimals, format_integers, join_columns
 from bodyscan.export.formats.glb import write_glb
-from bodyscan.export.formats.obj import write_obj
+from bodyscan.export.formats.obj import format_decimals, format_integers, join_columns, write_obj
 from bodyscan.export.formats.stl import write_stl
 from bodyscan.export.scan import export_scan
 from bodyscan.fusion.storage import StoredScan
@@ -29,12 +28,11 @@ from bodyscan.mesh.ply import read_ply_mesh
 from bodyscan.version import __version__
 
 MESH_FORMATS = ("ply", "obj", "stl", "glb")
-CLOUD_FORMATS = ("ply", "glb")
 ORIGIN = Provenance("S-0042", "3f2a")
 
 
 @given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=20), st.integers(0, 6))
-def test_fixed_writes_what_python_writes(values: list[float], decimals: int) -> None:
+def test_decimals_are_rounded_as_python_does(values: list[float], decimals: int) -> None:
     text = join_columns([format_decimals(np.array(values), decimals), "\n"]).decode().split()
     assert len(text) == len(values)
     for mine, value in zip(text, values, strict=True):
@@ -42,13 +40,11 @@ def test_fixed_writes_what_python_writes(values: list[float], decimals: int) -> 
         assert float(mine) == pytest.approx(value, abs=0.5000001 * 10.0**-decimals)
         assert len(mine.partition(".")[2]) == decimals
         assert mine != "-0"
-        assert not (
-            mine.lstrip("-").startswith("0") and len(mine.partition(".")[0].lstrip("-")) > 1
-        )
+        assert str(int(mine.partition(".")[0].lstrip("-"))) == mine.partition(".")[0].lstrip("-")
 
 
 @given(st.lists(st.integers(0, 10**7), min_size=1, max_size=20))
-def test_whole_writes_what_python_writes(values: list[int]) -> None:
+def test_integers_are_written_as_python_does(values: list[int]) -> None:
     assert join_columns(["f ", format_integers(np.array(values)), "\n"]).decode() == "".join(
         f"f {value}\n" for value in values
     )
@@ -108,12 +104,12 @@ def glb_parts(path: Path) -> tuple[dict[str, Any], bytes]:
 
 
 def accessor(document: dict[str, Any], binary: bytes, number: int) -> np.ndarray:
-    told = document["accessors"][number]
-    view = document["bufferViews"][told["bufferView"]]
+    info = document["accessors"][number]
+    view = document["bufferViews"][info["bufferView"]]
     assert view["byteOffset"] % 4 == 0
-    kind = {5126: "<f4", 5123: "<u2", 5125: "<u4"}[told["componentType"]]
-    width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[told["type"]]
-    values = np.frombuffer(binary, kind, told["count"] * width, view["byteOffset"])
+    kind = {5126: "<f4", 5123: "<u2", 5125: "<u4"}[info["componentType"]]
+    width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[info["type"]]
+    values = np.frombuffer(binary, kind, info["count"] * width, view["byteOffset"])
     assert view["byteLength"] == values.nbytes
     return values.reshape(-1, width)
 
@@ -127,9 +123,9 @@ def test_glb_mesh(tmp_path: Path) -> None:
     read = {k: accessor(document, binary, n) for k, n in primitive["attributes"].items()}
     x, y, z = mesh.vertices.T / 1000.0
     np.testing.assert_allclose(read["POSITION"], np.stack([y, z, x], axis=1), atol=1e-7)
-    told = document["accessors"][primitive["attributes"]["POSITION"]]
-    np.testing.assert_array_equal(told["min"], read["POSITION"].min(axis=0))
-    np.testing.assert_array_equal(told["max"], read["POSITION"].max(axis=0))
+    info = document["accessors"][primitive["attributes"]["POSITION"]]
+    np.testing.assert_array_equal(info["min"], read["POSITION"].min(axis=0))
+    np.testing.assert_array_equal(info["max"], read["POSITION"].max(axis=0))
     np.testing.assert_allclose(np.linalg.norm(read["NORMAL"], axis=1), 1.0, atol=1e-6)
     # Vertex colours are linear light; sRGB's middle grey 188 is half of white.
     order = np.argsort(mesh.colours[:, 0])
@@ -157,28 +153,30 @@ def test_glb_cloud(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", [f".{name}" for name in MESH_FORMATS])
-def test_beside_each_mesh_stands_what_it_is(tmp_path: Path, suffix: str) -> None:
+def test_the_json_beside_a_mesh_describes_it(tmp_path: Path, suffix: str) -> None:
     mesh = ball()
     write_body(tmp_path / f"body{suffix}", mesh, ORIGIN)
-    told = json.loads((tmp_path / f"body{suffix}.json").read_text())
-    assert told["units"] == ("m" if suffix == ".glb" else "mm")
-    assert told["axes"]["y"] == ("up" if suffix == ".glb" else "left")
-    assert told["kind"] == "mesh"
-    assert told["vertices"] == len(mesh.vertices)
-    assert told["faces"] == len(mesh.faces)
-    assert told["filled_faces"] == np.count_nonzero(mesh.filled)
-    assert told["subject"] == "S-0042"
-    assert told["calibration_id"] == "3f2a"
-    assert told["software"] == f"bodyscan {__version__}"
+    info = json.loads((tmp_path / f"body{suffix}.json").read_text())
+    expected = {
+        "units": "m" if suffix == ".glb" else "mm",
+        "kind": "mesh",
+        "vertices": len(mesh.vertices),
+        "faces": len(mesh.faces),
+        "filled_faces": np.count_nonzero(mesh.filled),
+        "subject": "S-0042",
+        "calibration_id": "3f2a",
+        "software": f"bodyscan {__version__}",
+    }
+    assert info == info | expected
+    assert info["axes"]["y"] == ("up" if suffix == ".glb" else "left")
     assert sorted(p.name for p in tmp_path.iterdir()) == [f"body{suffix}", f"body{suffix}.json"]
 
 
-@pytest.mark.parametrize("suffix", [f".{name}" for name in CLOUD_FORMATS])
-def test_beside_each_cloud_too(tmp_path: Path, suffix: str) -> None:
+@pytest.mark.parametrize("suffix", [".ply", ".glb"])
+def test_the_json_beside_a_cloud_describes_it(tmp_path: Path, suffix: str) -> None:
     write_body(tmp_path / f"cloud{suffix}", points(), ORIGIN)
-    told = json.loads((tmp_path / f"cloud{suffix}.json").read_text())
-    assert told["kind"] == "cloud"
-    assert told["points"] == 500
+    info = json.loads((tmp_path / f"cloud{suffix}.json").read_text())
+    assert (info["kind"], info["points"]) == ("cloud", 500)
 
 
 @pytest.mark.parametrize(
@@ -206,9 +204,9 @@ def test_a_scan_in_several_versions(tmp_path: Path) -> None:
     names = ["body.ply", "body.stl", "body-open.ply", "body-open.stl"]
     assert [path.name for path in written] == names
     assert all(path.is_file() for path in written)
-    told = json.loads((tmp_path / "body-open.ply.json").read_text())
-    assert told["filled_faces"] == 0
-    assert told["subject"] is None
+    info = json.loads((tmp_path / "body-open.ply.json").read_text())
+    assert info["filled_faces"] == 0
+    assert info["subject"] is None
     with pytest.raises(BadInput, match="cannot be written as 'fbx'"):
         export_scan(scan, tmp_path, ["fbx"], ["full"])
     with pytest.raises(BadInput, match="no 'heavy' to export"):
@@ -219,8 +217,10 @@ def test_in_the_body_frame_the_body_faces_x_over_the_origin(tmp_path: Path) -> N
     """A flat upright body, turned by 30 degrees and put aside: in its own frame it stands straight."""
     flat = ball()
     straight = flat.vertices * [1.0, 3.0, 1.0]
-    placing = RigidTransform.from_rotation_vector([0.0, 0.0, np.radians(30.0)], [200.0, -90.0, 0.0])
-    askew = replace(flat, vertices=placing.apply(straight))
+    rig_from_body = RigidTransform.from_rotation_vector(
+        [0.0, 0.0, np.radians(30.0)], [200.0, -90.0, 0.0]
+    )
+    rotated = replace(flat, vertices=rig_from_body.apply(straight))
     facts = {
         "subject": "S-0042",
         "calibration_id": "3f2a",
@@ -228,21 +228,21 @@ def test_in_the_body_frame_the_body_faces_x_over_the_origin(tmp_path: Path) -> N
         "failed": {"p1-1": "is missing"},
         "alignment": {"motion_mm": {"p1-2": 1.25}},
     }
-    written = export_scan(StoredScan(points(), askew, facts), tmp_path, ["ply"], frame="body")
+    written = export_scan(StoredScan(points(), rotated, facts), tmp_path, ["ply"], frame="body")
     exported = read_ply_mesh(written[0])
     width, depth = np.ptp(exported.vertices[:, 1]), np.ptp(exported.vertices[:, 0])
     assert width == pytest.approx(np.ptp(straight[:, 1]), rel=1e-3)
     assert depth == pytest.approx(np.ptp(straight[:, 0]), rel=1e-3)
     assert np.abs(exported.vertices.mean(axis=0)[:2]).max() < 1e-3 * width
-    told = json.loads((tmp_path / "body.ply.json").read_text())
-    assert told["frame"] == "body"
-    back = np.array(told["rig_from_frame"])
+    info = json.loads((tmp_path / "body.ply.json").read_text())
+    assert info["frame"] == "body"
+    back = np.array(info["rig_from_frame"])
     np.testing.assert_allclose(
-        exported.vertices @ back[:3, :3].T + back[:3, 3], askew.vertices, atol=1e-6
+        exported.vertices @ back[:3, :3].T + back[:3, 3], rotated.vertices, atol=1e-6
     )
-    assert told["verdict"]["grade"] == "usable"
-    assert told["left_out"] == {"p1-1": "is missing"}
-    assert told["sway_mm"] == {"p1-2": 1.25}
-    assert told["coverage"] == pytest.approx(1.0 - told["filled_area_mm2"] / told["area_mm2"])
+    assert info["verdict"]["grade"] == "usable"
+    assert info["left_out"] == {"p1-1": "is missing"}
+    assert info["sway_mm"] == {"p1-2": 1.25}
+    assert info["coverage"] == pytest.approx(1.0 - info["filled_area_mm2"] / info["area_mm2"])
     with pytest.raises(BadInput, match="'room' to export"):
-        export_scan(StoredScan(points(), askew, facts), tmp_path, ["ply"], frame="room")
+        export_scan(StoredScan(points(), rotated, facts), tmp_path, ["ply"], frame="room")

@@ -20,7 +20,7 @@ from typer.testing import CliRunner
 from bodyscan.cli.main import app
 from bodyscan.errors import BadInput
 from bodyscan.export.body_file import Provenance, write_body
-from bodyscan.export.body_format import BODY_FORMATS
+from bodyscan.export.formats import BODY_FORMATS
 from bodyscan.export.scan import export_scan
 from bodyscan.fusion.storage import StoredScan
 from bodyscan.interchange.rig_format import RIG_FORMATS
@@ -41,8 +41,8 @@ def test_it_is_exported_as_all_are(tmp_path: Path) -> None:
     (written,) = export_scan(SCAN, tmp_path, ["XYZ"], ["full"])
     assert written == tmp_path / "body.xyz"
     np.testing.assert_allclose(np.loadtxt(written)[:, :3], ball().vertices, atol=6e-4)
-    told = json.loads((tmp_path / "body.xyz.json").read_text())
-    assert (told["kind"], told["units"], told["axes"]["z"]) == ("mesh", "mm", "up")
+    info = json.loads((tmp_path / "body.xyz.json").read_text())
+    assert (info["kind"], info["units"], info["axes"]["z"]) == ("mesh", "mm", "up")
     write_body(tmp_path / "cloud.xyz", points(), Provenance(None, "3f2a"))
     assert len(np.loadtxt(tmp_path / "cloud.xyz")) == 500
     pipeline = {"name": "p", "kind": "fuse", "export": {"formats": ["ply", "xyz"]}}
@@ -56,7 +56,7 @@ def test_a_name_that_is_taken_is_refused() -> None:
             BODY_FORMATS.register(name, xyz_format.FORMAT)
 
 
-def test_a_format_that_there_is_not_is_named_with_those_there_are(tmp_path: Path) -> None:
+def test_an_unknown_format_is_refused_with_a_list_of_formats(tmp_path: Path) -> None:
     with pytest.raises(BadInput, match=r"'xyz'") as caught:
         export_scan(SCAN, tmp_path, ["xyz"])
     assert caught.value.remedy == "choose from glb, obj, ply, stl"
@@ -97,5 +97,5 @@ def test_the_docs_have_every_format_with_what_it_holds() -> None:
     text = (Path(__file__).parents[2] / "docs" / "formats.md").read_text("utf-8")
     rows = dict(re.findall(r"^\| `\.(\w+)` \| (.*?) \|", text, re.MULTILINE))
     assert set(rows) == set(BODY_FORMATS.names())
-    for name, told in rows.items():
-        assert set(told.split(", ")) == set(BODY_FORMATS.find(name).holds), name
+    for name, info in rows.items():
+        assert set(info.split(", ")) == set(BODY_FORMATS.find(name).holds), name

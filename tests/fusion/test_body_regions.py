@@ -12,8 +12,7 @@ from ray_cast_scan import Scan, cast_scan, load_body, load_rig
 from bodyscan.arrays import Bytes, Mask
 from bodyscan.fusion.regions import CELL_MM, Regions, label_regions, lies_in
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.mesh.body import BodyCloud
-from bodyscan.mesh.regions import DARK_CLOTH, HAIR, SKIN, UNSURE, covered_shares
+from bodyscan.mesh.body import DARK_CLOTH, HAIR, SKIN, UNSURE, BodyCloud, compute_cover_shares
 from bodyscan.reconstruction.range_image import RangeImage
 
 BRIGHT = 120
@@ -229,8 +228,8 @@ def test_where_it_cannot_be_known_what_is_skin_all_is_unsure(seen: Seen, why: st
 
 def test_of_what_covers_the_skin_is_spoken_where_it_is_more_than_moles() -> None:
     regions = np.repeat(np.array([SKIN, HAIR, DARK_CLOTH, UNSURE], np.uint8), [700, 200, 97, 3])
-    assert covered_shares(regions) == pytest.approx({"hair": 0.2, "dark cloth": 0.097})
-    assert covered_shares(None) == {}
+    assert compute_cover_shares(regions) == pytest.approx({"hair": 0.2, "dark cloth": 0.097})
+    assert compute_cover_shares(None) == {}
 
 
 def test_pixels_that_are_looked_at_lie_in_the_cells_asked_about() -> None:

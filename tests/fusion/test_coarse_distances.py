@@ -7,7 +7,7 @@ import pytest
 
 from bodyscan.arrays import Array
 from bodyscan.fusion.hole_filling import Distances, _grid_around, _mirror, crossed, interpolated
-from bodyscan.mesh.bricks import SIDE, Bricks
+from bodyscan.mesh.surface_nets import SIDE, Bricks
 
 CELL_MM, FINE_MM = 7.0, 3.0
 ORIGIN = np.array([-40.0, 15.0, -3.5])
@@ -23,7 +23,7 @@ def distances(values: Array) -> Distances:
 
 
 def fine(shape: tuple[int, int, int]) -> Bricks:
-    return Bricks.where(np.ones(shape, bool), ORIGIN, FINE_MM)
+    return Bricks.from_mask(np.ones(shape, bool), ORIGIN, FINE_MM)
 
 
 def test_between_nodes_it_is_linear_and_beyond_the_grid_as_at_its_rim() -> None:
@@ -33,7 +33,7 @@ def test_between_nodes_it_is_linear_and_beyond_the_grid_as_at_its_rim() -> None:
 
     bricks = fine((6, 5, 7))
     found = interpolated(distances(field(nodes(SHAPE, CELL_MM))), bricks)
-    index = SIDE * bricks.places[:, None, None, None] + np.moveaxis(np.indices((SIDE,) * 3), 0, -1)
+    index = SIDE * bricks.indices[:, None, None, None] + np.moveaxis(np.indices((SIDE,) * 3), 0, -1)
     last = ORIGIN + CELL_MM * (np.array(SHAPE) - 1.0)
     truth = field(np.minimum(ORIGIN + FINE_MM * index, last))
     assert (ORIGIN + FINE_MM * index > last).any()

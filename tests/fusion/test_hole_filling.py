@@ -13,8 +13,8 @@ from bodyscan.fusion.hole_filling import CELL_MM, likely_distances
 from bodyscan.fusion.meshing import mesh
 from bodyscan.fusion.signed_distances import splat
 from bodyscan.mesh.body import BodyCloud
-from bodyscan.mesh.bricks import SIDE, Bricks, dense_of
-from bodyscan.mesh.topology import topology
+from bodyscan.mesh.surface_nets import SIDE, Bricks, join_bricks
+from bodyscan.mesh.topology import compute_topology
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.rig.pair import NominalPose
 from bodyscan.settings import MeshSettings
@@ -87,9 +87,9 @@ def test_a_bound_too_narrow_for_coarser_grids_pushes_the_surface_as_far_as_a_wid
 
 
 def test_splatted_distances_are_those_of_the_surface() -> None:
-    bricks = Bricks.where(np.ones((4, 4, 4), bool), np.full(3, -48.0), 3.0)
+    bricks = Bricks.from_mask(np.ones((4, 4, 4), bool), np.full(3, -48.0), 3.0)
     cloud = ball((0.0, 0.0, 0.0), 30.0, 20_000)
-    values, weights = (dense_of(part, (4, 4, 4)) for part in splat(cloud, bricks))
+    values, weights = (join_bricks(part, (4, 4, 4)) for part in splat(cloud, bricks))
     index = np.moveaxis(np.indices(values.shape), 0, -1)
     truth = np.linalg.norm(bricks.origin + 3.0 * index, axis=-1) - 30.0
     near = np.abs(truth) < 2.0
@@ -106,7 +106,7 @@ def test_a_ball_seen_in_part_is_closed(share: float, dent_mm: float) -> None:
     whole = ball((0.0, 0.0, 600.0), 150.0, 100_000)
     seen = whole.points[:, 2] > 600.0 + 150.0 * (1.0 - 2.0 * share)
     found = mesh(cloud_of(whole.points[seen], whole.normals[seen]), MeshSettings())
-    shape = topology(found.vertices, found.faces)
+    shape = compute_topology(found.vertices, found.faces)
     assert (shape.manifold, shape.components, shape.euler) == (True, 1, 2)
     off = np.linalg.norm(found.vertices - [0.0, 0.0, 600.0], axis=1) - 150.0
     measured = np.unique(found.faces[~found.filled])
@@ -125,7 +125,7 @@ def test_two_limbs_close_to_each_other_stay_two() -> None:
         np.concatenate([one.points, other.points]), np.concatenate([one.normals, other.normals])
     )
     found = mesh(both, MeshSettings())
-    shape = topology(found.vertices, found.faces)
+    shape = compute_topology(found.vertices, found.faces)
     assert (shape.components, shape.euler) == (1, 2)
     assert np.ptp(found.vertices[:, 1]) == pytest.approx(160.0, abs=1.0)
 
@@ -174,14 +174,14 @@ def test_a_point_says_the_more_the_better_it_is_known_but_nine_times_the_usual_a
 ) -> None:
     """A node between two planes, as far before one as it is behind the other; the middle one of three
     points, far off, is what is usual."""
-    bricks = Bricks.where(np.ones((2, 2, 2), bool), np.zeros(3), 4.0)
+    bricks = Bricks.from_mask(np.ones((2, 2, 2), bool), np.zeros(3), 4.0)
     points = np.array([[20.0, 20.0, 18.0], [20.0, 20.0, 22.0], [40.0, 40.0, 40.0]])
     usual = sigmas[1] if times == 4.0 else np.sqrt(sigmas[0] * sigmas[1])
     cloud = replace(
         cloud_of(points, np.tile([0.0, 0.0, 1.0], (3, 1))),
         sigma_mm=np.array([*sigmas, usual], np.float32),
     )
-    values, weights = (dense_of(part, (2, 2, 2)) for part in splat(cloud, bricks))
+    values, weights = (join_bricks(part, (2, 2, 2)) for part in splat(cloud, bricks))
     more = times if times == 4.0 else times**2
     # 2 mm over the first, 2 mm under the other; single precision.
     assert values[5, 5, 5] == pytest.approx(2.0 * (more - 1.0) / (more + 1.0), rel=1e-5)

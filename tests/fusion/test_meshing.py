@@ -16,10 +16,9 @@ from bodyscan.errors import ScanFailed
 from bodyscan.evaluation.surface import deviation, signed_distances
 from bodyscan.fusion.meshing import mesh
 from bodyscan.fusion.signed_distances import REACH_CELLS, touched
-from bodyscan.mesh.body import BodyCloud, BodyMesh
-from bodyscan.mesh.bricks import SIDE
-from bodyscan.mesh.regions import HAIR, SKIN, UNSURE
-from bodyscan.mesh.topology import signed_volume, topology
+from bodyscan.mesh.body import HAIR, SKIN, UNSURE, BodyCloud, BodyMesh
+from bodyscan.mesh.surface_nets import SIDE
+from bodyscan.mesh.topology import compute_topology, signed_volume
 from bodyscan.settings import MeshSettings
 
 
@@ -55,7 +54,7 @@ def test_bricks_are_wanted_that_hold_a_node_within_reach_or_next_to_one() -> Non
 
 
 def test_closed_manifold_one_piece_outward(scan: Scan, body: BodyMesh) -> None:
-    found = topology(body.vertices, body.faces)
+    found = compute_topology(body.vertices, body.faces)
     assert found.closed
     assert found.manifold
     assert found.components == 1
@@ -77,7 +76,7 @@ def handles_between(body: BodyMesh, low_mm: float, high_mm: float) -> int:
     arms are plain tubes there."""
     z = body.vertices[body.faces][:, :, 2]
     part = body.faces[((z > low_mm) & (z < high_mm)).all(axis=1)]
-    found = topology(body.vertices, part)
+    found = compute_topology(body.vertices, part)
     edges = np.sort(np.concatenate([part[:, [0, 1]], part[:, [1, 2]], part[:, [2, 0]]]), axis=1)
     once = np.unique(edges, axis=0, return_counts=True)
     rim = once[0][once[1] == 1]
@@ -149,7 +148,7 @@ def sole_area(truth: Truth) -> float:
 
 def test_the_same_cloud_gives_the_same_bytes(scan: Scan, cloud: BodyCloud) -> None:
     high = np.where(cloud.points[:, 2] > 1000.0, HAIR, SKIN).astype(np.uint8)
-    some = replace(cloud, regions=high).every(4)
+    some = replace(cloud, regions=high).subsample(4)
     one, other = (
         mesh(
             some,
@@ -177,11 +176,11 @@ def test_the_same_cloud_gives_the_same_bytes(scan: Scan, cloud: BodyCloud) -> No
 def test_a_body_clear_of_the_floor_needs_no_hints(cloud: BodyCloud) -> None:
     lifted = replace(cloud, points=cloud.points + np.array([0.0, 0.0, 200.0]))
     found = mesh(lifted, MeshSettings(depth=6))
-    assert topology(found.vertices, found.faces).manifold
+    assert compute_topology(found.vertices, found.faces).manifold
     assert found.vertices[:, 2].min() > 100.0
 
 
 def test_a_handful_of_points_is_an_error(cloud: BodyCloud) -> None:
-    few = cloud.every(1000)
+    few = cloud.subsample(1000)
     with pytest.raises(ScanFailed, match="too small"):
         mesh(few, MeshSettings())

@@ -11,8 +11,7 @@ from ray_cast_scan import ROOT, load_body
 
 from bodyscan.measurement.head import BRAINCASE_MM, _between, _Ellipsoid, _fit, estimate_head_top
 from bodyscan.measurement.measurements import measure
-from bodyscan.mesh.body import BodyMesh
-from bodyscan.mesh.regions import DARK_CLOTH, HAIR, SKIN, UNSURE
+from bodyscan.mesh.body import DARK_CLOTH, HAIR, SKIN, UNSURE, BodyMesh
 from bodyscan.report.measurements import tables
 
 HAIRLINE, SLANT = 0.95, 0.5

@@ -13,8 +13,7 @@ from made_bodies import boxes, cylinder, ellipsoid, mesh_of, together
 from bodyscan.errors import BadInput
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.measurement.measurements import Slice, heights_from, measure
-from bodyscan.mesh.body import BodyMesh, BreathAt
-from bodyscan.mesh.regions import DARK_CLOTH, HAIR, SKIN
+from bodyscan.mesh.body import DARK_CLOTH, HAIR, SKIN, BodyMesh, BreathAt
 from bodyscan.report.measurements import measurements_document, tables
 
 SUBJECT = Path(__file__).parents[2] / "data" / "subjects" / "woman_average.ply"

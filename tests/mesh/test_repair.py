@@ -1,6 +1,9 @@
-"""Damaged surfaces become closed manifold ones; sound ones stay."""
+"""Damaged surfaces become closed manifolds, slivers are collapsed; sound surfaces stay."""
 
 from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import open3d as o3d
@@ -8,14 +11,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_bodies import arrays, together
+from made_scan import egg
 
-from bodyscan.mesh.repair import close_mesh, largest_piece
-from bodyscan.mesh.topology import topology
+from bodyscan.export.body_file import Provenance, write_body
+from bodyscan.mesh.body import BodyMesh
+from bodyscan.mesh.repair import close_mesh, collapse_slivers, extract_largest_piece
+from bodyscan.mesh.topology import compute_topology, directed_edges, face_areas
 
-SPHERE = o3d.geometry.TriangleMesh.create_sphere(100.0, 12)
-VERTICES = np.asarray(SPHERE.vertices)
-FACES = np.asarray(SPHERE.triangles).astype(np.int64)
-VOLUME = topology(VERTICES, FACES).volume_mm3
+VERTICES, FACES = arrays(o3d.geometry.TriangleMesh.create_sphere(100.0, 12))
+VOLUME = compute_topology(VERTICES, FACES).volume_mm3
 
 
 def test_a_sound_surface_stays_as_it_is() -> None:
@@ -30,34 +34,30 @@ def test_a_sound_surface_stays_as_it_is() -> None:
 def test_holes_are_closed(seed: int, share: float) -> None:
     kept = np.random.default_rng(seed).random(len(FACES)) >= share
     vertices, faces = close_mesh(VERTICES, FACES[kept])
-    found = topology(vertices, faces)
+    found = compute_topology(vertices, faces)
     assert found.manifold
     assert found.volume_mm3 > 0
 
 
 def test_a_hole_of_one_face_costs_next_to_no_volume() -> None:
-    found = topology(*close_mesh(VERTICES, FACES[1:]))
+    found = compute_topology(*close_mesh(VERTICES, FACES[1:]))
     assert found.euler == 2
     assert found.components == 1
     assert found.volume_mm3 == pytest.approx(VOLUME, rel=1e-6)
 
 
-def test_a_fin_on_an_edge_goes() -> None:
+FIN = [FACES[50, 0], FACES[50, 1], len(VERTICES)]
+
+
+@pytest.mark.parametrize("extra", [FIN, FACES[30], FACES[30, ::-1], [5, 5, 6]], ids=str)
+def test_faces_too_many_at_an_edge_are_removed(extra: list[int]) -> None:
+    """A fin, a face twice, in either direction, and a face with a repeated corner."""
     vertices = np.concatenate([VERTICES, [[0.0, 0.0, 200.0]]])
-    fin = [FACES[50, 0], FACES[50, 1], len(VERTICES)]
-    assert not topology(vertices, np.concatenate([FACES, [fin]])).closed
-    found = topology(*close_mesh(vertices, np.concatenate([FACES, [fin]])))
+    faces = np.concatenate([FACES, [extra]])
+    assert not compute_topology(vertices, faces).closed
+    found = compute_topology(*close_mesh(vertices, faces))
     assert found.manifold
-    assert found.euler == 2
-    # The two faces at the edge go with the fin, and a flat patch takes their place.
-    assert found.volume_mm3 == pytest.approx(VOLUME, rel=0.01)
-
-
-@pytest.mark.parametrize("turned", [False, True])
-def test_a_doubled_face_goes(turned: bool) -> None:
-    again = FACES[30:31, ::-1] if turned else FACES[30:31]
-    found = topology(*close_mesh(VERTICES, np.concatenate([FACES, again])))
-    assert found.manifold
+    # The two faces at the edge go as well, and a flat patch takes their place.
     assert found.volume_mm3 == pytest.approx(VOLUME, rel=0.01)
 
 
@@ -66,25 +66,55 @@ def test_surfaces_that_touch_in_a_vertex_are_parted() -> None:
     top = VERTICES[0]
     vertices = np.concatenate([VERTICES, 2.0 * top - VERTICES])
     faces = np.concatenate([FACES, other[:, ::-1]])
-    before = topology(vertices, faces)
+    before = compute_topology(vertices, faces)
     assert before.closed
     assert not before.manifold
-    found = topology(*close_mesh(vertices, faces))
+    found = compute_topology(*close_mesh(vertices, faces))
     assert found.manifold
     assert (found.components, found.euler) == (2, 4)
 
 
-def test_a_face_with_a_repeated_corner_goes() -> None:
-    found = topology(*close_mesh(VERTICES, np.concatenate([FACES, [[5, 5, 6]]])))
-    assert found.manifold
-
-
-def test_of_several_pieces_the_one_that_was_measured_most_is_kept() -> None:
-    """A wall's back, filled, may have more faces than what stands before it."""
+def test_the_piece_nearest_to_most_points_is_kept() -> None:
     make = o3d.geometry.TriangleMesh.create_sphere
     small, large = arrays(make(40.0, 8)), arrays(make(100.0, 24).translate([500.0, 0.0, 0.0]))
     vertices, faces = together(small, large)
-    assert len(largest_piece(vertices, faces)[1]) == len(large[1])
+    assert len(extract_largest_piece(vertices, faces)[1]) == len(large[1])
     points = np.concatenate([np.repeat(1.01 * small[0], 50, axis=0), large[0]])
-    kept, _ = largest_piece(vertices, faces, points)
+    kept, _ = extract_largest_piece(vertices, faces, points)
     np.testing.assert_allclose(np.linalg.norm(kept, axis=1).max(), 40.0)
+
+
+def pinched() -> tuple[BodyMesh, BodyMesh]:
+    """An egg, and the same with both ends of one of its edges within a ten-thousandth of a mm."""
+    whole = egg(resolution=12)
+    vertices = np.round(whole.vertices, 3)
+    a, b = whole.faces[40, :2]
+    vertices[b] = vertices[a] + 2e-5
+    return whole, replace(whole, vertices=vertices)
+
+
+def test_the_edge_is_drawn_together_and_the_mesh_stays_closed() -> None:
+    _, mesh = pinched()
+    found = collapse_slivers(mesh)
+    assert len(found.faces) == len(mesh.faces) - 2
+    assert len(found.vertices) == len(mesh.vertices) - 1 == len(found.sigma_mm)
+    assert len(found.filled) == len(found.faces)
+    edges = {tuple(edge) for edge in directed_edges(found.faces).tolist()}
+    assert edges == {(b, a) for a, b in edges}
+    np.testing.assert_allclose(
+        np.ptp(found.vertices, axis=0), np.ptp(mesh.vertices, axis=0), atol=1e-4
+    )
+
+
+def test_a_sound_mesh_is_left_alone() -> None:
+    whole, _ = pinched()
+    assert collapse_slivers(whole) is whole
+
+
+def test_no_face_of_an_exported_obj_is_without_area(tmp_path: Path) -> None:
+    _, mesh = pinched()
+    write_body(tmp_path / "body.obj", mesh, Provenance(None, "01"))
+    rows = [line.split() for line in (tmp_path / "body.obj").read_text().splitlines()]
+    vertices = np.array([row[1:4] for row in rows if row[0] == "v"], float)
+    faces = np.array([[int(c.split("/")[0]) - 1 for c in row[1:]] for row in rows if row[0] == "f"])
+    assert face_areas(vertices, faces).min() > 0.0

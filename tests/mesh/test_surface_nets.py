@@ -5,16 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bodyscan.mesh.bricks import SIDE, Bricks, bricks_of, dense_of
-from bodyscan.mesh.surface_nets import surface_nets
-from bodyscan.mesh.topology import topology
+from bodyscan.mesh.surface_nets import SIDE, Bricks, extract_surface, join_bricks, split_into_bricks
+from bodyscan.mesh.topology import compute_topology
 
 SHAPE = (3, 2, 4)
 
 
 def grid(kept: np.ndarray | None = None) -> Bricks:
     wanted = np.ones(SHAPE, bool) if kept is None else kept
-    return Bricks.where(wanted, np.array([10.0, -20.0, 5.0]), 2.0)
+    return Bricks.from_mask(wanted, np.array([10.0, -20.0, 5.0]), 2.0)
 
 
 def nodes(bricks: Bricks) -> np.ndarray:
@@ -27,12 +26,12 @@ def test_a_ball_is_round_and_outward() -> None:
     bricks = grid()
     centre, radius = bricks.origin + [23.0, 15.3, 31.1], 12.2
     values = np.linalg.norm(nodes(bricks) - centre, axis=-1) - radius
-    vertices, faces = surface_nets(bricks, bricks_of(values.astype(np.float32)))
-    found = topology(vertices, faces)
+    vertices, faces = extract_surface(bricks, split_into_bricks(values.astype(np.float32)))
+    found = compute_topology(vertices, faces)
     assert (found.manifold, found.components, found.euler) == (True, 1, 2)
     # Means of crossings lie inside a curved surface by up to cell^2 / (4 radius), 0.08 mm.
-    off = np.linalg.norm(vertices - centre, axis=1) - radius
-    assert -0.12 < off.min() < off.max() < 0.04
+    error = np.linalg.norm(vertices - centre, axis=1) - radius
+    assert -0.12 < error.min() < error.max() < 0.04
     assert found.volume_mm3 == pytest.approx(4 / 3 * np.pi * radius**3, rel=0.03)
 
 
@@ -43,9 +42,9 @@ def test_noise_gives_closed_manifold_surfaces(seed: int) -> None:
     values = np.ones([SIDE * size for size in SHAPE], np.float32)
     values[1:-1, 1:-1, 1:-1] = rng.normal(size=[SIDE * size - 2 for size in SHAPE])
     bricks = grid()
-    vertices, faces = surface_nets(bricks, bricks_of(values))
+    vertices, faces = extract_surface(bricks, split_into_bricks(values))
     assert len(faces) > 3000
-    found = topology(vertices, faces)
+    found = compute_topology(vertices, faces)
     assert found.closed
     assert found.manifold
     np.testing.assert_array_equal(np.unique(faces), np.arange(len(vertices)))
@@ -54,11 +53,11 @@ def test_noise_gives_closed_manifold_surfaces(seed: int) -> None:
 def test_bricks_away_from_the_surface_are_not_needed() -> None:
     whole = grid()
     values = np.linalg.norm(nodes(whole) - whole.origin - [15.0, 15.0, 25.0], axis=-1) - 10.0
-    dense = bricks_of(values.astype(np.float32))
+    dense = split_into_bricks(values.astype(np.float32))
     near = np.abs(dense).reshape(len(dense), -1).min(axis=1) < 4.0
     kept = near.reshape(SHAPE)
     assert 4 < near.sum() < near.size
-    all_of_it, sparse = surface_nets(whole, dense), surface_nets(grid(kept), dense[near])
+    all_of_it, sparse = extract_surface(whole, dense), extract_surface(grid(kept), dense[near])
     np.testing.assert_array_equal(all_of_it[0], sparse[0])
     np.testing.assert_array_equal(all_of_it[1], sparse[1])
 
@@ -68,12 +67,14 @@ def test_surfaces_closer_than_a_cell_stay_apart() -> None:
     bricks = grid()
     centres = bricks.origin + [[14.0, 14.0, 14.0], [14.0, 14.0, 34.0]]
     to_each = np.linalg.norm(nodes(bricks)[..., None, :] - centres, axis=-1) - 9.1
-    vertices, faces = surface_nets(bricks, bricks_of(to_each.min(axis=-1).astype(np.float32)))
-    found = topology(vertices, faces)
+    vertices, faces = extract_surface(
+        bricks, split_into_bricks(to_each.min(axis=-1).astype(np.float32))
+    )
+    found = compute_topology(vertices, faces)
     assert found.manifold
     assert found.components == 2
 
 
 def test_bricks_and_dense_values_are_the_same() -> None:
     dense = np.random.default_rng(0).normal(size=[SIDE * n for n in SHAPE]).astype(np.float32)
-    np.testing.assert_array_equal(dense_of(bricks_of(dense), SHAPE), dense)
+    np.testing.assert_array_equal(join_bricks(split_into_bricks(dense), SHAPE), dense)

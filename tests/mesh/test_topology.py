@@ -1,121 +1,179 @@
-"""Small surfaces whose topology is known."""
+"""Half-edges, topology, normals and handles of small surfaces that are known."""
 
 from __future__ import annotations
 
+import networkx as nx
 import numpy as np
 import open3d as o3d
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from made_bodies import arrays, together
 
+from bodyscan.arrays import Indices
 from bodyscan.mesh.topology import (
+    RIM,
+    UNSOUND,
+    compute_topology,
     drop_unused_vertices,
-    face_components,
     face_normals,
+    find_handles,
+    find_twins,
+    label_components,
+    label_corner_fans,
+    prune_branches,
     signed_volume,
-    topology,
     vertex_normals,
 )
 
+make = o3d.geometry.TriangleMesh
+TORUS = np.asarray(make.create_torus(30.0, 10.0, 12, 8).triangles).astype(np.int64)
+COUNT = int(TORUS.max()) + 1
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], float)
 TETRAHEDRON = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
+APEX = np.array([0, 4, 5, 6])
 
 
-def arrays(mesh: o3d.geometry.TriangleMesh) -> tuple[np.ndarray, np.ndarray]:
-    return np.asarray(mesh.vertices), np.asarray(mesh.triangles).astype(np.int64)
+@given(seed=st.integers(0, 1000), missing=st.integers(0, 60))
+def test_twins_run_in_the_opposite_direction(seed: int, missing: int) -> None:
+    removed = np.random.default_rng(seed).choice(len(TORUS), missing, replace=False)
+    faces = np.delete(TORUS, removed, axis=0)
+    edges = np.stack([faces.ravel(), np.roll(faces, -1, axis=1).ravel()], axis=-1)
+    known = {(int(a), int(b)): number for number, (a, b) in enumerate(edges)}
+    expected = [known.get((int(b), int(a)), RIM) for a, b in edges]
+    np.testing.assert_array_equal(find_twins(faces, COUNT).ravel(), expected)
 
 
-def test_a_tetrahedron() -> None:
-    found = topology(CORNERS, TETRAHEDRON)
-    assert found.closed
-    assert found.manifold
-    assert (found.components, found.euler) == (1, 2)
-    assert found.volume_mm3 == pytest.approx(1 / 6)
+def test_edges_of_three_faces_and_edges_without_length_are_unsound() -> None:
+    twin = find_twins(np.concatenate([TORUS, [[TORUS[0, 0], TORUS[0, 1], COUNT]]]), COUNT + 1)
+    assert twin[0, 0] == twin[-1, 0] == UNSOUND
+    assert np.count_nonzero(twin == UNSOUND) == 3  # both half-edges in the torus, and the fin's
+    assert find_twins(np.array([[0, 0, 1]]), 2)[0, 0] == UNSOUND
 
 
-def test_a_torus_has_a_handle() -> None:
-    found = topology(*arrays(o3d.geometry.TriangleMesh.create_torus(30.0, 10.0)))
-    assert found.manifold
-    assert (found.components, found.euler) == (1, 0)
+def test_every_vertex_of_a_closed_surface_has_one_fan() -> None:
+    labels, count = label_corner_fans(find_twins(TORUS, COUNT))
+    assert count == COUNT
+    assert len(np.unique(np.stack([labels.ravel(), TORUS.ravel()]), axis=1).T) == COUNT
+    labels, count = label_corner_fans(find_twins(np.empty((0, 3), np.int64), 0))
+    assert (labels.shape, count) == ((0, 3), 0)
 
 
-@given(missing=st.integers(0, 3))
-def test_a_missing_face_opens_it(missing: int) -> None:
-    found = topology(CORNERS, np.delete(TETRAHEDRON, missing, axis=0))
-    assert not found.closed
-    assert not found.manifold
-    assert found.euler == 1
+def test_a_vertex_with_two_rims_has_two_fans() -> None:
+    """Four of six faces around vertex 0, in two pairs that have only the vertex in common."""
+    faces = np.array([[0, k, k % 6 + 1] for k in (1, 2, 4, 5)])
+    labels, count = label_corner_fans(find_twins(faces, 7))
+    assert labels[0, 0] == labels[1, 0] != labels[2, 0] == labels[3, 0]
+    assert count == 2 + 6
 
 
-@given(turned=st.integers(0, 3))
-def test_a_turned_face_is_found(turned: int) -> None:
-    faces = TETRAHEDRON.copy()
-    faces[turned] = faces[turned, ::-1]
-    assert not topology(CORNERS, faces).closed
+TWO = (np.concatenate([CORNERS, CORNERS + 5.0]), np.concatenate([TETRAHEDRON, TETRAHEDRON + 4]))
+TOUCHING = np.concatenate([CORNERS, -CORNERS[1:]])
 
 
-def test_all_faces_turned_is_closed_but_inside_out() -> None:
-    found = topology(CORNERS, TETRAHEDRON[:, ::-1])
-    assert found.manifold
-    assert found.volume_mm3 == pytest.approx(-1 / 6)
-
-
-def test_two_pieces() -> None:
-    vertices = np.concatenate([CORNERS, CORNERS + 5.0])
-    faces = np.concatenate([TETRAHEDRON, TETRAHEDRON + 4])
-    found = topology(vertices, faces)
-    assert found.manifold
-    assert (found.components, found.euler) == (2, 4)
-    np.testing.assert_array_equal(face_components(faces, 8), [0] * 4 + [1] * 4)
-
-
-def test_two_pieces_that_touch_in_one_vertex_are_closed_but_no_manifold() -> None:
-    vertices = np.concatenate([CORNERS, -CORNERS[1:]])
-    other = np.array([0, 4, 5, 6])[TETRAHEDRON][:, ::-1]
-    found = topology(vertices, np.concatenate([TETRAHEDRON, other]))
-    assert found.closed
-    assert not found.manifold
-    assert found.components == 1
-
-
-def test_three_faces_at_an_edge_are_not_closed() -> None:
-    vertices = np.concatenate([CORNERS, [[1.0, 1.0, 1.0]]])
-    faces = np.concatenate([TETRAHEDRON, [[0, 1, 4]]])
-    assert not topology(vertices, faces).closed
-
-
-def test_a_degenerate_face_is_not_closed() -> None:
-    assert not topology(CORNERS, np.concatenate([TETRAHEDRON, [[0, 0, 1]]])).closed
-
-
-@given(
-    scale=st.floats(0.1, 100.0),
-    shift=st.tuples(*[st.floats(-1000.0, 1000.0)] * 3),
+@pytest.mark.parametrize(
+    ("vertices", "faces", "closed", "manifold", "components", "euler"),
+    [
+        (CORNERS, TETRAHEDRON, True, True, 1, 2),
+        (CORNERS, TETRAHEDRON[:, ::-1], True, True, 1, 2),
+        (*arrays(make.create_torus(30.0, 10.0)), True, True, 1, 0),
+        (*TWO, True, True, 2, 4),
+        (TOUCHING, np.concatenate([TETRAHEDRON, APEX[TETRAHEDRON][:, ::-1]]), True, False, 1, 3),
+        *((CORNERS, np.delete(TETRAHEDRON, k, axis=0), False, False, 1, 1) for k in range(4)),
+        (np.vstack([CORNERS, [1, 1, 1]]), np.vstack([TETRAHEDRON, [0, 1, 4]]), False, False, 1, 2),
+        (CORNERS, np.vstack([TETRAHEDRON, [0, 0, 1]]), False, False, 1, 2),
+    ],
 )
+def test_topology_of_known_surfaces(
+    vertices: np.ndarray, faces: Indices, closed: bool, manifold: bool, components: int, euler: int
+) -> None:
+    found = compute_topology(vertices, faces)
+    assert (found.closed, found.manifold, found.components) == (closed, manifold, components)
+    if faces.shape[0] == 4 or closed:
+        assert found.euler == euler
+
+
+@given(flipped=st.integers(0, 3))
+def test_a_flipped_face_opens_the_surface_and_flipping_all_changes_the_volumes_sign(
+    flipped: int,
+) -> None:
+    faces = TETRAHEDRON.copy()
+    faces[flipped] = faces[flipped, ::-1]
+    assert not compute_topology(CORNERS, faces).closed
+    assert compute_topology(CORNERS, TETRAHEDRON).volume_mm3 == pytest.approx(1 / 6)
+    assert compute_topology(CORNERS, TETRAHEDRON[:, ::-1]).volume_mm3 == pytest.approx(-1 / 6)
+
+
+def test_components_are_numbered_and_unused_vertices_dropped() -> None:
+    np.testing.assert_array_equal(label_components(TWO[1], 8), [0] * 4 + [1] * 4)
+    vertices = np.concatenate([[[9.0, 9.0, 9.0]], CORNERS, [[8.0, 8.0, 8.0]]])
+    kept, faces, used = drop_unused_vertices(vertices, TETRAHEDRON + 1)
+    np.testing.assert_array_equal(kept, CORNERS)
+    np.testing.assert_array_equal(faces, TETRAHEDRON)
+    np.testing.assert_array_equal(used, [1, 2, 3, 4])
+    assert compute_topology(vertices, TETRAHEDRON + 1).euler == 2
+
+
+@given(scale=st.floats(0.1, 100.0), shift=st.tuples(*[st.floats(-1000.0, 1000.0)] * 3))
 def test_volume_of_a_box(scale: float, shift: tuple[float, float, float]) -> None:
-    vertices, faces = arrays(o3d.geometry.TriangleMesh.create_box(1.0, 2.0, 3.0))
+    vertices, faces = arrays(make.create_box(1.0, 2.0, 3.0))
     volume = signed_volume(scale * vertices + np.array(shift), faces)
     # Differences of products of three coordinates of up to a thousand: 1e9 times 1e-16 each.
     assert volume == pytest.approx(6.0 * scale**3, rel=1e-9, abs=1e-5)
 
 
-def test_normals_of_a_sphere_point_outward() -> None:
-    vertices, faces = arrays(o3d.geometry.TriangleMesh.create_sphere(10.0, resolution=40))
+def test_normals() -> None:
+    vertices, faces = arrays(make.create_sphere(10.0, resolution=40))
     cosine = np.sum(vertex_normals(vertices, faces) * vertices, axis=1) / 10.0
     assert cosine.min() > 0.998  # facets of 4.5 degrees
-
-
-def test_normals_of_faces_are_the_cross_products_of_their_edges() -> None:
     rng = np.random.default_rng(4)
     vertices, faces = rng.normal(size=(30, 3)), rng.integers(0, 30, (80, 3))
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     np.testing.assert_array_equal(face_normals(vertices, faces), np.cross(b - a, c - a))
 
 
-def test_unused_vertices_are_dropped() -> None:
-    vertices = np.concatenate([[[9.0, 9.0, 9.0]], CORNERS, [[8.0, 8.0, 8.0]]])
-    kept, faces, used = drop_unused_vertices(vertices, TETRAHEDRON + 1)
-    np.testing.assert_array_equal(kept, CORNERS)
-    np.testing.assert_array_equal(faces, TETRAHEDRON)
-    np.testing.assert_array_equal(used, [1, 2, 3, 4])
-    assert topology(vertices, TETRAHEDRON + 1).euler == 2
+def upright_ring(radius_mm: float, at: tuple[float, float, float]) -> tuple[np.ndarray, Indices]:
+    torus = make.create_torus(radius_mm, 0.25 * radius_mm, 60, 30)
+    torus.rotate(torus.get_rotation_matrix_from_xyz((np.pi / 2.0, 0.0, 0.0)), (0.0, 0.0, 0.0))
+    vertices, faces = arrays(torus)
+    return vertices + at, faces
+
+
+def test_a_handle_has_its_height_and_position() -> None:
+    """From the lowest layer to the highest that its hole separates, and those that close it."""
+    (handle,) = find_handles(*upright_ring(120.0, (30.0, -70.0, 1000.0)))
+    assert handle.y_mm == pytest.approx(-70.0, abs=5.0)
+    assert 0.5 * (handle.low_mm + handle.high_mm) == pytest.approx(1000.0, abs=10.0)
+    # The hole is 180 mm high: of layers of 20 mm nine, and one on either side.
+    assert handle.high_mm - handle.low_mm == pytest.approx(200.0, abs=20.0)
+
+
+def test_surfaces_without_a_handle_and_with_small_ones() -> None:
+    for radius in (150.0, 5.0):  # the second within one layer
+        vertices, faces = arrays(make.create_sphere(radius, 40))
+        assert not find_handles(vertices + [0.0, 0.0, 1010.0], faces, min_height_mm=0.0)
+    small = upright_ring(40.0, (0.0, 0.0, 500.0))
+    assert not find_handles(*small)
+    assert len(find_handles(*small, min_height_mm=50.0)) == 1
+    assert len(find_handles(*upright_ring(60.0, (0.0, 0.0, 500.0)))) == 1  # its hole: 90 mm
+    # A tetrahedron 200 mm high, one of whose edges has a vertex half way up.
+    corners = np.array([[0, 0, 0], [90, 0, 0], [0, 90, 0], [0, 0, 200], [0, 0, 100]], float)
+    faces = np.array([[0, 2, 1], [1, 2, 3], [0, 1, 4], [4, 1, 3], [2, 0, 4], [2, 4, 3]])
+    assert not find_handles(corners, faces)
+
+
+def test_handles_are_sorted_by_height_then_from_right_to_left() -> None:
+    centres = ((0.0, 200.0, 1000.0), (0.0, 0.0, 1400.0), (0.0, -200.0, 1000.0), (0.0, 0.0, 500.0))
+    found = find_handles(*together(*(upright_ring(80.0, centre) for centre in centres)))
+    assert [round(handle.y_mm, -2) for handle in found] == [0.0, -200.0, 200.0, 0.0]
+    assert np.diff([handle.low_mm for handle in found]).tolist() == [500.0, 0.0, 400.0]
+
+
+def test_pruning_branches_leaves_the_graphs_core() -> None:
+    rng = np.random.default_rng(5)
+    for count in range(1, 60):
+        links = rng.integers(2 + count // 3, size=(count, 2))
+        links = links[links[:, 0] != links[:, 1]]
+        core = nx.k_core(nx.Graph(links.tolist()), 2)
+        found = {frozenset(link) for link in prune_branches(links).tolist()}
+        assert found == {frozenset(edge) for edge in core.edges}

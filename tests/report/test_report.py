@@ -23,9 +23,7 @@ from bodyscan.evaluation.comparison import compare_surfaces
 from bodyscan.files.atomic import write_json
 from bodyscan.fusion.storage import Origin
 from bodyscan.jobs.forgetting import find_subject
-from bodyscan.mesh.body import BodyCloud
-from bodyscan.mesh.holes import holes
-from bodyscan.mesh.regions import HAIR, SKIN
+from bodyscan.mesh.body import HAIR, SKIN, BodyCloud, find_filled_patches
 from bodyscan.report.body_model import layers
 from bodyscan.report.model import Layer, Shape, pack
 from bodyscan.report.page import Number, render
@@ -137,16 +135,16 @@ def test_holes_are_found_where_nothing_was_measured() -> None:
     height = mesh.vertices[mesh.faces][:, :, 2].mean(axis=1)
     (sole, crown) = height < 80.0, height > 1600.0
     both = replace(mesh, filled=sole | crown)
-    found = sorted(holes(both), key=lambda hole: hole.middle[2])
-    assert [hole.faces for hole in found] == ["down", "up"]
+    found = sorted(find_filled_patches(both), key=lambda hole: hole.centre[2])
+    assert [hole.facing for hole in found] == ["down", "up"]
     for hole, chosen in zip(found, (sole, crown), strict=True):
         patch = o3d.geometry.TriangleMesh(
             o3d.utility.Vector3dVector(mesh.vertices),
             o3d.utility.Vector3iVector(mesh.faces[chosen]),
         )
         assert hole.area_mm2 == pytest.approx(patch.get_surface_area(), rel=1e-9)
-        assert height[chosen].min() < hole.middle[2] < height[chosen].max()
-    assert holes(replace(mesh, filled=np.zeros_like(mesh.filled))) == []
+        assert height[chosen].min() < hole.centre[2] < height[chosen].max()
+    assert find_filled_patches(replace(mesh, filled=np.zeros_like(mesh.filled))) == []
 
 
 def test_a_larger_body_lies_outside_of_a_smaller_one(tmp_path: Path) -> None:

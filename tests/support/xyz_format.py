@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bodyscan.export.body_format import BodyFormat
+from bodyscan.export.formats import BodyFormat
 from bodyscan.files.atomic import write_text
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 

@@ -15,7 +15,7 @@ from bodyscan.evaluation.surface import deviation, normalized_errors, signed_dis
 from bodyscan.fusion.storage import load_scan
 from bodyscan.geometry.sheet_arrays import to_arrays
 from bodyscan.mesh.ply import read_ply_mesh
-from bodyscan.mesh.topology import topology
+from bodyscan.mesh.topology import compute_topology
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.storage import load_calibration, save_calibration
 from bodyscan.workflows.evaluate import compare_rig, evaluate_workspace, load_truth
@@ -72,7 +72,7 @@ def test_points_are_as_far_off_as_they_say(workspace: Workspace) -> None:
 
 def test_the_mesh_is_closed_and_looks_outwards(workspace: Workspace) -> None:
     stored = load_scan(workspace.folder / "scan")
-    shape = topology(stored.mesh.vertices, stored.mesh.faces)
+    shape = compute_topology(stored.mesh.vertices, stored.mesh.faces)
     assert shape.closed
     assert shape.components == 1
     assert shape.volume_mm3 > 0
@@ -88,7 +88,7 @@ def test_exports_are_there_and_say_what_they_are(workspace: Workspace) -> None:
     exported = read_ply_mesh(folder / "body.ply")
     # A few triangles without area are left out, no others.
     assert 0 <= len(stored.mesh.faces) - len(exported.faces) < 1e-4 * len(stored.mesh.faces)
-    shape = topology(exported.vertices, exported.faces)
+    shape = compute_topology(exported.vertices, exported.faces)
     assert shape.closed
     assert shape.components == 1
 

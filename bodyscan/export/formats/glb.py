@@ -11,18 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyscan.arrays import Bytes, Indices
-from bodyscan.export.body_format import BodyFormat
+from bodyscan.export.formats import BodyFormat
 from bodyscan.files.atomic import atomic_replacement
 from bodyscan.mesh.body import BodyCloud, BodyMesh
-
-FLOAT, UNSIGNED_SHORT, UNSIGNED_INT = 5126, 5123, 5125
-ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
-POINTS, TRIANGLES = 0, 4
 
 
 def write_glb(path: Path, body: BodyCloud | BodyMesh) -> None:
     """Write a mesh or a cloud. A mesh's vertices carry `_FILLED`, 1 where nothing was measured; all
-    carry `_REGION`, an index into `regions.NAMES`, if it is known."""
+    carry `_REGION`, an index into `REGION_NAMES`, if it is known."""
     points = body.points if isinstance(body, BodyCloud) else body.vertices
     attributes = {
         "POSITION": _y_up(points) / 1000.0,
@@ -38,7 +34,7 @@ def write_glb(path: Path, body: BodyCloud | BodyMesh) -> None:
     document, chunks = _document(attributes, indices)
     text = json.dumps(document, separators=(",", ":")).encode("ascii")
     text += b" " * (-len(text) % 4)
-    size = sum(len(chunk) for chunk in chunks)
+    size = sum(map(len, chunks))
     with atomic_replacement(Path(path)) as temporary, temporary.open("wb") as stream:
         stream.write(struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + size))
         stream.write(struct.pack("<I4s", len(text), b"JSON") + text)
@@ -48,12 +44,12 @@ def write_glb(path: Path, body: BodyCloud | BodyMesh) -> None:
 
 
 def _y_up(vectors: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Rig frame (x front, y left, z up) to glTF's (x left, y up, z front)."""
+    """Vectors (N, 3) of the rig frame (x front, y left, z up) in glTF's (x left, y up, z front)."""
     return vectors[:, [1, 2, 0]]
 
 
 def _linear(colours: Bytes) -> NDArray[np.uint16]:
-    """sRGB bytes (N, 3) to linear shorts (N, 4): glTF's vertex colours are linear, with alpha."""
+    """Linear shorts (N, 4) with alpha, as glTF's vertex colours are, of sRGB bytes (N, 3)."""
     encoded = np.arange(256) / 255.0
     linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
     table = np.rint(65535.0 * linear).astype(np.uint16)
@@ -68,39 +64,39 @@ def _document(
     views: list[dict[str, Any]] = []
     chunks: list[bytes] = []
 
-    def add(values: NDArray[Any], component: int, kind: str, target: int, **extra: Any) -> int:
+    def add(values: NDArray[Any], kind: str, *, is_index: bool = False, **extra: Any) -> int:
         data = values.tobytes()
-        offset = sum(len(chunk) for chunk in chunks)
-        views.append({"buffer": 0, "byteOffset": offset, "byteLength": len(data), "target": target})
-        accessors.append(
-            {
-                "bufferView": len(views) - 1,
-                "componentType": component,
-                "count": len(values) if kind != "SCALAR" else values.size,
-                "type": kind,
-                **extra,
-            }
-        )
+        views.append({
+            "buffer": 0,
+            "byteOffset": sum(map(len, chunks)),
+            "byteLength": len(data),
+            "target": 34963 if is_index else 34962,  # ELEMENT_ARRAY_BUFFER, ARRAY_BUFFER
+        })  # fmt: skip
+        accessors.append({
+            "bufferView": len(views) - 1,
+            # FLOAT, UNSIGNED_SHORT, UNSIGNED_INT
+            "componentType": {"f4": 5126, "u2": 5123, "u4": 5125}[values.dtype.str[1:]],
+            "count": len(values) if kind != "SCALAR" else values.size,
+            "type": kind,
+            **extra,
+        })  # fmt: skip
         chunks.append(data)
         return len(accessors) - 1
 
     numbers = {}
     for name, values in attributes.items():
         if name == "COLOR_0":
-            shorts = values.astype("<u2")
-            numbers[name] = add(shorts, UNSIGNED_SHORT, "VEC4", ARRAY_BUFFER, normalized=True)
+            numbers[name] = add(values.astype("<u2"), "VEC4", normalized=True)
             continue
         floats = values.astype("<f4")
-        kind = "SCALAR" if floats.ndim == 1 else "VEC3"
         ends = {}
         if name == "POSITION":
             ends = {"min": floats.min(axis=0).tolist(), "max": floats.max(axis=0).tolist()}
-        numbers[name] = add(floats, FLOAT, kind, ARRAY_BUFFER, **ends)
-    primitive: dict[str, Any] = {"attributes": numbers, "material": 0, "mode": POINTS}
+        numbers[name] = add(floats, "SCALAR" if floats.ndim == 1 else "VEC3", **ends)
+    primitive: dict[str, Any] = {"attributes": numbers, "material": 0, "mode": 0}  # POINTS
     if indices is not None:
-        corners = indices.astype("<u4").ravel()
-        primitive["mode"] = TRIANGLES
-        primitive["indices"] = add(corners, UNSIGNED_INT, "SCALAR", ELEMENT_ARRAY_BUFFER)
+        primitive["mode"] = 4  # TRIANGLES
+        primitive["indices"] = add(indices.astype("<u4").ravel(), "SCALAR", is_index=True)
     surface = {"metallicFactor": 0.0, "roughnessFactor": 0.9}
     document = {
         "asset": {"version": "2.0", "generator": "bodyscan"},
@@ -111,7 +107,7 @@ def _document(
         "materials": [{"name": "body", "pbrMetallicRoughness": surface}],
         "accessors": accessors,
         "bufferViews": views,
-        "buffers": [{"byteLength": sum(len(chunk) for chunk in chunks)}],
+        "buffers": [{"byteLength": sum(map(len, chunks))}],
     }
     return document, chunks
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bodyscan.export.body_format import BodyFormat
+from bodyscan.export.formats import BodyFormat
 from bodyscan.mesh.ply import write_ply
 
 FORMAT = BodyFormat(

@@ -6,25 +6,23 @@ from pathlib import Path
 
 import numpy as np
 
-from bodyscan.export.body_format import BodyFormat
+from bodyscan.export.formats import BodyFormat
 from bodyscan.files.atomic import atomic_replacement
 from bodyscan.mesh.body import BodyMesh
 from bodyscan.mesh.topology import face_normals
 
-TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-HEADER = b"bodyscan: mm, x the way the subject faces, z up, floor at z = 0"
-
 
 def write_stl(path: Path, mesh: BodyMesh) -> None:
     """Write a mesh in mm, rig frame. STL has no colours, vertex normals or filled faces."""
-    corners = mesh.vertices[mesh.faces]
+    kind = [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")]
     cross = face_normals(mesh.vertices, mesh.faces)
     length = np.linalg.norm(cross, axis=1, keepdims=True)
-    triangles = np.zeros(len(mesh.faces), TRIANGLE)
+    triangles = np.zeros(len(mesh.faces), kind)
     triangles["normal"] = cross / np.where(length > 0, length, 1.0)
-    triangles["corners"] = corners
+    triangles["corners"] = mesh.vertices[mesh.faces]
     with atomic_replacement(Path(path)) as temporary, temporary.open("wb") as stream:
-        stream.write(HEADER.ljust(80, b"\0"))
+        header = b"bodyscan: mm, x the way the subject faces, z up, floor at z = 0"
+        stream.write(header.ljust(80, b"\0"))
         stream.write(np.uint32(len(triangles)).astype("<u4").tobytes())
         stream.write(triangles.data)
 
