@@ -1,6 +1,9 @@
-"""Run all benchmarks, or those named, and write what they print into docs/results.md.
+"""Run all benchmarks, or those named, and write their tables into docs/results.md.
 
 python -m benchmarks [NAME ...]    (the names are the keys of BENCHMARKS)
+
+The page begins with what a builder reads in a minute, written by hand, and kept as it stands. Each
+section follows a marker `<!-- NAME -->`. What programs printed goes to build/results/NAME.txt.
 """
 
 from __future__ import annotations
@@ -25,10 +28,9 @@ from benchmarks import (
     full_size,
     fusion,
     fuzz,
+    independent_people,
     lens,
-    motion_budget,
     mutants,
-    one_solve,
     people,
     png,
     procam,
@@ -42,17 +44,17 @@ from bodyscan.files.atomic import write_text
 
 PROJECT = Path(__file__).parents[1]
 RESULTS = PROJECT / "docs" / "results.md"
+RAW = PROJECT / "build" / "results"
 BENCHMARKS: dict[str, Callable[[], str]] = {
+    "independent-people": independent_people.report,
     "three-pole": full_size.three_pole,
     "four-pole": full_size.four_pole,
     "living": full_size.living,
     "skin": skin.report,
     "people": people.report,
-    "motion-budget": motion_budget.report,
     "sigmas": sigmas.report,
     "sigmas-rigs": rig_sigmas.known,
     "sigmas-fresh": rig_sigmas.fresh,
-    "one-solve": one_solve.report,
     "fusion": fusion.report,
     "faults": faults.report,
     "fuzz": fuzz.report,
@@ -67,7 +69,7 @@ BENCHMARKS: dict[str, Callable[[], str]] = {
     "lens": lens.report,
     "mutants": mutants.report,
 }
-SLOW = ("mutants", "day", "sigmas-rigs", "sigmas-fresh", "motion-budget")
+SLOW = ("mutants", "day", "sigmas-rigs", "sigmas-fresh")
 """Run only when named."""
 
 
@@ -77,20 +79,27 @@ def main() -> None:
     made: dict[str, str] = {}
     for name in named:
         found, load = BENCHMARKS[name]().strip(), os.getloadavg()[1]
-        title, _, rest = found.partition("\n")
+        title, _, rest = _without_raw(name, found).partition("\n")
         made[name] = f"{title}\n\n{_origin(load)}\n{rest}"
         print(made[name], flush=True)
     sections = _sections() | made  # read now: other runs may have written meanwhile
-    head = (
-        "# Results\n\nWritten by `make bench` (`python -m benchmarks`); each section says how, when, "
-        "on what and of which\ncommit it was got, and whether the code has changed since.\n"
-    )
+    head = RESULTS.read_text("utf-8").split("<!-- ")[0] if RESULTS.exists() else "# Results\n\n"
     body = [
         f"<!-- {name} -->\n{_aged(name, sections[name])}\n"
         for name in BENCHMARKS
         if name in sections
     ]
-    write_text(RESULTS, "\n".join([head, *body]))
+    write_text(RESULTS, head + "\n".join(body))
+
+
+def _without_raw(name: str, section: str) -> str:
+    """A section without what programs printed, which is written to build/results/NAME.txt."""
+    raw = re.findall(r"^```\n(.*?)^```$", section, re.DOTALL | re.MULTILINE)
+    if not raw:
+        return section
+    write_text(RAW / f"{name}.txt", "\n".join(raw))
+    bare = re.sub(r"\n+(?:\w+:\n\n)?^```\n.*?^```$", "", section, flags=re.DOTALL | re.MULTILINE)
+    return f"{bare.rstrip()}\n\nWhat the commands printed: `build/results/{name}.txt`."
 
 
 def _origin(load: float) -> str:
@@ -107,8 +116,8 @@ def _origin(load: float) -> str:
 def _processor() -> str:
     """The processor's name and generation, or the instruction set if the system gives neither."""
     try:
-        told = dict(re.findall(r"(.+?)\s*: (.+)", Path("/proc/cpuinfo").read_text("utf-8")))
-        return f"{told['model name']} (family {told['cpu family']})"
+        facts = dict(re.findall(r"(.+?)\s*: (.+)", Path("/proc/cpuinfo").read_text("utf-8")))
+        return f"{facts['model name']} (family {facts['cpu family']})"
     except (OSError, KeyError):
         return platform.machine()
 
@@ -143,8 +152,8 @@ def _aged(name: str, section: str) -> str:
         parts = [title, rest]
     else:
         commits = "1 commit has" if since == "1" else f"{since} commits have"
-        said = f"**Older than the code**: {commits} changed it since."
-        parts = [title, origin[0], said, rest.replace(origin[0], "", 1)]
+        note = f"**Older than the code**: {commits} changed it since."
+        parts = [title, origin[0], note, rest.replace(origin[0], "", 1)]
     return "\n\n".join(part.strip() for part in parts)
 
 

@@ -61,12 +61,10 @@ def _stood(rig: str, folder: str, subject: str) -> str:
     shutil.rmtree(workspace / "calibration", ignore_errors=True)
     shutil.copytree(PROJECT / "bench" / rig / "calibration", workspace / "calibration")
     outputs, _, _ = run_commands(commands, workspace)
-    return f"""`{rig}`, `{subject}`:
-
-```
+    return f"""| `{rig}`, `{subject}` | |
+|---|---|
 {_against_truth(outputs)}
 {_by_parts(workspace)}
-```
 
 ```
 {outputs["scan"].strip()}
@@ -81,8 +79,8 @@ def _by_parts(workspace: Path) -> str:
     points = fit_to_surface(stored.cloud.points, *surface).apply(stored.cloud.points)
     errors, arms = signed_distances(points, *surface), of_arms(points, surface[0], body)
     return (
-        f"  of the cloud            arms RMS {rms(errors[arms]):.3f}, trunk, legs and head "
-        f"{rms(errors[~arms]):.3f} mm"
+        f"| of the cloud | arms RMS {rms(errors[arms]):.3f}, trunk, legs and head "
+        f"{rms(errors[~arms]):.3f} mm |"
     )
 
 
@@ -102,9 +100,9 @@ memory of each:
 |---|---|---|
 {rows}
 
-```
+| against the truth (synthetic) | |
+|---|---|
 {_against_truth(outputs)}
-```
 
 Calibration:
 
@@ -125,8 +123,12 @@ def _subject(name: str) -> Path:
 
 
 def _against_truth(outputs: dict[str, str]) -> str:
-    found = re.search(r"against the truth.*?(?=results:)", outputs["evaluate"], re.DOTALL)
-    return found.group(0).rstrip() if found else outputs["evaluate"]
+    """The rows of a table from the figures that `evaluate` printed."""
+    found = re.search(r"against the truth[^\n]*\n(.*?)(?=results:)", outputs["evaluate"], re.DOTALL)
+    lines = found.group(1).splitlines() if found else []
+    # A name and its figures stand two spaces or more apart, or have a colon between them.
+    cells = [re.split(r"\s{2,}|: ", line.strip(), maxsplit=1) for line in lines if line.strip()]
+    return "\n".join(f"| {one[0]} | {' '.join(one[1:])} |" for one in cells)
 
 
 def _commands(rig: Path, workspace: Path, subject: Path) -> dict[str, list[object]]:
