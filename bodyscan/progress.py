@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import TypeVar
+from typing import TypeVar, cast
 
 THREADS = 2
 """Threads that a stage uses, and cores that a job of a batch takes. All times in docs/results.md
@@ -29,6 +29,44 @@ def step(progress: Progress, stage: str) -> Iterator[None]:
     progress(stage, 1, 1)
 
 
+def background() -> ThreadPoolExecutor:
+    """One more thread beside the caller's, which runs what is submitted to it in that order.
+
+    For work on one core while stages keep the other busy. Leaving the `with` block waits for it.
+    """
+    return ThreadPoolExecutor(1)
+
+
+def iterate_threads(
+    work: Callable[[Item], Result],
+    items: Iterable[Item],
+    error: type[Error],
+    *,
+    stage: str,
+    progress: Progress = silent,
+    workers: int = THREADS,
+) -> Iterator[tuple[Item, Result | Error]]:
+    """Run `work` on every item in threads; yield each item with its result, or its error of that
+    type, in the order of the items and as soon as it is there."""
+
+    def attempt(item: Item) -> Result | Error:
+        try:
+            return work(item)
+        except error as found:
+            return found
+
+    todo: Sequence[Item] = list(items)
+    progress(stage, 0, len(todo))
+    pool = ThreadPoolExecutor(workers)
+    try:
+        results = zip(todo, pool.map(attempt, todo), strict=True)
+        for done, (item, result) in enumerate(results, start=1):
+            progress(stage, done, len(todo))
+            yield item, result
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
 def map_threads(
     work: Callable[[Item], Result],
     items: Iterable[Item],
@@ -37,7 +75,7 @@ def map_threads(
     progress: Progress = silent,
     workers: int = THREADS,
 ) -> list[Result]:
-    """Run `work` on every item in threads; results are in the order of the items."""
+    """Run `work` on every item in threads; return the results in the order of the items."""
     todo: Sequence[Item] = list(items)
     progress(stage, 0, len(todo))
     results = []
@@ -46,11 +84,6 @@ def map_threads(
             results.append(result)
             progress(stage, done, len(todo))
     return results
-
-
-def split_range(count: int) -> list[slice]:
-    """Split range(count) into THREADS slices of nearly equal length."""
-    return [slice(k * count // THREADS, (k + 1) * count // THREADS) for k in range(THREADS)]
 
 
 def attempt_each(
@@ -62,16 +95,16 @@ def attempt_each(
     progress: Progress = silent,
 ) -> tuple[dict[Item, Result], dict[Item, Error]]:
     """Run `work` on every item in threads; return results and errors of type `error`, by item."""
-    todo = list(items)
     good: dict[Item, Result] = {}
     bad: dict[Item, Error] = {}
+    for item, result in iterate_threads(work, items, error, stage=stage, progress=progress):
+        if isinstance(result, error):
+            bad[item] = result
+        else:
+            good[item] = cast(Result, result)
+    return good, bad
 
-    def attempt(item: Item) -> None:
-        try:
-            good[item] = work(item)
-        except error as found:
-            bad[item] = found
 
-    map_threads(attempt, todo, stage=stage, progress=progress)
-    # In the order of the items, whichever finished first.
-    return {i: good[i] for i in todo if i in good}, {i: bad[i] for i in todo if i in bad}
+def split_range(count: int) -> list[slice]:
+    """Split range(count) into THREADS slices of nearly equal length."""
+    return [slice(k * count // THREADS, (k + 1) * count // THREADS) for k in range(THREADS)]

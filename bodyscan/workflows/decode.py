@@ -3,29 +3,33 @@
 from __future__ import annotations
 
 import re
-from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from itertools import islice
-from threading import Lock
-from types import MappingProxyType
+from collections import defaultdict
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby, islice
 
 from bodyscan.boards.view import BoardView, ViewKey
+from bodyscan.calibration.board_views import LocatedView
+from bodyscan.calibration.camera import CameraCalibration
 from bodyscan.calibration.striped_view import (
     BIN_PX,
     BoardBoundaries,
     Box,
+    StripedView,
+    bands_apart,
     boundaries_near,
     box_around,
+    box_of_print,
     crop_around,
     most_apart,
+    on_print,
 )
 from bodyscan.captures.folder import Captures, ImageSequence
 from bodyscan.captures.images import read_sequence
 from bodyscan.errors import BodyscanError, DecodingFailed, ImageError, format_error
 from bodyscan.geometry.crop import WHOLE, Crop
 from bodyscan.outcome import Outcome
-from bodyscan.progress import Progress, attempt_each, silent
+from bodyscan.progress import Progress, iterate_threads, silent
 from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.templates import fill
@@ -36,14 +40,9 @@ from bodyscan.stripes.stripe_limits import StripeLimits
 from bodyscan.stripes.stripe_map import ResponseShare, StripeMap
 
 NUMBER = re.compile(r"\d[\d.]*%?(, \d[\d.]*%?)*")
-MOST_REASONS = 3
-FEW = 2
-"""Up to this many shots are reported one by one; more that share a fault, together."""
+"""Figures in an error's text, left out to tell whether two shots failed for the same reason."""
 
 Failure = tuple[ImageSequence, BodyscanError]
-Keep = Callable[[BoardView, BoardBoundaries], BoardBoundaries]
-Through = Callable[[str, Mapping[ViewKey, BoardBoundaries]], None]
-"""Called with a pair's name and the boundaries from all of its shots."""
 
 
 def decode_sequence(
@@ -80,130 +79,175 @@ def decode_sequence(
             where=where,
         )
 
-    one_way = sequence.without_crossing, pair.projector.model_copy(update={"crossing": None})
+    first_direction = (
+        sequence.without_crossing,
+        pair.projector.model_copy(update={"crossing": None}),
+    )
     if sequence.lacks_crossing:
         fault = f"images are missing, such as {sequence.missing[0]}"
-        return replace(decode(*one_way), crossing_fault=fault)
+        return replace(decode(*first_direction), crossing_fault=fault)
     try:
         return decode(sequence, pair.projector)
     except ImageError as error:
         if pair.projector.crossing is None or sequence.missing:
             raise
-        return replace(decode(*one_way), crossing_fault=str(error))
-
-
-def _all(view: BoardView, boundaries: BoardBoundaries) -> BoardBoundaries:
-    return boundaries
-
-
-def _no_use(_pair: str, _found: Mapping[ViewKey, BoardBoundaries]) -> None:
-    """A `Through` that does nothing."""
+        return replace(decode(*first_direction), crossing_fault=str(error))
 
 
 @dataclass(frozen=True, eq=False)
-class _OnBoards:
-    """What one sequence gave: boundaries near each view, what the projector's response moved, and why
-    stripes that cross are not used."""
+class BoardStripes:
+    """What one sequence shows on boards.
 
-    near: Mapping[ViewKey, BoardBoundaries] = field(default_factory=dict)
+    boundaries: near each view.
+    responses: corrections of the projector's response.
+    crossing_fault: why the stripes that cross are not used; "" if they are, or there are none.
+    """
+
+    boundaries: Mapping[ViewKey, BoardBoundaries]
     responses: tuple[ResponseShare, ...] = ()
     crossing_fault: str = ""
 
 
-def decode_on_boards(
+@dataclass(frozen=True, eq=False)
+class PairStripes:
+    """What the sequences of one pair show on boards, or why one could not be decoded."""
+
+    name: str
+    sequences: Mapping[ImageSequence, BoardStripes | BodyscanError]
+
+    @property
+    def boundaries(self) -> dict[ViewKey, BoardBoundaries]:
+        return {
+            key: near
+            for found in self.sequences.values()
+            if isinstance(found, BoardStripes)
+            for key, near in found.boundaries.items()
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class PrintAreas:
+    """Where the prints of boards lie in the images, by the pose that each camera finds by itself.
+
+    A rig has tens of millions of boundaries: only means on the prints are kept, as many as light
+    sheets are fitted to. A pair by itself, whose stripes also place the boards, keeps all of them.
+    """
+
+    rig: Rig
+    cameras: Mapping[str, CameraCalibration]
+    located: Mapping[ViewKey, LocatedView]
+
+    def box(self, view: BoardView) -> Box:
+        """The box, px, around the print of a view's board."""
+        camera, board = self.cameras[view.pair].camera, self.rig.board(view.board)
+        return box_of_print(camera, board, self.located[view.key])
+
+    def select(self, view: BoardView, boundaries: BoardBoundaries) -> BoardBoundaries:
+        """The boundaries on the print of a view's board."""
+        shot = StripedView(self.located[view.key], self.rig.board(view.board), boundaries)
+        code = self.rig.pair(view.pair).projector
+        assert code is not None
+        camera = self.cameras[view.pair].camera
+        return on_print(camera, code, shot.board, shot.camera_from_face, boundaries)
+
+    def band_step(self, pair: Pair, views: Sequence[BoardView]) -> int:
+        """Use one in this many bands of BIN_PX along the stripes of a pair."""
+        if pair.projector is None or len(self.cameras) < 2:
+            return 1
+        return bands_apart(pair.projector, [self.box(view) for view in views])
+
+
+def decode_pairs(
     rig: Rig,
     captures: Captures,
     views: Iterable[BoardView],
     progress: Progress = silent,
     *,
-    box: Callable[[BoardView], Box] = box_around,
-    keep: Keep = _all,
-    every: Mapping[str, int] = MappingProxyType({}),
-    through: Through = _no_use,
-) -> Outcome[dict[ViewKey, BoardBoundaries]]:
-    """Decode stripe boundaries near each of these views; bad sequences become notes.
+    prints: PrintAreas | None = None,
+) -> Generator[PairStripes]:
+    """Decode stripe boundaries near each of these views, pair after pair in the order of names.
 
-    box: the part of a view's image in which stripes are wanted.
-    keep: selects the boundaries of a view to keep; a rig has tens of millions.
-    every: by pair, keep one in this many bands of BIN_PX along the stripes; shots take turns.
-    through: called with each pair as soon as its last sequence is done, from any thread.
-
-    A pair none of whose sequences can be decoded is a failure.
+    prints: select the boundaries on the boards' prints; all within half a board's size if None.
     """
-    wanted: dict[tuple[str, str], list[BoardView]] = defaultdict(list)
-    for view in views:
-        wanted[view.pair, view.shot].append(view)
+    wanted = _by_sequence(views)
     sequences = [s for s in captures.sequences if s.has_stripes and (s.pair, s.shot) in wanted]
+    box: Callable[[BoardView], Box] = prints.box if prints else box_around
+    step: dict[str, int] = {}
+    for name in {s.pair for s in sequences}:
+        of_pair = [v for (pair, _), group in wanted.items() if pair == name for v in group]
+        step[name] = prints.band_step(rig.pair(name), of_pair) if prints else 1
+    turn = {s: captures.of_pair(s.pair).index(s) for s in sequences}  # shots take turns in bands
 
-    turn = {s: captures.of_pair(s.pair).index(s) for s in sequences}
-
-    def decode(sequence: ImageSequence) -> _OnBoards:
-        own = wanted[sequence.pair, sequence.shot]
-        boxes = [box(view) for view in own]
+    def decode(sequence: ImageSequence) -> BoardStripes:
+        pair, group = rig.pair(sequence.pair), wanted[sequence.pair, sequence.shot]
+        boxes = [box(view) for view in group]
         crop = crop_around(boxes)
-        pair = rig.pair(sequence.pair)
-        apart = min(every.get(pair.name, 1), most_apart(boxes, pair.camera))
         corner = crop[0].start, crop[1].start
-        bands = LineBands(BIN_PX, apart, turn[sequence], corner)
+        every = min(step[pair.name], most_apart(boxes, pair.camera))
+        bands = LineBands(BIN_PX, every, turn[sequence], corner)
         stripes = decode_sequence(sequence, pair, crop=crop, bands=bands)
         near = {
-            view.key: keep(view, boundaries_near(stripes, around, crop))
-            for view, around in zip(own, boxes, strict=True)
+            view.key: boundaries_near(stripes, around, crop)
+            for view, around in zip(group, boxes, strict=True)
         }
-        return _OnBoards(near, tuple(responses_in(stripes)), stripes.crossing_fault)
+        if prints:
+            near = {view.key: prints.select(view, near[view.key]) for view in group}
+        return BoardStripes(near, tuple(responses_in(stripes)), stripes.crossing_fault)
 
-    decoded, errors = attempt_each(
-        _telling(decode, sequences, through),
+    decoded = iterate_threads(
+        decode,
         sorted(sequences, key=lambda sequence: sequence.pair),
         BodyscanError,
         stage="decoding stripes",
         progress=progress,
     )
+    for pair, found in groupby(decoded, key=lambda one: one[0].pair):
+        yield PairStripes(pair, dict(found))
+
+
+def decode_on_boards(
+    rig: Rig, captures: Captures, views: Sequence[BoardView], progress: Progress = silent
+) -> Outcome[dict[ViewKey, BoardBoundaries]]:
+    """Decode stripe boundaries near each of these views, as `collect_stripes` returns them."""
+    return collect_stripes(rig, captures, views, decode_pairs(rig, captures, views, progress))
+
+
+def collect_stripes(
+    rig: Rig, captures: Captures, views: Iterable[BoardView], pairs: Iterable[PairStripes]
+) -> Outcome[dict[ViewKey, BoardBoundaries]]:
+    """The boundaries of all pairs; bad sequences become notes, and a pair none of whose sequences
+    can be decoded is a failure."""
+    wanted = _by_sequence(views)
+    every = {sequence: found for pair in pairs for sequence, found in pair.sequences.items()}
+    boundaries: dict[ViewKey, BoardBoundaries] = {}
+    failures: list[Failure] = []
+    faults: dict[ImageSequence, str] = {}
     responses: dict[str, list[ResponseShare]] = defaultdict(list)
-    for sequence, found in decoded.items():
+    for sequence in filter(every.__contains__, captures.sequences):
+        found = every[sequence]
+        if isinstance(found, BodyscanError):
+            failures.append((sequence, found))
+            continue
+        boundaries |= found.boundaries
+        faults[sequence] = found.crossing_fault
         responses[sequence.pair] += found.responses
-    boundaries = {
-        key: near for s in sequences if s in decoded for key, near in decoded[s].near.items()
-    }
-    failures = [(sequence, errors[sequence]) for sequence in sequences if sequence in errors]
     failed = failed_pairs(failures, {pair for pair, _, _ in boundaries})
-    failed |= _without_stripes(rig, wanted, {sequence.pair for sequence in sequences})
-    kept = [failure for failure in failures if failure[0].pair not in failed]
-    notes = (
-        *failure_notes(kept),
-        *one_way_notes({s: found.crossing_fault for s, found in decoded.items()}),
-        *response_notes(responses),
-    )
+    failed |= _without_stripes(rig, wanted, {sequence.pair for sequence in every})
+    partial = [failure for failure in failures if failure[0].pair not in failed]
+    notes = (*failure_notes(partial), *crossing_notes(faults), *response_notes(responses))
     return Outcome(boundaries, notes, failed)
 
 
-def _telling(
-    decode: Callable[[ImageSequence], _OnBoards],
-    sequences: Iterable[ImageSequence],
-    through: Through,
-) -> Callable[[ImageSequence], _OnBoards]:
-    """`decode`, which tells of a pair what its sequences gave as soon as the last of them is done."""
-    by_pair: dict[str, dict[ViewKey, BoardBoundaries]] = defaultdict(dict)
-    left, counting = Counter(sequence.pair for sequence in sequences), Lock()
-
-    def telling(sequence: ImageSequence) -> _OnBoards:
-        found = _OnBoards()
-        try:
-            found = decode(sequence)
-        finally:
-            with counting:
-                by_pair[sequence.pair] |= found.near
-                left[sequence.pair] -= 1
-                last = not left[sequence.pair]
-            if last:
-                through(sequence.pair, by_pair.pop(sequence.pair))
-        return found
-
-    return telling
+def _by_sequence(views: Iterable[BoardView]) -> dict[tuple[str, str], list[BoardView]]:
+    """Views by pair and shot."""
+    found: dict[tuple[str, str], list[BoardView]] = defaultdict(list)
+    for view in views:
+        found[view.pair, view.shot].append(view)
+    return found
 
 
 def _without_stripes(
-    rig: Rig, wanted: Iterable[tuple[str, str]], striped: set[str]
+    rig: Rig, wanted: Iterable[tuple[str, str]], decoded: set[str]
 ) -> dict[str, str]:
     """Pairs with a projector that saw the board but have no stripe sequence, with the reason."""
     shots = dict(wanted)
@@ -212,23 +256,23 @@ def _without_stripes(
         + fill(rig.files, shot=shots[pair.name], pair=pair.name, frame=rig.frames.of_code(code)[0])
         for pair in rig.pairs
         for code in [pair.projector]
-        if code is not None and pair.name in shots and pair.name not in striped
+        if code is not None and pair.name in shots and pair.name not in decoded
     }
 
 
-def one_way_notes(faults: Mapping[ImageSequence, str]) -> Iterator[str]:
+def crossing_notes(faults: Mapping[ImageSequence, str]) -> Iterator[str]:
     """One line for each pair and each reason why its crossing stripes are not used."""
     shots: dict[tuple[str, str], list[tuple[str, str]]] = defaultdict(list)
     for sequence, fault in faults.items():
         if fault:
-            # Details that differ between shots, shares and file names, are quoted from the first.
-            alike = NUMBER.sub("", fault.partition("such as")[0])
-            shots[sequence.pair, alike].append((sequence.shot, fault))
-    for (pair, _), own in sorted(shots.items()):
-        named, fault = ", ".join(shot for shot, _ in own), own[0][1]
+            # Shares of pixels and file names differ between shots: they are quoted from the first.
+            kind = NUMBER.sub("", fault.partition("such as")[0])
+            shots[sequence.pair, kind].append((sequence.shot, fault))
+    for (pair, _), group in sorted(shots.items()):
+        names, fault = ", ".join(shot for shot, _ in group), group[0][1]
         yield (
             f"{pair}: stripes of the first direction alone are used in "
-            f"shot{'s' if len(own) > 1 else ''} {named}, not those of `crossing`: {fault}"
+            f"shot{'s' if len(group) > 1 else ''} {names}, not those of `crossing`: {fault}"
         )
 
 
@@ -249,27 +293,26 @@ def failed_pairs(failures: Sequence[Failure], good: set[str]) -> dict[str, str]:
     """Pairs that failed in every shot, with the reason, or the first few of several reasons."""
     reasons: dict[str, dict[str, str]] = defaultdict(dict)
     for sequence, error in failures:
-        said = format_error(error)
+        reason = format_error(error)
         # One fault gives a different share of pixels in each shot.
-        reasons[sequence.pair].setdefault(NUMBER.sub("", said), said)
+        reasons[sequence.pair].setdefault(NUMBER.sub("", reason), reason)
     return {
-        pair: next(iter(said.values()))
-        if len(said) == 1
-        else "no stripe sequence can be decoded: "
-        + "\n  or: ".join(islice(said.values(), MOST_REASONS))
-        for pair, said in reasons.items()
+        pair: next(iter(found.values()))
+        if len(found) == 1
+        else "no stripe sequence can be decoded: " + "\n  or: ".join(islice(found.values(), 3))
+        for pair, found in reasons.items()
         if pair not in good
     }
 
 
 def failure_notes(failures: Sequence[Failure]) -> Iterator[str]:
-    """One line a shot, or one for all shots of a pair that failed alike."""
+    """One line a shot, or one for three or more shots of a pair that failed for one reason."""
     same: dict[tuple[str, str], list[Failure]] = defaultdict(list)
     for failure in failures:
         same[failure[0].pair, format_error(failure[1])].append(failure)
-    for (pair, said), group in same.items():
-        if len(group) <= FEW:
+    for (pair, reason), group in same.items():
+        if len(group) < 3:
             yield from (str(error) for _, error in group)
         else:
             shots = ", ".join(sequence.shot for sequence, _ in group)
-            yield f"{pair}: {said}\n  in {len(group)} shots: {shots}"
+            yield f"{pair}: {reason}\n  in {len(group)} shots: {shots}"

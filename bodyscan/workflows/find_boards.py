@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +33,7 @@ from bodyscan.calibration.known_pair import read_known_camera
 from bodyscan.calibration.lens_choice import calibrate_with_lenses
 from bodyscan.captures.folder import Captures, ImageSequence
 from bodyscan.captures.images import read_board_image
-from bodyscan.errors import BadInput, BodyscanError, DegeneratePoses
+from bodyscan.errors import BadInput, BodyscanError, DegeneratePoses, FailedWork, format_list
 from bodyscan.files.corners_vnl import Corners, write_corners
 from bodyscan.geometry.lenses import FAMILY, LENSES
 from bodyscan.geometry.robust import rms_length
@@ -40,16 +41,13 @@ from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, attempt_each, map_threads, silent
 from bodyscan.registration.board_appearance import appearance_notes, without_odd_mirrored
+from bodyscan.registration.board_checks import describe_findings
 from bodyscan.registration.soundness import camera_faults
 from bodyscan.rig.known import Known
 from bodyscan.rig.pair import AUTO
 from bodyscan.rig.rig import Rig
 
 HERE = Path()
-NO_POSE_PX = 1.0
-"""A view farther off its best pose than this, px, and than NO_POSE_TIMES its camera's usual error,
-shows another board or mixed-up corners: real corners are good to a few tenths of a pixel."""
-NO_POSE_TIMES = 6.0
 LOOKED_AT = 3
 """Images without a board, per pair, that are examined closely: seconds each."""
 
@@ -63,19 +61,9 @@ class FoundBoards(Outcome[list[BoardView]]):
 
     refused: Mapping[ImageSequence, BodyscanError] = field(default_factory=dict)
 
-    def blamed_on_images(self, failures: Mapping[str, str], captures: Captures) -> dict[str, str]:
-        """Failures of cameras, with the reason replaced where too few images could be used."""
-        return {name: self._refusal(name, captures) or why for name, why in failures.items()}
-
-    def _refusal(self, pair: str, captures: Captures) -> str:
-        taken = sum(sequence.pair == pair for sequence in captures.sequences)
-        errors = [error for sequence, error in self.refused.items() if sequence.pair == pair]
-        if not errors or taken - len(errors) >= FEWEST_POSES:
-            return ""
-        # The most common error: when images are few, one may be bad for a reason of its own.
-        usual = Counter(error.what for error in errors).most_common(1)[0][0]
-        error = next(error for error in errors if error.what == usual)
-        return f"{len(errors)} of its {taken} images cannot be used: {error}"
+    def searched(self, captures: Captures) -> int:
+        """Number of images in which boards were looked for."""
+        return len(captures.sequences) - len(self.refused)
 
 
 def find_all_boards(rig: Rig, captures: Captures, progress: Progress = silent) -> FoundBoards:
@@ -151,13 +139,13 @@ def write_found_corners(
     if len(rig.boards) != 1:
         return
     count = len(corner_points(rig.boards[0]))
-    seen = {(view.pair, view.shot): view for view in views}
+    by_sequence = {(view.pair, view.shot): view for view in views}
 
     def row(sequence: ImageSequence) -> tuple[str, Corners]:
         image = sequence.seen_in
         inside = [folder for folder in captures.folders if image.is_relative_to(folder)]
         name = image.relative_to(inside[0]).as_posix() if inside else image.name
-        view = seen.get((sequence.pair, sequence.shot))
+        view = by_sequence.get((sequence.pair, sequence.shot))
         if view is None:
             return name, ()
         pixels = np.full((count, 2), np.nan)
@@ -173,15 +161,14 @@ def _look_closer(
     """What images without a board do show, for pairs that saw few boards or missed few."""
     chosen: list[ImageSequence] = []
     for pair in rig.pairs:
-        own = [sequence for sequence in without if sequence.pair == pair.name]
-        seen = sum(view.pair == pair.name for view in views)
-        if seen < FEWEST_POSES or len(own) <= LOOKED_AT:
-            chosen += own[:LOOKED_AT]
+        images = [sequence for sequence in without if sequence.pair == pair.name]
+        found = sum(view.pair == pair.name for view in views)
+        if found < FEWEST_POSES or len(images) <= LOOKED_AT:
+            chosen += images[:LOOKED_AT]
 
     def look(sequence: ImageSequence) -> str:
         image = read_board_image(sequence, rig.pair(sequence.pair))
-        said = [f"{board.name}: {describe_unfound(image, board)}" for board in rig.boards]
-        return "; ".join(said)
+        return "; ".join(f"{board.name}: {describe_unfound(image, board)}" for board in rig.boards)
 
     return dict(zip(chosen, map_threads(look, chosen, stage="looking closer"), strict=True))
 
@@ -201,19 +188,22 @@ def calibrate_cameras(
     """
 
     def calibrate(name: str) -> CameraCalibration:
-        found = fitted(name)
-        for place, what in camera_faults(found.camera, rig.pair(name), "camera"):
+        found = fit(name)
+        for where, what in camera_faults(found.camera, rig.pair(name), "camera"):
             raise DegeneratePoses(
-                f"what fits its boards best is no camera: {place} {what}",
-                remedy="are corners mixed up in some of its views, or its boards not as described? "
-                "Leave out the shots in doubt",
+                f"the best fit to its boards is not a possible camera: {where} {what}",
+                remedy="Possible causes: corners are mixed up in some of its views, or its boards are "
+                "not as described. Leave out the shots in doubt",
             )
         return found
 
-    def fitted(name: str) -> CameraCalibration:
+    def fit(name: str) -> CameraCalibration:
         spec = rig.pair(name).camera
-        own = [v for v in views if v.pair == name and has_enough_corners(v, rig.board(v.board))]
-        planar = [planar_view(view, rig.board(view.board)) for view in own]
+        planar = [
+            planar_view(view, rig.board(view.board))
+            for view in views
+            if view.pair == name and has_enough_corners(view, rig.board(view.board))
+        ]
         if rig.pair(name).known is not None:
             return calibrate_known_camera(planar, read_known_camera(rig.pair(name), folder))
         kinds = FAMILY if spec.lens == AUTO else (LENSES[spec.lens],)
@@ -237,13 +227,58 @@ def calibrate_cameras(
 
 
 def _known_notes(name: str, known: Known, found: CameraCalibration) -> Iterator[str]:
-    held = "held" if known.sigma_px is None else f"a start that is right to {known.sigma_px:g} px"
-    yield f"{name}: camera from {known.file} ({known.format}), {held}"
-    if found.rms_px > NO_POSE_PX:
+    use = "fixed" if known.sigma_px is None else f"a prior of sigma {known.sigma_px:g} px"
+    yield f"{name}: camera from {known.file} ({known.format}), {use}"
+    if found.rms_px > 1.0:
         yield (
-            f"{name}: boards fit the camera from {known.file} to {found.rms_px:.1f} px only: is it "
-            "this camera's, with the lens as it is set now?"
+            f"{name}: boards fit the camera from {known.file} only to {found.rms_px:.1f} px RMS. "
+            "Possible causes: the file is another camera's, or focus or zoom have changed since"
         )
+
+
+def require_cameras(
+    rig: Rig,
+    captures: Captures,
+    boards: FoundBoards,
+    cameras: Outcome[dict[str, CameraCalibration]],
+) -> Outcome[dict[str, CameraCalibration]]:
+    """The cameras, with the reasons of those that failed traced back to their images.
+
+    Raises FailedWork if there is none.
+    """
+    searched, failures = boards.searched(captures), dict(cameras.failures)
+    if searched and not boards.value:
+        # More poses of a board that is not as described would not help.
+        failures = {name: reason.partition("\n")[0] for name, reason in failures.items()}
+    for name in failures:
+        taken = sum(sequence.pair == name for sequence in captures.sequences)
+        errors = [error for sequence, error in boards.refused.items() if sequence.pair == name]
+        if errors and taken - len(errors) < FEWEST_POSES:
+            # The most common error: when images are few, one may be bad for a reason of its own.
+            common = Counter(error.what for error in errors).most_common(1)[0][0]
+            error = next(error for error in errors if error.what == common)
+            failures[name] = f"{len(errors)} of its {taken} images cannot be used: {error}"
+    if not cameras.value:
+        raise no_pair_calibrated(rig, failures, _describe_boardless(rig, boards, searched))
+    return replace(cameras, failures=failures)
+
+
+def no_pair_calibrated(rig: Rig, failed: Mapping[str, str], remedy: str = "") -> FailedWork:
+    """The error for a rig of which nothing is left."""
+    what = f"no pair could be calibrated:{format_list(failed)}"
+    return FailedWork(what, where=f"rig {rig.name}", remedy=remedy)
+
+
+def _describe_boardless(rig: Rig, boards: FoundBoards, searched: int) -> str:
+    """What images without the described board show instead: one image for each kind of finding,
+    whatever the number of markers counted."""
+    examples: dict[str, str] = {}
+    for note in boards.notes:
+        _, found, what = note.partition("no board found:")
+        if found:
+            examples.setdefault(re.sub(r"\d+ (?=markers of|of)", "", what), note)
+    findings = describe_findings(rig, boards.value, searched)
+    return "\n  ".join([*filter(None, [findings]), *list(examples.values())[:3]])
 
 
 def locate_views(
@@ -258,16 +293,17 @@ def locate_views(
     fitted: dict[ViewKey, tuple[RigidTransform, Array]] = {}
     for name, found in cameras.items():
         # All at once: solving for one board's pose takes as many calls as for thirty.
-        own = [view for view in usable if view.pair == name]
-        planar = [planar_view(view, rig.board(view.board)) for view in own]
+        of_camera = [view for view in usable if view.pair == name]
+        planar = [planar_view(view, rig.board(view.board)) for view in of_camera]
         starts = [roughly_located(found.camera, view) for view in planar]
-        poses = zip(*locate_boards(found.camera, planar, starts), strict=True) if own else ()
-        fitted |= zip((view.key for view in own), poses, strict=True)
+        poses = zip(*locate_boards(found.camera, planar, starts), strict=True) if planar else ()
+        fitted |= zip((view.key for view in of_camera), poses, strict=True)
     located, notes = [], []
     for view in usable:
         board, (pose, residuals) = rig.board(view.board), fitted[view.key]
         rms = rms_length(residuals)
-        if rms > max(NO_POSE_PX, NO_POSE_TIMES * cameras[view.pair].rms_px):
+        # Real corners are good to a few tenths of a pixel: this is another board, or a mix-up.
+        if rms > max(1.0, 6.0 * cameras[view.pair].rms_px):
             notes.append(
                 f"{view.pair}: board {board.name} in shot {view.shot} fits no pose ({rms:.2f} px); "
                 "not used"

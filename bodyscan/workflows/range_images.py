@@ -18,7 +18,7 @@ from bodyscan.reconstruction.triangulation import reconstruct_range_image
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.rig.rig import Rig
 from bodyscan.stripes.stripe_map import ResponseShare
-from bodyscan.workflows.decode import decode_sequence, one_way_notes, response_notes, responses_in
+from bodyscan.workflows.decode import crossing_notes, decode_sequence, response_notes, responses_in
 
 Reconstructed = tuple[RangeImage, tuple[ResponseShare, ...], str]
 """A range image with the projector's response and why the crossing stripes were not used."""
@@ -98,7 +98,7 @@ def reconstruct_range_images(
     for image, shares, _ in found.values():
         responses[image.pair] += shares
     notes = [f"{image.pair}: {image.agreement}" for image in images if image.agreement is not None]
-    notes += map(captures.relative, one_way_notes({one: own[-1] for one, own in found.items()}))
+    notes += map(captures.relative, crossing_notes({one: own[-1] for one, own in found.items()}))
     return Outcome(images, (*notes, *response_notes(responses)), failed)
 
 

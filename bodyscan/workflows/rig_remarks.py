@@ -1,4 +1,4 @@
-"""Remarks on a calibrated rig, apart from the calibration itself: boards, ties, halves."""
+"""Remarks on a calibrated rig, which the calibration itself does not need: notes and advice."""
 
 from __future__ import annotations
 
@@ -18,45 +18,45 @@ from bodyscan.registration.rig_solve import RigSolution
 
 
 @dataclass(frozen=True, eq=False)
-class JoinedRig:
+class SolvedRig:
     """A calibration and what the remarks on it are made from.
 
-    placed: the joint solve, including pairs that failed later.
+    solution: the joint solve, including pairs that failed later.
     views: all boards that were found.
-    images: number of images that could be searched.
+    images: number of images in which boards were looked for.
     """
 
     calibration: RigCalibration
-    placed: RigSolution
+    solution: RigSolution
     views: Sequence[BoardView]
     images: int
 
 
-def remarked(found: JoinedRig, progress: Progress = silent) -> RigCalibration:
-    """The calibration with notes on its boards, and advice.
+def add_remarks(solved: SolvedRig, progress: Progress = silent) -> RigCalibration:
+    """Add notes on the boards, and advice, to a calibration.
 
     None of these is essential: a remark that fails is replaced by a note.
     """
-    own, placed = found.calibration, found.placed
-    notes: list[str] = list(own.notes)
+    found = solved.calibration
+    notes: list[str] = list(found.notes)
     advice: list[str] = []
     with optional("coverage of the pictures", notes.append):
-        notes += coverage_notes(own.rig, found.views)
+        notes += coverage_notes(found.rig, solved.views)
     with optional("boards that were not found", notes.append):
-        notes += boards_not_found(own.rig, found.views, found.images)
-    if len(placed.rig_from_camera) > 1 and not own.failed:
+        notes += boards_not_found(found.rig, solved.views, solved.images)
+    if len(solved.solution.rig_from_camera) > 1 and not found.failed:
         with step(progress, "advice"):
             with optional("advice", notes.append):
-                advice += advise(own.rig, placed).lines
+                advice += advise(found.rig, solved.solution).lines
             with optional("halves of the shots", notes.append):
-                advice.append(compare_halves(own.rig, placed).summary)
+                advice.append(compare_halves(found.rig, solved.solution).summary)
     with optional("boards by the stripes", notes.append):
-        advice += stripe_board_notes(own.pairs)
-    return replace(own, notes=tuple(notes), advice=tuple(advice))
+        advice += stripe_board_notes(found.pairs)
+    return replace(found, notes=tuple(notes), advice=tuple(advice))
 
 
 def stripe_board_notes(pairs: Mapping[str, PairCalibration]) -> Iterator[str]:
-    """A line on how far the boards as measured by the stripes lie from their corners."""
+    """Say how far the boards as measured by the stripes lie from their corners."""
     boards = {n: p.quality.boards_mm for n, p in pairs.items() if p.quality.boards_mm is not None}
     if boards:
         worst = max(sorted(boards), key=lambda name: boards[name][1])

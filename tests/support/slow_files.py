@@ -15,6 +15,7 @@ SLOW = (
     "alignment/test_together.py",
     "alignment/test_following.py",
     "fusion/test_seams.py",
+    "workflows/test_people.py",
     "workflows/test_codes_calibrated.py",
     "workflows/test_any_subset.py",
     "boards/test_detection.py",

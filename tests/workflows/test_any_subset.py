@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache
 
@@ -16,21 +16,19 @@ from seen_boards import SeenBoards, seen_boards
 from small_workspace import Detected
 
 from bodyscan.arrays import Array
-from bodyscan.boards.view import BoardView, ViewKey
-from bodyscan.calibration.striped_view import BoardBoundaries
+from bodyscan.boards.view import BoardView
 from bodyscan.captures.folder import Captures
 from bodyscan.errors import BodyscanError, FailedWork, RigDisconnected
-from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.storage import load_calibration, save_calibration
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_frame import RigFrame
 from bodyscan.workflows import calibrate_rig, find_boards
-from bodyscan.workflows.calibrate_rig import join_rig
-from bodyscan.workflows.decode import Keep
+from bodyscan.workflows.calibrate_rig import solve_boards
+from bodyscan.workflows.decode import BoardStripes, PairStripes, PrintAreas
 from bodyscan.workflows.find_boards import FoundBoards
-from bodyscan.workflows.rig_remarks import remarked
+from bodyscan.workflows.rig_remarks import add_remarks
 
 Views = Sequence[BoardView]
 Spoiling = Callable[[Views, np.random.Generator], Views]
@@ -40,7 +38,7 @@ seen = cache(seen_boards)
 def calibrated(boards: SeenBoards, views: Views) -> RigCalibration:
     """The real way from boards found in images to a calibration with all that is said of it, none of
     which may fail but for a reason."""
-    found = remarked(join_rig(boards.rig, boards.captures(views), boards.found(views)))
+    found = add_remarks(solve_boards(boards.rig, boards.captures(views), boards.found(views)))
     assert not [note for note in found.notes if "failed with" in note]
     return found
 
@@ -144,26 +142,25 @@ def test_any_subset_of_images_with_stripes_does_too(
     }
 
     def decoded(
-        _rig: Rig,
-        _captures: Captures,
-        wanted: Views,
-        _progress: Progress,
-        *,
-        box: object,
-        keep: Keep,
-        every: object,
-        through: object,
-    ) -> Outcome[dict[ViewKey, BoardBoundaries]]:
-        keys = {view.key: view for view in wanted}
-        return Outcome({key: keep(keys[key], striped[key]) for key in keys if key in striped})
+        _rig: Rig, captures: Captures, wanted: Views, _: Progress, *, prints: PrintAreas
+    ) -> Iterator[PairStripes]:
+        for name in names:
+            yield PairStripes(name, {
+                sequence: BoardStripes({
+                    view.key: prints.select(view, striped[view.key])
+                    for view in wanted
+                    if (view.pair, view.shot) == (name, sequence.shot) and view.key in striped
+                })
+                for sequence in captures.of_pair(name)
+            })  # fmt: skip
 
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(calibrate_rig, "decode_on_boards", decoded)
+        patched.setattr(calibrate_rig, "decode_pairs", decoded)
         try:
-            joined = join_rig(detected.rig, detected.captures, FoundBoards(views))
+            joined = solve_boards(detected.rig, detected.captures, FoundBoards(views))
         except BodyscanError:
             return
-        found = remarked(joined)
+        found = add_remarks(joined)
     assert set(found.pairs) <= pairs
     assert set(found.pairs) | set(found.failed) == set(names)
     assert not [note for note in found.notes if "failed with" in note]
@@ -205,7 +202,7 @@ def test_what_no_camera_can_be_is_left_out_and_never_written(
     assert "alpha is not a focal length" in cameras.failures["c2"]
     # Whatever else such a camera may come from, what the solve makes of it is not kept.
     monkeypatch.setattr(find_boards, "camera_faults", lambda *_: ())
-    with pytest.raises(FailedWork, match="what no rig can be"):
+    with pytest.raises(FailedWork, match="impossible rig"):
         calibrated(boards, views)
 
 
@@ -243,37 +240,24 @@ def test_too_few_shots_for_halves_are_said_to_be_so(shots: int, said: str | None
     assert any(f"{said} cannot be halved" in note for note in found.notes)
 
 
-def test_pairs_that_nothing_joins_are_decoded_no_further(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_decoding_stops_when_the_joint_solve_has_failed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Images take seconds a pair, and the error is known long before."""
-    boards, failed = seen(4), threading.Event()
-    refusal = RigDisconnected("nothing joins them")
-    asked: list[BodyscanError] = []
+    boards, solving = seen(4), threading.Event()
+    decoded: list[str] = []
 
-    def decoded(
-        _rig: Rig,
-        _captures: Captures,
-        wanted: Views,
-        *_: object,
-        box: Callable[[BoardView], object],
-        **__: object,
-    ) -> Outcome[dict[ViewKey, BoardBoundaries]]:
-        box(wanted[0])
-        failed.set()
-        for _again in range(600):
-            try:
-                box(wanted[0])
-            except BodyscanError as error:
-                asked.append(error)
-                break
-            time.sleep(0.1)
-        return Outcome({})
+    def decode(*_: object, **__: object) -> Iterator[PairStripes]:
+        solving.set()
+        for name in sorted(boards.placings):
+            decoded.append(name)
+            yield PairStripes(name, {})
+            time.sleep(0.5)
 
-    def join(*_: object) -> None:
-        assert failed.wait(60.0)
-        raise refusal
+    def solve(*_: object) -> None:
+        assert solving.wait(60.0)
+        raise RigDisconnected("nothing joins them")
 
-    monkeypatch.setattr(calibrate_rig, "decode_on_boards", decoded)
-    monkeypatch.setattr(calibrate_rig, "_join_pairs", join)
+    monkeypatch.setattr(calibrate_rig, "decode_pairs", decode)
+    monkeypatch.setattr(calibrate_rig, "solve_rig", solve)
     with pytest.raises(RigDisconnected):
-        join_rig(boards.rig, boards.captures(boards.views), boards.found(boards.views))
-    assert asked == [refusal]
+        solve_boards(boards.rig, boards.captures(boards.views), boards.found(boards.views))
+    assert len(decoded) < len(boards.placings)

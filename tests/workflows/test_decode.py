@@ -1,7 +1,6 @@
 """Sequences that cannot be decoded: each cause said once, a pair of which all fail by its cause."""
 
 import threading
-from collections.abc import Mapping
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -20,11 +19,10 @@ from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_file import load_rig
 from bodyscan.workflows import decode
 from bodyscan.workflows.decode import (
-    decode_on_boards,
+    crossing_notes,
     decode_sequence,
     failed_pairs,
     failure_notes,
-    one_way_notes,
 )
 
 TWO_WAYS = """
@@ -120,7 +118,7 @@ def test_a_shot_without_its_crossing_images_keeps_the_others(tmp_path: Path) -> 
     known = np.isfinite(found.s)
     assert known.mean() > 0.9
     assert np.median(np.abs(found.s - s)[known]) < 0.1  # stripes; they are 3 pixels wide
-    (note,) = one_way_notes({sequence: found.crossing_fault})
+    (note,) = crossing_notes({sequence: found.crossing_fault})
     assert "row0.png" in note
     scan, projector = tmp_path / "scan", rig.pairs[0].projector
     assert projector is not None
@@ -138,11 +136,11 @@ def test_a_shot_without_its_crossing_images_keeps_the_others(tmp_path: Path) -> 
         decode_sequence(sequence, rig.pairs[0])
 
 
-def test_a_pair_is_through_with_its_last_shot_and_notes_are_in_the_order_of_shots(
+def test_pairs_are_decoded_one_after_another_and_notes_are_in_the_order_of_shots(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Whichever shot's images are read first."""
-    done = {("p1", "b"): threading.Event()}
+    done = threading.Event()
     pairs: Any = {name: SimpleNamespace(name=name, camera=None) for name in ("p1", "p2")}
     sequences = [
         ImageSequence(pair, shot, Path("lit.png"), None, (Path("a.png"),), ())
@@ -158,23 +156,18 @@ def test_a_pair_is_through_with_its_last_shot_and_notes_are_in_the_order_of_shot
         if sequence.pair == "p2" and sequence.shot == "a":
             raise DecodingFailed("is bad", where="pair p2, shot a")
         if (sequence.pair, sequence.shot) == ("p1", "a"):
-            assert done["p1", "b"].wait(60.0)
-        if (sequence.pair, sequence.shot) in done:
-            done[sequence.pair, sequence.shot].set()
+            assert done.wait(60.0)
+        done.set()
         return SimpleNamespace(crossing_fault="an image is missing", response=None, crossing=None)
 
     monkeypatch.setattr(decode, "decode_sequence", decoded)
     monkeypatch.setattr(decode, "boundaries_near", lambda *_: "boundaries")
-    monkeypatch.setattr(decode, "crop_around", lambda _: (slice(0, 1), slice(0, 1)))
     monkeypatch.setattr(decode, "most_apart", lambda *_: 1)
-    through: dict[str, list[str]] = {}
-
-    def tell(pair: str, found: Mapping[tuple[str, str, str], object]) -> None:
-        assert pair not in through
-        through[pair] = sorted(shot for _, shot, _ in found)
-
     views = [BoardView(s.pair, s.shot, "board", np.arange(4), np.zeros((4, 2))) for s in sequences]
-    found = decode_on_boards(rig, captures, views, box=lambda _: None, through=tell)  # type: ignore[arg-type, return-value]
-    assert through == {"p1": ["a", "b"], "p2": ["b"]}
-    assert list(found.value) == [("p1", "a", "board"), ("p2", "b", "board"), ("p1", "b", "board")]
-    assert "in shots a, b" in found.notes[1]
+    found = list(decode.decode_pairs(rig, captures, views))
+    assert [(one.name, sorted(shot for _, shot, _ in one.boundaries)) for one in found] == [
+        ("p1", ["a", "b"]), ("p2", ["b"]),
+    ]  # fmt: skip
+    every = decode.collect_stripes(rig, captures, views, found)
+    assert list(every.value) == [("p1", "a", "board"), ("p2", "b", "board"), ("p1", "b", "board")]
+    assert "in shots a, b" in every.notes[1]
