@@ -207,7 +207,7 @@ def main(rig: Path, scans: int = DAY) -> None:
     """Run a day in the resident process that `watch` keeps; prints seconds and MiB of each scan."""
     from bodyscan.settings import ScanSettings
     from bodyscan.workflows.preparation import Preparation
-    from bodyscan.workflows.scan_folder import scan_folder
+    from bodyscan.workflows.scan_person import scan_folder
 
     preparation = Preparation(rig / "calibration")
     names = [pair.name for pair in preparation.calibration.rig.pairs]

@@ -320,7 +320,7 @@ def write_report(result: AnyPath, path: AnyPath | None = None) -> Verdict:
 
     Raises BadInput for anything that is neither a calibration nor a scan.
     """
-    from bodyscan.workflows.write_report import write_report as write
+    from bodyscan.report.result_page import write_report as write
 
     return write(Path(result), None if path is None else Path(path))[1]
 

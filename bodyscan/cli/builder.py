@@ -50,9 +50,9 @@ def check(output: Output, rig_file: RigFile) -> None:
 
     known_errors: list[str] = []
     if any(pair.known for pair in load_rig(rig_file).pairs):
-        from bodyscan.workflows.import_rig import known_errors_of
+        from bodyscan.workflows.import_rig import find_known_errors
 
-        known_errors = known_errors_of(rig_file)
+        known_errors = find_known_errors(rig_file)
     found = look_over(rig_file, known_errors=known_errors)
     output.say(*report_lines(found), wrong=not found.ok)
     output.figures(images=found.images, shots=len(found.shots))
@@ -168,7 +168,7 @@ def check_calibration(
     output.say(*found.lines, wrong=not found.valid)
     output.figures(valid=found.valid)
     if repair is not None:
-        repaired = found.repaired(rig)
+        repaired = found.repair(rig)
         keep_former(repair)
         output.made("repaired", save_calibration(repaired, repair))
     output.exit_code = 0 if found.valid else 1
@@ -218,9 +218,9 @@ def sigma_map(
     ] = None,
 ) -> None:
     """Draw how well the poses of the pairs determine each place of the scan volume."""
-    from bodyscan.workflows.draw_sigma_map import draw_sigma_map
+    from bodyscan.report.sigma_map import write_sigma_map
 
-    output.made("picture", draw_sigma_map(calibration, out))
+    output.made("picture", write_sigma_map(calibration, out))
 
 
 def export_rig(

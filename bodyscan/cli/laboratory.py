@@ -164,7 +164,7 @@ def accept(
     from bodyscan.registration.storage import load_calibration
     from bodyscan.report.acceptance_page import NO_STANDARD, screen_table
     from bodyscan.report.page import is_synthetic
-    from bodyscan.workflows.accept_rig import judge_readings, read_captures, refuse_former
+    from bodyscan.workflows.accept_rig import judge_readings, read_captures, refuse_existing_test
 
     captured = [*(spheres or ()), *(plate or ())]
     if bool(captured) == (simulate is not None):
@@ -177,7 +177,7 @@ def accept(
     file = load_acceptance(artefact, dict(limit_from(text) for text in limit or ()))
     place = calibration or (simulate or Path()) / "calibration"
     folder = out or (place if place.is_dir() else place.parent).parent / "acceptance"
-    refuse_former(folder, overwrite)
+    refuse_existing_test(folder, overwrite)
     rig = load_calibration(place)
     with output.stages() as progress:
         if simulate is not None:

@@ -75,7 +75,7 @@ def scan(
     from bodyscan.cli import tables
     from bodyscan.files.model_file import apply_settings
     from bodyscan.fusion.storage import make_room
-    from bodyscan.workflows.scan_folder import scan_folder
+    from bodyscan.workflows.scan_person import scan_folder
 
     out = out or folder.with_name(f"{folder.name}-model")
     require_writable(out)
@@ -128,7 +128,7 @@ def report(
     ] = None,
 ) -> None:
     """Write a report on a calibration or a scan: one HTML file that opens anywhere and prints."""
-    from bodyscan.workflows.write_report import write_report
+    from bodyscan.report.result_page import write_report
 
     path, verdict = write_report(result, out, compare)
     output.verdict(verdict)

@@ -39,7 +39,7 @@ def main() -> int:
         return error.exit_code
     kinds = _kinds(preparation)
     # Now, not while someone waits for the first verdict.
-    import_module("bodyscan.workflows.scan_folder")
+    import_module("bodyscan.workflows.scan_person")
     tell(ready=True)
     while True:
         request = requests.get()

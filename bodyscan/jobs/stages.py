@@ -78,7 +78,7 @@ def run_scan(
 
     preparation: what a resident process has already loaded and decoded.
     """
-    from bodyscan.workflows.scan_folder import scan_folder
+    from bodyscan.workflows.scan_person import scan_folder
 
     settings = job.pipeline.scan
     *_, pictures = scan_folder(
@@ -107,13 +107,11 @@ def run_export(job: Job, out: Path, progress: Progress, announce: Announce) -> N
 
 def run_report(job: Job, out: Path, progress: Progress, announce: Announce) -> None:
     """Report as `bodyscan report` does."""
-    from bodyscan.files.atomic import write_text
-    from bodyscan.report.page import render
-    from bodyscan.report.result_page import build_page
+    from bodyscan.report.result_page import write_report
 
     with step(progress, "reporting"):
         folder = job.folder / ("scan" if job.pipeline.kind == "fuse" else "calibration")
-        write_text(out / "report.html", render(build_page(folder)))
+        write_report(folder, out / "report.html")
 
 
 def rig_inputs(job: Job) -> dict[str, Path]:

@@ -16,7 +16,7 @@ from bodyscan.progress import Progress, silent
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.rig.rig import Volume
 from bodyscan.simulation import artefact
-from bodyscan.workflows.read_artefacts import read_plates, read_spheres
+from bodyscan.workflows.accept_rig import read_plates, read_spheres
 
 SPHERES = (
     ("middle, across", (0.0, 0.0, 0.45), (0.0, 1.0, 0.0)),

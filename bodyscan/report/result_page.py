@@ -1,19 +1,44 @@
-"""Finds out what a folder holds, a calibration or a scan, and makes its report."""
+"""Report a stored calibration or scan as one HTML file."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 from bodyscan.errors import BadInput
+from bodyscan.files.atomic import write_json, write_text
 from bodyscan.fusion import scan_facts as scans
 from bodyscan.registration import storage as calibrations
-from bodyscan.report.page import Page
+from bodyscan.report.page import Page, render
+from bodyscan.verdict import Verdict
 
 REMEDY = "give the folder that `bodyscan calibrate-rig` or `bodyscan scan` wrote"
 
 
+def write_report(
+    result: Path, path: Path | None = None, other: Path | None = None
+) -> tuple[Path, Verdict]:
+    """Write the report; return its path and its verdict.
+
+    result: what calibrate-rig or scan wrote.
+    path: report.html in the result if None.
+    other: a scan or a known surface to compare with.
+
+    Raises BadInput for anything that is not a result.
+    """
+    folder = result if result.is_dir() else result.parent
+    path = path or folder / calibrations.REPORT_NAME
+    if path.is_dir():
+        raise BadInput("is a folder", where=str(path), remedy="give --out the name of a file")
+    page = build_page(result, other)
+    write_text(path, render(page))
+    if page.subject is not None and path.parent.resolve() != folder.resolve():
+        # As beside an export, so that `bodyscan forget` knows whose it is.
+        write_json(path.with_name(f"{path.name}.json"), {"subject": page.subject})
+    return path, page.verdict
+
+
 def build_page(result: Path, other: Path | None = None) -> Page:
-    """The page for a calibration or scan, given as its folder or as the JSON in it.
+    """Build the page for a calibration or scan, given as its folder or as the JSON in it.
 
     Raises BadInput if it is neither, or if `other` is given for a calibration.
     """
@@ -35,7 +60,7 @@ def build_page(result: Path, other: Path | None = None) -> Page:
         raise BadInput(
             "is a calibration: only scans can be compared",
             where=str(result),
-            remedy="give a scan's folder; what moved in a rig, `bodyscan check-calibration` tells",
+            remedy="give a scan's folder; `bodyscan check-calibration` finds what moved in a rig",
         )
     from bodyscan.report.calibration_page import calibration_page
 

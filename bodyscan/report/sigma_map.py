@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from pathlib import Path
 
 import cv2
 import numpy as np
 
 from bodyscan.arrays import Array, Bytes, Indices
 from bodyscan.errors import BadInput
+from bodyscan.files.atomic import write_bytes
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 from bodyscan.geometry.visibility import in_image
 from bodyscan.registration.rig_calibration import RigCalibration
+from bodyscan.registration.storage import MAP_NAME, load_calibration
 from bodyscan.report.canvas import (
     BACKGROUND,
     INK,
@@ -111,6 +114,19 @@ def draw_sigma_map(calibration: RigCalibration, *, height_px: int = 900) -> byte
     scale = Scale(0.0, max(top, 1e-6), "sigma, mm", turbo())
     panels = [_panel(values, scale, caption, volume, height_px) for caption, values in maps.items()]
     return png([*panels, colour_bar(scale, height_px)])
+
+
+def write_sigma_map(calibration: Path, path: Path | None = None) -> Path:
+    """Draw the map of a stored calibration and return the picture's path, beside it if none is given.
+
+    Raises BadInput for a path that does not end in .png and where no sigma is known,
+    CalibrationFileError.
+    """
+    path = path or (calibration if calibration.is_dir() else calibration.parent) / MAP_NAME
+    if path.suffix.lower() != ".png":
+        raise BadInput("the map is drawn as PNG", where=str(path), remedy="name it .png")
+    write_bytes(path, draw_sigma_map(load_calibration(calibration)))
+    return path
 
 
 def plane_points(volume: Volume, right: Array, step_mm: float) -> Array:

@@ -2,30 +2,43 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 
-from bodyscan.captures.folder import open_scan
-from bodyscan.errors import BadInput
+import numpy as np
+
+from bodyscan.arrays import Array
+from bodyscan.captures.folder import Captures, open_scan
+from bodyscan.errors import BadInput, BodyscanError
+from bodyscan.evaluation import artefacts
 from bodyscan.evaluation.acceptance_file import AcceptanceFile
 from bodyscan.evaluation.acceptance_readings import (
+    ALL,
     Figure,
+    PlateRow,
     Readings,
+    SpacingRow,
+    SphereRow,
     acceptance_document,
     figures,
     grade_acceptance,
 )
 from bodyscan.files.atomic import write_json, write_text
 from bodyscan.files.os_errors import require_writable
+from bodyscan.fusion.cleaning import clean
+from bodyscan.fusion.merging import merge
 from bodyscan.optional import optional
 from bodyscan.progress import Progress, silent
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.storage import calibration_id
 from bodyscan.report.acceptance_page import acceptance_page
 from bodyscan.report.page import render
+from bodyscan.settings import FusionSettings
 from bodyscan.verdict import Verdict
-from bodyscan.workflows.read_artefacts import read_plates, read_spheres
+from bodyscan.workflows.range_images import reconstruct_range_images
 
 FILE_NAME = "acceptance.json"
 
@@ -46,14 +59,14 @@ class Acceptance:
     notes: tuple[str, ...]
 
 
-def refuse_former(folder: Path, overwrite: bool) -> None:
+def refuse_existing_test(folder: Path, overwrite: bool) -> None:
     """Raise BadInput if `folder` holds a test that may not be replaced, or cannot be written to."""
     require_writable(folder)
     if (folder / FILE_NAME).exists() and not overwrite:
         raise BadInput(
-            "an acceptance test lies here already",
+            "holds an acceptance test already",
             where=str(folder),
-            remedy="give another --out, or say --overwrite",
+            remedy="give another --out, or --overwrite to replace it",
         )
 
 
@@ -66,13 +79,13 @@ def read_captures(
 ) -> Readings:
     """Read captured artefacts, one folder a place."""
     # Open them all before reading the first, so that a wrong folder fails before any work is done.
-    places = [
+    sites = [
         (folder, open_scan(calibration.rig, folder), read)
         for folders, read in ((spheres, read_spheres), (plates, read_plates))
         for folder in folders
     ]
     total = Readings()
-    for folder, captures, read in places:
+    for folder, captures, read in sites:
         total += read(calibration, captures, folder.name, file, progress)
     return total
 
@@ -108,3 +121,135 @@ def judge_readings(
         page_path if page_path.exists() else None,
         tuple(notes),
     )
+
+
+MIN_POINTS = 400
+"""Points from which a single pair's sphere or plate is judged."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Cloud:
+    view: str
+    points: Array
+    normals: Array
+
+
+def read_spheres(
+    calibration: RigCalibration,
+    captures: Captures,
+    site: str,
+    file: AcceptanceFile,
+    progress: Progress = silent,
+) -> Readings:
+    """Read every shot of a folder of the spheres at one place."""
+    centres, radius = np.array(file.spheres.centres_mm), file.spheres.radius_mm
+
+    def read(shot: str, clouds: Sequence[_Cloud]) -> Readings:
+        merged, *single = clouds
+        near = artefacts.locate_spheres(merged.points, merged.normals, radius, centres)
+        read = [artefacts.read_sphere(merged.points, merged.normals, s, radius) for s in near]
+        artefacts.require_spheres(read, radius, centres)
+        rows = [_row(site, shot, ALL, k, one) for k, one in enumerate(read, start=1)]
+        for cloud in single:
+            rows += _read_single_pair(cloud, site, shot, read, radius)
+        pairs = combinations(range(1, len(centres) + 1), 2)
+        errors = artefacts.spacing_errors(read, centres)
+        spacings = tuple(
+            SpacingRow(site, shot, f"{a}-{b}", float(error))
+            for (a, b), error in zip(pairs, errors, strict=True)
+        )
+        return Readings(tuple(rows), spacings)
+
+    return _each_shot(calibration, captures, site, read, progress)
+
+
+def read_plates(
+    calibration: RigCalibration,
+    captures: Captures,
+    site: str,
+    file: AcceptanceFile,
+    progress: Progress = silent,
+) -> Readings:
+    """Read every shot of a folder of the plate at one place."""
+    width, height = file.plate.size_mm
+
+    def row(shot: str, cloud: _Cloud) -> PlateRow:
+        one = artefacts.read_plate(cloud.points, cloud.normals)
+        share = 100.0 * one.area_mm2 / (width * height)
+        return PlateRow(site, shot, cloud.view, one.points, one.flatness_mm, one.rms_mm, share)
+
+    def read(shot: str, clouds: Sequence[_Cloud]) -> Readings:
+        rows = [row(shot, clouds[0])]
+        for cloud in clouds[1:]:
+            if len(cloud.points) >= MIN_POINTS:
+                with suppress(BodyscanError):  # this pair sees only an edge of it
+                    rows.append(row(shot, cloud))
+        return Readings(plates=tuple(rows))
+
+    return _each_shot(calibration, captures, site, read, progress)
+
+
+def _each_shot(
+    calibration: RigCalibration,
+    captures: Captures,
+    site: str,
+    read: Callable[[str, Sequence[_Cloud]], Readings],
+    progress: Progress,
+) -> Readings:
+    """Sum `read` over the clouds of every shot; a shot that fails is listed as a problem."""
+    total = Readings()
+    for shot in captures.shots:
+        try:
+            total += read(shot, _clouds(calibration, captures, shot, progress))
+        except BodyscanError as error:
+            problem = "; ".join(filter(None, (error.what, error.remedy)))
+            total += Readings(problems=(f"{site}, {shot}: {problem}",))
+    return total
+
+
+def _clouds(
+    calibration: RigCalibration, captures: Captures, shot: str, progress: Progress
+) -> list[_Cloud]:
+    """All pairs' points merged like a scan's, without alignment, then those of each pair; rig frame.
+
+    Raises ScanFailed.
+    """
+    one = replace(captures, shots=(shot,), sequences=captures.of_shot(shot))
+    images = reconstruct_range_images(calibration, one, progress).value
+    cleaned = clean(images, calibration.rig_from_camera, calibration.rig.volume)
+    measured = [image for image in cleaned if image.valid.any()]
+    # About 3,000 of the points lie on a sphere of 60 mm.
+    cloud = merge(measured, calibration.rig_from_camera, FusionSettings(points=200_000)).cloud
+    found = [_Cloud(ALL, cloud.points, cloud.normals.astype(np.float64))]
+    for image in measured:
+        valid = image.valid & np.isfinite(image.normals).all(axis=-1)
+        rig_from_camera = calibration.rig_from_camera[image.pair]
+        found.append(
+            _Cloud(
+                image.pair,
+                rig_from_camera.apply(image.points[valid].astype(np.float64)),
+                rig_from_camera.rotate(image.normals[valid].astype(np.float64)),
+            )
+        )
+    return found
+
+
+def _read_single_pair(
+    cloud: _Cloud,
+    site: str,
+    shot: str,
+    merged: Sequence[artefacts.SphereReading],
+    radius_mm: float,
+) -> Iterator[SphereRow]:
+    """Read by one pair alone the spheres that all pairs together found."""
+    for k, sphere in enumerate(merged, start=1):
+        try:
+            one = artefacts.read_sphere(cloud.points, cloud.normals, sphere.fitted, radius_mm)
+        except BodyscanError:
+            continue  # this pair does not see it
+        if one.points >= MIN_POINTS:
+            yield _row(site, shot, cloud.view, k, one)
+
+
+def _row(site: str, shot: str, view: str, sphere: int, one: artefacts.SphereReading) -> SphereRow:
+    return SphereRow(site, shot, view, sphere, one.points, one.form_mm, one.shell_mm, one.size_mm)

@@ -123,7 +123,7 @@ def solve_boards(
             remedy="Possible causes: corners are mixed up in some views, or shots of different "
             "moments are listed as one. Leave out the shots in doubt",
         )
-    return SolvedRig(calibration, solution, boards.value, boards.searched(captures))
+    return SolvedRig(calibration, solution, boards.value, boards.count_searched(captures))
 
 
 @dataclass(frozen=True, eq=False)

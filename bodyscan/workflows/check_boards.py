@@ -24,49 +24,42 @@ from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.workflows.decode import decode_on_boards
 from bodyscan.workflows.find_boards import find_all_boards, locate_views
 
-LEAST_NOISE_PX = 0.02
-IMPORTED_PX = 0.5
-"""RMS error of corners, px, that OpenCV's users commonly reach."""
-STRIPE_SIGMAS, STRIPE_MM = 5.0, 0.25
-"""A projector is blamed only if its stripes are off a board by this many sigmas and this far."""
-
 
 @dataclass(frozen=True)
 class StripeOffset:
-    """How far the surface measured by a pair's stripes lies from the board shown by its corners.
+    """Distance of the surface that a pair's stripes measure from the board that its corners show.
 
     offset_mm: median over all boards, positive away from the camera.
-    turned_mm: the tilt, as half the difference between the board's two ends.
+    tilt_mm: half the difference between the board's two ends.
     sigma_mm: the sigma that the calibration predicts.
     """
 
     pair: str
     offset_mm: float
-    turned_mm: float
+    tilt_mm: float
     sigma_mm: float
 
     @property
     def moved(self) -> bool:
-        """Whether the projector has moved relative to its camera."""
-        off = max(abs(self.offset_mm), abs(self.turned_mm))
-        return off > max(STRIPE_SIGMAS * self.sigma_mm, STRIPE_MM)
+        """Whether the projector has moved relative to its camera: 5 sigmas and 0.25 mm."""
+        return max(abs(self.offset_mm), abs(self.tilt_mm)) > max(5.0 * self.sigma_mm, 0.25)
 
 
 @dataclass(frozen=True, eq=False)
 class BoardCheck:
-    """What shots of a board say about a calibrated rig.
+    """What shots of a board tell about a calibrated rig.
 
     drift: of the cameras.
     stripes: of the projectors whose stripes were taken on a board.
-    seen: pairs that saw a board.
-    unseen: calibrated pairs that did not.
+    checked: pairs that saw a board.
+    unchecked: calibrated pairs that did not.
     notes: what was dropped.
     """
 
     drift: Drift
     stripes: tuple[StripeOffset, ...]
-    seen: tuple[str, ...]
-    unseen: tuple[str, ...]
+    checked: tuple[str, ...]
+    unchecked: tuple[str, ...]
     notes: tuple[str, ...]
 
     @property
@@ -83,34 +76,34 @@ def check_boards(
     Raises BoardNotFound if no board is seen by two pairs and none has decoded stripes on it.
     """
     views = find_all_boards(calibration.rig, captures, progress)
-    seen_by = locate_views(calibration.rig, views.value, _cameras(calibration))
-    located = [view for view in seen_by.value if not view.ambiguous]
+    located = locate_views(calibration.rig, views.value, _cameras(calibration))
+    unique = [view for view in located.value if not view.ambiguous]
     poses = [
         seen_pose(view, calibration.pairs[view.pair].camera, _noise_px(calibration, view.pair))
-        for view in located
+        for view in unique
     ]
     drift = find_drift(
         poses, calibration.rig_from_camera, calibration.covariance, calibration.rig.poles
     )
     # Which end of a plain board is which makes no difference to its surface.
-    stripes = _stripe_offsets(calibration, captures, views.value, seen_by.value, progress)
-    notes = (*views.notes, *seen_by.notes, *stripes.notes)
+    stripes = _stripe_offsets(calibration, captures, views.value, located.value, progress)
+    notes = (*views.notes, *located.notes, *stripes.notes)
     if not drift.rig_from_board and not stripes.value:
-        raise _nothing_seen(captures, seen_by.value, notes)
-    seen = tuple(sorted({view.pair for view in (located or seen_by.value)}))
-    unseen = tuple(sorted(set(calibration.pairs) - set(seen)))
-    return BoardCheck(drift, stripes.value, seen, unseen, notes)
+        raise _nothing_to_compare(captures, located.value, notes)
+    checked = tuple(sorted({view.pair for view in (unique or located.value)}))
+    unchecked = tuple(sorted(set(calibration.pairs) - set(checked)))
+    return BoardCheck(drift, stripes.value, checked, unchecked, notes)
 
 
-def _nothing_seen(
-    captures: Captures, seen: Sequence[LocatedView], notes: Sequence[str]
+def _nothing_to_compare(
+    captures: Captures, located: Sequence[LocatedView], notes: Sequence[str]
 ) -> BoardNotFound:
     """The error for captures that show nothing to compare the rig with, and every note so far."""
-    turned = sorted({view.board for view in seen if view.ambiguous})
+    symmetric = sorted({view.board for view in located if view.ambiguous})
     what = (
-        f"board {', '.join(turned)} looks the same turned round, so that cameras cannot be held "
-        "against each other by it"
-        if turned
+        f"board {', '.join(symmetric)} looks the same when turned by 180 degrees, so cameras cannot "
+        "be compared by it"
+        if symmetric
         else "no board is seen by two calibrated pairs at once"
     )
     why = "".join(f"\n  {note}" for note in dict.fromkeys(notes))
@@ -122,29 +115,30 @@ def _nothing_seen(
     )
 
 
-def repaired(calibration: RigCalibration, moves: Sequence[Move]) -> RigCalibration:
-    """The calibration with the moved pairs at their new poses, everything else unchanged.
+def apply_moves(calibration: RigCalibration, moves: Sequence[Move]) -> RigCalibration:
+    """Set the moved pairs to their new poses, and leave everything else unchanged.
 
     A pole takes along those of its pairs that saw no board. The covariance of a move is added to that
     of its pairs, which share its error.
     """
-    placing, covariance = dict(calibration.rig_from_camera), calibration.covariance
+    poses, covariance = dict(calibration.rig_from_camera), calibration.covariance
     poles = calibration.rig.poles
     for move in moves:
         carried = {poles[pair] for pair in move.pairs if len(move.pairs) > 1}
-        pairs = [pair for pair in placing if pair in move.pairs or poles.get(pair) in carried]
-        placing |= {pair: move.motion @ placing[pair] for pair in pairs}
+        pairs = [pair for pair in poses if pair in move.pairs or poles.get(pair) in carried]
+        poses |= {pair: move.motion @ poses[pair] for pair in pairs}
         covariance = covariance.moved_together(pairs, move.covariance)
-    said = tuple(f"repaired: {move_line(move)}" for move in moves)
+    notes = tuple(f"repaired: {move_line(move)}" for move in moves)
     return replace(
         calibration,
-        rig_from_camera=placing,
+        rig_from_camera=poses,
         covariance=covariance,
-        notes=(*calibration.notes, *said),
+        notes=(*calibration.notes, *notes),
     )
 
 
 def move_line(move: Move) -> str:
+    """State how far a pair or pole moved."""
     return (
         f"{move.name} moved by {move.shift_mm:.2f} mm (sigma {move.sigma_mm:.2f}) and "
         f"{move.turn_deg:.3f} degrees"
@@ -153,13 +147,13 @@ def move_line(move: Move) -> str:
 
 def _noise_px(calibration: RigCalibration, pair: str) -> float:
     """Sigma of one coordinate of a corner, px, as measured by the calibration."""
-    return max(_corners_px(calibration.pairs[pair]) / np.sqrt(2.0), LEAST_NOISE_PX)
+    return max(_corners_px(calibration.pairs[pair]) / np.sqrt(2.0), 0.02)
 
 
 def _corners_px(pair: PairCalibration) -> float:
-    """RMS error of a pair's corners, px; for an imported pair, what such calibrations reach."""
+    """RMS error of a pair's corners, px; 0.5, which OpenCV's users reach, if none is known."""
     known = pair.quality.corners_rms_px
-    return known if known is not None else pair.quality.imported_sigma_px or IMPORTED_PX
+    return known if known is not None else pair.quality.imported_sigma_px or 0.5
 
 
 def _cameras(calibration: RigCalibration) -> Mapping[str, CameraCalibration]:
@@ -182,18 +176,19 @@ def _stripe_offsets(
     decoded = decode_on_boards(calibration.rig, captures, wanted, progress)
     parts: dict[str, list[Array]] = defaultdict(list)
     for key, boundaries in decoded.value.items():
-        parts[key[0]].append(_off_board(calibration, known[key], boundaries))
-    offsets = [_offset(pair, np.concatenate(own)) for pair, own in sorted(parts.items())]
+        parts[key[0]].append(_stripe_distances(calibration, known[key], boundaries))
+    offsets = [_offset(pair, np.concatenate(rows)) for pair, rows in sorted(parts.items())]
     lost = (f"{pair}: {reason}" for pair, reason in decoded.failures.items())
     return Outcome(
         tuple(offset for offset in offsets if offset is not None), (*decoded.notes, *lost)
     )
 
 
-def _off_board(
+def _stripe_distances(
     calibration: RigCalibration, view: LocatedView, boundaries: BoardBoundaries
 ) -> Array:
-    """(N, 3): distance from the board along its normal (mm), place on it (-1 to 1), sigma (mm)."""
+    """Distances of a view's stripe boundaries from the board: (N, 3), distance along its normal (mm),
+    position across the stripes (-1 to 1), sigma (mm)."""
     rig, pair = calibration.rig, calibration.pairs[view.pair]
     projector = rig.pair(view.pair).projector
     assert projector is not None
@@ -207,18 +202,19 @@ def _off_board(
     facing = np.abs(rays @ view.camera_from_board.rotation[:, 2])
     away = (measured.depth - points.points[:, 2]) * facing
     axis = 1 if projector.direction == "horizontal" else 0
-    place = points.points[:, axis] - np.mean(points.points[:, axis])
-    place = place / max(float(np.abs(place).max(initial=0.0)), 1e-9)
-    rows = np.stack([away, place, np.sqrt(measured.variance_mm2) * facing], axis=1)
+    across = points.points[:, axis] - np.mean(points.points[:, axis])
+    across = across / max(float(np.abs(across).max(initial=0.0)), 1e-9)
+    rows = np.stack([away, across, np.sqrt(measured.variance_mm2) * facing], axis=1)
     return rows[np.all(np.isfinite(rows), axis=1)]
 
 
 def _offset(pair: str, rows: Array) -> StripeOffset | None:
+    """Medians of such distances over all boards; None for fewer than 100 boundaries."""
     if len(rows) < 100:
         return None
-    away, place, sigma = rows.T
-    low, high = place < -0.4, place > 0.4
-    turned = 0.0
+    away, across, sigma = rows.T
+    low, high = across < -0.4, across > 0.4
+    tilt = 0.0
     if min(low.sum(), high.sum()) > 20:
-        turned = 0.5 * float(np.median(away[high]) - np.median(away[low]))
-    return StripeOffset(pair, float(np.median(away)), turned, float(np.median(sigma)))
+        tilt = 0.5 * float(np.median(away[high]) - np.median(away[low]))
+    return StripeOffset(pair, float(np.median(away)), tilt, float(np.median(sigma)))

@@ -1,4 +1,4 @@
-"""`bodyscan check-calibration`: choose the check that fits the captures, and word its result."""
+"""Check a calibrated rig: choose the check that fits the captures, and put its result into words."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from bodyscan.captures.folder import Captures, join_captures, open_check
 from bodyscan.errors import BadInput, FailedWork
 from bodyscan.progress import Progress, silent
 from bodyscan.registration.rig_calibration import RigCalibration
-from bodyscan.workflows.check_boards import BoardCheck, check_boards, move_line, repaired
+from bodyscan.workflows.check_boards import BoardCheck, apply_moves, check_boards, move_line
 from bodyscan.workflows.check_scans import ScanCheck, check_scans
 
 
@@ -26,28 +26,28 @@ class Findings:
 
     @property
     def valid(self) -> bool:
-        """Whether the rig is known to be unchanged; False if a check cannot tell."""
+        """Whether the rig is known to be unchanged; False if that is undecided."""
         if isinstance(self.check, ScanCheck) and not self.check.decided:
             return self.check.quiet
         return self.check.valid
 
-    def repaired(self, calibration: RigCalibration) -> RigCalibration:
-        """The repaired calibration. Raises FailedWork if the check cannot say what moved where."""
+    def repair(self, calibration: RigCalibration) -> RigCalibration:
+        """Correct the poses of what moved. Raises FailedWork if the check does not determine them."""
         if isinstance(self.check, ScanCheck):
             raise FailedWork(
-                "people's scans tell that something moved, not exactly where it is now",
-                remedy="show the board in a few shots and repair from those",
+                "scans of people show that something moved, but not exactly where it is now",
+                remedy="take a few shots of the board and repair from those",
             )
         projectors = [offset.pair for offset in self.check.stripes if offset.moved]
         if projectors:
             raise FailedWork(
                 f"the projector of {', '.join(projectors)} moved against its camera",
-                remedy="only a new calibration of that pair mends this: capture the stripes on the "
-                "board again and run calibrate-rig",
+                remedy="capture the stripes on the board again and run calibrate-rig: only a new "
+                "calibration of that pair corrects this",
             )
         if not self.check.drift.moves:
             raise FailedWork("nothing moved: there is nothing to repair")
-        return repaired(calibration, self.check.drift.moves)
+        return apply_moves(calibration, self.check.drift.moves)
 
 
 def check_rig(
@@ -76,109 +76,110 @@ def check_rig(
             remedy="check one kind at a time",
         )
     if kinds == {"scan"}:
-        return _of_scans(check_scans(calibration, [one for _, one in captures], progress))
-    shots = join_captures(tuple(_named_apart([one for _, one in captures])))
-    return _of_boards(calibration, check_boards(calibration, shots, progress))
+        return describe_scan_check(check_scans(calibration, [one for _, one in captures], progress))
+    shots = join_captures(tuple(number_shots([one for _, one in captures])))
+    return describe_board_check(calibration, check_boards(calibration, shots, progress))
 
 
-def _named_apart(parts: Sequence[Captures]) -> list[Captures]:
-    """Captures of several folders, with the folder's number before each shot's name."""
-    if len(parts) == 1:
-        return list(parts)
+def number_shots(folders: Sequence[Captures]) -> list[Captures]:
+    """Put the folder's number before the name of each shot, if there are several folders."""
+    if len(folders) == 1:
+        return list(folders)
     return [
         replace(
-            part,
-            shots=tuple(f"{number}/{shot}" for shot in part.shots),
-            sequences=tuple(replace(s, shot=f"{number}/{s.shot}") for s in part.sequences),
+            captures,
+            shots=tuple(f"{number}/{shot}" for shot in captures.shots),
+            sequences=tuple(replace(s, shot=f"{number}/{s.shot}") for s in captures.sequences),
         )
-        for number, part in enumerate(parts, start=1)
+        for number, captures in enumerate(folders, start=1)
     ]
 
 
-def _or_imported(calibration: RigCalibration, pair: str) -> str:
-    imported = calibration.pairs[pair].quality.imported
-    return f", or {imported} is not its calibration" if imported else ""
-
-
-def _of_boards(calibration: RigCalibration, check: BoardCheck) -> Findings:
+def describe_board_check(calibration: RigCalibration, check: BoardCheck) -> Findings:
+    """Put the check by boards into words."""
     drift = check.drift
-    together = bool(drift.rig_from_board)
-    valid = (
-        "all that see the board agree" if together else "stripes lie where the board's corners are"
-    )
-    said = [
-        f"valid: {valid}"
-        if check.valid
-        else "NOT valid: something moved; --repair writes a calibration with that put right"
-        if drift.moves
-        else "NOT valid: what stripes measure is not where the board is"
-    ]
-    said += [move_line(move) for move in drift.moves]
-    said += [
-        f"projector of {offset.pair} moved against its camera{_or_imported(calibration, offset.pair)}: "
-        "the board's surface is measured "
-        f"{offset.offset_mm:+z.2f} mm off, tilted by {offset.turned_mm:+z.2f} mm at its ends"
-        for offset in check.stripes
-        if offset.moved
-    ]
-    if together:
-        said.append(
-            f"{len(check.seen)} pairs saw a board; their views are {drift.misfit_before:.1f} sigmas "
-            f"off (root mean square)"
-            + (f", {drift.misfit:.1f} after the moves" if drift.moves else "")
+    shared = bool(drift.rig_from_board)
+    if check.valid:
+        lines = [
+            "valid: all that see the board agree"
+            if shared
+            else "valid: the stripes lie on the board"
+        ]
+    elif drift.moves:
+        lines = ["NOT valid: something moved; --repair writes a corrected calibration"]
+    else:
+        lines = ["NOT valid: the stripes do not lie on the board"]
+    lines += [move_line(move) for move in drift.moves]
+    for offset in filter(lambda offset: offset.moved, check.stripes):
+        imported = calibration.pairs[offset.pair].quality.imported
+        other = f", or {imported} is not its calibration" if imported else ""
+        lines.append(
+            f"{offset.pair}: the stripes measure the board {offset.offset_mm:+z.2f} mm from its "
+            f"corners, tilted by {offset.tilt_mm:+z.2f} mm at its ends. Possible causes: the projector "
+            f"moved against its camera{other}"
+        )
+    if shared:
+        after = f", {drift.misfit:.1f} after the moves" if drift.moves else ""
+        lines.append(
+            f"{len(check.checked)} pairs saw a board; their views differ by "
+            f"{drift.misfit_before:.1f} sigmas RMS{after}"
         )
     if check.stripes:
         worst = max(check.stripes, key=lambda offset: abs(offset.offset_mm))
-        said.append(
-            f"stripes of {len(check.stripes)} pairs lie on the board to {abs(worst.offset_mm):.2f} mm "
-            f"(farthest: {worst.pair})"
+        lines.append(
+            f"stripes of {len(check.stripes)} pairs lie within {abs(worst.offset_mm):.2f} mm of the "
+            f"board (worst: {worst.pair})"
         )
-    if check.unseen:
-        said.append(f"not checked, for they saw no board: {', '.join(check.unseen)}")
+    if check.unchecked:
+        lines.append(f"not checked, because they saw no board: {', '.join(check.unchecked)}")
     if drift.lonely:
-        said.append(f"not checked, for nobody shares their board: {', '.join(drift.lonely)}")
-    return Findings(check, (*said, *(f"note: {note}" for note in check.notes)))
+        lines.append(
+            f"not checked, because no other pair saw their board: {', '.join(drift.lonely)}"
+        )
+    return Findings(check, (*lines, *(f"note: {note}" for note in check.notes)))
 
 
-def _of_scans(check: ScanCheck) -> Findings:
+def describe_scan_check(check: ScanCheck) -> Findings:
+    """Put the check by scans into words."""
     step = check.search.step
     moved = [drift for drift in (*check.poles, *check.pairs) if drift.moved]
+    count = len(check.before_mm)
+    scans = "1 scan" if count == 1 else f"{count} scans"
     if not check.valid:
-        said = ["NOT valid: what no person's motion explains"]
-    elif check.apart:
-        groups = "; ".join(", ".join(group) for group in check.apart)
-        said = [
-            f"undecided: no surface is seen by more than one of these groups of pairs: {groups}. How "
-            "they stand to each other a scan does not tell; give shots of the board that they share"
-        ]
+        verdict = "NOT valid: no motion of a person explains how the pairs differ"
+    elif check.groups:
+        groups = "; ".join(", ".join(group) for group in check.groups)
+        verdict = (
+            f"undecided: no surface is seen by more than one of these groups of pairs: {groups}. "
+            "Scans do not determine how these stand to each other: give shots of a board that they "
+            "share"
+        )
     elif check.decided:
-        said = [f"valid: a pole or pair that had moved by {check.unseen_mm:.1f} mm would be seen"]
+        verdict = (
+            f"valid: a pole or pair that moved by {check.detectable_mm:.1f} mm would be noticed"
+        )
     elif check.quiet:
-        said = ["valid: all pairs see the same surface, and alignment moves none of them"]
+        verdict = "valid: all pairs see the same surface, and alignment moves none of them"
     else:
-        less = f" by less than {check.unseen_mm:.1f} mm" if check.unseen_mm < np.inf else ""
-        count = len(check.before_mm)
+        known = np.isfinite(check.detectable_mm)
+        less = f" by less than {check.detectable_mm:.1f} mm" if known else ""
         more = f"{FEWEST_SCANS} scans or more" if count < FEWEST_SCANS else "more scans"
-        said = [
-            f"undecided: from {_scans(check)} a pair that moved{less} cannot be told from a person's "
+        verdict = (
+            f"undecided: in {scans}, a pair that moved{less} cannot be distinguished from a person's "
             f"sway; give {more}, or a shot of the board (with `kind: calibration` in its captures.yaml)"
-        ]
+        )
+    lines = [verdict]
     if step is not None:
-        said.append(
-            f"{step.name} stands {step.shift_mm:.1f} mm off, turned by {step.turn_deg:.2f} degrees"
+        lines.append(
+            f"{step.name} is displaced by {step.shift_mm:.1f} mm and rotated by {step.turn_deg:.2f} "
+            "degrees"
         )
     for drift in moved:
         if step is None or drift.pair not in step.name:
-            said.append(f"{drift.pair}: {drift.shift_mm:.2f} mm (sigma {drift.sigma_mm:.2f})")
+            lines.append(f"{drift.pair}: {drift.shift_mm:.2f} mm (sigma {drift.sigma_mm:.2f})")
     before, after = max(check.before_mm), max(check.after_mm)
     if np.isfinite(before):
-        overlaps = f"overlaps in {_scans(check)}: {before:.2f} mm RMS at most, {after:.2f} aligned"
-        said.append(overlaps)
+        lines.append(f"overlaps in {scans}: {before:.2f} mm RMS at most, {after:.2f} aligned")
     farthest = max(check.pairs, key=lambda drift: drift.shift_mm)
-    said.append(f"most moved on average: {farthest.pair}, {farthest.shift_mm:.2f} mm")
-    return Findings(check, tuple(said))
-
-
-def _scans(check: ScanCheck) -> str:
-    count = len(check.before_mm)
-    return "1 scan" if count == 1 else f"{count} scans"
+    lines.append(f"moved most on average: {farthest.pair}, {farthest.shift_mm:.2f} mm")
+    return Findings(check, tuple(lines))

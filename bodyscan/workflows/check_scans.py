@@ -1,4 +1,4 @@
-"""What ordinary scans of people say about a rig: whether a pair always has to move the same way."""
+"""Check with ordinary scans of people whether a pair or pole is displaced from its calibrated pose."""
 
 from __future__ import annotations
 
@@ -20,21 +20,16 @@ from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.settings import AlignmentSettings
 from bodyscan.workflows.range_images import reconstruct_range_images
 
-OVERLAP_MM = 0.5
-MOST_UNSEEN_MM = 5.0
-"""mm: alignment corrects a pole that moved by less; girths are still good to 2 mm
-(docs/results.md, faults)."""
-
 
 @dataclass(frozen=True, eq=False)
 class ScanCheck:
-    """What scans of people say about a rig.
+    """What scans of people tell about a rig.
 
     before_mm, after_mm: of each scan, RMS distance of its overlaps before and after alignment.
-    pairs: the motion that the overlaps asked of each pair.
-    poles: the same for poles whose pairs moved alike.
+    pairs: the mean motion of each pair by alignment.
+    poles: the same of poles, where their pairs moved together.
     search: the search for single moves, given the time at which each pair saw the person.
-    apart: groups of pairs that no overlap of any scan connects, the largest first; empty if there
+    groups: groups of pairs that no overlap of any scan connects, the largest first; empty if there
         is only one group. How groups stand relative to each other is not observed: pairs that moved
         far enough share nothing.
     """
@@ -44,29 +39,32 @@ class ScanCheck:
     pairs: tuple[PairDrift, ...]
     poles: tuple[PairDrift, ...]
     search: StepSearch
-    apart: tuple[tuple[str, ...], ...] = ()
+    groups: tuple[tuple[str, ...], ...] = ()
 
     @property
-    def unseen_mm(self) -> float:
+    def detectable_mm(self) -> float:
         """The largest move of a pair or pole, mm, that could pass for a person's motion."""
         by_mean = max(drift.limit_mm for drift in (*self.pairs, *self.poles))
         return min(by_mean, self.search.least_mm)
 
     @property
     def decided(self) -> bool:
-        """Whether a harmful move can be told from sway, and all pairs are connected."""
-        return self.unseen_mm <= MOST_UNSEEN_MM and not self.apart
+        """Whether a harmful move can be distinguished from sway, and all pairs are connected.
+
+        Alignment corrects a pole that moved by less than 5 mm: girths are still good to 2 mm.
+        """
+        return self.detectable_mm <= 5.0 and not self.groups
 
     @property
     def quiet(self) -> bool:
         """Whether there is nothing to explain, neither sway nor a move."""
         still = all(drift.shift_mm < LEAST_MM for drift in self.pairs)
-        return still and max(self.before_mm) < OVERLAP_MM and not self.apart
+        return still and max(self.before_mm) < 0.5 and not self.groups
 
     @property
     def valid(self) -> bool:
-        alike = any(drift.moved for drift in (*self.pairs, *self.poles))
-        return not alike and self.search.step is None
+        drifted = any(drift.moved for drift in (*self.pairs, *self.poles))
+        return not drifted and self.search.step is None
 
 
 def check_scans(
@@ -77,11 +75,11 @@ def check_scans(
     for captures in scans:
         images = reconstruct_range_images(calibration, captures, progress).value
         cleaned = clean(images, calibration.rig_from_camera, calibration.rig.volume)
-        seen = require_subject(cleaned)
+        kept = require_subject(cleaned)
         alignments.append(
-            align(seen, calibration.rig_from_camera, calibration.covariance, AlignmentSettings())
+            align(kept, calibration.rig_from_camera, calibration.covariance, AlignmentSettings())
         )
-        moments.append({image.pair: image.time_ms for image in seen})
+        moments.append({image.pair: image.time_ms for image in kept})
     return judge_scans(alignments, calibration.rig_from_camera, calibration.rig.poles, moments)
 
 
@@ -107,12 +105,12 @@ def judge_scans(
         ).reshape(-1, 3)
         for name, at in rig_from_camera.items()
     }
-    pairs = [mean_drift(name, own) for name, own in sorted(shifts.items()) if len(own)]
-    together = []
+    pairs = [mean_drift(name, each) for name, each in sorted(shifts.items()) if len(each)]
+    whole_poles = []
     for pole in sorted(set(poles.values())):
-        own = [shifts[n] for n in sorted(shifts) if poles.get(n) == pole and len(shifts[n])]
-        if len(own) > 1 and len({len(one) for one in own}) == 1:
-            together.append(mean_drift(f"pole {pole}", np.mean(own, axis=0)))
+        of_pole = [shifts[n] for n in sorted(shifts) if poles.get(n) == pole and len(shifts[n])]
+        if len(of_pole) > 1 and len({len(one) for one in of_pole}) == 1:
+            whole_poles.append(mean_drift(f"pole {pole}", np.mean(of_pole, axis=0)))
     if moments_ms is None:
         moments_ms = [dict.fromkeys(found.rig_from_camera) for found in alignments]
     motions = [
@@ -123,13 +121,14 @@ def judge_scans(
         tuple(found.rms_before_mm for found in alignments),
         tuple(found.rms_after_mm for found in alignments),
         tuple(pairs),
-        tuple(together),
+        tuple(whole_poles),
         find_steps(list(zip(motions, moments_ms, strict=True)), poles),
-        _apart(alignments),
+        _separate_groups(alignments),
     )
 
 
-def _apart(alignments: Sequence[Alignment]) -> tuple[tuple[str, ...], ...]:
+def _separate_groups(alignments: Sequence[Alignment]) -> tuple[tuple[str, ...], ...]:
+    """Connected components of the overlaps of all scans, the largest first; () if there is one."""
     graph = nx.Graph()
     for found in alignments:
         graph.add_nodes_from(found.rig_from_camera)

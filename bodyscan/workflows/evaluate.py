@@ -80,7 +80,7 @@ def load_truth(folder: Path) -> Truth:
             if isinstance(error, FileNotFoundError)
             else "has a truth.json that cannot be read",
             where=str(folder),
-            remedy="only workspaces made by `bodyscan simulate` can be held against the truth",
+            remedy="only workspaces made by `bodyscan simulate` can be compared with the truth",
         ) from error
     surface = folder / "subject.ply"
     if not surface.exists():
@@ -101,7 +101,7 @@ def compare_rig(calibration: RigCalibration, truth: Truth) -> RigDeviation:
     unknown = [name for name in names if name not in truth.facts["pairs"]]
     if unknown:
         raise BadInput(
-            f"the truth knows no pair {', '.join(unknown)}",
+            f"the truth has no pair {', '.join(unknown)}",
             where=f"calibration of rig {calibration.rig.name}",
             remedy="calibrate the rig file that `bodyscan simulate` wrote into this workspace",
         )
@@ -159,13 +159,13 @@ def _scan_lines(
     assert truth.vertices is not None
     assert truth.faces is not None
     surface, pairs = (truth.vertices, truth.faces), truth.facts["pairs"]
-    place = sway_residual(_placings(stored, calibration), pairs, truth.vertices)
+    sway = sway_residual(_aligned_poses(stored, calibration), pairs, truth.vertices)
     still_from_rig = RigidTransform.identity()
     if "motion" in truth.facts:  # fit to the body as it was then
         still_from_rig = fit_to_surface(stored.cloud.points, *surface)
     elif truth.facts["settings"]["person"]["sway_mm"]:
-        still_from_rig = place.rig_from_still.inverse()  # a swaying subject has no fixed pose
-    own, body = stored.mesh, transform_mesh(stored.mesh, still_from_rig)
+        still_from_rig = sway.rig_from_still.inverse()  # a swaying subject has no fixed pose
+    in_rig, body = stored.mesh, transform_mesh(stored.mesh, still_from_rig)
     points = still_from_rig.apply(stored.cloud.points)
     cloud = signed_distances(points, *surface)
     measured = np.unique(body.faces[~body.filled])
@@ -178,7 +178,7 @@ def _scan_lines(
     with part("cloud"):
         lines += _cloud_lines(cloud, stored.cloud.sigma_mm)
     with part("mesh"):
-        lines += _mesh_lines(mesh, own)
+        lines += _mesh_lines(mesh, in_rig)
     with part("torso girths"):
         lines.append(f"  torso girths (tape)     {_girth_figures(girth_errors(body, *surface))}")
     if truth.at_mean_breath is not None:
@@ -188,22 +188,22 @@ def _scan_lines(
     with part("coverage"):
         lines.append(_coverage_line(*coverage_of_seen(points, *surface, pairs)))
     lines.append(
-        f"  pairs to each other     {place.apart_mm:.3f} mm RMS over the body, along and across"
+        f"  pairs to each other     {sway.apart_mm:.3f} mm RMS over the body, along and across"
     )
     with part("cloud-deviation.png"):
         drawn = draw_deviation(stored.cloud.points, stored.cloud.normals, cloud)
         write_bytes(folder / "cloud-deviation.png", drawn)
     with part("mesh-deviation.png"):
-        drawn = draw_deviation(own.vertices[measured], own.normals[measured], mesh)
+        drawn = draw_deviation(in_rig.vertices[measured], in_rig.normals[measured], mesh)
         write_bytes(folder / "mesh-deviation.png", drawn)
     return lines
 
 
 def _cloud_lines(signed_mm: Array, sigma_mm: Floats) -> Iterator[str]:
-    spread, beyond = normalized_errors(signed_mm, sigma_mm)
+    scale, beyond = normalized_errors(signed_mm, sigma_mm)
     yield f"  cloud, {len(signed_mm):,} points   {_figures(deviation(signed_mm))}"
     yield (
-        f"  error over sigma        {spread:.2f} (robust; 1 is honest), {100.0 * beyond:.2f} % "
+        f"  error over sigma        {scale:.2f} (robust; 1 is right), {100.0 * beyond:.2f} % "
         "of the points beyond three sigmas"
     )
 
@@ -219,14 +219,14 @@ def _mesh_lines(signed_mm: Array, mesh: BodyMesh) -> Iterator[str]:
     )
 
 
-def _coverage_line(seen: float, covered: float) -> str:
+def _coverage_line(visible: float, covered: float) -> str:
     return (
-        f"  covered within 1 mm     {100.0 * covered:.1f} % of the {100.0 * seen:.1f} % of the "
+        f"  covered within 1 mm     {100.0 * covered:.1f} % of the {100.0 * visible:.1f} % of the "
         "surface that a camera and its projector see"
     )
 
 
-def _placings(stored: StoredScan, calibration: RigCalibration) -> dict[str, RigidTransform]:
+def _aligned_poses(stored: StoredScan, calibration: RigCalibration) -> dict[str, RigidTransform]:
     """rig_from_camera of the pairs in the scan, as aligned if they were."""
     measured = [name for name, points in stored.facts["measured"].items() if points]
     alignment = stored.facts["alignment"]

@@ -61,8 +61,8 @@ class FoundBoards(Outcome[list[BoardView]]):
 
     refused: Mapping[ImageSequence, BodyscanError] = field(default_factory=dict)
 
-    def searched(self, captures: Captures) -> int:
-        """Number of images in which boards were looked for."""
+    def count_searched(self, captures: Captures) -> int:
+        """Count the images in which boards were looked for."""
         return len(captures.sequences) - len(self.refused)
 
 
@@ -107,7 +107,7 @@ def find_all_boards(rig: Rig, captures: Captures, progress: Progress = silent) -
 def _given_view(rig: Rig, captures: Captures, sequence: ImageSequence) -> list[BoardView]:
     """The board whose corners were found elsewhere, [] if none were.
 
-    Raises BadInput when the rig has several boards, because the corners do not say whose they are.
+    Raises BadInput when the rig has several boards, because corners alone do not identify the board.
     """
     if len(rig.boards) != 1:
         raise BadInput(
@@ -246,7 +246,7 @@ def require_cameras(
 
     Raises FailedWork if there is none.
     """
-    searched, failures = boards.searched(captures), dict(cameras.failures)
+    searched, failures = boards.count_searched(captures), dict(cameras.failures)
     if searched and not boards.value:
         # More poses of a board that is not as described would not help.
         failures = {name: reason.partition("\n")[0] for name, reason in failures.items()}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
@@ -30,7 +29,7 @@ from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.outcome import Outcome
-from bodyscan.progress import Progress, silent, step
+from bodyscan.progress import Progress, background, silent, step
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.settings import AlignmentSettings, FusionSettings, ScanSettings
@@ -38,7 +37,7 @@ from bodyscan.verdict import Announce, say_nothing
 
 
 @dataclass(frozen=True, eq=False)
-class _Placed:
+class _Subject:
     """Range images that show something of the subject, carried to one moment if it moved.
 
     rig_from_camera: the pairs' poses after alignment; as calibrated for those that saw nothing.
@@ -87,66 +86,66 @@ def fuse(
     with step(progress, "cleaning"):
         calibrated, volume = calibration.rig_from_camera, calibration.rig.volume
         cleaned = clean(measured.value, calibrated, volume, empty=empty)
-        placed = _Placed(require_subject(cleaned), dict(calibrated), calibration.covariance)
-    if settings.alignment.matching != "none" and len(placed.images) > 1:
+        subject = _Subject(require_subject(cleaned), dict(calibrated), calibration.covariance)
+    if settings.alignment.matching != "none" and len(subject.images) > 1:
         with step(progress, "aligning"):
-            placed = _aligned(placed, calibration, settings.alignment)
+            subject = _align(subject, calibration, settings.alignment)
     with step(progress, "merging"):
-        merged = _merged(placed, settings.fusion)
+        merged = _merge(subject, settings.fusion)
     with step(progress, "judging"):
         judged = partial(
             grade_scan,
             merged.cloud,
             RigEvidence.of(calibration),
-            _image_evidence(calibration, measured, cleaned, placed, merged.contradictions),
+            _image_evidence(calibration, measured, cleaned, subject, merged.contradictions),
             settings.use,
-            together=placed.together,
-            person=placed.person,
+            together=subject.together,
+            person=subject.person,
         )
         announce(judged(), final=False)
     with step(progress, "meshing"):
-        cloud, mesh = _meshed(merged.cloud, measured.value, placed, settings, made)
-        verdict = judged(mesh=mesh, surface=_surface_check(mesh, cleaned, placed))
+        cloud, mesh = _mesh(merged.cloud, measured.value, subject, settings, made)
+        verdict = judged(mesh=mesh, surface=_surface_check(mesh, cleaned, subject))
     return Scan(
         cloud,
         mesh,
-        placed.together.alignment if placed.together else None,
+        subject.together.alignment if subject.together else None,
         {image.pair: int(image.valid.sum()) for image in cleaned},
         dict(measured.failures),
         verdict,
-        tuple(placed.images),
-        placed.rig_from_camera,
-        placed.person,
+        tuple(subject.images),
+        subject.rig_from_camera,
+        subject.person,
         measured.notes,
     )
 
 
-def _aligned(
-    calibrated: _Placed, calibration: RigCalibration, settings: AlignmentSettings
-) -> _Placed:
+def _align(
+    calibrated: _Subject, calibration: RigCalibration, settings: AlignmentSettings
+) -> _Subject:
     """Align the images and carry them to one moment."""
     images, start, boards = calibrated.images, calibrated.rig_from_camera, calibrated.known
     found = align(images, start, boards, settings)
     together = bring_together(images, start, found, boards, calibration.rig.poles, settings)
     rig_from_camera = start | together.alignment.rig_from_camera
     images = at_once(images, rig_from_camera, together.followed)
-    tied, known, aligned = together.alignment.motion_mm, boards, together.alignment.poses
+    moved, known, aligned = together.alignment.motion_mm, boards, together.alignment.poses
     if aligned is not None:
         # As the boards left them, if nobody moved; as the overlaps left them, whoever moved.
-        known = better_known(boards, aligned, tied)
-    untied = {image.pair for image in images} - tied.keys()
-    known = SwayPrior.of(settings).loosen(known, untied)
-    return _Placed(images, rig_from_camera, known, together)
+        known = better_known(boards, aligned, moved)
+    unaligned = {image.pair for image in images} - moved.keys()
+    known = SwayPrior.of(settings).loosen(known, unaligned)
+    return _Subject(images, rig_from_camera, known, together)
 
 
-def _merged(placed: _Placed, settings: FusionSettings) -> MergedCloud:
+def _merge(subject: _Subject, settings: FusionSettings) -> MergedCloud:
     """Merge to one cloud; its sigmas include those of the pairs' poses and the person's motion."""
     # Following a person fits the pairs to each other: what it leaves between them is not the poses'.
-    poses = None if placed.followed else placed.known
-    merged = merge(placed.images, placed.rig_from_camera, settings, poses=poses)
-    cloud = add_pose_variance(merged.cloud, placed.there, placed.known)
-    if placed.followed:
-        cloud = add_motion_variance(merged.cloud, cloud, placed.followed)
+    poses = None if subject.followed else subject.known
+    merged = merge(subject.images, subject.rig_from_camera, settings, poses=poses)
+    cloud = add_pose_variance(merged.cloud, subject.there, subject.known)
+    if subject.followed:
+        cloud = add_motion_variance(merged.cloud, cloud, subject.followed)
     return replace(merged, cloud=cloud)
 
 
@@ -154,54 +153,56 @@ def _image_evidence(
     calibration: RigCalibration,
     measured: Outcome[Sequence[RangeImage]],
     cleaned: Sequence[RangeImage],
-    placed: _Placed,
+    subject: _Subject,
     contradictions: Contradictions,
 ) -> ImageEvidence:
-    poles, asked = calibration.rig.poles, [image.pair for image in cleaned]
-    shifted = placed.together.shifted if placed.together else ()
+    poles, tried = calibration.rig.poles, [image.pair for image in cleaned]
+    shifted = subject.together.shifted if subject.together else ()
     moved = {name for one in shifted for name in one.pairs}
     unmoved = [image for image in measured.value if image.pair not in moved]
     return ImageEvidence(
         measured.failures,
-        silent_poles(poles, [*asked, *measured.failures], [image.pair for image in placed.images]),
+        silent_poles(poles, [*tried, *measured.failures], [image.pair for image in subject.images]),
         {image.pair: image.agreement for image in measured.value if image.agreement},
-        judge_seams(placed.images, placed.there, poles),
+        judge_seams(subject.images, subject.there, poles),
         contradictions,
         find_floor(unmoved, calibration.rig_from_camera, calibration.rig.volume),
     )
 
 
-def _meshed(
+def _mesh(
     cloud: BodyCloud,
     measured: Sequence[RangeImage],
-    placed: _Placed,
+    subject: _Subject,
     settings: ScanSettings,
     made: Made,
 ) -> tuple[BodyCloud, BodyMesh]:
-    """The cloud with its regions, and the mesh with its displacement to mean breath."""
+    """Label the cloud's regions, and mesh it; the mesh holds its displacement to mean breath."""
 
-    def named() -> BodyCloud:
-        regions = label_regions(cloud, placed.images, placed.there, settings.fusion.window_mm)
+    def label() -> BodyCloud:
+        regions = label_regions(cloud, subject.images, subject.there, settings.fusion.window_mm)
         # A smooth surface leaves out how far strands of hair stand off it.
         sigma_mm = np.hypot(cloud.sigma_mm, regions.relief_mm)
         known = replace(cloud, sigma_mm=sigma_mm, regions=regions.numbers)
         made(known)
         return known
 
-    with ThreadPoolExecutor(1) as beside:
+    with background() as other:
         # Meshing mostly uses one core, so regions are labelled on the other meanwhile.
-        naming = beside.submit(named)
-        shape = closed_surface(cloud, settings.mesh, measured, placed.rig_from_camera)
-        known = naming.result()
+        labelling = other.submit(label)
+        shape = closed_surface(cloud, settings.mesh, measured, subject.rig_from_camera)
+        known = labelling.result()
     mesh = attach_attributes(*shape, known, settings.mesh.reach_mm)
-    if placed.followed:
-        mesh = placed.followed.breathing(mesh)
+    if subject.followed:
+        mesh = subject.followed.breathing(mesh)
     made(mesh)
     return known, mesh
 
 
-def _surface_check(mesh: BodyMesh, cleaned: Sequence[RangeImage], placed: _Placed) -> SurfaceCheck:
+def _surface_check(
+    mesh: BodyMesh, cleaned: Sequence[RangeImage], subject: _Subject
+) -> SurfaceCheck:
     """Check the mesh against the images of all pairs, including those that saw nothing."""
-    carried = {image.pair: image for image in placed.images}
+    carried = {image.pair: image for image in subject.images}
     images = [carried.get(image.pair, image) for image in cleaned]
-    return check_surface(mesh, images, placed.rig_from_camera)
+    return check_surface(mesh, images, subject.rig_from_camera)

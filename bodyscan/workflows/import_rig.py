@@ -21,12 +21,6 @@ from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_file import load_rig
 
-USUAL_PX = 1.0
-"""Sigma, px, of pixels whose calibration states none, for alignment, which must know how far pairs
-may be off relative to each other: what is commonly called good."""
-USUAL_DISTANCE_MM = 1300.0
-"""Distance of the scanned surface from a camera, where that sigma applies."""
-
 
 def import_folder(
     rig_file: Path, folder: Path, sigma_px: float | None = None
@@ -49,7 +43,7 @@ def import_rig(rig: Rig, folder: Path, sigma_px: float | None = None) -> RigCali
     """
     if rig.rig_frame.shot is not None:
         raise BadInput(
-            "a board is to fix the rig frame, but an import looks at no images",
+            "the rig frame is to be fixed by a board, but an import reads no images",
             where=f"rig {rig.name}",
             remedy="name a pair in `rig_frame`, or leave it out to take the frame of the files",
         )
@@ -63,21 +57,21 @@ def import_rig(rig: Rig, folder: Path, sigma_px: float | None = None) -> RigCali
     if not known:
         raise next(iter(failed.values()))
     if sigma_px is not None:
-        known = {name: replace(own, sigma_px=sigma_px) for name, own in known.items()}
-    rig_from_camera = _placed(rig, known)
+        known = {name: replace(one, sigma_px=sigma_px) for name, one in known.items()}
+    rig_from_camera = _rig_from_camera(rig, known)
     return RigCalibration(
         rig,
-        {name: _calibrated(rig.pair(name), own) for name, own in known.items()},
+        {name: _calibration_of(rig.pair(name), one) for name, one in known.items()},
         rig_from_camera,
         _covariance(known, rig_from_camera),
         {},
         {name: relative_text(str(error), folder) for name, error in failed.items()},
-        tuple(_note(name, own) for name, own in known.items()),
+        tuple(_note(name, one) for name, one in known.items()),
     )
 
 
-def known_errors_of(rig_file: Path) -> list[str]:
-    """What is wrong with the files that a rig file names as `known`, one or two lines each."""
+def find_known_errors(rig_file: Path) -> list[str]:
+    """Find errors in the files that a rig file names as `known`; one or two lines each."""
     errors = []
     for pair in load_rig(rig_file).pairs:
         try:
@@ -112,11 +106,11 @@ def _read(pair: Pair, folder: Path, *, several: bool) -> KnownPair:
     return known
 
 
-def _placed(rig: Rig, known: dict[str, KnownPair]) -> dict[str, RigidTransform]:
+def _rig_from_camera(rig: Rig, known: dict[str, KnownPair]) -> dict[str, RigidTransform]:
     """`rig_from_camera` of each pair."""
     world_from_camera = {
-        name: (own.camera_from_world or RigidTransform.identity()).inverse()
-        for name, own in known.items()
+        name: (one.camera_from_world or RigidTransform.identity()).inverse()
+        for name, one in known.items()
     }
     carried = rig_from_world(rig, world_from_camera)
     if carried is None:
@@ -124,7 +118,7 @@ def _placed(rig: Rig, known: dict[str, KnownPair]) -> dict[str, RigidTransform]:
     return {name: carried @ pose for name, pose in world_from_camera.items()}
 
 
-def _calibrated(pair: Pair, known: KnownPair) -> PairCalibration:
+def _calibration_of(pair: Pair, known: KnownPair) -> PairCalibration:
     camera, code = known.camera, pair.projector
     covariance = np.zeros((len(camera.parameters),) * 2)
     if known.sigma_px is not None:
@@ -141,23 +135,27 @@ def _calibrated(pair: Pair, known: KnownPair) -> PairCalibration:
 def _covariance(
     known: dict[str, KnownPair], rig_from_camera: dict[str, RigidTransform]
 ) -> PoseCovariance:
-    """Covariance of the poses: each pair independently off by as much as its pixels, at the usual
-    distance; zero for a single pair, which has nothing to be off from."""
+    """Covariance of the poses: each pair independently rotated by the sigma of its pixels, and shifted
+    by as much at the surface, 1300 mm away; zero for a single pair, which defines the rig frame.
+
+    Where a calibration states no sigma, 1 px: alignment must know how far pairs may be displaced.
+    """
     names = tuple(sorted(known))
     matrix = np.zeros((6 * len(names),) * 2)
     for k, name in enumerate(names if len(names) > 1 else ()):
-        own = known[name]
-        turn = (own.sigma_px or USUAL_PX) / own.camera.alpha
-        sigmas = np.repeat([turn, turn * USUAL_DISTANCE_MM], 3)
+        one = known[name]
+        turn = (one.sigma_px or 1.0) / one.camera.alpha
+        sigmas = np.repeat([turn, 1300.0 * turn], 3)
         to_rig: Array = adjoint(rig_from_camera[name])
         matrix[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = to_rig @ np.diag(sigmas**2) @ to_rig.T
     return PoseCovariance(names, matrix)
 
 
 def _note(name: str, known: KnownPair) -> str:
+    """Say where a pair's calibration comes from, and how accurate it is."""
     exact = (
-        "how exact it is is not known: sigmas of what is scanned hold the decoding alone"
+        "its accuracy is not known: sigmas of scans cover the decoding alone"
         if known.sigma_px is None
-        else f"taken to be right to {known.sigma_px:g} px"
+        else f"taken to be accurate to {known.sigma_px:g} px"
     )
     return f"{name}: imported from {known.source}; {exact}"

@@ -49,7 +49,7 @@ class Preparation:
             captures = open_scan(self.calibration.rig, folder)
         except BodyscanError:
             return
-        wanted = [s for s in captures.sequences if s.pair in pairs and self._can(s)]
+        wanted = [s for s in captures.sequences if s.pair in pairs and self._is_whole(s)]
 
         def make(sequence: ImageSequence) -> _Made | None:
             stamps = _stamps(captures, sequence)
@@ -59,10 +59,10 @@ class Preparation:
                 return None
             return _Made(made, stamps)
 
-        own = self._made.setdefault(folder, {})
-        own |= {sequence: self._pool.submit(make, sequence) for sequence in wanted}
+        started = self._made.setdefault(folder, {})
+        started |= {sequence: self._pool.submit(make, sequence) for sequence in wanted}
 
-    def made_of(self, captures: Captures) -> dict[ImageSequence, Reconstructed]:
+    def take(self, captures: Captures) -> dict[ImageSequence, Reconstructed]:
         """Hand over the range images of these captures whose files have not changed since.
 
         Waits for those being made. They are handed over once, so that none is kept twice.
@@ -72,12 +72,12 @@ class Preparation:
             made |= self._made.pop(folder, {})
         found = {sequence: one.result() for sequence, one in made.items()}
         return {
-            sequence: own.range_image
-            for sequence, own in found.items()
-            if own is not None and _stamps(captures, sequence) == own.stamps
+            sequence: one.range_image
+            for sequence, one in found.items()
+            if one is not None and _stamps(captures, sequence) == one.stamps
         }
 
-    def _can(self, sequence: ImageSequence) -> bool:
+    def _is_whole(self, sequence: ImageSequence) -> bool:
         calibrated = sequence.pair in self.calibration.pairs
         return calibrated and sequence.has_stripes and not sequence.missing
 

@@ -98,7 +98,7 @@ def reconstruct_range_images(
     for image, shares, _ in found.values():
         responses[image.pair] += shares
     notes = [f"{image.pair}: {image.agreement}" for image in images if image.agreement is not None]
-    notes += map(captures.relative, crossing_notes({one: own[-1] for one, own in found.items()}))
+    notes += map(captures.relative, crossing_notes({one: made[-1] for one, made in found.items()}))
     return Outcome(images, (*notes, *response_notes(responses)), failed)
 
 

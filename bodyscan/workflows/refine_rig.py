@@ -17,7 +17,7 @@ from bodyscan.workflows.range_images import reconstruct_range_images
 def refine_rig(
     calibration: RigCalibration, captures: Captures, name: str, progress: Progress = silent
 ) -> Outcome[RigCalibration]:
-    """The calibration with the pairs brought closer together, within what the boards allow.
+    """Refine the poses of the pairs by ICP on a rigid object, within the covariance of the boards.
 
     captures: a scan of an object that stood still.
     name: what the calibration's notes call it.
@@ -28,15 +28,17 @@ def refine_rig(
     measured = reconstruct_range_images(calibration, captures, progress)
     with step(progress, "aligning"):
         cleaned = clean(measured.value, calibration.rig_from_camera, calibration.rig.volume)
-        seen = require_subject(cleaned)
         found = refine_on_object(
-            seen, calibration.rig_from_camera, calibration.covariance, calibration.rig.poles
+            require_subject(cleaned),
+            calibration.rig_from_camera,
+            calibration.covariance,
+            calibration.rig.poles,
         )
     if not found.better:
         raise FailedWork(
             "\n".join(
                 [
-                    "the overlaps come no closer, or hardly: the calibration is better as it is",
+                    "the overlaps do not come closer, or hardly: the calibration stays as it is",
                     *(f"  {line}" for line in found.lines),
                 ]
             )

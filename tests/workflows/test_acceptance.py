@@ -57,11 +57,11 @@ def ball(
 
 
 def test_a_former_test_is_replaced_only_where_that_is_asked(tmp_path: Path) -> None:
-    accept_rig.refuse_former(tmp_path, overwrite=False)
+    accept_rig.refuse_existing_test(tmp_path, overwrite=False)
     (tmp_path / accept_rig.FILE_NAME).write_text("{}")
-    accept_rig.refuse_former(tmp_path, overwrite=True)
+    accept_rig.refuse_existing_test(tmp_path, overwrite=True)
     with pytest.raises(BadInput, match="an acceptance test lies here already"):
-        accept_rig.refuse_former(tmp_path, overwrite=False)
+        accept_rig.refuse_existing_test(tmp_path, overwrite=False)
 
 
 def test_form_and_size_are_what_was_put_in() -> None:

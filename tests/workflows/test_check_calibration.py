@@ -13,7 +13,7 @@ from bodyscan.alignment.icp import Alignment, Overlap
 from bodyscan.errors import BoardNotFound
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.storage import load_calibration, save_calibration
-from bodyscan.workflows.check_rig import _of_scans
+from bodyscan.workflows.check_rig import describe_scan_check
 from bodyscan.workflows.check_scans import judge_scans
 
 
@@ -142,8 +142,8 @@ def test_pairs_that_share_nothing_with_the_others_are_not_confirmed() -> None:
     apart = judge_scans([aligned(still, joined=False)] * 3, start, {})
     assert not apart.quiet
     assert not apart.decided
-    assert apart.apart == (("p1-1", "p1-2", "p2-1"), ("p3-1",))
-    findings = _of_scans(apart)
+    assert apart.groups == (("p1-1", "p1-2", "p2-1"), ("p3-1",))
+    findings = describe_scan_check(apart)
     assert not findings.valid
     assert "undecided: no surface is seen by more than one" in findings.lines[0]
     assert "p1-1, p1-2, p2-1; p3-1" in findings.lines[0]

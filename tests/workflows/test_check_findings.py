@@ -13,8 +13,13 @@ from bodyscan.errors import FailedWork
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.drift import Move
-from bodyscan.workflows.check_boards import repaired
-from bodyscan.workflows.check_rig import Findings, _named_apart, _of_boards, _of_scans
+from bodyscan.workflows.check_boards import apply_moves
+from bodyscan.workflows.check_rig import (
+    Findings,
+    describe_board_check,
+    describe_scan_check,
+    number_shots,
+)
 
 CALIBRATION: Any = SimpleNamespace(
     pairs={
@@ -35,7 +40,7 @@ class Placed:
 
 
 def offset(pair: str, mm: float, moved: bool = False) -> SimpleNamespace:
-    return SimpleNamespace(pair=pair, offset_mm=mm, turned_mm=-0.31, moved=moved)
+    return SimpleNamespace(pair=pair, offset_mm=mm, tilt_mm=-0.31, moved=moved)
 
 
 def boards(
@@ -46,10 +51,10 @@ def boards(
         lonely=others.pop("lonely", ()),
     )  # fmt: skip
     check = SimpleNamespace(
-        drift=drift, valid=valid, stripes=stripes, seen=("p", "q"),
-        unseen=others.pop("unseen", ()), notes=others.pop("notes", ()),
+        drift=drift, valid=valid, stripes=stripes, checked=("p", "q"),
+        unchecked=others.pop("unseen", ()), notes=others.pop("notes", ()),
     )  # fmt: skip
-    return _of_boards(CALIBRATION, cast(Any, check))
+    return describe_board_check(CALIBRATION, cast(Any, check))
 
 
 def test_a_rig_that_stood_still_says_by_how_much_it_is_known() -> None:
@@ -57,11 +62,11 @@ def test_a_rig_that_stood_still_says_by_how_much_it_is_known() -> None:
     assert found.valid
     assert found.lines == (
         "valid: all that see the board agree",
-        "2 pairs saw a board; their views are 1.3 sigmas off (root mean square)",
-        "stripes of 2 pairs lie on the board to 0.11 mm (farthest: q)",
+        "2 pairs saw a board; their views differ by 1.3 sigmas RMS",
+        "stripes of 2 pairs lie within 0.11 mm of the board (worst: q)",
     )
     alone = boards(offset("p", 0.04), together=False)
-    assert alone.lines[0] == "valid: stripes lie where the board's corners are"
+    assert alone.lines[0] == "valid: the stripes lie on the board"
     assert len(alone.lines) == 2
 
 
@@ -69,23 +74,24 @@ def test_a_projector_that_moved_is_told_and_not_put_right() -> None:
     found = boards(offset("p", 0.84, True), offset("q", -2.0, True), valid=False)
     assert not found.valid
     assert found.lines[:3] == (
-        "NOT valid: what stripes measure is not where the board is",
-        "projector of p moved against its camera: the board's surface is measured +0.84 mm off, "
-        "tilted by -0.31 mm at its ends",
-        "projector of q moved against its camera, or theirs.json is not its calibration: the board's "
-        "surface is measured -2.00 mm off, tilted by -0.31 mm at its ends",
+        "NOT valid: the stripes do not lie on the board",
+        "p: the stripes measure the board +0.84 mm from its corners, tilted by -0.31 mm at its ends. "
+        "Possible causes: the projector moved against its camera",
+        "q: the stripes measure the board -2.00 mm from its corners, tilted by -0.31 mm at its ends. "
+        "Possible causes: the projector moved against its camera, or theirs.json is not its "
+        "calibration",
     )
     with pytest.raises(FailedWork, match="projector of p, q moved"):
-        found.repaired(CALIBRATION)
+        found.repair(CALIBRATION)
     with pytest.raises(FailedWork, match="nothing moved"):
-        boards(offset("p", 0.04)).repaired(CALIBRATION)
+        boards(offset("p", 0.04)).repair(CALIBRATION)
 
 
 def test_what_was_not_checked_is_named() -> None:
     found = boards(unseen=("r", "s"), lonely=("t",), notes=("dim",))
     assert found.lines[2:] == (
-        "not checked, for they saw no board: r, s",
-        "not checked, for nobody shares their board: t",
+        "not checked, because they saw no board: r, s",
+        "not checked, because no other pair saw their board: t",
         "note: dim",
     )
 
@@ -106,7 +112,7 @@ def test_shots_of_several_folders_are_told_apart_by_their_folders_number() -> No
     other = Folder(("a",), (Sequence("a"),))
 
     def named(*folders: Folder) -> list[Any]:
-        return list(_named_apart(cast(Any, folders)))
+        return list(number_shots(cast(Any, folders)))
 
     assert named(one) == [one]
     assert named(one, other) == [
@@ -119,11 +125,12 @@ def test_shots_of_several_folders_are_told_apart_by_their_folders_number() -> No
 def test_an_undecided_check_asks_for_more_scans(scans: int, asked: str) -> None:
     still = SimpleNamespace(pair="p", moved=False, shift_mm=0.1, sigma_mm=0.1)
     check = SimpleNamespace(
-        search=SimpleNamespace(step=None), poles=(), pairs=(still,), valid=True, apart=(),
-        decided=False, quiet=False, unseen_mm=1.84, before_mm=(0.4,) * scans, after_mm=(0.2,) * scans,
+        search=SimpleNamespace(step=None), poles=(), pairs=(still,), valid=True, groups=(),
+        decided=False, quiet=False, detectable_mm=1.84, before_mm=(0.4,) * scans,
+        after_mm=(0.2,) * scans,
     )  # fmt: skip
-    first = _of_scans(cast(Any, check)).lines[0]
-    assert first.startswith(f"undecided: from {scans} scans a pair that moved by less than 1.8 mm")
+    first = describe_scan_check(cast(Any, check)).lines[0]
+    assert first.startswith(f"undecided: in {scans} scans, a pair that moved by less than 1.8 mm")
     assert f"give {asked}, or a shot of the board" in first
 
 
@@ -138,7 +145,7 @@ def test_pairs_of_a_repaired_pole_are_as_well_known_to_each_other_as_before() ->
     calibration: Any = Placed(rig, placing, known, ("as it was",))
     motion = RigidTransform(np.eye(3), np.array([3.0, 0.0, 4.0]))
     move = Move("pole p1", names[:2], motion, np.diag([1e-6] * 3 + [0.25] * 3), 5.0, 0.9, 0.0)
-    mended = repaired(calibration, [move])
+    mended = apply_moves(calibration, [move])
     after = mended.covariance
     np.testing.assert_allclose(after.between("p1-1", "p1-2"), known.between("p1-1", "p1-2"))
     for name in (*move.pairs, "p1-3"):

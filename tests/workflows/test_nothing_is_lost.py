@@ -15,8 +15,8 @@ from bodyscan.fusion.storage import load_scan
 from bodyscan.registration.storage import load_calibration
 from bodyscan.report import calibration_page, pictures
 from bodyscan.report.page import render
+from bodyscan.report.result_page import write_report
 from bodyscan.workflows import calibrate_rig, rig_remarks
-from bodyscan.workflows.write_report import write_report
 
 
 def broken(*_: object, **__: object) -> NoReturn:

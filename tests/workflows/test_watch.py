@@ -116,7 +116,7 @@ def test_pairs_that_come_one_by_one_are_decoded_side_by_side(
     pairs = sorted({sequence.pair for sequence in captures.sequences})[:2]
     for pair in pairs:
         preparation.prepare(person, [pair])
-    assert preparation.made_of(captures) == {}
+    assert preparation.take(captures) == {}
     assert sorted(met) == pairs
 
 
