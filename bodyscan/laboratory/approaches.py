@@ -234,20 +234,16 @@ def free_planes(points: BoundaryPoints, stripes: int, direction: Axis) -> LightP
     return fit_light_planes(points, stripes, direction).planes
 
 
-MATRIX_POINTS = 20000
-"""This many points determine the few numbers of a matrix far better than the model fits."""
-
-
 def pinhole_planes(points: BoundaryPoints, stripes: int, direction: Axis) -> LightPlanes:
     """Planes of the 2 x 4 matrix of Bolles et al. 1981."""
-    few = subsample(points, MATRIX_POINTS)
+    few = subsample(points, 20_000)
     fitted = fit_pinhole(few.points, few.index.astype(float))
     return fitted.planes(stripes, direction)
 
 
 def remapped_planes(points: BoundaryPoints, stripes: int, direction: Axis) -> LightPlanes:
     """Planes of the 2 x 4 matrix with a re-mapped index."""
-    few = subsample(points, MATRIX_POINTS)
+    few = subsample(points, 20_000)
     return fit_remapped_pinhole(few.points, few.index.astype(float), stripes, direction)
 
 

@@ -25,11 +25,6 @@ from bodyscan.simulation.sensor import expose
 from bodyscan.stripes.decoding import decode_stripes
 from bodyscan.stripes.stripe_map import StripeMap
 
-SPHERE_RINGS = 400
-"""Facets of a sphere are then less than 0.0005 mm inside it."""
-LAMP_GREY, AMBIENT_GREY = 255.0, 13.0
-WHITE, GROUND, WALL = 0.8, 0.5, 0.3
-
 
 @dataclass(frozen=True, eq=False)
 class Exposure:
@@ -46,9 +41,9 @@ def board_scene(setup: ChapterSetup, camera_from_board: RigidTransform) -> list[
 
 def sphere_scene() -> list[Surface]:
     """Five white spheres on the ground, and a wall behind."""
-    mesh = o3d.geometry.TriangleMesh.create_sphere(apparatus.RADIUS_MM, resolution=SPHERE_RINGS)
+    mesh = o3d.geometry.TriangleMesh.create_sphere(apparatus.RADIUS_MM, resolution=400)
     arms = np.asarray(mesh.vertices)
-    ball = Surface(arms, np.asarray(mesh.triangles), WHITE, normals=arms / apparatus.RADIUS_MM)
+    ball = Surface(arms, np.asarray(mesh.triangles), 0.8, normals=arms / apparatus.RADIUS_MM)
     spheres = [replace(ball, vertices=arms + centre) for centre in apparatus.CENTRES]
     return [*spheres, _ground(), _wall()]
 
@@ -58,7 +53,7 @@ def plate_scene() -> list[Surface]:
     pose = apparatus.pose_about(apparatus.PLATE_MIDDLE, apparatus.PLATE_TURN, middle=np.zeros(3))
     width, height = apparatus.PLATE_MM
     across, down = np.array([width, 0.0, 0.0]), np.array([0.0, height, 0.0])
-    plate = grid_surface(-0.5 * (across + down), across, down, albedo=WHITE)
+    plate = grid_surface(-0.5 * (across + down), across, down, albedo=0.8)
     return [replace(plate, open_to_light=True).transform(pose), _wall()]
 
 
@@ -71,7 +66,7 @@ def expose_scene(
     """
     rng = np.random.default_rng([setup.seed, apparatus.NOISE, number])
     settings = setup.settings
-    lamps = Lamps(LAMP_GREY, AMBIENT_GREY, apparatus.DISTANCE_MM * 1.05, apparatus.DISTANCE_MM)
+    lamps = Lamps(255.0, 13.0, apparatus.DISTANCE_MM * 1.05, apparatus.DISTANCE_MM)
     images = render_pair(
         Scene(surfaces), setup.view, setup.projector, lamps, settings.projection, rng
     )
@@ -93,22 +88,16 @@ def _ground() -> Surface:
     across, down = np.array([1.0, 0.0, 0.0]), apparatus.CENTRES[3] - apparatus.CENTRES[0]
     down = (down - (down @ across) * across) / np.linalg.norm(down[1:])
     below = apparatus.CENTRES[1] + apparatus.RADIUS_MM * np.cross(across, down)
-    return grid_surface(
-        below - 300.0 * (across + down), 600.0 * across, 600.0 * down, albedo=GROUND
-    )
+    return grid_surface(below - 300.0 * (across + down), 600.0 * across, 600.0 * down, albedo=0.5)
 
 
 def _wall() -> Surface:
     corner = np.array([-1500.0, -1500.0, 2.0 * apparatus.DISTANCE_MM])
     across, down = np.array([3000.0, 0.0, 0.0]), np.array([0.0, 3000.0, 0.0])
-    return grid_surface(corner, across, down, albedo=WALL, encloses=True)
+    return grid_surface(corner, across, down, albedo=0.3, encloses=True)
 
 
 TARGET = Target(apparatus.BOARD, apparatus.PROJECTOR)
-ON_SPHERE_MM = 0.02
-RIM_PX = 4
-WALL_MM = 600.0
-_BOARDS, _STAGE, _SPHERES, _PLATE = 0, 100, 200, 300
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,13 +146,13 @@ def take_captures(
     shots = []
     for number, pose in enumerate([*poses, *stage]):
         of_stage = number - boards
-        stream = _STAGE + of_stage if of_stage >= 0 else _BOARDS + number
+        stream = 100 + of_stage if of_stage >= 0 else number
         name = f"stage{of_stage + 1}" if of_stage >= 0 else f"board{number + 1}"
         shots.append(_board_shot(setup, pose, name, stream))
         progress("rendering", number + 1, total)
-    spheres = _expose(setup, sphere_scene(), _SPHERES)
+    spheres = _expose(setup, sphere_scene(), 200)
     progress("rendering", total - 1, total)
-    plate = _expose(setup, plate_scene(), _PLATE)
+    plate = _expose(setup, plate_scene(), 300)
     progress("rendering", total, total)
     return ChapterCaptures(
         setup,
@@ -199,11 +188,11 @@ def _label_spheres(setup: ChapterSetup, truth: PixelTruth) -> Indices:
     )
     distances = np.nan_to_num(distances, nan=np.inf)
     nearest = np.argmin(distances, axis=-1)
-    on = (distances.min(axis=-1) < ON_SPHERE_MM) & np.isfinite(truth.s)
+    on = (distances.min(axis=-1) < 0.02) & np.isfinite(truth.s)
     return np.where(on, nearest, -1).astype(np.int64)
 
 
 def _mask_plate(truth: PixelTruth) -> Mask:
-    near = (np.nan_to_num(truth.depth, nan=np.inf) < WALL_MM) & np.isfinite(truth.s)
-    window = np.ones((2 * RIM_PX + 1, 2 * RIM_PX + 1), np.uint8)
+    near = (np.nan_to_num(truth.depth, nan=np.inf) < 600.0) & np.isfinite(truth.s)
+    window = np.ones((9, 9), np.uint8)
     return cv2.erode(near.astype(np.uint8), window, borderValue=0) > 0

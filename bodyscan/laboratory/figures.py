@@ -19,7 +19,6 @@ matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 
-INK, GREY = "#333333", "#999999"
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")
 """Okabe and Ito's colours, which the colour-blind can tell apart too."""
 
@@ -46,7 +45,7 @@ def draw_projector(
         (tilt, 2, "tilt angle, degrees"),
     ):
         values = _baseline_angle_tilt(true, direction)[part]
-        axis.plot(true.s, values, color=INK, linewidth=3.0, alpha=0.35, label=true.name)
+        axis.plot(true.s, values, color="#333333", linewidth=3.0, alpha=0.35, label=true.name)
         for colour, curve in zip(COLOURS, curves, strict=False):
             values_of_model = _baseline_angle_tilt(curve, direction)[part]
             axis.plot(curve.s, values_of_model, ".", color=colour, markersize=2.5, label=curve.name)
@@ -105,7 +104,9 @@ def _distribution(axis: Axes, residuals_mm: Array) -> None:
     density = density / (len(residuals_mm) * np.diff(edges))
     axis.stairs(density, edges, fill=True, color=COLOURS[0], alpha=0.6)
     normal = np.exp(-0.5 * (edges / sigma_mm) ** 2) / (sigma_mm * np.sqrt(2.0 * np.pi))
-    axis.plot(edges, normal, color=INK, linewidth=1.0, label=f"normal, sigma {sigma_mm:.4f} mm")
+    axis.plot(
+        edges, normal, color="#333333", linewidth=1.0, label=f"normal, sigma {sigma_mm:.4f} mm"
+    )
     axis.set_yscale("log")
     axis.set_ylim(normal.max() * 1e-4, normal.max() * 3.0)
     axis.set_xlabel("distance of a boundary point from its plane, mm")
@@ -116,7 +117,7 @@ def _distribution(axis: Axes, residuals_mm: Array) -> None:
 def _plain(axis: Axes) -> None:
     for side in ("top", "right"):
         axis.spines[side].set_visible(False)
-    axis.grid(color=GREY, alpha=0.25, linewidth=0.6)
+    axis.grid(color="#999999", alpha=0.25, linewidth=0.6)
 
 
 def _save(figure: matplotlib.figure.Figure, path: Path) -> Path:

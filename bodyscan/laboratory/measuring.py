@@ -27,9 +27,6 @@ from bodyscan.laboratory.chapter_captures import ChapterCaptures, SceneCapture
 from bodyscan.simulation.files import describe_camera
 
 Stripes = NDArray[np.floating[Any]]
-BEST_SHARE = 0.9
-SECANT_MM, SECANT_STRIPES, SECANT_STEPS = 0.1, 1e-3, 6
-"""From a plane a tenth of a millimetre beside the sheet, down to rounding."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,10 +122,10 @@ class TrueSheets:
         planes = self.setup.projector.plane(s)
         first = -planes[..., 3] / np.sum(planes[..., :3] * rays, axis=-1)
         light = self.setup.projector.stripe
-        further = first + SECANT_MM
+        further = first + 0.1
         residual = light(rays * first[..., None]) - s
         with np.errstate(invalid="ignore", divide="ignore"):
-            for _ in range(SECANT_STEPS):
+            for _ in range(6):  # down to rounding
                 next_residual = light(rays * further[..., None]) - s
                 change = next_residual - residual
                 step = np.where(change == 0.0, 0.0, next_residual * (further - first) / change)
@@ -137,7 +134,7 @@ class TrueSheets:
 
     def depth_per_stripe(self, rays: Array, s: Array, depth: Array | None = None) -> Array:
         here = self.depth(rays, s) if depth is None else depth
-        return (self.depth(rays, s + SECANT_STRIPES) - here) / SECANT_STRIPES
+        return (self.depth(rays, s + 1e-3) - here) / 1e-3
 
     def variance_mm2(self, rays: Array, s: Array, depth: Array | None = None) -> Array:
         return np.zeros(rays.shape[:-1])
@@ -177,9 +174,7 @@ def noise_bound(captures: ChapterCaptures) -> NoiseBound:
         distance = [np.linalg.norm(points - centre, axis=1) for points in both]
         half = 0.5 * (distance[0] - distance[1]) ** 2
         sigma = capture.stripes.sigma[pixels]
-        order = np.argsort(np.where(np.isfinite(half), sigma, np.inf))[
-            : int(BEST_SHARE * pixels.sum())
-        ]
+        order = np.argsort(np.where(np.isfinite(half), sigma, np.inf))[: int(0.9 * pixels.sum())]
         everything.append(float(np.nanmean(half)))
         best.append(float(np.nanmean(half[order])))
     return NoiseBound(tuple(everything), tuple(best))

@@ -35,10 +35,6 @@ if TYPE_CHECKING:
     from bodyscan.laboratory.figures import RangeData
 
 
-SEEDS, STAGE_STOPS, SAMPLES = 250, 7, 5
-QUICK_SEEDS, QUICK_STAGE_STOPS, QUICK_SAMPLES = 5, 3, 3
-
-
 def reproduce(
     out: Path,
     *,
@@ -57,10 +53,10 @@ def reproduce(
     boards: number of board poses, from 3 as in the chapter to 10.
     """
     settings = (apparatus.real_settings if real_light else apparatus.ideal_settings)(
-        QUICK_SAMPLES if quick else SAMPLES
+        3 if quick else 5
     )
     setup = apparatus.chapter_setup(settings, seed)
-    stops = QUICK_STAGE_STOPS if quick else STAGE_STOPS
+    stops = 3 if quick else 7
     captures = take_captures(setup, boards=boards, stage_stops=stops, progress=progress)
     calibrated = calibrate_all(captures)
     found = _measure_all(captures, calibrated, seed, quick, real_light, progress)
@@ -99,7 +95,7 @@ def _measure_all(
         real_light=real_light,
         boards=len(captures.boards),
         calibrated=calibrated,
-        trial=sigma_trial(QUICK_SEEDS if quick else SEEDS, seed),
+        trial=sigma_trial(5 if quick else 250, seed),
         whole=results[0],
         fine=results[1],
         by_stage=results[2],

@@ -18,10 +18,6 @@ from bodyscan.calibration.pinhole_projector import fit_pinhole
 from bodyscan.geometry.light_planes import Axis, LightPlanes
 from bodyscan.geometry.robust import cauchy_weights, spread
 
-MIN_POINTS = 12
-REWEIGHTINGS = 4
-CAUCHY_SIGMAS = 3.0
-
 
 def fit_invariable_baseline(
     data: BoundaryPoints, stripes: int, direction: Axis, *, fit_tilt: bool = True
@@ -58,13 +54,13 @@ def _fit(
     common = np.stack(shared, axis=1) if shared else np.zeros((len(x), 0))
     sigma = np.maximum(across, 1e-6) * data.sigma_px
     robust = np.ones(len(x))
-    for _ in range(REWEIGHTINGS):
+    for _ in range(4):
         weights = robust / sigma**2
         each, all_ = _solve(per_stripe, common, x, weights, data.index, stripes + 1)
         residuals = x - np.sum(per_stripe * each[data.index], axis=1) - common @ all_
         scaled = residuals / sigma
-        robust = cauchy_weights(scaled, 1, CAUCHY_SIGMAS * spread(scaled))
-    observed = np.bincount(data.index, minlength=stripes + 1) >= MIN_POINTS
+        robust = cauchy_weights(scaled, 1, 3.0 * spread(scaled))
+    observed = np.bincount(data.index, minlength=stripes + 1) >= 12
     baseline = each[:, 1] if variable else np.full(stripes + 1, all_[0])
     tilt = all_[-1] if fit_tilt else 0.0
     return _planes(np.where(observed, each[:, 0], np.nan), baseline, float(tilt), direction)
@@ -108,10 +104,6 @@ def _planes(slope: Array, baseline: Array, tilt: float, direction: Axis) -> Ligh
     return LightPlanes.exact(planes, direction)
 
 
-POWERS = (3, 4, 5)
-"""The matrix itself has a scale, a shift and a perspective of the index: powers 0 to 2."""
-
-
 def fit_remapped_pinhole(points: Array, s: Array, stripes: int, direction: Axis) -> LightPlanes:
     """Planes of the best 2 x 4 matrix and re-mapping of s (N,) at points (N, 3), camera frame.
 
@@ -133,7 +125,7 @@ def fit_remapped_pinhole(points: Array, s: Array, stripes: int, direction: Axis)
         above, below = whole @ values[:4], whole @ values[4:8]
         return np.asarray(above / below - index - powers @ values[8:], np.float64)
 
-    flat = np.concatenate([matrix.ravel(), np.zeros(len(POWERS))])
+    flat = np.concatenate([matrix.ravel(), np.zeros(3)])
     noise = spread(residuals(flat))
     solved = least_squares(residuals, flat, loss="cauchy", f_scale=noise, x_scale="jac").x
     u = np.arange(stripes + 1.0) / half - 1.0
@@ -143,5 +135,5 @@ def fit_remapped_pinhole(points: Array, s: Array, stripes: int, direction: Axis)
 
 
 def _powers(u: Array) -> Array:
-    """Powers (N, 3) of the index u in [-1, 1]."""
-    return np.stack([u**power for power in POWERS], axis=-1)
+    """Powers 3 to 5 (N, 3) of the index u in [-1, 1]; the matrix has those from 0 to 2."""
+    return np.stack([u**power for power in (3, 4, 5)], axis=-1)

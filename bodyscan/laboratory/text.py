@@ -156,7 +156,7 @@ def _against_truth(found: Reproduction) -> str:
     rows = [_figures(m) for m in found.fine]
     return (
         "## What E does not see\n\n"
-        + _table(_FIGURES, rows)
+        + _table(ACCURACY_COLUMNS, rows)
         + "\n\nE hardly depends on the calibration (compare the true one's with (iii)'s), these do. "
         "`plate`: a flat plate of 160 x 120 mm as decoded, RMS from its own plane, and of that the "
         "smooth part; `systematic`: the same plate with every pixel's stripe coordinate known exactly, "
@@ -209,7 +209,15 @@ def _figures_of(found: Reproduction) -> str:
     )
 
 
-_FIGURES = ["", "mean E", "plate RMS", "smooth part", "systematic", "centres RMS", "scale ppm"]
+ACCURACY_COLUMNS = [
+    "",
+    "mean E",
+    "plate RMS",
+    "smooth part",
+    "systematic",
+    "centres RMS",
+    "scale ppm",
+]
 
 
 def _figures(m: ApproachAccuracy) -> list[str]:
@@ -229,9 +237,9 @@ def _rivals(found: Reproduction) -> str:
         [
             "## The rival projectors",
             "Calibrated by the slide stage (Tsai's camera with its lens):",
-            _table(_FIGURES, [_figures(m) for m in found.by_stage]),
+            _table(ACCURACY_COLUMNS, [_figures(m) for m in found.by_stage]),
             "Calibrated by the reference plane in three poses (Zhang's camera):",
-            _table(_FIGURES, [_figures(m) for m in found.by_reference]),
+            _table(ACCURACY_COLUMNS, [_figures(m) for m in found.by_reference]),
             "`tilted`: the baseline's direction in the image is fitted, not taken for the camera's x "
             "axis. The baseline models are given an angle of their own for every stripe.",
         ]

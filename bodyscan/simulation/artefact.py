@@ -22,13 +22,7 @@ from bodyscan.simulation.presets import settings_of
 from bodyscan.simulation.rays import View
 from bodyscan.simulation.scene import Surface, grid_surface
 from bodyscan.simulation.settings import SimulationSettings
-from bodyscan.simulation.simulate import Task, render_task, sensor_of, true_pairs
-
-ALBEDO = 0.7
-RINGS = 200
-"""Facets of a 60 mm sphere are then less than 0.002 mm inside it."""
-GREY = 225.0
-_RAYS, _NOISE = 11, 12
+from bodyscan.simulation.simulate import Stream, Task, render_task, sensor_of, true_pairs
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,17 +63,18 @@ def open_workspace(workspace: Path) -> SimulatedRig:
 
 def sphere_surfaces(centres: Array, radius_mm: float) -> tuple[Surface, ...]:
     """White balls at centres (N, 3)."""
-    mesh = o3d.geometry.TriangleMesh.create_sphere(radius_mm, resolution=RINGS)
+    # Facets of a 60 mm sphere are then less than 0.002 mm inside it.
+    mesh = o3d.geometry.TriangleMesh.create_sphere(radius_mm, resolution=200)
     arms, triangles = np.asarray(mesh.vertices), np.asarray(mesh.triangles)
     return tuple(
-        Surface(arms + centre, triangles, ALBEDO, normals=arms / radius_mm) for centre in centres
+        Surface(arms + centre, triangles, 0.7, normals=arms / radius_mm) for centre in centres
     )
 
 
 def plate_surface(width_mm: float, height_mm: float) -> tuple[Surface, ...]:
     """A white plate in the plane x = 0, centred on the origin, visible from either side."""
     across, up = np.array([0.0, width_mm, 0.0]), np.array([0.0, 0.0, height_mm])
-    return (grid_surface(-0.5 * (across + up), across, up, albedo=ALBEDO),)
+    return (grid_surface(-0.5 * (across + up), across, up, albedo=0.7),)
 
 
 def capture_artefact(
@@ -108,12 +103,12 @@ def capture_artefact(
     names = [f"s{k + 1:02d}" for k in range(shots)]
 
     def work(pair: TruePair) -> None:
-        rays = np.random.default_rng([simulated.seed, _RAYS, order[pair.name]])
+        rays = np.random.default_rng([simulated.seed, Stream.ARTEFACT_RAYS, order[pair.name]])
         view = View.from_camera(pair.camera, settings.optics, rays)
         fixed = sensor_of(pair.camera, settings, simulated.seed, order[pair.name])
         for k, name in enumerate(names):
-            seed = [simulated.seed, _NOISE, order[pair.name], number, k]
-            task = Task(k, name, out.name, tuple(surfaces), rig_from_artefact, GREY, True)
+            seed = [simulated.seed, Stream.ARTEFACT_NOISE, order[pair.name], number, k]
+            task = Task(k, name, out.name, tuple(surfaces), rig_from_artefact, 225.0, True)
             noise = np.random.default_rng(seed)
             render_task(rig, pair, view, room, task, settings, out.parent, noise, fixed)
 

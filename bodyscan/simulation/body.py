@@ -92,18 +92,6 @@ def save_truth(surface: Surface, path: Path) -> None:
         o3d.io.write_triangle_mesh(str(temporary), mesh, write_ascii=False)
 
 
-MOLE_MM = (1.5, 5.0)
-"""Radii; the surface's vertices are 3 mm apart."""
-MOLE_ALBEDO = 0.45
-"""Relative to the skin around."""
-
-# As shares of the stature.
-HAIRLINE, NAPE, SLANT = 0.945, 0.885, 0.5
-"""Height of the hairline above the head's middle, height at the nape, rise towards the face."""
-KNEE_END, WAIST, HIPS = 0.41, 0.565, 0.15
-"""Of shorts; the hands hang farther out than the hips."""
-
-
 def dress(bare: Surface, skin: Skin, rng: np.random.Generator) -> Surface:
     """The surface covered as `skin` says. Hair is rough: its surface is the truth as well."""
     vertices, albedo = bare.vertices.copy(), np.array(bare.albedo, float)
@@ -111,7 +99,7 @@ def dress(bare: Surface, skin: Skin, rng: np.random.Generator) -> Surface:
         albedo *= 1.0 + skin.mottling * _mottle(vertices, rng)
     for centre in rng.integers(len(vertices), size=skin.moles):
         away = np.linalg.norm(vertices - vertices[centre], axis=1)
-        albedo[away < rng.uniform(*MOLE_MM)] *= MOLE_ALBEDO
+        albedo[away < rng.uniform(1.5, 5.0)] *= 0.45  # vertices are 3 mm apart
     lets_in = np.ones(len(vertices))
     if skin.shorts > 0:
         cloth = mask_shorts(vertices)
@@ -143,15 +131,15 @@ def _mottle(vertices: Array, rng: np.random.Generator) -> Array:
 
 
 def mask_hair(vertices: Array) -> Mask:
-    """Vertices (N,) on the scalp: above a line that rises from the nape to the forehead."""
+    """Find vertices (N,) on the scalp: above a line that rises from the nape to the forehead."""
     height = float(vertices[:, 2].max())
-    head = vertices[:, 2] > NAPE * height
+    head = vertices[:, 2] > 0.885 * height  # the nape
     middle = 0.5 * (vertices[head, 0].min() + vertices[head, 0].max())
-    line = HAIRLINE * height + SLANT * (vertices[:, 0] - middle)
+    line = 0.945 * height + 0.5 * (vertices[:, 0] - middle)
     return head & (vertices[:, 2] > line)
 
 
 def mask_shorts(vertices: Array) -> Mask:
-    """Vertices (N,) from above the knees to the waist."""
+    """Find vertices (N,) from above the knees to the waist; hands hang farther out."""
     z, y = vertices[:, 2] / vertices[:, 2].max(), vertices[:, 1] / vertices[:, 2].max()
-    return (z > KNEE_END) & (z < WAIST) & (np.abs(y) < HIPS)
+    return (z > 0.41) & (z < 0.565) & (np.abs(y) < 0.15)

@@ -28,18 +28,6 @@ from bodyscan.simulation.projector import MirrorProjector
 from bodyscan.simulation.scene import Surface
 from bodyscan.simulation.settings import Pace, SimulationSettings
 
-WHEN = datetime(2026, 11, 21, 10, 0, 0)
-"""The date written into captures.yaml: always the same, so that the bytes are too."""
-
-# Noise has no repetitions: Huffman coding of differences alone is quickest and smallest.
-_PNG = [
-    cv2.IMWRITE_PNG_COMPRESSION,
-    1,
-    cv2.IMWRITE_PNG_STRATEGY,
-    cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY,
-]
-_PNG += [cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB]
-
 
 def scale_rig(rig: Rig, scale: float, calibration: str) -> Rig:
     """Scale a rig's image size and number of stripes; its captures lie in one folder."""
@@ -79,7 +67,7 @@ def write_captures(
     )
     captures = CapturesFile(
         kind=kind,
-        when=WHEN,
+        when=datetime(2026, 11, 21, 10, 0, 0),  # the same bytes whenever it is run
         subject=subject,
         simulated=True,
         shots=entries,
@@ -105,7 +93,10 @@ def write_image(path: Path, image: Bytes) -> None:
 
     Images are not flushed to the disk one by one: there are thousands, and they can be made again.
     """
-    options = _PNG if path.suffix.lower() == ".png" else []
+    # Noise has no repetitions: Huffman coding of differences alone is quickest and smallest.
+    png = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB]
+    png += [cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY]
+    options = png if path.suffix.lower() == ".png" else []
     _, packed = cv2.imencode(path.suffix, image, options)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.stem}.partial{path.suffix}")

@@ -18,24 +18,6 @@ from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.simulation.scene import Surface
 from bodyscan.simulation.settings import Person
 
-SLOWEST_HZ, FASTEST_HZ, WAVES = 0.15, 1.2, 6
-"""Of sway and of limbs held still: nearly all power of postural sway is below 1 Hz (Winter 1995,
-Gait and Posture 3)."""
-
-# As shares of the stature; for adults, ANSUR II.
-ANKLE, FOOT = 0.055, 0.035
-"""The whole body rotates about the ankle, except for what is below the top of the foot."""
-NECK, CHIN = 0.835, 0.885
-ELBOW_SIDE, SHOULDER = 0.36, 0.46
-"""Distances from the fingertips along the skin: all arm up
-to the first, no arm beyond the second."""
-CHEST, BELLY, BREATHING = 0.72, 0.60, 0.065
-"""Heights of the two, and the standard deviation of the part that moves with each."""
-SIDEWAYS = 0.25
-"""How far each side moves out, relative to how far the front comes forward."""
-BELLY_LATE = 0.6
-"""Phase by which the belly follows the chest, radians of a breath."""
-
 
 @dataclass(frozen=True, eq=False)
 class RandomSignal:
@@ -63,11 +45,12 @@ def draw_signal(
 
     Sizes fall with frequency, so that slow motion dominates.
     """
-    hz = np.geomspace(SLOWEST_HZ, FASTEST_HZ, WAVES) * rng.uniform(0.9, 1.1, WAVES)
-    sizes = rng.standard_normal((WAVES, components)) / hz[:, None] ** 1.5
+    # Nearly all power of postural sway is below 1 Hz (Winter 1995, Gait and Posture 3).
+    hz = np.geomspace(0.15, 1.2, 6) * rng.uniform(0.9, 1.1, 6)
+    sizes = rng.standard_normal((len(hz), components)) / hz[:, None] ** 1.5
     rate = 2.0 * np.pi * hz[:, None] if speed else 1.0
     sizes = sizes * (rms / np.sqrt(0.5 * np.sum((sizes * rate) ** 2)))
-    return RandomSignal(hz, sizes, rng.uniform(0.0, 2.0 * np.pi, (WAVES, components)))
+    return RandomSignal(hz, sizes, rng.uniform(0.0, 2.0 * np.pi, (len(hz), components)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,12 +146,12 @@ def moves(person: Person) -> bool:
 
 
 def animate(still: Surface, person: Person, rng: np.random.Generator) -> LivingBody:
-    """A living person whose mean pose is `still`."""
+    """Give a still surface joints, breath and sway; lengths are shares of the stature (ANSUR II)."""
     vertices = still.vertices
     height = float(vertices[:, 2].max())
     z = vertices[:, 2] / height
     arms = [_arm_weights(still, side, height) for side in (-1.0, 1.0)]
-    head = _smoothstep(z, NECK, CHIN) * (1.0 - arms[0]) * (1.0 - arms[1])
+    head = _smoothstep(z, 0.835, 0.885) * (1.0 - arms[0]) * (1.0 - arms[1])
     limbs = [(weights, np.radians(person.arms_deg)) for weights in arms]
     limbs += [(head, np.radians(person.head_deg))]
     joints = tuple(
@@ -176,20 +159,20 @@ def animate(still: Surface, person: Person, rng: np.random.Generator) -> LivingB
         for weights, rms in limbs
     )
     # Leaning forward is a rotation about y, leaning left one about -x; there is none about z.
-    pivot = np.array([0.0, 0.0, ANKLE * height])
+    pivot = np.array([0.0, 0.0, 0.055 * height])
     lean = draw_signal(person.sway_mm_s / (height - pivot[2]), 2, rng, speed=True)
-    flat = np.zeros((WAVES, 1))
+    flat = np.zeros((len(lean.hz), 1))
     sway = RandomSignal(lean.hz, np.hstack([lean.sizes, flat]), np.hstack([lean.phases, flat]))
     start = float(rng.uniform(0.0, 2.0 * np.pi))
     breath = Breath(
         person.breath_mm,
         person.breath_s * float(rng.uniform(0.95, 1.05)),
-        (start, start - BELLY_LATE),
+        (start, start - 0.6),  # the belly follows the chest
     )
     trunk = (1.0 - arms[0]) * (1.0 - arms[1])
     breath_modes = _breath_modes(vertices, trunk, height)
     return LivingBody(
-        still, joints, breath_modes, breath, Joint(_smoothstep(z, FOOT, ANKLE), pivot, sway)
+        still, joints, breath_modes, breath, Joint(_smoothstep(z, 0.035, 0.055), pivot, sway)
     )
 
 
@@ -204,7 +187,7 @@ def _arm_weights(still: Surface, side: float, height: float) -> Array:
     positive y (side 1) or negative y (-1)."""
     fingertip = int(np.argmax(side * still.vertices[:, 1]))
     along = dijkstra(_edges(still), indices=[fingertip], limit=0.6 * height)[0]
-    return 1.0 - _smoothstep(along / height, ELBOW_SIDE, SHOULDER)
+    return 1.0 - _smoothstep(along / height, 0.36, 0.46)
 
 
 def _edges(surface: Surface) -> csr_matrix:
@@ -224,8 +207,8 @@ def _border(vertices: Array, weights: Array) -> Array:
 def _breath_modes(vertices: Array, trunk: Array, height: float) -> Array:
     """Motion (N, 3, 2) with chest and belly, per mm by which the max_displacement vertex of each stands
     out: the front forward, the sides outward, the back not at all."""
-    heights = np.array([CHEST, BELLY]) * height
-    sigma = BREATHING * height
+    heights = np.array([0.72, 0.60]) * height
+    sigma = 0.065 * height
     rises = np.exp(-0.5 * ((vertices[:, 2:] - heights) / sigma) ** 2)
     level = np.linspace(heights.min(), heights.max(), 50)[:, None]
     rises = rises / np.exp(-0.5 * ((level - heights) / sigma) ** 2).sum(axis=1).max()
@@ -233,7 +216,7 @@ def _breath_modes(vertices: Array, trunk: Array, height: float) -> Array:
     back, front = np.percentile(vertices[inside, 0], [2.0, 98.0])
     wide = np.percentile(np.abs(vertices[inside, 1]), 98.0)
     forward = _smoothstep((vertices[:, 0] - back) / (front - back), 0.3, 1.0)
-    outward = SIDEWAYS * np.clip(vertices[:, 1] / wide, -1.5, 1.5)
+    outward = 0.25 * np.clip(vertices[:, 1] / wide, -1.5, 1.5)
     directions = np.stack([forward, outward, np.zeros(len(vertices))], axis=1) * trunk[:, None]
     return directions[:, :, None] * rises[:, None, :]
 

@@ -119,15 +119,9 @@ def _kernels(blurs: tuple[float, ...]) -> Floats:
     return np.asarray(bells / bells.sum(axis=1, keepdims=True), np.float32)
 
 
-PARTS = 16
-"""Values of light per stripe, if light changes inside stripes."""
-
-KNOWN = (Gray, Binary, LightSection, PhaseShift, StripeIndex)
-
-
 def refuse_unknown_code(code: StripeCode, pair: str) -> None:
     """Raises BadInput for a code that has no formulas here."""
-    if type(code) not in KNOWN:
+    if type(code) not in (Gray, Binary, LightSection, PhaseShift, StripeIndex):
         raise BadInput(
             f"its code {code.code} is none that the simulator knows how to project",
             where=f"pair {pair}",
@@ -162,7 +156,8 @@ def projected_patterns(code: StripeCode, frames: FrameNames) -> dict[str, Array]
     if isinstance(code, LightSection):
         return _name_images(frames, STRIPE, np.eye(code.stripes))
     if isinstance(code, PhaseShift):
-        position = (np.arange(code.stripes * PARTS) + 0.5) / PARTS
+        parts = 16  # values per stripe
+        position = (np.arange(code.stripes * parts) + 0.5) / parts
         waves = np.concatenate([_wave_images(wave, position) for wave in code.waves])
         phases = _name_images(frames, PHASE, waves)
         if not code.needs_gray:

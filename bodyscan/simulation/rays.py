@@ -90,11 +90,6 @@ class View:
                 yield band.crop_columns(int(columns[0]), int(columns[-1]))
 
 
-FLAT_MM = 0.04
-"""How far a corner may be off the facet at the opposite one. Between them the surface is then
-within a quarter of it, a tenth of a scan's error."""
-
-
 @dataclass(frozen=True, eq=False)
 class RayEnds:
     """What the rays (R, C, K) of a band meet.
@@ -176,7 +171,8 @@ def _mask_smooth(hits: Hits, corners: RayEnds) -> Mask:
     for one, other in ((first, second), (third, fourth)):
         edge = points[other] - points[one]
         for facet in (facets[one], facets[other]):
-            even &= np.abs(np.einsum("rck,rck->rc", edge, facet)) < FLAT_MM
+            # A corner this near the facet of the opposite one: the surface between is within 0.01 mm.
+            even &= np.abs(np.einsum("rck,rck->rc", edge, facet)) < 0.04
     return np.asarray(even)
 
 

@@ -15,9 +15,6 @@ from bodyscan.geometry.transforms import RigidTransform
 
 Tensor = o3d.core.Tensor
 
-_LIFT_MM = 0.3
-"""What is nearer than this to a surface casts no shadow on it."""
-
 
 class Print(Protocol):
     """Something printed on a surface."""
@@ -157,7 +154,8 @@ class Scene:
             rays = np.empty((chosen.size, 6), np.float32)
             rays[:, :3] = points.take(chosen, axis=0)
             rays[:, 3:] = towards.take(chosen, axis=0)
-            near = _LIFT_MM / float(np.abs(rays[:, 3:]).max())
+            # What is nearer than 0.3 mm casts no shadow.
+            near = 0.3 / float(np.abs(rays[:, 3:]).max())
             answer = self._rays.test_occlusions(
                 Tensor.from_numpy(rays), tnear=near, tfar=0.95, nthreads=2
             )

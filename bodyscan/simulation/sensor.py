@@ -48,9 +48,6 @@ def draw_flicker(
     }
 
 
-_FOCUS_STEPS = 5
-
-
 def exposure(lit: Floats, grey: float, lighting: Lighting) -> float:
     """The exposure at which the brightest thousandth of a lit image begins at `grey`."""
     bright = max(float(np.percentile(lit, 99.9)), 1e-3)
@@ -142,11 +139,12 @@ def blurs_of(optics: Optics, out_of_focus: Floats) -> list[tuple[float, Floats |
     the blur is wider where the scene is out of focus (0..1)."""
     if optics.defocus_px <= 0:
         return [(optics.blur_px, None)]
-    level = out_of_focus * (_FOCUS_STEPS - 1)
+    steps = 5
+    level = out_of_focus * (steps - 1)
     blurs: list[tuple[float, Floats | None]] = []
-    for step in range(_FOCUS_STEPS):
+    for step in range(steps):
         share = np.maximum(1.0 - np.abs(level - step), 0.0).astype(np.float32)
-        wide = np.hypot(optics.blur_px, optics.defocus_px * step / (_FOCUS_STEPS - 1))
+        wide = np.hypot(optics.blur_px, optics.defocus_px * step / (steps - 1))
         if share.any():
             blurs.append((float(wide), share))
     return blurs

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from enum import IntEnum
 from pathlib import Path
 from threading import Lock
 
@@ -41,14 +42,25 @@ from bodyscan.simulation.sensor import (
 )
 from bodyscan.simulation.settings import SimulationSettings
 
+
+class Stream(IntEnum):
+    """Streams of random numbers by purpose, each independent of what the others draw."""
+
+    PAIRS = 1
+    BOARDS = 2
+    PLAN = 3
+    SKIN = 4
+    SWAY = 5
+    RAYS = 6
+    NOISE = 7
+    LIFE = 8
+    PIXELS = 9
+    ARTEFACT_RAYS = 11
+    ARTEFACT_NOISE = 12
+
+
 CALIBRATION, PERSON = "captures/calibration", "captures/person"
 PERSON_SHOT = "s01"
-
-_BRIGHT_AT = 0.85
-"""Where a surface is as bright as `Lighting.laser_grey` says, in working distances."""
-
-_PAIRS, _BOARDS, _PLAN, _SKIN, _SWAY, _RAYS, _NOISE, _LIFE, _PIXELS = range(1, 10)
-"""Purposes of random numbers: each has its own stream, whatever the others draw."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,20 +141,20 @@ def _decide(
 
     pairs = true_pairs(rig, settings, seed)
     boards = {
-        board.name: make_board(board, settings.board, stream(_BOARDS, number))
+        board.name: make_board(board, settings.board, stream(Stream.BOARDS, number))
         for number, board in enumerate(rig.boards)
     }
     shots = default_shots(len(pairs)) if shots is None else shots
-    plan = plan_boards(rig, pairs, shots, stream(_PLAN)) if shots else []
+    plan = plan_boards(rig, pairs, shots, stream(Stream.PLAN)) if shots else []
     if subject is None:
         return Truth(rig.name, seed, settings, pairs, boards, tuple(plan), None, None, {})
-    person = body.load_subject(subject, settings.person, stream(_SKIN), settings.skin)
+    person = body.load_subject(subject, settings.person, stream(Stream.SKIN), settings.skin)
     height = float(person.vertices[:, 2].max())
-    sways = body.draw_sways(settings.person, height, len(pairs), stream(_SWAY))
+    sways = body.draw_sways(settings.person, height, len(pairs), stream(Stream.SWAY))
     by_pair = dict(zip(pairs, sways, strict=True))
     motion = None
     if moves(settings.person):
-        living = animate(person, settings.person, stream(_LIFE))
+        living = animate(person, settings.person, stream(Stream.LIFE))
         times = files.times_of_person(rig, PERSON_SHOT, settings.pace)
         every = [ms for by_frame in times.values() for ms in by_frame.values()]
         motion = Motion(living, times, (min(every) + max(every)) / 2.0, by_pair)
@@ -156,7 +168,9 @@ def _decide(
 
 def true_pairs(rig: Rig, settings: SimulationSettings, seed: int) -> dict[str, TruePair]:
     """The pairs of a data set with these settings and seed, wherever they are needed."""
-    return build_pairs(rig, settings, lambda number: np.random.default_rng([seed, _PAIRS, number]))
+    return build_pairs(
+        rig, settings, lambda number: np.random.default_rng([seed, Stream.PAIRS, number])
+    )
 
 
 def _tasks(truth: Truth, pair: str) -> list[Task]:
@@ -208,12 +222,12 @@ def _render_all(rig: Rig, truth: Truth, out: Path, workers: int, progress: Progr
 
     def work(numbered: tuple[int, TruePair]) -> None:
         number, pair = numbered
-        rays = np.random.default_rng([truth.seed, _RAYS, number])
+        rays = np.random.default_rng([truth.seed, Stream.RAYS, number])
         view = View.from_camera(pair.camera, truth.settings.optics, rays)
         fixed = sensor_of(pair.camera, truth.settings, truth.seed, number)
         empty = see_empty(pair, view, room, truth.settings)
         for task in tasks[pair.name]:
-            noise = np.random.default_rng([truth.seed, _NOISE, number, task.number])
+            noise = np.random.default_rng([truth.seed, Stream.NOISE, number, task.number])
             render_task(rig, pair, view, room, task, truth.settings, out, noise, fixed, empty)
             count_task()
 
@@ -224,7 +238,9 @@ def sensor_of(
     camera: TrueCamera, settings: SimulationSettings, seed: int, number: int
 ) -> FixedPattern | None:
     """Fixed pattern of the camera with that number, wherever it is needed."""
-    return fixed_pattern(camera, settings.noise, np.random.default_rng([seed, _PIXELS, number]))
+    return fixed_pattern(
+        camera, settings.noise, np.random.default_rng([seed, Stream.PIXELS, number])
+    )
 
 
 def _counter(stage: str, total: int, progress: Progress) -> Callable[[], None]:
@@ -336,7 +352,7 @@ def _lamps(pair: TruePair, settings: SimulationSettings) -> Lamps:
     return Lamps(
         light.laser_grey,
         light.ambient_grey,
-        _BRIGHT_AT * reach,
+        0.85 * reach,
         reach,
         light.window_grey,
         tuple(window.tolist()),
