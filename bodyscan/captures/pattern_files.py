@@ -14,7 +14,6 @@ from bodyscan.files.atomic import write_bytes, write_json
 from bodyscan.rig.frame_names import FrameNames
 from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig import Rig
-from bodyscan.stripes.patterns import pattern_frames
 from bodyscan.stripes.stripe_code import StripeCode
 
 LIST_NAME = "patterns.json"
@@ -45,7 +44,7 @@ def write_patterns(rig: Rig, out: Path, width: int, height: int) -> tuple[Path, 
     width, height: of the projector's image, px.
 
     Returns the lists. Raises BadInput for a rig whose projectors show no images, and as
-    `pattern_frames`.
+    `StripeCode.pattern_images`.
     """
     kinds: dict[StripeCode, list[Pair]] = {}
     for pair in rig.pairs:
@@ -61,7 +60,7 @@ def write_patterns(rig: Rig, out: Path, width: int, height: int) -> tuple[Path, 
         )
     names = _folder_names(tuple(kinds))
     # Make every kind before writing the first: if one does not fit, nothing is written.
-    made = {kind: pattern_frames(kind, width, height) for kind in kinds}
+    made = {kind: kind.pattern_images(width, height) for kind in kinds}
     return tuple(
         _write_kind(Path(out) / names[kind], rig.frames, kind, pairs, made[kind])
         for kind, pairs in kinds.items()

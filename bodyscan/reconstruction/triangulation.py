@@ -45,7 +45,7 @@ def reconstruct_range_image(pair: PairCalibration, stripes: StripeMap) -> RangeI
             remedy="scan with the camera settings of the calibration, or calibrate again",
         )
     points, sigma_mm, common_mm = _triangulated(pair, pair.sheets, stripes.s, stripes.sigma)
-    agreement, alike_px = None, stripes.alike_px
+    agreement, alike_px = None, stripes.correlation_px
     if pair.crossing is not None and stripes.crossing is not None:
         across = stripes.crossing
         *others, common_too = _triangulated(pair, pair.crossing, across.s, across.sigma)

@@ -168,6 +168,6 @@ class FrameNames(ImageNames):
         for own in (self, self.crossing):
             for kind in image_kinds():
                 if kind.name not in refused:
-                    names += own.of_kind(kind, kind.most)
+                    names += own.of_kind(kind, kind.max_count)
         for _, twice in islice(duplicates(names), 1):  # of a kind, all named alike
             yield (), f"gives two images the same name ({twice!r})"

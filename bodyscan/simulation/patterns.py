@@ -22,8 +22,7 @@ from bodyscan.stripes.codes.gray import INVERSE, PATTERN, Binary, Gray
 from bodyscan.stripes.codes.light_section import STRIPE, LightSection
 from bodyscan.stripes.codes.phase_shift import PHASE, PhaseShift
 from bodyscan.stripes.codes.stripe_index import INDEX, StripeIndex
-from bodyscan.stripes.stripe_code import ImageKind, StripeCode
-from bodyscan.stripes.wave import Wave
+from bodyscan.stripes.stripe_code import ImageKind, StripeCode, Wave
 
 PAD = 4
 """Stripes by which a table of light extends beyond the sweep."""

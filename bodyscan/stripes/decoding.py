@@ -9,7 +9,7 @@ import numpy as np
 
 from bodyscan.arrays import Greys
 from bodyscan.errors import DecodingFailed, WrongDirection
-from bodyscan.stripes.line_bands import LineBands
+from bodyscan.stripes.scan_lines import LineBands
 from bodyscan.stripes.stripe_code import ImageKind, SequenceImages, StripeCode
 from bodyscan.stripes.stripe_limits import StripeLimits
 from bodyscan.stripes.stripe_map import StripeMap
@@ -25,70 +25,70 @@ def decode_stripes(
     bands: LineBands | None = None,
     where: str = "",
 ) -> StripeMap:
-    """The stripe coordinate of every pixel, from one pair's images of one shot.
+    """Compute the stripe coordinate of every pixel from one pair's images of one shot.
 
     lit, dark: (H, W); None if the code can do without (see docs/formats.md).
     coded: (F, H, W), the images of the code in the order of its `image_counts`, then those of the
         crossing stripes, which give the map's `crossing`.
     limits: the stripes that matter; others get no s.
-    bands: where boundaries are wanted, and no s.
+    bands: the lines on which boundaries are wanted, and no s.
 
-    Raises DecodingFailed, naming the image if it can be identified, for inconsistent images. If
-    only those of the crossing stripes are inconsistent, the map is that of the others and says why.
+    Raises DecodingFailed for inconsistent images. If only those of the crossing stripes are
+    inconsistent, the map is that of the others and says why.
     """
     try:
-        own, *others = images_by_kind(code, coded)
-        found = _decode(code, lit, dark, own, limits, bands)
+        images, *crossing_images = images_by_kind(code, coded)
+        stripes = _decode_direction(code, lit, dark, images, limits, bands)
         if code.crossing is None:
-            return found
+            return stripes
     except DecodingFailed as error:
         raise DecodingFailed(error.what, where=where, remedy=error.remedy) from error
     try:
-        crossing = _decode(code.crossing, lit, dark, others[0], None, bands)
-        return replace(found, crossing=crossing)
+        crossing = _decode_direction(code.crossing, lit, dark, crossing_images[0], None, bands)
+        return replace(stripes, crossing=crossing)
     except DecodingFailed as error:
         remedy = error.remedy
         if isinstance(error, WrongDirection):
             remedy = "exchange the lists of frames and of `crossing`, or correct `direction`"
-        return replace(found, crossing_fault=f"{error.what}\n  {remedy}" if remedy else error.what)
+        fault = f"{error.what}\n  {remedy}" if remedy else error.what
+        return replace(stripes, crossing_fault=fault)
 
 
-def _decode(
-    way: StripeCode,
+def _decode_direction(
+    code: StripeCode,
     lit: Greys | None,
     dark: Greys | None,
     coded: Mapping[ImageKind, Greys],
     limits: StripeLimits | None,
     bands: LineBands | None,
 ) -> StripeMap:
-    """The map of stripes that run one way."""
+    """Decode the stripes of one direction."""
     shape = next(iter(coded.values())).shape[1:]
     if lit is None:
-        lit = way.lit_from(coded)
+        lit = code.lit_from(coded)
     if lit.shape != shape:
         raise DecodingFailed(f"images of {shape} px, lit frame of {lit.shape} px")
     if dark is not None and dark.shape != shape:
         raise DecodingFailed(f"dark frame of {dark.shape} px, lit frame of {lit.shape} px")
-    found = way.decode(SequenceImages(lit, dark, coded, bands), limits)
-    if limits is None or found.beyond is not None:
-        return found
-    return restrict(found, limits)
+    stripes = code.decode(SequenceImages(lit, dark, coded, bands), limits)
+    if limits is None or stripes.beyond is not None:
+        return stripes
+    return restrict(stripes, limits)
 
 
-def restrict(found: StripeMap, limits: StripeLimits) -> StripeMap:
-    """The stripe map with s only between the limits."""
-    kept, beyond = limits.split(found.s, np.isfinite(found.s))
-    nothing = np.float32(np.nan)
-    s, sigma = np.where(kept, found.s, nothing), np.where(kept, found.sigma, nothing)
-    return replace(found, s=s, sigma=sigma, beyond=beyond)
+def restrict(stripes: StripeMap, limits: StripeLimits) -> StripeMap:
+    """Remove s beyond the limits from a stripe map."""
+    kept, beyond = limits.split(stripes.s, np.isfinite(stripes.s))
+    s, sigma = (np.where(kept, each, np.float32(np.nan)) for each in (stripes.s, stripes.sigma))
+    return replace(stripes, s=s, sigma=sigma, beyond=beyond)
 
 
 def images_by_kind(code: StripeCode, coded: Greys) -> list[dict[ImageKind, Greys]]:
-    """The images (F, H, W) of a code, and of the crossing stripes, by kind.
+    """Split the images (F, H, W) of a code by kind, and those of the crossing stripes.
 
     Raises DecodingFailed if there are too few or too many.
     """
-    counts = [way.image_counts for way in code.directions]
+    counts = [direction.image_counts for direction in code.directions]
     ends = np.cumsum([number for each in counts for number in each.values()])
     if len(coded) != ends[-1]:
         raise DecodingFailed(

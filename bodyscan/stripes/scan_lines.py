@@ -1,59 +1,59 @@
-"""The frames of a stripe sequence, laid out so that every row crosses the stripes."""
+"""The images of a stripe sequence laid out so that every row crosses the stripes."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import cast
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.arrays import Bytes, Floats, Greys, Indices, Mask
+from bodyscan.arrays import Array, Bytes, Floats, Greys, Indices, Mask
 from bodyscan.compiled import compiled
-from bodyscan.stripes.line_bands import BandLines
 
 Words = NDArray[np.uint16]
 
 WHOLE_SHARE = 128
-"""All of the light, in images of its shares."""
+"""A share of 1 in images of shares (`ScanLines.direct_share`)."""
 
 
 @dataclass(frozen=True, eq=False)
 class ScanLines:
-    """Frames as scan lines: L lines, each of P positions across the stripes.
+    """Images as scan lines: L lines, each of P pixels across the stripes.
 
     lit, dark: (L, P).
     patterns: (F, L, P), the images of the code.
     inverses: (F, L, P), None if none are projected. All of one type, see `Greys`.
-    turned: the lines are the camera image's columns (its stripes are horizontal).
-    bands: which of its lines they are, if not all.
+    transposed: the lines are the camera image's columns (its stripes are horizontal).
+    bands: which of the camera image's lines these are, if not all.
     """
 
     lit: Greys
     dark: Greys
     patterns: Greys
     inverses: Greys | None
-    turned: bool
+    transposed: bool
     bands: BandLines | None = None
 
     @staticmethod
-    def along_lines(
+    def from_images(
         lit: Greys, dark: Greys, patterns: Greys, inverses: Greys | None, direction: str
     ) -> ScanLines:
-        """From images (H, W) and stacks (F, H, W)."""
+        """Lay out images (H, W) and stacks (F, H, W)."""
         if direction != "horizontal":
             return ScanLines(lit, dark, patterns, inverses, False)
         lit, dark = cv2.transpose(lit), cv2.transpose(dark)
-        turned = None if inverses is None else transpose(inverses)
-        return ScanLines(lit, dark, transpose(patterns), turned, True)
+        inverses = None if inverses is None else transpose(inverses)
+        return ScanLines(lit, dark, transpose(patterns), inverses, True)
 
     @property
     def contrast(self) -> Floats:
         """Lit minus dark, (L, P), grey levels."""
         return cv2.subtract(self.lit, self.dark, dtype=cv2.CV_32F)
 
-    def words(self) -> NDArray[np.uint16]:
-        """Code words (L, P), the first pattern being the most significant bit."""
+    def words(self) -> Words:
+        """Read the code words (L, P), the first pattern being the most significant bit."""
         words = np.zeros(self.lit.shape, np.uint16)
         for bit in range(len(self.patterns)):
             if self.inverses is None:
@@ -64,35 +64,37 @@ class ScanLines:
         return words
 
     def bright(self, bit: int) -> Mask:
-        """Where a pattern is brighter (L, P) than its inverse, or without one than the middle
-        between lit and dark."""
+        """Where a pattern is brighter (L, P) than its inverse, or without inverses than the mean of
+        lit and dark."""
         if self.inverses is not None:
             return np.asarray(self.patterns[bit] > self.inverses[bit])
         if self.lit.dtype != np.uint8:
             return np.asarray(2.0 * self.patterns[bit] > self.lit + self.dark)
-        middle = cv2.add(self.lit, self.dark, dtype=cv2.CV_16S)
-        return np.asarray(2 * self.patterns[bit].astype(np.int16) > middle)
+        total = cv2.add(self.lit, self.dark, dtype=cv2.CV_16S)
+        return np.asarray(2 * self.patterns[bit].astype(np.int16) > total)
 
-    def difference(self, bit: Indices, at: Indices, variance: Floats) -> tuple[Floats, Floats]:
-        """Pattern minus inverse of bits (N,) at flat pixels (N, K), and its noise, grey levels.
+    def difference(self, bit: Indices, pixels: Indices, variance: Floats) -> tuple[Floats, Floats]:
+        """Compute pattern minus inverse of bits (N,) at flat pixels (N, K), and its standard
+        deviation, grey levels; 0 where the pixel is negative.
 
-        Pixels below 0 get 0. Without inverses, twice the excess of the pattern over the middle of
-        lit and dark.
+        Without inverses: twice the excess of the pattern over the mean of lit and dark.
+
+        variance: (256,) of each grey level.
         """
         patterns, inverses = self.patterns.reshape(-1), self._inverses.reshape(-1)
         return _differences(
-            self.lit.ravel(), self.dark.ravel(), patterns, inverses, bit, at, variance
+            self.lit.ravel(), self.dark.ravel(), patterns, inverses, bit, pixels, variance
         )
 
     def direct_share(self, bit: int, variance: Floats) -> Bytes:
-        """Share (L, P) of lit minus dark that shows in `difference` of one bit, or as much as its
-        noise allows, in 1/WHOLE_SHARE; at most 255."""
+        """Compute |difference| of one bit plus its noise, as a share (L, P) of lit minus dark in
+        units of 1/WHOLE_SHARE, at most 255."""
         share = np.empty(self.lit.size, np.uint8)
         inverse = self._inverses[bit : bit + 1].reshape(-1)
         frames = (self.lit.ravel(), self.dark.ravel(), self.patterns[bit].ravel(), inverse)
         # With whole grey levels there is at least one wherever there is any light.
-        least = np.float32(1.0 if self.lit.dtype == np.uint8 else 0.02)
-        _share(*frames, variance, least, share)
+        min_contrast = np.float32(1.0 if self.lit.dtype == np.uint8 else 0.02)
+        _share(*frames, variance, min_contrast, share)
         return share.reshape(self.lit.shape)
 
     @property
@@ -101,19 +103,76 @@ class ScanLines:
         return self.patterns[:0] if self.inverses is None else self.inverses
 
 
+@dataclass(frozen=True)
+class LineBands:
+    """One in `every` of the bands of `width` neighbouring lines: a board shows more boundaries than
+    any fit needs.
+
+    turn: which of the `every` bands.
+    corner: row and column of the camera's image at which the images begin. Bands are counted from
+        the camera image's first line, so that they do not depend on the crop.
+    """
+
+    width: int
+    every: int
+    turn: int
+    corner: tuple[int, int]
+
+    def lines(self, count: int, *, transposed: bool) -> BandLines:
+        """Select the lines to decode out of `count`.
+
+        The correction at edges of brightness moves boundaries across up to 2 lines, and 8 more are
+        needed to judge pixels: `albedo_edges` looks 3 lines aside, at pixels that depend on 2 more.
+        """
+        band = (self.corner[transposed] + np.arange(count)) // self.width
+        inside = band % self.every == self.turn % self.every
+        near, wanted = (
+            np.convolve(inside, np.ones(2 * margin + 1), "same") > 0.0 for margin in (8, 2)
+        )
+        return BandLines(np.flatnonzero(near), wanted[near], inside)
+
+
+@dataclass(frozen=True, eq=False)
+class BandLines:
+    """Lines in and around bands.
+
+    number: (L,) of the lines to decode.
+    wanted: (L,) those whose boundaries may lie in a band.
+    inside: (count,) of all lines, those in a band.
+    """
+
+    number: Indices
+    wanted: Mask
+    inside: Mask
+
+    def locate(self, line: Indices, across: Array) -> tuple[Array, Mask]:
+        """Convert positions across these lines (N,), of boundaries on lines (N,), to positions
+        across all lines, px; also returns which of them lie in a band (N,)."""
+        across = across + (self.number - np.arange(len(self.number)))[line]
+        nearest = np.clip(np.floor(across).astype(np.int64), 0, len(self.inside) - 1)
+        return across, self.inside[nearest]
+
+    def cut(self, images: Greys, *, transposed: bool) -> Greys:
+        """Cut these rows, or columns if transposed, out of images (..., H, W)."""
+        ends = np.flatnonzero(np.diff(self.number) > 1) + 1
+        runs = [slice(run[0], run[-1] + 1) for run in np.split(self.number, ends)]
+        parts = [images[..., run] if transposed else images[..., run, :] for run in runs]
+        return cast(Greys, np.concatenate(parts, axis=-1 if transposed else -2))
+
+
 def transpose(images: Greys) -> Greys:
     """Transpose each image of a stack (F, H, W)."""
-    turned = np.empty((len(images), *images.shape[:0:-1]), images.dtype)
-    for image, target in zip(images, turned, strict=True):
+    result = np.empty((len(images), *images.shape[:0:-1]), images.dtype)
+    for image, target in zip(images, result, strict=True):
         cv2.transpose(image, dst=target)
-    return turned
+    return result
 
 
 @compiled
 def _append_bit(words: Words, pattern: Greys, inverse: Greys) -> None:
     """Shift code words (N,) by one bit and set it where the pattern is brighter."""
-    for at in range(words.size):
-        words[at] = (words[at] << 1) | (pattern[at] > inverse[at])
+    for n in range(words.size):
+        words[n] = (words[n] << 1) | (pattern[n] > inverse[n])
 
 
 @compiled
@@ -121,12 +180,12 @@ def _difference(
     pattern: float, inverse: float, lit: float, dark: float, inverted: bool, variance: Floats
 ) -> tuple[np.float32, np.float32]:
     """See `ScanLines.difference`; for one pixel."""
-    seen = np.float32(pattern)
+    level = np.float32(pattern)
     if inverted:
-        return seen - np.float32(inverse), np.sqrt(
+        return level - np.float32(inverse), np.sqrt(
             variance[np.int64(pattern)] + variance[np.int64(inverse)]
         )
-    above = (seen - np.float32(lit)) + (seen - np.float32(dark))
+    above = (level - np.float32(lit)) + (level - np.float32(dark))
     twice = np.float32(2.0) * variance[np.int64(pattern)]
     return above, np.sqrt(twice + twice + variance[np.int64(lit)] + variance[np.int64(dark)])
 
@@ -138,20 +197,20 @@ def _differences(
     patterns: Greys,
     inverses: Greys,
     bit: Indices,
-    at: Indices,
+    pixels: Indices,
     variance: Floats,
 ) -> tuple[Floats, Floats]:
-    difference, noise = np.zeros(at.shape, np.float32), np.zeros(at.shape, np.float32)
+    difference, noise = np.zeros(pixels.shape, np.float32), np.zeros(pixels.shape, np.float32)
     inverted = inverses.size > 0
-    for k in range(at.shape[0]):
-        for n in range(at.shape[1]):
-            pixel = at[k, n]
+    for k in range(pixels.shape[0]):
+        for n in range(pixels.shape[1]):
+            pixel = pixels[k, n]
             if pixel < 0:
                 continue
-            place = bit[k] * lit.size + pixel
-            inverse = inverses[place] if inverted else patterns[place]
+            index = bit[k] * lit.size + pixel
+            inverse = inverses[index] if inverted else patterns[index]
             difference[k, n], noise[k, n] = _difference(
-                patterns[place], inverse, lit[pixel], dark[pixel], inverted, variance
+                patterns[index], inverse, lit[pixel], dark[pixel], inverted, variance
             )
     return difference, noise
 
@@ -163,14 +222,14 @@ def _share(
     pattern: Greys,
     inverse: Greys,
     variance: Floats,
-    least: np.float32,
+    min_contrast: np.float32,
     share: Bytes,
 ) -> None:
     inverted = inverse.size > 0
     other = inverse if inverted else pattern
-    most = np.float32(255.0)
-    for at in range(lit.size):
-        light, black = lit[at], dark[at]
-        difference, noise = _difference(pattern[at], other[at], light, black, inverted, variance)
-        contrast = max(np.float32(light) - np.float32(black), least)
-        share[at] = min(np.float32(WHOLE_SHARE) * (abs(difference) + noise) / contrast, most)
+    for n in range(lit.size):
+        light, black = lit[n], dark[n]
+        difference, noise = _difference(pattern[n], other[n], light, black, inverted, variance)
+        contrast = max(np.float32(light) - np.float32(black), min_contrast)
+        relative = np.float32(WHOLE_SHARE) * (abs(difference) + noise) / contrast
+        share[n] = min(relative, np.float32(255.0))

@@ -1,7 +1,7 @@
-"""What a stripe code is: the images a projector shows one after the other, and how they are read.
+"""Interface of a stripe code: the images that a projector shows in turn, and how they are decoded.
 
 Each code is one file of `bodyscan.stripes.codes`. Every rig file needs the codes' descriptions, so
-anything heavy (numpy, numba, OpenCV) is imported inside `intensity` and `decode`.
+anything heavy (numpy, numba, OpenCV) is imported inside methods.
 """
 
 from __future__ import annotations
@@ -19,11 +19,12 @@ from pydantic import (
     model_serializer,
 )
 
+from bodyscan.errors import BadInput
 from bodyscan.files.model import Model, Problem
 
 if TYPE_CHECKING:
-    from bodyscan.arrays import Array, Greys
-    from bodyscan.stripes.line_bands import LineBands
+    from bodyscan.arrays import Array, Bytes, Greys
+    from bodyscan.stripes.scan_lines import LineBands
     from bodyscan.stripes.stripe_limits import StripeLimits
     from bodyscan.stripes.stripe_map import StripeMap
 
@@ -37,24 +38,22 @@ class ImageKind:
     name: its key below `frames` in a rig file.
     template: the names of its images if the rig file does not say.
     number: the field of the template that numbers them from 0, None for a single image.
-    most: how many there can be.
+    max_count: how many there can be.
     """
 
     name: str
     template: str
     number: str | None = None
-    most: int = 1
+    max_count: int = 1
 
 
 @dataclass(frozen=True, eq=False)
 class SequenceImages:
-    """What a camera saw of a sequence, grey levels.
+    """A camera's images of a sequence, grey levels, all uint8, or float32 with fractions of levels.
 
     lit, dark: (H, W); dark is None if not taken.
     coded: (n, H, W) of each kind.
-    bands: where only boundaries are wanted; codes that can look there alone, and give no s.
-
-    All images are of one type: uint8, or float32 if they hold fractions of grey levels.
+    bands: the lines on which boundaries are wanted, and no s; codes may ignore it.
     """
 
     lit: Greys
@@ -63,15 +62,44 @@ class SequenceImages:
     bands: LineBands | None = None
 
 
+Shift = Literal["forward", "backward"]
+
+
+@dataclass(frozen=True)
+class Wave:
+    """Image k of `steps` shows 1/2 + 1/2 cos(2 pi ((s - origin) / period -+ k / steps) + start).
+
+    period, origin: stripes.
+    start: radians.
+    shift: forward if the wave moves to larger s from image to image (the sign before k is minus),
+        backward if it moves to smaller s.
+    """
+
+    period: float
+    steps: int
+    shift: Shift = "forward"
+    start: float = 0.0
+    origin: float = 0.0
+
+    @property
+    def sign(self) -> float:
+        """Sign of the shift: 1 forward."""
+        return 1.0 if self.shift == "forward" else -1.0
+
+    @property
+    def first_turn(self) -> float:
+        """s / period where image 0 is brightest, modulo 1."""
+        return (self.origin / self.period - self.start / 6.283185307179586) % 1.0
+
+
 class StripeCode(Model):
-    """The stripes that a projector shows: how many, which way they run, and how they are told
-    apart.
+    """Number, direction and coding of the stripes that a projector shows.
 
     A code adds the keys that it takes in the rig file as fields, and defines the following.
 
     kinds: of its images, in the order in which they are shown.
-    uses_dark: whether it has use for an image without the projector's light.
-    is_projected: False if an instrument projects its own stripes and outputs what it read.
+    uses_dark: whether an image without the projector's light is of use.
+    is_projected: False for an instrument that projects stripes itself and outputs decoded numbers.
     has_edges: whether its light changes at boundaries of stripes, which then should lie on whole
         projector pixels.
     crossing: stripes that the same projector shows afterwards in the other direction, if any.
@@ -124,10 +152,37 @@ class StripeCode(Model):
         return tuple(range(sum(self.image_counts.values())))
 
     def moment(self, times: Mapping[str, Array]) -> float:
-        """The moment for which its stripe map stands, in the
-        unit of the images' times (n,) by kind."""
+        """The time at which its stripe map holds, in the unit of the images' times (n,) by kind."""
         first = min(float(each.min()) for each in times.values())
         return (first + max(float(each.max()) for each in times.values())) / 2.0
+
+    def pattern_images(self, width: int, height: int) -> Bytes:
+        """Render the projector's images (F, height, width) uint8, read-only, in the order of
+        `image_counts`, followed by those of the crossing stripes.
+
+        The stripes divide the projector's image evenly. Raises BadInput if they are narrower than
+        one of its pixels, or if the code is not projected.
+        """
+        import numpy as np
+
+        images = [code._pattern_images(width, height) for code in self.directions]
+        return images[0] if len(images) == 1 else np.concatenate(images)
+
+    def _pattern_images(self, width: int, height: int) -> Bytes:
+        import numpy as np
+
+        horizontal = self.direction == "horizontal"
+        side, across = ("height", height) if horizontal else ("width", width)
+        if self.stripes > across:
+            raise BadInput(
+                f"{self.stripes} stripes do not fit on {across} projector pixels",
+                remedy=f"give the projector's own {side}, or project fewer stripes",
+            )
+        s = (np.arange(across) + 0.5) * self.stripes / across
+        lines = np.concatenate([self.intensity(kind, s) for kind in self.image_counts])
+        grey = np.rint(255.0 * lines).astype(np.uint8)
+        grey = grey[:, :, None] if horizontal else grey[:, None, :]
+        return np.broadcast_to(grey, (len(grey), height, width))
 
     @abstractmethod
     def intensity(self, kind: ImageKind, s: Array) -> Array:

@@ -1,15 +1,23 @@
-"""The stripe coordinate s of every pixel, from the boundaries on either side of it."""
+"""The stripe coordinate s of every pixel, interpolated along runs of boundaries.
+
+Also how far boundaries scatter about smooth runs, compared with their sigmas. Grey noise is measured
+where two images show the same thing. But JPEG errs with the content of an image, exposures vary from
+a pattern to its inverse, and pixels of projector and camera beat: each shifts a boundary relative to
+its neighbours, and all of it shows here. So does relief finer than the stripes (hair), where noise
+is low enough.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from bodyscan.arrays import Array, Floats, Indices, Mask
 from bodyscan.compiled import compiled
+from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
 from bodyscan.stripes.boundaries import MIN_STRIPE_PX, Boundaries
 
 SMOOTHERS = (
@@ -17,21 +25,10 @@ SMOOTHERS = (
     np.array([-2.0, 3.0, 6.0, 7.0, 6.0, 3.0, -2.0]) / 21.0,
 )
 """Local quadratic fits to 5 and to 7 equally spaced values (Savitzky and Golay 1964)."""
-
 REACH_PX = 6.0
-MAX_STRAY = 4.0
-SLACK = 0.15
-BEYOND = 0.4
-"""How far s is extrapolated past the last boundary of a run, in stripes."""
-BEYOND_DOUBT = 3.0
-"""Factor on the sigma of s there."""
-MAX_PULL = 0.05
-"""More than blur does to s on any smooth surface."""
-
-SHARED, SHARED_BY_RUNS = 1.4, 2.4
-"""Stripes over which the noise of s is alike. One stripe apart, two pixels between boundaries share a
-quarter of it, and 0.65 if the boundaries were smoothed; two apart nothing, and 0.14: a line that falls
-to nothing at these distances is nowhere off by more than a tenth."""
+"""Greatest distance over which a run is smoothed."""
+MIN_SCATTER = 1.2
+"""Sigmas too small by this factor are corrected; less may be due to the surface."""
 
 
 def interpolate_stripes(
@@ -40,74 +37,64 @@ def interpolate_stripes(
     usable: Mask,
     rough: Mask | None = None,
 ) -> tuple[Floats, Floats]:
-    """s and its standard deviation, (L, P) each, NaN where there is none.
+    """Interpolate s and its standard deviation, (L, P) each, NaN where there is none.
 
     rough: (N,) boundaries on relief that a smooth run would flatten: they are left in place.
 
     Between two boundaries s is a cubic with slopes from the boundaries around them (Hermite). Past
-    the last boundary of a run it continues a little with the slope there.
+    the last boundary of a run it is extrapolated a little with the slope there.
     """
     s = np.full(codes.shape, np.nan, np.float32)
     sigma = s.copy()
     if boundaries.joined.any():
-        found = _Segments.of(boundaries, rough)
-        segments = (found.start, found.width, found.index, found.rise, found.sigma)
-        bends = (found.slope_in, found.slope_out, found.pull)
-        places = (boundaries.line, boundaries.before)
-        _fill(s, sigma, codes, usable, *places, segments, bends, SLACK)
+        segments = _fit_segments(boundaries, rough)
+        _fill(s, sigma, codes, usable, boundaries.line, boundaries.before, segments)
     return s, sigma
 
 
-def alike_along_lines(boundaries: Boundaries) -> float:
-    """Distance along a line, px, within which pixels share noise: all between two boundaries, and
-    more where those share it because a run was smoothed. 0 without stripes."""
+def correlation_along_lines(boundaries: Boundaries) -> float:
+    """Compute the distance along a line, px, within which pixels share noise; 0 without stripes.
+
+    One stripe apart, two pixels between boundaries share a quarter of it, and 0.65 if the boundaries
+    were smoothed; two apart nothing, and 0.14. A correlation that falls linearly to zero at 1.4 and
+    2.4 stripes differs from these by a tenth at most.
+    """
     width = np.diff(boundaries.position)[boundaries.joined]
     width = width[width >= MIN_STRIPE_PX]
     if not len(width):
         return 0.0
-    usual = float(np.median(width))
-    smoothed = (len(SMOOTHERS[0]) - 1) * usual < 2 * REACH_PX
-    return (SHARED_BY_RUNS if smoothed else SHARED) * usual
+    median = float(np.median(width))
+    smoothed = (len(SMOOTHERS[0]) - 1) * median < 2 * REACH_PX
+    return (2.4 if smoothed else 1.4) * median
 
 
-@dataclass(frozen=True, eq=False)
-class _Segments:
-    """s on a scan line between boundaries j and j + 1: NaN if they are not joined.
+def _fit_segments(boundaries: Boundaries, rough: Mask | None = None) -> tuple[Array, ...]:
+    """Fit s on scan lines between boundaries j and j + 1; NaN if they are not joined.
 
-    start: place of boundary j, px.
+    Returns, (N - 1,) each:
+    start: position of boundary j, px.
     width: distance to the next, px.
     index: s at boundary j.
     rise: change of s to the next.
-    slope_in, slope_out: ds per px at both ends.
-    pull: what blur adds to s where s bends, blur^2 / 2 times its second derivative.
     sigma: of s.
+    slope_in, slope_out: ds per px at both ends.
+    blur_bias: what blur adds to s on a curved surface, blur^2 / 2 times its second derivative.
     """
-
-    start: Array
-    width: Array
-    index: Array
-    rise: Array
-    slope_in: Array
-    slope_out: Array
-    pull: Array
-    sigma: Array
-
-    @staticmethod
-    def of(boundaries: Boundaries, rough: Mask | None = None) -> _Segments:
-        smooth = boundaries.joined
-        if rough is not None:
-            smooth = smooth & ~(rough[1:] | rough[:-1])
-        position, sigma_px = smooth_runs(boundaries, smooth)
-        width = np.where(boundaries.joined, np.diff(position), np.nan)
-        width[width < MIN_STRIPE_PX] = np.nan
-        rise = np.diff(boundaries.index).astype(float)
-        secant = rise / width
-        slope_in, slope_out = end_slopes(secant, width)
-        pull = np.clip(0.5 * boundaries.blur2 * (slope_out - slope_in) / width, -MAX_PULL, MAX_PULL)
-        variance = sigma_px * sigma_px
-        sigma = np.abs(secant) * np.sqrt((variance[1:] + variance[:-1]) / 2)
-        start, index = position[:-1], boundaries.index[:-1].astype(float)
-        return _Segments(start, width, index, rise, slope_in, slope_out, pull, sigma)
+    smooth = boundaries.joined
+    if rough is not None:
+        smooth = smooth & ~(rough[1:] | rough[:-1])
+    position, sigma_px = smooth_runs(boundaries, smooth)
+    width = np.where(boundaries.joined, np.diff(position), np.nan)
+    width[width < MIN_STRIPE_PX] = np.nan
+    rise = np.diff(boundaries.index).astype(float)
+    secant = rise / width
+    slope_in, slope_out = estimate_end_slopes(secant, width)
+    # More than 0.05 is more than blur does to s on any smooth surface.
+    bias = np.clip(0.5 * boundaries.blur2 * (slope_out - slope_in) / width, -0.05, 0.05)
+    variance = sigma_px * sigma_px
+    sigma = np.abs(secant) * np.sqrt((variance[1:] + variance[:-1]) / 2)
+    start, index = position[:-1], boundaries.index[:-1].astype(float)
+    return start, width, index, rise, sigma, slope_in, slope_out, bias
 
 
 @compiled
@@ -119,95 +106,75 @@ def _fill(
     line: Indices,
     before: Indices,
     segments: tuple[Array, ...],
-    bends: tuple[Array, ...],
-    slack: float,
 ) -> None:
     """Write s and sigma (L, P) of usable pixels from the segments they lie in; beyond a run's ends,
     from its last segment, the one before the pixel in preference to the one after.
 
     line, before: (N,) of the boundaries.
-    segments, bends: (N - 1,) each, see `_Segments`.
-    slack: by how many stripes s may leave the code's stripe.
+    segments: see `_fit_segments`.
     """
     last, count = -1, line.size
     for row in range(codes.shape[0]):
-        for place in range(codes.shape[1]):
+        for x in range(codes.shape[1]):
             while last + 1 < count and (
-                line[last + 1] < row or (line[last + 1] == row and before[last + 1] < place)
+                line[last + 1] < row or (line[last + 1] == row and before[last + 1] < x)
             ):
                 last += 1
-            if not usable[row, place]:
+            if not usable[row, x]:
                 continue
-            code, passed = codes[row, place], last >= 0 and line[last] == row
-            value, doubt = np.nan, np.nan
+            code, passed = codes[row, x], last >= 0 and line[last] == row
+            value, error = np.nan, np.nan
             if passed and last + 1 < count:
-                value, doubt = _within(place, code, last, segments, bends, SLACK)
+                value, error = _interpolate(x, code, last, segments)
             if passed and last >= 1 and math.isnan(value):
-                value, doubt = _beside(place, code, last - 1, segments, bends, SLACK)
+                value, error = _extrapolate(x, code, last - 1, segments)
             if last + 2 < count and line[last + 1] == row and math.isnan(value):
-                value, doubt = _beside(place, code, last + 1, segments, bends, SLACK)
-            s[row, place], sigma[row, place] = value, doubt
+                value, error = _extrapolate(x, code, last + 1, segments)
+            s[row, x], sigma[row, x] = value, error
 
 
 @compiled
-def _within(
-    place: int,
-    code: int,
-    k: int,
-    segments: tuple[Array, ...],
-    bends: tuple[Array, ...],
-    slack: float,
-) -> tuple[float, float]:
-    """s and its standard deviation at a place (px) between the boundaries of segment k, or NaN."""
-    start, width, index, rise, sigma = segments
-    slope_in, slope_out, pull = bends
-    x, secant = place - start[k], rise[k] / width[k]
+def _interpolate(pixel: int, code: int, k: int, segments: tuple[Array, ...]) -> tuple[float, float]:
+    """s and its standard deviation at a pixel between the boundaries of segment k, or NaN."""
+    start, width, index, rise, sigma, slope_in, slope_out, bias = segments
+    x, secant = pixel - start[k], rise[k] / width[k]
     square = (3.0 * secant - 2.0 * slope_in[k] - slope_out[k]) / width[k]
     cube = (slope_in[k] + slope_out[k] - 2.0 * secant) / (width[k] * width[k])
-    value = ((cube * x + square) * x + slope_in[k]) * x + index[k] - pull[k]
-    return _credible(value, sigma[k], code, index[k] + 0.5 * rise[k], slack)
+    value = ((cube * x + square) * x + slope_in[k]) * x + index[k] - bias[k]
+    return _accept(value, sigma[k], code, index[k] + 0.5 * rise[k])
 
 
 @compiled
-def _beside(
-    place: int,
-    code: int,
-    k: int,
-    segments: tuple[Array, ...],
-    bends: tuple[Array, ...],
-    slack: float,
-) -> tuple[float, float]:
-    """s and its standard deviation at a place (px) before or after segment k, or NaN: its bend
-    continues, and the doubt grows by what that adds."""
-    start, width, index, rise, sigma = segments
-    slope_in, slope_out, pull = bends
-    x, base, slope = place - start[k], index[k] - pull[k], slope_in[k]
+def _extrapolate(pixel: int, code: int, k: int, segments: tuple[Array, ...]) -> tuple[float, float]:
+    """s and its standard deviation at a pixel before or after segment k, or NaN: its curvature
+    continues, and its contribution counts as an error besides three sigmas of the segment."""
+    start, width, index, rise, sigma, slope_in, slope_out, bias = segments
+    x, base, slope = pixel - start[k], index[k] - bias[k], slope_in[k]
     if x > 0.5 * width[k]:
         x, base, slope = x - width[k], base + rise[k], slope_out[k]
-    bending = 0.5 * x * x * (slope_out[k] - slope_in[k]) / width[k]
-    doubt = math.sqrt((BEYOND_DOUBT * sigma[k]) ** 2 + bending * bending)
-    return _credible(base + x * slope + bending, doubt, code, index[k] + 0.5 * rise[k], slack)
+    curvature = 0.5 * x * x * (slope_out[k] - slope_in[k]) / width[k]
+    error = math.sqrt((3.0 * sigma[k]) ** 2 + curvature * curvature)
+    return _accept(base + x * slope + curvature, error, code, index[k] + 0.5 * rise[k])
 
 
 @compiled
-def _credible(
-    value: float, doubt: float, code: int, middle: float, slack: float
-) -> tuple[float, float]:
-    """Both values, or NaN if the pixel's code disagrees or s leaves the segment (`middle` is s at
-    its middle) by more than a part of a stripe."""
-    if abs(value - code - 0.5) < 0.5 + slack and abs(value - middle) < 0.5 + BEYOND:
-        return value, doubt
+def _accept(value: float, error: float, code: int, middle: float) -> tuple[float, float]:
+    """Both values, or NaN if s is 0.15 stripes outside the pixel's code or 0.4 outside the segment.
+
+    middle: s in the middle of the segment.
+    """
+    if abs(value - code - 0.5) < 0.65 and abs(value - middle) < 0.9:
+        return value, error
     return np.nan, np.nan
 
 
 @compiled
-def end_slopes(secant: Array, width: Array) -> tuple[Array, Array]:
-    """Slopes of s at both ends of every segment, from the neighbouring segments; the segment's own
-    secant if there are none.
+def estimate_end_slopes(secant: Array, width: Array) -> tuple[Array, Array]:
+    """Estimate the slopes of s at both ends of every segment from the neighbouring segments.
 
     Within a run the slope at a boundary is that of the parabola through it and its neighbours; at a
-    run's end the parabola of the one segment is continued. Segments in which s runs the other way
-    say nothing about this one.
+    run's end the parabola of the one segment is continued; a segment alone has its secant's slope.
+    Segments in which s runs the other way are ignored.
     """
     count = secant.size
     slope_in, slope_out = np.full(count, np.nan), np.full(count, np.nan)
@@ -217,13 +184,13 @@ def end_slopes(secant: Array, width: Array) -> tuple[Array, Array]:
             slope_in[k] = slope_out[k - 1] = both / (width[k - 1] + width[k])
     for k in range(count):
         first, last = slope_in[k], slope_out[k]
-        slope_in[k] = _completed(first, last, secant[k])
-        slope_out[k] = _completed(last, first, secant[k])
+        slope_in[k] = _continue_slope(first, last, secant[k])
+        slope_out[k] = _continue_slope(last, first, secant[k])
     return slope_in, slope_out
 
 
 @compiled
-def _completed(slope: float, other: float, secant: float) -> float:
+def _continue_slope(slope: float, other: float, secant: float) -> float:
     """The slope at one end; if unknown, of the parabola with slope `other` at the other end."""
     if not math.isnan(slope):
         return slope
@@ -231,11 +198,12 @@ def _completed(slope: float, other: float, secant: float) -> float:
 
 
 def smooth_runs(boundaries: Boundaries, joined: Mask) -> tuple[Array, Array]:
-    """Positions and their sigmas, px, after a local quadratic fit along each unbroken run.
+    """Smooth positions by a local quadratic fit along each unbroken run; returns them and their
+    sigmas, px.
 
-    Along a run the index counts evenly, so the fit of place against index is a fixed filter. It
+    Along a run the index counts evenly, so the fit of position against index is a fixed filter. It
     reaches no farther than about 6 px and not past the run's ends; a boundary that it would move by
-    more than noise explains is left in place.
+    more than four sigmas is left in place.
     """
     position, sigma = boundaries.position.copy(), boundaries.sigma_px.copy()
     for weights in SMOOTHERS:
@@ -245,7 +213,7 @@ def smooth_runs(boundaries: Boundaries, joined: Mask) -> tuple[Array, Array]:
 
 @compiled
 def _smooth(
-    seen: Array,
+    measured: Array,
     sigma_px: Array,
     joined: Mask,
     weights: Array,
@@ -254,14 +222,66 @@ def _smooth(
 ) -> None:
     """Apply one filter of `smooth_runs`; overwrites position and sigma (N,) where it fits."""
     half = weights.size // 2
-    share = math.sqrt(np.sum(weights * weights))
+    gain = math.sqrt(np.sum(weights * weights))
     run = 0  # how many boundaries before this one belong to its run
-    for last in range(1, seen.size):
+    for last in range(1, measured.size):
         run = run + 1 if joined[last - 1] else 0
-        if run < 2 * half or seen[last] - seen[last - 2 * half] >= 2 * REACH_PX:
+        if run < 2 * half or measured[last] - measured[last - 2 * half] >= 2 * REACH_PX:
             continue
         middle, fitted = last - half, 0.0
         for k in range(weights.size):
-            fitted += weights[k] * seen[last - 2 * half + k]
-        if abs(fitted - seen[middle]) < MAX_STRAY * sigma_px[middle]:
-            position[middle], sigma[middle] = fitted, sigma_px[middle] * share
+            fitted += weights[k] * measured[last - 2 * half + k]
+        if abs(fitted - measured[middle]) < 4.0 * sigma_px[middle]:
+            position[middle], sigma[middle] = fitted, sigma_px[middle] * gain
+
+
+def estimate_scatter(boundaries: Boundaries) -> float:
+    """Estimate the ratio of observed to predicted distances from a parabola through five boundaries
+    of a run, robustly; 1 if it is not clearly more, or there are too few."""
+    starts = len(boundaries.joined) - len(SMOOTHERS[0]) + 2
+    residual = _measure_residuals(boundaries, max(1, starts // 20_000))[1]
+    if len(residual) < 1000:
+        return 1.0
+    ratio = SIGMAS_PER_MEDIAN * float(np.median(np.abs(residual)))
+    return ratio if ratio > MIN_SCATTER else 1.0
+
+
+def estimate_local_scatter(boundaries: Boundaries) -> Array:
+    """Estimate the same ratio, at most 3, in windows of 31 px around each boundary, (N,), that hold
+    some 400 others; 1 where it is not clearly more."""
+    middle, residual = _measure_residuals(boundaries, 1)
+    if not len(middle):
+        return np.ones(len(boundaries.line))
+    width = int(boundaries.before.max()) + 1
+    pixels = boundaries.line * width + boundaries.before
+    size = (int(boundaries.line.max()) + 1) * width
+
+    def sum_around(values: Array | None) -> Floats:
+        total = np.bincount(pixels[middle], values, size).reshape(-1, width).astype(np.float32)
+        summed = cv2.boxFilter(total, -1, (31, 31), normalize=False, borderType=cv2.BORDER_CONSTANT)
+        return np.asarray(summed.ravel()[pixels])
+
+    count = np.maximum(sum_around(None), 1.0)
+    # One that strays farther strays alone.
+    mean = sum_around(np.minimum(np.square(residual), 3.0**2)) / count
+    # The mean of n squares of normal deviates is known to sqrt(2 / n).
+    significant = mean > MIN_SCATTER**2 + 3.0 * np.sqrt(2.0 / count)
+    return np.sqrt(np.where(significant, mean, 1.0))
+
+
+def _measure_residuals(boundaries: Boundaries, step: int) -> tuple[Indices, Array]:
+    """Every `step`th boundary in the middle of five of a run (M,), and its distance from a parabola
+    through the five, in predicted sigmas (M,)."""
+    weights = SMOOTHERS[0]
+    middle, span = len(weights) // 2, len(weights) - 1
+    first = np.arange(0, max(len(boundaries.joined) - span + 1, 0), step)
+    run = boundaries.position[first + span] - boundaries.position[first] < 2.0 * REACH_PX
+    for k in range(span):
+        run &= boundaries.joined[first + k]
+    first = first[run]
+    residual, variance = np.zeros(len(first)), np.zeros(len(first))
+    for k, weight in enumerate(weights):
+        gain = weight - (k == middle)
+        residual += gain * boundaries.position[first + k]
+        variance += (gain * boundaries.sigma_px[first + k]) ** 2
+    return first + middle, residual / np.sqrt(variance)

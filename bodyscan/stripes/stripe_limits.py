@@ -1,4 +1,4 @@
-"""Which stripes of an image are worth decoding: those on things in the scan volume."""
+"""Limits of the stripe coordinates that are decoded: those of points in the scan volume."""
 
 from __future__ import annotations
 
@@ -12,8 +12,6 @@ from bodyscan.arrays import Floats, Mask
 from bodyscan.compiled import compiled
 
 TILE_PX = 8  # fits into a word of 64 bits
-
-LEAST_STANDING = 1e-3  # of what is seen in the volume
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,21 +35,21 @@ class StripeLimits:
     around_px: float
 
     def split(
-        self, s: NDArray[np.int32] | Floats, usable: Mask, *, turned: bool = False
+        self, s: NDArray[np.int32] | Floats, usable: Mask, *, transposed: bool = False
     ) -> tuple[Mask, Mask]:
-        """Pixels (L, P) of `usable` that are wanted, and those that lie beyond.
+        """Find the pixels (L, P) of `usable` that are wanted, and those that lie beyond.
 
         s: (L, P) stripe coordinates or, as integers, stripes.
-        turned: the lines are the camera image's columns.
+        transposed: the lines are the camera image's columns.
         """
         limits = np.stack([self.near, self.far, self.standing])
-        limits = np.ascontiguousarray(limits.transpose(0, 2, 1)) if turned else limits
+        limits = np.ascontiguousarray(limits.transpose(0, 2, 1)) if transposed else limits
         middle = 0.5 if s.dtype.kind == "i" else 0.0
         there, deep = np.empty(s.shape, np.bool_), np.empty(s.shape, np.bool_)
         rows, columns = (-(-size // TILE_PX) for size in s.shape)
         standing = np.zeros((TILE_PX * rows, TILE_PX * columns), np.bool_)
         _split(s, middle, self.rising, usable, limits, self.block_px, there, deep, standing)
-        if np.count_nonzero(standing) < LEAST_STANDING * np.count_nonzero(there):
+        if np.count_nonzero(standing) < 1e-3 * np.count_nonzero(there):
             return there, deep & ~there
         eights = standing.view(np.uint64).reshape(rows, TILE_PX, columns)
         tiles = eights.any(axis=1).view(np.uint8)
@@ -80,8 +78,8 @@ def _split(
     """
     sign = np.float32(1.0 if rising else -1.0)
     offset = sign * np.float32(middle)
-    lines, places = s.shape
-    wide = np.empty((3, limits.shape[1], places), np.float32)
+    lines, width = s.shape
+    wide = np.empty((3, limits.shape[1], width), np.float32)
     for kind in range(3):
         for row in range(limits.shape[1]):
             _widen(limits[kind, row], block_px, wide[kind, row])
@@ -102,16 +100,16 @@ def _split(
 @compiled
 def _blend(one: Floats, other: Floats, share: np.float32) -> Floats:
     between = np.empty(one.size, np.float32)
-    for place in range(one.size):
-        between[place] = one[place] + share * (other[place] - one[place])
+    for x in range(one.size):
+        between[x] = one[x] + share * (other[x] - one[x])
     return between
 
 
 @compiled
 def _depths(s: NDArray[np.int32] | Floats, sign: np.float32, offset: np.float32) -> Floats:
     depth = np.empty(s.size, np.float32)
-    for place in range(s.size):
-        depth[place] = sign * np.float32(s[place]) + offset
+    for x in range(s.size):
+        depth[x] = sign * np.float32(s[x]) + offset
     return depth
 
 
@@ -119,25 +117,25 @@ def _depths(s: NDArray[np.int32] | Floats, sign: np.float32, offset: np.float32)
 def _split_line(
     depth: Floats, usable: Mask, near: Floats, far: Floats, low: Floats, there: Mask, deep: Mask
 ) -> None:
-    for place in range(depth.size):
-        there[place] = usable[place] & (depth[place] >= near[place]) & (depth[place] <= far[place])
-    for place in range(depth.size):
-        deep[place] = usable[place] & (depth[place] > low[place]) & (far[place] > near[place])
+    for x in range(depth.size):
+        there[x] = usable[x] & (depth[x] >= near[x]) & (depth[x] <= far[x])
+    for x in range(depth.size):
+        deep[x] = usable[x] & (depth[x] > low[x]) & (far[x] > near[x])
 
 
 @compiled
 def _stand(there: Mask, deep: Mask, standing: Mask) -> None:
-    for place in range(there.size):
-        standing[place] = there[place] & (not deep[place])
+    for x in range(there.size):
+        standing[x] = there[x] & (not deep[x])
 
 
 @compiled
 def _widen(edges: Floats, block_px: int, values: Floats) -> None:
     """Fill values (P,) at pixel centres, linear between those at the edges of blocks (columns,)."""
-    for place in range(values.size):
-        column = place // block_px
-        share = np.float32((place + 0.5) / block_px - column)
-        values[place] = edges[column] + share * (edges[column + 1] - edges[column])
+    for x in range(values.size):
+        column = x // block_px
+        share = np.float32((x + 0.5) / block_px - column)
+        values[x] = edges[column] + share * (edges[column + 1] - edges[column])
 
 
 @compiled
@@ -146,6 +144,6 @@ def _keep(tiles: Mask, there: Mask, deep: Mask) -> None:
     not in `there`."""
     for line in range(there.shape[0]):
         tile = tiles[line // TILE_PX]
-        for place in range(there.shape[1]):
-            there[line, place] &= tile[place]
-            deep[line, place] &= not there[line, place]
+        for x in range(there.shape[1]):
+            there[line, x] &= tile[x]
+            deep[line, x] &= not there[line, x]

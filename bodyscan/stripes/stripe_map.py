@@ -1,4 +1,4 @@
-"""Which stripe is where in the images of one pair in one shot."""
+"""The stripe map of one pair's images of one shot, and its assembly from what decoders find."""
 
 from __future__ import annotations
 
@@ -6,15 +6,18 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from bodyscan.arrays import Array, Bytes, Floats, Greys, Indices, Mask, whole_grey
-from bodyscan.stripes.boundaries import Boundaries
+from bodyscan.stripes.albedo_edges import Brightness, correct_across_lines
+from bodyscan.stripes.boundaries import MIN_SIGMA_PX, Boundaries, join_runs
 from bodyscan.stripes.scan_lines import ScanLines
+from bodyscan.stripes.stripe_coordinates import interpolate_stripes
 
 
 @dataclass(frozen=True)
 class ResponseShare:
-    """What the projector's response did to s before it was removed, and what noise still does.
+    """Error of s due to the projector's response, before its correction, and due to noise after it.
 
     response_rms, noise_rms: stripes, over the pixels that have s.
     """
@@ -25,9 +28,9 @@ class ResponseShare:
     def __str__(self) -> str:
         total = self.response_rms**2 + self.noise_rms**2
         return (
-            f"the projector's response moved s by {self.response_rms:.2g} stripes RMS and was taken"
-            f" out ({self.response_rms**2 / total:.0%} of the variance, noise of"
-            f" {self.noise_rms:.2g} stripes being the rest)"
+            f"an error of s of {self.response_rms:.2g} stripes RMS due to the projector's response was"
+            f" corrected ({self.response_rms**2 / total:.0%} of the variance; the rest is noise of"
+            f" {self.noise_rms:.2g} stripes)"
         )
 
 
@@ -40,17 +43,17 @@ class StripeMap:
     sigma: (height, width) float32, standard deviation of s, in stripes; NaN likewise.
     lit: (height, width) uint8, the fully lit image (grey).
     boundary_index: (N,) int64: boundary i lies between stripes i - 1 and i, that is s = i.
-    boundary_pixels: (N, 2) float64, where it was seen, px, sub-pixel.
+    boundary_pixels: (N, 2) float64, its position, px, sub-pixel.
     boundary_sigma_px: (N,) float32, standard deviation across the stripe, px.
     stripes: S, the number of stripes projected.
     beyond: (height, width) bool, lit by a stripe that lies deeper than wanted, where s is NaN (see
         `StripeLimits`); None if all stripes were wanted.
     crossing: the map of the stripes that run the other way, if such were projected.
-    alike_px: distance along rows and along columns within which pixels share noise, as they lie between
-        the same boundaries; 0 if each has its own.
     crossing_fault: why there is none although they were, else "".
-    response: what the projector's response did, for codes that measure it; None if noise explains
-        it.
+    response: error due to the projector's response, for codes that measure it; None if noise
+        explains it.
+    correlation_px: distance along rows and along columns within which pixels share noise, as they
+        lie between the same boundaries; 0 if their noise is independent.
     """
 
     s: Floats
@@ -64,10 +67,10 @@ class StripeMap:
     crossing: StripeMap | None = None
     response: ResponseShare | None = None
     crossing_fault: str = ""
-    alike_px: tuple[float, float] = (0.0, 0.0)
+    correlation_px: tuple[float, float] = (0.0, 0.0)
 
 
-def stripe_map(
+def assemble_map(
     images: ScanLines,
     lit: Greys,
     s: Floats,
@@ -76,27 +79,103 @@ def stripe_map(
     stripes: int,
     beyond: Mask | None = None,
 ) -> StripeMap:
-    """Bring what was read along scan lines back into the camera's own layout."""
-    if images.turned:
+    """Transpose results along scan lines back into the camera's own layout."""
+    if images.transposed:
         s, sigma = cv2.transpose(s), cv2.transpose(sigma)
         beyond = None if beyond is None else beyond.T
-    found = boundary_map(images, lit, boundaries, stripes)
-    return replace(found, s=s, sigma=sigma, beyond=beyond)
+    only_boundaries = assemble_boundaries(images, lit, boundaries, stripes)
+    return replace(only_boundaries, s=s, sigma=sigma, beyond=beyond)
 
 
-def boundary_map(images: ScanLines, lit: Greys, boundaries: Boundaries, stripes: int) -> StripeMap:
-    """The boundaries alone, in the camera's own layout."""
+def assemble_boundaries(
+    images: ScanLines, lit: Greys, boundaries: Boundaries, stripes: int
+) -> StripeMap:
+    """Make a map of boundaries alone, in the camera's own layout."""
     across, kept = boundaries.line_position, np.ones(len(boundaries.line), bool)
     if images.bands is not None:
-        across, kept = images.bands.places(boundaries.line, across)
-    places = (across, boundaries.position) if images.turned else (boundaries.position, across)
-    nothing = np.empty((0, 0), np.float32)
+        across, kept = images.bands.locate(boundaries.line, across)
+    axes = (across, boundaries.position) if images.transposed else (boundaries.position, across)
+    empty = np.empty((0, 0), np.float32)
     return StripeMap(
-        s=nothing,
-        sigma=nothing,
+        s=empty,
+        sigma=empty,
         lit=whole_grey(lit),
         boundary_index=boundaries.index[kept],
-        boundary_pixels=np.stack(places, axis=-1)[kept],
+        boundary_pixels=np.stack(axes, axis=-1)[kept],
         boundary_sigma_px=boundaries.sigma_px[kept].astype(np.float32),
         stripes=stripes,
     )
+
+
+def assemble_from_pixels(
+    images: ScanLines,
+    lit: Greys,
+    s: Floats,
+    sigma: Floats,
+    variance: Floats,
+    stripes: int,
+    *,
+    codes: NDArray[np.int32] | None = None,
+) -> StripeMap:
+    """Make the map from s and its standard deviation (L, P) at each pixel, NaN where there is none.
+
+    variance: (256,) of each grey level.
+    codes: (L, P) stripes; if given, s interpolated between boundaries replaces a pixel's s where its
+        sigma is smaller.
+
+    Edges of the surface's brightness shift s as they shift boundaries (see `albedo_edges`); that is
+    corrected first. Boundaries are where s passes a whole number between two pixels of a line.
+    """
+    brightness = Brightness.from_images(images, variance, np.isfinite(s))
+    raw = find_whole_numbers(s, sigma, 0.0)
+    edges = brightness.at_boundaries(raw.line * s.shape[1] + raw.before)
+    blur2 = edges.estimate_blur2(raw.position, raw.joined)
+    s, sigma = _correct_along_lines(s, sigma, brightness, blur2)
+    s, sigma = correct_across_lines(s, sigma, brightness, blur2)
+    s[(s < 0) | (s > stripes)] = np.nan
+    sigma[np.isnan(s)] = np.nan
+    boundaries = find_whole_numbers(s, sigma, blur2)
+    if codes is not None:
+        between, between_sigma = interpolate_stripes(boundaries, codes, np.isfinite(s))
+        better = between_sigma < sigma
+        s, sigma = np.where(better, between, s), np.where(better, between_sigma, sigma)
+    return assemble_map(images, lit, s, sigma, boundaries, stripes)
+
+
+def find_whole_numbers(s: Floats, sigma: Floats, blur2: float) -> Boundaries:
+    """Find boundaries where s passes a whole number between two neighbours on a line, interpolated
+    linearly; a step of 1.5 stripes or more leads to another surface."""
+    here, there = s[:, :-1], s[:, 1:]
+    step = there - here
+    whole = np.rint((here + there) / 2)
+    passed = (np.minimum(here, there) < whole) & (whole <= np.maximum(here, there))
+    line, before = np.nonzero(passed & (np.abs(step) < 1.5))
+    slope = step[line, before].astype(np.float64)
+    index = whole[line, before].astype(np.int64)
+    share = (index - here[line, before]) / slope
+    error = np.hypot((1.0 - share) * sigma[line, before], share * sigma[line, before + 1])
+    position = before + share
+    return Boundaries(
+        line=line,
+        before=before,
+        position=position,
+        line_position=line.astype(np.float64),
+        sigma_px=np.hypot(error / np.abs(slope), MIN_SIGMA_PX),
+        index=index,
+        joined=join_runs(line, before, position, index, np.isfinite(s)),
+        blur2=blur2,
+    )
+
+
+def _correct_along_lines(
+    s: Floats, sigma: Floats, brightness: Brightness, blur2: float
+) -> tuple[Floats, Floats]:
+    """Correct s (L, P) for edges that cross the scan lines; returns s and its standard deviation."""
+    lines, width = s.shape
+    along = brightness.at_boundaries(np.arange(lines * width - 1)).along
+    step = np.append(along, 0.0).reshape(lines, width).astype(np.float32)
+    gradient = np.zeros_like(step)
+    gradient[:, 1:-1] = (step[:, 1:-1] + step[:, :-2]) / 2
+    transposed = Brightness(brightness.logarithm.T, brightness.noise2.T, gradient.T, step.T)
+    s, sigma = correct_across_lines(s.T, sigma.T, transposed, blur2)
+    return np.ascontiguousarray(s.T), np.ascontiguousarray(sigma.T)

@@ -1,4 +1,4 @@
-"""Which pixels of a stripe sequence show the projector's light clearly enough to be decoded."""
+"""Selection of the pixels of a stripe sequence that show the projector's light clearly enough."""
 
 from __future__ import annotations
 
@@ -10,75 +10,87 @@ from numpy.typing import NDArray
 
 from bodyscan.arrays import Floats, Mask
 from bodyscan.compiled import compiled
-from bodyscan.stripes.indirect_light import mostly_direct
-from bodyscan.stripes.scan_lines import ScanLines
+from bodyscan.errors import DecodingFailed, WrongDirection
+from bodyscan.stripes.scan_lines import WHOLE_SHARE, ScanLines
 
 SATURATED = 254
 MIN_CONTRAST = 4.0
 MIN_CONTRAST_TO_NOISE = 5.0
-WHOLLY_COVERED = 0.7
 
 
-def least_contrast(of: np.dtype[Any]) -> float:
-    """Least contrast in grey levels for images of type `of`: fewer whole grey levels say nothing;
-    with finer ones, noise alone decides."""
-    return MIN_CONTRAST if of == np.uint8 else 0.0
+def min_contrast(dtype: np.dtype[Any]) -> float:
+    """Minimum contrast in grey levels for images of type `dtype`: fewer whole levels are rounding
+    errors; with finer ones, noise alone decides."""
+    return MIN_CONTRAST if dtype == np.uint8 else 0.0
 
 
-def usable_pixels(
-    images: ScanLines,
-    codes: NDArray[np.int32],
-    variance: Floats,
-    stripes: int,
-    fine_bit: int,
-) -> Mask:
-    """Pixels (L, P) whose stripes `codes` can be relied on: those of `shown_pixels` except for
-    pixels beside a jump of the code by more than one (such as a mixed pixel at a depth jump)."""
-    return shown_pixels(images, codes, variance, stripes, fine_bit)[0]
-
-
-def shown_pixels(
+def find_usable_pixels(
     images: ScanLines,
     codes: NDArray[np.int32],
     variance: Floats,
     stripes: int,
     fine_bit: int,
 ) -> tuple[Mask, Mask]:
-    """The usable pixels (L, P), and all that show a code, including those beside its jumps.
+    """Find the pixels (L, P) whose stripes `codes` can be relied on, and all that are lit well.
 
-    Excluded are low contrast, saturation, codes that were not projected, pixels that the surface's
-    rim covers only in part, and pixels that get more light from other surfaces than from the
-    projector.
+    Excluded from both are low contrast, saturation, codes that were not projected, pixels that the
+    surface's rim covers only in part, and pixels that get more light from other surfaces than from
+    the projector; from the former also pixels next to a jump of the code by more than one (such as a
+    mixed pixel at a depth discontinuity).
 
     variance: (256,) of each grey level.
-    fine_bit: see `mostly_direct`.
+    fine_bit: see `find_direct_pixels`.
     """
     contrast = cv2.subtract(images.lit, images.dark)
-    least = np.maximum(least_contrast(contrast.dtype), MIN_CONTRAST_TO_NOISE * np.sqrt(variance))
+    needed = np.maximum(min_contrast(contrast.dtype), MIN_CONTRAST_TO_NOISE * np.sqrt(variance))
     if contrast.dtype == np.uint8:
-        least = np.minimum(np.ceil(least), 255).astype(np.uint8)
-        bright = contrast >= cv2.LUT(cv2.max(images.lit, images.dark), least)
+        needed = np.minimum(np.ceil(needed), 255).astype(np.uint8)
+        bright = contrast >= cv2.LUT(cv2.max(images.lit, images.dark), needed)
     else:
-        bright = contrast >= least[np.maximum(images.lit, images.dark).astype(np.uint8)]
-    bright &= ~half_covered_pixels(contrast, bright)
-    shown = bright & (images.lit < SATURATED) & (codes >= 0) & (codes < stripes)
-    usable = shown & ~beside_jumps(codes, shown)
-    direct = mostly_direct(images, usable, fine_bit, variance)
-    return usable & direct, shown & direct
+        bright = contrast >= needed[np.maximum(images.lit, images.dark).astype(np.uint8)]
+    bright &= ~find_half_covered_pixels(contrast, bright)
+    coded = bright & (images.lit < SATURATED) & (codes >= 0) & (codes < stripes)
+    usable = coded & ~find_code_jumps(codes, coded)
+    direct = find_direct_pixels(images, usable, fine_bit, variance)
+    return usable & direct, coded & direct
 
 
-def half_covered_pixels(contrast: NDArray[Any], lit: Mask) -> Mask:
-    """Pixels (L, P) beside one that is not lit and much darker than their brightest neighbour.
+def find_half_covered_pixels(contrast: NDArray[Any], lit: Mask) -> Mask:
+    """Find pixels (L, P) next to one that is not lit and much darker than their brightest neighbour.
 
     They straddle the rim of the surface, and show s of its part of them, not of their centre.
     """
-    around = np.ones((3, 3), np.uint8)
-    at_rim = cv2.erode(lit.view(np.uint8), around, borderValue=1) == 0
-    return at_rim & (contrast < np.float32(WHOLLY_COVERED) * cv2.dilate(contrast, around))
+    window = np.ones((3, 3), np.uint8)
+    at_rim = cv2.erode(lit.view(np.uint8), window, borderValue=1) == 0
+    return at_rim & (contrast < np.float32(0.7) * cv2.dilate(contrast, window))
 
 
-def beside_jumps(codes: NDArray[np.int32], usable: Mask) -> Mask:
-    """Pixels (L, P) whose code differs from a usable neighbour's by more than one."""
+def find_direct_pixels(images: ScanLines, usable: Mask, bit: int, variance: Floats) -> Mask:
+    """Find the pixels (L, P) that get more light from the projector than from other surfaces.
+
+    usable: (L, P) pixels to examine.
+    bit: the pattern with stripes two wide.
+    variance: (256,) of each grey level.
+
+    A pixel's lit minus dark is direct light D plus light I from other surfaces. A fine pattern minus
+    its inverse is about +-D (Nayar et al. 2006), and a bit is certain where D > I (Xu and Aliaga
+    2007). The finest bit decides, or the next coarser one that the projector shows sharply, to 0.8
+    of the contrast in a tenth of the pixels (in procam-board its lens leaves a fifth of the finest).
+    Where a bit flips its difference is small whatever the light; such dips along the lines, up to
+    7 px wide, are filled.
+    """
+    window = np.ones((1, 7), np.uint8)
+    for fine in range(bit, max(bit - 3, -1), -1):
+        share = images.direct_share(fine, variance)
+        filled = cv2.morphologyEx(share, cv2.MORPH_CLOSE, window)
+        sharp = np.count_nonzero((filled >= 0.8 * WHOLE_SHARE) & usable)
+        if sharp and sharp >= (1.0 - 90 / 100.0) * np.count_nonzero(usable):
+            return np.asarray(filled >= 0.5 * WHOLE_SHARE)
+    return np.ones_like(usable)
+
+
+def find_code_jumps(codes: NDArray[np.int32], usable: Mask) -> Mask:
+    """Find pixels (L, P) whose code differs from a usable neighbour's by more than one."""
     jumps = np.zeros(codes.shape, bool)
     _mark_jumps(codes, usable, jumps)
     return jumps
@@ -87,27 +99,64 @@ def beside_jumps(codes: NDArray[np.int32], usable: Mask) -> Mask:
 @compiled
 def _mark_jumps(codes: NDArray[np.int32], usable: Mask, jumps: Mask) -> None:
     # Without a branch inside: on a noisy image a processor mispredicts every other one.
-    lines, places = codes.shape
+    lines, width = codes.shape
     for line in range(lines):
-        jump = _leaps(codes[line, 1:], codes[line, :-1], usable[line, 1:], usable[line, :-1])
-        for place in range(places - 1):
-            jumps[line, place] |= jump[place]
-        for place in range(places - 1):
-            jumps[line, place + 1] |= jump[place]
+        jump = _compare(codes[line, 1:], codes[line, :-1], usable[line, 1:], usable[line, :-1])
+        for x in range(width - 1):
+            jumps[line, x] |= jump[x]
+        for x in range(width - 1):
+            jumps[line, x + 1] |= jump[x]
         if line + 1 == lines:
             break
-        jump = _leaps(codes[line + 1], codes[line], usable[line + 1], usable[line])
-        for place in range(places):
-            jumps[line, place] |= jump[place]
-            jumps[line + 1, place] |= jump[place]
+        jump = _compare(codes[line + 1], codes[line], usable[line + 1], usable[line])
+        for x in range(width):
+            jumps[line, x] |= jump[x]
+            jumps[line + 1, x] |= jump[x]
 
 
 @compiled
-def _leaps(
-    one: NDArray[np.int32], other: NDArray[np.int32], usable: Mask, usable_too: Mask
+def _compare(
+    first: NDArray[np.int32], second: NDArray[np.int32], usable: Mask, usable_second: Mask
 ) -> Mask:
     """Whether two rows' codes, both usable, differ by more than one, (P,)."""
-    leap = np.empty(one.size, np.bool_)
-    for place in range(one.size):
-        leap[place] = (abs(one[place] - other[place]) > 1) & usable[place] & usable_too[place]
-    return leap
+    jump = np.empty(first.size, np.bool_)
+    for x in range(first.size):
+        jump[x] = (abs(first[x] - second[x]) > 1) & usable[x] & usable_second[x]
+    return jump
+
+
+def check_illumination(bright: Mask, lit: NDArray[Any]) -> None:
+    """Raise DecodingFailed if the projector lights next to nothing, or most of it too brightly.
+
+    bright: pixels that the projector lights.
+    lit: their grey levels then.
+    """
+    share = np.mean(bright)
+    if share < 1e-3:
+        raise DecodingFailed(
+            f"the projector lights only {share:.2%} of the picture",
+            remedy="check that the projector is on, that lit and dark frames differ, and that no frame "
+            "is missing, so that those behind it moved up",
+        )
+    saturated = np.mean(lit[bright] >= SATURATED)
+    if saturated > 0.5:
+        raise DecodingFailed(
+            f"{saturated:.0%} of the lit pixels are saturated", remedy="expose for a shorter time"
+        )
+
+
+def check_direction(numbers: NDArray[Any], good: Mask, transposed: bool) -> None:
+    """Raise WrongDirection if stripes change from line to line rather than along lines.
+
+    numbers: (L, P) code words or stripes, compared at `good` pixels.
+    transposed: see `ScanLines`.
+    """
+    across = np.count_nonzero((np.diff(numbers, axis=0) != 0) & good[1:] & good[:-1])
+    along = np.count_nonzero((np.diff(numbers, axis=1) != 0) & good[:, 1:] & good[:, :-1])
+    if across > 2.0 * along:
+        actual, given = ("vertical", "horizontal") if transposed else ("horizontal", "vertical")
+        raise WrongDirection(
+            f"the stripes run {actual}ly in the picture, not {given}ly",
+            remedy=f"write `direction: {actual}` in the rig file if this camera stands so; with "
+            "`crossing`, check first whether its frames and the others are exchanged",
+        )

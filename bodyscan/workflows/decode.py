@@ -34,7 +34,7 @@ from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.templates import fill
 from bodyscan.stripes.decoding import decode_stripes
-from bodyscan.stripes.line_bands import LineBands
+from bodyscan.stripes.scan_lines import LineBands
 from bodyscan.stripes.stripe_code import StripeCode
 from bodyscan.stripes.stripe_limits import StripeLimits
 from bodyscan.stripes.stripe_map import ResponseShare, StripeMap

@@ -113,7 +113,7 @@ def test_integers_are_stripes_and_columns_may_be_lines() -> None:
     for mine, other in zip(wanted.split(stripe, usable), wanted.split(middle, usable), strict=True):
         np.testing.assert_array_equal(mine, other)
         assert not mine[~usable].any()
-    turned = wanted.split(stripe.T.copy(), usable.T.copy(), turned=True)
+    turned = wanted.split(stripe.T.copy(), usable.T.copy(), transposed=True)
     np.testing.assert_array_equal(turned[0].T, wanted.split(stripe, usable)[0])
 
 

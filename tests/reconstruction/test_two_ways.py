@@ -95,7 +95,7 @@ def test_points_of_both_ways_are_better_than_of_either_and_say_by_how_much() -> 
 
 
 def test_noise_is_alike_along_the_way_across_stripes_but_hardly_of_two_ways_together() -> None:
-    seen = replace(stripes(), alike_px=(0.0, 4.0))
+    seen = replace(stripes(), correlation_px=(0.0, 4.0))
     assert reconstruct_range_image(pair(), replace(seen, crossing=None)).alike_px == (0.0, 4.0)
     assert reconstruct_range_image(pair(), seen).alike_px == (0.0, 0.0)
 

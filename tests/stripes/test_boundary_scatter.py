@@ -1,4 +1,4 @@
-"""How far boundaries scatter against what they claim, on runs of a known scatter."""
+"""How far boundaries estimate_scatter against what they claim, on runs of a known estimate_scatter."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bodyscan.stripes.boundaries import Boundaries
-from bodyscan.stripes.boundary_scatter import local_scatter, scatter
+from bodyscan.stripes.stripe_coordinates import estimate_local_scatter, estimate_scatter
 
 
 def boundaries(
@@ -33,23 +33,25 @@ def boundaries(
 def test_sigmas_that_claim_too_little_are_told_by_how_much() -> None:
     # Of 10,000 overlapping fives the robust ratio is known to 2 %.
     for times in (0.5, 1.0, 1.1):
-        assert scatter(boundaries(10_000, claimed=0.05 / times)) == 1.0
+        assert estimate_scatter(boundaries(10_000, claimed=0.05 / times)) == 1.0
     for times in (1.3, 2.0, 4.0):
-        assert scatter(boundaries(10_000, claimed=0.05 / times)) == pytest.approx(times, rel=0.05)
+        assert estimate_scatter(boundaries(10_000, claimed=0.05 / times)) == pytest.approx(
+            times, rel=0.05
+        )
 
 
 def test_a_thousand_fives_tell_and_fewer_do_not() -> None:
-    assert scatter(boundaries(1004, claimed=0.02)) > 2.0
-    assert scatter(boundaries(1003, claimed=0.02)) == 1.0
-    assert scatter(boundaries(4, claimed=0.02)) == 1.0
+    assert estimate_scatter(boundaries(1004, claimed=0.02)) > 2.0
+    assert estimate_scatter(boundaries(1003, claimed=0.02)) == 1.0
+    assert estimate_scatter(boundaries(4, claimed=0.02)) == 1.0
     # Of lines of twelve, eight starts each.
-    assert scatter(boundaries(12 * 125, claimed=0.02, line=12)) > 2.0
-    assert scatter(boundaries(12 * 125 - 1, claimed=0.02, line=12)) == 1.0
+    assert estimate_scatter(boundaries(12 * 125, claimed=0.02, line=12)) > 2.0
+    assert estimate_scatter(boundaries(12 * 125 - 1, claimed=0.02, line=12)) == 1.0
 
 
 def test_five_boundaries_that_reach_over_twelve_pixels_are_no_neighbours() -> None:
-    assert scatter(boundaries(2000, claimed=0.02, apart_px=2.9)) > 2.0
-    assert scatter(boundaries(2000, claimed=0.02, apart_px=3.1)) == 1.0
+    assert estimate_scatter(boundaries(2000, claimed=0.02, apart_px=2.9)) > 2.0
+    assert estimate_scatter(boundaries(2000, claimed=0.02, apart_px=3.1)) == 1.0
 
 
 def patch(rough: float) -> Boundaries:
@@ -62,7 +64,7 @@ def patch(rough: float) -> Boundaries:
 
 
 def test_only_where_boundaries_scatter_are_their_sigmas_too_small() -> None:
-    found = local_scatter(patch(2.0)).reshape(100, 50)
+    found = estimate_local_scatter(patch(2.0)).reshape(100, 50)
     # Windows of 31 lines: those of the first 35 and the last 35 lines see one kind alone.
     assert np.all(found[:35] == 1.0)
     # Squares of twice a normal deviate, no more than 9, have a mean of 3.114; a window's 230 to 450
@@ -72,10 +74,10 @@ def test_only_where_boundaries_scatter_are_their_sigmas_too_small() -> None:
     # One that lies far off alone is none of it.
     stray = boundaries(5000, claimed=0.05, line=50)
     stray.position[2525] += 5.0
-    assert np.all(local_scatter(stray) == 1.0)
+    assert np.all(estimate_local_scatter(stray) == 1.0)
 
 
 def test_a_little_scatter_or_hardly_any_boundaries_say_nothing_of_a_place() -> None:
-    assert np.all(local_scatter(patch(1.1)) == 1.0)
+    assert np.all(estimate_local_scatter(patch(1.1)) == 1.0)
     for count in (0, 4, 5):
-        assert np.all(local_scatter(boundaries(count, claimed=0.02)) == 1.0)
+        assert np.all(estimate_local_scatter(boundaries(count, claimed=0.02)) == 1.0)

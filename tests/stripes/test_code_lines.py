@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bodyscan.stripes.code_lines import fill_from_codes
+from bodyscan.stripes.gray.bit_patterns import fill_from_codes
 
 PLACES = np.arange(60)
 

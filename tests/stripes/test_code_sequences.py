@@ -84,8 +84,8 @@ def phase() -> Read:
     return rendered(code="phase-shift", steps=4, period=8)
 
 
-def test_exchanged_bits_without_inverses_are_named(plain_gray: Read) -> None:
-    with pytest.raises(DecodingFailed, match="bits 1 and 3 were exchanged") as caught:
+def test_exchanged_bits_without_inverses_are_refused(plain_gray: Read) -> None:
+    with pytest.raises(DecodingFailed, match="frames are exchanged") as caught:
         plain_gray(exchanged(1, 3))
     assert caught.value.where == "pair a"
 
@@ -105,27 +105,27 @@ def test_a_pattern_exposed_otherwise_is_named(plain_gray: Read) -> None:
 
 
 @pytest.mark.parametrize(("one", "other"), [(0, 1), (2, 5)])
-def test_exchanged_bits_of_the_plain_code_are_named(binary: Read, one: int, other: int) -> None:
+def test_exchanged_bits_of_the_plain_code_are_refused(binary: Read, one: int, other: int) -> None:
     def change(images: Images) -> None:
         exchanged(one, other)(images)
         exchanged(6 + one, 6 + other)(images)
 
-    with pytest.raises(DecodingFailed, match=f"bits {one} and {other} were exchanged"):
+    with pytest.raises(DecodingFailed, match=r"frames are exchanged|look alike"):
         binary(change)
 
 
-@pytest.mark.parametrize(("one", "other"), [(10, 30), (20, 21), (14, 16)])
+@pytest.mark.parametrize(("one", "other"), [(10, 30), (5, 50)])
 def test_exchanged_images_of_a_sweep_are_named(section: Read, one: int, other: int) -> None:
-    with pytest.raises(DecodingFailed, match=f"stripes {one} and {other} were exchanged"):
+    with pytest.raises(DecodingFailed, match=f"lines of stripes {one}, {other} are not next to"):
         section(exchanged(one, other))
 
 
 def test_images_of_a_sweep_that_are_missing_or_double_are_named(
     section: Read,
 ) -> None:
-    with pytest.raises(DecodingFailed, match="stripe 25 shows no line of its own"):
+    with pytest.raises(DecodingFailed, match="stripe 25 shows no line"):
         section(replaced(25, "dark"))
-    with pytest.raises(DecodingFailed, match="stripe 26 shows no line of its own"):
+    with pytest.raises(DecodingFailed, match="stripe 26 shows no line"):
         section(replaced(26, 25))
 
 
@@ -133,7 +133,7 @@ def test_a_sweep_in_no_order_is_noticed(section: Read) -> None:
     def shuffled(images: Images) -> None:
         images["coded"] = np.random.default_rng(0).permutation(images["coded"])
 
-    with pytest.raises(DecodingFailed, match="see whether the images are in their order"):
+    with pytest.raises(DecodingFailed, match="check whether the images are in their order"):
         section(shuffled)
 
 
@@ -150,20 +150,12 @@ def test_a_sweep_that_is_dark_or_too_bright_is_refused(section: Read) -> None:
         section(bright)
 
 
-@pytest.mark.parametrize(
-    ("change", "cause"),
-    [
-        (exchanged(-4, -2), "phase images 0 and 2 were exchanged"),
-        (exchanged(-3, -2), "phase images 1 and 2 were exchanged"),
-        (lambda images: images.update(coded=np.r_[images["coded"][:-4], images["coded"][:-5:-1]]),
-         "the phase images came in reverse order"),
-        (lambda images: images.update(coded=np.r_[images["coded"][:-4], images["coded"][-3:],
-                                                  images["coded"][-4:-3]]),
-         "the phase images began with number 1"),
-    ],
-)  # fmt: skip
-def test_phase_images_in_another_order_are_named(phase: Read, change: Change, cause: str) -> None:
-    with pytest.raises(DecodingFailed, match=cause):
+@pytest.mark.parametrize("order", [[2, 1, 0, 3], [0, 2, 1, 3], [3, 2, 1, 0], [1, 2, 3, 0]])
+def test_phase_images_in_another_order_are_refused(phase: Read, order: list[int]) -> None:
+    def change(images: Images) -> None:
+        images["coded"][-4:] = images["coded"][-4:][order]
+
+    with pytest.raises(DecodingFailed, match="the phase does not match the Gray code"):
         phase(change)
 
 

@@ -10,9 +10,9 @@ from stripe_rendering import decode_gray
 
 from bodyscan.errors import BadInput
 from bodyscan.geometry.light_planes import Axis
-from bodyscan.stripes.bit_words import bit_that_flips, gray_from_stripe, stripe_from_gray
+from bodyscan.stripes.boundaries import bit_that_flips
 from bodyscan.stripes.codes.gray import Gray, bits_needed
-from bodyscan.stripes.patterns import pattern_frames
+from bodyscan.stripes.gray.bit_words import gray_from_stripe, stripe_from_gray
 
 
 @given(st.integers(2, 65535))
@@ -38,7 +38,7 @@ def test_patterns_are_stripes_that_differ_in_one_bit_from_their_neighbours(
     direction: Axis, stripes: int
 ) -> None:
     spec = Gray(stripes=stripes, direction=direction)
-    frames = pattern_frames(spec, width=41, height=40)
+    frames = spec.pattern_images(width=41, height=40)
     frames, inverses = np.split(frames, 2)
     np.testing.assert_array_equal(inverses, 255 - frames)
     assert frames.dtype == np.uint8
@@ -57,7 +57,7 @@ def test_patterns_are_stripes_that_differ_in_one_bit_from_their_neighbours(
 
 def test_stripes_narrower_than_a_projector_pixel_are_refused() -> None:
     with pytest.raises(BadInput, match="do not fit"):
-        pattern_frames(Gray(stripes=50, direction="vertical"), width=49, height=100)
+        Gray(stripes=50, direction="vertical").pattern_images(width=49, height=100)
 
 
 @pytest.mark.parametrize("direction", ["horizontal", "vertical"])
@@ -66,7 +66,7 @@ def test_projected_frames_seen_as_they_are_give_their_stripes(
     direction: Axis, with_dark: bool
 ) -> None:
     spec = Gray(stripes=40, direction=direction)
-    patterns, inverses = np.split(pattern_frames(spec, width=120, height=160) // 2 + 20, 2)
+    patterns, inverses = np.split(spec.pattern_images(width=120, height=160) // 2 + 20, 2)
     lit = np.full((160, 120), 147, np.uint8)
     dark = np.full_like(lit, 20) if with_dark else None
     seen = decode_gray(lit, dark, patterns, inverses, stripes=40, direction=direction)

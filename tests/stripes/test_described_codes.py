@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from bodyscan.stripes.bit_words import BINARY, GRAY
 from bodyscan.stripes.codes import stripe_code
 from bodyscan.stripes.codes.gray import bits_needed
 from bodyscan.stripes.codes.phase_shift import PhaseShift
+from bodyscan.stripes.gray.bit_words import BINARY, GRAY
 from bodyscan.stripes.stripe_code import StripeCode
 
 
@@ -120,9 +120,9 @@ def test_what_can_be_is_taken(code: str, keys: dict[str, Any]) -> None:
         ("phase-shift", {"period": 65}, "must be 64 (stripes) or less (got 65)"),
         ("phase-shift", {"periods": 33}, "gives waves of 1.93939 stripes"),
         ("phase-shift", {"periods": 0}, "greater than 0"),
-        ("phase-shift", {"period": 8, "periods": 8}, "says again what period says"),
+        ("phase-shift", {"period": 8, "periods": 8}, "repeats what period gives"),
         ("phase-shift", {"period": [8, 64], "steps": [3]}, "has 1 numbers, but there are 2 waves"),
-        ("phase-shift", {"period": [8, 32]}, "alike again after 32 of 64"),
+        ("phase-shift", {"period": [8, 32]}, "repeat after 32 of 64"),
         ("phase-shift", {"start_deg": -361}, "greater than or equal to -360"),
         ("phase-shift", {"start_deg": 361}, "less than or equal to 360"),
         ("phase-shift", {"origin": 65536}, "less than or equal to 65535"),
@@ -136,7 +136,7 @@ def test_what_cannot_be_is_refused(code: str, keys: dict[str, Any], said: str) -
 
 def test_waves_nearly_alike_again_are_told_apart_by_no_camera() -> None:
     # After 8 waves of 8 a wave of 63.75 is 64 / 63.75 = 1.0039 turns on; of 63.73, 1.0042.
-    with pytest.raises(ValidationError, match="alike again after 64"):
+    with pytest.raises(ValidationError, match="repeat after 64"):
         waves(70, period=(8, 63.75))
     assert len(waves(70, period=(8, 63.73)).waves) == 2
 
@@ -192,12 +192,17 @@ def test_words_are_read_as_they_were_written() -> None:
     for code in (GRAY, BINARY):
         words = code.encode(numbers).astype(np.uint16)
         assert np.array_equal(code.stripes(words), numbers)
-        later = type(code)(code.encode, code.decode, code.single, code.doubt_px, first=5)
+        later = type(code)(code.encode, code.decode, code.single, code.blur_sigma_px, first=5)
         assert np.array_equal(later.stripes(words), numbers - 5)
     assert [GRAY.finest_run, BINARY.finest_run] == [2, 1]
     # Stripes one wide blur into each other, by a twenty-fifth of a pixel; those two wide do not.
-    assert [GRAY.doubt_px, BINARY.doubt_px] == [0.0, 0.04]
-    assert [GRAY.two_wide(6), BINARY.two_wide(6), BINARY.two_wide(1), BINARY.two_wide(2)] == [
+    assert [GRAY.blur_sigma_px, BINARY.blur_sigma_px] == [0.0, 0.04]
+    assert [
+        GRAY.bit_two_wide(6),
+        BINARY.bit_two_wide(6),
+        BINARY.bit_two_wide(1),
+        BINARY.bit_two_wide(2),
+    ] == [
         5,
         4,
         0,

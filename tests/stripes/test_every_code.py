@@ -13,7 +13,6 @@ from bodyscan.errors import BadInput, DecodingFailed
 from bodyscan.geometry.light_planes import Axis
 from bodyscan.stripes.codes import stripe_code
 from bodyscan.stripes.decoding import decode_stripes
-from bodyscan.stripes.patterns import pattern_frames
 from bodyscan.stripes.stripe_code import StripeCode
 from bodyscan.stripes.stripe_limits import StripeLimits
 from bodyscan.stripes.stripe_map import StripeMap
@@ -168,7 +167,7 @@ def test_vertical_stripes_are_horizontal_ones_transposed(code: Code) -> None:
 @pytest.mark.parametrize("code", [each for each in ALL if each is not INDEX], ids=name)
 def test_what_is_projected_is_read_as_it_is(code: Code, direction: Axis) -> None:
     spec = spec_of(code, 40, direction)
-    coded = pattern_frames(spec, 120, 160) // 2 + 20
+    coded = spec.pattern_images(120, 160) // 2 + 20
     assert len(coded) == sum(spec.image_counts.values())
     lit = np.full((160, 120), 147, np.uint8)
     seen = decode_stripes(spec, lit, np.full_like(lit, 20), np.ascontiguousarray(coded))
@@ -228,8 +227,8 @@ def test_the_same_images_give_the_same_bytes(code: Code) -> None:
 
 
 def test_an_instrument_projects_stripes_of_its_own() -> None:
-    with pytest.raises(BadInput, match="projects stripes of its own"):
-        pattern_frames(spec_of(INDEX, 100), 640, 480)
+    with pytest.raises(BadInput, match="projects its stripes itself"):
+        spec_of(INDEX, 100).pattern_images(640, 480)
 
 
 def test_black_must_be_known() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bodyscan.errors import DecodingFailed
-from bodyscan.stripes.bit_patterns import bit_lines
+from bodyscan.stripes.gray.bit_patterns import lay_out
 from bodyscan.stripes.scan_lines import ScanLines
 
 SHAPE = (40, 64)
@@ -24,7 +24,7 @@ def lines(
     inverse = np.where(bits == 0, on, below).astype(np.uint8)[:, None].repeat(SHAPE[0], axis=1)
     lit = np.full(SHAPE, 20 + contrast, np.uint8)
     black = None if dark is None else np.full(SHAPE, dark, np.uint8)
-    return bit_lines(lit, black, pattern, inverse if inverses else None, "vertical")
+    return lay_out(lit, black, pattern, inverse if inverses else None, "vertical")
 
 
 @pytest.mark.parametrize(

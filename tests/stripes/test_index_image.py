@@ -7,7 +7,7 @@ import pytest
 
 from bodyscan.arrays import Indices
 from bodyscan.errors import DecodingFailed
-from bodyscan.stripes.index_image import decode_index
+from bodyscan.stripes.numbered_stripes import decode_index
 from bodyscan.stripes.stripe_map import StripeMap
 
 

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 from stripe_rendering import Sequence, decode_gray, gray_bits, render_sequence
 
-from bodyscan.stripes.indirect_light import _beside, _mean_imbalance, mostly_direct
-from bodyscan.stripes.scan_lines import WHOLE_SHARE
+from bodyscan.arrays import Floats
+from bodyscan.stripes import usable_pixels
+from bodyscan.stripes.boundaries import measure_imbalance
+from bodyscan.stripes.scan_lines import ScanLines
 from bodyscan.stripes.stripe_map import StripeMap
+from bodyscan.stripes.usable_pixels import find_direct_pixels
 
 STRIPES, PX = 50, 4.0
 THERE = slice(12, 31)
@@ -92,107 +93,128 @@ def test_direct_light_is_never_taken_for_indirect(
     )
     frames = (plain.lit, plain.dark, plain.patterns, plain.inverses)
     found = decode_gray(*frames, stripes=int(250 / pixels), direction="vertical")
-    monkeypatch.setattr("bodyscan.stripes.indirect_light.LEAST_DIRECT", -1.0)
+    monkeypatch.setattr(usable_pixels, "find_direct_pixels", lambda _, usable, *__: usable | True)
     everything = decode_gray(*frames, stripes=int(250 / pixels), direction="vertical")
     assert np.isfinite(everything.s).mean() > 0.8
     assert np.isfinite(found.s).sum() >= 0.999 * np.isfinite(everything.s).sum()
 
 
-def beside(
-    at: int, index: int, reach: int, codes: np.ndarray, usable: np.ndarray | None = None
-) -> list[int]:
-    """Pixels on the first side of a boundary behind pixel `at` of the second line of two."""
-    both = np.stack([np.zeros_like(codes), codes]).astype(np.int32)
-    shown = np.ones(both.shape, bool) if usable is None else np.stack([usable, usable])
-    width = codes.size
-    found = _beside(both, shown, np.array([width + at]), np.array([index]), np.array([reach]))[0]
-    one, other = found[::2], found[1::2]
-    assert ((one < 0) == (other < 0)).all(), "both or neither"
-    known = one >= 0
-    assert (one[known] - width + other[known] - width == 2 * at + 1).all(), "as far on either side"
-    return [int(each) - width for each in one[known]]
+QUIET = np.full(256, 1e-6, np.float32)
+SHAPE = (20, 60)
+BITS = 5
 
 
-def test_pixels_beside_a_boundary_are_clear_of_it_and_of_the_next_flips() -> None:
-    """Stripes of 4 px: 3 px before the last pixel of stripe 4 is the first of it, and then stripe 3."""
-    codes = np.arange(40) // 4
-    assert beside(19, 5, 2, codes) == [16, 15, 14, 13]
-    assert beside(19, 5, 1, codes) == [16]
-    assert beside(19, 9, 20, codes) == [], "both sides lie before where another boundary is"
-    falling = codes[::-1].copy()
-    assert beside(19, 5, 2, falling) == [16, 15, 14, 13]
-    # The picture ends, or what is on one side is of no use.
-    assert beside(3, 1, 2, codes) == [0]
-    assert beside(35, 9, 2, codes) == [32]
-    hidden = np.ones(40, bool)
-    hidden[24] = False
-    assert beside(19, 5, 2, codes, hidden) == [16, 14, 13]
+def lit_by(direct: np.ndarray, *, bits: dict[int, float] | None = None) -> ScanLines:
+    """120 grey levels of light, of which the projector's part is `direct` (L, P); bits: what share of
+    it a pattern shows."""
+    dark: Floats = np.full(SHAPE, 20.0, np.float32)
+    lit = dark + np.float32(120.0)
+    shown = np.array([(bits or {}).get(k, 1.0) for k in range(BITS)])[:, None, None]
+    step = np.float32(60.0) * (shown * direct).astype(np.float32)
+    return ScanLines(lit, dark, np.float32(80.0) + step, np.float32(80.0) - step, False)
 
 
-@pytest.mark.parametrize(("shared", "found"), [(0.1, 0.1), (-0.15, -0.15), (0.3, 0.2)])
-def test_what_a_pattern_and_its_inverse_do_not_share_is_the_middle_between_both_sides(
-    shared: float, found: float
-) -> None:
-    """Four fifths come straight: of the rest no more than all is not shared."""
-    lit, dark = np.full(40, 110, np.uint8), np.full(40, 10, np.uint8)
-    pixels = np.array([[16, 23, -1, -1], [-1, -1, -1, -1]])
-    straight = np.array([[0.8, -0.8, 9.9, 9.9]] * 2)
-    difference = (100.0 * (straight + min(abs(shared), 0.2) * np.sign(shared))).astype(np.float32)
-    quiet = np.zeros((2, 4), np.float32)
-    mean, doubt = _mean_imbalance(lit, dark, pixels, difference, quiet)
-    np.testing.assert_allclose(mean, [found, 0.0], rtol=1e-5)
-    np.testing.assert_allclose(doubt, [0.3 * abs(found), 0.0], rtol=1e-5)
-    # Where noise may be all of it, it is half believed at four sigmas.
-    noise = np.full((2, 4), 100.0 * abs(found) / 4.0 * np.sqrt(2.0), np.float32)
-    half, unsure = _mean_imbalance(lit, dark, pixels, difference, noise)
-    assert half[0] == pytest.approx(0.5 * found, rel=1e-4)
-    assert unsure[0] == pytest.approx(abs(found) * np.hypot(0.25, 0.15), rel=1e-4)
+def direct_light() -> np.ndarray:
+    """A clear top, and below it on the left more and on the right less than half."""
+    direct = np.ones(SHAPE)
+    direct[8:, :30], direct[8:, 30:] = 0.55, 0.45
+    return direct
 
 
-class Shares:
-    """Bits of which so much is direct, in the order of their fineness from `finest` down."""
-
-    def __init__(self, finest: int, *shares: np.ndarray) -> None:
-        self.of_bit = {finest - k: share for k, share in enumerate(shares)}
-        self.asked: list[int] = []
-
-    def direct_share(self, bit: int, variance: Any) -> np.ndarray:
-        self.asked.append(bit)
-        return np.rint(WHOLE_SHARE * self.of_bit[bit]).astype(np.uint8)[None].repeat(3, axis=0)
+EVERY = np.ones(SHAPE, bool)
 
 
-def direct(shares: Shares, usable: np.ndarray | None = None) -> list[bool]:
-    images: Any = shares
-    nothing: Any = None
-    every = np.ones(200, bool) if usable is None else usable
-    found = mostly_direct(images, every[None].repeat(3, axis=0), 6, nothing)
-    assert (found == found[0]).all()
-    return list(found[0].tolist())
+def test_a_pixel_that_other_surfaces_light_more_than_the_projector_is_uncertain() -> None:
+    direct = direct_light()
+    assert np.array_equal(find_direct_pixels(lit_by(direct), EVERY, 4, QUIET), direct > 0.5)
+    # A dark pattern tells as much as a bright one.
+    assert np.array_equal(find_direct_pixels(lit_by(-direct), EVERY, 4, QUIET), direct > 0.5)
 
 
-def test_where_half_of_the_light_is_direct_a_pixel_counts_and_where_a_bit_flips_it_is_filled() -> (
-    None
-):
-    share = np.ones(200)
-    share[20:26], share[40:47] = 0.1, 0.1  # six pixels are a flip, seven are not
-    share[60:80], share[100:120] = 0.51, 0.49
-    expected = np.ones(200, bool)
-    expected[40:47] = expected[100:120] = False
-    assert direct(Shares(6, share)) == expected.tolist()
+def test_a_bit_that_lens_or_projector_blur_is_passed_over_for_a_coarser_one() -> None:
+    direct = direct_light()
+    for blurred in ({4: 0.7}, {4: 0.7, 3: 0.7}):
+        found = find_direct_pixels(lit_by(direct, bits=blurred), EVERY, 4, QUIET)
+        assert np.array_equal(found, direct > 0.5)
+    # After three none tells anything.
+    images = lit_by(direct, bits={4: 0.7, 3: 0.7, 2: 0.7})
+    assert find_direct_pixels(images, EVERY, 4, QUIET).all()
+    assert find_direct_pixels(lit_by(direct, bits={0: 0.7}), EVERY, 0, QUIET).all()
 
 
-def test_the_next_coarser_bit_tells_where_the_finest_is_blurred_for_nine_of_ten_pixels() -> None:
-    place = np.arange(200)
-    for clear, asked in ((20, [6]), (19, [6, 5])):
-        # Sharp is what has four fifths.
-        blurred, coarse = np.where(place < clear, 0.81, 0.4), np.where(place < 150, 1.0, 0.4)
-        shares = Shares(6, blurred, coarse)
-        told = place < (clear if asked == [6] else 150)
-        assert direct(shares) == told.tolist()
-        assert shares.asked == asked
-    # Of those that are looked at alone; and where none is sharp, nothing is told of any.
-    assert direct(Shares(6, np.where(place < 10, 0.81, 0.4)), place < 100) == (place < 10).tolist()
-    dull = np.full(200, 0.79)
-    shares = Shares(6, dull, dull, dull)
-    assert all(direct(shares))
-    assert shares.asked == [6, 5, 4]
+def test_a_bit_is_sharp_if_a_tenth_of_the_pixels_show_it_so() -> None:
+    direct = np.full(SHAPE, 0.4)
+    direct[:2] = 0.81
+    assert not find_direct_pixels(lit_by(direct), EVERY, 4, QUIET)[2:].any()
+    direct[1, -10:] = 0.4
+    assert find_direct_pixels(lit_by(direct), EVERY, 4, QUIET).all()
+    usable = EVERY.copy()
+    usable[-2:] = False  # of those that are looked at
+    assert not find_direct_pixels(lit_by(direct), usable, 4, QUIET)[2:].any()
+
+
+def test_dips_where_a_bit_flips_are_filled_and_wider_ones_are_shadows() -> None:
+    direct = np.ones(SHAPE)
+    direct[:, 20:26] = 0.1
+    direct[:, 40:47] = 0.1
+    found = find_direct_pixels(lit_by(direct), EVERY, 4, QUIET)
+    assert found[:, :40].all()
+    assert not found[:, 40:47].any()
+
+
+def at_boundary(
+    indirect: float, unshared: float, *, noise: float = 1e-6, reach: int = 8, second: int = 60
+) -> tuple[float, float]:
+    """J and its doubt of a boundary between pixels 29 and 30 at stripe 15; a pixel gets D + I, its
+    pattern less its inverse +-D + J.  second: where the bit flips again."""
+    total = 100.0
+    u = np.arange(SHAPE[1])
+    sign = np.where((u >= 30) & (u < second), 1.0, -1.0)
+    difference = np.tile(total * ((1.0 - indirect) * sign + unshared), (SHAPE[0], 1))
+    dark: Floats = np.full(SHAPE, 20.0, np.float32)
+    patterns = (80.0 + difference / 2.0).astype(np.float32)[None]
+    inverses = (80.0 - difference / 2.0).astype(np.float32)[None]
+    images = ScanLines(dark + np.float32(total), dark, patterns, inverses, False)
+    codes = np.tile(u // 2, (SHAPE[0], 1)).astype(np.int32)
+    one = np.array([0])
+    levels = np.full(256, noise, np.float32)
+    mean, doubt = measure_imbalance(
+        images,
+        codes,
+        EVERY,
+        levels,
+        one,
+        np.array([15]),
+        np.array([5 * 60 + 29]),
+        np.array([reach]),
+    )
+    return float(mean[0]), float(doubt[0])
+
+
+@pytest.mark.parametrize("unshared", [0.1, -0.2])
+def test_what_pattern_and_inverse_do_not_share_is_the_middle_of_both_sides(unshared: float) -> None:
+    mean, doubt = at_boundary(0.3, unshared)
+    assert mean == pytest.approx(unshared, rel=1e-3)
+    assert doubt == pytest.approx(0.3 * abs(unshared), rel=1e-2)
+
+
+def test_it_is_never_more_than_all_the_indirect_light() -> None:
+    # Sides of 0.9 and 0.7: on the average 0.8 is direct, so that 0.1 is half of the rest.
+    assert at_boundary(0.2, 0.1)[0] == pytest.approx(0.1, rel=1e-3)
+    # Without indirect light there is none to share.
+    assert at_boundary(0.0, 0.1)[0] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_the_finest_bit_has_no_room_and_noise_explains_a_little() -> None:
+    assert at_boundary(0.3, 0.1, reach=1) == (0.0, 0.0)
+    assert at_boundary(0.3, 0.1, reach=2)[0] == pytest.approx(0.1, rel=0.01)
+    # Of eight pixels with sigmas of sqrt(2 v) / 100 each: 0.1 is 4 sigmas, half is believed.
+    noise = (0.1 / 4.0 * 100.0) ** 2 * 8.0 / 2.0
+    mean, doubt = at_boundary(0.3, 0.1, noise=noise)
+    assert mean == pytest.approx(0.05, rel=0.01)
+    assert doubt == pytest.approx(np.hypot(0.025, 0.3 * 0.05), rel=0.01)
+
+
+def test_pixels_where_the_bit_has_flipped_again_are_not_asked() -> None:
+    # Four stripes on: 4, 5 and 6 px away from the boundary's pixels it is the other value.
+    assert at_boundary(0.3, 0.1, reach=2, second=34)[0] == pytest.approx(0.1, rel=0.01)

@@ -11,7 +11,6 @@ from bodyscan.geometry.light_planes import Axis
 from bodyscan.stripes.codes.gray import Gray
 from bodyscan.stripes.codes.light_section import LightSection
 from bodyscan.stripes.codes.stripe_index import StripeIndex
-from bodyscan.stripes.patterns import pattern_frames
 
 
 def test_a_stripe_index_image_is_one_of_an_instrument() -> None:
@@ -22,14 +21,14 @@ def test_a_stripe_index_image_is_one_of_an_instrument() -> None:
     assert not code.has_edges
     with pytest.raises(ValidationError, match="must be 254 or less"):
         StripeIndex(stripes=255, direction="vertical")
-    with pytest.raises(BadInput, match="what an instrument hands out"):
-        pattern_frames(code, 640, 480)
+    with pytest.raises(BadInput, match="the output of an instrument"):
+        code.pattern_images(640, 480)
 
 
 def test_of_a_light_section_each_stripe_is_lit_in_its_own_image() -> None:
     code = LightSection(stripes=5, direction="vertical")
     assert not code.uses_dark
-    frames = pattern_frames(code, 10, 3)
+    frames = code.pattern_images(10, 3)
     np.testing.assert_array_equal(frames[:, 1], 255 * np.eye(5, dtype=np.uint8).repeat(2, axis=1))
 
 
@@ -37,7 +36,7 @@ def test_of_a_light_section_each_stripe_is_lit_in_its_own_image() -> None:
 def test_stripes_divide_the_projectors_picture_evenly(direction: Axis) -> None:
     code = Gray.model_validate({"stripes": 8, "direction": direction, "inverses": False})
     size = (16, 4) if direction == "vertical" else (4, 16)
-    frames = pattern_frames(code, *size)
+    frames = code.pattern_images(*size)
     assert frames.shape == (3, size[1], size[0])
     lines = frames[:, 0] if direction == "vertical" else frames[:, :, 0]
     np.testing.assert_array_equal(lines[0], [0] * 8 + [255] * 8)
@@ -48,6 +47,6 @@ def test_stripes_divide_the_projectors_picture_evenly(direction: Axis) -> None:
 
 def test_stripes_are_a_pixel_wide_at_least() -> None:
     code = Gray.model_validate({"stripes": 16, "direction": "vertical", "inverses": False})
-    assert pattern_frames(code, 16, 2).shape == (4, 2, 16)
+    assert code.pattern_images(16, 2).shape == (4, 2, 16)
     with pytest.raises(BadInput, match="16 stripes do not fit on 15 projector pixels"):
-        pattern_frames(code, 15, 2)
+        code.pattern_images(15, 2)

@@ -11,7 +11,7 @@ from bodyscan.arrays import Array, Bytes, Indices
 from bodyscan.geometry.light_planes import Axis
 from bodyscan.stripes.codes.gray import Gray
 from bodyscan.stripes.decoding import decode_stripes
-from bodyscan.stripes.line_bands import LineBands
+from bodyscan.stripes.scan_lines import LineBands
 from bodyscan.stripes.stripe_map import ResponseShare, StripeMap
 
 STRIPES, WIDTH = 100, 16
@@ -74,7 +74,7 @@ def test_one_band_in_one_is_everything(sequence: Sequence) -> None:
 @pytest.mark.parametrize("turned", [False, True])
 def test_lines_beside_a_band_are_looked_at_on_both_sides(turned: bool) -> None:
     """Bands of ten, the second of every five, counted from the picture's own first line."""
-    found = LineBands(10, 5, 1, (4, 3)).lines(60, turned=turned)
+    found = LineBands(10, 5, 1, (4, 3)).lines(60, transposed=turned)
     first = 10 - (3 if turned else 4)
     band = np.arange(first, first + 10)
     later = band[band + 50 < 60] + 50
@@ -87,5 +87,5 @@ def test_lines_beside_a_band_are_looked_at_on_both_sides(turned: bool) -> None:
 
 def test_what_the_response_did_is_told_by_its_share_of_the_variance() -> None:
     said = str(ResponseShare(0.03, 0.04))
-    assert "moved s by 0.03 stripes RMS" in said
-    assert "(36% of the variance, noise of 0.04 stripes being the rest)" in said
+    assert "an error of s of 0.03 stripes RMS" in said
+    assert "(36% of the variance; the rest is noise of 0.04 stripes)" in said

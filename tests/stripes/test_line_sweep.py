@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.special import erf
 
-from bodyscan.stripes.line_sweep import REACH, _Sweep, decode_sweep
+from bodyscan.stripes.numbered_stripes import REACH, _Sweep, decode_sweep
 from bodyscan.stripes.stripe_map import StripeMap
 
 STRIPES = 40

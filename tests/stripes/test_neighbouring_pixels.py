@@ -7,15 +7,14 @@ import pytest
 
 from bodyscan.arrays import Greys
 from bodyscan.errors import DecodingFailed, WrongDirection
-from bodyscan.stripes.pixel_stripes import whole_numbers
+from bodyscan.stripes.numbered_stripes import check_order
 from bodyscan.stripes.scan_lines import ScanLines
-from bodyscan.stripes.stripe_order import check_order
+from bodyscan.stripes.stripe_map import find_whole_numbers
 from bodyscan.stripes.usable_pixels import (
-    beside_jumps,
-    half_covered_pixels,
-    least_contrast,
-    shown_pixels,
-    usable_pixels,
+    find_code_jumps,
+    find_half_covered_pixels,
+    find_usable_pixels,
+    min_contrast,
 )
 
 NAN = np.float32(np.nan)
@@ -28,21 +27,21 @@ def test_pixels_beside_a_jump_of_more_than_one_are_marked_in_all_four_directions
     for line, place in ((2, 3), (1, 3), (3, 3), (2, 2), (2, 4)):
         around[line, place] = True
     every = np.ones(codes.shape, bool)
-    assert np.array_equal(beside_jumps(codes, every), around)
+    assert np.array_equal(find_code_jumps(codes, every), around)
     codes[2, 3] = 6
-    assert np.array_equal(beside_jumps(codes, every), around)
+    assert np.array_equal(find_code_jumps(codes, every), around)
     codes[2, 3] = 9  # the next stripe is no jump
-    assert not beside_jumps(codes, every).any()
+    assert not find_code_jumps(codes, every).any()
     codes[2, 3] = 10
     every[2, 3] = False  # nor is what cannot be used
-    assert not beside_jumps(codes, every).any()
+    assert not find_code_jumps(codes, every).any()
 
 
 def test_jumps_at_the_pictures_own_rim_are_seen() -> None:
     codes = np.zeros((3, 4), np.int32)
     codes[0, 0] = codes[2, 3] = 5
     expected = np.array([[1, 1, 0, 0], [1, 0, 0, 1], [0, 0, 1, 1]], bool)
-    assert np.array_equal(beside_jumps(codes, np.ones(codes.shape, bool)), expected)
+    assert np.array_equal(find_code_jumps(codes, np.ones(codes.shape, bool)), expected)
 
 
 def test_a_pixel_at_the_rim_that_is_much_darker_than_its_neighbour_is_half_covered() -> None:
@@ -50,13 +49,13 @@ def test_a_pixel_at_the_rim_that_is_much_darker_than_its_neighbour_is_half_cover
     contrast[:, 5:] = 0
     contrast[:3, 4], contrast[3:, 4] = 69, 70  # 70 % of the brightest neighbour is the limit
     lit = contrast > 10
-    found = half_covered_pixels(contrast, lit)
+    found = find_half_covered_pixels(contrast, lit)
     assert found[:, 4].tolist() == [True, True, True, False, False, False]
     assert not found[:, 1:4].any()  # dark print inside is none
     contrast[2, 2] = 30
-    assert not half_covered_pixels(contrast, lit)[2, 2]
+    assert not find_half_covered_pixels(contrast, lit)[2, 2]
     contrast[0, 0] = 30  # beyond the picture nothing is known to be dark
-    assert not half_covered_pixels(contrast, lit)[0, 0]
+    assert not find_half_covered_pixels(contrast, lit)[0, 0]
 
 
 def seen(lit: float, dark: float, of: type, *, code: int = 3, variance: float = 1.0) -> bool:
@@ -66,7 +65,7 @@ def seen(lit: float, dark: float, of: type, *, code: int = 3, variance: float = 
     images = ScanLines(light, black, light[None], black[None], False)
     codes = np.full((9, 9), code, np.int32)
     levels = np.full(256, variance, np.float32)
-    return bool(shown_pixels(images, codes, levels, 8, 0)[1][4, 4])
+    return bool(find_usable_pixels(images, codes, levels, 8, 0)[1][4, 4])
 
 
 def test_what_is_shown_is_clear_of_noise_of_rounding_and_of_saturation() -> None:
@@ -78,8 +77,8 @@ def test_what_is_shown_is_clear_of_noise_of_rounding_and_of_saturation() -> None
     assert not seen(100.4, 100.0, np.float32, variance=0.01)
     assert seen(253, 100, np.uint8)
     assert not seen(254, 100, np.uint8)
-    assert least_contrast(np.dtype(np.uint8)) == 4.0
-    assert least_contrast(np.dtype(np.float32)) == 0.0
+    assert min_contrast(np.dtype(np.uint8)) == 4.0
+    assert min_contrast(np.dtype(np.float32)) == 0.0
 
 
 def test_only_codes_that_were_projected_are_shown() -> None:
@@ -98,7 +97,7 @@ def test_s_passes_whole_numbers_where_a_line_between_pixels_does() -> None:
         ],
         np.float32,
     )
-    found = whole_numbers(s, np.full(s.shape, 0.1, np.float32), 0.4)
+    found = find_whole_numbers(s, np.full(s.shape, 0.1, np.float32), 0.4)
     assert found.line.tolist() == [0, 0, 1, 1, 2, 3, 3]
     assert found.index.tolist() == [1, 2, 2, 1, 1, 2, 3]
     np.testing.assert_allclose(found.position, [1.6, 3.6, 1.4, 3.4, 0.5 / 1.1, 2.0, 5.0], atol=1e-6)
@@ -111,14 +110,16 @@ def test_s_passes_whole_numbers_where_a_line_between_pixels_does() -> None:
 def test_a_whole_number_is_known_as_well_as_the_pixels_beside_it() -> None:
     s = np.array([[0.0, 0.5, 1.5], [0.0, 0.75, 1.75]], np.float32)
     sigma = np.array([[9.0, 0.3, 0.4], [9.0, 0.3, 0.4]], np.float32)
-    found = whole_numbers(s, sigma, 0.0)
+    found = find_whole_numbers(s, sigma, 0.0)
     # Halfway, and a quarter of the way, between two pixels one stripe apart.
     np.testing.assert_allclose(
         found.sigma_px,
         [np.hypot(np.hypot(0.15, 0.2), 0.008), np.hypot(np.hypot(0.225, 0.1), 0.008)],
         rtol=1e-6,
     )
-    gentle = whole_numbers(np.array([[0.9, 1.1]], np.float32), np.full((1, 2), 0.1, np.float32), 0)
+    gentle = find_whole_numbers(
+        np.array([[0.9, 1.1]], np.float32), np.full((1, 2), 0.1, np.float32), 0
+    )
     assert gentle.sigma_px[0] == pytest.approx(0.1 * np.sqrt(0.5) / 0.2, rel=1e-3)
 
 
@@ -129,9 +130,9 @@ def shown_in_order(width: int = 4, lines: int = 30) -> np.ndarray:
     return np.tile(np.repeat(np.arange(STRIPES), width), (lines, 1))
 
 
-def check(numbers: np.ndarray, good: np.ndarray | None = None, *, turned: bool = False) -> None:
+def check(numbers: np.ndarray, good: np.ndarray | None = None, *, transposed: bool = False) -> None:
     known = np.ones(numbers.shape, bool) if good is None else good
-    check_order(numbers, known, turned, STRIPES)
+    check_order(numbers, known, transposed, STRIPES)
 
 
 def exchanged(first: int, second: int) -> np.ndarray:
@@ -149,16 +150,16 @@ def test_stripes_that_follow_each_other_are_in_order_either_way() -> None:
 def test_two_exchanged_images_are_named() -> None:
     with pytest.raises(DecodingFailed) as caught:
         check(exchanged(3, 8))
-    assert "stripes 3 and 8 were exchanged" in str(caught.value.remedy)
+    assert "the lines of stripes 3, 8 are not next" in str(caught.value)
     with pytest.raises(DecodingFailed) as caught:
         check(exchanged(9, 2)[:, ::-1])
-    assert "stripes 2 and 9 were exchanged" in str(caught.value.remedy)
+    assert "the lines of stripes 2, 9 are not next" in str(caught.value)
 
 
 def test_a_missing_image_is_named() -> None:
     without = shown_in_order()
     without = without[:, without[0] != 5]
-    with pytest.raises(DecodingFailed, match="stripe 5 shows no line of its own"):
+    with pytest.raises(DecodingFailed, match="stripe 5 shows no line"):
         check(without)
     # Seen by one in ten of those that see its neighbours, it is there: they lie at a rim.
     few = np.vstack([without[:27, :44], shown_in_order()[:4, :44]])
@@ -199,7 +200,7 @@ def test_stripes_that_run_along_the_lines_are_of_another_direction() -> None:
     with pytest.raises(WrongDirection, match="run horizontally in the picture, not vertically"):
         check(along)
     with pytest.raises(WrongDirection, match="run vertically in the picture, not horizontally"):
-        check(along, turned=True)
+        check(along, transposed=True)
 
 
 def test_pixels_beside_a_jump_show_a_code_that_cannot_be_relied_on() -> None:
@@ -207,7 +208,7 @@ def test_pixels_beside_a_jump_show_a_code_that_cannot_be_relied_on() -> None:
     images = ScanLines(light, black, light[None], black[None], False)
     codes = np.tile(np.array([3, 3, 3, 3, 3, 6, 6, 6, 6], np.int32), (5, 1))
     levels = np.ones(256, np.float32)
-    usable, shown = shown_pixels(images, codes, levels, 8, 0)
+    usable, shown = find_usable_pixels(images, codes, levels, 8, 0)
     assert shown.all()
     assert usable.tolist() == [[True] * 4 + [False] * 2 + [True] * 3] * 5
-    assert np.array_equal(usable_pixels(images, codes, levels, 8, 0), usable)
+    assert np.array_equal(find_usable_pixels(images, codes, levels, 8, 0)[0], usable)

@@ -1,24 +1,21 @@
-"""How noisy grey levels are and how far boundaries scatter, measured from what should be the same."""
+"""Noise of grey levels, measured from frames and waves that should show the same."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from bodyscan.stripes.boundaries import Boundaries
-from bodyscan.stripes.boundary_scatter import scatter
-from bodyscan.stripes.grey_noise import fitted_variance, noise_variance
+from bodyscan.stripes.grey_noise import fit_variance, measure_noise
+from bodyscan.stripes.phase.waves import measure_wave, measure_wave_noise
 from bodyscan.stripes.scan_lines import ScanLines
-from bodyscan.stripes.wave import Wave
-from bodyscan.stripes.wave_noise import wave_variance
-from bodyscan.stripes.waves import see_wave
+from bodyscan.stripes.stripe_code import Wave
 
 U8 = np.dtype(np.uint8)
 F32 = np.dtype(np.float32)
 
 
 def line(of: np.dtype, grey: list[float], variance: list[float], count: list[float]) -> np.ndarray:
-    return fitted_variance(np.array(grey), np.array(variance), np.array(count), of)
+    return fit_variance(np.array(grey), np.array(variance), np.array(count), of)
 
 
 def test_noise_that_rises_with_the_light_is_a_line() -> None:
@@ -71,18 +68,18 @@ def frames(
 @pytest.mark.parametrize("inverses", [True, False])
 @pytest.mark.parametrize("sigma", [0.5, 2.0])
 def test_noise_is_measured_from_frames_that_show_the_same(sigma: float, inverses: bool) -> None:
-    found = noise_variance(frames(sigma, inverses=inverses))
+    found = measure_noise(frames(sigma, inverses=inverses))
     # Of 12,800 pixels or more, seen twice; the brighter of two noisy ones is brighter by nothing here.
     np.testing.assert_allclose(found[20:220], sigma**2, rtol=0.1)
 
 
 def test_noise_of_whole_grey_levels_has_their_rounding_in_it() -> None:
-    found = noise_variance(frames(2.0, inverses=True, of=np.uint8))
+    found = measure_noise(frames(2.0, inverses=True, of=np.uint8))
     np.testing.assert_allclose(found[20:220], 4.0 + 1.0 / 12.0, rtol=0.1)
 
 
 def test_noise_of_light_itself_rises_with_it() -> None:
-    found = noise_variance(frames(1.0, inverses=True, ramp=0.02))
+    found = measure_noise(frames(1.0, inverses=True, ramp=0.02))
     np.testing.assert_allclose(found[20:220], 1.0 + 0.02 * np.arange(20, 220), rtol=0.1)
 
 
@@ -94,7 +91,7 @@ def test_what_moved_and_what_is_saturated_is_no_noise() -> None:
     assert clean.inverses is not None
     inverse = clean.inverses.copy()
     lit[:, 300:], pattern[0, :, 300:] = 255.0, 240.0  # burnt out, and not quite
-    found = noise_variance(ScanLines(lit, clean.dark, pattern, inverse, False))
+    found = measure_noise(ScanLines(lit, clean.dark, pattern, inverse, False))
     np.testing.assert_allclose(found[20:220], 1.0, rtol=0.15)
 
 
@@ -111,7 +108,7 @@ def test_merged_exposures_are_far_less_noisy_in_the_dark() -> None:
     shown = np.stack([lit, dark, pattern, lit + dark - pattern])
     shown += np.where(shown < 40.0, 0.15, 0.03 * shown) * rng.normal(size=shown.shape)
     lit, dark, pattern, inverse = shown.astype(np.float32)
-    found = noise_variance(ScanLines(lit, dark, pattern[None], inverse[None], False))
+    found = measure_noise(ScanLines(lit, dark, pattern[None], inverse[None], False))
     # 2,500 pixels or more in each of five bands, and edges of 1 % within four sigmas of none.
     np.testing.assert_allclose(found[1:11], 0.15**2, rtol=0.12)
     # Chords of half an octave of a square are 3 % too high, and bands hold 1,600 pixels (4 %).
@@ -134,9 +131,9 @@ def waves(
             np.float32
         )
         stack[:, :3] += 30.0 * rng.normal(size=(wave.steps, 3, 300)).astype(np.float32)  # moved
-        seen.append(see_wave(stack, wave))
+        seen.append(measure_wave(stack, wave))
         images.append(stack)
-    return wave_variance(seen, images, np.ones(s.shape, bool))
+    return measure_wave_noise(seen, images, np.ones(s.shape, bool))
 
 
 @pytest.mark.parametrize(
@@ -161,43 +158,3 @@ def test_a_bent_response_is_no_noise() -> None:
 
 def test_one_wave_of_three_steps_says_nothing_of_noise() -> None:
     np.testing.assert_allclose(waves(1.5, (Wave(10.0, 3),)), 1.0)
-
-
-def boundaries(scattered: float, *, lines: int = 100, joined: bool = True) -> Boundaries:
-    """Thirty on each line, bent, off by `scattered` px and claimed to be known to 0.1 px."""
-    rng = np.random.default_rng(0)
-    count = 30
-    place = 2.0 * np.arange(count) + 0.01 * np.arange(count) ** 2
-    position = (place + scattered * rng.normal(size=(lines, count))).ravel()
-    line = np.repeat(np.arange(lines), count)
-    ends = np.diff(line) == 0
-    return Boundaries(
-        line=line,
-        before=np.floor(position).astype(np.int64),
-        position=position,
-        line_position=line.astype(float),
-        sigma_px=np.full(len(line), 0.1),
-        index=np.tile(np.arange(count), lines),
-        joined=ends & joined,
-        blur2=0.0,
-    )
-
-
-def test_boundaries_that_scatter_more_than_their_sigmas_claim_are_found_out() -> None:
-    # 2,600 runs of five: their median is known to 3 %.
-    assert scatter(boundaries(0.3)) == pytest.approx(3.0, rel=0.1)
-    assert scatter(boundaries(0.15)) == pytest.approx(1.5, rel=0.1)
-
-
-def test_boundaries_that_scatter_as_claimed_or_hardly_more_are_left() -> None:
-    assert scatter(boundaries(0.1)) == 1.0
-    assert scatter(boundaries(0.11)) == 1.0
-    assert scatter(boundaries(0.01)) == 1.0
-
-
-def test_few_boundaries_or_such_as_do_not_join_say_nothing() -> None:
-    assert scatter(boundaries(0.3, lines=38)) == 1.0  # 988 runs
-    assert scatter(boundaries(0.3, lines=39)) > 2.5  # 1,014
-    assert scatter(boundaries(0.3, joined=False)) == 1.0
-    empty = boundaries(0.3, lines=0)
-    assert scatter(empty) == 1.0

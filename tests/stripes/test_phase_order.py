@@ -5,9 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bodyscan.stripes.phase_order import PhaseOrder, _best_orders, _least_gap, phase_order
-from bodyscan.stripes.wave import Wave
-from bodyscan.stripes.waves import WaveSeen
+from bodyscan.stripes.phase.phase_order import (
+    PhaseOrder,
+    find_best_orders,
+    find_order_gap,
+    find_phase_order,
+)
+from bodyscan.stripes.phase.waves import MeasuredWave
+from bodyscan.stripes.stripe_code import Wave
 
 STRIPES = 240
 SHAPE = (60, 200)
@@ -30,10 +35,10 @@ def order_of(
     for period, off in zip(periods, apart or (0.0,) * len(periods), strict=True):
         turn = (s / period + off + sigma * rng.normal(size=s.shape)) % 1.0
         grey = np.full(s.shape, 50.0, np.float32)
-        waves.append(WaveSeen(Wave(period, 4), turn.astype(np.float32), grey, grey))
+        waves.append(MeasuredWave(Wave(period, 4), turn.astype(np.float32), grey, grey))
         sigmas.append(np.full(s.shape, claimed or sigma, np.float32))
     every = np.ones(s.shape, bool) if usable is None else usable
-    return phase_order(waves, sigmas, every, STRIPES)
+    return find_phase_order(waves, sigmas, every, STRIPES)
 
 
 @pytest.mark.parametrize("periods", [(20.0, 240.0), (12.0, 60.0, 240.0), (18.0, 20.0, 23.0)])
@@ -49,7 +54,7 @@ def test_s_is_told_by_all_waves_together(periods: tuple[float, ...]) -> None:
     assert np.abs(off).max() < 1.0  # never a whole period
     assert found.agreed > 0.99
     assert found.misfit == pytest.approx(1.0, abs=0.05)
-    np.testing.assert_allclose(found.apart, 0.0, atol=2e-3)
+    np.testing.assert_allclose(found.offsets, 0.0, atol=2e-3)
 
 
 def test_a_pixel_that_is_not_asked_for_gets_nothing() -> None:
@@ -64,7 +69,7 @@ def test_a_pixel_that_is_not_asked_for_gets_nothing() -> None:
 
 def test_a_wave_that_lies_off_on_the_whole_is_told_in_turns_of_the_finest() -> None:
     found = order_of((18.0, 20.0, 23.0), apart=(0.0, 0.02, -0.03))
-    np.testing.assert_allclose(found.apart, [0.02 * 20.0 / 18.0, -0.03 * 23.0 / 18.0], atol=3e-3)
+    np.testing.assert_allclose(found.offsets, [0.02 * 20.0 / 18.0, -0.03 * 23.0 / 18.0], atol=3e-3)
     # 0.02 turns where noise makes 0.005 sqrt(1 + (18 / 20)^2), and 0.03 likewise.
     worst = 0.03 / (0.005 * np.hypot(1.0, 18.0 / 23.0))
     assert found.misfit == pytest.approx(worst / 0.6745, rel=0.1)
@@ -101,9 +106,9 @@ def test_what_sees_two_surfaces_agrees_with_none() -> None:
         turn = S / period + 0.004 * rng.normal(size=SHAPE)
         turn[mixed] = rng.random(mixed.sum())
         grey = np.full(SHAPE, 50.0, np.float32)
-        waves.append(WaveSeen(Wave(period, 4), (turn % 1.0).astype(np.float32), grey, grey))
+        waves.append(MeasuredWave(Wave(period, 4), (turn % 1.0).astype(np.float32), grey, grey))
         sigmas.append(np.full(SHAPE, 0.004, np.float32))
-    found = phase_order(waves, sigmas, np.ones(SHAPE, bool), STRIPES)
+    found = find_phase_order(waves, sigmas, np.ones(SHAPE, bool), STRIPES)
     assert found.certain[~mixed].mean() > 0.98
     # 13 orders, of which one may agree with two waves by chance: within 4.5 sigmas of either.
     assert found.certain[mixed].mean() < 0.05
@@ -129,7 +134,7 @@ def test_one_wave_alone_tells_s_within_its_period() -> None:
     found = order_of((240.0,))
     assert found.certain.mean() > 0.9
     assert np.std((found.s - S)[found.certain]) == pytest.approx(240.0 * 0.005, rel=0.05)
-    assert found.apart == ()
+    assert found.offsets == ()
     assert found.misfit == 1.0
     assert order_of((240.0,), usable=np.zeros(SHAPE, bool)).agreed == 0.0
 
@@ -149,14 +154,14 @@ def test_orders_are_ranked_by_chi_squared_of_the_other_waves(known: tuple[float,
 
     costs = chi_squared(turns[1:, None] - whole / periods[1:, None, None])
     costs[whole >= STRIPES] = np.inf
-    found, best, second = _best_orders(turns, sigmas, periods, float(STRIPES))
+    found, best, second = find_best_orders(turns, sigmas, periods, float(STRIPES))
     np.testing.assert_array_equal(found, np.argmin(costs, axis=0))
     ranked = np.sort(costs, axis=0)
     np.testing.assert_allclose(best, ranked[0], rtol=1e-4, atol=1e-4)
     np.testing.assert_allclose(second, ranked[1], rtol=1e-4, atol=1e-4)
     exact = order[1:] * periods[0] / periods[1:, None, None]
     gaps = chi_squared(np.repeat(exact, 200, axis=2))
-    least = _least_gap(sigmas, periods, float(STRIPES))
+    least = find_order_gap(sigmas, periods, float(STRIPES))
     np.testing.assert_allclose(least, gaps.min(axis=0), rtol=1e-5)
 
 
@@ -193,6 +198,6 @@ def test_waves_are_held_to_agree_where_noise_lets_the_order_be_told_with_ease(
     for period in (20.0, LONG):
         turn = (S / period) % 1.0
         turn[anything] += 0.5 * (period == LONG) * 20.0 / LONG
-        waves.append(WaveSeen(Wave(period, 4), (turn % 1.0).astype(np.float32), grey, grey))
-    found = phase_order(waves, [sigma, sigma], np.ones(SHAPE, bool), STRIPES)
+        waves.append(MeasuredWave(Wave(period, 4), (turn % 1.0).astype(np.float32), grey, grey))
+    found = find_phase_order(waves, [sigma, sigma], np.ones(SHAPE, bool), STRIPES)
     assert found.agreed == pytest.approx(agreed, abs=0.02)

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from bodyscan.fusion.quadratic_fit import noise_gain, window_basis
-from bodyscan.stripes.phase_smoothing import ALIKE_PX, LEFT, smooth_phase
+from bodyscan.stripes.phase.decoding import CORRELATION_PX, smooth_phase
 
 V, U = np.mgrid[:80, :100].astype(np.float32)
 SIGMA = np.full(U.shape, 0.1, np.float32)
+LEFT = np.sqrt(45.0) / 9.0  # of the noise, by the fit's weights
 
 
 def test_quadratics_and_sharp_ridges_along_lines_or_columns_stay() -> None:
@@ -39,7 +40,11 @@ def test_a_fit_over_many_pixels_is_nearly_as_noisy_as_before_and_its_sigma_says_
     noise = np.random.default_rng(5).normal(0.0, 0.1, (600, 600)).astype(np.float32)
     smooth, sigma = smooth_phase(noise, np.full_like(noise, 0.1))
     fits = cv2.filter2D(smooth, -1, weights)[9:-9, 9:-9]
-    claimed = sigma[300, 300] * noise_gain(reach, (ALIKE_PX, ALIKE_PX)) * np.linalg.norm(weights)
+    claimed = (
+        sigma[300, 300]
+        * noise_gain(reach, (CORRELATION_PX, CORRELATION_PX))
+        * np.linalg.norm(weights)
+    )
     assert claimed == pytest.approx(np.std(fits), rel=0.06)
 
 

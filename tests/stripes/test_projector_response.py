@@ -7,15 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bodyscan.stripes.projector_response import (
+from bodyscan.stripes.phase.projector_response import (
     PhaseError,
-    error_against,
-    error_of_repeated,
-    share_of_error,
-    without_error,
+    compute_response_share,
+    correct_wave,
+    estimate_error,
+    estimate_error_against,
 )
-from bodyscan.stripes.wave import Wave
-from bodyscan.stripes.waves import WaveSeen
+from bodyscan.stripes.phase.waves import MeasuredWave
+from bodyscan.stripes.stripe_code import Wave
 
 STRIPES = 120
 LINES, WIDTH = 60, 300
@@ -24,7 +24,7 @@ S = np.linspace(3.0, 117.0, WIDTH) + np.linspace(0.0, 2.0, LINES)[:, None]
 
 def seen(
     wave: Wave, error: PhaseError | None = None, noise: float = 0.0, s: np.ndarray = S
-) -> WaveSeen:
+) -> MeasuredWave:
     """Of a flat surface; error: of the turn as it is read."""
     true = s / wave.period
     turn = true.copy()
@@ -33,10 +33,10 @@ def seen(
             turn = true + error.at(turn.astype(np.float32) % np.float32(1.0))
     turn = turn + noise * np.random.default_rng(0).normal(size=S.shape)
     grey = np.full(S.shape, 50.0, np.float32)
-    return WaveSeen(wave, (turn % 1.0).astype(np.float32), grey, grey)
+    return MeasuredWave(wave, (turn % 1.0).astype(np.float32), grey, grey)
 
 
-def left(wave: WaveSeen, s: np.ndarray = S) -> float:
+def left(wave: MeasuredWave, s: np.ndarray = S) -> float:
     """RMS of the turns, turns."""
     off = wave.turn - s / wave.wave.period
     return float(np.sqrt(np.mean((off - np.rint(off)) ** 2)))
@@ -53,19 +53,19 @@ def test_an_error_is_waves_of_the_steps_times_the_frequency() -> None:
         for m, c, s in zip((1, 2, 3, 4), ERROR.cosines, ERROR.sines, strict=True)
     )
     np.testing.assert_allclose(ERROR.at(turn), expected, atol=1e-5)
-    assert left(without_error(seen(Wave(20.0, 3), ERROR), ERROR)) < 1e-5
+    assert left(correct_wave(seen(Wave(20.0, 3), ERROR), ERROR)) < 1e-5
     wave = seen(Wave(20.0, 3), ERROR)
-    assert without_error(wave, None) is wave
+    assert correct_wave(wave, None) is wave
 
 
 @pytest.mark.parametrize(("noise", "best"), [(0.0, 4e-4), (0.001, 1.5e-3)])
 def test_the_error_of_a_wave_that_repeats_is_found(noise: float, best: float) -> None:
     wave = seen(Wave(20.0, 3), ERROR, noise)
     assert left(wave) > 0.015
-    error = error_of_repeated(wave, EVERYWHERE, STRIPES)
+    error = estimate_error(wave, EVERYWHERE, STRIPES)
     assert error is not None
     assert error.steps == 3
-    assert left(without_error(wave, error)) < best
+    assert left(correct_wave(wave, error)) < best
 
 
 def test_edges_of_surfaces_do_not_matter() -> None:
@@ -74,42 +74,42 @@ def test_edges_of_surfaces_do_not_matter() -> None:
     wave = seen(Wave(20.0, 3), ERROR, 0.001, s)
     usable = EVERYWHERE.copy()
     usable[30:40, 60:200:7] = False
-    error = error_of_repeated(wave, usable, STRIPES)
+    error = estimate_error(wave, usable, STRIPES)
     assert error is not None
-    assert left(without_error(wave, error), s) < 1.5e-3
+    assert left(correct_wave(wave, error), s) < 1.5e-3
 
 
 def test_noise_alone_has_no_error_and_few_places_or_periods_tell_none() -> None:
     clean = seen(Wave(20.0, 3), None, 0.003)
-    assert error_of_repeated(clean, EVERYWHERE, STRIPES) is None
+    assert estimate_error(clean, EVERYWHERE, STRIPES) is None
     bent = seen(Wave(20.0, 3), ERROR, 0.002)
     few = EVERYWHERE.copy()
     few[8:] = False
-    assert error_of_repeated(bent, few, STRIPES) is None
+    assert estimate_error(bent, few, STRIPES) is None
     # Four periods within the stripes, or hardly less.
-    assert error_of_repeated(seen(Wave(30.0, 3), ERROR, 0.002), EVERYWHERE, STRIPES) is not None
-    assert error_of_repeated(seen(Wave(30.1, 3), ERROR, 0.002), EVERYWHERE, STRIPES) is None
+    assert estimate_error(seen(Wave(30.0, 3), ERROR, 0.002), EVERYWHERE, STRIPES) is not None
+    assert estimate_error(seen(Wave(30.1, 3), ERROR, 0.002), EVERYWHERE, STRIPES) is None
 
 
 def test_the_error_of_a_long_wave_is_found_against_a_finer_one() -> None:
     fine, long = seen(Wave(12.0, 8), None, 0.002), seen(Wave(120.0, 3), ERROR, 0.001)
-    error = error_against(long, fine, EVERYWHERE, STRIPES)
+    error = estimate_error_against(long, fine, EVERYWHERE, STRIPES)
     assert error is not None
     assert left(long) > 0.015
-    assert left(without_error(long, error)) < 1.3e-3
+    assert left(correct_wave(long, error)) < 1.3e-3
     # One that repeats within the stripes is not asked.
-    assert error_against(seen(Wave(119.0, 3), ERROR), fine, EVERYWHERE, STRIPES) is None
+    assert estimate_error_against(seen(Wave(119.0, 3), ERROR), fine, EVERYWHERE, STRIPES) is None
     # Without an error the two agree.
-    none = error_against(seen(Wave(120.0, 3), None, 0.001), fine, EVERYWHERE, STRIPES)
+    none = estimate_error_against(seen(Wave(120.0, 3), None, 0.001), fine, EVERYWHERE, STRIPES)
     assert none is None or np.abs([none.cosines, none.sines]).max() < 3e-4
 
 
 def test_a_wave_that_has_nothing_to_do_with_the_finer_one_gives_no_error() -> None:
     fine, long = seen(Wave(12.0, 8), None, 0.002), seen(Wave(120.0, 3), ERROR, 0.001)
     mixed = replace(fine, turn=np.random.default_rng(0).random(S.shape).astype(np.float32))
-    assert error_against(long, mixed, EVERYWHERE, STRIPES) is None
+    assert estimate_error_against(long, mixed, EVERYWHERE, STRIPES) is None
     backwards = replace(long, turn=np.float32(1.0) - long.turn)
-    assert error_against(backwards, fine, EVERYWHERE, STRIPES) is None
+    assert estimate_error_against(backwards, fine, EVERYWHERE, STRIPES) is None
 
 
 def test_what_the_error_did_to_s_is_told_beside_noise() -> None:
@@ -117,14 +117,14 @@ def test_what_the_error_did_to_s_is_told_beside_noise() -> None:
     sigma = np.full(S.shape, 0.03, np.float32)
     sigma[0] = np.nan
     sigma[1] = 0.07
-    share = share_of_error(ERROR, wave, sigma)
+    share = compute_response_share(ERROR, wave, sigma)
     assert share is not None
     true = np.std(ERROR.at(np.linspace(0, 1, 3000, endpoint=False, dtype=np.float32)))
     noise = np.sqrt((58 * 0.03**2 + 0.07**2) / 59)
     found = [getattr(share, name) for name in share.__dataclass_fields__]
     np.testing.assert_allclose(found, [20.0 * true, noise], rtol=1e-4)
-    assert share_of_error(None, wave, sigma) is None
-    assert share_of_error(ERROR, wave, np.full(S.shape, np.nan, np.float32)) is None
+    assert compute_response_share(None, wave, sigma) is None
+    assert compute_response_share(ERROR, wave, np.full(S.shape, np.nan, np.float32)) is None
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
@@ -138,9 +138,11 @@ def test_a_surface_that_shows_one_side_of_the_error_hides_no_whole_turn_of_the_f
     grey = np.full(turn.shape, 50.0, np.float32)
     s = STRIPES * (turn - error.at(turn)).astype(float)
     noisy = s / 4.0 + 0.002 * np.random.default_rng(0).normal(size=s.shape)
-    fine = WaveSeen(Wave(4.0, 8), (noisy % 1.0).astype(np.float32), grey, grey)
+    fine = MeasuredWave(Wave(4.0, 8), (noisy % 1.0).astype(np.float32), grey, grey)
     seen_there = np.sin(2.0 * np.pi * 3 * turn) < 0.5
-    found = error_against(WaveSeen(Wave(120.0, 3), turn, grey, grey), fine, seen_there, STRIPES)
+    found = estimate_error_against(
+        MeasuredWave(Wave(120.0, 3), turn, grey, grey), fine, seen_there, STRIPES
+    )
     assert found is not None
     # Noise leaves 0.002 / 30 of a turn even of one pixel; a whole turn amiss is 1 / 30.
     np.testing.assert_allclose(found.sines, error.sines, atol=5e-4)

@@ -10,19 +10,16 @@ from scipy.ndimage import gaussian_filter1d
 
 from bodyscan.arrays import Greys, Mask
 from bodyscan.stripes.albedo_edges import (
-    USUAL_BLUR2,
+    BoundaryBrightness,
     Brightness,
-    BrightnessEdges,
-    gentle_gradient,
-    without_edges_across,
+    correct_across_lines,
+    fit_gradient,
 )
 from bodyscan.stripes.boundaries import Boundaries, find_boundaries
 from bodyscan.stripes.scan_lines import ScanLines
 from bodyscan.stripes.stripe_coordinates import (
-    _fill,
-    _Segments,
-    alike_along_lines,
-    end_slopes,
+    correlation_along_lines,
+    estimate_end_slopes,
     interpolate_stripes,
     smooth_runs,
 )
@@ -86,26 +83,6 @@ def test_beside_the_last_boundary_s_goes_on_for_four_tenths_of_a_stripe() -> Non
     assert np.isnan(sigma[np.isnan(s)]).all()
 
 
-def test_a_boundary_by_itself_at_the_very_end_tells_nothing_of_pixels_beside_it() -> None:
-    """Nor does what lies in memory behind the last segment: here the one that goes on from it."""
-    on = np.arange(6)
-    line = np.array([0, 0, 0, 0, 1, 1])
-    whole = replace(run(10.0 + 5.0 * on, on + 3), line=line, joined=line[1:] == line[:-1])
-    of = _Segments.of(whole)
-    codes = np.tile(np.floor(1.0 + 0.2 * X).astype(np.int32), (2, 1))
-    for count, told in ((6, True), (5, False)):
-        s, sigma = np.full((2, *codes.shape), np.nan, np.float32)
-        known = of.start, of.width, of.index, of.rise, of.sigma
-        bends = of.slope_in, of.slope_out, of.pull
-        segments, bent_ = (tuple(each[: count - 1] for each in own) for own in (known, bends))
-        usable = np.ones(codes.shape, bool)
-        _fill(
-            s, sigma, codes, usable, whole.line[:count], whole.before[:count], segments, bent_, 0.15
-        )
-        assert np.isfinite(s[0]).sum() > 10
-        assert np.isfinite(s[1]).any() == told
-
-
 def test_beside_a_run_s_is_three_times_as_uncertain_and_by_all_of_its_bend() -> None:
     s, sigma = interpolated(run(POSITION, INDEX, sigma=0.002))
     for end, side, segment in ((0, -1.0, 0), (-1, 1.0, -1)):
@@ -157,12 +134,14 @@ def test_slopes_are_those_of_parabolas_through_neighbours() -> None:
     x = np.array([0.0, 2.0, 5.0, 6.0])
     y = 1.0 + 3.0 * x + 0.5 * x**2
     secant, width = np.diff(y) / np.diff(x), np.diff(x)
-    slope_in, slope_out = end_slopes(secant, width)
+    slope_in, slope_out = estimate_end_slopes(secant, width)
     np.testing.assert_allclose(slope_in, 3.0 + x[:-1])
     np.testing.assert_allclose(slope_out, 3.0 + x[1:])
     # Where s runs the other way, and where there is nothing, a segment is alone.
     nan = np.nan
-    slope_in, slope_out = end_slopes(np.array([2.0, -3.0, nan, 5.0]), np.array([1.0, 2, nan, 1.0]))
+    slope_in, slope_out = estimate_end_slopes(
+        np.array([2.0, -3.0, nan, 5.0]), np.array([1.0, 2, nan, 1.0])
+    )
     np.testing.assert_array_equal(slope_in, [2.0, -3.0, nan, 5.0])
     np.testing.assert_array_equal(slope_out, [2.0, -3.0, nan, 5.0])
 
@@ -224,13 +203,13 @@ def test_a_gentle_gradient_is_that_of_the_plane_through_what_is_usable() -> None
     image = (2.0 + 0.03 * u - 0.05 * v).astype(np.float32)
     usable: Mask = np.asarray(rng.random(image.shape) < 0.7)
     image[~usable] = 99.0
-    along, across = gentle_gradient(image, usable)
+    along, across = fit_gradient(image, usable)
     assert not along[~usable].any()
     assert not across[~usable].any()
     usable[[0, 1, -2, -1]] = usable[:, [0, 1, -2, -1]] = False  # there may be too few
     np.testing.assert_allclose(along[usable], 0.03, atol=2e-5)
     np.testing.assert_allclose(across[usable], -0.05, atol=2e-5)
-    assert not gentle_gradient(image, np.zeros_like(usable))[0].any()
+    assert not fit_gradient(image, np.zeros_like(usable))[0].any()
 
 
 def test_twelve_pixels_that_spread_tell_a_gradient_and_fewer_or_a_line_do_not() -> None:
@@ -238,11 +217,11 @@ def test_twelve_pixels_that_spread_tell_a_gradient_and_fewer_or_a_line_do_not() 
     image = (0.03 * u - 0.05 * v).astype(np.float32)
     for columns, known in ((4, True), (3, False)):
         usable = (np.abs(v - 9) <= 1) & (u >= 10) & (u < 10 + columns)
-        along, across = gentle_gradient(image, usable)
+        along, across = fit_gradient(image, usable)
         np.testing.assert_allclose(along[9, 11], 0.03 * known, atol=1e-5)
         np.testing.assert_allclose(across[9, 11], -0.05 * known, atol=1e-5)
     line = (v == 9) & (u > 5)
-    assert not gentle_gradient(image, line)[0].any()
+    assert not fit_gradient(image, line)[0].any()
 
 
 def flat_brightness(across: float) -> Brightness:
@@ -256,25 +235,25 @@ def test_an_edge_along_the_lines_pulls_s_by_blur_times_slope() -> None:
     s = (3.0 + 0.5 * u + 0.4 * v).astype(np.float32)
     s[3, 5] = np.nan  # its neighbours know one side alone
     sigma = np.full(s.shape, 0.03, np.float32)
-    freed, doubt = without_edges_across(s, sigma, flat_brightness(0.5), 0.6)
+    freed, doubt = correct_across_lines(s, sigma, flat_brightness(0.5), 0.6)
     shift = 0.6 * 0.5 * 0.4
     np.testing.assert_allclose(s - freed, np.where(np.isnan(s), np.nan, shift), atol=1e-6)
     np.testing.assert_allclose(doubt[~np.isnan(s)], np.hypot(0.03, 2.0 * 0.3 * shift), rtol=1e-5)
     assert np.isnan(freed[3, 5])
     # By six tenths of a pixel at most, either way.
-    freed, _ = without_edges_across(s, sigma, flat_brightness(5.0), 0.6)
+    freed, _ = correct_across_lines(s, sigma, flat_brightness(5.0), 0.6)
     np.testing.assert_allclose((s - freed)[:2], 0.6 * 0.4, atol=1e-6)
-    freed, _ = without_edges_across(s, sigma, flat_brightness(-5.0), 0.6)
+    freed, _ = correct_across_lines(s, sigma, flat_brightness(-5.0), 0.6)
     np.testing.assert_allclose((s - freed)[:2], -0.6 * 0.4, atol=1e-6)
     # What leaps from line to line is no one surface.
-    freed, doubt = without_edges_across(3.0 * s, sigma, flat_brightness(0.5), 0.6)
+    freed, doubt = correct_across_lines(3.0 * s, sigma, flat_brightness(0.5), 0.6)
     np.testing.assert_array_equal(freed, 3.0 * s)
     np.testing.assert_allclose(doubt[0], 0.03, rtol=1e-6)
 
 
-def edges(along: np.ndarray, sigma: float = 0.01) -> BrightnessEdges:
+def edges(along: np.ndarray, sigma: float = 0.01) -> BoundaryBrightness:
     ones = np.ones(len(along))
-    return BrightnessEdges(ones, ones, along, 0.0 * ones, sigma * ones)
+    return BoundaryBrightness(ones, ones, along, 0.0 * ones, sigma * ones)
 
 
 def beside_edges(count: int, blur2: float, steep: float = 0.8) -> tuple[float, np.ndarray]:
@@ -282,7 +261,7 @@ def beside_edges(count: int, blur2: float, steep: float = 0.8) -> tuple[float, n
     along = np.zeros(4 * count + 1)
     along[2::4] = steep * np.where(np.arange(count) % 2, 1.0, -1.0)
     position = 3.0 * np.arange(len(along)) - blur2 * along
-    return edges(along).blur2(position, np.ones(len(along) - 1, bool)), along
+    return edges(along).estimate_blur2(position, np.ones(len(along) - 1, bool)), along
 
 
 def test_blur_is_told_from_boundaries_on_edges_where_there_are_enough() -> None:
@@ -296,16 +275,18 @@ def test_blur_is_told_from_boundaries_on_edges_where_there_are_enough() -> None:
     along = beside_edges(100, 0.7)[1]
     position = 3.0 * np.arange(len(along)) - 0.7 * along
     joined = np.ones(len(along) - 1, bool)
-    assert edges(along, 0.17).blur2(position, joined) == 0.45  # five sigmas are 0.85
-    assert edges(along, 0.15).blur2(position, joined) == pytest.approx(0.7)
+    assert edges(along, 0.17).estimate_blur2(position, joined) == 0.45  # five sigmas are 0.85
+    assert edges(along, 0.15).estimate_blur2(position, joined) == pytest.approx(0.7)
     joined[1::4] = False
-    assert edges(along).blur2(position, joined) == 0.45
+    assert edges(along).estimate_blur2(position, joined) == 0.45
 
 
 def test_a_shift_is_doubted_by_three_tenths_and_by_noise_no_larger_than_itself() -> None:
     along, across = np.array([0.4, 0.4, 0.01]), np.array([0.3, 0.3, 0.0])
     ones = np.ones(3)
-    found = BrightnessEdges(ones, ones, along, across, np.array([0.0, 0.2, 0.2])).doubt(0.5)
+    found = BoundaryBrightness(ones, ones, along, across, np.array([0.0, 0.2, 0.2])).shift_sigma(
+        0.5
+    )
     np.testing.assert_allclose(
         found, 0.5 * np.sqrt([0.15**2, 0.15**2 + 0.04, 0.003**2 + 0.0001]), rtol=1e-9
     )
@@ -317,23 +298,23 @@ def test_brightness_beside_a_boundary_is_lit_less_dark_on_either_side(of: type) 
     lit[:, 10:] = 60
     dark: Greys = np.full((8, 20), 20).astype(of)
     images = ScanLines(lit, dark, lit[None], None, False)
-    sharp = Brightness.of(images, np.full(256, 1e-6, np.float32), np.ones(lit.shape, bool))
-    found = sharp.at(np.array([3 * 20 + 4, 3 * 20 + 9]))
+    sharp = Brightness.from_images(images, np.full(256, 1e-6, np.float32), np.ones(lit.shape, bool))
+    found = sharp.at_boundaries(np.array([3 * 20 + 4, 3 * 20 + 9]))
     np.testing.assert_allclose(found.before, [100.0, 100.0], rtol=1e-3)
     np.testing.assert_allclose(found.behind, [100.0, 40.0], rtol=1e-3)
     np.testing.assert_allclose(found.along, [0.0, np.log(0.4)], atol=1e-3)
     np.testing.assert_allclose(found.across, 0.0, atol=1e-6)
     np.testing.assert_allclose(found.sigma[0], np.sqrt(2.0 * 2e-6) / 100.0, rtol=1e-3)
     # Noise that may explain the step takes it for shading.
-    noisy = Brightness.of(images, np.full(256, 4e4, np.float32), np.ones(lit.shape, bool))
-    assert abs(noisy.at(np.array([69])).along[0] - sharp.shading.ravel()[69]) < 0.05
+    noisy = Brightness.from_images(images, np.full(256, 4e4, np.float32), np.ones(lit.shape, bool))
+    assert abs(noisy.at_boundaries(np.array([69])).along[0] - sharp.shading.ravel()[69]) < 0.05
 
 
 def test_an_edge_from_line_to_line_is_seen_where_noise_does_not_explain_it() -> None:
     lit = np.full((20, 8), 120, np.uint8)
     lit[10:] = 60
     images = ScanLines(lit, np.full_like(lit, 20), lit[None], None, False)
-    sharp = Brightness.of(images, np.full(256, 1e-6, np.float32), np.ones(lit.shape, bool))
+    sharp = Brightness.from_images(images, np.full(256, 1e-6, np.float32), np.ones(lit.shape, bool))
     np.testing.assert_allclose(sharp.across[[9, 10], 4], np.log(0.4) / 2.0, rtol=1e-3)
     np.testing.assert_allclose(sharp.across[[4, 15], 4], 0.0, atol=1e-4)
 
@@ -355,19 +336,17 @@ def test_a_boundary_lies_where_the_light_of_its_pixels_has_its_middle(
     inverse = np.stack([10.0 + bright * (1.0 - part) for part in share]).astype(np.float32)
     dark = np.full(bright.shape, 10.0, np.float32)
     lit = (10.0 + bright).astype(np.float32)
-    images = ScanLines.along_lines(lit, dark, pattern, inverse, "vertical")
+    images = ScanLines.from_images(lit, dark, pattern, inverse, "vertical")
     variance, usable = np.full(256, 1e-4, np.float32), np.ones(bright.shape, bool)
-    brightness = Brightness.of(images, variance, usable)
+    brightness = Brightness.from_images(images, variance, usable)
     found = find_boundaries(images, brightness, stripe.astype(np.int32), usable, variance)
-    assert found.blur2 == USUAL_BLUR2, "no edge tells another"
+    assert found.blur2 == 0.45, "no edge tells another"
     assert found.index.reshape(15, 7).tolist() == [[1, 2, 3, 4, 5, 6, 7]] * 15
     inner = (found.line > 0) & (found.line < 14)
     # Pixel 19 is the last of stripe 0: half a pixel behind its middle.  Greys are not rounded.
-    np.testing.assert_allclose(
-        (found.line_position - found.line)[inner], USUAL_BLUR2 * down, atol=1e-3
-    )
+    np.testing.assert_allclose((found.line_position - found.line)[inner], 0.45 * down, atol=1e-3)
     moved = found.position - (20.0 * found.index - 0.5)
-    np.testing.assert_allclose(moved[inner], USUAL_BLUR2 * right, atol=1e-3)
+    np.testing.assert_allclose(moved[inner], 0.45 * right, atol=1e-3)
 
 
 def test_on_relief_boundaries_are_left_in_place() -> None:
@@ -400,8 +379,8 @@ def test_pixels_share_the_noise_of_the_boundaries_around_them(width: float) -> N
         boundaries = run(even + 0.05 * rng.normal(size=len(index)), index, 0.05)
         s, _ = interpolate_stripes(boundaries, np.tile(codes, (2, 1)), np.ones((2, WIDTH), bool))
         off.append(s[1, 20:80] - (X[20:80] / width - 1))
-    alike = alike_along_lines(boundaries)
+    alike = correlation_along_lines(boundaries)
     seen = np.array([np.mean([o[: 60 - k] * o[k:] for o in off]) for k in range(16)])
     line = np.maximum(0.0, 1.0 - np.arange(16) / alike)
     np.testing.assert_allclose(seen / seen[0], line, atol=0.16)
-    assert alike_along_lines(run(even[:1], index[:1])) == 0.0
+    assert correlation_along_lines(run(even[:1], index[:1])) == 0.0

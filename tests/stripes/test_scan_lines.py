@@ -19,12 +19,12 @@ def frames(inverses: bool, of: type = np.uint8, direction: str = "vertical") -> 
     dark: Greys = rng.integers(0, 40, SHAPE).astype(of)
     patterns: Greys = rng.integers(0, 250, (3, *SHAPE)).astype(of)
     others: Greys = rng.integers(0, 250, (3, *SHAPE)).astype(of)
-    return ScanLines.along_lines(lit, dark, patterns, others if inverses else None, direction)
+    return ScanLines.from_images(lit, dark, patterns, others if inverses else None, direction)
 
 
 def test_horizontal_stripes_make_lines_of_columns() -> None:
     across, along = frames(True), frames(True, direction="horizontal")
-    assert (across.turned, along.turned) == (False, True)
+    assert (across.transposed, along.transposed) == (False, True)
     assert np.array_equal(along.lit, across.lit.T)
     assert np.array_equal(along.dark, across.dark.T)
     assert along.inverses is not None

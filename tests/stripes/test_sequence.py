@@ -51,25 +51,25 @@ def test_a_good_sequence_is_read(good: Sequence) -> None:
 
 
 @pytest.mark.parametrize("bit", range(BITS))
-def test_an_exchanged_pattern_and_inverse_are_named(good: Sequence, bit: int) -> None:
+def test_an_exchanged_pattern_and_inverse_are_refused(good: Sequence, bit: int) -> None:
     bad = with_frame(good, "patterns", bit, good.inverses[bit])
     bad = with_frame(bad, "inverses", bit, good.patterns[bit])
-    with pytest.raises(DecodingFailed, match=f"pattern and inverse of bit {bit} were exchanged"):
+    with pytest.raises(DecodingFailed, match="exchanged, lost or moved"):
         read(bad)
 
 
 @pytest.mark.parametrize(("one", "other"), [(0, 1), (2, 3), (5, 6), (1, 5)])
-def test_exchanged_bits_are_named(good: Sequence, one: int, other: int) -> None:
+def test_exchanged_bits_are_refused(good: Sequence, one: int, other: int) -> None:
     order = list(range(BITS))
     order[one], order[other] = other, one
-    with pytest.raises(DecodingFailed, match=f"bits {one} and {other} were exchanged"):
+    with pytest.raises(DecodingFailed, match=r"frames are exchanged|look alike"):
         read(reordered(good, order))
 
 
-def test_reversed_bits_and_exchanged_lists_are_named(good: Sequence) -> None:
-    with pytest.raises(DecodingFailed, match="reverse order"):
+def test_reversed_bits_and_exchanged_lists_are_refused(good: Sequence) -> None:
+    with pytest.raises(DecodingFailed, match="frames are exchanged"):
         read(reordered(good, list(range(BITS))[::-1]))
-    with pytest.raises(DecodingFailed, match="all patterns and inverses were exchanged"):
+    with pytest.raises(DecodingFailed, match="frames are exchanged"):
         read(replace(good, patterns=good.inverses, inverses=good.patterns))
 
 
@@ -94,7 +94,7 @@ def test_half_of_the_stripes_without_their_first_bit_is_no_wrong_order(good: Seq
             stripes=STRIPES // 2, direction="horizontal",
         )  # fmt: skip
     assert refused.value.remedy is not None
-    assert re.search("first bit is missing|bit 0 is missing", refused.value.remedy)
+    assert re.search("none is missing|bit 0 is missing", refused.value.remedy)
 
 
 def test_a_bit_in_place_of_another_is_noticed(good: Sequence) -> None:
@@ -115,7 +115,7 @@ def test_a_rim_where_one_bit_alone_flips_is_no_wrong_order() -> None:
 
     scene = render_sequence(at, stripes=STRIPES, albedo=albedo)
     assert np.isfinite(read(scene).s).mean() > 0.5
-    with pytest.raises(DecodingFailed, match="bits 3 and 4 were exchanged"):
+    with pytest.raises(DecodingFailed, match="frames are exchanged"):
         read(reordered(scene, [0, 1, 2, 4, 3, 5, 6]))
 
 

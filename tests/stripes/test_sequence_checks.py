@@ -1,4 +1,4 @@
-"""From how much on a stripe sequence does not add up: each limit from both sides."""
+"""Checks of exposure, direction and order of the frames of a bit sequence (sharp synthetic frames)."""
 
 from __future__ import annotations
 
@@ -9,151 +9,95 @@ import pytest
 
 from bodyscan.arrays import Bytes, Indices, Mask
 from bodyscan.errors import DecodingFailed, WrongDirection
-from bodyscan.stripes.bit_words import BINARY, GRAY, WordCode
+from bodyscan.stripes.gray.bit_words import BINARY, GRAY, WordCode
+from bodyscan.stripes.gray.sequence_checks import check_exposure, check_words
 from bodyscan.stripes.scan_lines import ScanLines
-from bodyscan.stripes.sequence_checks import (
-    check_codes,
-    check_direction,
-    check_exposure,
-    check_illumination,
-)
+from bodyscan.stripes.usable_pixels import check_direction, check_illumination
 
 BITS = 6
 
 
-def some(share: float, shape: tuple[int, int] = (100, 100)) -> Mask:
-    """The first pixels of a picture, so large a share of it."""
+def first_pixels(share: float, shape: tuple[int, int] = (100, 100)) -> Mask:
+    """A mask of the first pixels of an image, so large a share of it."""
     return np.asarray(np.arange(shape[0] * shape[1]) < share * shape[0] * shape[1]).reshape(shape)
 
 
-def frames(lit: Bytes, dark: Bytes | int = 20, patterns: Sequence[Bytes] = ()) -> ScanLines:
+def exposed(lit: Bytes, dark: Bytes | int = 20, patterns: Sequence[Bytes] = ()) -> None:
+    """Check the exposure: of lit and dark alone without patterns, which then have inverses."""
     dark = np.broadcast_to(np.uint8(dark), lit.shape) if isinstance(dark, int) else dark
     coded = np.array(patterns, np.uint8) if patterns else np.empty((0, *lit.shape), np.uint8)
-    return ScanLines(lit.astype(np.uint8), dark, coded, None, turned=False)
+    inverses = None if patterns else coded
+    check_exposure(ScanLines(lit.astype(np.uint8), dark, coded, inverses, transposed=False))
 
 
-def exposed(images: ScanLines) -> None:
-    """Exposure alone is asked for: of frames that bear no pattern."""
-    check_exposure(ScanLines(images.lit, images.dark, images.patterns, images.patterns, False))
-
-
-def test_one_pixel_in_a_thousand_has_to_be_lit() -> None:
+def test_a_projector_that_lights_next_to_nothing_or_too_much_is_refused() -> None:
     lit = np.full((100, 100), 200)
-    check_illumination(some(0.001), lit)
+    check_illumination(first_pixels(0.001), lit)
     with pytest.raises(DecodingFailed, match=r"lights only 0\.09% of the picture"):
-        check_illumination(some(0.0009), lit)
-
-
-def test_half_of_what_is_lit_may_be_saturated() -> None:
-    for share, wrong in ((0.3, False), (0.31, True)):
-        lit = np.where(some(share), 255, 200)
-        lit[~some(0.6)] = 255  # not lit by the projector
-        if wrong:
-            with pytest.raises(DecodingFailed, match="52% of the lit pixels are saturated"):
-                check_illumination(some(0.6), lit)
-        else:
-            check_illumination(some(0.6), lit)
-
-
-def test_four_grey_levels_are_light() -> None:
-    exposed(frames(np.full((100, 100), 24)))
+        check_illumination(first_pixels(0.0009), lit)
+    saturated = np.where(first_pixels(0.31), 255, 200)
+    with pytest.raises(DecodingFailed, match="52% of the lit pixels are saturated"):
+        check_illumination(first_pixels(0.6), saturated)
+    check_illumination(first_pixels(0.9), saturated)
+    exposed(np.full((100, 100), 24))
     with pytest.raises(DecodingFailed, match="lights only"):
-        exposed(frames(np.full((100, 100), 23)))
+        exposed(np.full((100, 100), 23))
 
 
 def test_a_dark_frame_brighter_than_the_lit_one_was_exchanged_with_it() -> None:
-    dimmer, brighter = some(0.49), some(0.51)
-    exposed(frames(np.where(dimmer, 20, 60), 40))
-    exposed(frames(np.where(brighter, 37, 60), 40))  # by three levels: noise
-    for image in (np.where(brighter, 36, 60), np.where(some(0.002), 20, 40)):
-        with pytest.raises(DecodingFailed, match="the dark frame is brighter"):
-            exposed(frames(image, 40))
-    with pytest.raises(DecodingFailed, match="lights only"):  # too few to tell
-        exposed(frames(np.where(some(0.0005), 20, 40), 40))
+    exposed(np.where(first_pixels(0.49), 20, 60), 40)
+    exposed(np.where(first_pixels(0.51), 37, 60), 40)  # by three levels: noise
+    with pytest.raises(DecodingFailed, match="the dark frame is brighter"):
+        exposed(np.where(first_pixels(0.51), 36, 60), 40)
 
 
 @pytest.mark.parametrize(("side", "level"), [(1, 120), (-1, 20)])
-def test_a_pattern_may_leave_lit_and_dark_by_noise_and_a_seventh_of_their_contrast(
-    side: int, level: int
-) -> None:
+def test_without_inverses_a_pattern_lies_between_dark_and_lit(side: int, level: int) -> None:
+    """Four grey levels beyond them are noise, and 15 % of their contrast besides."""
     lit = np.full((100, 100), 120)
-    for excess, wrong in ((18, False), (19, True)):  # four levels are noise: 14.5 and 15.5 %
-        beyond = np.where(some(0.5), excess, excess + 1)
-        image = frames(lit, 20, [np.full_like(lit, 70), level + side * beyond])
+    for excess, wrong in ((18, False), (20, True)):
+        patterns = [np.full_like(lit, 70), np.full_like(lit, level + side * excess)]
         if wrong:
             with pytest.raises(DecodingFailed, match=r"bit 1 is brighter .* \(by 16% of their"):
-                check_exposure(image)
+                exposed(lit, 20, patterns)
         else:
-            check_exposure(image)
+            exposed(lit, 20, patterns)
 
 
-def test_what_leaves_lit_and_dark_counts_as_its_share_of_the_bright_pixels() -> None:
-    """However far beyond a pixel is, and in a picture so large that only some pixels are looked at;
-    dim and saturated ones do not count."""
-    lit = np.full((340, 400), 120)
-    lit[:, 300:350], lit[:, 350:] = 60, 255
-    for columns, wrong in ((42, False), (48, True)):  # of the 300 that count: 14 and 16 %
-        pattern = np.full_like(lit, 70)
-        pattern[:, :columns] = 250
-        pattern[:, 300:350] = 250
-        pattern[:, 350:] = 0
-        if wrong:
-            with pytest.raises(DecodingFailed, match="bit 0 is brighter"):
-                check_exposure(frames(lit, 20, [pattern]))
-        else:
-            check_exposure(frames(lit, 20, [pattern]))
-
-
-@pytest.mark.parametrize("turned", [False, True])
-def test_stripes_that_change_twice_as_often_from_line_to_line_run_the_other_way(
-    turned: bool,
+@pytest.mark.parametrize("transposed", [False, True])
+def test_stripes_that_change_more_often_from_line_to_line_run_the_other_way(
+    transposed: bool,
 ) -> None:
     good = np.ones((10, 10), bool)
-    place = np.arange(10)
-    numbers = np.minimum(place, 2) + 20 * np.minimum(place, 5)[:, None]
-    check_direction(numbers - 20 * (place[:, None] >= 5), good, turned)
-    ran, wanted = ("vertical", "horizontal") if turned else ("horizontal", "vertical")
-    with pytest.raises(WrongDirection, match=f"run {ran}ly in the picture, not {wanted}ly"):
-        check_direction(numbers, good, turned)
-    good[1::2] = False  # nothing is known of what lies between lines then
-    check_direction(numbers, good, turned)
+    x = np.arange(10)
+    numbers = np.minimum(x, 2) + 20 * np.minimum(x, 5)[:, None]
+    check_direction(numbers - 20 * (x[:, None] >= 5), good, transposed)
+    actual, given = ("vertical", "horizontal") if transposed else ("horizontal", "vertical")
+    with pytest.raises(WrongDirection, match=f"run {actual}ly in the picture, not {given}ly"):
+        check_direction(numbers, good, transposed)
+    good[1::2] = False  # no two neighbouring lines are known
+    check_direction(numbers, good, transposed)
 
 
-def images(words: Indices, *, inverses: bool) -> ScanLines:
-    """Sharp frames of code words (L, P)."""
+def sharp_frames(words: Indices, *, inverses: bool) -> ScanLines:
     bit = words >> np.arange(BITS - 1, -1, -1)[:, None, None] & 1
     patterns = (20 + 100 * bit).astype(np.uint8)
     lit = np.full(words.shape, 120, np.uint8)
     other = 140 - patterns if inverses else None
-    return ScanLines(lit, np.full_like(lit, 20), patterns, other, turned=False)
+    return ScanLines(lit, np.full_like(lit, 20), patterns, other, transposed=False)
 
 
 def check(words: Indices, code: WordCode, *, inverses: bool = True, stripes: int = 64) -> None:
     variance = np.full(256, 0.5, np.float32)
-    sharp = images(words, inverses=inverses)
-    check_codes(sharp, words.astype(np.uint16), code, stripes, variance)
+    images = sharp_frames(words, inverses=inverses)
+    check_words(images, words.astype(np.uint16), code, stripes, variance)
 
 
-def refused(words: Indices, code: WordCode, said: str, **asked: bool | int) -> None:
-    with pytest.raises(DecodingFailed, match=said):
-        check(words, code, **asked)  # type: ignore[arg-type]
+UP = np.tile(np.arange(64).repeat(5), (60, 1))
 
 
-def counted(stripe: Indices, code: WordCode = GRAY) -> Indices:
+def encoded(stripe: Indices, code: WordCode = GRAY) -> Indices:
     return np.asarray(code.encode(stripe))
-
-
-def changing(one: tuple[int, int], other: tuple[int, int], first: int, second: int) -> Indices:
-    """Lines on which one word follows another, and then the finest bit turns to and fro; so many
-    with the first two words and then with the others."""
-    lines = []
-    for before, after in (one,) * first + (other,) * second:
-        rest = np.tile([after ^ 1] * 4 + [after] * 4, 3)
-        lines.append(np.r_[[before] * 12, [after] * 12, rest])
-    return np.array(lines)
-
-
-UP = np.tile(np.arange(64).repeat(5), (40, 1))
 
 
 @pytest.mark.parametrize("inverses", [False, True])
@@ -161,137 +105,100 @@ UP = np.tile(np.arange(64).repeat(5), (40, 1))
 def test_a_twentieth_of_the_codes_may_lie_beyond_the_last_stripe(
     code: WordCode, inverses: bool
 ) -> None:
-    check(counted(UP, code), code, stripes=61, inverses=inverses)
-    refused(
-        counted(UP, code), code, "6% of the codes lie beyond", stripes=60, inverses=inverses
-    )  # of 64
+    check(encoded(UP, code), code, stripes=61, inverses=inverses)
+    with pytest.raises(DecodingFailed, match="6% of the codes lie beyond the last stripe"):
+        check(encoded(UP, code), code, stripes=60, inverses=inverses)
 
 
-# Where bit 2 flips, 8 follows 7; a word that differs in that bit and lies farther off does not.
-RIGHT = {GRAY: (4, 12), BINARY: (7, 8)}
-WRONG = {GRAY: (0, 8), BINARY: (7, 9)}
-
-
-@pytest.mark.parametrize(
-    ("code", "inverses", "least"),
-    [(GRAY, True, 50), (GRAY, False, 75), (BINARY, True, 60), (BINARY, False, 75)],
-)
-def test_how_many_changes_of_a_bit_have_to_be_between_neighbours(
-    code: WordCode, inverses: bool, least: int
-) -> None:
-    check(changing(RIGHT[code], WRONG[code], least, 100 - least), code, inverses=inverses)
-    said = "where bit 2 flips, stripes do not follow each other"
-    wrong = changing(RIGHT[code], WRONG[code], least - 1, 101 - least)
-    refused(wrong, code, said, inverses=inverses)
+def exchange(words: Indices, first: int, second: int) -> Indices:
+    """Exchange two bits, 0 the coarsest."""
+    one, other = (1 << (BITS - 1 - bit) for bit in (first, second))
+    rest = words & ~(one | other)
+    return np.asarray(rest | (words & one > 0) * other | (words & other > 0) * one)
 
 
 @pytest.mark.parametrize("inverses", [False, True])
-def test_fewer_than_fifty_changes_of_a_bit_tell_nothing(inverses: bool) -> None:
-    check(changing(RIGHT[GRAY], WRONG[GRAY], 0, 49), GRAY, inverses=inverses)
-    refused(changing(RIGHT[GRAY], WRONG[GRAY], 0, 50), GRAY, "where bit 2", inverses=inverses)
+@pytest.mark.parametrize("code", [GRAY, BINARY])
+@pytest.mark.parametrize("bits", [(0, 1), (0, 5), (1, 3), (3, 4)])
+def test_exchanged_bits_are_refused_with_the_measured_disagreement(
+    code: WordCode, inverses: bool, bits: tuple[int, int]
+) -> None:
+    message = r"exchanged, lost or moved \(where bit \d changes, only \d+% of neighbouring pixels"
+    with pytest.raises(DecodingFailed, match=message):
+        check(exchange(encoded(UP, code), *bits), code, inverses=inverses)
+
+
+@pytest.mark.parametrize("flipped", [0b010000, 0b000001, 0b111111])
+def test_patterns_exchanged_with_their_inverses_are_refused(flipped: int) -> None:
+    with pytest.raises(DecodingFailed, match="exchanged, lost or moved"):
+        check(encoded(UP % 60) ^ flipped, GRAY, stripes=60)
+
+
+def test_light_that_varies_between_frames_spoils_some_changes_only() -> None:
+    """In a third of the lines, another stripe follows where bit 2 flips: a rim, not a wrong frame."""
+    words = encoded(UP)
+    rims = np.where(np.arange(60)[:, None] % 3 == 0, words, encoded(UP))
+    rims[::3, 40:45] = encoded(np.array(4))
+    check(rims, GRAY)
 
 
 @pytest.mark.parametrize("code", [GRAY, BINARY])
-def test_stripes_that_count_down_on_a_seventh_of_the_picture_do_not_count_up(
-    code: WordCode,
-) -> None:
-    """Every other line is looked at: 7 and 8 of 50."""
-    for down, wrong in ((14, False), (16, True)):
-        words = np.tile(np.arange(64).repeat(5), (100, 1))
-        words[:down] = words[:down, ::-1]
-        if wrong:
-            refused(counted(words, code), code, "count up and down in turn", inverses=False)
-        else:
-            check(counted(words, code), code, inverses=False)
-
-
-@pytest.mark.parametrize(("width", "wrong"), [(6, True), (8, False)])
-def test_three_stripes_in_so_many_pixels_are_counting(width: int, wrong: bool) -> None:
-    """Over 16 pixels; two may have been misread."""
-    words = np.tile(np.arange(40).repeat(width), (120, 1))
-    words[:60] = words[:60, ::-1]
+@pytest.mark.parametrize(("down", "wrong"), [(8, False), (24, True)])
+def test_stripes_count_one_way_along_the_lines(code: WordCode, down: int, wrong: bool) -> None:
+    stripe = np.tile(np.arange(64).repeat(5), (100, 1))
+    stripe[:down] = stripe[:down, ::-1]
     if wrong:
-        refused(counted(words), GRAY, "count up and down in turn", inverses=False)
+        with pytest.raises(DecodingFailed, match="stripes count up and down in turn"):
+            check(encoded(stripe, code), code, inverses=False)
     else:
-        check(counted(words), GRAY, inverses=False)
+        check(encoded(stripe, code), code, inverses=False)
 
 
-@pytest.mark.parametrize(("length", "wrong"), [(67, False), (68, True)])
-def test_fifty_places_at_which_stripes_count_down_are_too_few_to_tell(
-    length: int, wrong: bool
+def frame_pairs(**strength: float) -> tuple[np.ndarray, np.ndarray]:
+    """Float frames and inverses of Gray code; strength: contrast of a bit (`b5=0.2`)."""
+    bit = encoded(UP) >> np.arange(BITS - 1, -1, -1)[:, None, None] & 1
+    share = np.array([strength.get(f"b{k}", 1.0) for k in range(BITS)])[:, None, None]
+    half = 100.0 * share * (bit - 0.5)
+    return (70.0 + half).astype(np.float32), (70.0 - half).astype(np.float32)
+
+
+def check_pairs(patterns: np.ndarray, inverses: np.ndarray) -> None:
+    lit = np.full(UP.shape, 120.0, np.float32)
+    images = ScanLines(lit, np.full_like(lit, 20.0), patterns, inverses, transposed=False)
+    check_words(images, images.words(), GRAY, 64, np.full(256, 0.5, np.float32))
+
+
+def test_a_pattern_with_the_inverse_of_another_bit_is_refused() -> None:
+    patterns, inverses = frame_pairs()
+    check_pairs(patterns, inverses)
+    with pytest.raises(DecodingFailed, match=r"differ clearly: bit 2 \(\d\d% of the pixels\)"):
+        check_pairs(patterns, inverses[[0, 2, 1, 3, 4, 5]])
+    with pytest.raises(DecodingFailed, match="differ clearly: bit 0"):  # moved up by one
+        check_pairs(patterns[1:], np.vstack([inverses[:1], inverses[2:]]))
+
+
+def test_a_bit_that_shows_nowhere_is_named() -> None:
+    patterns, inverses = frame_pairs()
+    noise = np.random.default_rng(0).normal(0.0, 0.3, UP.shape).astype(np.float32)
+    for copy in (patterns[5:], patterns[5:] + noise):
+        with pytest.raises(DecodingFailed, match="bit 5 look alike"):
+            check_pairs(patterns, np.vstack([inverses[:5], copy]))
+
+
+def test_the_finest_bits_may_be_blurred_to_an_even_grey() -> None:
+    patterns, inverses = frame_pairs(b5=0.0)
+    patterns[5] += np.random.default_rng(0).normal(0.0, 0.5, UP.shape).astype(np.float32)
+    check_pairs(patterns, inverses)
+    patterns, inverses = frame_pairs(b2=0.0, b3=0.0, b4=0.0, b5=0.0)
+    with pytest.raises(DecodingFailed, match="bit 2 look alike"):
+        check_pairs(patterns, inverses)
+
+
+@pytest.mark.parametrize(("level", "which"), [(120.0, "brighter"), (20.0, "darker")])
+def test_a_finest_pattern_brighter_or_darker_than_its_inverse_everywhere_is_named(
+    level: float, which: str
 ) -> None:
-    """Of two lines with a dark one between; 17 of the places are the run-up."""
-    up = np.arange(40).repeat(4)[:length]
-    words = counted(np.array([up, up, up[::-1]]))
-    sharp = images(words, inverses=False)
-    sharp.lit[1] = 20
-
-    def asked() -> None:
-        check_codes(sharp, words.astype(np.uint16), GRAY, 64, np.ones(256, np.float32))
-
-    if wrong:
-        with pytest.raises(DecodingFailed, match="count up and down in turn"):
-            asked()
-    else:
-        asked()
-
-
-@pytest.mark.parametrize(("leap", "wrong"), [(1, True), (2, False)])
-def test_what_falls_from_stripe_to_stripe_counts_down_and_what_leaps_is_an_edge(
-    leap: int, wrong: bool
-) -> None:
-    """Down by three or more stripes within 16 pixels, in half of the lines."""
-    rises = np.tile(np.arange(40).repeat(4), (120, 1))
-    rises[:60] = np.maximum(63 - leap * np.arange(160) // 4, 0)
-    words = counted(rises // leap * leap)
-    if wrong:
-        refused(words, GRAY, "count up and down in turn", inverses=False)
-    else:
-        check(words, GRAY, inverses=False)
-
-
-def test_three_causes_are_named_at_most_the_simplest_first() -> None:
-    """Words of the last four stripes of 64 where there are 32. More would undo it: any exchange of the
-    coarsest bit, alone lit, for one of the next three."""
-    words = counted(np.tile(np.arange(60, 64).repeat(5), (120, 1)))
-    with pytest.raises(DecodingFailed) as refused_:
-        check(words, GRAY, stripes=32)
-    assert str(refused_.value).endswith(
-        "it would fit if pattern and inverse of bit 0 were exchanged, or if bits 0 and 1 were "
-        "exchanged, or if bits 0 and 2 were exchanged"
-    )
-
-
-def exchanged(words: Indices, one: int, other: int) -> Indices:
-    """Of two bits, 0 the coarsest."""
-    first, second = (1 << (BITS - 1 - bit) for bit in (one, other))
-    rest = words & ~(first | second)
-    return np.asarray(rest | (words & first > 0) * second | (words & second > 0) * first)
-
-
-PICTURE = counted(np.tile(np.arange(60).repeat(5), (120, 1)))
-REVERSED = exchanged(exchanged(exchanged(PICTURE, 0, 5), 1, 4), 2, 3)
-
-
-@pytest.mark.parametrize(
-    ("words", "cause"),
-    [
-        (PICTURE ^ 0b010000, "pattern and inverse of bit 1 were exchanged"),
-        (PICTURE ^ 0b000001, "pattern and inverse of bit 5 were exchanged"),
-        (PICTURE ^ 0b111111, "all patterns and inverses were exchanged"),
-        (REVERSED, "the bits came in reverse order"),
-        (exchanged(PICTURE, 1, 3), "bits 1 and 3 were exchanged"),
-        (exchanged(PICTURE, 0, 5), "bits 0 and 5 were exchanged"),
-    ],
-)
-def test_a_mistake_with_the_frames_is_named(words: Indices, cause: str) -> None:
-    refused(words, GRAY, f"it would fit if (.*, or if )?{cause}", stripes=60)
-
-
-@pytest.mark.parametrize(("right", "named"), [(79, False), (82, True)])
-def test_a_cause_is_named_if_four_of_five_changes_of_each_bit_fit(right: int, named: bool) -> None:
-    """The coarsest bit was exchanged, so that all words lie beyond; undone, bit 2 fits in so many."""
-    words = changing(RIGHT[GRAY], WRONG[GRAY], right, 100 - right) ^ 0b100000
-    with pytest.raises(DecodingFailed) as found:
-        check(words, GRAY, stripes=32)
-    assert ("if pattern and inverse of bit 0 were exchanged" in str(found.value)) == named
+    patterns, inverses = frame_pairs()
+    patterns[5], inverses[5] = level, 140.0 - level
+    with pytest.raises(DecodingFailed, match=f"pattern 5 is {which} than its inverse nearly"):
+        check_pairs(patterns, inverses)

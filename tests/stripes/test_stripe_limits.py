@@ -65,7 +65,7 @@ def test_between_the_corners_of_blocks_limits_are_linear() -> None:
         assert there.all() if inside else not there.any()
         # Lines that are the image's columns.
         turned, _ = limits(-1e6, down, 1e6).split(
-            (s + off).T.astype(np.float32), EVERY.T, turned=True
+            (s + off).T.astype(np.float32), EVERY.T, transposed=True
         )
         np.testing.assert_array_equal(turned, there.T)
 

@@ -109,9 +109,9 @@ def test_vertical_stripes_are_horizontal_ones_transposed() -> None:
     np.testing.assert_array_equal(turned.sigma.T, seen.sigma)
     np.testing.assert_array_equal(turned.boundary_pixels[:, ::-1], seen.boundary_pixels)
     # Pixels share noise across stripes, along columns if these are horizontal.
-    assert seen.alike_px[0] == 0.0
-    assert turned.alike_px == seen.alike_px[::-1]
-    assert seen.alike_px[1] > 2.0
+    assert seen.correlation_px[0] == 0.0
+    assert turned.correlation_px == seen.correlation_px[::-1]
+    assert seen.correlation_px[1] > 2.0
 
 
 def test_stripes_may_count_upwards() -> None:

@@ -5,8 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bodyscan.stripes.wave import Wave, alike_again
-from bodyscan.stripes.waves import see_wave, split_waves, white_and_black, white_image
+from bodyscan.stripes.codes.phase_shift import find_repetition
+from bodyscan.stripes.phase.waves import (
+    estimate_white_and_black,
+    estimate_white_image,
+    measure_wave,
+    split_waves,
+)
+from bodyscan.stripes.stripe_code import Wave
 
 S = np.linspace(0.0, 47.0, 60).reshape(3, 20)
 
@@ -29,7 +35,7 @@ def shown(wave: Wave, bright: float = 80.0, dark: float = 15.0) -> np.ndarray:
     ],
 )
 def test_a_waves_turn_is_s_over_its_period_whatever_its_start(wave: Wave) -> None:
-    seen = see_wave(shown(wave), wave)
+    seen = measure_wave(shown(wave), wave)
     off = seen.turn - S / wave.period
     np.testing.assert_allclose(off - np.rint(off), 0.0, atol=1e-5)
     assert seen.turn.min() >= 0.0
@@ -41,7 +47,7 @@ def test_a_waves_turn_is_s_over_its_period_whatever_its_start(wave: Wave) -> Non
 def test_a_wave_that_says_no_more_is_brightest_at_zero_first_and_moves_forward() -> None:
     k = np.arange(4)[:, None, None]
     images = 50.0 + 40.0 * np.cos(2.0 * np.pi * (S / 12.0 - k / 4.0))
-    off = see_wave(images.astype(np.float32), Wave(12.0, 4)).turn - S / 12.0
+    off = measure_wave(images.astype(np.float32), Wave(12.0, 4)).turn - S / 12.0
     np.testing.assert_allclose(off - np.rint(off), 0.0, atol=1e-5)
 
 
@@ -51,18 +57,18 @@ def test_sigma_is_how_far_noise_turns_a_wave(wave: Wave, noise: float) -> None:
     off = []
     for _ in range(60):
         noisy = (clean + noise * rng.normal(size=clean.shape)).astype(np.float32)
-        turned = see_wave(noisy, wave).turn - S / wave.period
+        turned = measure_wave(noisy, wave).turn - S / wave.period
         off.append(turned - np.rint(turned))
-    sigma = see_wave(clean, wave).sigma(np.full(S.shape, noise, np.float32))
+    sigma = measure_wave(clean, wave).sigma(np.full(S.shape, noise, np.float32))
     # 3,600 of them: their deviation is known to 1.2 %.
     assert np.std(off) == pytest.approx(float(sigma.mean()), rel=0.05)
     # Without noise what no wave is better than: half a thousandth of a turn.
-    np.testing.assert_allclose(see_wave(clean, wave).sigma(np.zeros(S.shape, np.float32)), 5e-4)
+    np.testing.assert_allclose(measure_wave(clean, wave).sigma(np.zeros(S.shape, np.float32)), 5e-4)
 
 
 def test_where_there_is_no_light_the_amplitude_is_not_zero() -> None:
     wave = Wave(12.0, 4)
-    seen = see_wave(np.zeros((4, 3, 20), np.float32), wave)
+    seen = measure_wave(np.zeros((4, 3, 20), np.float32), wave)
     np.testing.assert_allclose(seen.amplitude, 1e-3)
     assert np.isfinite(seen.sigma(np.ones((3, 20), np.float32))).all()
 
@@ -73,18 +79,18 @@ def test_lit_and_dark_are_the_waves_own_highest_and_lowest() -> None:
     parts = split_waves(images, waves)
     assert [len(part) for part in parts] == [3, 5]
     assert np.array_equal(np.concatenate(parts), images)
-    white, black = white_and_black(
-        [see_wave(part, wave) for part, wave in zip(parts, waves, strict=True)]
+    white, black = estimate_white_and_black(
+        [measure_wave(part, wave) for part, wave in zip(parts, waves, strict=True)]
     )
     np.testing.assert_allclose(white, 95.0, rtol=1e-5)
     np.testing.assert_allclose(black, 15.0, rtol=1e-4)
-    np.testing.assert_allclose(white_image(images, waves), 95.0, rtol=1e-5)
-    in_levels = white_image(np.rint(images).astype(np.uint8), waves)
+    np.testing.assert_allclose(estimate_white_image(images, waves), 95.0, rtol=1e-5)
+    in_levels = estimate_white_image(np.rint(images).astype(np.uint8), waves)
     assert in_levels.dtype == np.uint8
     np.testing.assert_allclose(in_levels.astype(int), 95, atol=1)
     # Grey levels are 0 to 255, whatever a noisy wave says.
-    glaring = see_wave(shown(waves[0], bright=270.0, dark=-10.0), waves[0])
-    white, black = white_and_black([glaring])
+    glaring = measure_wave(shown(waves[0], bright=270.0, dark=-10.0), waves[0])
+    white, black = estimate_white_and_black([glaring])
     assert set(white.ravel().tolist()) == {255.0}
     assert set(black.ravel().tolist()) == {0.0}
 
@@ -106,16 +112,16 @@ def test_lit_and_dark_are_the_waves_own_highest_and_lowest() -> None:
 def test_waves_are_alike_again_after_what_they_have_in_common(
     periods: tuple[float, ...], stripes: int, again: float | None
 ) -> None:
-    assert alike_again(periods, stripes, 0.05) == again
+    assert find_repetition(periods, stripes, 0.05) == again
 
 
 def test_how_nearly_alike_is_for_the_caller_to_say() -> None:
     # After three periods of 10 a wave of 28 is 30 / 28 = 1.0714 turns on.
-    assert alike_again((10.0, 28.0), 35, 0.08) == 30.0
-    assert alike_again((10.0, 28.0), 35, 0.07) is None
+    assert find_repetition((10.0, 28.0), 35, 0.08) == 30.0
+    assert find_repetition((10.0, 28.0), 35, 0.07) is None
 
 
 def test_a_wave_finer_than_a_stripe_is_followed_over_all_stripes() -> None:
     # Alike again after eight periods of half a stripe: more of them than stripes.
-    assert alike_again((0.5, 4.0), 5, 0.05) == 4.0
-    assert alike_again((0.5, 4.0), 4, 0.05) is None
+    assert find_repetition((0.5, 4.0), 5, 0.05) == 4.0
+    assert find_repetition((0.5, 4.0), 4, 0.05) is None

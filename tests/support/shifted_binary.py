@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from bodyscan.stripes.stripe_limits import StripeLimits
     from bodyscan.stripes.stripe_map import StripeMap
 
-DIGIT = ImageKind("digit", "digit{digit:02d}", "digit", most=16)
+DIGIT = ImageKind("digit", "digit{digit:02d}", "digit", max_count=16)
 
 
 class ShiftedBinary(StripeCode):
@@ -43,7 +43,7 @@ class ShiftedBinary(StripeCode):
     def decode(self, images: SequenceImages, limits: StripeLimits | None) -> StripeMap:
         import numpy as np
 
-        from bodyscan.stripes.index_image import decode_index
+        from bodyscan.stripes.numbered_stripes import decode_index
 
         digits = images.coded[DIGIT]
         middle = (images.lit.astype(float) + images.dark) / 2

@@ -1,4 +1,4 @@
-"""Stripes numbered in bits: one image per bit, and one of each bit's inverse if wanted.
+"""Gray and plain binary code: one image per bit, and one of each bit's inverse if wanted.
 
 With inverses a boundary is the crossing of two curves, whether the surface is black or white;
 without them, black must be known from a dark image.
@@ -18,17 +18,17 @@ from bodyscan.stripes.stripe_code import ImageKind, SequenceImages, StripeCode
 
 if TYPE_CHECKING:
     from bodyscan.arrays import Array
-    from bodyscan.stripes.bit_words import WordCode
+    from bodyscan.stripes.gray.bit_words import WordCode
     from bodyscan.stripes.stripe_limits import StripeLimits
     from bodyscan.stripes.stripe_map import StripeMap
 
-PATTERN = ImageKind("pattern", "bit{bit:02d}", "bit", most=16)
-INVERSE = ImageKind("inverse", "bit{bit:02d}-inverse", "bit", most=16)
-MOST_CODES = 1 << PATTERN.most
+PATTERN = ImageKind("pattern", "bit{bit:02d}", "bit", max_count=16)
+INVERSE = ImageKind("inverse", "bit{bit:02d}-inverse", "bit", max_count=16)
+MAX_CODES = 1 << PATTERN.max_count
 
 
 def bits_needed(words: int) -> int:
-    """Number of bits, and so of pattern images, for this many words (>= 2): ceil(log2(words))."""
+    """Compute the number of bits, and so of patterns, for this many words (>= 2): ceil(log2(words))."""
     return max(1, (words - 1).bit_length())
 
 
@@ -40,14 +40,14 @@ class _NumberedStripes(StripeCode):
     kinds: ClassVar = (PATTERN, INVERSE)
 
     inverses: bool = True
-    first_code: Annotated[int, Field(ge=0, lt=MOST_CODES)] = 0
+    first_code: Annotated[int, Field(ge=0, lt=MAX_CODES)] = 0
 
     def problems(self) -> Iterator[Problem]:
         yield from super().problems()
-        if self.first_code + self.stripes > MOST_CODES:
-            most = MOST_CODES - self.stripes
+        if self.first_code + self.stripes > MAX_CODES:
+            highest = MAX_CODES - self.stripes
             wrong = (
-                f"must be {most} or less: {self.stripes} stripes from there take more than 16 bits"
+                f"must be {highest} or less: {self.stripes} stripes from there need over 16 bits"
             )
             yield ("first_code",), f"{wrong} (got {self.first_code})"
 
@@ -100,13 +100,12 @@ class _NumberedStripes(StripeCode):
         return bright if kind == PATTERN else 1.0 - bright
 
     def decode(self, images: SequenceImages, limits: StripeLimits | None) -> StripeMap:
-        from bodyscan.stripes.bit_patterns import bit_lines, decode_bits
+        from bodyscan.stripes.gray.bit_patterns import decode_bits, lay_out
 
         patterns, inverses = images.coded[PATTERN], images.coded.get(INVERSE)
         frames = images.lit, images.dark, patterns, inverses
-        lines = bit_lines(*frames, self.direction, images.bands)
-        code, lit = self.word_code, images.lit
-        return decode_bits(code, lines, lit, self.stripes, limits)
+        lines = lay_out(*frames, self.direction, images.bands)
+        return decode_bits(self.word_code, lines, images.lit, self.stripes, limits)
 
 
 class Gray(_NumberedStripes):
@@ -116,7 +115,7 @@ class Gray(_NumberedStripes):
 
     @property
     def word_code(self) -> WordCode:
-        from bodyscan.stripes.bit_words import GRAY
+        from bodyscan.stripes.gray.bit_words import GRAY
 
         return replace(GRAY, first=self.first_code)
 
@@ -128,7 +127,7 @@ class Binary(_NumberedStripes):
 
     @property
     def word_code(self) -> WordCode:
-        from bodyscan.stripes.bit_words import BINARY
+        from bodyscan.stripes.gray.bit_words import BINARY
 
         return replace(BINARY, first=self.first_code)
 

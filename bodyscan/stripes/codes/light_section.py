@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from bodyscan.stripes.stripe_limits import StripeLimits
     from bodyscan.stripes.stripe_map import StripeMap
 
-STRIPE = ImageKind("stripe", "stripe{stripe:03d}", "stripe", most=1000)
+STRIPE = ImageKind("stripe", "stripe{stripe:03d}", "stripe", max_count=1000)
 
 
 class LightSection(StripeCode):
@@ -34,7 +34,7 @@ class LightSection(StripeCode):
         return np.asarray(np.floor(s) == np.arange(self.stripes)[:, None], float)
 
     def decode(self, images: SequenceImages, limits: StripeLimits | None) -> StripeMap:
-        from bodyscan.stripes.line_sweep import decode_sweep
+        from bodyscan.stripes.numbered_stripes import decode_sweep
 
         return decode_sweep(images.lit, images.coded[STRIPE], self.direction)
 

@@ -14,20 +14,14 @@ from pydantic import Field
 
 from bodyscan.files.model import Problem
 from bodyscan.stripes.codes.gray import INVERSE, PATTERN, bits_needed
-from bodyscan.stripes.stripe_code import ImageKind, SequenceImages, StripeCode
-from bodyscan.stripes.wave import Shift, Wave, alike_again
+from bodyscan.stripes.stripe_code import ImageKind, SequenceImages, Shift, StripeCode, Wave
 
 if TYPE_CHECKING:
     from bodyscan.arrays import Array, Greys
     from bodyscan.stripes.stripe_limits import StripeLimits
     from bodyscan.stripes.stripe_map import StripeMap
 
-PHASE = ImageKind("phase", "phase{step:02d}", "step", most=256)
-USUAL_PERIOD = 8.0
-
-LEAST_CHANGE = 0.004
-"""Share of a period: waves that change by less look the same to any camera (8 times the least sigma
-of a phase, so that an order can be found at all)."""
+PHASE = ImageKind("phase", "phase{step:02d}", "step", max_count=256)
 
 Steps = Annotated[int, Field(ge=3, le=64)]
 Period = Annotated[float, Field(ge=2, le=1e6)]
@@ -61,7 +55,7 @@ class PhaseShift(StripeCode):
     def problems(self) -> Iterator[Problem]:
         yield from super().problems()
         if self.period is not None and self.periods is not None:
-            yield ("periods",), "says again what period says: give one of the two"
+            yield ("periods",), "repeats what period gives: give one of the two"
             return
         lengths = self._lengths
         if isinstance(self.steps, tuple) and len(self.steps) != len(lengths):
@@ -77,13 +71,13 @@ class PhaseShift(StripeCode):
             wrong = f"must be {self.stripes} (stripes) or less (got {lengths[0]:g})"
             yield (key,), wrong
             return
-        again = alike_again(lengths, self.stripes, LEAST_CHANGE)
+        again = find_repetition(lengths, self.stripes)
         if again is not None:
             all_periods = ", ".join(f"{length:g}" for length in lengths)
             yield (
                 (key,),
-                f"does not tell all stripes apart: waves of {all_periods} stripes are alike again"
-                f" after {again:g} of {self.stripes}; one must cover all of them, or their beat",
+                f"does not distinguish all stripes: waves of {all_periods} stripes repeat after"
+                f" {again:g} of {self.stripes}; one must cover all of them, or their beat",
             )
 
     @property
@@ -93,7 +87,7 @@ class PhaseShift(StripeCode):
             counts = self.periods if isinstance(self.periods, tuple) else (self.periods,)
             return tuple(self.stripes / count for count in counts)
         if self.period is None:
-            return (min(USUAL_PERIOD, float(self.stripes)),)
+            return (min(8.0, float(self.stripes)),)
         return self.period if isinstance(self.period, tuple) else (self.period,)
 
     @property
@@ -139,14 +133,14 @@ class PhaseShift(StripeCode):
     def lit_from(self, coded: Mapping[ImageKind, Greys]) -> Greys:
         if self.needs_gray:
             return super().lit_from(coded)
-        from bodyscan.stripes.waves import white_image
+        from bodyscan.stripes.phase.waves import estimate_white_image
 
-        return white_image(coded[PHASE], self.waves)
+        return estimate_white_image(coded[PHASE], self.waves)
 
     def intensity(self, kind: ImageKind, s: Array) -> Array:
         import numpy as np
 
-        from bodyscan.stripes.bit_words import GRAY
+        from bodyscan.stripes.gray.bit_words import GRAY
 
         if kind == PHASE:
             return np.concatenate([
@@ -161,17 +155,34 @@ class PhaseShift(StripeCode):
         return bright if kind == PATTERN else 1.0 - bright
 
     def decode(self, images: SequenceImages, limits: StripeLimits | None) -> StripeMap:
-        from bodyscan.stripes.bit_patterns import bit_lines
-        from bodyscan.stripes.phase_steps import decode_phase
-        from bodyscan.stripes.phase_waves import decode_waves
+        from bodyscan.stripes.gray.bit_patterns import lay_out
+        from bodyscan.stripes.phase.decoding import decode_wave, decode_waves
 
         phases = images.coded[PHASE]
         if not self.needs_gray:
             return decode_waves(phases, self.waves, images.lit, self.direction, self.stripes)
         patterns, inverses = images.coded[PATTERN], images.coded.get(INVERSE)
-        lines = bit_lines(images.lit, images.dark, patterns, inverses, self.direction)
+        lines = lay_out(images.lit, images.dark, patterns, inverses, self.direction)
         (wave,) = self.waves
-        return decode_phase(lines, images.lit, phases, self.half_periods, wave, self.stripes)
+        return decode_wave(lines, images.lit, phases, self.half_periods, wave, self.stripes)
+
+
+def find_repetition(
+    periods: tuple[float, ...], stripes: int, min_change: float = 0.004
+) -> float | None:
+    """Find by how many stripes s can move, fewer than `stripes`, without any wave changing by as much
+    as `min_change` of its period; None if it cannot, in which case the waves determine s.
+
+    The default is 8 times the minimum sigma of a phase, so that an order can be found at all.
+    """
+    finest = min(periods)
+    for count in range(1, int(stripes / finest) + 1):
+        moved = count * finest
+        if moved >= stripes:
+            break
+        if all(abs(moved / period - round(moved / period)) < min_change for period in periods):
+            return moved
+    return None
 
 
 CODES = (PhaseShift,)

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from bodyscan.stripes.stripe_map import StripeMap
 
 INDEX = ImageKind("index", "index")
-LARGEST_NUMBER = 254
 
 
 class StripeIndex(StripeCode):
@@ -34,8 +33,8 @@ class StripeIndex(StripeCode):
 
     def problems(self) -> Iterator[Problem]:
         yield from super().problems()
-        if self.stripes > LARGEST_NUMBER:
-            wrong = f"must be {LARGEST_NUMBER} or less for stripe-index (got {self.stripes})"
+        if self.stripes > 254:
+            wrong = f"must be 254 or less for stripe-index (got {self.stripes})"
             yield ("stripes",), wrong
 
     @property
@@ -45,12 +44,12 @@ class StripeIndex(StripeCode):
     def intensity(self, kind: ImageKind, s: Array) -> Array:
         """Raises BadInput: there is nothing to project."""
         raise BadInput(
-            "a stripe-index image is what an instrument hands out: it projects stripes of its own",
+            "a stripe-index image is the output of an instrument that projects its stripes itself",
             remedy="choose another code for a projector that shows images",
         )
 
     def decode(self, images: SequenceImages, limits: StripeLimits | None) -> StripeMap:
-        from bodyscan.stripes.index_image import decode_index
+        from bodyscan.stripes.numbered_stripes import decode_index
 
         return decode_index(images.lit, images.coded[INDEX], self.direction, self.stripes)
 

@@ -1,0 +1,1 @@
+"""Decoding of Gray and plain binary codes."""

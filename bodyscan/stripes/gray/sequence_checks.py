@@ -1,0 +1,294 @@
+"""Checks that the frames of a sequence of bits are consistent."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.arrays import Floats, Greys, Mask
+from bodyscan.errors import DecodingFailed
+from bodyscan.stripes.gray.bit_words import WordCode
+from bodyscan.stripes.scan_lines import ScanLines
+from bodyscan.stripes.usable_pixels import SATURATED, check_direction, check_illumination
+
+Codes = NDArray[np.uint16]
+
+MIN_CONTRAST = 4
+FINE_BITS = 3
+"""The finest bits, which blur and noise may hide."""
+CLEAR_SIGMAS = 4.0
+"""Sigmas of pattern minus inverse beyond which noise alone cannot have decided a bit."""
+MIN_CHANGES = 50
+ORDER_REMEDY = (
+    "check that frames are in their order, that none is missing or taken twice, that pattern and "
+    "inverse lists are not exchanged, and that `stripes` and `first_code` are right"
+)
+
+
+def check_exposure(images: ScanLines) -> None:
+    """Raise DecodingFailed for frames that are black or overexposed.
+
+    The sum of a pattern and its inverse is not checked: cameras and projectors are non-linear, so
+    blurred patterns look brighter than sharp ones. Without an inverse, a pattern must nowhere be
+    brighter than lit or darker than dark, or its threshold would be wrong.
+    """
+    step = _sampling_step(images)
+    some = (slice(None, None, step), slice(None, None, step))
+    lit, dark = images.lit[some].astype(np.int16), images.dark[some].astype(np.int16)
+    contrast = lit - dark
+    bright = contrast >= MIN_CONTRAST
+    if np.mean(contrast <= -MIN_CONTRAST) > max(float(np.mean(bright)), 1e-3):
+        raise DecodingFailed(
+            "the dark frame is brighter than the lit frame",
+            remedy="check whether the names of the two are exchanged in the rig file",
+        )
+    check_illumination(bright, lit)
+    if images.inverses is not None:
+        return
+    bright &= lit < SATURATED
+    bright &= contrast >= np.median(contrast[bright])
+    light, black = (image[some][bright].astype(float) for image in (images.lit, images.dark))
+    for bit, pattern in enumerate(images.patterns):
+        level = pattern[some][bright].astype(float)
+        outside = np.maximum(np.maximum(level - light, black - level) - 4.0, 0.0)  # 4: noise
+        error = float(np.mean(np.minimum(outside / (light - black), 1.0)))
+        if error > 0.15:
+            raise DecodingFailed(
+                f"the pattern of bit {bit} is brighter than the lit frame or darker than the dark "
+                f"one (by {error:.0%} of their contrast)",
+                remedy="check whether it was exposed as they were",
+            )
+
+
+def _sampling_step(images: ScanLines) -> int:
+    """Step along and across lines at which some 50,000 pixels represent the image."""
+    return max(1, round(math.sqrt(images.lit.size / 50_000)))
+
+
+def check_words(
+    images: ScanLines, words: Codes, code: WordCode, stripes: int, variance: Floats
+) -> None:
+    """Raise DecodingFailed if frames are exchanged, lost or moved.
+
+    words: (L, P) code words as read.
+    variance: (256,) of each grey level.
+
+    Pattern and inverse must be of one bit. Where a code word changes from one pixel to the next, the
+    stripes must be neighbours: in Gray code, if just one bit differs, whichever it is. Along a line
+    of any camera stripes count one way; they do not if the first pattern is missing. Exchanging the
+    coarsest pattern and its inverse reverses the whole order; it shows only in codes beyond the last
+    stripe, and not at all if all codes are in use.
+    """
+    bits, step = len(images.patterns), _sampling_step(images)
+    contrast = cv2.subtract(images.lit, images.dark)
+    sample = contrast[::step, ::step]
+    # Darker pixels are misread too often to be evidence.
+    good = contrast >= np.median(sample[sample >= MIN_CONTRAST])
+    some = (slice(None, None, 2 * step), slice(None, None, 2 * step))
+    used = words[some][good[some]]
+    if images.inverses is not None:
+        patterns, inverses = images.patterns[:, *some], images.inverses[:, *some]
+        used = used[_check_pairs(patterns[:, good[some]], inverses[:, good[some]], variance)]
+    # Noise flips the finest bits both along and across lines.
+    coarse = words >> max(min(FINE_BITS, bits - FINE_BITS), 0)
+    check_direction(coarse, good, images.transposed)
+    shares = _share_in_step(images, words, good, code, variance)
+    # In a right sequence light that varied between frames, and rims, put up to half of a coarse
+    # bit's changes out of step, even where they are clear of noise.
+    min_share = 0.75 if images.inverses is None else 0.5 if code.single else 0.6
+    worst = min(shares, key=lambda bit: shares[bit], default=0)
+    if shares and shares[worst] < min_share:
+        raise DecodingFailed(
+            "the patterns do not make a stripe code: frames are exchanged, lost or moved (where bit "
+            f"{worst} changes, only {shares[worst]:.0%} of neighbouring pixels are in neighbouring "
+            "stripes)",
+            remedy=ORDER_REMEDY,
+        )
+    numbers = code.stripes(used)
+    beyond = float(np.mean((numbers < 0) | (numbers >= stripes))) if numbers.size else 0.0
+    if beyond > 0.05:
+        raise DecodingFailed(
+            "the patterns do not make a stripe code: frames are exchanged, lost or moved "
+            f"({beyond:.0%} of the codes lie beyond the last stripe)",
+            remedy=ORDER_REMEDY,
+        )
+    _check_folds(code.stripes(words[:: 2 * step]), good[:: 2 * step])
+
+
+def _check_pairs(patterns: Greys, inverses: Greys, variance: Floats) -> Mask:
+    """Raise DecodingFailed if a pattern (bits, N) and its inverse are not of one bit, or not seen.
+
+    Blur, non-linear grey levels, light from other surfaces and noise all weaken fine patterns more
+    than coarse ones. Where a fine bit is clear, so is every coarser one, except for the few pixels at
+    its own boundaries. A pattern that is paired with another bit's inverse, or with the lit or the
+    dark frame, is bright in both or dark in both over half of the image, whatever the exposure;
+    nothing else does that.
+
+    Returns where noise decided none but the finest bits, (N,).
+    """
+    bits = len(patterns)
+    contrast = np.abs(patterns.astype(np.float32) - inverses)
+    levels = (each.astype(np.uint8, copy=False) for each in (patterns, inverses))
+    sigma = np.sqrt(sum(variance[level] for level in levels))
+    clear = contrast >= CLEAR_SIGMAS * sigma
+    if contrast.shape[1] >= 200:
+        _check_visibility(patterns, inverses, contrast, clear)
+    finer, strong = contrast[-1], contrast[-1] >= 8.0 * sigma[-1]
+    for bit in range(bits - 2, -1, -1):
+        # Blurred stripes of the finest bit are a quarter as strong or less in a seventh of their
+        # width (2 asin(1/4) / pi), next to their boundaries; coarser ones in half as much.
+        weak = contrast[bit][strong] < 0.25 * finer[strong]
+        max_share = 0.35 if bit >= bits - FINE_BITS else 0.15
+        if weak.size >= 200 and np.mean(weak) > max_share:
+            raise DecodingFailed(
+                f"pattern and inverse look alike where finer ones differ clearly: bit {bit} "
+                f"({np.mean(weak):.0%} of the pixels)",
+                remedy="check whether a frame is missing, so that those behind it moved up, or "
+                "stands in another's place",
+            )
+        finer = np.maximum(finer, contrast[bit])
+        strong = strong | (contrast[bit] >= 8.0 * sigma[bit])
+    return np.asarray(clear[: max(bits - FINE_BITS, 1)].all(axis=0))
+
+
+def _check_visibility(patterns: Greys, inverses: Greys, contrast: Floats, clear: Mask) -> None:
+    """Raise DecodingFailed if a bit shows nowhere, or the finest pattern is brighter than its inverse
+    nearly everywhere.
+
+    contrast: |pattern - inverse| (bits, N).
+    clear: where noise alone cannot have decided a bit, (bits, N).
+    """
+    bits = len(patterns)
+    for bit, share in enumerate(clear.mean(axis=1)):
+        blurred = bit >= bits - FINE_BITS and _is_even_grey(patterns, inverses, bit)
+        if share < 0.02 and not blurred:
+            raise DecodingFailed(
+                f"pattern and inverse of bit {bit} look alike: they differ in {share:.1%} of the lit "
+                "pixels",
+                remedy="check whether one of the two is missing or was taken twice; if the stripes "
+                "are finer than camera or projector can show, leave the finest bit out (half the "
+                "stripes)",
+            )
+    coarse = max(bits - 1 - FINE_BITS, 0)
+    bright, coarse_bright = (np.mean(patterns[bit] > inverses[bit]) for bit in (bits - 1, coarse))
+    distinct = np.median(contrast[-1]) > 0.25 * np.median(contrast.max(axis=0))
+    if distinct and abs(coarse_bright - 0.5) < 0.35 <= abs(bright - 0.5):
+        raise DecodingFailed(
+            f"pattern {bits - 1} is {'brighter' if bright > 0.5 else 'darker'} than its inverse "
+            "nearly everywhere, though it is the finest",
+            remedy="check whether one of the two is missing, or another image stands in for it",
+        )
+
+
+def _is_even_grey(patterns: Greys, inverses: Greys, bit: int) -> bool:
+    """Whether a pattern is an even grey between the darkest and the brightest that each pixel sees.
+
+    Then projector or lens could not show its stripes, and the pixels are judged one by one; a
+    pattern used as its own inverse is black and white, or exactly equal to it.
+    """
+    if np.mean(patterns[bit] == inverses[bit]) > 0.9:
+        return False
+    low = np.minimum(patterns, inverses).min(axis=0).astype(np.float32)
+    high = np.maximum(patterns, inverses).max(axis=0)
+    level = (patterns[bit] - low) / np.maximum(high - low, 1.0)
+    first, middle, third = np.percentile(level, [25, 50, 75])
+    return bool(third - first < 0.3 < middle < 1.0)
+
+
+def _share_in_step(
+    images: ScanLines, words: Codes, good: Mask, code: WordCode, variance: Floats
+) -> dict[int, float]:
+    """Compute for each bit the share of its changes along lines that lead to a neighbouring stripe.
+
+    A change belongs to the coarsest bit that differs; bits with fewer than 50 changes are left out.
+    In Gray code with inverses only changes that are clear of noise count: noise flips single bits.
+    """
+    bits = len(images.patterns)
+    some = slice(None, None, 1 + words.size // 600_000)
+    difference = words[some, 1:] ^ words[some, :-1]
+    change = (difference != 0) & good[some, 1:] & good[some, :-1]
+    if code.single:
+        change &= difference & (difference - 1) == 0
+    line, x = np.nonzero(change)
+    bit = bits - np.frexp(difference[line, x].astype(np.float64))[1]
+    line *= some.step
+    shares = {}
+    for k in range(bits):
+        changes = np.flatnonzero(bit == k)
+        changes = changes[:: 1 + len(changes) // 2000]
+        here, masks = (line[changes], x[changes]), np.zeros(len(changes), np.uint16)
+        if code.single and images.inverses is not None:
+            clear, masks = _find_clear_changes(images, words, *here, k, variance)
+            here, masks = (here[0][clear], here[1][clear]), masks[clear]
+        if len(masks) >= MIN_CHANGES:
+            first, second = words[here] & ~masks, words[here[0], here[1] + 1] & ~masks
+            steps = np.abs(code.stripes(first) - code.stripes(second))
+            shares[k] = float(np.mean(steps == 1))
+    return shares
+
+
+def _find_clear_changes(
+    images: ScanLines,
+    words: Codes,
+    line: NDArray[np.intp],
+    x: NDArray[np.intp],
+    bit: int,
+    variance: Floats,
+) -> tuple[Mask, Codes]:
+    """Find changes of a bit between pixels (N,) and the next ones that are clear of noise and rims.
+
+    Every coarser bit and the next finer one must be clear in both pixels. Returned besides are masks
+    (N,) of the finer bits that noise may have flipped. A coarse bit must be clear and unchanged 4 px
+    to either side too: where it is weak throughout, noise flips it to and fro. Where the brightness
+    doubles, the change may be a rim, behind which another surface may show any stripe.
+    """
+    patterns, inverses = images.patterns, images.inverses
+    assert inverses is not None
+    bits, last = len(patterns), words.shape[1] - 1
+
+    def is_clear(k: int, at: NDArray[np.intp]) -> Mask:
+        pattern, inverse = patterns[k][line, at], inverses[k][line, at]
+        noise = variance[pattern.astype(np.uint8)] + variance[inverse.astype(np.uint8)]
+        step = pattern.astype(np.float32) - inverse.astype(np.float32)
+        return np.asarray(np.square(step) >= CLEAR_SIGMAS**2 * noise)
+
+    left, right = np.maximum(x - 4, 0), np.minimum(x + 5, last)
+    contrast = cv2.subtract(images.lit, images.dark)
+    sides = [contrast[line, each].astype(np.float32) for each in (left, right)]
+    clear = np.maximum(*sides) <= 2.0 * np.minimum(*sides)
+    masks = np.zeros(len(line), np.uint16)
+    for k in range(bits):
+        if k != bit:
+            unclear = ~(is_clear(k, x) & is_clear(k, x + 1))
+            if k <= bit + 1:
+                clear &= ~unclear
+            else:
+                masks = np.where(unclear & (masks == 0), np.uint16((1 << (bits - k)) - 1), masks)
+    if bit == bits - 1:
+        clear[:] = False  # any two words that differ in the finest bit are neighbours
+    elif bit < bits - FINE_BITS:
+        mask = np.uint16(1 << (bits - 1 - bit))
+        clear &= (x >= 4) & (x + 5 <= last) & is_clear(bit, left) & is_clear(bit, right)
+        for near, far in ((x, left), (x + 1, right)):
+            clear &= (words[line, near] ^ words[line, far]) & mask == 0
+    return clear, masks
+
+
+def _check_folds(stripes: NDArray[np.int32], good: Mask) -> None:
+    """Raise DecodingFailed if stripes (L, P) count up and down along lines: a pattern is missing."""
+    reach = 16
+    jumps = np.cumsum(np.abs(np.diff(stripes, axis=1)) > 1, axis=1)
+    gain = stripes[:, reach + 1 :] - stripes[:, 1:-reach]
+    whole = jumps[:, reach:] == jumps[:, :-reach]
+    # More than two stripes over 16 pixels without a jump: more than misread pixels give.
+    known = whole & (np.abs(gain) >= 3) & good[:, reach + 1 :] & good[:, 1:-reach]
+    up, down = np.count_nonzero(gain[known] > 0), np.count_nonzero(gain[known] < 0)
+    if min(up, down) > max(0.15 * (up + down), MIN_CHANGES):
+        raise DecodingFailed(
+            "the patterns do not make a stripe code: stripes count up and down in turn "
+            f"({min(up, down) / (up + down):.0%} of the pixels against the others)",
+            remedy="check whether the pattern of bit 0 is missing or another one stands in for it",
+        )

@@ -1,0 +1,345 @@
+"""Stripes decoded from waves: one with a Gray code of its half periods, or several of other periods."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import cv2
+import numpy as np
+
+from bodyscan.arrays import Floats, Greys, Mask
+from bodyscan.errors import DecodingFailed
+from bodyscan.stripes.gray.bit_patterns import read_words
+from bodyscan.stripes.gray.bit_words import GRAY
+from bodyscan.stripes.grey_noise import measure_noise
+from bodyscan.stripes.phase.phase_order import PhaseOrder, find_phase_order
+from bodyscan.stripes.phase.projector_response import (
+    MIN_PERIODS,
+    PhaseError,
+    compute_response_share,
+    correct_wave,
+    estimate_error,
+    estimate_error_against,
+)
+from bodyscan.stripes.phase.waves import (
+    MeasuredWave,
+    convert_like,
+    estimate_white_and_black,
+    measure_wave,
+    measure_wave_noise,
+    split_waves,
+)
+from bodyscan.stripes.scan_lines import ScanLines, transpose
+from bodyscan.stripes.stripe_code import Shift, Wave
+from bodyscan.stripes.stripe_map import StripeMap, assemble_from_pixels
+from bodyscan.stripes.usable_pixels import (
+    MIN_CONTRAST_TO_NOISE,
+    SATURATED,
+    check_direction,
+    check_illumination,
+    find_code_jumps,
+    find_half_covered_pixels,
+    find_usable_pixels,
+    min_contrast,
+)
+
+CORRELATION_PX = 1.2
+"""Distance within which neighbours share noise after `smooth_phase`: the fit keeps all that varies
+slowly, so a mean of many pixels is as noisy as before."""
+MIN_SHARE_AGREED = 0.6
+MAX_OFFSET = 0.06
+"""Share of the finest period, between waves overall; the smallest wrong start, 30 degrees, gives
+0.083 of it for any whole ratio of their periods except 12 k + 1."""
+
+
+def decode_wave(
+    images: ScanLines, lit: Greys, phases: Greys, half_periods: int, wave: Wave, stripes: int
+) -> StripeMap:
+    """Compute the stripe map from one wave and a Gray code of its half periods.
+
+    images: scan lines of the Gray code.
+    lit: (H, W) in the camera's layout.
+    phases: (steps, H, W), the images of the wave.
+
+    Near its own boundaries the Gray code's word is off by at most one, so the middle of its half
+    period is never half a period from s, and the period whose phase is nearest to it is the right
+    one. Raises DecodingFailed if the images are inconsistent.
+    """
+    variance = measure_noise(images)
+    halves = GRAY.stripes(read_words(GRAY, images, half_periods, variance))
+    fine_bit = GRAY.bit_two_wide(len(images.patterns))
+    usable, _ = find_usable_pixels(images, halves, variance, half_periods, fine_bit)
+    phases = transpose(phases) if images.transposed else phases
+    check_wave_images(images, phases, usable)
+    measured = measure_wave(phases, wave)
+    noise = np.sqrt(variance[np.clip(measured.mean, 0, 255).astype(np.uint8)])
+    least = min_contrast(phases.dtype) / 2.0
+    usable &= measured.amplitude >= np.maximum(least, MIN_CONTRAST_TO_NOISE * noise)
+    coarse = (halves.astype(np.float32) + 0.5) / 2.0
+    check_phase(measured.turn, coarse, usable)
+    error = estimate_error(measured, usable, stripes)
+    turn = correct_wave(measured, error).turn
+    period = np.float32(wave.period)
+    s = (turn + np.rint(coarse - turn)) * period
+    sigma = measured.sigma(noise)
+    s[~usable] = np.nan
+    s, sigma = smooth_phase(s, np.where(usable, sigma * period, np.float32(np.nan)))
+    result = assemble_from_pixels(images, lit, s, sigma, variance, stripes)
+    response = compute_response_share(error, measured, result.sigma)
+    return replace(result, response=response, correlation_px=(CORRELATION_PX, CORRELATION_PX))
+
+
+def check_wave_images(images: ScanLines, waves: Greys, usable: Mask) -> None:
+    """Raise DecodingFailed if an image of a wave is missing, taken twice or exposed differently.
+
+    Over the image, each is half as bright as the lit one, and so are all together at each pixel.
+    """
+    if not usable.any():
+        return
+    dark, contrast = images.dark[usable], images.contrast[usable]
+    levels = (waves[:, usable].astype(np.float32) - dark) / contrast
+    for step, level in enumerate(levels):
+        if abs(np.mean(level) - 0.5) > 0.3:
+            raise DecodingFailed(
+                f"phase image {step} is {np.mean(level):.0%} as bright as lit, not about half",
+                remedy="check whether it is missing or was exposed differently",
+            )
+    strength = float(np.percentile(np.abs(levels - 0.5), 90))
+    _check_distinct(levels, strength, "phase images {} and {} look alike")
+    error = np.median(np.abs(levels.mean(axis=0) - 0.5))
+    if error > 0.15:
+        raise DecodingFailed(
+            f"the phase images' mean is not the middle of lit and dark (off by {error:.0%})",
+            remedy="check whether all of them were exposed as the lit image was",
+        )
+
+
+def _check_distinct(images: Floats, strength: float, message: str) -> None:
+    """Raise DecodingFailed if two images (N, M) of a wave differ by a tenth of what they should.
+
+    Two neighbours of N differ by sin(pi / N) on average, times their strength.
+    """
+    for first, second in combinations(range(len(images)), 2):
+        difference = float(np.mean(np.abs(images[first] - images[second])))
+        if difference < 0.1 * strength * np.sin(np.pi / len(images)):
+            raise DecodingFailed(
+                message.format(first, second),
+                remedy="check whether one of the two is missing or was taken twice",
+            )
+
+
+def check_phase(turn: Floats, coarse: Floats, usable: Mask) -> None:
+    """Raise DecodingFailed if phases are outside their half periods, or jump between them.
+
+    turn: (L, P) of the wave.
+    coarse: (L, P) middles of the half periods, turns.
+    """
+    change = (np.abs(np.diff(coarse, axis=1)) == 0.5) & usable[:, 1:] & usable[:, :-1]
+    line, x = np.nonzero(change)
+    if not len(line):
+        return
+    offset = turn[usable] - coarse[usable]
+    outside = float(np.mean(np.abs(offset - np.rint(offset)) > 0.3))  # a right one: 1/4 at most
+    pixels = np.stack([x, x + 1])
+    before, behind = turn[line, pixels] + np.rint(coarse[line, pixels] - turn[line, pixels])
+    wrong = max(outside, float(np.mean(np.abs(behind - before) > 0.6)))
+    if wrong > 0.15:
+        raise DecodingFailed(
+            f"the phase does not match the Gray code at {wrong:.0%} of the pixels",
+            remedy="check whether the images are in their order, and `steps`, `period`, `start_deg` "
+            "and `shift` right",
+        )
+
+
+def smooth_phase(s: Floats, sigma: Floats) -> tuple[Floats, Floats]:
+    """Smooth s (L, P), NaN where there is none, by a quadratic fitted to 3 x 3 pixels; returns it
+    and its standard deviation.
+
+    The fit preserves whatever changes only along lines or only along columns, however sharply; it
+    removes only what changes from pixel to pixel both ways, which a lens and a pixel blur away on any
+    surface. Where it would change s by more than four sigmas there is an edge: s is kept. Source:
+    Savitzky and Golay, Analytical Chemistry 36 (1964), in two dimensions.
+    """
+    weights = np.array([[-1, 2, -1], [2, 5, 2], [-1, 2, -1]], np.float32) / np.float32(9.0)
+    gain = np.float32(np.sqrt(np.sum(np.square(weights))))
+    fitted = cv2.filter2D(s, cv2.CV_32F, weights, borderType=cv2.BORDER_CONSTANT)
+    fitted[[0, -1]] = np.nan
+    fitted[:, [0, -1]] = np.nan
+    kept = np.abs(fitted - s) <= 4.0 * sigma
+    return np.where(kept, fitted, s), np.where(kept, gain * sigma, sigma)
+
+
+def decode_waves(
+    images: Greys, waves: tuple[Wave, ...], lit: Greys, direction: str, stripes: int
+) -> StripeMap:
+    """Compute the stripe map from waves of several periods: s from their phases, black and white
+    from their means and amplitudes.
+
+    images: (F, H, W), those of each wave in the order of `waves`.
+    lit: (H, W).
+
+    Raises DecodingFailed if the images are inconsistent.
+    """
+    transposed = direction == "horizontal"
+    lines = transpose(images) if transposed else images
+    read = WaveReading.from_images(lines, waves, stripes)
+    check_illumination(read.bright, read.brightest)
+    check_several_waves(read, stripes)
+    if not is_consistent(read.order):
+        raise _explain_inconsistency(lines, waves, stripes, read)
+    order, finest = read.order, read.waves[0]
+    halves = np.floor(2.0 * np.nan_to_num(order.s) / finest.wave.period).astype(np.int32)
+    check_direction(halves, order.certain, transposed)
+    usable = order.certain & ~find_code_jumps(halves, order.certain)
+    s = np.where(usable, order.s, np.float32(np.nan))
+    sigma = np.where(usable, order.sigma, np.float32(np.nan))
+    s, sigma = smooth_phase(s, sigma)
+    light = ScanLines(read.white, read.black, lines[:0], None, transposed)
+    result = assemble_from_pixels(light, lit, s, sigma, read.variance, stripes)
+    response = compute_response_share(read.errors[0], finest, result.sigma)
+    return replace(result, response=response, correlation_px=(CORRELATION_PX, CORRELATION_PX))
+
+
+@dataclass(frozen=True, eq=False)
+class WaveReading:
+    """Waves measured along scan lines (L, P).
+
+    waves: the finest first, with their errors removed.
+    images: of each wave.
+    errors: of each wave.
+    bright: clearly lit.
+    brightest: of all images.
+    variance: (256,) of each grey level.
+    """
+
+    waves: list[MeasuredWave]
+    images: list[Greys]
+    errors: list[PhaseError | None]
+    bright: Mask
+    brightest: Greys
+    white: Greys
+    black: Greys
+    variance: Floats
+    order: PhaseOrder
+
+    @staticmethod
+    def from_images(lines: Greys, waves: tuple[Wave, ...], stripes: int) -> WaveReading:
+        """Measure waves in images (F, L, P), correct them for the projector's response and find s."""
+        stacks = split_waves(lines, waves)
+        both = sorted(zip(waves, stacks, strict=True), key=lambda each: each[0].period)
+        images = [stack for _, stack in both]
+        measured = [measure_wave(stack, wave) for wave, stack in both]
+        brightest = lines.max(axis=0)
+        white, black = estimate_white_and_black(measured)
+        contrast = np.min([2.0 * wave.amplitude for wave in measured], axis=0)
+        bright = contrast >= min_contrast(lines.dtype)
+        variance = measure_wave_noise(measured, images, bright & (brightest < SATURATED))
+        noise = np.sqrt(variance[np.clip(np.rint(measured[0].mean), 0, 255).astype(np.uint8)])
+        bright = bright & (contrast >= np.float32(2.0 * MIN_CONTRAST_TO_NOISE) * noise)
+        usable = bright & (brightest < SATURATED)
+        usable &= ~find_half_covered_pixels(contrast, bright)
+        errors = [estimate_error(wave, usable, stripes) for wave in measured]
+        corrected = [correct_wave(*each) for each in zip(measured, errors, strict=True)]
+        for k in range(1, len(corrected)):
+            if errors[k] is None:
+                errors[k] = estimate_error_against(corrected[k], corrected[0], usable, stripes)
+                corrected[k] = correct_wave(corrected[k], errors[k])
+        sigmas = [wave.sigma(noise) for wave in corrected]
+        order = find_phase_order(corrected, sigmas, usable, stripes)
+        light = convert_like(white, lines), convert_like(black, lines)
+        return WaveReading(corrected, images, errors, bright, brightest, *light, variance, order)
+
+
+def check_several_waves(read: WaveReading, stripes: int) -> None:
+    """Raise DecodingFailed if an image is missing, taken twice or exposed differently.
+
+    All waves have the same mean at each pixel (lamps and sensors drift by less than 15 %), and no
+    two images of a wave are the same.
+    """
+    good = read.bright & (read.brightest < SATURATED)
+    if not good.any():
+        return
+    finest = read.waves[0]
+    for wave, images in zip(read.waves, read.images, strict=True):
+        ratio = float(np.median(wave.mean[good] / finest.mean[good]))
+        if abs(ratio - 1.0) > 0.15:
+            raise DecodingFailed(
+                f"the images of the wave of {wave.wave.period:g} stripes are on average {ratio:.2f} "
+                f"times as bright as those of the wave of {finest.wave.period:g}",
+                remedy="check whether one of them is missing, or was exposed differently",
+            )
+        if wave.wave.period * MIN_PERIODS <= stripes:  # on a small subject longer ones may be alike
+            message = f"images {{}} and {{}} of the wave of {wave.wave.period:g} stripes look alike"
+            strength = float(np.median(wave.amplitude[good]))
+            _check_distinct(images[:, good].astype(np.float32), strength, message)
+
+
+def is_consistent(order: PhaseOrder) -> bool:
+    """Whether the waves of most pixels agree, and not by being shifted all over the image."""
+    offset = max(map(abs, order.offsets), default=0.0)
+    return order.agreed >= MIN_SHARE_AGREED and offset < MAX_OFFSET
+
+
+def _explain_inconsistency(
+    lines: Greys, waves: tuple[Wave, ...], stripes: int, read: WaveReading
+) -> DecodingFailed:
+    """The error to raise if the waves of most pixels do not agree, with keys that would fit."""
+    rows = np.flatnonzero(read.bright.sum(axis=1) > 0)
+    some = lines[:, rows[:: max(1, len(rows) // 20)]]  # enough to try some sixty descriptions
+    orders = (
+        (key, WaveReading.from_images(some, tried, stripes).order)
+        for key, tried in list_other_keys(waves, stripes)
+    )
+    fitting = [(order.misfit, key) for key, order in orders if is_consistent(order)]
+    best = min((misfit for misfit, _ in fitting), default=0.0)
+    # Keys that mirror all stripes fit as well as those that do not: report both.
+    keys = [key for misfit, key in fitting if misfit <= 1.3 * best][:2]
+    what = f"the phases of the waves agree at only {read.order.agreed:.0%} of the pixels"
+    if read.order.agreed >= MIN_SHARE_AGREED:
+        what = f"the waves begin {max(read.order.offsets, key=abs):.2f} of a period apart"
+    remedy = "check whether the images are in their order, and `steps`, `period` or `periods`, "
+    remedy += "`start_deg` and `shift` right"
+    return DecodingFailed(
+        what, remedy="the images would fit " + " or ".join(keys) if keys else remedy
+    )
+
+
+def list_other_keys(
+    waves: tuple[Wave, ...], stripes: int
+) -> Iterator[tuple[str, tuple[Wave, ...]]]:
+    """List other values of the keys in the rig file, as people mistake them, and their waves.
+
+    Starts in steps of 30 degrees are for waves that are written as sines, or begin in the middle of a
+    step; both shifts; periods near the given ones, twice and half of them.
+    """
+    other: Shift = "backward" if waves[0].shift == "forward" else "forward"
+    for start in range(30, 360, 30):
+        moved = tuple(replace(wave, start=wave.start + math.radians(start)) for wave in waves)
+        degrees = (math.degrees(moved[0].start) + 180.0) % 360.0 - 180.0
+        yield f"`start_deg: {degrees:g}`", moved
+        back = tuple(replace(wave, shift=other) for wave in moved)
+        yield f"`shift: {other}` with `start_deg: {degrees:g}`", back
+    yield f"`shift: {other}`", tuple(replace(wave, shift=other) for wave in waves)
+    for k, wave in enumerate(waves):
+        for key, period in _list_other_periods(wave.period, stripes):
+            yield key, (*waves[:k], replace(wave, period=period), *waves[k + 1 :])
+
+
+def _list_other_periods(period: float, stripes: int) -> Iterator[tuple[str, float]]:
+    """Periods near the given one, twice and half of it, as people write them: whole numbers of
+    periods in all stripes, or of stripes in a period."""
+    for key, given in (("periods", stripes / period), ("period", period)):
+        whole = round(given)
+        if whole < 2 or abs(given - whole) > 1e-6 * given:
+            continue
+        reach = max(4, round(0.1 * whole))
+        near = range(max(2, whole - reach), min(whole + reach, stripes // 2) + 1)
+        twice = 2 * whole if 2 * whole <= stripes // 2 else whole
+        half = whole // 2 if whole % 2 == 0 and whole > 2 else whole
+        for other in dict.fromkeys((*near, twice, half)):
+            if other != whole:
+                length = stripes / other if key == "periods" else float(other)
+                yield f"`{key}` with {other} in place of {whole}", length

@@ -1,0 +1,143 @@
+"""Phase, amplitude and noise of waves of light, shifted by a part of their period from image to image.
+
+Image k of N shows 1/2 + 1/2 cos(phi - 2 pi k / N), so that, whatever the surface's brightness,
+
+    phi = atan2(sum I_k sin(2 pi k / N), sum I_k cos(2 pi k / N)).
+
+Source: Creath, Phase-measurement interferometry techniques, Progress in Optics 26 (1988).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from bodyscan.arrays import Array, Floats, Greys, Indices, Mask
+from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
+from bodyscan.stripes.grey_noise import BANDS, MIN_PIXELS, fit_variance
+from bodyscan.stripes.stripe_code import Wave
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredWave:
+    """One wave at the pixels (L, P).
+
+    turn: s / period modulo 1.
+    amplitude, mean: grey levels, at least 1e-3.
+    """
+
+    wave: Wave
+    turn: Floats
+    amplitude: Floats
+    mean: Floats
+
+    def sigma(self, noise: Floats) -> Floats:
+        """Compute the standard deviation (L, P) of `turn`; noise: of one image's grey levels.
+
+        5e-4 of a period is left by rounding and by light that is not quite a wave.
+        """
+        by_noise = noise / (self.amplitude * np.float32(np.pi * np.sqrt(2.0 * self.wave.steps)))
+        return np.hypot(by_noise, np.float32(5e-4))
+
+
+def measure_wave(images: Greys, wave: Wave) -> MeasuredWave:
+    """Measure a wave in its images (steps, L, P)."""
+    angle = 2.0 * np.pi * np.arange(len(images)) / len(images)
+    if wave.shift == "backward":
+        angle = -angle
+    sine, cosine, mean = (
+        np.einsum("nlp,n->lp", images, weight.astype(np.float32))
+        for weight in (np.sin(angle), np.cos(angle), np.full(len(images), 1.0 / len(images)))
+    )
+    amplitude = np.hypot(sine, cosine) * np.float32(2.0 / len(images))
+    turn = np.arctan2(sine, cosine) / np.float32(2.0 * np.pi) + np.float32(wave.first_turn)
+    floor = np.float32(1e-3)
+    return MeasuredWave(wave, turn % np.float32(1.0), np.maximum(amplitude, floor), mean)
+
+
+def estimate_white_and_black(waves: Sequence[MeasuredWave]) -> tuple[Floats, Floats]:
+    """Estimate the grey levels under all of the projector's light, and under none of it."""
+    white = np.mean([wave.mean + wave.amplitude for wave in waves], axis=0)
+    black = np.mean([wave.mean - wave.amplitude for wave in waves], axis=0)
+    return np.minimum(white, 255.0), np.maximum(black, 0.0)
+
+
+def estimate_white_image(images: Greys, waves: tuple[Wave, ...]) -> Greys:
+    """Estimate the image under all of the projector's light, (H, W), from images (F, H, W) of
+    waves."""
+    parts = zip(split_waves(images, waves), waves, strict=True)
+    white, _ = estimate_white_and_black([measure_wave(part, wave) for part, wave in parts])
+    return convert_like(white, images)
+
+
+def convert_like(grey: Floats, images: Greys) -> Greys:
+    """Convert grey levels to the type of the images."""
+    return np.rint(grey).astype(np.uint8) if images.dtype == np.uint8 else grey
+
+
+def split_waves(images: Greys, waves: tuple[Wave, ...]) -> list[Greys]:
+    """Split images into those (F, L, P) of each wave, which follow each other."""
+    ends = np.cumsum([0, *(wave.steps for wave in waves)])
+    return [images[first:end] for first, end in pairwise(ends)]
+
+
+def measure_wave_noise(
+    waves: Sequence[MeasuredWave], images: Sequence[Greys], usable: Mask
+) -> Floats:
+    """Measure the variance (256,) of one image's grey level, for each grey level.
+
+    Several waves, or more than three steps of one, give the surface's mean brightness and the shape
+    of a wave more than once; the differences are noise.
+
+    waves, images: the waves, and the images (N, L, P) of each.
+    usable: (L, P) pixels that the projector lights.
+    """
+    some = np.flatnonzero(usable)
+    some = some[:: max(1, len(some) // 300_000)]
+    # Sorted by the mean of all images, which is independent of the difference of two waves' means.
+    steps = [wave.wave.steps for wave in waves]
+    level = np.average([wave.mean.ravel()[some] for wave in waves], axis=0, weights=steps)
+    misfits = list(_compute_misfits(waves, images, some))
+    bands = [band for band in np.array_split(np.argsort(level), BANDS) if misfits]
+    bands = [band for band in bands if len(band) >= MIN_PIXELS]
+    grey = np.array([np.mean(level[band]) for band in bands])
+    variance = np.array(
+        [np.mean([_estimate_variance(each[band]) for each in misfits]) for band in bands]
+    )
+    return fit_variance(grey, variance, np.ones(len(bands)), images[0].dtype)
+
+
+def _compute_misfits(
+    waves: Sequence[MeasuredWave], images: Sequence[Greys], some: Indices
+) -> Iterator[Array]:
+    """Quantities at some pixels that are zero without noise, each with one image's variance."""
+    for first, second in pairwise(waves):
+        difference = first.mean.ravel()[some] - second.mean.ravel()[some]
+        yield difference / np.sqrt(1.0 / first.wave.steps + 1.0 / second.wave.steps)
+    for wave, stack in zip(waves, images, strict=True):
+        if wave.wave.steps > 3:
+            yield _compute_wave_misfit(wave, stack, some)
+
+
+def _compute_wave_misfit(wave: MeasuredWave, images: Greys, some: Indices) -> Array:
+    """A component of the images orthogonal to mean and wave, less the harmonics 2 to 4 of the
+    projector's response."""
+    step = np.arange(wave.wave.steps)
+    turn = 2.0 * np.pi * step / wave.wave.steps
+    known = np.stack([np.ones(len(step)), np.cos(turn), np.sin(turn)])
+    weights = np.linalg.svd(known)[2][-1]
+    misfit = np.asarray(weights @ images.reshape(len(images), -1)[:, some])
+    phase = 2.0 * np.pi * wave.turn.ravel()[some]
+    amplitude = wave.amplitude.ravel()[some]
+    shapes = np.stack([amplitude * f(h * phase) for h in (2, 3, 4) for f in (np.cos, np.sin)], 1)
+    return np.asarray(misfit - shapes @ np.linalg.lstsq(shapes, misfit, rcond=None)[0])
+
+
+def _estimate_variance(misfit: Array) -> float:
+    """Variance about the mean, without outliers (a surface's edge, something that moved)."""
+    deviation = np.abs(misfit - np.median(misfit))
+    limit = 4.0 * SIGMAS_PER_MEDIAN * max(float(np.median(deviation)), 1e-3)
+    return float(np.var(misfit[deviation <= limit]))
