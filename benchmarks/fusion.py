@@ -457,7 +457,7 @@ def _scan_of(workspace: Path) -> tuple[Any, Any]:
 
 def _spacing(cloud: BodyCloud) -> float:
     """Voxel size that gives about as many points as ours."""
-    from bodyscan.fusion.thinning import voxel_size_for
+    from bodyscan.fusion.voxel_thinning import voxel_size_for
 
     return voxel_size_for(cloud.points.astype(np.float32), len(cloud.points))
 

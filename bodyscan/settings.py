@@ -107,7 +107,7 @@ class MeshSettings(Model):
 
 
 class UseLimits(Model):
-    """What a scan is used for: how wrong a girth of the trunk may be (`fusion.scan_verdict`).
+    """What a scan is used for: how wrong a girth of the trunk may be (`fusion.verdict`).
 
     A surface 1 mm off all round makes a girth wrong by 6.3 mm, so the limits come to 0.32 and
     0.64 mm between the surfaces of two pairs.

@@ -16,9 +16,9 @@ import numpy as np
 
 from bodyscan.arrays import Array, Bytes, Floats
 from bodyscan.compiled import compiled
-from bodyscan.fusion.evidence import Evidence
+from bodyscan.fusion.consistency import Consistency
 from bodyscan.fusion.smoothing import SmoothSurface
-from bodyscan.fusion.thinning import Samples
+from bodyscan.fusion.voxel_thinning import Samples
 
 DARKEST, BRIGHTEST = 8, 250
 """Grey levels beyond which a pixel says nothing about the light."""
@@ -37,7 +37,7 @@ class EvenGrey:
 
 
 def even_brightness(
-    samples: Samples, surfaces: Sequence[SmoothSurface], evidence: Sequence[Evidence]
+    samples: Samples, surfaces: Sequence[SmoothSurface], consistency: Sequence[Consistency]
 ) -> EvenGrey:
     """Grey levels as if all pairs were exposed alike and lit the body evenly."""
     centres = [surface.rig_from_camera.translation for surface in surfaces]
@@ -52,7 +52,7 @@ def even_brightness(
             for part, centre in zip(own, centres, strict=True)
         ]
     )
-    overlaps = _overlaps(samples, surfaces, evidence, of_samples, of_surfaces)
+    overlaps = _overlaps(samples, surfaces, consistency, of_samples, of_surfaces)
     power = light_power([(overlap.ratio, overlap.shade) for overlap in overlaps])
     ratios = [(o.a, o.b, float(np.median(o.ratio - power * o.shade)), o.spots) for o in overlaps]
     gain = gains(ratios, len(surfaces))
@@ -94,12 +94,12 @@ class _Overlap:
 def _overlaps(
     samples: Samples,
     surfaces: Sequence[SmoothSurface],
-    evidence: Sequence[Evidence],
+    consistency: Sequence[Consistency],
     of_samples: Floats,
     of_surfaces: Sequence[Floats],
 ) -> list[_Overlap]:
     found = []
-    for b, (surface, one) in enumerate(zip(surfaces, evidence, strict=True)):
+    for b, (surface, one) in enumerate(zip(surfaces, consistency, strict=True)):
         starts = np.searchsorted(one.index, samples.starts)
         for a, (start, end) in enumerate(pairwise(starts)):
             step = 1 + (end - start) // SPOTS

@@ -43,7 +43,7 @@ class Crown:
     offsets: Array
 
     @staticmethod
-    def of(points: Array, normals: Array | Floats) -> Crown:
+    def from_cloud(points: Array, normals: Array | Floats) -> Crown:
         """The crown of a body's points (N, 3), z up, with normals (N, 3)."""
         highest = points[np.argmax(points[:, 2])]
         near = points[:, 2] > highest[2] - DOME_MM

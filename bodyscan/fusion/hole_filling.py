@@ -86,7 +86,7 @@ def likely_distances(
     guess = np.maximum(fill_harmonically(values, fixed, least, SURE * reach), -height)
     free = _seen_through(guess, measured, bricks, range_images, rig_from_camera, workers)
     least[free] = 0.5 * cell_mm
-    _hold_crown(least, guess, measured, bricks, Crown.of(cloud.points, cloud.normals))
+    _hold_crown(least, guess, measured, bricks, Crown.from_cloud(cloud.points, cloud.normals))
     if np.isfinite(least).any():
         _mirror(least, below, ~measured)
         guess = np.maximum(fill_harmonically(values, fixed, least, SURE * reach), -height)

@@ -1,4 +1,4 @@
-"""Merge aligned range images into one cloud: smooth each, thin, average what several pairs saw.
+"""Merge aligned range images into one cloud: smooth each, thin, average what several pairs measured.
 
 Neighbours are found on pixel grids: inside an image by its own grid, in another image by
 projecting the point into it. No search tree is built.
@@ -9,13 +9,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, NamedTuple
 
-from bodyscan.fusion.averaging import average
-from bodyscan.fusion.brightness import even_brightness
-from bodyscan.fusion.contradictions import Contradictions
-from bodyscan.fusion.evidence import compare
-from bodyscan.fusion.smoothing import smooth
-from bodyscan.fusion.thinning import take_samples
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.arrays import Array, Bytes, Floats
+from bodyscan.compiled import compiled
+from bodyscan.fusion.brightness import EvenGrey, even_brightness
+from bodyscan.fusion.consistency import Consistency, Contradictions, compare_with_surface
+from bodyscan.fusion.quadratic_fit import NORMAL_MEDIAN
+from bodyscan.fusion.smoothing import Numbers, SmoothSurface, smooth
+from bodyscan.fusion.voxel_thinning import Samples, take_samples
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud
@@ -26,7 +32,7 @@ from bodyscan.settings import FusionSettings
 
 @dataclass(frozen=True, eq=False)
 class MergedCloud:
-    """A cloud, and what the pairs said against each other's points."""
+    """A cloud, and how much the pairs contradict each other's points."""
 
     cloud: BodyCloud
     contradictions: Contradictions
@@ -42,7 +48,7 @@ def merge(
 ) -> MergedCloud:
     """Merge aligned, cleaned range images into one even cloud of about `settings.points` points.
 
-    poses: how well the pairs' poses are known; None for exactly. See `averaging.scatter`.
+    poses: how well the pairs' poses are known; None for exactly. See `estimate_excess`.
 
     Surfaces of two pairs within `settings.agreement_mm` along the normal are averaged by weight;
     between that and `settings.double_mm` they are a double surface, of which the heavier one stays.
@@ -53,21 +59,179 @@ def merge(
             lambda image: smooth(image, rig_from_camera[image.pair], settings.window_mm),
             range_images,
         )
-        shown = {
-            image.pair: surface
-            for image, surface in zip(range_images, smoothed, strict=True)
-            if surface is not None
-        }
-        surfaces = list(shown.values())
+        surfaces = [surface for surface in smoothed if surface is not None]
         samples = take_samples(surfaces, settings.points)
         compared = pool.map(
-            lambda number: compare(
+            lambda number: compare_with_surface(
                 samples, surfaces[number], number, settings.agreement_mm, settings.double_mm
             ),
             range(len(surfaces)),
         )
-        evidence = list(compared)
-    grey = even_brightness(samples, surfaces, evidence)
-    cloud = average(samples, surfaces, evidence, grey, poses, workers)
-    found = Contradictions.of(list(shown), evidence, samples, surfaces, settings.agreement_mm)
-    return MergedCloud(cloud, found)
+        consistency = list(compared)
+    grey = even_brightness(samples, surfaces, consistency)
+    cloud = average(samples, surfaces, consistency, grey, poses, workers)
+    pairs = [surface.pair for surface in surfaces]
+    contradictions = Contradictions.count(
+        pairs, consistency, samples, surfaces, settings.agreement_mm
+    )
+    return MergedCloud(cloud, contradictions)
+
+
+def average(
+    samples: Samples,
+    surfaces: Sequence[SmoothSurface],
+    consistency: Sequence[Consistency],
+    grey: EvenGrey,
+    poses: PoseCovariance | None = None,
+    workers: int = THREADS,
+) -> BodyCloud:
+    """Average each sample with the surfaces that agree with it; outvoted samples are dropped.
+
+    poses: how well the pairs' poses are known, None for exactly.
+    """
+    block = 1 << 16  # samples whose sums fit into a processor's cache
+    excess = estimate_excess(samples, surfaces, consistency, poses) ** 2
+
+    def part(start: int) -> tuple[NDArray[Any], ...]:
+        some = slice(start, start + block)
+        normals, sigma_mm = samples.normals[some], samples.sigma_mm[some]
+        sums = _start_sums(normals, sigma_mm, samples.weight[some], grey.samples[some])
+        for surface, one, levels in zip(surfaces, consistency, grey.surfaces, strict=True):
+            fields = (surface.normals, surface.sigma_mm, surface.weight, levels)
+            here = slice(*np.searchsorted(one.index, (some.start, some.stop)))
+            agreed = one.index[here] - start, one.at[here], one.shift_mm[here]
+            _add_surface(fields, *agreed, sums)
+            here = slice(*np.searchsorted(one.against_index, (some.start, some.stop)))
+            weights = surface.weight[one.against_at[here]]
+            sums.against[one.against_index[here] - start] += weights
+        return _average(samples.points[some], normals, sums, excess)
+
+    with ThreadPoolExecutor(workers) as pool:
+        parts = list(pool.map(part, range(0, len(samples.points), block)))
+    return BodyCloud(*(np.concatenate(fields) for fields in zip(*parts, strict=True)))
+
+
+def estimate_excess(
+    samples: Samples,
+    surfaces: Sequence[SmoothSurface],
+    consistency: Sequence[Consistency],
+    poses: PoseCovariance | None = None,
+) -> float:
+    """Robust sigma of the distances between pairs over their predicted sigmas; at least 1.
+
+    Errors of the pairs' poses are part of the prediction here, because they are no errors of the
+    points; `pose_variance` adds them to the points' sigmas. One point in 8 takes part.
+    """
+    ratios = [np.empty(0)]
+    for surface, one in zip(surfaces, consistency, strict=True):
+        index, shift_mm = one.index[::8], one.shift_mm[::8]
+        variance = samples.sigma_mm[index] ** 2 + surface.sigma_mm[one.at[::8]] ** 2
+        if poses is not None:
+            variance += _pose_variance(samples, index, surfaces, surface.pair, poses)
+        ratios.append(np.abs(shift_mm) / np.sqrt(variance))
+    every = np.concatenate(ratios)
+    return max(1.0, float(np.median(every)) / NORMAL_MEDIAN) if every.size else 1.0
+
+
+def _pose_variance(
+    samples: Samples,
+    index: Numbers,
+    surfaces: Sequence[SmoothSurface],
+    other: str,
+    poses: PoseCovariance,
+) -> Floats:
+    """Variance (n,) mm^2 along the normals of samples `index`, by the poses of their pairs relative
+    to the pair `other`."""
+    variance = np.empty(len(index), np.float32)
+    ends = np.searchsorted(index, samples.starts)
+    for surface, (first, last) in zip(surfaces, pairwise(ends), strict=True):
+        points, normals = samples.points[index[first:last]], samples.normals[index[first:last]]
+        lever = np.hstack([np.cross(points, normals), normals])
+        variance[first:last] = np.sum(lever @ poses.between(surface.pair, other) * lever, axis=1)
+    return variance
+
+
+class _Sums(NamedTuple):
+    """Sums (N,) over the pairs that show each of N samples, the sample's own pair included.
+
+    weight: of weights; against: of the weights of surfaces that contradict the sample.
+    shift, square, grey: of weights times shift, its square and grey level.
+    normal: of weights times normals, (N, 3).
+    variance: of the squares of weights times sigmas.
+    pairs: their number.
+    """
+
+    weight: Array
+    shift: Array
+    square: Array
+    grey: Array
+    normal: Array
+    variance: Array
+    against: Array
+    pairs: Bytes
+
+
+def _start_sums(normals: Floats, sigma_mm: Floats, weights: Floats, grey: Floats) -> _Sums:
+    """Sums over the samples alone."""
+    shift, square, against = np.zeros((3, len(weights)))
+    return _Sums(
+        weights.astype(np.float64),
+        shift,
+        square,
+        (weights * grey).astype(np.float64),
+        (weights[:, None] * normals).astype(np.float64),
+        ((weights * sigma_mm) ** 2).astype(np.float64),
+        against,
+        np.ones(len(weights), np.uint8),
+    )
+
+
+@compiled
+def _add_surface(
+    surface: tuple[Floats, Floats, Floats, Floats],
+    index: Numbers,
+    at: Numbers,
+    shifts: Floats,
+    sums: _Sums,
+) -> None:
+    """Add points `at` of a surface (normals, sigmas, weights, greys) to the sums at `index`."""
+    normals, sigma_mm, weights, levels = surface
+    for n in range(len(index)):
+        here, there = index[n], at[n]
+        weight, shift = float(weights[there]), shifts[n]
+        sums.weight[here] += weight
+        sums.shift[here] += weight * shift
+        sums.square[here] += weight * shift * shift
+        sums.grey[here] += weight * levels[there]
+        sums.variance[here] += (weight * sigma_mm[there]) ** 2
+        for k in range(3):
+            sums.normal[here, k] += weight * normals[there, k]
+        sums.pairs[here] += 1
+
+
+@compiled
+def _average(
+    points: Floats, normals: Floats, sums: _Sums, excess: float
+) -> tuple[Array, Floats, Floats, Bytes, Bytes]:
+    """Points, normals, sigmas, colours and number of pairs of the samples that were not outvoted.
+
+    excess: variance of the pairs' differences over the predicted one. Sigmas are enlarged by it,
+        and by more where pairs differ by more than three of their sigmas.
+    """
+    kept = np.flatnonzero(sums.against < sums.weight)
+    position, normal = np.empty((len(kept), 3)), np.empty((len(kept), 3), np.float32)
+    sigma, grey = np.empty(len(kept), np.float32), np.empty((len(kept), 3), np.uint8)
+    for n in range(len(kept)):
+        here = kept[n]
+        weight = sums.weight[here]
+        mean = sums.shift[here] / weight
+        squares = sums.square[here] - weight * mean * mean
+        chi2 = squares / max(sums.pairs[here] - 1, 1)
+        sigma[n] = np.sqrt(sums.variance[here] * max(excess, chi2 / 9.0)) / weight
+        x, y, z = sums.normal[here, 0], sums.normal[here, 1], sums.normal[here, 2]
+        length = np.sqrt(x * x + y * y + z * z)
+        for k in range(3):
+            position[n, k] = points[here, k] + mean * normals[here, k]
+            normal[n, k] = sums.normal[here, k] / length
+            grey[n, k] = min(max(np.rint(sums.grey[here] / weight), 0.0), 255.0)
+    return position, normal, sigma, grey, sums.pairs[kept]

@@ -16,7 +16,7 @@ from bodyscan.verdict import Grade, Verdict
 CORNERS_RMS_PX = 0.3
 """Corners are found to less than a tenth of a pixel in sharp, well-lit images."""
 SHEETS_RMS_MM, HELD_OUT_MM = 0.3, 0.5
-"""A scan's overlaps are doubted from 0.4 mm on (fusion/scan_verdict.py)."""
+"""A scan's overlaps are doubted from 0.4 mm on (fusion/verdict/overlaps.py)."""
 COVERED_PERCENT = 40.0
 """Share of the image: a lens is only known where boards were."""
 POSES, STRIPE_SHOTS = 6, 4

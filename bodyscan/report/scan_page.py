@@ -12,9 +12,11 @@ import numpy as np
 
 from bodyscan.alignment.body_parts import PartMotion, PersonMotion
 from bodyscan.evaluation.comparison import Comparison, compare_surfaces
-from bodyscan.fusion import scan_verdict as limits
 from bodyscan.fusion.scan_facts import read_facts, told_verdict
 from bodyscan.fusion.storage import StoredScan, load_scan
+from bodyscan.fusion.verdict.coverage import MAX_FILLED
+from bodyscan.fusion.verdict.motion import MAX_MOTION_MM, MAX_RESIDUAL_MM
+from bodyscan.fusion.verdict.overlaps import MAX_DISAGREEMENT_MM
 from bodyscan.mesh.body import compute_cover_shares, find_filled_patches
 from bodyscan.mesh.topology import compute_topology
 from bodyscan.registration.rig_calibration import FLOOR_AXES
@@ -146,7 +148,7 @@ def _numbers(scan: StoredScan) -> Numbers:
             made_up,
             "% of area",
             "of the mesh's surface, filled to close it where nothing was measured",
-            100.0 * limits.SOME_FILLED,
+            100.0 * MAX_FILLED,
             digits=1,
         ),
         Number("largest hole", largest, "cm²", "area of the largest filled patch", digits=1),
@@ -178,7 +180,7 @@ def _alignment_numbers(facts: Mapping[str, Any]) -> list[Number]:
             alignment["rms_after_mm"],
             "mm RMS",
             "distance between what two pairs measured of the same place, after alignment",
-            limits.SOME_DISAGREEMENT_MM,
+            MAX_DISAGREEMENT_MM,
         ),
         Number(
             "overlap residual before",
@@ -193,7 +195,7 @@ def _alignment_numbers(facts: Mapping[str, Any]) -> list[Number]:
                 "mm",
                 "how far the subject moved between pairs at most, as the alignment found it: pair "
                 f"{farthest}, at the body's middle",
-                limits.SOME_MOTION_MM,
+                MAX_MOTION_MM,
                 digits=2,
             )
             for farthest, motion in motions[:1]
@@ -211,7 +213,7 @@ def _person(person: Mapping[str, Any]) -> Section:
             "known to",
             "mm",
             "standard deviation of what is left of that, along the surface's normals.",
-            limits.SOME_LEFT_MM,
+            MAX_RESIDUAL_MM,
             digits=2,
         ),
         Column(
@@ -283,14 +285,14 @@ def _pairs(facts: Mapping[str, Any]) -> Section:
             "mm",
             "by the alignment, at the body's middle: sway of the subject and error of the pair's "
             "placing together.",
-            limits.SOME_MOTION_MM,
+            MAX_MOTION_MM,
             digits=3,
         ),
         Column(
             "residual",
             "mm RMS",
             "from the other pairs' surfaces where they overlap, after alignment.",
-            limits.SOME_DISAGREEMENT_MM,
+            MAX_DISAGREEMENT_MM,
         ),
     )
     lost = [f"{name} gave nothing: {reason}" for name, reason in facts["failed"].items()]
@@ -334,7 +336,7 @@ def _sway_picture(motion: Mapping[str, float]) -> Picture:
     return Picture(
         "Sway",
         "How far the alignment moved each pair against the subject, at the body's middle.",
-        charts.bars(dict(sorted(motion.items())), "moved, mm", (limits.SOME_MOTION_MM,)),
+        charts.bars(dict(sorted(motion.items())), "moved, mm", (MAX_MOTION_MM,)),
     )
 
 

@@ -15,16 +15,18 @@ from bodyscan.alignment.icp import align
 from bodyscan.alignment.sway_prior import SwayPrior, better_known
 from bodyscan.alignment.together import Together, bring_together
 from bodyscan.fusion.cleaning import clean, require_subject
-from bodyscan.fusion.contradictions import Contradictions
-from bodyscan.fusion.floor import find_floor
+from bodyscan.fusion.consistency import Contradictions
 from bodyscan.fusion.merging import MergedCloud, merge
 from bodyscan.fusion.meshing import attach_attributes, closed_surface
 from bodyscan.fusion.pose_variance import add_motion_variance, add_pose_variance
 from bodyscan.fusion.regions import label_regions
 from bodyscan.fusion.scan import Made, Scan, no_use
-from bodyscan.fusion.scan_verdict import ImageEvidence, RigEvidence, grade_scan, silent_poles
-from bodyscan.fusion.seams import judge_seams
-from bodyscan.fusion.surface_check import SurfaceCheck, check_surface
+from bodyscan.fusion.verdict import grade_scan
+from bodyscan.fusion.verdict.coverage import measure_coverage
+from bodyscan.fusion.verdict.evidence import Coverage, ImageEvidence, RigEvidence
+from bodyscan.fusion.verdict.floor import find_floor
+from bodyscan.fusion.verdict.overlaps import find_seams
+from bodyscan.fusion.verdict.rig import find_silent_poles
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud, BodyMesh
@@ -96,7 +98,7 @@ def fuse(
         judged = partial(
             grade_scan,
             merged.cloud,
-            RigEvidence.of(calibration),
+            RigEvidence.from_calibration(calibration),
             _image_evidence(calibration, measured, cleaned, subject, merged.contradictions),
             settings.use,
             together=subject.together,
@@ -105,7 +107,7 @@ def fuse(
         announce(judged(), final=False)
     with step(progress, "meshing"):
         cloud, mesh = _mesh(merged.cloud, measured.value, subject, settings, made)
-        verdict = judged(mesh=mesh, surface=_surface_check(mesh, cleaned, subject))
+        verdict = judged(mesh=mesh, coverage=_coverage(mesh, cleaned, subject))
     return Scan(
         cloud,
         mesh,
@@ -162,9 +164,11 @@ def _image_evidence(
     unmoved = [image for image in measured.value if image.pair not in moved]
     return ImageEvidence(
         measured.failures,
-        silent_poles(poles, [*tried, *measured.failures], [image.pair for image in subject.images]),
+        find_silent_poles(
+            poles, [*tried, *measured.failures], [image.pair for image in subject.images]
+        ),
         {image.pair: image.agreement for image in measured.value if image.agreement},
-        judge_seams(subject.images, subject.there, poles),
+        find_seams(subject.images, subject.there, poles),
         contradictions,
         find_floor(unmoved, calibration.rig_from_camera, calibration.rig.volume),
     )
@@ -199,10 +203,8 @@ def _mesh(
     return known, mesh
 
 
-def _surface_check(
-    mesh: BodyMesh, cleaned: Sequence[RangeImage], subject: _Subject
-) -> SurfaceCheck:
+def _coverage(mesh: BodyMesh, cleaned: Sequence[RangeImage], subject: _Subject) -> Coverage:
     """Check the mesh against the images of all pairs, including those that saw nothing."""
     carried = {image.pair: image for image in subject.images}
     images = [carried.get(image.pair, image) for image in cleaned]
-    return check_surface(mesh, images, subject.rig_from_camera)
+    return measure_coverage(mesh, images, subject.rig_from_camera)

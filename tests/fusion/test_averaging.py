@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from flat_walls import ASIDE, WALL_MM, wall
 
-from bodyscan.fusion.averaging import average, scatter
 from bodyscan.fusion.brightness import EvenGrey
-from bodyscan.fusion.evidence import Evidence, compare
+from bodyscan.fusion.consistency import Consistency, compare_with_surface
+from bodyscan.fusion.merging import average, estimate_excess
 from bodyscan.fusion.smoothing import SmoothSurface
-from bodyscan.fusion.thinning import Samples, take_samples
+from bodyscan.fusion.voxel_thinning import Samples, take_samples
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud
@@ -34,19 +34,21 @@ def known_to(surface: SmoothSurface, sigma_mm: float, rim: float = 1.0) -> Smoot
 
 def fused(
     further_mm: float, sigmas: tuple[float, float], rim: float = 1.0
-) -> tuple[BodyCloud, Samples, list[SmoothSurface], list[Evidence]]:
+) -> tuple[BodyCloud, Samples, list[SmoothSurface], list[Consistency]]:
     """Two walls, the second so much further and with a rim's weight, made one."""
     surfaces = [
         known_to(wall(WALL_MM, 100, RigidTransform.identity()), sigmas[0]),
         known_to(wall(WALL_MM + further_mm, 120, ASIDE), sigmas[1], rim),
     ]
     samples = take_samples(surfaces, 10**6)
-    evidence = [compare(samples, surface, k, 1.5, 6.0) for k, surface in enumerate(surfaces)]
+    consistency = [
+        compare_with_surface(samples, surface, k, 1.5, 6.0) for k, surface in enumerate(surfaces)
+    ]
     return (
-        average(samples, surfaces, evidence, as_seen(samples, surfaces), workers=1),
+        average(samples, surfaces, consistency, as_seen(samples, surfaces), workers=1),
         samples,
         surfaces,
-        evidence,
+        consistency,
     )
 
 
@@ -71,7 +73,7 @@ def test_at_a_rim_a_surface_counts_for_less_and_so_it_does_in_the_sigma() -> Non
 def test_what_one_pair_alone_saw_is_as_certain_as_it_says() -> None:
     surface = known_to(wall(WALL_MM, 60, RigidTransform.identity()), 0.1)
     samples = take_samples([surface], 10**6)
-    alone = [compare(samples, surface, 0, 1.5, 6.0)]
+    alone = [compare_with_surface(samples, surface, 0, 1.5, 6.0)]
     cloud = average(samples, [surface], alone, as_seen(samples, [surface]), workers=1)
     assert cloud.sigma_mm == pytest.approx(0.1, rel=1e-5)
 
@@ -83,8 +85,10 @@ def test_where_a_surface_ends_there_is_no_step() -> None:
         wall(WALL_MM + 0.5, 100, ASIDE),
     ]
     samples = take_samples(surfaces, 10**6)
-    evidence = [compare(samples, surface, k, 1.5, 6.0) for k, surface in enumerate(surfaces)]
-    cloud = average(samples, surfaces, evidence, as_seen(samples, surfaces), workers=1)
+    consistency = [
+        compare_with_surface(samples, surface, k, 1.5, 6.0) for k, surface in enumerate(surfaces)
+    ]
+    cloud = average(samples, surfaces, consistency, as_seen(samples, surfaces), workers=1)
     left, right = surfaces[1].points[:, 0].min(), surfaces[0].points[:, 0].max()
     middle = np.abs(cloud.points[:, 1]) < 20.0
     x, z = cloud.points[middle, 0], cloud.points[middle, 2]
@@ -101,9 +105,9 @@ def test_the_mean_lies_where_the_weights_say() -> None:
 
 
 def test_pairs_that_disagree_everywhere_are_all_less_certain() -> None:
-    cloud, samples, surfaces, evidence = fused(0.5, (0.1, 0.1))
+    cloud, samples, surfaces, consistency = fused(0.5, (0.1, 0.1))
     # 0.5 mm apart, with 0.14 expected: 3.5 times, over 0.6745 since a median is compared.
-    times = scatter(samples, surfaces, evidence)
+    times = estimate_excess(samples, surfaces, consistency)
     assert times == pytest.approx(0.5 / np.hypot(0.1, 0.1) / 0.6745, rel=0.01)
     both = cloud.pairs_seen == 2
     assert cloud.sigma_mm[both] == pytest.approx(times * 0.1 / np.sqrt(2.0), rel=0.01)
@@ -112,22 +116,24 @@ def test_pairs_that_disagree_everywhere_are_all_less_certain() -> None:
 def test_pairs_that_stand_apart_as_their_poses_are_known_are_no_less_certain() -> None:
     """Of 0.5 mm along z, 0.48 are explained by how well the two poses are known; a turn about z, which
     moves no point of the wall along its normal, explains nothing."""
-    _, samples, surfaces, evidence = fused(0.5, (0.1, 0.1))
+    _, samples, surfaces, consistency = fused(0.5, (0.1, 0.1))
     first, second = (
         replace(surface, pair=name) for surface, name in zip(surfaces, "ab", strict=True)
     )
     along_z = np.diag([0.0, 0.0, 0.0, 0.0, 0.0, 0.48**2])
     about_z = np.diag([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
-    unknown = scatter(samples, [first, second], evidence)
+    unknown = estimate_excess(samples, [first, second], consistency)
     for turned, expected in ((along_z, 0.5 / 0.5 / 0.6745), (about_z, unknown)):
         both = np.zeros((12, 12))
         both[6:, 6:] = turned
         poses = PoseCovariance(("a", "b"), both)
-        found = scatter(samples, [first, second], evidence, poses)
+        found = estimate_excess(samples, [first, second], consistency, poses)
         assert found == pytest.approx(expected, rel=0.01)
     # Errors that both share set nothing apart.
     alike = PoseCovariance(("a", "b"), np.tile(along_z, (2, 2)))
-    assert scatter(samples, [first, second], evidence, alike) == pytest.approx(unknown, rel=1e-6)
+    assert estimate_excess(samples, [first, second], consistency, alike) == pytest.approx(
+        unknown, rel=1e-6
+    )
 
 
 def test_a_place_where_pairs_disagree_by_more_than_elsewhere_is_less_certain() -> None:
@@ -139,9 +145,11 @@ def test_a_place_where_pairs_disagree_by_more_than_elsewhere_is_less_certain() -
     moved = surfaces[1].points + np.where(some, 0.8, 0.0)[:, None] * np.array([0.0, 0.0, 1.0])
     surfaces[1] = replace(surfaces[1], points=moved.astype(np.float32))
     samples = take_samples(surfaces, 10**6)
-    evidence = [compare(samples, surface, k, 1.5, 6.0) for k, surface in enumerate(surfaces)]
-    assert scatter(samples, surfaces, evidence) == 1.0
-    cloud = average(samples, surfaces, evidence, as_seen(samples, surfaces), workers=1)
+    consistency = [
+        compare_with_surface(samples, surface, k, 1.5, 6.0) for k, surface in enumerate(surfaces)
+    ]
+    assert estimate_excess(samples, surfaces, consistency) == 1.0
+    cloud = average(samples, surfaces, consistency, as_seen(samples, surfaces), workers=1)
     both = cloud.pairs_seen == 2
     apart = np.isclose(np.abs(cloud.points[:, 2] - WALL_MM), 0.4, atol=0.01) & both
     assert apart.sum() > 50
@@ -160,7 +168,7 @@ def test_surfaces_that_look_other_ways_are_not_one() -> None:
     ]
     turned = replace(surfaces[1], normals=-surfaces[1].normals)
     samples = take_samples([surfaces[0], turned], 10**6)
-    found = compare(replace(samples, starts=samples.starts), turned, 1, 1.5, 6.0)
+    found = compare_with_surface(replace(samples, starts=samples.starts), turned, 1, 1.5, 6.0)
     own = found.index[found.index < samples.starts[1]]
     assert not own.size
 
@@ -176,7 +184,7 @@ def test_how_far_pairs_scatter_is_told_against_their_sigmas_where_they_overlap()
         every = np.arange(some)
         return SimpleNamespace(index=every, at=every, shift_mm=mm * rng.standard_normal(some))
 
-    assert scatter(samples, [surface], [seen(1.5)]) == pytest.approx(3.0, rel=0.05)
-    assert scatter(samples, [surface], [seen(0.2)]) == 1.0
-    assert scatter(samples, [surface], [seen(1.5, 0)]) == 1.0
-    assert scatter(samples, [], []) == 1.0
+    assert estimate_excess(samples, [surface], [seen(1.5)]) == pytest.approx(3.0, rel=0.05)
+    assert estimate_excess(samples, [surface], [seen(0.2)]) == 1.0
+    assert estimate_excess(samples, [surface], [seen(1.5, 0)]) == 1.0
+    assert estimate_excess(samples, [], []) == 1.0

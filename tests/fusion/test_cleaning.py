@@ -10,7 +10,7 @@ from ray_cast_scan import Scan, load_rig
 
 from bodyscan.evaluation.surface import signed_distances
 from bodyscan.fusion.cleaning import _inside, clean, cut_to_volume, drop_flying_pixels, inside
-from bodyscan.fusion.surface_check import check_surface
+from bodyscan.fusion.verdict.coverage import measure_coverage
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyMesh
 from bodyscan.reconstruction.range_image import RangeImage
@@ -154,7 +154,7 @@ def test_what_is_cut_to_the_volume_is_cleaned_and_checked_alike(
         none[:, 0].astype(np.float32),
         np.zeros(len(faces), bool),
     )
-    checks = [check_surface(mesh, images, there) for images in (cleaned, alike)]
+    checks = [measure_coverage(mesh, images, there) for images in (cleaned, alike)]
     assert len(checks[0].yields) == len(cleaned)
     assert checks[0].yields == checks[1].yields
     first = scan.range_images[0]

@@ -40,7 +40,7 @@ def head(seen: Callable[[Array], Mask], noise_mm: float = 0.1, tilt: float = 0.0
 
 
 def unknown_mm(cloud: BodyCloud) -> float:
-    return Crown.of(cloud.points, cloud.normals).unknown_mm
+    return Crown.from_cloud(cloud.points, cloud.normals).unknown_mm
 
 
 def beside_a_hole(points: Array) -> Mask:
@@ -71,7 +71,7 @@ def test_what_is_not_convex_holds_nothing() -> None:
     up = np.tile([0.0, 0.0, 1.0], (3000, 1))
     wall = head(lambda points: np.abs(points[:, 2] - TOP + RADIUS) < 20.0)
     raised = wall.points + [0.0, 0.0, 60.0]
-    found = Crown.of(np.concatenate([ledge, raised]), np.concatenate([up, wall.normals]))
+    found = Crown.from_cloud(np.concatenate([ledge, raised]), np.concatenate([up, wall.normals]))
     assert found.unknown_mm > 40.0
 
 
@@ -127,7 +127,7 @@ def test_planes_hold_that_are_no_steeper_than_sixty_degrees_and_that_no_part_of_
     turn = np.linspace(0.0, 2.0 * np.pi, 200)
     rim = np.column_stack([radius * np.cos(turn), radius * np.sin(turn), np.full(200, TOP - depth)])
     whole = head(lambda points: np.ones(len(points), bool), noise_mm=0.0, tilt=0.0)
-    found = Crown.of(
+    found = Crown.from_cloud(
         np.concatenate([whole.points, rim]),
         np.concatenate([whole.normals, np.tile([1.0, 0.0, 0.0], (200, 1))]),
     )
@@ -141,4 +141,4 @@ def test_a_plane_that_points_exceed_by_half_a_millimetre_holds_nothing(
     higher_mm: float, planes: int
 ) -> None:
     points = np.array([[0.0, 0.0, TOP], [30.0, 0.0, TOP + higher_mm]])
-    assert len(Crown.of(points, np.tile([0.0, 0.0, 1.0], (2, 1))).offsets) == planes
+    assert len(Crown.from_cloud(points, np.tile([0.0, 0.0, 1.0], (2, 1))).offsets) == planes

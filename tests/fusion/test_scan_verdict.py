@@ -14,9 +14,9 @@ from ray_cast_scan import Truth, cast_scan, load_body, load_rig, nominal_placing
 from bodyscan.arrays import Array, Indices
 from bodyscan.errors import ScanFailed
 from bodyscan.fusion.cleaning import apply_mask
-from bodyscan.fusion.floor import find_floor
 from bodyscan.fusion.meshing import closed_surface
 from bodyscan.fusion.scan import Scan
+from bodyscan.fusion.verdict.floor import find_floor
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.outcome import Outcome
@@ -217,7 +217,7 @@ def test_a_failed_pair_is_named_and_so_are_a_doubtful_size_and_floor(
     assert scan.verdict.grade == "usable"
     assert "p2-3: bit03.png is missing" in said(scan)
     assert "1.042 times as far apart as their nominal poses" in said(scan)
-    assert "the floor is seen at -8 mm" in said(scan)
+    assert "the floor is at -8 mm" in said(scan)
 
 
 def test_half_the_pairs_give_half_a_body(images: list[RangeImage]) -> None:

@@ -14,7 +14,7 @@ SLOW = (
     "workflows/test_real_captures.py",
     "alignment/test_together.py",
     "alignment/test_following.py",
-    "fusion/test_seams.py",
+    "fusion/test_verdict_overlaps.py",
     "workflows/test_people.py",
     "workflows/test_codes_calibrated.py",
     "workflows/test_any_subset.py",

@@ -12,8 +12,8 @@ from bodyscan.alignment.body_parts import PersonMotion
 from bodyscan.alignment.icp import Alignment
 from bodyscan.alignment.pole_steps import StepSearch
 from bodyscan.alignment.together import Together
-from bodyscan.fusion.scan_verdict import ImageEvidence, RigEvidence, grade_scan
-from bodyscan.fusion.surface_check import SurfaceCheck
+from bodyscan.fusion.verdict import grade_scan
+from bodyscan.fusion.verdict.evidence import Coverage, ImageEvidence, RigEvidence
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.rig.rig import Volume
 from bodyscan.settings import UseLimits
@@ -39,7 +39,7 @@ def verdict_given(
     *,
     use: UseLimits = UseLimits(),  # noqa: B008  (frozen)
     person: PersonMotion | None = None,
-    surface: SurfaceCheck | None = None,
+    coverage: Coverage | None = None,
     **given: Any,
 ) -> Verdict:
     """given: fields of RigEvidence, of ImageEvidence and of Together."""
@@ -47,7 +47,7 @@ def verdict_given(
     together = _evidence(Together, given)
     assert not given, f"no evidence has {', '.join(given)}"
     return grade_scan(
-        cloud, rig, images, use, together=together, person=person, mesh=mesh, surface=surface
+        cloud, rig, images, use, together=together, person=person, mesh=mesh, coverage=coverage
     )
 
 

@@ -102,7 +102,7 @@ def test_a_verdict_that_misses_a_check_is_not_good(
 ) -> None:
     scan = make_scan(tmp_path / "scan")
     whole = verdict_given(scan.cloud, scan.mesh)
-    monkeypatch.setattr("bodyscan.fusion.scan_verdict.rings", broken)
+    monkeypatch.setattr("bodyscan.fusion.verdict.shape.find_handles", broken)
     missed = verdict_given(scan.cloud, scan.mesh)
     said = set(missed.reasons) - set(whole.reasons)
     assert len(said) == 1

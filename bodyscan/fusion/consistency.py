@@ -1,32 +1,31 @@
-"""What one smoothed range image says about points that others measured.
+"""Geometric consistency of the pairs: which points others confirm, and which they contradict.
 
-A point is projected into the image and compared with the surface at that pixel: no search tree.
+A point is projected into another pair's image and compared with the smoothed surface at that pixel:
+no search tree.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import erfc
 
 from bodyscan.arrays import Array, Floats
 from bodyscan.compiled import compiled
-from bodyscan.fusion.smoothing import SmoothSurface
-from bodyscan.fusion.thinning import Samples
+from bodyscan.fusion.smoothing import Numbers, SmoothSurface
+from bodyscan.fusion.voxel_thinning import Samples
 from bodyscan.geometry.camera_tables import projection_table
 from bodyscan.geometry.quadratic_table import Table, look_up
 
-Numbers = NDArray[np.int32]
-
-SAME_WAY = 0.6  # cosine between the normals of what may be one surface
-NEAREST_MM = 1.0  # points behind the camera are not examined
-EDGE_ON = 0.1  # cameras that see a point flatter than this are not asked about it
+Counts = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
-    """What one other surface says about samples, in their order.
+class Consistency:
+    """What one surface shows of the samples of others, in the samples' order.
 
     index: numbers of the samples that it agrees with.
     at: numbers of its points there.
@@ -41,10 +40,84 @@ class Evidence:
     against_at: Numbers
 
 
-def compare(
+@dataclass(frozen=True, eq=False)
+class Contradictions:
+    """How often pairs contradict each other's points.
+
+    pairs: P of them.
+    compared: how often points of the column's pair were compared with the row's surface, (P, P).
+    against: how often that surface contradicted them, (P, P).
+    by_noise: share of contradictions expected for a single surface, by the sigmas of both points.
+    """
+
+    pairs: tuple[str, ...]
+    compared: Counts
+    against: Counts
+    by_noise: float = 0.0
+
+    @staticmethod
+    def count(
+        pairs: Sequence[str],
+        consistency: Sequence[Consistency],
+        samples: Samples,
+        surfaces: Sequence[SmoothSurface],
+        agreement_mm: float,
+    ) -> Contradictions:
+        """Count what each pair's surface shows of all samples; consistency: one for each pair."""
+
+        def count_by_pair(index: Numbers) -> Counts:
+            pair = np.searchsorted(samples.starts, index, side="right") - 1
+            return np.bincount(pair, minlength=len(pairs))
+
+        against = np.array([count_by_pair(one.against_index) for one in consistency])
+        agreed = np.array([count_by_pair(one.index) for one in consistency])
+        sigma = np.concatenate(
+            [
+                np.hypot(samples.sigma_mm[index], surface.sigma_mm[at])
+                for one, surface in zip(consistency, surfaces, strict=True)
+                for index, at in ((one.index, one.at), (one.against_index, one.against_at))
+            ]
+        )
+        beyond = erfc(agreement_mm / (np.sqrt(2.0) * np.maximum(sigma, 1e-6)))
+        by_noise = float(beyond.mean()) if len(beyond) else 0.0
+        return Contradictions(tuple(pairs), agreed + against, against, by_noise)
+
+    @property
+    def share(self) -> float:
+        """Share of contradictions in all comparisons."""
+        return float(self.against.sum() / max(self.compared.sum(), 1))
+
+    @property
+    def beyond_noise(self) -> float:
+        """The share that noise does not explain."""
+        return self.share - self.by_noise
+
+    def find_outlier(self, groups: Mapping[str, frozenset[str]]) -> str:
+        """The smallest of the groups without which the others agree best.
+
+        Empty unless less than half of the share of contradictions is left without it.
+        """
+        left = {name: self._share_without(group) for name, group in groups.items()}
+        outliers = [
+            name
+            for name, group in groups.items()
+            if len(self.pairs) > len(group) + 1 and left[name] < 0.5 * self.share
+        ]
+        lowest = min((left[name] for name in outliers), default=0.0)
+        # If a single pair is the outlier, leaving it out is as good as leaving out its pole.
+        near = [name for name in outliers if left[name] <= lowest + 0.1 * (self.share - lowest)]
+        return min(near, key=lambda name: (len(groups[name]), left[name]), default="")
+
+    def _share_without(self, group: frozenset[str]) -> float:
+        kept = np.flatnonzero([name not in group for name in self.pairs])
+        rows = np.ix_(kept, kept)
+        return float(self.against[rows].sum() / max(self.compared[rows].sum(), 1))
+
+
+def compare_with_surface(
     samples: Samples, surface: SmoothSurface, number: int, agreement_mm: float, double_mm: float
-) -> Evidence:
-    """What `surface` (number `number`) says about the samples that do not come from it.
+) -> Consistency:
+    """Compare the samples of other pairs with `surface`, which is number `number`.
 
     It agrees if it lies within `agreement_mm` of them, and contradicts them if it is a double
     surface within `double_mm`, or was seen through them.
@@ -65,7 +138,7 @@ def compare(
         (agreement_mm, double_mm),
         (index, at, shift, against_index, against_at),
     )
-    return Evidence(
+    return Consistency(
         index[:agreed].copy(),
         at[:agreed].copy(),
         shift[:agreed].copy(),
@@ -77,33 +150,33 @@ def compare(
 @compiled
 def _compare(
     samples: tuple[Floats, Floats],
-    own: tuple[int, int],
+    excluded: tuple[int, int],
     surface: tuple[Floats, Floats, Numbers],
     corner: tuple[int, int],
     projection: Table,
     camera_from_rig: tuple[Array, Array],
-    bent: bool,
+    warped: bool,
     limits_mm: tuple[float, float],
-    evidence: tuple[Numbers, Numbers, Floats, Numbers, Numbers],
+    found: tuple[Numbers, Numbers, Floats, Numbers, Numbers],
 ) -> tuple[int, int]:
-    """Fill in the evidence; return how many samples are agreed with and how many contradicted.
+    """Write `found`; return how many samples are agreed with and how many contradicted.
 
     samples: points and normals.
-    own: range of the samples that are the surface's own.
+    excluded: range of the samples that come from the surface itself.
     surface: points, normals and the image of their numbers, which begins at `corner`.
-    bent: whether its points are no longer seen at their pixels.
+    warped: whether its points do not lie on the rays of their pixels.
     limits_mm: of agreement, and of a double surface.
     """
     points, normals = samples
     surface_points, surface_normals, numbers = surface
-    index, at, shifts, against_index, against_at = evidence
+    index, at, shifts, against_index, against_at = found
     centre = -camera_from_rig[0].T @ camera_from_rig[1]
     agreed = contradicted = 0
     for n in range(len(points)):
-        if own[0] <= n < own[1] or not _faces(points[n], normals[n], centre):
+        if excluded[0] <= n < excluded[1] or not _faces(points[n], normals[n], centre):
             continue
         x, y, z = _in_camera(points[n], camera_from_rig)
-        if z <= NEAREST_MM:
+        if z <= 1.0:  # mm
             continue
         u, v = look_up(projection, x / z, y / z)
         column, row = int(np.rint(u)) - corner[0], int(np.rint(v)) - corner[1]
@@ -112,7 +185,7 @@ def _compare(
         there = numbers[row, column]
         if there < 0:
             continue
-        if bent:
+        if warped:
             x, y, z = _in_camera(surface_points[there], camera_from_rig)
             at_u, at_v = look_up(projection, x / z, y / z)
             column, row = column + int(np.rint(u - at_u)), row + int(np.rint(v - at_v))
@@ -121,14 +194,14 @@ def _compare(
             there = numbers[row, column]
             if there < 0:
                 continue
-        alike = outward = 0.0
+        cosine = outward = 0.0
         for k in range(3):
             normal = surface_normals[there, k]
-            alike += normals[n, k] * normal
+            cosine += normals[n, k] * normal
             outward += (surface_points[there, k] - points[n, k]) * normal
-        same = alike > SAME_WAY
+        same = cosine > 0.6  # may be one surface
         # Along the sample's normal to the tangent plane of the surface.
-        shift = outward / alike
+        shift = outward / cosine
         if same and abs(shift) <= limits_mm[0]:
             index[agreed], at[agreed], shifts[agreed] = n, there, shift
             agreed += 1
@@ -141,13 +214,13 @@ def _compare(
 
 @compiled
 def _faces(point: Floats, normal: Floats, centre: Array) -> bool:
-    """Whether a point faces a camera's centre: n.(centre - point) > EDGE_ON * distance."""
+    """Whether a camera sees a point not edge-on: n.(centre - point) > 0.1 distance."""
     towards = distance2 = 0.0
     for k in range(3):
         away = centre[k] - point[k]
         towards += normal[k] * away
         distance2 += away * away
-    return towards > 0 and towards * towards > EDGE_ON**2 * distance2
+    return towards > 0 and towards * towards > 0.1**2 * distance2
 
 
 @compiled

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from bodyscan.arrays import Array, Indices
-from bodyscan.fusion.surface_check import SurfaceCheck, check_surface
+from bodyscan.fusion.verdict.coverage import measure_coverage
+from bodyscan.fusion.verdict.evidence import Coverage
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.transforms import RigidTransform
@@ -45,11 +46,11 @@ def seen(pair: str, *, shift_mm: float = 0.0, left_of: int = 121, camera: Camera
 
 def checked(
     *images: Any, columns: int = 20, rows: int = 14, turn: RigidTransform = HERE
-) -> SurfaceCheck:
+) -> Coverage:
     """turn: of the wall."""
     vertices, faces = grid(columns, rows)
     mesh: Any = SimpleNamespace(vertices=turn.apply(vertices), faces=faces)
-    return check_surface(mesh, images, {image.pair: HERE for image in images})
+    return measure_coverage(mesh, images, {image.pair: HERE for image in images})
 
 
 def test_cameras_that_saw_it_all_missed_nothing() -> None:

@@ -13,7 +13,13 @@ from bodyscan.alignment.icp import Alignment, align
 from bodyscan.alignment.matching import Matches
 from bodyscan.arrays import Array
 from bodyscan.fusion.cleaning import clean
-from bodyscan.fusion.seams import Seam, SeamReport, _patches, find_misfits, judge_seams
+from bodyscan.fusion.verdict.evidence import Seam, SeamReport
+from bodyscan.fusion.verdict.overlaps import (
+    estimate_step,
+    find_misaligned,
+    find_seams,
+    patch_medians,
+)
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
@@ -48,18 +54,18 @@ def judged(
     covariance = PoseCovariance(tuple(placed), np.diag(sigmas**2))
     seen = [image for image in clean(images, dict(placed), RIG.volume) if image.valid.any()]
     aligned = align(seen, placed, covariance, AlignmentSettings())
-    return judge_seams(seen, aligned.rig_from_camera, RIG.poles), aligned
+    return find_seams(seen, aligned.rig_from_camera, RIG.poles), aligned
 
 
 def said(report: SeamReport) -> dict[str, float]:
-    found = find_misfits(report.seams, report.groups, LIMIT_MM)
+    found = find_misaligned(report.seams, report.groups, LIMIT_MM)
     return {misfit.name: misfit.step_mm for misfit in found}
 
 
 def test_what_belongs_together_fits(woman: list[RangeImage]) -> None:
     report, aligned = judged(woman)
     assert not said(report)
-    assert not report.untied
+    assert not report.isolated
     # Pole 2 shares hardly more than rims with the others: they tie it.
     assert set(aligned.motion_mm) == set(PLACED)
 
@@ -131,7 +137,7 @@ def test_what_shares_no_surface_is_not_tied(woman: list[RangeImage]) -> None:
     two = {name: PLACED[name] for name in ("p1-1", "p2-4")}
     images = [image for image in woman if image.pair in two]
     report, aligned = judged(images, two)
-    assert len(report.untied) == 1
+    assert len(report.isolated) == 1
     assert not aligned.motion_mm
 
 
@@ -151,11 +157,11 @@ def test_the_fewest_pairs_that_explain_the_steps_are_named() -> None:
         seam("b1", "c1", 0),
     ]
     pole = [*fits, seam("a1", "b1", 3.0), seam("a2", "c2", 2.0)]
-    (found,) = find_misfits(pole, POLES, LIMIT_MM)
+    (found,) = find_misaligned(pole, POLES, LIMIT_MM)
     assert found.name == "pole a"
     assert found.step_mm == pytest.approx(3.0, abs=0.1)
     one = [*fits, seam("a1", "b1", 0.0), seam("b2", "a1", 3.0), seam("b2", "c2", 3.0, 30)]
-    assert [misfit.name for misfit in find_misfits(one, POLES, LIMIT_MM)] == ["pair b2"]
+    assert [misfit.name for misfit in find_misaligned(one, POLES, LIMIT_MM)] == ["pair b2"]
 
 
 def test_noise_makes_no_step() -> None:
@@ -164,7 +170,7 @@ def test_noise_makes_no_step() -> None:
     apart = np.abs(rng.normal(0.0, 0.6, 400))
     for sigma, steps in ((0.6, 0), (0.2, 1)):
         seams = [Seam(("a1", "b1"), apart, np.full(400, sigma))]
-        assert len(find_misfits(seams, POLES, LIMIT_MM)) == steps
+        assert len(find_misaligned(seams, POLES, LIMIT_MM)) == steps
 
 
 def test_sigmas_of_patches_say_how_far_their_medians_scatter() -> None:
@@ -174,7 +180,7 @@ def test_sigmas_of_patches_say_how_far_their_medians_scatter() -> None:
     apart = np.repeat(rng.standard_normal(400 * 16), 5) + 0.3
     points = np.column_stack([40.0 * (patch % 20) + 1.0, 40.0 * (patch // 20) + 39.0, 0.0 * patch])
     points[::2, :2] += [38.0, -38.0]
-    found, sigma = _patches(Matches(points, points, apart, apart, patch))
+    found, sigma = patch_medians(Matches(points, points, apart, apart, patch))
     assert len(found) == 400, "all 40 mm of a patch go together"
     # Medians of 16 scatter by 1.25 / 4; the robust sigma of so few is 5 % low.
     assert sigma.mean() == pytest.approx(1.2533 / 4.0, rel=0.1)
@@ -186,13 +192,13 @@ def test_a_patch_of_eight_matches_counts() -> None:
     points = np.zeros((15, 3))
     points[8:, 0] = 400.0
     matches = Matches(points, points, np.full(15, -2.0), np.ones(15), np.arange(15))
-    found, sigma = _patches(matches)
+    found, sigma = patch_medians(matches)
     assert found.tolist() == [2.0]
     assert sigma.tolist() == [0.0]
 
 
 def test_a_step_is_what_three_of_four_patches_keep_to() -> None:
     apart = np.array([0.0, 1.0, 2.0, 3.0, 50.0])
-    assert Seam(("a", "b"), apart, np.zeros(5)).step_mm == pytest.approx(3.0)
-    assert Seam(("a", "b"), apart, np.full(5, 2.0)).step_mm == pytest.approx(np.sqrt(5.0))
-    assert Seam(("a", "b"), apart, np.full(5, 4.0)).step_mm == 0.0
+    assert estimate_step([Seam(("a", "b"), apart, np.zeros(5))]) == pytest.approx(3.0)
+    assert estimate_step([Seam(("a", "b"), apart, np.full(5, 2.0))]) == pytest.approx(np.sqrt(5.0))
+    assert estimate_step([Seam(("a", "b"), apart, np.full(5, 4.0))]) == 0.0

@@ -8,63 +8,63 @@ import numpy as np
 import pytest
 from flat_walls import ASIDE, WALL_MM, wall
 
-from bodyscan.fusion.averaging import average
 from bodyscan.fusion.brightness import EvenGrey
-from bodyscan.fusion.evidence import EDGE_ON, Evidence, _faces, compare
+from bodyscan.fusion.consistency import Consistency, compare_with_surface
+from bodyscan.fusion.merging import average
 from bodyscan.fusion.smoothing import SmoothSurface
-from bodyscan.fusion.thinning import Samples, take_samples
+from bodyscan.fusion.voxel_thinning import Samples, take_samples
 from bodyscan.geometry.transforms import RigidTransform
 
 
-def seen_beside(further_mm: float) -> tuple[Samples, list[SmoothSurface], Evidence]:
+def seen_beside(further_mm: float) -> tuple[Samples, list[SmoothSurface], Consistency]:
     """Samples of two walls, the second camera's that much further; what it says about the first's."""
     surfaces = [
         wall(WALL_MM, 100, RigidTransform.identity()),
         wall(WALL_MM + further_mm, 120, ASIDE),
     ]
     samples = take_samples(surfaces, 10**6)
-    return samples, surfaces, compare(samples, surfaces[1], 1, 1.5, 6.0)
+    return samples, surfaces, compare_with_surface(samples, surfaces[1], 1, 1.5, 6.0)
 
 
 @pytest.mark.parametrize("further_mm", [-1.2, 0.0, 0.8])
 def test_near_walls_agree(further_mm: float) -> None:
-    samples, surfaces, evidence = seen_beside(further_mm)
+    samples, surfaces, consistency = seen_beside(further_mm)
     own = np.arange(samples.starts[1])
-    assert np.isin(evidence.index, own).all()
+    assert np.isin(consistency.index, own).all()
     # 40 mm are 54 of 160 pixels: the camera aside shows 66 % of what the other does.
-    assert 0.65 < len(evidence.index) / len(own) < 0.68
-    assert not evidence.against_index.size
+    assert 0.65 < len(consistency.index) / len(own) < 0.68
+    assert not consistency.against_index.size
     # Normals look at the cameras: what lies further is behind. float32 at 320 mm, and the lens.
-    np.testing.assert_allclose(evidence.shift_mm, -further_mm, atol=1e-3)
-    apart = surfaces[1].points[evidence.at] - samples.points[evidence.index]
+    np.testing.assert_allclose(consistency.shift_mm, -further_mm, atol=1e-3)
+    apart = surfaces[1].points[consistency.at] - samples.points[consistency.index]
     # Looked up is the pixel next to the sample: half of 0.75 mm, and the ray's slope (up to 0.4).
     assert np.abs(apart[:, :2]).max() < 0.4 + 0.4 * abs(further_mm)
 
 
 @pytest.mark.parametrize("further_mm", [3.0, -3.0, 40.0])
 def test_second_skins_and_what_is_seen_through_contradict(further_mm: float) -> None:
-    samples, _, evidence = seen_beside(further_mm)
-    assert not evidence.index.size
-    assert len(evidence.against_index) > 0.6 * samples.starts[1]
+    samples, _, consistency = seen_beside(further_mm)
+    assert not consistency.index.size
+    assert len(consistency.against_index) > 0.6 * samples.starts[1]
 
 
 def test_a_wall_in_front_says_nothing() -> None:
     """Only that the second camera does not see what lies behind."""
-    _, _, evidence = seen_beside(-40.0)
-    assert not evidence.index.size
-    assert not evidence.against_index.size
+    _, _, consistency = seen_beside(-40.0)
+    assert not consistency.index.size
+    assert not consistency.against_index.size
 
 
 def test_means_by_weight() -> None:
-    samples, surfaces, evidence = seen_beside(0.8)
-    nothing = compare(samples, surfaces[0], 0, 0.0, 0.0)
+    samples, surfaces, consistency = seen_beside(0.8)
+    nothing = compare_with_surface(samples, surfaces[0], 0, 0.0, 0.0)
     own = [surface.colours.astype(np.float32) for surface in surfaces]
     grey = EvenGrey(samples.colours.astype(np.float32), own)
-    cloud = average(samples, surfaces, [nothing, evidence], grey)
+    cloud = average(samples, surfaces, [nothing, consistency], grey)
     assert len(cloud.points) == len(samples.points)
     inner = np.zeros(len(cloud.points), bool)
-    inner[evidence.index] = True
-    ours, theirs = samples.weight[evidence.index], surfaces[1].weight[evidence.at]
+    inner[consistency.index] = True
+    ours, theirs = samples.weight[consistency.index], surfaces[1].weight[consistency.at]
     share = theirs / (ours + theirs)
     np.testing.assert_allclose(cloud.points[inner, 2], WALL_MM + 0.8 * share, atol=2e-3)
     np.testing.assert_allclose(cloud.colours[inner, 0], 100 + 20 * share, atol=0.51)
@@ -80,21 +80,11 @@ def test_a_surface_that_was_bent_is_asked_where_its_points_went() -> None:
     samples, surfaces, still = seen_beside(0.8)
     aside = np.array([3.0, 0.0, 0.0], np.float32)
     moved = replace(surfaces[1], points=surfaces[1].points + aside, bent=True)
-    found = compare(samples, moved, 1, 1.5, 6.0)
+    found = compare_with_surface(samples, moved, 1, 1.5, 6.0)
     assert len(found.index) > 0.95 * len(still.index)
     np.testing.assert_allclose(found.shift_mm, -0.8, atol=2e-3)
     apart = moved.points[found.at] - samples.points[found.index]
     assert np.abs(apart[:, :2]).max() < 0.4 + 0.4 * 0.8 + 0.75
-    asked = compare(samples, replace(moved, bent=False), 1, 1.5, 6.0)
+    asked = compare_with_surface(samples, replace(moved, bent=False), 1, 1.5, 6.0)
     off = moved.points[asked.at] - samples.points[asked.index]
     assert np.median(off[:, 0]) > 2.0, "looked up where they were"
-
-
-@pytest.mark.parametrize("distance_mm", [1.0, 1500.0])
-def test_a_camera_is_asked_where_it_sees_a_surface_less_than_edge_on(distance_mm: float) -> None:
-    normal = np.array([0.0, 0.6, 0.8], np.float32)
-    along = np.array([1.0, 0.0, 0.0])
-    point = np.array([30.0, -20.0, 900.0], np.float32)
-    for cosine, asked in ((1.02 * EDGE_ON, True), (0.98 * EDGE_ON, False), (-1.0, False)):
-        way = cosine * normal + np.sqrt(1.0 - cosine**2) * along
-        assert _faces(point, normal, point + distance_mm * way) == asked

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bodyscan.errors import ScanFailed
-from bodyscan.fusion.thinning import one_per_voxel, take_samples, voxel_size_for
+from bodyscan.fusion.voxel_thinning import one_per_voxel, take_samples, voxel_size_for
 from bodyscan.geometry.transforms import RigidTransform
 
 

@@ -1,0 +1,162 @@
+"""What a scan's verdict is based on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from bodyscan.alignment.body_parts import PersonMotion
+from bodyscan.alignment.icp import Alignment
+from bodyscan.alignment.sway_prior import centre_sigmas
+from bodyscan.alignment.together import Together
+from bodyscan.arrays import Array, Mask
+from bodyscan.fusion.consistency import Contradictions
+from bodyscan.mesh.body import BodyCloud, BodyMesh
+from bodyscan.reconstruction.two_ways import Agreement
+from bodyscan.registration.nominal_size import NominalSize, nominal_size
+from bodyscan.registration.rig_calibration import RigCalibration
+from bodyscan.rig.rig import Volume
+from bodyscan.settings import UseLimits
+from bodyscan.verdict import Grade
+
+GIRTH_PER_MM = 2.0 * np.pi
+"""mm by which a girth is wrong if its surface is displaced by 1 mm all round."""
+
+Finding = tuple[Grade, str]
+
+
+@dataclass(frozen=True, eq=False)
+class RigEvidence:
+    """What a verdict takes from the rig and its calibration.
+
+    unjudged: pairs with an imported calibration of unknown accuracy.
+    nominal: distances between cameras compared with their nominal positions, if known.
+    cameras: positions (N, 3) of all the rig's cameras; None for all round. What none of them could
+        see is no reason to repeat.
+    boards_mm: sigma of each pair's pose as calibrated, at the body's centre: see `centre_sigmas`.
+    """
+
+    volume: Volume
+    unjudged: tuple[str, ...] = ()
+    nominal: NominalSize | None = None
+    cameras: Array | None = None
+    boards_mm: Mapping[str, float] = field(default_factory=dict)
+
+    @staticmethod
+    def from_calibration(calibration: RigCalibration) -> RigEvidence:
+        pairs, poses = calibration.pairs, calibration.rig_from_camera
+        return RigEvidence(
+            calibration.rig.volume,
+            tuple(name for name, pair in pairs.items() if pair.quality.unjudged),
+            nominal_size(calibration.rig, poses),
+            np.array([pose.translation for pose in poses.values()]),
+            centre_sigmas(calibration.covariance),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Seam:
+    """A surface that two pairs measured, by patches: distances (N,) mm and their sigmas (N,)."""
+
+    pairs: tuple[str, str]
+    distances_mm: Array
+    sigma_mm: Array
+
+
+@dataclass(frozen=True, eq=False)
+class SeamReport:
+    """The seams of a scan.
+
+    groups: poles and single pairs, which may have moved by themselves, by name.
+    isolated: groups of pairs that share no surface with the largest: their poses are not checked.
+    """
+
+    seams: tuple[Seam, ...]
+    groups: Mapping[str, frozenset[str]]
+    isolated: tuple[tuple[str, ...], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class ImageEvidence:
+    """What a verdict takes from the range images.
+
+    failed: pairs that gave none, with the reason.
+    silent: poles of which no pair saw anybody, see `find_silent_poles`.
+    agreements: of pairs that project stripes of two directions.
+    seams: see `find_seams`.
+    contradictions: see `merge`.
+    floor_mm: height at which the floor was measured, see `find_floor`.
+    """
+
+    failed: Mapping[str, str] = field(default_factory=dict)
+    silent: tuple[str, ...] = ()
+    agreements: Mapping[str, Agreement] = field(default_factory=dict)
+    seams: SeamReport | None = None
+    contradictions: Contradictions | None = None
+    floor_mm: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Coverage:
+    """A sample of N faces of the mesh, and how much of them each pair measured.
+
+    heights_mm: heights of the faces, (N,).
+    areas_mm2: areas that they stand for, (N,).
+    filled: whether no pair measured them, (N,).
+    yields: by pair, the share that it measured of the faces that it sees and others measured; pairs
+        that see next to nothing are left out.
+    saturated: by pair, share of those faces that are white in its lit image.
+    """
+
+    heights_mm: Array
+    areas_mm2: Array
+    filled: Mask
+    yields: Mapping[str, float]
+    saturated: Mapping[str, float]
+
+    @property
+    def filled_share(self) -> float:
+        return float(self.areas_mm2[self.filled].sum() / max(self.areas_mm2.sum(), 1e-12))
+
+
+@dataclass(frozen=True, eq=False)
+class ScanEvidence:
+    """Everything that the checks of a scan look at.
+
+    use: how wrong a girth may be.
+    together: the result of alignment; None if it took no part.
+    person: how a moving body moved.
+    mesh, coverage: None while there is no mesh; findings that need it are then left out.
+    """
+
+    cloud: BodyCloud
+    rig: RigEvidence
+    images: ImageEvidence
+    use: UseLimits
+    together: Together | None = None
+    person: PersonMotion | None = None
+    mesh: BodyMesh | None = None
+    coverage: Coverage | None = None
+
+    @property
+    def alignment(self) -> Alignment | None:
+        return self.together.alignment if self.together else None
+
+    @property
+    def poses_corrected(self) -> bool:
+        """Whether alignment found displaced poles, or all poles farther out, and corrected them."""
+        return bool(self.together and (self.together.shifted or self.together.size))
+
+    @property
+    def shape(self) -> BodyMesh | None:
+        """The mesh unless more than half is filled: filled surface may have any shape."""
+        if self.mesh is None:
+            return None
+        filled = self.coverage.filled_share if self.coverage else self.mesh.filled_share
+        return self.mesh if filled <= 0.5 else None
+
+
+Check = Callable[[ScanEvidence], Iterable[Finding]]
+"""Yields a grade and a message for each fault of a scan."""

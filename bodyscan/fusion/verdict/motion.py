@@ -1,0 +1,116 @@
+"""Checks of what moved: poles since the calibration, or the person during the scan."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from bodyscan.alignment.pole_steps import STILL_MM
+from bodyscan.fusion.verdict.evidence import GIRTH_PER_MM, Finding, ScanEvidence
+from bodyscan.settings import UseLimits
+
+UNCORRECTED_SHARE = 0.2
+"""Share of a pair's motion that no rigid motion of the whole body explains: arms and breath."""
+MAX_RESIDUAL_MM = UseLimits().usable_girth_mm / GIRTH_PER_MM
+"""Motion left after correction that costs the usable girth error."""
+MAX_MOTION_MM = MAX_RESIDUAL_MM / UNCORRECTED_SHARE
+
+
+def check_displaced_poles(scan: ScanEvidence) -> Iterator[Finding]:
+    """Poles and pairs that alignment found displaced, and corrected.
+
+    What the correction left shows at the seams. But whether a single pair moved or measures wrongly
+    (another lens, rows lost), which no pose corrects, cannot be determined; and if several moved,
+    the overlaps alone determine the body's size.
+    """
+    steps = scan.together.shifted if scan.together else ()
+    for step in steps:
+        # A bumped pole turns about its foot and carries its view of the body along, by the turn
+        # times its distance, at least a metre. If the body's middle stays within a quarter of
+        # that, and 5 degrees are too large for a bump, it was the body that turned.
+        lever_mm = np.radians(step.turn_deg) * 1000.0
+        if step.turn_deg > 5.0 and step.shift_mm < 0.25 * lever_mm:
+            yield (
+                "repeat",
+                f"the person turned by {step.turn_deg:.0f} degrees before or after {step.name} fired: "
+                f"a pole that turned as much would have displaced the body by {lever_mm:.0f} mm, not "
+                f"by {step.shift_mm:.0f} mm",
+            )
+            continue
+        yield (
+            "repeat" if len(step.pairs) == 1 or len(steps) > 1 or step.all_moved else "usable",
+            f"{step.name} is displaced by {step.shift_mm:.1f} mm and {step.turn_deg:.2f} degrees from "
+            "its calibrated pose, alone and in one step, which no motion of a person explains; it was "
+            "aligned with the others. Calibrate again, unless `timing` of captures.yaml is wrong",
+        )
+
+
+def check_size(scan: ScanEvidence) -> Iterator[Finding]:
+    """A common step of all poles outwards or inwards, corrected too."""
+    size = scan.together.size if scan.together else None
+    if size is None:
+        return
+    girth_mm = abs(size.out_mm) * GIRTH_PER_MM
+    where, wrong = ("farther from", "small") if size.out_mm > 0.0 else ("nearer to", "large")
+    yield (
+        "repeat" if girth_mm > scan.use.usable_girth_mm else "usable",
+        f"all poles are {abs(size.out_mm):.1f} mm (sigma {size.sigma_mm:.1f} mm) {where} the body than "
+        f"calibrated, which no motion of a person explains. Girths would be {girth_mm:.0f} mm too "
+        f"{wrong}; now the overlaps alone determine the body's size. Calibrate again",
+    )
+
+
+def check_displaced_pairs(scan: ScanEvidence) -> Iterator[Finding]:
+    """Pairs displaced by more than sway and their calibration's errors explain.
+
+    A head or arms that move by themselves may have the same effect.
+    """
+    if scan.together is None:
+        return
+    search = scan.together.search
+    boards_mm = np.array(list(scan.rig.boards_mm.values()) or [0.0])
+    expected_mm = float(np.sqrt(np.mean(boards_mm**2) / 3.0))  # along one axis
+    girth_mm = float(np.sqrt(max(search.own_mm**2 - expected_mm**2, 0.0))) * GIRTH_PER_MM
+    if girth_mm <= scan.use.good_girth_mm:
+        return
+    sways = search.sway_mm > STILL_MM
+    yield (
+        "repeat" if girth_mm > scan.use.usable_girth_mm and not sways else "usable",
+        f"the pairs are displaced by {search.own_mm:.1f} mm RMS from their calibrated poses, and no "
+        f"sway explains it. Possible causes: {'head or arms moved; ' if sways else ''}the rig was "
+        "moved since the calibration. Take a board shot, or calibrate again",
+    )
+
+
+def check_motion(scan: ScanEvidence) -> Iterator[Finding]:
+    """The effect of motion on girths.
+
+    If the person was followed, of what that left; otherwise of how far the pairs were moved, beyond
+    what their own pose errors explain.
+    """
+    alignment = None if scan.poses_corrected else scan.alignment
+    usable_mm = scan.use.usable_girth_mm
+    for part in scan.person.parts if scan.person else ():
+        girth_mm = part.left_mm * GIRTH_PER_MM
+        if girth_mm > usable_mm:
+            yield (
+                "repeat" if girth_mm > 3.0 * usable_mm else "usable",
+                f"the {part.name} moved by {part.moved_mm:.1f} mm during the scan, of which "
+                f"{part.left_mm:.1f} mm are left after correction: repeat if you need it better",
+            )
+    if scan.person or alignment is None or not alignment.motion_mm:
+        return
+    # Motions within three sigmas of the boards' may be errors that these left open.
+    beyond_mm = {
+        name: np.sqrt(max(mm**2 - (3.0 * scan.rig.boards_mm.get(name, 0.0)) ** 2, 0.0))
+        for name, mm in alignment.motion_mm.items()
+    }
+    name = max(beyond_mm, key=lambda one: beyond_mm[one])
+    girth_mm = beyond_mm[name] * UNCORRECTED_SHARE * GIRTH_PER_MM
+    if girth_mm > usable_mm:
+        yield (
+            "repeat" if girth_mm > 2.0 * usable_mm else "usable",
+            f"the person moved by {alignment.motion_mm[name]:.1f} mm between the pairs' captures "
+            f"(pair {name})",
+        )

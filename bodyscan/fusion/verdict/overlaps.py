@@ -1,0 +1,226 @@
+"""Checks of the overlaps: whether surfaces of two pairs continue each other and agree.
+
+Alignment searches a few millimetres far, and does not see what it leaves out: a pair displaced by
+more overlaps with nothing, or with something that is not the same spot. Seams compare pairs nearly
+up to their rims and over centimetres, by the median of every patch, which noise hardly moves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from bodyscan.alignment.matching import (
+    SEAM_RIM_PX,
+    AlignmentPoints,
+    Matches,
+    alignment_points,
+    match_projected,
+)
+from bodyscan.alignment.overlaps import tied_groups
+from bodyscan.alignment.pole_steps import moving_alone
+from bodyscan.arrays import Array, Indices
+from bodyscan.fusion.verdict.evidence import (
+    GIRTH_PER_MM,
+    Finding,
+    ScanEvidence,
+    Seam,
+    SeamReport,
+)
+from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.progress import THREADS
+from bodyscan.reconstruction.range_image import RangeImage
+
+MAX_DISAGREEMENT_MM = 0.4
+"""RMS distance of overlapping surfaces in a good scan, if their sigmas do not predict more."""
+SEAM_REACH_MM = 40.0
+"""A pole displaced by more shares no surface any more; an arm is farther from the trunk."""
+PATCH_MM = 40.0
+"""A limb's width: anything narrower affects no girth."""
+
+
+def find_seams(
+    images: Sequence[RangeImage],
+    rig_from_camera: Mapping[str, RigidTransform],
+    poles: Mapping[str, str],
+) -> SeamReport:
+    """Compare the surfaces of every two pairs by patches, after alignment.
+
+    images: cleaned.
+    poles: the pole of each pair that stands on one.
+    """
+    with ThreadPoolExecutor(THREADS) as pool:
+        points = list(pool.map(lambda im: alignment_points(im, 3.0, SEAM_RIM_PX), images))
+        compared = pool.map(
+            lambda two: _compare_pairs(two[0], two[1], rig_from_camera), combinations(points, 2)
+        )
+        seams = tuple(seam for seam in compared if len(seam.distances_mm))
+    names = [image.pair for image in images]
+    count = {image.pair: np.count_nonzero(image.valid) for image in images}
+    # A pair that measured less than a hundredth of everything affects no girth.
+    relevant = [name for name in names if count[name] > 0.01 * sum(count.values())]
+    shared = [seam.pairs for seam in seams if set(seam.pairs) <= set(relevant)]
+    groups = sorted(tied_groups(relevant, shared), key=lambda group: (-len(group), min(group)))
+    isolated = tuple(tuple(sorted(group)) for group in groups[1:])
+    return SeamReport(seams, moving_alone(names, poles), isolated)
+
+
+def _compare_pairs(
+    one: AlignmentPoints, other: AlignmentPoints, rig_from_camera: Mapping[str, RigidTransform]
+) -> Seam:
+    here, there = rig_from_camera[one.image.pair], rig_from_camera[other.image.pair]
+    both = (
+        match_projected(one, other, here, there, SEAM_REACH_MM),
+        match_projected(other, one, there, here, SEAM_REACH_MM),
+    )
+    patches = [patch_medians(matches) for matches in both]
+    distances, sigma = (np.concatenate(part) for part in zip(*patches, strict=True))
+    return Seam((one.image.pair, other.image.pair), distances, sigma)
+
+
+def patch_medians(matches: Matches) -> tuple[Array, Array]:
+    """Median distances of patches of 8 matches or more, and their sigmas from the scatter."""
+    x, y, z = np.floor(matches.points / PATCH_MM).astype(np.int64).T
+    # 4096 patches reach from one end of any volume to the other.
+    key = (x * 4096 + y) * 4096 + z
+    _, number, count = np.unique(key, return_inverse=True, return_counts=True)
+    median = _group_medians(matches.distances, number, count)
+    deviation = _group_medians(np.abs(matches.distances - median[number]), number, count)
+    # 1.2533: sigma of a median over that of a mean. 5 neighbouring matches share their errors.
+    independent = np.maximum(count / 5.0, 1.0)
+    sigma = 1.2533 * SIGMAS_PER_MEDIAN * deviation / np.sqrt(independent)
+    enough = count >= 8
+    return np.abs(median[enough]), sigma[enough]
+
+
+def _group_medians(values: Array, group: Indices, count: Indices) -> Array:
+    """Median of the values of each group, numbered from 0."""
+    ascending = np.argsort(values)
+    # There are few patches, and 16-bit numbers are sorted in one pass.
+    small = group[ascending].astype(np.min_scalar_type(len(count)))
+    ordered = values[ascending[np.argsort(small, kind="stable")]]
+    return ordered[np.cumsum(count) - count + count // 2]
+
+
+@dataclass(frozen=True)
+class Misalignment:
+    """A pole or a pair whose surfaces are displaced by `step_mm` where they meet the others'."""
+
+    name: str
+    step_mm: float
+
+
+def find_misaligned(
+    seams: Sequence[Seam], groups: Mapping[str, frozenset[str]], limit_mm: float
+) -> tuple[Misalignment, ...]:
+    """The fewest groups of pairs without which all other steps are within the limit, worst first."""
+    found: list[Misalignment] = []
+    while _largest_step(groups, seams) > limit_mm:
+        without = {
+            name: [seam for seam in seams if not group.intersection(seam.pairs)]
+            for name, group in groups.items()
+        }
+        steps = {name: _step_around(group, seams) for name, group in groups.items()}
+        worst = min(
+            (name for name in groups if steps[name] > limit_mm),
+            key=lambda n: (
+                max(_largest_step(groups, without[n]), limit_mm),
+                len(groups[n]),
+                -steps[n],
+            ),
+        )
+        found.append(Misalignment(worst, steps[worst]))
+        seams = without[worst]
+    return tuple(sorted(found, key=lambda one: -one.step_mm))
+
+
+def estimate_step(seams: Sequence[Seam]) -> float:
+    """Step that three of four patches do not exceed, less what noise alone would give, mm.
+
+    One patch in four may show something else, such as hair or a hand that moved.
+    """
+    distance = np.concatenate([seam.distances_mm for seam in seams])
+    sigma = np.concatenate([seam.sigma_mm for seam in seams])
+    return float(np.sqrt(max(np.percentile(distance**2 - sigma**2, 75.0), 0.0)))
+
+
+def _largest_step(groups: Mapping[str, frozenset[str]], seams: Sequence[Seam]) -> float:
+    return max((_step_around(group, seams) for group in groups.values()), default=0.0)
+
+
+def _step_around(group: frozenset[str], seams: Sequence[Seam]) -> float:
+    around = [seam for seam in seams if len(group.intersection(seam.pairs)) == 1]
+    return estimate_step(around) if around else 0.0
+
+
+def check_seams(scan: ScanEvidence) -> Iterator[Finding]:
+    """Poles and pairs whose surfaces do not continue where the others' end."""
+    report = scan.images.seams
+    if report is None:
+        return
+    limit_mm = scan.use.good_girth_mm / GIRTH_PER_MM
+    for group in find_misaligned(report.seams, report.groups, limit_mm):
+        yield (
+            "repeat" if group.step_mm * GIRTH_PER_MM > scan.use.usable_girth_mm else "usable",
+            f"{group.name} does not fit the others: its surface is displaced by {group.step_mm:.2g} mm "
+            "where it meets theirs. Possible causes: the person turned or stepped aside meanwhile; it "
+            "was moved since the calibration; its images are of another scan or person; cables or "
+            "folders were exchanged",
+        )
+    for names in report.isolated:
+        yield (
+            "usable",
+            f"{', '.join(names)} shares no surface with the others: if the person, or a pole, moved in "
+            "between, nothing would show it",
+        )
+
+
+def check_disagreement(scan: ScanEvidence) -> Iterator[Finding]:
+    """Noise that sigmas do not include; seams are judged without noise."""
+    if scan.alignment is None:
+        return
+    rms_mm, expected_mm = scan.alignment.rms_after_mm, scan.alignment.expected_mm
+    if rms_mm > max(MAX_DISAGREEMENT_MM, 2.0 * expected_mm):
+        yield (
+            "usable",
+            f"the pairs disagree by {rms_mm:.2f} mm RMS where they overlap; their sigmas predict "
+            f"{expected_mm:.2f} mm. Possible causes: the calibration is another rig's; something was "
+            "moved since; the person did not stand still",
+        )
+
+
+def check_contradictions(scan: ScanEvidence) -> Iterator[Finding]:
+    """Pairs that see through each other's surfaces, which nearby points alone do not show.
+
+    Aligning displaced poles should have ended that. Below 0.001 where all is well.
+    """
+    found, report = scan.images.contradictions, scan.images.seams
+    if found is None or found.beyond_noise <= 0.005:
+        return
+    if scan.poses_corrected:
+        yield (
+            "repeat",
+            f"the pairs contradict each other at {found.share:.1%} of their common points, even with "
+            "the displaced poles aligned. Possible causes: a lens or a projector was touched; the "
+            "calibration was edited",
+        )
+        return
+    outlier = found.find_outlier(report.groups) if report else ""
+    yield (
+        "repeat" if found.beyond_noise > 0.02 else "usable",
+        f"{f'{outlier} and the others' if outlier else 'the pairs'} contradict each other: at "
+        f"{found.share:.1%} of the pairs' common points one sees no surface where the other does. "
+        "Possible causes: "
+        + (
+            f"the person turned or stepped aside meanwhile; {outlier} was moved since the calibration, "
+            "or is from another scan; "
+            if outlier
+            else "the calibration is another rig's; something was moved since; "
+        )
+        + "cables or folders were exchanged",
+    )
