@@ -105,7 +105,7 @@ def _score(person: str, truth: TruePerson, folder: Path, *, timed: bool) -> tupl
     )
     scan = load_scan(result)
     points, sigma = scan.cloud.points.astype(float), scan.cloud.sigma_mm.astype(float)
-    truth_from_scan = _align(points, truth)
+    truth_from_scan = align_to_truth(points, truth)
     moved = points @ truth_from_scan[:3, :3].T + truth_from_scan[:3, 3]
     cells = _distance_cells(moved, sigma, truth)
     measured = json.loads((result / "measurements.json").read_text("utf-8"))
@@ -176,7 +176,7 @@ def _closest(scene: Any, points: Array) -> tuple[Array, Array, Indices]:
     return found["points"].numpy().astype(float), normals, found["primitive_ids"].numpy()
 
 
-def _align(points: Array, truth: TruePerson) -> Array:
+def align_to_truth(points: Array, truth: TruePerson) -> Array:
     """Find the rigid motion (4, 4) of the cloud to the truth: robust point-to-plane ICP."""
     scene, result = _scene(truth), np.eye(4)
     rng = np.random.default_rng(0)
@@ -198,14 +198,29 @@ def _align(points: Array, truth: TruePerson) -> Array:
     return result
 
 
-def _distance_cells(points: Array, sigma: Array, truth: TruePerson) -> str:
-    """Cells of the first table for a cloud that lies on the truth."""
+def measure_distances(points: Array, truth: TruePerson) -> tuple[Array, Indices]:
+    """Signed distances (N,) of points to the true mesh, outside positive, and nearest vertices."""
     on, _, face = _closest(_scene(truth), points)
     off = points - on
     # A vertex normal decides the side: at a closest point on an edge a face's may not.
     near = truth.faces[face][np.arange(len(face)), _nearest_corner(points, truth, face)]
     distance = np.linalg.norm(off, axis=1)
     distance *= np.where(np.sum(off * _vertex_normals(truth)[near], axis=1) < 0.0, -1.0, 1.0)
+    return distance, near
+
+
+def measure_rms_without_hair(points: Array, truth: TruePerson) -> float:
+    """Lay points (N, 3) on the true mesh; RMS distance where there is no hair, mm."""
+    truth_from_scan = align_to_truth(points, truth)
+    moved = points @ truth_from_scan[:3, :3].T + truth_from_scan[:3, 3]
+    distance, near = measure_distances(moved, truth)
+    kept = (np.abs(distance) < 10.0) & (truth.region[near] != HAIR)
+    return float(np.sqrt(np.mean(distance[kept] ** 2)))
+
+
+def _distance_cells(points: Array, sigma: Array, truth: TruePerson) -> str:
+    """Cells of the first table for a cloud that lies on the truth."""
+    distance, near = measure_distances(points, truth)
     close, hair = np.abs(distance) < 10.0, truth.region[near] == HAIR
     masks = [
         ~hair & (truth.part[near] == PARTS.index(p)) for p in ("arms", "trunk", "legs", "head")

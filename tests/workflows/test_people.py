@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from required import missing
 from small_workspace import PROJECT, run
-from true_person import bare_rms_mm, load_person
 
+from benchmarks.independent_people import load_truth, measure_rms_without_hair
 from bodyscan.fusion.storage import load_scan
 
 
@@ -24,4 +24,5 @@ def test_the_cloud_of_the_woman_lies_on_the_true_body(tmp_path: Path) -> None:
     points = load_scan(out).cloud.points
     some = np.random.default_rng(0).choice(len(points), min(len(points), 100_000), replace=False)
     # It is 0.17 mm.
-    assert bare_rms_mm(points[some].astype(float), load_person(woman)) < 0.20
+    truth = load_truth(woman / "truth")
+    assert measure_rms_without_hair(points[some].astype(float), truth) < 0.20
