@@ -12,7 +12,7 @@ from bodyscan.arrays import Array
 from bodyscan.boards.view import BoardView
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.transforms import RigidTransform, rigid_fit
+from bodyscan.geometry.transforms import RigidTransform, fit_rigid_transform
 from bodyscan.registration.board_shape import BoardShape
 from bodyscan.registration.rig_solve import RigSolution, solve_rig
 from bodyscan.rig.rig import Rig
@@ -78,7 +78,7 @@ def _off_board(corners: Array, points: Array) -> float:
     """RMS distance (mm) of points (N, 3) to the corners (N, 3) rigidly fitted to them."""
     if len(corners) < 4:
         return float("nan")
-    fitted = rigid_fit(corners, points).apply(corners)
+    fitted = fit_rigid_transform(corners, points).apply(corners)
     return float(np.sqrt(np.mean(np.sum((fitted - points) ** 2, axis=1))))
 
 

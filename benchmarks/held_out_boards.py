@@ -87,7 +87,7 @@ def _models(
     )
     plain = pinhole.sheets(points.points, stripes, direction)
     return {
-        "smooth planes": fit_sheets(BowedSheets.of_pinhole(plain, 0), points).sheets,
+        "smooth planes": fit_sheets(BowedSheets.from_pinhole(plain, 0), points).sheets,
         "free planes": fit_planes(points, stripes, direction, 0.0).planes,
         "chosen by held-out boards": fit_light_sheets(points, stripes, direction).sheets,
         "pinhole (2 x 4, stripes)": pinhole.planes(stripes, direction),

@@ -15,7 +15,7 @@ from bodyscan.arrays import Array, Mask
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.pose_covariance import position_sigma
-from bodyscan.geometry.transforms import RigidTransform, rigid_fit
+from bodyscan.geometry.transforms import RigidTransform, fit_rigid_transform
 from bodyscan.registration.rig_solve import RigSolution, solve_rig
 from bodyscan.rig.board import Board
 from bodyscan.rig.rig import Rig
@@ -144,7 +144,7 @@ def _score(
 
 def _aligned(seen: SeenRig, placings: dict[str, RigidTransform], scored: Scored) -> Scored:
     names = sorted(placings)
-    motion = rigid_fit(
+    motion = fit_rigid_transform(
         np.array([placings[name].translation for name in names]),
         np.array([seen.pairs[name].rig_from_camera.translation for name in names]),
     )

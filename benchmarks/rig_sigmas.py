@@ -15,9 +15,9 @@ from bodyscan.arrays import Array
 from bodyscan.boards.board_layout import corner_points
 from bodyscan.evaluation.surface import signed_distances
 from bodyscan.fusion.storage import load_scan
-from bodyscan.geometry.camera_fields import from_fields
+from bodyscan.geometry.camera_fields import camera_from_fields
 from bodyscan.geometry.robust import rms
-from bodyscan.geometry.transforms import RigidTransform, rigid_fit
+from bodyscan.geometry.transforms import RigidTransform, fit_rigid_transform
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.storage import load_calibration
 from bodyscan.workflows.evaluate import Truth, compare_rig, load_truth
@@ -130,7 +130,7 @@ def _turned_print(found: RigCalibration, truth: Truth) -> RigidTransform:
         return RigidTransform.identity()
     printed = np.array(truth.facts["boards"][board.name]["corners_mm"])
     rig_from_board = RigidTransform.from_matrix(truth.facts["shots"][shot]["rig_from_board"])
-    moved = rigid_fit(corner_points(board), printed)
+    moved = fit_rigid_transform(corner_points(board), printed)
     return rig_from_board @ moved @ rig_from_board.inverse()
 
 
@@ -139,7 +139,7 @@ def _turned(found: RigCalibration, true: Mapping[str, Any], name: str) -> Array:
     off = (
         found.rig_from_camera[name] @ RigidTransform.from_matrix(true["rig_from_camera"]).inverse()
     )
-    sigmas = np.sqrt(np.diag(found.covariance.of(name))[:3])
+    sigmas = np.sqrt(np.diag(found.covariance.marginal(name))[:3])
     if not sigmas.any():  # the camera that holds the frame
         return np.zeros(3)
     return np.asarray(off.twist[:3] / sigmas)
@@ -148,7 +148,7 @@ def _turned(found: RigCalibration, true: Mapping[str, Any], name: str) -> Array:
 def _camera_off(found: RigCalibration, true: Mapping[str, Any], name: str) -> Array:
     """Errors (7,) of the parameters that all lenses have, over their sigmas."""
     pair = found.pairs[name]
-    off = pair.camera.parameters[:7] - from_fields(true["camera"]).parameters[:7]
+    off = pair.camera.parameters[:7] - camera_from_fields(true["camera"]).parameters[:7]
     return np.asarray(off / np.sqrt(np.diag(pair.camera_covariance))[:7])
 
 

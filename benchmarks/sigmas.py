@@ -13,7 +13,7 @@ from scipy.spatial.distance import pdist
 from bodyscan.arrays import Array
 from bodyscan.boards.board_layout import corner_points
 from bodyscan.evaluation.spheres import centre_distances
-from bodyscan.geometry.camera_fields import from_fields
+from bodyscan.geometry.camera_fields import camera_from_fields
 from bodyscan.geometry.robust import rms
 from bodyscan.laboratory import apparatus
 from bodyscan.laboratory.approaches import calibrate_by_reference_plane
@@ -90,7 +90,7 @@ def _unit(boards: int, real_light: bool, seed: int) -> UnitErrors:
     ours, covariance, *_ = calibrate_ours(
         captures, *calibrate_by_reference_plane(TARGET, captures.boards)
     )
-    true = from_fields(describe_camera(apparatus.CAMERA)).parameters
+    true = camera_from_fields(describe_camera(apparatus.CAMERA)).parameters
     off = (ours.camera.parameters - true) / np.sqrt(np.diag(covariance))
     print_ppm = centre_distances(setup.board.corners, corner_points(apparatus.BOARD)).scale_ppm
     accuracy, best = (measure_artefacts(one, captures) for one in (ours, true_approach(setup)))

@@ -23,8 +23,8 @@ from bodyscan.captures.folder import open_scan
 from bodyscan.evaluation.body import sway_residual
 from bodyscan.evaluation.surface import signed_distances
 from bodyscan.fusion.scan import Scan
-from bodyscan.geometry.camera_fields import from_fields
-from bodyscan.geometry.robust import rms, spread
+from bodyscan.geometry.camera_fields import camera_from_fields
+from bodyscan.geometry.robust import rms, robust_scale
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import DARK_CLOTH, HAIR, REGION_NAMES, SKIN, compute_region_shares
 from bodyscan.mesh.topology import vertex_normals
@@ -125,7 +125,7 @@ def _scan(calibration: RigCalibration, person: Path) -> Scan:
 
 def _light_row(name: str, case: Case) -> str:
     scan, off = case.scan, _errors(case)
-    sigmas = spread(off / scan.cloud.sigma_mm)
+    sigmas = robust_scale(off / scan.cloud.sigma_mm)
     size = f"{off.mean():.3f}, {rms(off):.3f}, {np.percentile(np.abs(off), 95):.3f}"
     return f"| {name} | {size} | {sigmas:.2f} | {scan.verdict.grade} |"
 
@@ -146,7 +146,7 @@ def _region_rows(name: str, case: Case) -> list[str]:
         recall = np.mean(regions[of_points == kind] == kind)
         covered = np.mean(near[seen & (true == kind)])
         own = of_points == kind
-        sigmas = spread(off[own] / case.scan.cloud.sigma_mm[own])
+        sigmas = robust_scale(off[own] / case.scan.cloud.sigma_mm[own])
         figures = f"{precision:.4f} | {recall:.4f} | {100.0 * covered:.1f} %"
         figures += f" | {rms(off[own]):.3f} | {sigmas:.2f}"
         rows.append(f"| {name} | {REGION_NAMES[kind]} | {figures} |")
@@ -186,7 +186,7 @@ def _seen_by_two(vertices: Array, faces: Indices, pairs: Mapping[str, Any]) -> M
     for pair in pairs.values():
         at, camera = (
             RigidTransform.from_matrix(pair["rig_from_camera"]),
-            from_fields(pair["camera"]),
+            camera_from_fields(pair["camera"]),
         )
         u, v = camera.project(at.inverse().apply(vertices)).T
         seen = (u > 0) & (u < camera.width - 1) & (v > 0) & (v < camera.height - 1)

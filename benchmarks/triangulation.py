@@ -34,7 +34,7 @@ def triangulate(
         lambda points: _equations(cameras, camera_from_rig, pixels, seen, points),
         steps=STEPS,
         damping=0.0,
-        least=LEAST_PX,
+        min_sigma=LEAST_PX,
     ).state
     return points
 

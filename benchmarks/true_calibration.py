@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from bodyscan.calibration.pair import PairCalibration, PairQuality
-from bodyscan.geometry.camera_fields import from_fields
+from bodyscan.geometry.camera_fields import camera_from_fields
 from bodyscan.geometry.light_planes import LightPlanes
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform, adjoint
@@ -72,7 +72,7 @@ def calibration_from_facts(
 def _pair(
     pair: Pair, true: Mapping[str, Any], planes_mm: float, rng: np.random.Generator
 ) -> PairCalibration:
-    camera = from_fields(true["camera"])
+    camera = camera_from_fields(true["camera"])
     planes = np.array(true["boundary_planes"])
     planes *= np.where(planes[:, 3:] < 0.0, -1.0, 1.0)
     planes[:, 3] += planes_mm * rng.standard_normal()

@@ -79,7 +79,7 @@ class Kind:
 
         Other sway of the whole body is smaller, and no larger than the evidence asks for.
         """
-        about_ankles = adjoint(RigidTransform.shift(ankles(cells)))[:, :3] / LEAN_MM
+        about_ankles = adjoint(RigidTransform.from_translation(ankles(cells)))[:, :3] / LEAN_MM
         whole = Kind.whole("lean", cells, about_ankles, courses)
         fields = modulated(whole.fields, cells, above_feet(cells)[:, None])
         return replace(whole, fields=fields, bends=fields - whole.fields)
@@ -142,7 +142,7 @@ class BodyMotion:
         by_freedom = np.arange(6 * pairs).reshape(pairs, 6).T.ravel()
         known = invert_scaled(boards)[np.ix_(by_freedom, by_freedom)]
         pose = Kind.whole("pose", cells, np.eye(6), Courses.steady(pairs))
-        any_way = adjoint(RigidTransform.shift(BODY_CENTRE)) * sway
+        any_way = adjoint(RigidTransform.from_translation(BODY_CENTRE)) * sway
         shifts = rigid_fields(cells, np.zeros(3), ARM_MM)[:, :, 3:]
         any_part = modulated(shifts, cells, cells.alike(PART_MM, LEAST_PART))
         rising = Courses.of(of_breath, seconds)

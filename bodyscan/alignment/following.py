@@ -261,7 +261,7 @@ def _each_overlap(
 ) -> dict[tuple[int, int], Result]:
     """Measure the matches of every two pairs with the person as followed so far."""
     motion, cells = person
-    placed = [view.start.moved(motion.twist(k)) for k, view in enumerate(views)]
+    placed = [view.start.retract(motion.twist(k)) for k, view in enumerate(views)]
     bends = motion.bends()
 
     def of_two(i: int, j: int) -> Result | None:
@@ -313,7 +313,7 @@ def _placed(
 ) -> Alignment:
     twists = np.array([motion.twist(k, from_middle=True) for k in range(len(views))])
     shift = np.linalg.norm(centre_shifts(twists), axis=1)
-    placed = [view.start.moved(twist) for view, twist in zip(views, twists, strict=True)]
+    placed = [view.start.retract(twist) for view, twist in zip(views, twists, strict=True)]
     left = {(names[i], names[j]): rms_mm for (i, j), rms_mm in gaps.items()}
     return replace(
         aligned,

@@ -118,7 +118,7 @@ def align(
             motion, left = _register(pool, (coarse, clouds), start, names, prior, settings)
         widest = sway.covariance(names, prior, sway.most)
         motion, refused = bound_motions(names, motion, widest, settings.limit_sigmas)
-        moved = [t.moved(m) for t, m in zip(start, motion, strict=True)]
+        moved = [t.retract(m) for t, m in zip(start, motion, strict=True)]
         # Measure both with the same reach, so that they can be compared.
         was, now = (
             _each_overlap(_gap, pool, coarse, placings, settings.least_reach_mm, settings)
@@ -156,7 +156,7 @@ def _register(
     equations = partial(OverlapEquations.of, correlated=settings.correlated)
     coarse, fine = clouds
     for left in range(settings.rounds, 0, -1):
-        moved = [t.moved(m) for t, m in zip(start, motion, strict=True)]
+        moved = [t.retract(m) for t, m in zip(start, motion, strict=True)]
         taken = fine if left <= FINE_ROUNDS else coarse
         overlaps = _each_overlap(equations, pool, taken, moved, reach, settings)
         known = sway.covariance(names, prior, scale)

@@ -56,7 +56,7 @@ def register(
     edges: dict[tuple[int, int], _Edge] = {}
     for i, j in combinations(range(len(both)), 2):
         edge = _bring_together((coarse[i], coarse[j]), (fine[i], fine[j]), settings)
-        if edge and edge.sigmas(widest.between(names[j], names[i])) < settings.limit_sigmas:
+        if edge and edge.sigmas(widest.relative(names[j], names[i])) < settings.limit_sigmas:
             edges[i, j] = edge
     motions = np.zeros((len(both), 6))
     for _ in range(SWAYS):

@@ -11,7 +11,7 @@ from bodyscan.alignment.matching import Matches
 from bodyscan.arrays import Array
 from bodyscan.compiled import compiled
 from bodyscan.geometry.linear_gaussian import invert_scaled, solve_scaled
-from bodyscan.geometry.robust import spread
+from bodyscan.geometry.robust import robust_scale
 
 LEAST_SPREAD_MM = 0.01
 
@@ -46,7 +46,7 @@ class OverlapEquations:
 def match_weights(matches: Matches) -> Array:
     """(M,) Cauchy's weights, 1 / (1 + (d / 2 sigma)^2), over sigma^2, which holds what the distances
     spread by besides."""
-    spread_mm = spread(matches.distances, LEAST_SPREAD_MM)
+    spread_mm = robust_scale(matches.distances, LEAST_SPREAD_MM)
     variance = matches.sigma_mm**2 + spread_mm * spread_mm
     return 1.0 / (variance + 0.25 * matches.distances**2)
 

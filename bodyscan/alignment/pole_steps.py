@@ -172,7 +172,7 @@ def _mean(motions: Sequence[Mapping[str, Array]]) -> dict[str, Array]:
 
 def loosened(boards: PoseCovariance, pairs: Collection[str]) -> PoseCovariance:
     """The calibration's covariance with a pole's pairs free to move together."""
-    return boards.moved_together(pairs, FREE.of_one())
+    return boards.add_common_motion(pairs, FREE.of_one())
 
 
 def motions_between(

@@ -51,18 +51,18 @@ class SwayPrior:
 
     def covariance(self, names: Sequence[str], boards: PoseCovariance, scale: float = 1.0) -> Array:
         """The calibration's covariance plus `scale` times each pair's usual sway, (6P, 6P)."""
-        return boards.among(names) + np.kron(np.eye(len(names)), self.of_one(scale))
+        return boards.select(names) + np.kron(np.eye(len(names)), self.of_one(scale))
 
     def of_one(self, scale: float = 1.0) -> Array:
         """Covariance of one pair's sway, rig frame, (6, 6)."""
         rotation, translation = scale * np.radians(self.rotation_deg), scale * self.shift_mm
         own = np.diag([max(rotation, 1e-7) ** 2] * 3 + [max(translation, 1e-4) ** 2] * 3)
-        carry = adjoint(RigidTransform.shift(BODY_CENTRE))
+        carry = adjoint(RigidTransform.from_translation(BODY_CENTRE))
         return np.asarray(carry @ own @ carry.T)
 
     def loosen(self, boards: PoseCovariance, untied: Collection[str]) -> PoseCovariance:
         """The calibration's covariance plus the sway of the pairs that no overlap ties."""
-        return boards.plus(untied, self.of_one())
+        return boards.add_independent_motions(untied, self.of_one())
 
 
 def centre_shifts(motion: Array) -> Array:

@@ -215,7 +215,9 @@ def _fit(patches: _Patches, start: Array, along: Array, light: _LightPrior | Non
         return state
 
     # Settled within a tenth of a corner's sigma; one more step then makes it far less.
-    solution = minimize_each(state, equations, within=within, steps=12, settled=1e-2, damping=1e-3)
+    solution = minimize_each(
+        state, equations, within=within, steps=12, tolerance=1e-2, damping=1e-3
+    )
     total = np.maximum(patches.weight.sum(axis=1), 1.0)
     return _Fit(
         solution.state,

@@ -120,11 +120,11 @@ class _State:
 
     def moved(self, step: Array) -> _State:
         size = len(self.camera.parameters)
-        return _State(self.camera.moved(step[:size]), self.boards_moved(step[size:]).poses)
+        return _State(self.camera.retract(step[:size]), self.boards_moved(step[size:]).poses)
 
     def boards_moved(self, step: Array) -> _State:
         twists = zip(self.poses, step.reshape(-1, 6), strict=True)
-        return _State(self.camera, tuple(pose.moved(twist) for pose, twist in twists))
+        return _State(self.camera, tuple(pose.retract(twist) for pose, twist in twists))
 
 
 def calibrate_camera(
@@ -193,7 +193,7 @@ def fit_camera(
         ],
         _State.moved,
         unknowns=size + 6 * len(views),
-        settled=settled,
+        tolerance=settled,
         damping=damping,
     )
     return CameraFit(solution)
@@ -262,7 +262,7 @@ def locate_boards(
         _State.boards_moved,
         unknowns=6 * len(views),
         steps=30,
-        settled=settled,
+        tolerance=settled,
     )
     corners = solution.blocks[0]
     return solution.state.poses, _by_view(corners.residuals.reshape(-1, 2), corners)

@@ -21,7 +21,7 @@ from bodyscan.geometry.lens_sheets import LensSheets
 from bodyscan.geometry.lenses.brown import Brown
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.light_planes import LightPlanes, LightSheets
-from bodyscan.geometry.projector_sheets import projector_of_sheets
+from bodyscan.geometry.projector_sheets import projector_from_sheets
 from bodyscan.geometry.robust import rms
 from bodyscan.geometry.smooth_sheets import SmoothSheets
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
@@ -80,12 +80,12 @@ def fit_projector(
     """The projector with a lens (k1, k2, p1, p2; more if it came with more) whose sheets these are.
 
     With a single direction of stripes its pixels are square and its place along the stripes is
-    unknown: see `projector_of_sheets`. Raises BadInput if no such projector explains the sheets
+    unknown: see `projector_from_sheets`. Raises BadInput if no such projector explains the sheets
     within their noise, or only one whose image is mirrored.
     """
     first = _samples(camera, light)
     start = light if isinstance(light, LensSheets) else _fitted_lens(light, first)
-    projector, from_camera = projector_of_sheets(start)
+    projector, from_camera = projector_from_sheets(start)
     if crossing is None:
         found = FittedProjector(projector, from_camera)
         return found if start is light else _judged(found, [first])
@@ -231,7 +231,7 @@ def _refined(
     def moved(state: State, step: Array) -> State:
         whole = np.zeros(size)
         whole[free] = step
-        return state[0].moved(whole[POSE:]), state[1].moved(whole[:POSE])
+        return state[0].retract(whole[POSE:]), state[1].retract(whole[:POSE])
 
     solution = minimize((projector, from_camera), blocks, moved, unknowns=len(free))
     return FittedProjector(*solution.state)

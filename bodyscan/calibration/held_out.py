@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodyscan.arrays import Array, Indices
-from bodyscan.geometry.robust import cauchy_weights, spread
+from bodyscan.geometry.robust import cauchy_weights, robust_scale
 
 CLEARLY = 3.0
 """Standard errors by which a richer model must be better: by chance once in 700 times."""
@@ -38,7 +38,7 @@ def shared_weights(tried: Sequence[Array]) -> Array:
     """Weights (N,) of points with residuals (N, D) in each model: low where no model fits."""
     size = tried[0].shape[1]
     least = np.min([np.sum(residuals**2, axis=1) for residuals in tried], axis=0)
-    sigma = min(spread(residuals.ravel()) for residuals in tried)
+    sigma = min(robust_scale(residuals.ravel()) for residuals in tried)
     each = np.repeat(np.sqrt(least / size), size) / sigma
     return np.asarray(cauchy_weights(each, size, CAUCHY_SIGMAS)[::size], np.float64)
 
@@ -58,4 +58,4 @@ def gain(*compared: Compared) -> float:
 
 
 def _least_spread(one: Compared) -> float:
-    return min(spread(residuals.ravel()) for residuals in (one.simple, one.rich))
+    return min(robust_scale(residuals.ravel()) for residuals in (one.simple, one.rich))

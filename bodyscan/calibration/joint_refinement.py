@@ -37,8 +37,8 @@ Sheets = TypeVar("Sheets", bound=SmoothSheets)
 STEPS = 20
 SETTLED = 1e-2
 """Convergence, in variances: a tenth of a sigma in every unknown makes no difference."""
-CORNERS = Noise("corners, px", group=2, cauchy=4.0, least=1e-3)
-STRIPES = Noise("stripes, in sigmas", cauchy=4.0, least=1e-2)
+CORNERS = Noise("corners, px", group=2, cauchy=4.0, min_scale=1e-3)
+STRIPES = Noise("stripes, in sigmas", cauchy=4.0, min_scale=1e-2)
 FLOOR_PX = 0.02
 LEAST_SHOWN = 1e-6
 """Information on a print below this share of the best-known direction's counts as none."""
@@ -120,8 +120,8 @@ class _State(Generic[Sheets]):
 
     def moved(self, step: Array) -> _State[Sheets]:
         twists = step[self.first_pose : self.first_sheet].reshape(-1, 6)
-        poses = tuple(p.moved(twist) for p, twist in zip(self.poses, twists, strict=True))
-        camera = self.camera.moved(step[: self.first_pose])
+        poses = tuple(p.retract(twist) for p, twist in zip(self.poses, twists, strict=True))
+        camera = self.camera.retract(step[: self.first_pose])
         sheets = self.sheets.retract(step[self.first_sheet : self.first_form])
         of_form = self.of_form
         forms = {name: form.moved(step[of_form[name]]) for name, form in self.forms.items()}
@@ -271,7 +271,7 @@ def _solve(
         lambda state, step: state.moved(step),
         unknowns=state.unknowns,
         steps=steps,
-        settled=SETTLED,
+        tolerance=SETTLED,
         damping=1e-6,
     )
 
@@ -366,7 +366,7 @@ def _on_board(state: _State[Sheets], k: int, board: StripedBoard, rays: Array) -
 
 
 def _face(board: StripedBoard) -> RigidTransform:
-    return RigidTransform.shift([0.0, 0.0, board.view.points[0, 2]])
+    return RigidTransform.from_translation([0.0, 0.0, board.view.points[0, 2]])
 
 
 def _sigma(board: StripedBoard, points: Array, across: Array, by_point: Array) -> Array:
@@ -416,7 +416,7 @@ def _stripe_jacobian(state: _State[Sheets], k: int, board: StripedBoard, rays: A
         return there(rays + turn, pose)
 
     def moved(column: int, step: float) -> Array:
-        return there(rays, pose.moved(step * np.eye(6)[column]))
+        return there(rays, pose.retract(step * np.eye(6)[column]))
 
     by_place = [
         (change(column, size) - change(column, -size)) / (2.0 * size)

@@ -11,7 +11,7 @@ from bodyscan.arrays import Array
 from bodyscan.errors import CalibrationFileError
 from bodyscan.geometry.camera import Camera, CameraPrior
 from bodyscan.geometry.light_planes import LightSheets
-from bodyscan.geometry.projector_sheets import looked_at, sheets_of_projector
+from bodyscan.geometry.projector_sheets import intersect_central_rays, sheets_from_projector
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.interchange.found_camera import FoundCamera, camera_named
 from bodyscan.interchange.rig_format import MILLIMETRES, RIG_FORMATS
@@ -50,8 +50,8 @@ class KnownPair:
         """Sheets of the stripes that the projector shows."""
         assert self.projector is not None
         assert self.projector_from_camera is not None
-        middle = looked_at(self.camera, self.projector, self.projector_from_camera)
-        return sheets_of_projector(
+        middle = intersect_central_rays(self.camera, self.projector, self.projector_from_camera)
+        return sheets_from_projector(
             self.projector,
             self.projector_from_camera,
             middle,

@@ -131,7 +131,7 @@ def _fit(
     ideal = np.concatenate(
         [pose.apply(view.points) for pose, view in zip(poses, views, strict=True)]
     )
-    lens = kind().nearest(camera.lens, ideal[:, :2] / ideal[:, 2:])
+    lens = kind().fit_to(camera.lens, ideal[:, :2] / ideal[:, 2:])
     return fit_camera(replace(camera, lens=lens), poses, views)
 
 

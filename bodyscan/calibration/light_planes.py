@@ -15,7 +15,7 @@ from bodyscan.calibration.boundary_points import (
 )
 from bodyscan.geometry.light_planes import Axis, LightPlanes
 from bodyscan.geometry.linear_gaussian import invert_scaled
-from bodyscan.geometry.robust import cauchy_weights, spread
+from bodyscan.geometry.robust import cauchy_weights, robust_scale
 
 __all__ = [
     "BoundaryPoints",
@@ -72,7 +72,7 @@ def fit_light_planes(
         leverage = np.abs(np.sum(data.per_pixel * planes[data.index, :3], axis=1))
         spread_mm = np.maximum(leverage, 1e-6) * data.sigma_px
         normalized = distances / spread_mm
-        scale = spread(normalized[np.isfinite(normalized)], 1e-9)
+        scale = robust_scale(normalized[np.isfinite(normalized)], 1e-9)
         robust = np.nan_to_num(cauchy_weights(normalized, 1, CAUCHY_SIGMAS * scale))
     bad = ~enough | (opening < LEAST_OPENING)
     planes = np.where(bad[:, None], np.nan, planes)

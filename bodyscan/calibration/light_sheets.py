@@ -124,9 +124,9 @@ def smooth_models(
         ("lens k1", lens.with_lens(1)),
         ("lens k1 k2", lens),
         ("lens k1 k2 p1 p2", lens.with_lens(4)),
-        ("smooth planes", BowedSheets.of_pinhole(plain, 0)),
-        ("bowed sheets", BowedSheets.of_pinhole(plain, 1)),
-        ("bowed sheets, 3 terms", BowedSheets.of_pinhole(plain, 3)),
+        ("smooth planes", BowedSheets.from_pinhole(plain, 0)),
+        ("bowed sheets", BowedSheets.from_pinhole(plain, 1)),
+        ("bowed sheets, 3 terms", BowedSheets.from_pinhole(plain, 3)),
     ]
     return [(name, fit_sheets(model, data).sheets) for name, model in models]
 
@@ -138,7 +138,7 @@ def _lens_start(plain: LensSheets, data: BoundaryPoints) -> LensSheets:
     image's edge or outside it.
     """
     centres = [plain.parameters[1], *(share * plain.stripes for share in AXIS_STARTS)]
-    starts = [plain.turned(float(centre)).with_lens(2) for centre in centres]
+    starts = [plain.rotate_to(float(centre)).with_lens(2) for centre in centres]
     fits = [fit_sheets(start, data, most_steps=START_STEPS) for start in starts]
     return min(fits, key=lambda fit: np.nan_to_num(fit.noise, nan=np.inf)).sheets
 

@@ -11,7 +11,7 @@ from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.calibration.boundary_points import BoundaryPoints, select
 from bodyscan.calibration.held_out import CLEARLY, Compared, gain
 from bodyscan.geometry.light_planes import LightSheets
-from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN, rms, spread
+from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN, rms, robust_scale
 
 MOST_FOLDS = 6
 CAP = 30.0
@@ -112,7 +112,7 @@ class HeldOutErrors:
         together = (np.diff(data.index) == 0) & (np.diff(data.board) == 0)
         steps = np.diff(self.distances)[together]
         steps = steps[np.isfinite(steps)]
-        noise = 0.5 * spread(steps) ** 2 if steps.size else 0.0
+        noise = 0.5 * robust_scale(steps) ** 2 if steps.size else 0.0
         left = max(total - noise, LEAST_SHARE * total)
         return float(np.sqrt(left / unit_variance[known].mean()))
 

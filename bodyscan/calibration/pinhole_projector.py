@@ -9,7 +9,7 @@ import numpy as np
 from bodyscan.arrays import Array
 from bodyscan.geometry.lens_sheets import LensSheets
 from bodyscan.geometry.light_planes import Axis, LightPlanes
-from bodyscan.geometry.robust import spread
+from bodyscan.geometry.robust import robust_scale
 
 MOST_POINTS = 20000
 
@@ -30,12 +30,12 @@ class PinholeProjector:
 
     def sheets(self, points: Array, stripes: int, direction: Axis) -> LensSheets:
         """The same model as a projector without a lens that lights points (N, 3) mm on boards."""
-        return LensSheets.pinhole(self.matrix, points.mean(axis=0), stripes, direction)
+        return LensSheets.from_matrix(self.matrix, points.mean(axis=0), stripes, direction)
 
     def planes(self, stripes: int, direction: Axis) -> LightPlanes:
         """The same model as light planes, which share one line, through the projector's centre."""
         s = np.arange(stripes + 1.0)[:, None]
-        return LightPlanes.exact(self.matrix[0] - s * self.matrix[1], direction)
+        return LightPlanes.from_planes(self.matrix[0] - s * self.matrix[1], direction)
 
 
 def fit_pinhole(points: Array, s: Array) -> PinholeProjector:
@@ -57,7 +57,7 @@ def fit_pinhole(points: Array, s: Array) -> PinholeProjector:
 
     from scipy.optimize import least_squares  # imported here because scans do not need it
 
-    scale = 3.0 * spread(residuals(start), 1e-9)
+    scale = 3.0 * robust_scale(residuals(start), 1e-9)
     solved = least_squares(residuals, start, loss="cauchy", f_scale=scale).x.reshape(2, 4)
     solved[0] = solved[0] * half + middle * solved[1]
     solved[:, :3] /= size

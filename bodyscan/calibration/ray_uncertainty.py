@@ -10,7 +10,7 @@ from bodyscan.arrays import Array, Mask
 from bodyscan.calibration.board_views import PlanarView
 from bodyscan.calibration.camera import CameraFit
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.ray_uncertainty import RayUncertainty, nodes
+from bodyscan.geometry.ray_uncertainty import RayUncertainty, node_pixels
 from bodyscan.geometry.transforms import twist_jacobian
 
 MOST_CORNERS = 3000
@@ -34,7 +34,7 @@ def ray_uncertainty(
         [pose.apply(view.points) for pose, view in zip(richest.poses, views, strict=True)]
     )
     corners = corners[:: -(-len(corners) // MOST_CORNERS)]
-    pixels = nodes(camera.width, camera.height)
+    pixels = node_pixels(camera.width, camera.height)
     rays = chosen.rays(pixels)
     shown: Mask = np.asarray(np.isfinite(rays).all(axis=-1))
     points = rays[shown] * np.median(corners[:, 2])

@@ -17,7 +17,7 @@ Sheets = TypeVar("Sheets", bound=SmoothSheets)
 MOST_STEPS = 25
 SETTLED = 0.01
 """Convergence, in variances: sheets a tenth of a standard deviation away would be as good."""
-POINTS = Noise("points on boards", cauchy=3.0, least=1e-3)
+POINTS = Noise("points on boards", cauchy=3.0, min_scale=1e-3)
 FLOOR_PX = 0.02
 """px, added to every sigma: lens, board and camera are not known better than this, however many
 pixels were averaged."""
@@ -62,7 +62,7 @@ def fit_sheets(
         lambda sheets, step: sheets.retract(step),
         unknowns=jacobian.shape[1],
         steps=most_steps,
-        settled=SETTLED,
+        tolerance=SETTLED,
         damping=1e-6,
     )
     sheets, points = solution.state, solution.blocks[0]
@@ -74,7 +74,7 @@ def fit_sheets(
         sheets.with_covariance(0.5 * (covariance + covariance.T)),
         points.residuals / np.linalg.norm(by_point, axis=1),
         solution.weights[0],
-        solution.spreads[0],
+        solution.scales[0],
     )
 
 
@@ -104,7 +104,7 @@ def _of_boards(
     points, noise = solution.blocks[0], solution.covariance
     errors = data.board_errors
     off = np.einsum("ni,ni->n", by_point, errors.along_ray)
-    weights = solution.weights[0] / (points.sigma * solution.spreads[0]) ** 2
+    weights = solution.weights[0] / (points.sigma * solution.scales[0]) ** 2
     effects = errors.effects * (off * weights)[:, None]
     total = np.zeros_like(noise)
     for board in np.unique(data.board):

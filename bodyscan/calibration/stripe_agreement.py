@@ -163,7 +163,7 @@ def _misfit(
         plain = fit_pinhole(own.points, own.index.astype(float)).sheets(
             own.points, stripes, direction
         )
-        fit = fit_sheets(BowedSheets.of_pinhole(plain, 1), own, most_steps=STEPS)
+        fit = fit_sheets(BowedSheets.from_pinhole(plain, 1), own, most_steps=STEPS)
         off = np.abs(fit.distances_mm) / np.linalg.norm(own.per_pixel, axis=1)
         medians += [float(np.median(off[own.board == board])) for board in group]
     return float(np.sqrt(np.mean(np.square(medians))))

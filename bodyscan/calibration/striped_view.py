@@ -80,7 +80,7 @@ class StripedView:
     def camera_from_face(self) -> RigidTransform:
         """Transform from the face that was seen; its corners lie at z = 0, or near it if bent."""
         z_mm = self.face.z_mm if self.face else self.view.points[0, 2]
-        return self.view.camera_from_board @ RigidTransform.shift([0.0, 0.0, z_mm])
+        return self.view.camera_from_board @ RigidTransform.from_translation([0.0, 0.0, z_mm])
 
 
 def boundaries_near(stripes: StripeMap, box: Box, crop: Crop = WHOLE) -> BoardBoundaries:

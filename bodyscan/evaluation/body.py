@@ -11,9 +11,9 @@ import open3d as o3d
 
 from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.evaluation.surface import covered_spots, sample_surface
-from bodyscan.geometry.camera_fields import from_fields
+from bodyscan.geometry.camera_fields import camera_from_fields
 from bodyscan.geometry.robust import rms
-from bodyscan.geometry.transforms import RigidTransform, rigid_fit
+from bodyscan.geometry.transforms import RigidTransform, fit_rigid_transform
 from bodyscan.measurement.measurements import Measurements, Slice, measure
 from bodyscan.mesh.body import BodyMesh
 
@@ -54,7 +54,7 @@ def sway_residual(
         placed.append((placing @ camera.inverse() @ swayed).apply(body))
     mean = np.mean(placed, axis=0)
     apart = float(np.sqrt(np.mean(np.sum((np.array(placed) - mean) ** 2, axis=-1))))
-    return SwayResidual(rigid_fit(body, mean), apart)
+    return SwayResidual(fit_rigid_transform(body, mean), apart)
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ def coverage_of_seen(
         still_from_camera = RigidTransform.from_matrix(
             pair["swayed_from_still"]
         ).inverse() @ RigidTransform.from_matrix(pair["rig_from_camera"])
-        camera = from_fields(pair["camera"])
+        camera = camera_from_fields(pair["camera"])
         in_camera = still_from_camera.inverse().apply(spots)
         ahead = in_camera[:, 2] > 100.0
         u, v = camera.project(np.where(ahead[:, None], in_camera, 1.0)).T

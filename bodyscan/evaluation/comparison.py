@@ -95,7 +95,9 @@ def fit_to_surface(points: Array, vertices: Array, faces: Indices) -> RigidTrans
         motion = icp.registration_icp(cloud, known, reach, motion, loss).transformation
     rough = RigidTransform.from_matrix(motion)
     found = _laid_on_faces(rough, some, vertices - middle, faces)
-    return RigidTransform.shift(middle) @ found @ RigidTransform.shift(-middle)
+    return (
+        RigidTransform.from_translation(middle) @ found @ RigidTransform.from_translation(-middle)
+    )
 
 
 def _laid_on_faces(
@@ -107,7 +109,7 @@ def _laid_on_faces(
     those of one pair would be drawn a few hundredths of a millimetre towards it.
     """
     scene, centre = build_centred_scene(vertices, faces)
-    found = RigidTransform.shift(-centre) @ start
+    found = RigidTransform.from_translation(-centre) @ start
     for _ in range(ROUNDS):
         placed = found.apply(points)
         nearest = scene.compute_closest_points(o3d.core.Tensor(placed.astype(np.float32)))
@@ -115,8 +117,8 @@ def _laid_on_faces(
         off = np.sum((placed - nearest["points"].numpy()) * normals, axis=1)
         weight = np.maximum(1.0 - (off / (0.5 * REACHES_MM[-1])) ** 2, 0.0)  # Tukey's, its root
         jacobian = np.hstack([np.cross(placed, normals), normals]) * weight[:, None]
-        found = found.moved(np.linalg.lstsq(jacobian, -weight * off, rcond=None)[0])
-    return RigidTransform.shift(centre) @ found
+        found = found.retract(np.linalg.lstsq(jacobian, -weight * off, rcond=None)[0])
+    return RigidTransform.from_translation(centre) @ found
 
 
 def _is_scan(path: Path) -> bool:

@@ -8,7 +8,7 @@ from bodyscan.arrays import Array
 from bodyscan.errors import FailedWork
 from bodyscan.evaluation.planes import best_plane
 from bodyscan.evaluation.spheres import FEWEST_POINTS, Sphere, fit_sphere
-from bodyscan.geometry.robust import spread
+from bodyscan.geometry.robust import robust_scale
 
 VOTE_CELL = 0.2  # radii: size of a cell in which votes for a centre are counted
 TAKEN = 1.15  # radii from a centre within which points belong to no other sphere
@@ -57,9 +57,9 @@ def _find_sphere(points: Array, votes: Array, radius: float) -> Sphere | None:
         return None
     sphere = fit_sphere(own, radius)
     normal, offset = best_plane(own)
-    flat = spread(own @ normal - offset)
+    flat = robust_scale(own @ normal - offset)
     # Ground between the spheres gathers votes too, but a plane fits it better.
-    return sphere if spread(sphere.distances(own)) < ROUNDER * flat else None
+    return sphere if robust_scale(sphere.distances(own)) < ROUNDER * flat else None
 
 
 def _in_reading_order(spheres: list[Sphere]) -> list[Sphere]:

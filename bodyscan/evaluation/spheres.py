@@ -82,7 +82,7 @@ def fit_sphere(points: Array, radius: float | None = None) -> Sphere:
     def moved(sphere: Sphere, step: Array) -> Sphere:
         return Sphere(sphere.centre + step[:3], sphere.radius + float(np.sum(step[3:])))
 
-    return minimize(sphere, blocks, moved, unknowns=free, settled=SETTLED).state
+    return minimize(sphere, blocks, moved, unknowns=free, tolerance=SETTLED).state
 
 
 def measure_sphere(points: Array, radius: float) -> SphereAccuracy:

@@ -15,7 +15,7 @@ import numpy as np
 from bodyscan.arrays import Array, Bytes, Floats, Mask
 from bodyscan.compiled import compiled
 from bodyscan.errors import ScanFailed
-from bodyscan.geometry.crop import crop_of, widened
+from bodyscan.geometry.crop import find_crop, pad_crop
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.progress import THREADS
 from bodyscan.reconstruction.range_image import RangeImage
@@ -56,7 +56,7 @@ def clean(
         kept = inside(image, rig_from_camera[image.pair], volume)
         if image.pair in nobody:
             kept &= in_front_of(image, nobody[image.pair])
-        box = crop_of(kept)
+        box = find_crop(kept)
         if box is not None:
             kept[box] &= ~dark_gaps(image.colours[box])
         if box is not None and kept.any():
@@ -89,8 +89,8 @@ def apply_mask(image: RangeImage, kept: Mask) -> RangeImage:
 
 def cut_to_volume(image: RangeImage, rig_from_camera: RigidTransform, volume: Volume) -> RangeImage:
     """Crop to what lies inside the scan volume; cleaning leaves nothing else."""
-    box = crop_of(inside(image, rig_from_camera, volume)) or (slice(0, 1), slice(0, 1))
-    return image.cut(widened(box, ROOM_PX))
+    box = find_crop(inside(image, rig_from_camera, volume)) or (slice(0, 1), slice(0, 1))
+    return image.cut(pad_crop(box, ROOM_PX))
 
 
 def inside(image: RangeImage, rig_from_camera: RigidTransform, volume: Volume) -> Mask:

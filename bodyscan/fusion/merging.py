@@ -147,7 +147,7 @@ def _pose_variance(
     for surface, (first, last) in zip(surfaces, pairwise(ends), strict=True):
         points, normals = samples.points[index[first:last]], samples.normals[index[first:last]]
         lever = np.hstack([np.cross(points, normals), normals])
-        variance[first:last] = np.sum(lever @ poses.between(surface.pair, other) * lever, axis=1)
+        variance[first:last] = np.sum(lever @ poses.relative(surface.pair, other) * lever, axis=1)
     return variance
 
 

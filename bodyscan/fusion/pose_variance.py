@@ -33,7 +33,7 @@ def add_pose_variance(
     """
     centres = np.array([placing.translation for placing in rig_from_camera.values()])
     size = len(centres)
-    joint = prior.among(tuple(rig_from_camera)).reshape(size, 6, size, 6).swapaxes(1, 2)
+    joint = prior.select(tuple(rig_from_camera)).reshape(size, 6, size, 6).swapaxes(1, 2)
     rows, columns = np.triu_indices(6)
     packed = joint[..., rows, columns] + np.where(rows < columns, joint[..., columns, rows], 0.0)
     placing_mm = np.empty(len(cloud.points))

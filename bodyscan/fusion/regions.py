@@ -19,7 +19,7 @@ from bodyscan.arrays import Array, Bytes, Floats, Indices, Mask
 from bodyscan.compiled import compiled
 from bodyscan.fusion.brightness import DARKEST
 from bodyscan.fusion.roughness import Misfits, misfits
-from bodyscan.geometry.crop import crop_of
+from bodyscan.geometry.crop import find_crop
 from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import DARK_CLOTH, HAIR, SKIN, UNSURE, BodyCloud
@@ -191,7 +191,7 @@ def _texture(
         at, wanted = rig_from_camera[image.pair], np.zeros(image.sigma_mm.shape, np.bool_)
         matrix, grid = at.matrix[:3], asked.reshape(cells.shape)
         lies_in(image.points, image.sigma_mm, matrix, cells.origin, grid, wanted)
-        box = crop_of(wanted)
+        box = find_crop(wanted)
         return None if box is None else misfits(image, at, box, window_mm)
 
     each = map_threads(looked_at, range_images, stage="naming regions")

@@ -9,7 +9,7 @@ import numpy as np
 from bodyscan.arrays import Array, Floats
 from bodyscan.fusion.quadratic_fit import fit_full_windows, window_basis
 from bodyscan.fusion.smoothing import inverse_depths, pixel_size, window_reach
-from bodyscan.geometry.crop import Crop, ends_of
+from bodyscan.geometry.crop import Crop, crop_bounds
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
 
@@ -35,7 +35,7 @@ def misfits(
     sigma_mm, points = image.sigma_mm[box], image.points[box]
     common = np.zeros_like(sigma_mm) if image.common_mm is None else image.common_mm[box]
     whole = (slice(0, sigma_mm.shape[0]), slice(0, sigma_mm.shape[1]))
-    inverse, noise = inverse_depths(points, sigma_mm, common, ends_of(whole))
+    inverse, noise = inverse_depths(points, sigma_mm, common, crop_bounds(whole))
     reach = window_reach(pixel_size(inverse, image.camera), window_mm)
     fit, full = fit_full_windows(inverse, noise, reach)
     off = (inverse - fit.value)[full]

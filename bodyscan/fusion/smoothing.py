@@ -17,8 +17,8 @@ from bodyscan.compiled import compiled
 from bodyscan.fusion.quadratic_fit import QuadraticFit, fit_quadratics
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.camera_tables import projection_table
-from bodyscan.geometry.crop import crop_of, ends_of
-from bodyscan.geometry.quadratic_table import Table, slopes
+from bodyscan.geometry.crop import crop_bounds, find_crop
+from bodyscan.geometry.quadratic_table import Table, look_up_derivatives
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
 
@@ -67,12 +67,12 @@ def smooth(
 
     None if the range image shows nothing.
     """
-    box = crop_of(image.valid)
+    box = find_crop(image.valid)
     if box is None:
         return None
     common = np.zeros((1, 1), np.float32) if image.common_mm is None else image.common_mm
     common = np.broadcast_to(common, image.sigma_mm.shape)
-    inverse, noise = inverse_depths(image.points, image.sigma_mm, common, ends_of(box))
+    inverse, noise = inverse_depths(image.points, image.sigma_mm, common, crop_bounds(box))
     pixel_mm = pixel_size(inverse, image.camera)
     reach = window_reach(pixel_mm, window_mm)
     fit, fitted = fit_quadratics(inverse, noise, reach, pixel_mm, image.alike_px)
@@ -105,7 +105,7 @@ def _surface(
     sigma = np.empty(most, np.float32)
     count = _lay_out(
         (image.points, common),
-        ends_of(box),
+        crop_bounds(box),
         (fit.value, fit.slope_u, fit.slope_v, fit.sigma),
         fitted,
         projection_table(image.camera),
@@ -221,7 +221,7 @@ def _normal(
     A plane n.P = d has 1/z = n.(x, y, 1) / d in ideal normalised coordinates; the slopes per pixel
     are converted to these by the derivative of the projection.
     """
-    u_by_x, u_by_y, v_by_x, v_by_y = slopes(projection, x, y)
+    u_by_x, u_by_y, v_by_x, v_by_y = look_up_derivatives(projection, x, y)
     slope_x = by_u * u_by_x + by_v * v_by_x
     slope_y = by_u * u_by_y + by_v * v_by_y
     rest = inverse - x * slope_x - y * slope_y

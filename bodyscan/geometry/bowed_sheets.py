@@ -54,7 +54,7 @@ class BowedSheets(SmoothSheets):
     bow_terms: int
 
     @staticmethod
-    def of_pinhole(pinhole: LensSheets, bow_terms: int) -> BowedSheets:
+    def from_pinhole(pinhole: LensSheets, bow_terms: int) -> BowedSheets:
         """The planes of a projector without a lens, y' = (s - c) / f: the start of a fit."""
         size = 3 * (PLANE_DEGREE + 1) + bow_terms * (BOW_DEGREE + 1) + (bow_terms > 0)
         parameters, half = np.zeros(size), pinhole.stripes / 2.0

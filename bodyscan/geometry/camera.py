@@ -72,7 +72,7 @@ class Camera:
         """Parameter steps (P,) for numerical derivatives."""
         return np.array([*[MATRIX_STEP_PX] * len(MATRIX), *self.lens.difference_steps])
 
-    def moved(self, step: Array) -> Camera:
+    def retract(self, step: Array) -> Camera:
         """The camera after a step (P,) is added to its parameters."""
         own = {
             name: getattr(self, name) + float(change)

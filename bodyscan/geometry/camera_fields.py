@@ -16,7 +16,7 @@ from bodyscan.geometry.lenses.radial import Radial
 SIZE = ("width", "height")
 
 
-def to_fields(camera: Camera) -> dict[str, Any]:
+def camera_to_fields(camera: Camera) -> dict[str, Any]:
     """alpha, beta, gamma, u0, v0, the kind of lens, its coefficients by name, width and height."""
     own = {name: getattr(camera, name) for name in (*MATRIX, *SIZE)}
     lens = {name: getattr(camera.lens, name) for name in camera.lens.names}
@@ -24,8 +24,8 @@ def to_fields(camera: Camera) -> dict[str, Any]:
     return own | lens | kind
 
 
-def from_fields(content: Mapping[str, Any]) -> Camera:
-    """The camera whose fields `to_fields` returned.
+def camera_from_fields(content: Mapping[str, Any]) -> Camera:
+    """The camera whose fields `camera_to_fields` returned.
 
     Raises ValueError for an unknown lens, a missing or surplus name, or a value that is not finite.
     """

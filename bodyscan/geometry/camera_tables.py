@@ -65,7 +65,7 @@ def _within_tolerance(
 ) -> Table:
     for cell in CELLS_PX:
         cells = -(-camera.width // cell), -(-camera.height // cell)
-        found = QuadraticTable.of(function, low, high, cells, outside)
+        found = QuadraticTable.fit(function, low, high, cells, outside)
         if found.error * px_per_unit < TOLERANCE_PX:
             break
     return found.table

@@ -5,8 +5,8 @@ few columns. `minimize_each` solves many small problems of one kind at once (the
 points to triangulate) with stacked normal equations.
 
 Both use the same stopping rule. Costs are in units of a residual's variance; a problem has settled
-when the last step lowered its cost, or the next one can lower it, by less than `settled` variances.
-Then no combination of unknowns is farther from the minimum than about sqrt(`settled`) of its own
+when the last step lowered its cost, or the next one can lower it, by less than `tolerance` variances.
+Then no combination of unknowns is farther from the minimum than about sqrt(`tolerance`) of its own
 standard deviation.
 
 Source: Madsen, Nielsen, Tingleff, Methods for Non-Linear Least Squares Problems, 2004; robust
@@ -24,7 +24,7 @@ import numpy as np
 
 from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.geometry.linear_gaussian import invert_scaled, multiply_transposed, solve_scaled
-from bodyscan.geometry.robust import cauchy_cost, cauchy_weights, spread
+from bodyscan.geometry.robust import cauchy_cost, cauchy_weights, robust_scale
 
 Columns = Indices | slice
 State = TypeVar("State")
@@ -46,19 +46,19 @@ class Noise:
     """The error model of one kind of residual; blocks with equal `Noise` share one spread.
 
     group: how many neighbouring residuals (u and v of a corner) share one weight.
-    cauchy: spreads beyond which residuals count less and less (Cauchy loss); None: all count alike.
-    least: lower limit of the spread.
+    cauchy: scales beyond which residuals count less and less (Cauchy loss); None: all count alike.
+    min_scale: lower limit of the scale.
     known: the spread, where it need not be estimated.
     """
 
     kind: str
     group: int = 1
     cauchy: float | None = None
-    least: float = 1e-12
+    min_scale: float = 1e-12
     known: float | None = None
 
-    def spread_of(self, residuals: Array) -> float:
-        return spread(residuals, self.least) if self.known is None else self.known
+    def estimate_scale(self, residuals: Array) -> float:
+        return robust_scale(residuals, self.min_scale) if self.known is None else self.known
 
     def cost(self, residuals: Array) -> float:
         """Cost of residuals (N,) given in units of their spread."""
@@ -74,7 +74,7 @@ class Noise:
 
     def mean_square(self, residuals: Array) -> float:
         """Of residuals (N,) weighted against outliers, in their own unit squared."""
-        weights = self.weights(residuals / self.spread_of(residuals))
+        weights = self.weights(residuals / self.estimate_scale(residuals))
         return float(weights @ residuals**2 / np.sum(weights))
 
 
@@ -134,21 +134,21 @@ class Solution(Generic[State]):
     state: the minimum.
     blocks: evaluated there.
     weights: robust weights (N,) in [0, 1] of each block.
-    spreads: of each block, in its residuals' sigmas.
+    scales: of each block, in its residuals' sigmas.
     unknowns: P.
     """
 
     state: State
     blocks: tuple[Block, ...]
     weights: tuple[Array, ...]
-    spreads: tuple[float, ...]
+    scales: tuple[float, ...]
     unknowns: int
     report: Report
 
     @cached_property
     def covariance(self) -> Array:
         """Covariance (P, P) of the unknowns, with the residuals' spread as their noise."""
-        normal, _ = _equations(self.blocks, self.weights, self.spreads, self.unknowns)
+        normal, _ = _equations(self.blocks, self.weights, self.scales, self.unknowns)
         return invert_scaled(normal)
 
     def normal(self, kinds: Collection[Noise]) -> Array:
@@ -158,16 +158,16 @@ class Solution(Generic[State]):
         return _equations(
             [self.blocks[k] for k in own],
             [self.weights[k] for k in own],
-            [self.spreads[k] for k in own],
+            [self.scales[k] for k in own],
             self.unknowns,
         )[0]
 
     @property
     def variance(self) -> float:
-        """Weighted mean square residual per degree of freedom, in squared spreads: the factor for a
+        """Weighted mean square residual per degree of freedom, in squared scales: the factor for a
         covariance based on the residuals' own size instead of their spread."""
         squares, total = 0.0, 0.0
-        for block, weights, size in zip(self.blocks, self.weights, self.spreads, strict=True):
+        for block, weights, size in zip(self.blocks, self.weights, self.scales, strict=True):
             squares += float(weights @ (block.residuals / (block.sigma * size)) ** 2)
             total += float(np.sum(weights))
         return squares / max(total - self.unknowns, 1.0)
@@ -176,49 +176,49 @@ class Solution(Generic[State]):
 def minimize(
     start: State,
     blocks_at: Callable[[State], Iterable[Block]],
-    moved: Callable[[State, Array], State],
+    retract: Callable[[State, Array], State],
     *,
     unknowns: int,
     steps: int = 60,
-    settled: float = 1e-6,
+    tolerance: float = 1e-6,
     damping: float = 1e-3,
 ) -> Solution[State]:
     """Levenberg-Marquardt; each step uses robust weights from the residuals before it.
 
     blocks_at: returns the same blocks in the same order at any state; residuals that are not finite
         reject the state.
-    moved: applies a step (P,) to a state.
+    retract: applies a step (P,) to a state.
     damping: of the first step, as a share of a unit diagonal.
     """
     state, blocks = start, tuple(blocks_at(start))
     first, taken = blocks, 0
     ending: Ending = "out of steps"
-    weights, spreads = _weigh(blocks)
+    weights, scales = _weigh(blocks)
     while taken < steps:
-        cost = _cost(blocks, blocks, spreads)
-        normal, gradient = _equations(blocks, weights, spreads, unknowns)
+        cost = _cost(blocks, blocks, scales)
+        normal, gradient = _equations(blocks, weights, scales, unknowns)
         promised = 0.0
         for attempt in range(TRIES):
             step = -solve_scaled(normal, gradient, damping)
             promised = promised if attempt else -float(step @ gradient)
-            candidate = moved(state, step)
+            candidate = retract(state, step)
             tried = tuple(blocks_at(candidate))
-            gained = cost - _cost(tried, blocks, spreads)
-            if gained > 0.0 or promised < settled:
+            gained = cost - _cost(tried, blocks, scales)
+            if gained > 0.0 or promised < tolerance:
                 break
             damping = max(SLOWER * damping, FELT)
         if not gained > 0.0:
-            ending = "settled" if promised < settled else "stuck"
+            ending = "settled" if promised < tolerance else "stuck"
             break
         state, blocks, taken = candidate, tried, taken + 1
         damping = max(damping / FASTER, LEAST_DAMPING)
-        weights, spreads = _weigh(blocks)
-        if gained < settled:
+        weights, scales = _weigh(blocks)
+        if gained < tolerance:
             ending = "settled"
             break
-    before, after = (_cost(own, blocks, spreads) for own in (first, blocks))
+    before, after = (_cost(own, blocks, scales) for own in (first, blocks))
     report = Report(taken, before, after, ending)
-    return Solution(state, blocks, weights, spreads, unknowns, report)
+    return Solution(state, blocks, weights, scales, unknowns, report)
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,7 +237,7 @@ class StackedEquations:
     freedoms: Array
 
     @staticmethod
-    def of(residuals: Array, jacobian: Array, weights: Array) -> StackedEquations:
+    def from_residuals(residuals: Array, jacobian: Array, weights: Array) -> StackedEquations:
         """Equations of residuals (N, M), their Jacobian (N, M, P) and weights (N, M)."""
         weighted = np.swapaxes(jacobian * weights[..., None], 1, 2)
         return StackedEquations(
@@ -288,20 +288,20 @@ def minimize_each(
     *,
     steps: int,
     within: Callable[[Array], Array] = lambda state: state,
-    settled: float = 1e-6,
+    tolerance: float = 1e-6,
     damping: float = 1e-3,
-    least: float = 1e-12,
+    min_sigma: float = 1e-12,
 ) -> StackedSolution:
     """Levenberg-Marquardt on N problems (N, P) of a few unknowns, each with its own damping.
 
     within: brings a state back into its allowed range.
-    least: lower limit of a residual's standard deviation, so that residuals of nearly 0 settle too.
+    min_sigma: lower limit of a residual's standard deviation, so that residuals of nearly 0 settle too.
     """
     state, at = start, equations_at(start)
     strength, converged = np.full(len(start), damping), np.zeros(len(start), bool)
     for taken in range(steps):
         step = -solve_scaled(at.normal, at.gradient, strength)
-        enough = settled * np.maximum(at.variance, least**2)
+        enough = tolerance * np.maximum(at.variance, min_sigma**2)
         promised = -np.sum(step * at.gradient, axis=1)
         trial = within(state + step)
         tried = equations_at(trial)
@@ -321,23 +321,23 @@ def minimize_each(
 def _weigh(blocks: Sequence[Block]) -> tuple[tuple[Array, ...], tuple[float, ...]]:
     """Robust weights and spread of each block; all residuals of a kind share one spread."""
     weights: list[Array] = [np.empty(0)] * len(blocks)
-    spreads = [0.0] * len(blocks)
+    scales = [0.0] * len(blocks)
     for noise, numbers in _kinds(blocks).items():
         scaled = _scaled(blocks, blocks, numbers)
-        size = noise.spread_of(scaled)
+        size = noise.estimate_scale(scaled)
         cuts = np.cumsum([len(blocks[k].residuals) for k in numbers])[:-1]
         own = np.split(noise.weights(scaled / size), cuts)
         for k, part in zip(numbers, own, strict=True):
-            weights[k], spreads[k] = part, size
-    return tuple(weights), tuple(spreads)
+            weights[k], scales[k] = part, size
+    return tuple(weights), tuple(scales)
 
 
-def _cost(blocks: Sequence[Block], there: Sequence[Block], spreads: Sequence[float]) -> float:
-    """Total cost of blocks, with sigmas and spreads as they were `there`."""
+def _cost(blocks: Sequence[Block], there: Sequence[Block], scales: Sequence[float]) -> float:
+    """Total cost of blocks, with sigmas and scales as they were `there`."""
     total = 0.0
     with np.errstate(all="ignore"):
         for noise, numbers in _kinds(blocks).items():
-            total += noise.cost(_scaled(blocks, there, numbers) / spreads[numbers[0]])
+            total += noise.cost(_scaled(blocks, there, numbers) / scales[numbers[0]])
     return total
 
 
@@ -353,11 +353,11 @@ def _scaled(blocks: Sequence[Block], there: Sequence[Block], numbers: Sequence[i
 
 
 def _equations(
-    blocks: Sequence[Block], weights: Sequence[Array], spreads: Sequence[float], unknowns: int
+    blocks: Sequence[Block], weights: Sequence[Array], scales: Sequence[float], unknowns: int
 ) -> tuple[Array, Array]:
     """Normal matrix (P, P) and gradient (P,) of half the cost."""
     normal, gradient = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
-    for block, weight, size in zip(blocks, weights, spreads, strict=True):
+    for block, weight, size in zip(blocks, weights, scales, strict=True):
         if not len(block.residuals):
             continue
         weighted = block.jacobian * (weight / (block.sigma * size) ** 2)[:, None]

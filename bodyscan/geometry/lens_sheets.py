@@ -42,7 +42,7 @@ class LensSheets(SmoothSheets):
     """
 
     @staticmethod
-    def pinhole(matrix: Array, middle: Array, stripes: int, direction: Axis) -> LensSheets:
+    def from_matrix(matrix: Array, middle: Array, stripes: int, direction: Axis) -> LensSheets:
         """A projector without a lens: s = (row 0 . X) / (row 1 . X), matrix (2, 4), X homogeneous,
         camera frame. The matrix leaves the centre's place along the stripes open: it is put
         opposite `middle`."""
@@ -57,7 +57,7 @@ class LensSheets(SmoothSheets):
         return "lens"
 
     @property
-    def uncertain_alike(self) -> bool:
+    def only_centre_uncertain(self) -> bool:
         """Whether only c is uncertain, which moves all sheets together: true of a projector
         calibrated elsewhere and not fitted to boards, so that no place far from boards would be a
         guess."""
@@ -72,7 +72,7 @@ class LensSheets(SmoothSheets):
         size = FRAME + len(parameters)
         return replace(self, parameters=parameters, covariance=np.full((size, size), np.nan))
 
-    def turned(self, centre: float) -> LensSheets:
+    def rotate_to(self, centre: float) -> LensSheets:
         """Rotate about the line along its stripes so that its axis passes through s = centre."""
         focal, now = self.parameters[:SCALE]
         turn = np.array([np.arctan((centre - now) / focal), 0.0, 0.0])

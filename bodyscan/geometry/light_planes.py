@@ -30,7 +30,7 @@ class LightSheets(Protocol):
 
     @property
     def kind(self) -> str:
-        """`planes`, `smooth-planes`, `bowed` or `lens`: see `sheet_arrays.from_arrays`."""
+        """`planes`, `smooth-planes`, `bowed` or `lens`: see `sheet_arrays.sheets_from_arrays`."""
         ...
 
     def depth(self, rays: Array, s: Array) -> Array:
@@ -71,7 +71,7 @@ class LightPlanes:
     direction: Axis
 
     @staticmethod
-    def exact(planes: Array, direction: Axis) -> LightPlanes:
+    def from_planes(planes: Array, direction: Axis) -> LightPlanes:
         """Of planes (S + 1, 4) of any length and sign; how well they are known is not told."""
         unit = planes / np.linalg.norm(planes[:, :3], axis=1, keepdims=True)
         return LightPlanes(towards_camera(unit), np.full((len(planes), 4, 4), np.nan), direction)

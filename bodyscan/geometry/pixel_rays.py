@@ -9,19 +9,19 @@ from bodyscan.compiled import compiled
 from bodyscan.geometry.quadratic_table import Table
 
 
-def rays_through(rays: Table, wanted: Mask, first_row: int = 0) -> Array:
+def look_up_rays(rays: Table, wanted: Mask, first_row: int = 0) -> Array:
     """Rays (N, 3) through the N pixels that are `wanted` (rows, width), row by row.
 
     rays: the camera's `ray_table`.
     first_row: the image row of the first row of `wanted`.
     """
     found = np.empty((np.count_nonzero(wanted), 3))
-    _rays_through(rays, first_row, wanted, found)
+    _look_up_rays(rays, first_row, wanted, found)
     return found
 
 
 @compiled
-def _rays_through(table: Table, first_row: int, wanted: Mask, rays: Array) -> None:
+def _look_up_rays(table: Table, first_row: int, wanted: Mask, rays: Array) -> None:
     """Fill rays (N, 3) of the N pixels `wanted` (rows, width).
 
     As `look_up`, but within a row each cell's quadratics are reduced to one variable once.

@@ -21,23 +21,23 @@ class PoseCovariance:
     names: tuple[str, ...]
     matrix: Array
 
-    def of(self, name: str) -> Array:
+    def marginal(self, name: str) -> Array:
         """Covariance (6, 6) of one pair's motion."""
         k = 6 * self.names.index(name)
         return self.matrix[k : k + 6, k : k + 6]
 
-    def among(self, names: Sequence[str]) -> Array:
+    def select(self, names: Sequence[str]) -> Array:
         """Covariance (6N, 6N) of these pairs' motions, in their order."""
         rows = self._rows(names)
         return self.matrix[np.ix_(rows, rows)]
 
-    def plus(self, names: Collection[str], own: Array) -> PoseCovariance:
+    def add_independent_motions(self, names: Collection[str], own: Array) -> PoseCovariance:
         """After each of these pairs made a motion of its own, of covariance (6, 6)."""
         rows, matrix = self._rows(names), self.matrix.copy()
         matrix[np.ix_(rows, rows)] += np.kron(np.eye(len(names)), own)
         return PoseCovariance(self.names, matrix)
 
-    def between(self, a: str, b: str) -> Array:
+    def relative(self, a: str, b: str) -> Array:
         """Covariance (6, 6) of the motion of b relative to a."""
         i, j = 6 * self.names.index(a), 6 * self.names.index(b)
         m = self.matrix
@@ -45,7 +45,7 @@ class PoseCovariance:
         cross = m[rows_i, rows_j]
         return m[rows_i, rows_i] + m[rows_j, rows_j] - cross - cross.T
 
-    def moved_together(self, names: Collection[str], covariance: Array) -> PoseCovariance:
+    def add_common_motion(self, names: Collection[str], covariance: Array) -> PoseCovariance:
         """After these pairs, such as those of a pole, made one motion of covariance (6, 6).
 
         What they know of each other stays as it was.
@@ -70,4 +70,4 @@ def position_sigma(covariance: PoseCovariance, name: str, position: Array) -> Ar
 
     position: (3,) mm, rig frame, such as the centre of the pair's camera.
     """
-    return np.sqrt(np.diag(point_covariance(covariance.of(name), position)))
+    return np.sqrt(np.diag(point_covariance(covariance.marginal(name), position)))

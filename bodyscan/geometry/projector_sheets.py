@@ -19,7 +19,7 @@ DISTANCE = 5.0
 """Where a camera and a projector whose axes do not meet are assumed to look, in baselines."""
 
 
-def sheets_of_projector(
+def sheets_from_projector(
     projector: Camera,
     projector_from_camera: RigidTransform,
     middle: Array,
@@ -59,7 +59,7 @@ def sheets_of_projector(
     return LensSheets(frame, middle, stripes, direction, parameters, covariance)
 
 
-def projector_of_sheets(sheets: LensSheets) -> tuple[Camera, RigidTransform]:
+def projector_from_sheets(sheets: LensSheets) -> tuple[Camera, RigidTransform]:
     """The inverse: the projector as a camera with one pixel per stripe, and
     `projector_from_camera`.
 
@@ -82,7 +82,9 @@ def projector_of_sheets(sheets: LensSheets) -> tuple[Camera, RigidTransform]:
     return Camera(focal, focal, 0.0, u0, v0, lens_from_opencv(coefficients), size, size), frame
 
 
-def looked_at(camera: Camera, projector: Camera, projector_from_camera: RigidTransform) -> Array:
+def intersect_central_rays(
+    camera: Camera, projector: Camera, projector_from_camera: RigidTransform
+) -> Array:
     """The point (3,) mm, camera frame, on the ray through the middle of the camera's image that is
     nearest to the ray through the middle of the projector's."""
     camera_from_projector = projector_from_camera.inverse()

@@ -41,7 +41,7 @@ class QuadraticTable:
         return self.coefficients, self.frame
 
     @staticmethod
-    def of(
+    def fit(
         function: Callable[[Array], Array],
         low: Array,
         high: Array,
@@ -86,15 +86,15 @@ def look_up(table: Table, x: float, y: float) -> tuple[float, float]:
 
 
 @compiled
-def slopes(table: Table, x: float, y: float) -> tuple[float, float, float, float]:
+def look_up_derivatives(table: Table, x: float, y: float) -> tuple[float, float, float, float]:
     """Derivatives of the first value by x and y, then of the second, at (x, y)."""
     cells, frame = table
     across, down = (x - frame[0]) * frame[2], (y - frame[1]) * frame[3]
     column = min(max(int(across), 0), cells.shape[1] - 1)
     row = min(max(int(down), 0), cells.shape[0] - 1)
     x, y = across - column, down - row
-    a, b = _slopes(cells, row, column, 0, x, y)
-    c, d = _slopes(cells, row, column, 1, x, y)
+    a, b = _derivatives(cells, row, column, 0, x, y)
+    c, d = _derivatives(cells, row, column, 1, x, y)
     return a * frame[2], b * frame[3], c * frame[2], d * frame[3]
 
 
@@ -108,7 +108,7 @@ def _quadratic(c: Array, i: int, j: int, k: int, x: float, y: float) -> float:
 
 
 @compiled
-def _slopes(c: Array, i: int, j: int, k: int, x: float, y: float) -> tuple[float, float]:
+def _derivatives(c: Array, i: int, j: int, k: int, x: float, y: float) -> tuple[float, float]:
     return (
         c[i, j, k, 3] + y * c[i, j, k, 4] + 2.0 * x * c[i, j, k, 5],
         c[i, j, k, 1] + x * c[i, j, k, 4] + 2.0 * y * c[i, j, k, 2],

@@ -15,7 +15,7 @@ from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.camera_tables import ray_table
 from bodyscan.geometry.lens_sheets import LensSheets
 from bodyscan.geometry.light_planes import LightSheets
-from bodyscan.geometry.pixel_rays import rays_through
+from bodyscan.geometry.pixel_rays import look_up_rays
 from bodyscan.geometry.sheet_table import SheetTable
 from bodyscan.geometry.smooth_sheets import SmoothSheets
 
@@ -66,7 +66,9 @@ def stripes_per_pixel(sheets: LightSheets, camera: Camera, s: Floats) -> float:
     return float(np.median(found)) if found.size else 0.0
 
 
-def stripes_apart(sheets: LightSheets, camera: Camera, s: Floats, points: Floats) -> float:
+def measure_stripe_residual(
+    sheets: LightSheets, camera: Camera, s: Floats, points: Floats
+) -> float:
     """Distance in stripes between s (height, width) and the sheets through points (height, width,
     3): median over a sample of the pixels that have both; NaN if none has."""
     pixels, own = _sampled(s, np.isfinite(s) & np.isfinite(points[..., 2]))
@@ -106,7 +108,7 @@ def triangulate_image(
     for first in range(0, len(s), BAND):
         rows = slice(first, first + BAND)
         wanted = np.isfinite(s[rows])
-        rays = rays_through(pixels, wanted, first)
+        rays = look_up_rays(pixels, wanted, first)
         found = way(rays, s[rows][wanted].astype(np.float64))
         uncertain = sigma[rows], shared[rows]
         made = points[rows], sigma_mm[rows], common_mm[rows]
@@ -118,7 +120,7 @@ def triangulate_image(
 def _most_sigma(sheets: LightSheets) -> float:
     """MOST_SIGMA, or GUESSED times what the boards leave open where they were. A projector that was
     calibrated elsewhere is a guess nowhere, however roughly it may be known."""
-    if isinstance(sheets, LensSheets) and sheets.uncertain_alike:
+    if isinstance(sheets, LensSheets) and sheets.only_centre_uncertain:
         return np.inf
     if not isinstance(sheets, SmoothSheets):
         return MOST_SIGMA
@@ -135,7 +137,7 @@ def _most_sigma(sheets: LightSheets) -> float:
 def _way_to_measure(sheets: LightSheets) -> Way:
     """A function from rays (N, 3) at s (N,) to depth, dz/ds and variance, each (N,)."""
     if isinstance(sheets, BowedSheets):
-        return SheetTable.of(sheets).measure
+        return SheetTable.from_sheets(sheets).measure
     if isinstance(sheets, LensSheets):
         return sheets.measure
 

@@ -30,7 +30,7 @@ class RayUncertainty:
         """Both combined, (ROWS, COLUMNS)."""
         return np.hypot(self.noise_px, self.lens_px)
 
-    def with_excess(self, variances: float) -> RayUncertainty:
+    def inflate_noise(self, variances: float) -> RayUncertainty:
         """The same with the noise that many times larger, in variances."""
         return replace(self, noise_px=np.sqrt(variances) * self.noise_px)
 
@@ -43,7 +43,7 @@ class RayUncertainty:
         )
 
 
-def nodes(width: int, height: int) -> Array:
+def node_pixels(width: int, height: int) -> Array:
     """Pixels (ROWS, COLUMNS, 2) of the nodes."""
     u, v = np.linspace(0.0, width - 1.0, COLUMNS), np.linspace(0.0, height - 1.0, ROWS)
     return np.stack(np.meshgrid(u, v), axis=-1)

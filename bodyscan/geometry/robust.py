@@ -19,9 +19,9 @@ def rms_length(vectors: Array) -> float:
     return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))
 
 
-def spread(residuals: Array, least: float = 1e-12) -> float:
-    """Robust standard deviation from the median absolute value; at least `least`."""
-    return max(SIGMAS_PER_MEDIAN * float(np.median(np.abs(residuals))), least)
+def robust_scale(residuals: Array, min_scale: float = 1e-12) -> float:
+    """Robust standard deviation from the median absolute value; at least `min_scale`."""
+    return max(SIGMAS_PER_MEDIAN * float(np.median(np.abs(residuals))), min_scale)
 
 
 def cauchy_weights(residuals: Array, group: int, scale: float) -> Array:

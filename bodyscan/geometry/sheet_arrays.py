@@ -17,7 +17,7 @@ from bodyscan.geometry.transforms import RigidTransform
 KINDS = ("planes", "smooth-planes", "bowed", "lens")
 
 
-def to_arrays(sheets: LightSheets) -> dict[str, Array]:
+def sheets_to_arrays(sheets: LightSheets) -> dict[str, Array]:
     """Arrays that, with `sheets.kind` and `sheets.direction`, describe the sheets completely."""
     if isinstance(sheets, LightPlanes):
         return {"planes": sheets.coefficients, "covariance": sheets.covariance}
@@ -32,8 +32,8 @@ def to_arrays(sheets: LightSheets) -> dict[str, Array]:
     raise TypeError(f"no sheets of light: {type(sheets).__name__}")
 
 
-def from_arrays(kind: str, arrays: Mapping[str, Any], direction: Axis) -> LightSheets:
-    """Rebuild the sheets from what `to_arrays` returned.
+def sheets_from_arrays(kind: str, arrays: Mapping[str, Any], direction: Axis) -> LightSheets:
+    """Rebuild the sheets from what `sheets_to_arrays` returned.
 
     Raises ValueError for an unknown kind or arrays of the wrong size, KeyError for a missing one.
     """

@@ -42,7 +42,7 @@ class SheetTable:
 
     @staticmethod
     @lru_cache(maxsize=64)
-    def of(sheets: BowedSheets) -> SheetTable:
+    def from_sheets(sheets: BowedSheets) -> SheetTable:
         at = sheets.at(np.arange(NODES_PER_STRIPE * sheets.stripes + 1.0) / NODES_PER_STRIPE)
         terms, aside = 3 + sheets.bow_terms, sheets.bow_terms > 0
         by_parameter = _by_parameter(at, terms, len(sheets.parameters))

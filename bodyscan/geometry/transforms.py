@@ -28,7 +28,7 @@ class RigidTransform:
         return RigidTransform(np.eye(3), np.zeros(3))
 
     @staticmethod
-    def shift(translation: ArrayLike) -> RigidTransform:
+    def from_translation(translation: ArrayLike) -> RigidTransform:
         """By (3,) mm, without a turn."""
         return RigidTransform(np.eye(3), np.asarray(translation, float))
 
@@ -61,7 +61,7 @@ class RigidTransform:
 
     @property
     def twist(self) -> Array:
-        """Rotation vector (radians), then translation (mm), (6,): what `moved` takes."""
+        """Rotation vector (radians), then translation (mm), (6,): what `retract` takes."""
         return np.concatenate([self.rotation_vector, self.translation])
 
     @property
@@ -87,7 +87,7 @@ class RigidTransform:
         """Directions (..., 3) in b to directions (..., 3) in a."""
         return directions @ self.rotation.T
 
-    def moved(self, twist: ArrayLike) -> RigidTransform:
+    def retract(self, twist: ArrayLike) -> RigidTransform:
         """Apply a small motion in frame a on the left: exp(twist) @ self, to first order in
         coupling.
 
@@ -126,7 +126,7 @@ def twist_jacobian(points: Array) -> Array:
     return jacobian
 
 
-def rigid_fit(source: Array, target: Array) -> RigidTransform:
+def fit_rigid_transform(source: Array, target: Array) -> RigidTransform:
     """`target_from_source` that carries points (N, 3) onto (N, 3) best in least squares.
 
     Source: Arun, Huang, Blostein 1987, with Umeyama's correction against reflections.

@@ -11,7 +11,7 @@ from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.camera_tables import CAMERAS
 
 
-def in_image(camera: Camera, points: Array, margin_px: float = 0.0) -> Mask:
+def is_in_image(camera: Camera, points: Array, margin_px: float = 0.0) -> Mask:
     """Whether points (..., 3), camera frame, lie ahead of the camera and inside its image, (...).
 
     Far outside its image a lens model may fold back, so that points which the camera cannot see

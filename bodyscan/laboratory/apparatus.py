@@ -165,7 +165,7 @@ def stage_poses(readings: Array, seed: int) -> list[RigidTransform]:
     rng = np.random.default_rng([seed, STAGE])
     stage = pose_about(STAGE_MIDDLE, STAGE_TURN)
     stops = readings + STAGE_ERROR_MM * rng.standard_normal(len(readings))
-    slides = [RigidTransform.shift([0.0, 0.0, stop]) for stop in stops]
+    slides = [RigidTransform.from_translation([0.0, 0.0, stop]) for stop in stops]
     return [stage @ slide for slide in slides]
 
 

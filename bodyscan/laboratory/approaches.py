@@ -160,7 +160,7 @@ def stage_points(
 
 
 def _stage_pose(reading: float) -> RigidTransform:
-    return RigidTransform.shift([0.0, 0.0, reading])
+    return RigidTransform.from_translation([0.0, 0.0, reading])
 
 
 def _locate_by_homography(

@@ -19,7 +19,7 @@ from bodyscan.calibration.light_planes import PlaneFit, fit_light_planes
 from bodyscan.calibration.light_sheets import fit_light_sheets
 from bodyscan.calibration.refinement_choice import REFINED_BINS, refine_where_better
 from bodyscan.calibration.striped_view import BIN_PX
-from bodyscan.geometry.camera_fields import from_fields
+from bodyscan.geometry.camera_fields import camera_from_fields
 from bodyscan.laboratory import apparatus
 from bodyscan.laboratory.approaches import (
     Approach,
@@ -137,7 +137,7 @@ def sigma_trial(seeds: int, seed: int = 0) -> SigmaTrial:
     corners = corner_points(TARGET.board)
     poses = apparatus.board_poses()
     images = [apparatus.CAMERA.image(pose.apply(corners)) for pose in poses]
-    true, errors = from_fields(describe_camera(apparatus.CAMERA)), []
+    true, errors = camera_from_fields(describe_camera(apparatus.CAMERA)), []
     for number in range(seeds):
         rng = np.random.default_rng([seed, number])
         views = [

@@ -12,7 +12,7 @@ import numpy as np
 from bodyscan.arrays import Array
 from bodyscan.files.atomic import atomic_replacement
 from bodyscan.geometry.light_planes import Axis, baseline_angle_tilt
-from bodyscan.geometry.robust import spread
+from bodyscan.geometry.robust import robust_scale
 from bodyscan.report.canvas import round_up
 
 matplotlib.use("Agg")
@@ -98,7 +98,7 @@ def _baseline_angle_tilt(curve: PlaneCurve, direction: Axis) -> tuple[Array, Arr
 
 def _distribution(axis: Axes, residuals_mm: Array) -> None:
     """Distribution of the residuals, and a normal curve with their robust sigma."""
-    sigma_mm = spread(residuals_mm)
+    sigma_mm = robust_scale(residuals_mm)
     edges = np.linspace(-8.0 * sigma_mm, 8.0 * sigma_mm, 161)
     density, _ = np.histogram(residuals_mm, edges)
     density = density / (len(residuals_mm) * np.diff(edges))

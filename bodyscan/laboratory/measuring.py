@@ -16,7 +16,7 @@ from bodyscan.evaluation.spheres import (
     centre_distances,
     measure_sphere,
 )
-from bodyscan.geometry.camera_fields import from_fields
+from bodyscan.geometry.camera_fields import camera_from_fields
 from bodyscan.geometry.light_planes import Axis, towards_camera
 from bodyscan.geometry.ray_depths import intersect_rays
 from bodyscan.geometry.robust import rms
@@ -147,7 +147,7 @@ class TrueSheets:
 def true_approach(setup: ChapterSetup) -> Approach:
     """The simulator's pixels camera and light, which no calibration can better."""
     return Approach(
-        "true calibration", from_fields(describe_camera(apparatus.CAMERA)), TrueSheets(setup)
+        "true calibration", camera_from_fields(describe_camera(apparatus.CAMERA)), TrueSheets(setup)
     )
 
 

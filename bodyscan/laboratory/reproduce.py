@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bodyscan.files.atomic import write_text
-from bodyscan.geometry.transforms import rigid_fit
+from bodyscan.geometry.transforms import fit_rigid_transform
 from bodyscan.laboratory import apparatus
 from bodyscan.laboratory.approaches import Approach
 from bodyscan.laboratory.calibrating import Calibrations, calibrate_all, sigma_trial
@@ -145,6 +145,6 @@ def _range_data(approach: Approach, captures: ChapterCaptures) -> RangeData:
     )
     both = np.isfinite(points[..., 2]) & np.isfinite(captures.spheres.truth.s)
     laid = np.full(points.shape, np.nan)
-    laid[both] = rigid_fit(points[both], true[both]).apply(points[both])
+    laid[both] = fit_rigid_transform(points[both], true[both]).apply(points[both])
     normals = grid_normals(laid.astype(np.float32)).astype(float)
     return RangeData(approach.name, normals, laid[..., 2] - true[..., 2])

@@ -16,7 +16,7 @@ from bodyscan.arrays import Array, Indices
 from bodyscan.calibration.boundary_points import BoundaryPoints
 from bodyscan.calibration.pinhole_projector import fit_pinhole
 from bodyscan.geometry.light_planes import Axis, LightPlanes
-from bodyscan.geometry.robust import cauchy_weights, spread
+from bodyscan.geometry.robust import cauchy_weights, robust_scale
 
 
 def fit_invariable_baseline(
@@ -59,7 +59,7 @@ def _fit(
         each, all_ = _solve(per_stripe, common, x, weights, data.index, stripes + 1)
         residuals = x - np.sum(per_stripe * each[data.index], axis=1) - common @ all_
         scaled = residuals / sigma
-        robust = cauchy_weights(scaled, 1, 3.0 * spread(scaled))
+        robust = cauchy_weights(scaled, 1, 3.0 * robust_scale(scaled))
     observed = np.bincount(data.index, minlength=stripes + 1) >= 12
     baseline = each[:, 1] if variable else np.full(stripes + 1, all_[0])
     tilt = all_[-1] if fit_tilt else 0.0
@@ -101,7 +101,7 @@ def _planes(slope: Array, baseline: Array, tilt: float, direction: Axis) -> Ligh
     first, second = (along, across) if direction == "horizontal" else (across, along)
     planes = np.stack([first, second, -slope, baseline], axis=1)
     planes[~np.isfinite(slope)] = np.nan
-    return LightPlanes.exact(planes, direction)
+    return LightPlanes.from_planes(planes, direction)
 
 
 def fit_remapped_pinhole(points: Array, s: Array, stripes: int, direction: Axis) -> LightPlanes:
@@ -126,12 +126,12 @@ def fit_remapped_pinhole(points: Array, s: Array, stripes: int, direction: Axis)
         return np.asarray(above / below - index - powers @ values[8:], np.float64)
 
     flat = np.concatenate([matrix.ravel(), np.zeros(3)])
-    noise = spread(residuals(flat))
+    noise = robust_scale(residuals(flat))
     solved = least_squares(residuals, flat, loss="cauchy", f_scale=noise, x_scale="jac").x
     u = np.arange(stripes + 1.0) / half - 1.0
     remapped = u + _powers(u) @ solved[8:]
     rows = solved[:4] - remapped[:, None] * solved[4:8]
-    return LightPlanes.exact(rows @ np.linalg.inv(scale), direction)
+    return LightPlanes.from_planes(rows @ np.linalg.inv(scale), direction)
 
 
 def _powers(u: Array) -> Array:

@@ -10,9 +10,13 @@ from bodyscan.arrays import Floats, Mask
 from bodyscan.calibration.pair import PairCalibration
 from bodyscan.compiled import compiled
 from bodyscan.errors import BadInput
-from bodyscan.geometry.crop import crop_of, ends_of
+from bodyscan.geometry.crop import crop_bounds, find_crop
 from bodyscan.geometry.light_planes import LightSheets
-from bodyscan.geometry.ray_depths import stripes_apart, stripes_per_pixel, triangulate_image
+from bodyscan.geometry.ray_depths import (
+    measure_stripe_residual,
+    stripes_per_pixel,
+    triangulate_image,
+)
 from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.reconstruction.two_ways import Agreement, combine
@@ -95,7 +99,9 @@ def _apart(
     better = not both.any() or np.median(one[1][both]) <= np.median(other[1][both])
     sheets, s = (pair.crossing, stripes.crossing.s) if better else (pair.sheets, stripes.s)
     points = np.where(both[..., None], one[0] if better else other[0], np.float32(np.nan))
-    return SIGMAS_PER_MEDIAN * stripes_apart(sheets, pair.camera, s, points), sheets.stripes
+    return SIGMAS_PER_MEDIAN * measure_stripe_residual(
+        sheets, pair.camera, s, points
+    ), sheets.stripes
 
 
 def _require_fit(pair: PairCalibration, stripes: StripeMap, agreement: Agreement | None) -> None:
@@ -164,9 +170,9 @@ def grid_normals(points: Floats, measured: Mask | None = None) -> Floats:
     incomplete, because points at a rim are not reliable.
     """
     normals = np.full(points.shape, np.nan, np.float32)
-    shown = crop_of(np.isfinite(points[..., 2]) if measured is None else measured)
+    shown = find_crop(np.isfinite(points[..., 2]) if measured is None else measured)
     if shown is not None:
-        _grid_normals(np.ascontiguousarray(points, np.float32), ends_of(shown), normals)
+        _grid_normals(np.ascontiguousarray(points, np.float32), crop_bounds(shown), normals)
     return normals
 
 

@@ -137,7 +137,7 @@ def links_of(placed: RigSolution) -> tuple[Link, ...]:
     found = []
     graph = view_graph(placed.views, sorted(placed.rig_from_camera))
     for first, second, targets in graph.edges(data="targets"):
-        motion = placed.covariance.between(first, second)
+        motion = placed.covariance.relative(first, second)
         spread = point_covariance(motion, placed.rig_from_camera[second].translation)
         found.append(Link(first, second, len(targets), float(np.sqrt(np.trace(spread)))))
     return tuple(sorted(found, key=lambda link: (-link.sigma_mm, link.first, link.second)))

@@ -17,7 +17,7 @@ from bodyscan.calibration.board_views import LocatedView
 from bodyscan.calibration.held_out import CLEARLY, Compared, gain
 from bodyscan.geometry.linear_gaussian import solve_scaled
 from bodyscan.geometry.robust import rms, rms_length
-from bodyscan.geometry.transforms import rigid_fit
+from bodyscan.geometry.transforms import fit_rigid_transform
 from bodyscan.registration.full_solve import solve_fully
 from bodyscan.registration.inconsistent_views import fit_board
 from bodyscan.registration.joint_solve import JointSolution
@@ -215,7 +215,7 @@ def _flat(views: Sequence[LocatedView]) -> dict[str, BoardShape]:
 def _without_motion(shape: BoardShape) -> BoardShape:
     """The same shape, with the pose and size of the nominal board."""
     moved = shape.points + shape.offsets
-    fitted = rigid_fit(moved, shape.points).apply(moved)
+    fitted = fit_rigid_transform(moved, shape.points).apply(moved)
     middle = shape.points.mean(axis=0)
     arms, found = shape.points - middle, fitted - fitted.mean(axis=0)
     size = np.sum(arms * arms) / np.sum(arms * found)
@@ -279,7 +279,7 @@ def _corner_equations(
     sigma = np.repeat(sigmas, counts)
     jacobian = np.concatenate([by_place for by_place, _ in parts]) / sigma[:, None, None]
     residuals = np.concatenate(every) / sigma[:, None]
-    weights = CORNERS.weights(residuals.ravel() / CORNERS.spread_of(residuals.ravel()))
+    weights = CORNERS.weights(residuals.ravel() / CORNERS.estimate_scale(residuals.ravel()))
     variance = float(np.sum(weights * residuals.ravel() ** 2) / np.sum(weights))
     weighted = np.swapaxes(jacobian * weights.reshape(-1, 2, 1), 1, 2)
     information, pull = np.zeros((ends[-1], 3, 3)), np.zeros((ends[-1], 3))

@@ -177,14 +177,14 @@ class _Placings:
     motions: list[RigidTransform]
     boards: dict[Target, RigidTransform]
 
-    def moved(self, step: Array) -> _Placings:
+    def retract(self, step: Array) -> _Placings:
         twists, count = step.reshape(-1, 6), len(self.small)
         of_groups, of_boards = np.split(twists[count:], [len(self.motions)])
         boards = zip(self.boards.items(), of_boards, strict=True)
         return _Placings(
             self.small + twists[:count],
-            [motion.moved(twist) for motion, twist in zip(self.motions, of_groups, strict=True)],
-            {target: board.moved(twist) for (target, board), twist in boards},
+            [motion.retract(twist) for motion, twist in zip(self.motions, of_groups, strict=True)],
+            {target: board.retract(twist) for (target, board), twist in boards},
         )
 
 
@@ -206,7 +206,7 @@ class _State:
         prior: PoseCovariance,
     ) -> _State:
         # The pair that fixes the rig frame has zero covariance: give it a micron.
-        covariance = prior.among(pairs) + np.diag(
+        covariance = prior.select(pairs) + np.diag(
             np.tile([1e-6**2] * 3 + [1e-3**2] * 3, len(pairs))
         )
         boards = {
@@ -228,10 +228,10 @@ class _State:
         solution = minimize(
             start,
             lambda placings: self._blocks(groups, placings),
-            _Placings.moved,
+            _Placings.retract,
             unknowns=first_board + 6 * len(start.boards),
             steps=MOST_STEPS,
-            settled=SETTLED,
+            tolerance=SETTLED,
             damping=1e-9,
         )
         own, found = slice(first_group, first_board), solution.state
@@ -247,7 +247,7 @@ class _State:
         yield Block(self.prior_root @ held, lambda: self.prior_root, slice(0, held.size), EXACT)
         for pose in self.poses:
             pair, group = pairs.index(pose.pair), of_group.get(pose.pair)
-            camera = self.rig_from_camera[pose.pair].moved(placings.small[pair])
+            camera = self.rig_from_camera[pose.pair].retract(placings.small[pair])
             board = len(pairs) + len(groups) + targets.index(pose.target)
             touched = [pair, board]
             if group is not None:

@@ -46,10 +46,10 @@ def solve_fully(
     return minimize(
         solution,
         lambda state: _blocks(of_pair, state, unknowns, alike),
-        unknowns.moved,
+        unknowns.retract,
         unknowns=unknowns.count,
         steps=MOST_STEPS,
-        settled=SETTLED,
+        tolerance=SETTLED,
         damping=1e-9,
     ).state
 
@@ -71,19 +71,19 @@ class _Unknowns:
         self.count += size
         return np.arange(self.count - size, self.count)
 
-    def moved(self, solution: JointSolution, step: Array) -> JointSolution:
+    def retract(self, solution: JointSolution, step: Array) -> JointSolution:
         placed = {
-            name: pose.moved(step[self.of_pair[name]]) if len(self.of_pair[name]) else pose
+            name: pose.retract(step[self.of_pair[name]]) if len(self.of_pair[name]) else pose
             for name, pose in solution.root_from_camera.items()
         }
         boards = {
-            target: pose.moved(step[self.of_board[target]])
+            target: pose.retract(step[self.of_board[target]])
             for target, pose in solution.root_from_board.items()
         }
         cameras = dict(solution.cameras)
         if self.refine_cameras:
             cameras |= {
-                name: cameras[name].moved(step[own]) for name, own in self.of_camera.items()
+                name: cameras[name].retract(step[own]) for name, own in self.of_camera.items()
             }
         return JointSolution(placed, boards, cameras)
 

@@ -27,7 +27,7 @@ OTHER_SIZE = 0.005
 SAME_SIZE_SHOTS = 3
 STEPS = 15
 SETTLED = 1e-2  # variances: far less than separates a wrong view from a right one
-CORNERS = Noise("corners", group=2, least=0.1 * LEAST_BAD_PX)
+CORNERS = Noise("corners", group=2, min_scale=0.1 * LEAST_BAD_PX)
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,10 +191,10 @@ def fit_board(
     fitted = minimize(
         (placing, 1.0),
         lambda state: [_corners(view, solution, state, unknowns) for view in views],
-        lambda state, step: (state[0].moved(step[:6]), state[1] + float(np.sum(step[6:]))),
+        lambda state, step: (state[0].retract(step[:6]), state[1] + float(np.sum(step[6:]))),
         unknowns=unknowns,
         steps=STEPS,
-        settled=SETTLED,
+        tolerance=SETTLED,
         damping=1e-9,
     )
     residuals = tuple(block.residuals.reshape(-1, 2) for block in fitted.blocks)

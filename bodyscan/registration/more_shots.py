@@ -17,7 +17,7 @@ from bodyscan.calibration.board_views import LocatedView
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.linear_gaussian import invert_scaled
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
-from bodyscan.geometry.visibility import in_image
+from bodyscan.geometry.visibility import is_in_image
 from bodyscan.registration.normal_equations import (
     NormalEquations,
     normal_equations,
@@ -207,7 +207,7 @@ def _views(
             continue
         face = corners[:count] if facing > 0 else corners[-count:]
         points = camera_from_board.apply(face)
-        seen = in_image(cameras[name], points, EDGE_PX)
+        seen = is_in_image(cameras[name], points, EDGE_PX)
         if seen.sum() >= FEWEST_CORNERS:
             pixels = cameras[name].project(points[seen])
             yield LocatedView(name, "more", board.name, face[seen], pixels, camera_from_board)

@@ -186,7 +186,7 @@ def normal_equations(
     )
     sigmas = view_sigmas(residuals)
     residuals = tuple(r / sigma for r, sigma in zip(residuals, sigmas, strict=True))
-    spread = CORNERS.spread_of(np.concatenate(residuals))
+    spread = CORNERS.estimate_scale(np.concatenate(residuals))
 
     def of_target(number: int, target: Target) -> OfTarget:
         seen = [k for k, view in enumerate(views) if view.target == target]

@@ -16,7 +16,7 @@ from bodyscan.arrays import Array, Indices
 from bodyscan.boards.board_layout import corner_grid, corner_points
 from bodyscan.boards.view import BoardView
 from bodyscan.errors import FailedWork
-from bodyscan.geometry.transforms import rigid_fit
+from bodyscan.geometry.transforms import fit_rigid_transform
 from bodyscan.outcome import Outcome
 from bodyscan.registration.nominal_size import OTHER_SIZE, REFUSED_SIZE
 from bodyscan.registration.rig_solve import RigSolution
@@ -195,7 +195,7 @@ def _along(board: Board, ids: Indices, points: Array, excess: float) -> _Reading
     """The length of one board, from the scale of a similarity onto its layout."""
     layout = corner_points(board)
     length = board_length(board)
-    own, found = layout[ids], rigid_fit(layout[ids], points).inverse().apply(points)
+    own, found = layout[ids], fit_rigid_transform(layout[ids], points).inverse().apply(points)
     spread = own - own.mean(axis=0)
     scale = float(np.sum(spread * found) / np.sum(spread**2))
     left = found - found.mean(axis=0) - scale * spread
@@ -226,7 +226,7 @@ class _Middle:
     @staticmethod
     def of(board: Board, ids: Indices, points: Array) -> _Middle:
         own = corner_points(board)[ids]
-        rig_from_board = rigid_fit(own, points)
+        rig_from_board = fit_rigid_transform(own, points)
         width, height = board.size_mm
         middle, spread = np.array([0.5 * width, 0.5 * height, 0.0]), own - own.mean(axis=0)
         lever = np.linalg.norm(middle - own.mean(axis=0)) / np.sqrt(np.mean(spread**2) * 3.0)

@@ -235,7 +235,7 @@ def _placed(rig: Rig, solved: _Solved, refine: bool) -> RigSolution:
         known.cameras,
         known.excess,
         {
-            name: rays.with_excess(known.excess)
+            name: rays.inflate_noise(known.excess)
             for name, rays in (solved.lenses.rays if solved.lenses else {}).items()
         },
     )

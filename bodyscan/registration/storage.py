@@ -24,11 +24,11 @@ from bodyscan.files.json_file import read_json_object
 from bodyscan.files.model import first_fault
 from bodyscan.files.npz_file import read_npz
 from bodyscan.files.regular import read_regular
-from bodyscan.geometry.camera_fields import from_fields, to_fields
+from bodyscan.geometry.camera_fields import camera_from_fields, camera_to_fields
 from bodyscan.geometry.light_planes import LightSheets
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.ray_uncertainty import COLUMNS, ROWS, RayUncertainty
-from bodyscan.geometry.sheet_arrays import from_arrays, to_arrays
+from bodyscan.geometry.sheet_arrays import sheets_from_arrays, sheets_to_arrays
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.rig_calibration import RigCalibration, SeenCorners
 from bodyscan.registration.soundness import find_faults
@@ -93,10 +93,10 @@ def save_calibration(calibration: RigCalibration, folder: Path) -> Path:
     for name, pair in calibration.pairs.items():
         arrays[f"{name}/camera_covariance"] = pair.camera_covariance
         if pair.sheets is not None:
-            for key, array in to_arrays(pair.sheets).items():
+            for key, array in sheets_to_arrays(pair.sheets).items():
                 arrays[f"{name}/light/{key}"] = array
         if pair.crossing is not None:
-            for key, array in to_arrays(pair.crossing).items():
+            for key, array in sheets_to_arrays(pair.crossing).items():
                 arrays[f"{name}/crossing/{key}"] = array
         if pair.rays is not None:
             arrays[f"{name}/rays/noise_px"] = pair.rays.noise_px
@@ -240,7 +240,7 @@ def _pair_content(calibration: RigCalibration, name: str) -> dict[str, Any]:
     pair = calibration.pairs[name]
     crossing = {} if pair.crossing is None else {"crossing": _light_content(pair.crossing)}
     return {
-        "camera": to_fields(pair.camera),
+        "camera": camera_to_fields(pair.camera),
         "rig_from_camera": calibration.rig_from_camera[name].matrix,
         "light": None if pair.sheets is None else _light_content(pair.sheets),
         "quality": asdict(pair.quality),
@@ -256,7 +256,7 @@ def _calibration(content: dict[str, Any], arrays: dict[str, Any]) -> RigCalibrat
     pairs = {
         name: PairCalibration(
             name,
-            from_fields(part["camera"]),
+            camera_from_fields(part["camera"]),
             arrays[f"{name}/camera_covariance"],
             None if part["light"] is None else _light(part["light"], f"{name}/light/", arrays),
             _quality(part["quality"]),
@@ -289,7 +289,7 @@ def _calibration(content: dict[str, Any], arrays: dict[str, Any]) -> RigCalibrat
 
 
 def _light(content: dict[str, Any], prefix: str, arrays: dict[str, Any]) -> LightSheets:
-    return from_arrays(content["kind"], _under(prefix, arrays), content["direction"])
+    return sheets_from_arrays(content["kind"], _under(prefix, arrays), content["direction"])
 
 
 def _rays(name: str, arrays: dict[str, Any]) -> RayUncertainty | None:

@@ -25,7 +25,7 @@ AXES = ((200, 40, 40), (30, 140, 60), (40, 80, 200))
 def rig_model(calibration: RigCalibration) -> tuple[dict[str, object], float]:
     """The model for the viewer, and the factor by which the one-sigma ellipsoids are enlarged."""
     spread = {
-        name: point_covariance(calibration.covariance.of(name), placing.translation)
+        name: point_covariance(calibration.covariance.marginal(name), placing.translation)
         for name, placing in calibration.rig_from_camera.items()
     }
     longest = max(float(np.sqrt(np.linalg.eigvalsh(one)[-1])) for one in spread.values())

@@ -14,7 +14,7 @@ from bodyscan.files.atomic import write_bytes
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
-from bodyscan.geometry.visibility import in_image
+from bodyscan.geometry.visibility import is_in_image
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.storage import MAP_NAME, load_calibration
 from bodyscan.report.canvas import (
@@ -55,7 +55,7 @@ def sigma_at(
     """
     seen = np.stack(
         [
-            in_image(cameras[name], rig_from_camera[name].inverse().apply(points))
+            is_in_image(cameras[name], rig_from_camera[name].inverse().apply(points))
             if name in cameras
             else np.zeros(len(points), bool)
             for name in covariance.names

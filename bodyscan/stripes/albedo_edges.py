@@ -16,7 +16,7 @@ import numpy as np
 
 from bodyscan.arrays import Array, Floats, Greys, Indices, Mask
 from bodyscan.compiled import compiled
-from bodyscan.geometry.crop import crop_of
+from bodyscan.geometry.crop import find_crop
 from bodyscan.stripes.scan_lines import ScanLines
 
 UNEXPLAINED = 0.3
@@ -116,7 +116,7 @@ def fit_gradient(image: Floats, usable: Mask) -> tuple[Floats, Floats]:
     """Fit a plane to the usable pixels in 7 x 7 windows: its gradient along and across the lines
     (L, P), 1/px; 0 at pixels that are not usable or have fewer than 12 of them around."""
     along, across = np.zeros((2, *image.shape), np.float32)
-    box = crop_of(usable)
+    box = find_crop(usable)
     if box is None:
         return along, across
     inside = usable[box].astype(np.float32)

@@ -127,7 +127,7 @@ def apply_moves(calibration: RigCalibration, moves: Sequence[Move]) -> RigCalibr
         carried = {poles[pair] for pair in move.pairs if len(move.pairs) > 1}
         pairs = [pair for pair in poses if pair in move.pairs or poles.get(pair) in carried]
         poses |= {pair: move.motion @ poses[pair] for pair in pairs}
-        covariance = covariance.moved_together(pairs, move.covariance)
+        covariance = covariance.add_common_motion(pairs, move.covariance)
     notes = tuple(f"repaired: {move_line(move)}" for move in moves)
     return replace(
         calibration,

@@ -140,7 +140,7 @@ def test_sway_is_found_whatever_its_size(
     images, truth = scanned
     rng = np.random.default_rng(7)
     start = {
-        name: t.moved([*rng.normal(0.0, 1e-4 * sway_mm, 3), *rng.normal(0.0, sway_mm, 3)])
+        name: t.retract([*rng.normal(0.0, 1e-4 * sway_mm, 3), *rng.normal(0.0, sway_mm, 3)])
         for name, t in truth.items()
     }
     found = align(images, start, known_to(truth, 0.02, 0.001), AlignmentSettings())
@@ -195,7 +195,7 @@ def test_the_normal_equations_are_those_of_the_distances_jacobian() -> None:
     )
     jacobian = np.empty((200, 6))
     for k, step in enumerate(1e-6 * np.eye(6)):
-        moved = RigidTransform.identity().moved(step).apply(points)
+        moved = RigidTransform.identity().retract(step).apply(points)
         jacobian[:, k] = np.sum((moved - points) * normals, axis=1) / 1e-6
     spread = 1.4826 * np.median(np.abs(matches.distances))
     sigma = np.hypot(matches.sigma_mm, spread)

@@ -15,7 +15,7 @@ from bodyscan.alignment.body_cells import BodyCells, modulated, rigid_fields
 from bodyscan.alignment.matching import alignment_points, match_projected
 from bodyscan.fusion.smoothing import smooth
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.crop import WHOLE, crop_of, widened
+from bodyscan.geometry.crop import WHOLE, find_crop, pad_crop
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
@@ -89,7 +89,7 @@ def test_what_is_cut_away_changes_nothing(ball: tuple[RangeImage, BodyCells]) ->
     """A box that leaves nothing measured out, at no multiple of any step or block."""
     image, cells = ball
     whole = replace(image, beyond=~image.valid)
-    box = widened(crop_of(image.valid) or WHOLE, 5)
+    box = pad_crop(find_crop(image.valid) or WHOLE, 5)
     cut = whole.cut(box)
     assert cut.sigma_mm.shape < image.sigma_mm.shape
     depth = np.where(image.valid, image.points[..., 2], np.inf)

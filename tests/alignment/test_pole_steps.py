@@ -142,7 +142,7 @@ def test_without_moments_nobody_can_tell() -> None:
 def test_motions_are_those_of_alignment() -> None:
     twist = np.array([0.01, 0.0, -0.02, 3.0, 4.0, 5.0])
     before = {"a": RigidTransform.from_rotation_vector([0.1, 0.2, 0.3], [100.0, 200.0, 300.0])}
-    after = {"a": before["a"].moved(twist)}
+    after = {"a": before["a"].retract(twist)}
     np.testing.assert_allclose(motions_between(before, after)["a"], twist, atol=1e-12)
 
 

@@ -64,8 +64,8 @@ def test_a_pair_that_nothing_ties_is_known_as_the_boards_and_a_sway_say() -> Non
     known = PoseCovariance(("p1", "p2", "p3"), 0.1**2 * np.eye(18))
     loose = SwayPrior(1.0, 0.0, 0.3, 4.0).loosen(known, ["p2"])
     for tied in ("p1", "p3"):
-        assert np.array_equal(loose.of(tied), known.of(tied))
-    added = loose.of("p2") - known.of("p2")
+        assert np.array_equal(loose.marginal(tied), known.marginal(tied))
+    added = loose.marginal("p2") - known.marginal("p2")
     assert np.sqrt(np.diag(added))[3:] == pytest.approx([1.0, 1.0, 1.0], rel=1e-3)
 
 
@@ -73,8 +73,8 @@ def test_what_all_pairs_share_is_not_between_two() -> None:
     shared, own = 4.0 * np.eye(6), 0.01 * np.eye(6)
     known = PoseCovariance(("p1", "p2", "p3"), np.kron(np.ones((3, 3)), shared).astype(float))
     known.matrix[12:, 12:] += own
-    assert np.allclose(known.between("p1", "p2"), 0.0)
-    assert np.allclose(known.between("p2", "p3"), own)
+    assert np.allclose(known.relative("p1", "p2"), 0.0)
+    assert np.allclose(known.relative("p2", "p3"), own)
 
 
 @pytest.mark.parametrize(("first_mm", "second_mm"), [(0.1, 0.2), (0.2, 0.1)])

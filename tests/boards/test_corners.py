@@ -153,7 +153,7 @@ def test_compiled_equations_are_those_of_the_corner_s_image(rim_px: float) -> No
         (residuals(state + change) - residuals(state - change)) / (2 * step)
         for change in step * np.eye(9)
     ]
-    plain = StackedEquations.of(residuals(state), np.stack(slopes, axis=-1), weight)
+    plain = StackedEquations.from_residuals(residuals(state), np.stack(slopes, axis=-1), weight)
     found = StackedEquations(*sum_equations(pixels, grey, weight, rims, state))
     for name in ("normal", "gradient", "cost", "freedoms"):
         expected = getattr(plain, name)

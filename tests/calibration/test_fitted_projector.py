@@ -17,7 +17,7 @@ from bodyscan.geometry.lens_sheets import LensSheets
 from bodyscan.geometry.lenses import lens_from_opencv
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.light_planes import Axis, LightPlanes
-from bodyscan.geometry.projector_sheets import sheets_of_projector
+from bodyscan.geometry.projector_sheets import sheets_from_projector
 from bodyscan.geometry.transforms import RigidTransform
 
 CAMERA = Camera(1400.0, 1410.0, 0.3, 640.0, 500.0, Radial(-0.1, 0.05), 1280, 1024)
@@ -37,7 +37,7 @@ def projector(lens: str) -> Camera:
 
 
 def sheets(light: Camera, direction: Axis) -> LensSheets:
-    return sheets_of_projector(light, PLACE, MIDDLE, SIZE[direction], direction)
+    return sheets_from_projector(light, PLACE, MIDDLE, SIZE[direction], direction)
 
 
 def somewhere() -> Array:
@@ -85,7 +85,7 @@ def test_free_planes_of_a_pinhole_are_one() -> None:
 
 def bowed(sigma: float) -> BowedSheets:
     pinhole = sheets(projector("none"), "vertical")
-    own = BowedSheets.of_pinhole(pinhole, 0)
+    own = BowedSheets.from_pinhole(pinhole, 0)
     return replace(own, covariance=np.eye(len(own.parameters)) * sigma**2)
 
 

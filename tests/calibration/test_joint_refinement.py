@@ -137,7 +137,7 @@ def test_what_another_fit_finds_otherwise_is_in_the_covariances() -> None:
     np.testing.assert_allclose(same.camera_covariance, known)
     np.testing.assert_allclose(same.sheets.covariance, sheets.covariance, atol=1e-12)
     step = 0.3 * np.eye(count)[0]  # its focal length
-    other = JointFit(camera.camera.moved(step), {}, sheets, known, 0.1, {})
+    other = JointFit(camera.camera.retract(step), {}, sheets, known, 0.1, {})
     allowed = allowing_for(fit, other, boards)
     np.testing.assert_allclose(allowed.camera_covariance - known, np.outer(step, step), atol=1e-9)
     added = np.linalg.eigvalsh(allowed.sheets.covariance - sheets.covariance)

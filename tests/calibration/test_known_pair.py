@@ -79,6 +79,6 @@ def test_each_parameter_by_itself_moves_no_pixel_by_more_than_sigma() -> None:
     pixels = np.stack([u, v], axis=-1).reshape(-1, 2)
     rays = camera.rays(pixels)
     for k, sigma in enumerate(sigmas):
-        moved = camera.moved(1e-3 * sigma * np.eye(len(sigmas))[k])
+        moved = camera.retract(1e-3 * sigma * np.eye(len(sigmas))[k])
         shift = 1e3 * np.linalg.norm(moved.project(rays) - pixels, axis=1)
         assert shift.max() == pytest.approx(0.5, rel=0.01)

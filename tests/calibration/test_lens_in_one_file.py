@@ -20,7 +20,7 @@ from bodyscan.geometry.camera_tables import projection_table, ray_table
 from bodyscan.geometry.lenses import LENSES
 from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.lenses.radial import Radial
-from bodyscan.geometry.pixel_rays import rays_through
+from bodyscan.geometry.pixel_rays import look_up_rays
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.quadratic_table import look_up
 from bodyscan.geometry.transforms import RigidTransform
@@ -87,7 +87,7 @@ def test_its_rays_are_tabulated() -> None:
     wanted[::40, ::40] = True
     rows, columns = np.nonzero(wanted)
     pixels = np.column_stack([columns, rows]).astype(float)
-    rays = rays_through(ray_table(CAMERA), wanted)
+    rays = look_up_rays(ray_table(CAMERA), wanted)
     assert np.abs(CAMERA.project(rays) - pixels).max() < 1e-3
     found = [look_up(projection_table(CAMERA), x, y) for x, y, _ in CAMERA.rays(pixels)]
     assert np.abs(np.array(found) - pixels).max() < 1e-3

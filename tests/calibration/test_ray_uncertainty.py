@@ -18,7 +18,7 @@ from bodyscan.geometry.lenses import FAMILY
 from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.lenses.rational import Rational
-from bodyscan.geometry.ray_uncertainty import RayUncertainty, nodes
+from bodyscan.geometry.ray_uncertainty import RayUncertainty, node_pixels
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 
 FOCAL = 1400.0  # 30 degrees from the axis to the corner
@@ -41,7 +41,7 @@ def calibrated(lens: Lens, reach: float, seed: int) -> tuple[Camera, CameraCalib
 
 def errors_px(true: Camera, found: Camera, covered: float) -> np.ndarray:
     """(rows, columns), a coordinate's, less the motion that fits it best within `covered`."""
-    pixels = nodes(WIDTH, HEIGHT)
+    pixels = node_pixels(WIDTH, HEIGHT)
     points = true.rays(pixels) * DEPTH_MM
     apart = found.project(points) - pixels
     flat = points.reshape(-1, 3)
@@ -83,7 +83,7 @@ def test_boards_all_over_the_picture_know_it_all() -> None:
 def test_an_excess_makes_the_noise_larger_and_not_the_choice() -> None:
     _, found = calibrated(Radial(-0.25, 0.1), 0.3, 1)
     assert found.rays is not None
-    larger = found.rays.with_excess(4.0)
+    larger = found.rays.inflate_noise(4.0)
     np.testing.assert_allclose(larger.noise_px, 2.0 * found.rays.noise_px)
     np.testing.assert_array_equal(larger.lens_px, found.rays.lens_px)
 
@@ -123,14 +123,14 @@ def test_how_far_another_lens_shows_rays_elsewhere_is_told_but_for_a_motion_of_t
     """By the pixels themselves: what one camera shows of the other's rays, less the motion that brings
     the boards' corners together, a coordinate's share of it."""
     step = OFF * np.eye(7)[K1]
-    found = told_by(CHOSEN.moved(step)).lens_px
-    rays = CHOSEN.rays(nodes(WIDTH, HEIGHT)).reshape(-1, 3)
+    found = told_by(CHOSEN.retract(step)).lens_px
+    rays = CHOSEN.rays(node_pixels(WIDTH, HEIGHT)).reshape(-1, 3)
     corners = np.concatenate([
         RigidTransform.from_rotation_vector(turn, [-100.0 + 60.0 * k, -80.0, DEPTH_MM]).apply(POINTS)
         for k, turn in enumerate(([0.3, 0.2, 0.0], [-0.2, 0.4, 0.1]))
     ])  # fmt: skip
     points = rays * np.median(corners[:, 2])
-    other = CHOSEN.moved(step)
+    other = CHOSEN.retract(step)
 
     def apart(at: np.ndarray) -> np.ndarray:
         return other.project(at) - CHOSEN.project(at)
@@ -150,7 +150,7 @@ def test_how_far_another_lens_shows_rays_elsewhere_is_told_but_for_a_motion_of_t
 
 
 def test_a_sigma_of_a_coefficient_is_as_large_as_a_lens_that_differs_by_it() -> None:
-    by_noise, by_lens = told_by(CHOSEN, OFF), told_by(CHOSEN.moved(OFF * np.eye(7)[K1]))
+    by_noise, by_lens = told_by(CHOSEN, OFF), told_by(CHOSEN.retract(OFF * np.eye(7)[K1]))
     # First order in a thousandth.
     np.testing.assert_allclose(
         by_noise.noise_px, by_lens.lens_px, atol=1e-3 * by_lens.lens_px.max()
@@ -162,8 +162,8 @@ def test_a_sigma_of_a_coefficient_is_as_large_as_a_lens_that_differs_by_it() -> 
 def test_where_a_lens_folds_rays_are_as_uncertain_as_the_worst_that_it_has() -> None:
     """r (1 - r^2 / 2) is 0.54 at most, less than the picture's corners are from its middle."""
     folding = Camera(FOCAL, FOCAL, 0.0, 645.0, 508.0, Radial(-0.5, 0.0), WIDTH, HEIGHT)
-    found = told_by(folding.moved(1e-5 * np.eye(7)[K1]), 1e-5, folding)
-    pixels = nodes(WIDTH, HEIGHT)
+    found = told_by(folding.retract(1e-5 * np.eye(7)[K1]), 1e-5, folding)
+    pixels = node_pixels(WIDTH, HEIGHT)
     away = np.linalg.norm((pixels - [645.0, 508.0]) / FOCAL, axis=-1)
     folds = away > np.sqrt(2.0 / 3.0) * 2.0 / 3.0
     assert folds[0, 0]

@@ -60,7 +60,7 @@ def pushed(scene: Scene, push: tuple[float, float, float]) -> Scene:
 def turned(scene: Scene, degrees: float) -> Scene:
     projector = scene.projector
     assert isinstance(projector, Lens)
-    moved = projector.projector_from_camera.moved(np.array([np.radians(degrees), 0, 0, 0, 0, 0]))
+    moved = projector.projector_from_camera.retract(np.array([np.radians(degrees), 0, 0, 0, 0, 0]))
     return replace(scene, projector=replace(projector, projector_from_camera=moved))
 
 

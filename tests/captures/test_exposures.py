@@ -16,7 +16,7 @@ from bodyscan.captures.exposures import merge_exposures
 from bodyscan.captures.folder import open_scan
 from bodyscan.captures.images import read_sequence
 from bodyscan.errors import ImageError, RigFileError
-from bodyscan.geometry.robust import spread
+from bodyscan.geometry.robust import robust_scale
 from bodyscan.rig.rig_file import load_rig
 from bodyscan.stripes.codes import stripe_code
 from bodyscan.stripes.decoding import decode_stripes
@@ -92,7 +92,7 @@ def test_sigmas_of_hair_and_of_skin_are_as_large_as_their_errors(code: dict[str,
         normalised = ((seen.s - s) / seen.sigma)[rows, 5:-5]
         # Of some 2,500 boundaries a robust sigma is known to 2 %; the least sigma of a boundary
         # covers imperfect devices, which these are not: sigmas may be a sixth too large.
-        assert spread(normalised[np.isfinite(normalised)]) == pytest.approx(1.0, abs=0.2)
+        assert robust_scale(normalised[np.isfinite(normalised)]) == pytest.approx(1.0, abs=0.2)
 
 
 def test_the_merged_images_are_the_shorter_ones_with_less_noise() -> None:

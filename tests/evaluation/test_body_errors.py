@@ -12,7 +12,7 @@ from made_bodies import mesh_of
 
 from bodyscan.evaluation.body import coverage_of_seen, girth_errors, sway_residual
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.camera_fields import to_fields
+from bodyscan.geometry.camera_fields import camera_to_fields
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyMesh, BreathAt
@@ -67,7 +67,7 @@ def pairs(sways: list[RigidTransform]) -> dict[str, dict[str, Any]]:
     camera = RigidTransform(turn, np.array([1500.0, 0.0, 850.0]))
     return {
         f"p{k}": {
-            "camera": to_fields(CAMERA),
+            "camera": camera_to_fields(CAMERA),
             "rig_from_camera": camera.matrix,
             "projector": {"centre": [0.0, -300.0, 0.0]},
             "swayed_from_still": sway.matrix,
@@ -114,7 +114,7 @@ def test_no_camera_sees_beyond_the_middles_of_its_last_pixels() -> None:
     facts = {
         "rig_from_camera": still,
         "swayed_from_still": still,
-        "camera": to_fields(coarse),
+        "camera": camera_to_fields(coarse),
         "projector": {"centre": [0.0, 0.0, 0.0]},
     }
     seen, _ = coverage_of_seen(wall, wall, faces, {"p": facts})

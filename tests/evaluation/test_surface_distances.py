@@ -92,7 +92,7 @@ def test_a_scan_that_stands_centimetres_off_is_laid_onto_the_surface() -> None:
     """By 25 mm and five degrees: two scans of somebody who stepped off and on again."""
     vertices, faces = uneven_body()
     points, _ = sample_surface(vertices, faces, 20_000)
-    middle = RigidTransform.shift(np.array([300.0, 100.0, 900.0]))
+    middle = RigidTransform.from_translation(np.array([300.0, 100.0, 900.0]))
     turned = RigidTransform.from_rotation_vector([0.05, -0.04, 0.06], [15.0, -18.0, 10.0])
     off = middle @ turned @ middle.inverse()
     laid = fit_to_surface(off.apply(points), vertices, faces)

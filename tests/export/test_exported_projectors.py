@@ -21,7 +21,7 @@ from bodyscan.geometry.lenses import lens_from_opencv
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.light_planes import LightSheets
 from bodyscan.geometry.pose_covariance import PoseCovariance
-from bodyscan.geometry.projector_sheets import sheets_of_projector
+from bodyscan.geometry.projector_sheets import sheets_from_projector
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.interchange.rig_format import RIG_FORMATS
 from bodyscan.registration.rig_calibration import RigCalibration
@@ -58,8 +58,8 @@ def calibrate(lens: Array) -> RigCalibration:
     camera = Camera(1400.0, 1410.0, 0.0, 640.0, 500.0, Radial(-0.1, 0.05), 1280, 1024)
     light = Camera(1650.0, 1720.0, 0.0, 622.0, 763.0, lens_from_opencv(lens), 1280, 800)
     middle = np.array([0.0, 0.0, 1000.0])
-    columns = sheets_of_projector(light, PROJECTOR_FROM_CAMERA, middle, 1280, "vertical")
-    rows = sheets_of_projector(light, PROJECTOR_FROM_CAMERA, middle, 800, "horizontal")
+    columns = sheets_from_projector(light, PROJECTOR_FROM_CAMERA, middle, 1280, "vertical")
+    rows = sheets_from_projector(light, PROJECTOR_FROM_CAMERA, middle, 800, "horizontal")
     quality = PairQuality(0.1, 9)
     pairs = {
         name: PairCalibration(name, camera, np.eye(7), columns, quality, rows)

@@ -74,7 +74,7 @@ def test_draws_of_the_placing_spread_by_the_error_bar(cloud: BodyCloud) -> None:
     )
     sigma = add_pose_variance(alone, place, prior).sigma_mm
     twists = rng.normal(size=(4000, 6)) @ root.T
-    moved = np.array([RigidTransform.identity().moved(t).apply(points) for t in twists])
+    moved = np.array([RigidTransform.identity().retract(t).apply(points) for t in twists])
     along = np.einsum("knc,nc->kn", moved - points, normals)
     seen = sigma > 0
     assert seen.sum() > 20
@@ -120,7 +120,7 @@ def test_a_mean_of_three_pairs_spreads_by_its_error_bar(cloud: BodyCloud) -> Non
         chosen, places, PoseCovariance(("p0", "p1", "p2"), root @ root.T)
     ).sigma_mm
     twists = (rng.normal(size=(2000, 18)) @ root.T).reshape(2000, 3, 6).mean(axis=1)
-    moved = np.array([RigidTransform.identity().moved(t).apply(chosen.points) for t in twists])
+    moved = np.array([RigidTransform.identity().retract(t).apply(chosen.points) for t in twists])
     along = np.einsum("knc,nc->kn", moved - chosen.points, chosen.normals.astype(float))
     assert sigma == pytest.approx(along.std(axis=0), rel=0.065)
 

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.camera_tables import projection_table, ray_table
 from bodyscan.geometry.lenses.radial import Radial
-from bodyscan.geometry.pixel_rays import rays_through
-from bodyscan.geometry.quadratic_table import Table, look_up, slopes
+from bodyscan.geometry.pixel_rays import look_up_rays
+from bodyscan.geometry.quadratic_table import Table, look_up, look_up_derivatives
 
 MOST_PX = 1e-3
 SCANNER = Camera(1510.0, 1512.0, -0.5, 645.0, 508.0, Radial(-0.1, 0.05), 1280, 1024)
@@ -61,7 +61,7 @@ def test_a_lens_that_folds_within_the_picture_has_no_rays_beyond_and_shows_nothi
     camera = Camera(900.0, 900.0, 0.0, 640.0, 512.0, Radial(-0.6, 0.0), 1280, 1024)
     wanted = np.zeros((1024, 1280), bool)
     wanted[::16, ::16] = True
-    rays = rays_through(ray_table(camera), wanted)
+    rays = look_up_rays(ray_table(camera), wanted)
     rows, columns = np.nonzero(wanted)
     pixels = np.stack([columns, rows], axis=-1).astype(float)
     known = np.all(np.isfinite(rays), axis=1)
@@ -84,7 +84,7 @@ def test_a_lens_that_folds_within_the_picture_has_no_rays_beyond_and_shows_nothi
 def test_slopes_are_derivatives_of_the_projection(camera: Camera) -> None:
     rays = camera.rays(pixels_of(camera))
     table = projection_table(camera)
-    found = np.array([slopes(table, x, y) for x, y, _ in rays]).reshape(-1, 2, 2)
+    found = np.array([look_up_derivatives(table, x, y) for x, y, _ in rays]).reshape(-1, 2, 2)
     by_point = camera.jacobians(rays)[1][:, :, :2]
     # Straight lines for what bends: a normal is turned by as much at most, 0.01 degrees.
     assert np.abs(found - by_point).max() < 2e-4 * camera.alpha
@@ -94,7 +94,7 @@ def test_slopes_are_derivatives_of_the_projection(camera: Camera) -> None:
 @given(cameras, st.integers(0, 479))
 def test_rays_through_pixels_are_those_of_the_camera(camera: Camera, first: int) -> None:
     wanted = np.random.default_rng(first).random((min(12, 480 - first), 640)) < 0.1
-    rays = rays_through(ray_table(camera), wanted, first)
+    rays = look_up_rays(ray_table(camera), wanted, first)
     rows, columns = np.nonzero(wanted)
     pixels = np.stack([columns, rows + first], axis=-1).astype(float)
     assert np.max(np.abs(camera.project(rays) - pixels), initial=0.0) < MOST_PX
@@ -104,5 +104,5 @@ def test_rays_through_pixels_are_those_of_the_camera(camera: Camera, first: int)
 def test_equal_cameras_share_their_tables() -> None:
     again = Camera(1510.0, 1512.0, -0.5, 645.0, 508.0, Radial(-0.1, 0.05), 1280, 1024)
     assert projection_table(SCANNER) is projection_table(again)
-    other = SCANNER.moved(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1e-3, 0.0]))
+    other = SCANNER.retract(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1e-3, 0.0]))
     assert projection_table(SCANNER) is not projection_table(other)

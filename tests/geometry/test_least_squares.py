@@ -21,7 +21,7 @@ from bodyscan.geometry.least_squares import (
     minimize_each,
 )
 from bodyscan.geometry.linear_gaussian import invert_scaled, solve_scaled
-from bodyscan.geometry.robust import cauchy_cost, cauchy_weights, rms, rms_length, spread
+from bodyscan.geometry.robust import cauchy_cost, cauchy_weights, rms, rms_length, robust_scale
 
 TIME = np.linspace(0.0, 3.0, 60)
 TRUE = np.array([2.0, 0.7, -0.5])
@@ -146,7 +146,7 @@ def test_kinds_of_residuals_are_each_weighed_by_their_own_spread() -> None:
         ]
 
     solution = minimize(np.zeros(1), blocks, add, unknowns=1)
-    assert solution.spreads == pytest.approx([1.0, 0.01], rel=0.2)
+    assert solution.scales == pytest.approx([1.0, 0.01], rel=0.2)
     assert abs(solution.state[0] - 5.0) < 0.003
     assert np.sqrt(solution.covariance[0, 0]) == pytest.approx(0.01 / np.sqrt(200), rel=0.3)
 
@@ -253,7 +253,7 @@ class Many:
     def equations(self, states: Array) -> StackedEquations:
         residuals = np.stack([decay(state) for state in states]) - self.measured
         jacobians = np.stack([decay_jacobian(state) for state in states])
-        return StackedEquations.of(residuals, jacobians, self.weights)
+        return StackedEquations.from_residuals(residuals, jacobians, self.weights)
 
 
 def many(count: int = 5) -> Many:
@@ -276,7 +276,7 @@ def test_many_problems_at_once_come_out_as_one_by_one() -> None:
             residuals = (decay(state) - problems.measured[k])[seen]
             yield Block(residuals, lambda: decay_jacobian(state)[seen], slice(0, 3), PLAIN)
 
-        whole = minimize(start[k], blocks, add, unknowns=3, settled=1e-9)
+        whole = minimize(start[k], blocks, add, unknowns=3, tolerance=1e-9)
         assert np.allclose(together.state[k], whole.state, atol=1e-5)
         assert np.allclose(together.covariance()[k], whole.variance * whole.covariance, rtol=1e-3)
 
@@ -308,10 +308,10 @@ def test_what_nothing_ties_gets_the_shortest_solution_and_no_infinite_covariance
 
 def test_the_spread_is_a_standard_deviation_that_outliers_do_not_sway() -> None:
     values = np.random.default_rng(9).normal(0.0, 2.0, 20000)
-    assert spread(values) == pytest.approx(2.0, rel=0.02)
+    assert robust_scale(values) == pytest.approx(2.0, rel=0.02)
     values[:2000] = 1e6
-    assert spread(values) < 2.5
-    assert spread(np.zeros(5), 0.1) == 0.1
+    assert robust_scale(values) < 2.5
+    assert robust_scale(np.zeros(5), 0.1) == 0.1
 
 
 @pytest.mark.parametrize("group", [1, 2])

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from bodyscan.errors import BadInput
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.camera_fields import from_fields, to_fields
+from bodyscan.geometry.camera_fields import camera_from_fields, camera_to_fields
 from bodyscan.geometry.lenses import LENSES, lens_from_opencv
 from bodyscan.geometry.lenses.brown import Brown
 from bodyscan.geometry.lenses.lens import Lens
@@ -107,7 +107,7 @@ def test_jacobians_are_derivatives(camera: Camera) -> None:
         # Central differences of 0.01 mm: curvature leaves 1e-8 px/mm, rounding 1e-10.
         assert np.allclose(by_point[:, :, k], numeric, rtol=0.0, atol=1e-7)
     for k, step in enumerate(np.diag(camera.difference_steps)):
-        numeric = camera.moved(step).project(points) - camera.moved(-step).project(points)
+        numeric = camera.retract(step).project(points) - camera.retract(-step).project(points)
         # Pixels of 1e3 are rounded to 1e-13, over steps of at least 1e-5.
         expected = 2.0 * step[k] * by_parameter[:, :, k]
         assert np.allclose(numeric, expected, rtol=1e-6, atol=1e-11)
@@ -117,7 +117,7 @@ def test_jacobians_are_derivatives(camera: Camera) -> None:
 def test_a_step_of_a_difference_is_small_in_the_image(camera: Camera) -> None:
     points = camera.rays(pixels_of(camera))
     for step in np.diag(camera.difference_steps):
-        moved = np.abs(camera.moved(step).project(points) - camera.project(points)).max()
+        moved = np.abs(camera.retract(step).project(points) - camera.project(points)).max()
         assert 1e-6 < moved < 0.1  # px: far above rounding, far below what bends
 
 
@@ -127,13 +127,13 @@ def test_parameters_are_read_and_moved_by_name(camera: Camera) -> None:
     assert named["alpha"] == camera.alpha
     step = np.zeros(len(named))
     step[camera.parameter_names.index("gamma")] = 0.25
-    assert camera.moved(step) == replace(camera, gamma=camera.gamma + 0.25)
+    assert camera.retract(step) == replace(camera, gamma=camera.gamma + 0.25)
     assert len(camera.prior_sigmas) == len(camera.difference_steps) == len(named)
 
 
 @given(cameras)
 def test_a_camera_is_read_as_it_was_written(camera: Camera) -> None:
-    assert from_fields(to_fields(camera)) == camera
+    assert camera_from_fields(camera_to_fields(camera)) == camera
 
 
 @given(lenses())
@@ -148,7 +148,7 @@ def test_a_lens_of_opencvs_is_read_as_it_was_written(lens: Lens) -> None:
 
 
 def fields() -> dict[str, Any]:
-    return to_fields(Camera(600.0, 601.0, 0.0, 320.0, 240.0, LENSES["radial"](), 640, 480))
+    return camera_to_fields(Camera(600.0, 601.0, 0.0, 320.0, 240.0, LENSES["radial"](), 640, 480))
 
 
 @pytest.mark.parametrize("lens", [Brown(p1=0.01, p2=-0.02), Rational(p1=0.01, p2=-0.02)])
@@ -168,14 +168,14 @@ def test_points_in_whole_numbers_are_distorted_as_others_are(lens: Lens) -> None
 )
 def test_fields_of_no_camera_are_refused(changed: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        from_fields(fields() | changed)
+        camera_from_fields(fields() | changed)
 
 
 def test_a_coefficient_left_out_is_named() -> None:
     damaged = fields()
     del damaged["k2"]
     with pytest.raises(ValueError, match="lacks or does not have k2"):
-        from_fields(damaged)
+        camera_from_fields(damaged)
 
 
 def test_a_coefficient_that_lenses_share_is_as_likely_large_in_each() -> None:

@@ -13,7 +13,7 @@ from bodyscan.geometry.bowed_sheets import BowedSheets
 from bodyscan.geometry.lens_sheets import LensSheets
 from bodyscan.geometry.light_planes import LightPlanes, LightSheets
 from bodyscan.geometry.ray_depths import intersect_rays
-from bodyscan.geometry.sheet_arrays import from_arrays, to_arrays
+from bodyscan.geometry.sheet_arrays import sheets_from_arrays, sheets_to_arrays
 from bodyscan.geometry.smooth_sheets import SmoothSheets
 
 
@@ -130,7 +130,7 @@ def test_a_lens_without_distortion_is_the_two_by_four_matrix() -> None:
 
 
 def test_turning_a_projector_moves_its_axis_and_little_else() -> None:
-    turned = PINHOLE.turned(140.0)
+    turned = PINHOLE.rotate_to(140.0)
     assert turned.parameters[1] == 140.0
     assert np.allclose(turned.projector_from_camera.inverse().translation,
                        PINHOLE.projector_from_camera.inverse().translation)  # fmt: skip
@@ -155,11 +155,13 @@ def test_arrays_hold_everything() -> None:
     planes = LightPlanes(rng.normal(size=(5, 4)), rng.normal(size=(5, 4, 4)), "vertical")
     every: list[LightSheets] = [*models(7), planes]
     for sheets in every:
-        again = from_arrays(sheets.kind, to_arrays(sheets), sheets.direction)
+        again = sheets_from_arrays(sheets.kind, sheets_to_arrays(sheets), sheets.direction)
         assert type(again) is type(sheets)
         assert (again.kind, again.direction) == (sheets.kind, sheets.direction)
         assert again.stripes == sheets.stripes
-        for left, right in zip(to_arrays(sheets).values(), to_arrays(again).values(), strict=True):
+        for left, right in zip(
+            sheets_to_arrays(sheets).values(), sheets_to_arrays(again).values(), strict=True
+        ):
             assert np.array_equal(left, right)
         assert np.array_equal(again.depth(rays, s), sheets.depth(rays, s), equal_nan=True)
 
@@ -167,9 +169,9 @@ def test_arrays_hold_everything() -> None:
 def test_arrays_of_another_kind_are_refused() -> None:
     bowed = models(0)[6]
     with pytest.raises(ValueError, match="smooth-planes"):
-        from_arrays("smooth-planes", to_arrays(bowed), "horizontal")
+        sheets_from_arrays("smooth-planes", sheets_to_arrays(bowed), "horizontal")
     with pytest.raises(ValueError, match="cones"):
-        from_arrays("cones", to_arrays(bowed), "horizontal")
+        sheets_from_arrays("cones", sheets_to_arrays(bowed), "horizontal")
 
 
 def test_planes_have_slope_and_variance_between_two_and_at_the_last() -> None:
@@ -196,7 +198,7 @@ def test_planes_of_any_length_and_sign_measure_and_do_not_say_how_well() -> None
     planes = models(4)[4].tangent_planes(np.arange(STRIPES + 1.0))
     factor = np.random.default_rng(3).uniform(0.5, 3.0, (STRIPES + 1, 1))
     factor[::2] *= -1.0
-    exact = LightPlanes.exact(factor * planes, "horizontal")
+    exact = LightPlanes.from_planes(factor * planes, "horizontal")
     np.testing.assert_allclose(exact.coefficients, planes, rtol=1e-12)
     np.testing.assert_allclose(np.linalg.norm(exact.coefficients[:, :3], axis=1), 1.0)
     assert (exact.coefficients[:, 3] > 0.0).all()
@@ -204,13 +206,13 @@ def test_planes_of_any_length_and_sign_measure_and_do_not_say_how_well() -> None
     ray, s = np.array([[0.02, 0.01, 1.0]]), np.array([100.5])
     assert np.isfinite(exact.depth(ray, s)).all()
     assert np.isnan(exact.variance_mm2(ray, s)).all()
-    again = from_arrays("planes", to_arrays(exact), "horizontal")
+    again = sheets_from_arrays("planes", sheets_to_arrays(exact), "horizontal")
     assert np.isnan(again.variance_mm2(ray, s)).all()
 
 
 def test_a_plane_behind_the_camera_measures_nothing() -> None:
     ahead, behind = [0.0, 0.0, -1.0, 500.0], [0.0, 0.0, 1.0, 500.0]
-    planes = LightPlanes.exact(np.array([ahead, ahead, behind, behind]), "vertical")
+    planes = LightPlanes.from_planes(np.array([ahead, ahead, behind, behind]), "vertical")
     depth = planes.depth(np.tile([0.1, 0.0, 1.0], (2, 1)), np.array([0.5, 2.5]))
     np.testing.assert_allclose(depth, [500.0, np.nan])
 
@@ -276,7 +278,7 @@ def test_the_first_and_the_last_boundary_are_measured_as_well(terms: int) -> Non
     "model",
     [
         *(PINHOLE.with_lens(terms) for terms in (0, 1, 4, 8)),
-        *(BowedSheets.of_pinhole(PINHOLE, terms) for terms in (0, 1, 3)),
+        *(BowedSheets.from_pinhole(PINHOLE, terms) for terms in (0, 1, 3)),
     ],
     ids=lambda model: f"{model.kind}-{len(model.parameters)}",
 )

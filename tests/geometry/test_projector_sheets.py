@@ -11,7 +11,7 @@ from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.light_planes import Axis
-from bodyscan.geometry.projector_sheets import looked_at, sheets_of_projector
+from bodyscan.geometry.projector_sheets import intersect_central_rays, sheets_from_projector
 from bodyscan.geometry.transforms import RigidTransform
 
 CAMERA = Camera(2800.0, 2790.0, 0.0, 1300.0, 970.0, Radial(-0.1, 0.05), 2592, 1944)
@@ -56,7 +56,7 @@ def test_its_sheets_lie_where_opencv_projects_them(kind: str, direction: Axis) -
         stripes = SIZE[direction] // halves
         # Where the search starts must not matter: nobody says how far away the subject stands.
         for middle in ([0.0, 0.0, 300.0], [0.0, 0.0, 3000.0]):
-            sheets = sheets_of_projector(light, PLACE, np.array(middle), stripes, direction)
+            sheets = sheets_from_projector(light, PLACE, np.array(middle), stripes, direction)
             depth, per_stripe, variance = sheets.measure(
                 points[shown] / points[shown, 2:], s[shown] / halves
             )
@@ -75,13 +75,13 @@ def test_skew_turns_the_sheets_of_columns_alone() -> None:
     u, v = np.moveaxis(light.pixels_from_normalized(bent[:, 0]), -1, 0)
     expected_of: dict[Axis, Array] = {"vertical": u, "horizontal": v}
     for direction, expected in expected_of.items():
-        sheets = sheets_of_projector(light, PLACE, points[0], SIZE[direction], direction)
+        sheets = sheets_from_projector(light, PLACE, points[0], SIZE[direction], direction)
         np.testing.assert_allclose(sheets.stripe(points), expected + 0.5, rtol=0, atol=1e-9)
 
 
 def test_sigma_moves_all_sheets_together() -> None:
     light = projector(OpenCVs(LENSES["Brown"]))
-    sheets = sheets_of_projector(light, PLACE, np.array([0, 0, 700.0]), 640, "vertical", 0.5)
+    sheets = sheets_from_projector(light, PLACE, np.array([0, 0, 700.0]), 640, "vertical", 0.5)
     rays = np.array([[0.0, 0.0, 1.0], [0.1, 0.05, 1.0]])
     depth, per_stripe, variance = sheets.measure(rays, np.array([200.0, 300.0]))
     assert np.all(np.isfinite(depth))
@@ -102,7 +102,7 @@ def test_what_is_looked_at_lies_where_the_axes_meet() -> None:
     wanted = middle / np.linalg.norm(middle)
     correct, _ = cv2.Rodrigues(np.cross([0.0, 0.0, 1.0], wanted))
     place = RigidTransform(correct @ looks, -correct @ looks @ position)
-    found = looked_at(CAMERA, light, place)
+    found = intersect_central_rays(CAMERA, light, place)
     assert np.linalg.norm(found - target) < 15.0
     parallel = RigidTransform(np.eye(3), np.array([-200.0, 0.0, 0.0]))
-    assert looked_at(CAMERA, light, parallel)[2] == pytest.approx(1000.0, rel=0.3)
+    assert intersect_central_rays(CAMERA, light, parallel)[2] == pytest.approx(1000.0, rel=0.3)

@@ -37,7 +37,7 @@ def some_rays(count: int) -> tuple[Array, Array]:
 def test_it_agrees_with_the_sheets(sheets: BowedSheets) -> None:
     rays, s = some_rays(40_000)  # more than a chunk
     depth = sheets.depth(rays, s)
-    found, per_stripe, variance = SheetTable.of(sheets).measure(rays, s)
+    found, per_stripe, variance = SheetTable.from_sheets(sheets).measure(rays, s)
     near = depth < 3000.0  # where bodies are; far planes are nearly along the ray
     assert near.sum() > 5000
     # Linear between nodes: m'' / 8 / 64 of a plane that turns by a radian over 200 stripes, 3e-9 in
@@ -51,7 +51,7 @@ def test_it_agrees_with_the_sheets(sheets: BowedSheets) -> None:
 
 def test_nothing_outside_the_stripes_or_behind(sheets: BowedSheets) -> None:
     rays, _ = some_rays(300)
-    table = SheetTable.of(sheets)
+    table = SheetTable.from_sheets(sheets)
     for nowhere in (-0.1, STRIPES + 0.1, np.nan):
         assert np.isnan(table.measure(rays, np.full(len(rays), nowhere))).all()
     s = np.linspace(0.0, STRIPES, 300)
@@ -65,7 +65,7 @@ def test_measuring_takes_the_table(sheets: BowedSheets) -> None:
     rays, s = some_rays(500)
     found = intersect_rays(sheets, rays.reshape(20, 25, 3), s.reshape(20, 25))
     assert found.depth.shape == (20, 25)
-    expected = SheetTable.of(sheets).measure(rays, s)[0]
+    expected = SheetTable.from_sheets(sheets).measure(rays, s)[0]
     known = np.isfinite(found.depth.ravel())
     np.testing.assert_array_equal(found.depth.ravel()[known], expected[known])
 

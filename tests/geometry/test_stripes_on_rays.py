@@ -8,7 +8,7 @@ import pytest
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.light_planes import LightPlanes
-from bodyscan.geometry.ray_depths import intersect_rays, stripes_apart, stripes_per_pixel
+from bodyscan.geometry.ray_depths import intersect_rays, measure_stripe_residual, stripes_per_pixel
 from bodyscan.reconstruction.range_image import RangeImage
 
 CAMERA = Camera(400.0, 400.0, 0.0, 79.5, 59.5, Radial(), 160, 120)
@@ -43,12 +43,12 @@ def test_at_one_depth_s_changes_from_pixel_to_pixel_by_their_angle_over_the_shee
 
 def test_how_far_points_lie_beside_their_sheets_is_told_in_stripes() -> None:
     s, points = flat_wall()
-    assert stripes_apart(sheets(), CAMERA, s, points) == pytest.approx(0.0, abs=1e-3)
+    assert measure_stripe_residual(sheets(), CAMERA, s, points) == pytest.approx(0.0, abs=1e-3)
     for off in (0.3, -0.3):
-        assert stripes_apart(sheets(), CAMERA, s + np.float32(off), points) == pytest.approx(
-            0.3, rel=0.02
-        )
-    assert np.isnan(stripes_apart(sheets(), CAMERA, s, np.full_like(points, np.nan)))
+        assert measure_stripe_residual(
+            sheets(), CAMERA, s + np.float32(off), points
+        ) == pytest.approx(0.3, rel=0.02)
+    assert np.isnan(measure_stripe_residual(sheets(), CAMERA, s, np.full_like(points, np.nan)))
 
 
 def test_rays_meet_their_sheets_and_depth_changes_with_s() -> None:

@@ -4,7 +4,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from bodyscan.arrays import Array
-from bodyscan.geometry.transforms import RigidTransform, adjoint, cross_matrix, rigid_fit
+from bodyscan.geometry.transforms import RigidTransform, adjoint, cross_matrix, fit_rigid_transform
 
 vectors = arrays(float, 3, elements=st.floats(-3.0, 3.0))
 lengths = arrays(float, 3, elements=st.floats(-2000.0, 2000.0))
@@ -40,8 +40,8 @@ def test_matrix_round_trip(a_from_b: RigidTransform) -> None:
 @given(transforms, vectors, vectors)
 def test_adjoint_carries_small_motions(a_from_b: RigidTransform, turn: Array, shift: Array) -> None:
     twist = 1e-6 * np.concatenate([turn, shift])
-    in_b = a_from_b @ RigidTransform.identity().moved(twist)
-    in_a = RigidTransform.identity().moved(adjoint(a_from_b) @ twist) @ a_from_b
+    in_b = a_from_b @ RigidTransform.identity().retract(twist)
+    in_a = RigidTransform.identity().retract(adjoint(a_from_b) @ twist) @ a_from_b
     # The two agree to first order; the second-order term is (1e-6)^2 times metres.
     assert np.allclose(in_b.matrix, in_a.matrix, atol=1e-7)
 
@@ -54,5 +54,5 @@ def test_skew_is_the_cross_product(a: Array, b: Array) -> None:
 @given(transforms, st.integers(0, 2**32 - 1))
 def test_rigid_fit_recovers_the_transform(a_from_b: RigidTransform, seed: int) -> None:
     points = np.random.default_rng(seed).uniform(-500.0, 500.0, (12, 3))
-    found = rigid_fit(points, a_from_b.apply(points))
+    found = fit_rigid_transform(points, a_from_b.apply(points))
     assert np.allclose(found.matrix, a_from_b.matrix, atol=1e-9)

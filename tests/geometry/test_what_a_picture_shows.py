@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.crop import crop_of, ends_of, widened
+from bodyscan.geometry.crop import crop_bounds, find_crop, pad_crop
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.pose_covariance import PoseCovariance, point_covariance, position_sigma
-from bodyscan.geometry.ray_uncertainty import COLUMNS, ROWS, RayUncertainty, nodes
-from bodyscan.geometry.visibility import in_image
+from bodyscan.geometry.ray_uncertainty import COLUMNS, ROWS, RayUncertainty, node_pixels
+from bodyscan.geometry.visibility import is_in_image
 
 PLAIN = Camera(500.0, 510.0, 0.0, 159.5, 119.5, Radial(0.0, 0.0), 320, 240)
 BARREL = Camera(300.0, 300.0, 0.0, 159.5, 119.5, Radial(-0.3, 0.0), 320, 240)
@@ -19,12 +19,12 @@ BARREL = Camera(300.0, 300.0, 0.0, 159.5, 119.5, Radial(-0.3, 0.0), 320, 240)
 def test_a_crop_is_the_smallest_box_and_grows_no_farther_than_the_first_row() -> None:
     shown = np.zeros((9, 12), bool)
     shown[3, 5] = shown[6, 2] = True
-    crop = crop_of(shown)
+    crop = find_crop(shown)
     assert crop == (slice(3, 7), slice(2, 6))
-    assert ends_of(crop) == (3, 7, 2, 6)
-    assert widened(crop, 1) == (slice(2, 8), slice(1, 7))
-    assert widened(crop, 5) == (slice(0, 12), slice(0, 11))
-    assert crop_of(np.zeros((4, 4), bool)) is None
+    assert crop_bounds(crop) == (3, 7, 2, 6)
+    assert pad_crop(crop, 1) == (slice(2, 8), slice(1, 7))
+    assert pad_crop(crop, 5) == (slice(0, 12), slice(0, 11))
+    assert find_crop(np.zeros((4, 4), bool)) is None
 
 
 def at(camera: Camera, *pixels: tuple[float, float], depth: float = 800.0) -> np.ndarray:
@@ -34,19 +34,19 @@ def at(camera: Camera, *pixels: tuple[float, float], depth: float = 800.0) -> np
 def test_what_is_seen_lies_ahead_between_the_first_pixel_and_the_last() -> None:
     just_in = at(PLAIN, (0.001, 0.001), (318.999, 238.999), (160.0, 0.001), (0.001, 120.0))
     just_out = at(PLAIN, (-0.001, 5), (5, -0.001), (319.001, 5), (5, 239.001))
-    assert in_image(PLAIN, just_in).all()
-    assert not in_image(PLAIN, just_out).any()
-    assert not in_image(PLAIN, -just_in).any()
-    assert not in_image(PLAIN, np.array([[0.0, 0.0, 0.0]])).any()
-    assert in_image(PLAIN, just_in.reshape(2, 2, 3)).shape == (2, 2)
+    assert is_in_image(PLAIN, just_in).all()
+    assert not is_in_image(PLAIN, just_out).any()
+    assert not is_in_image(PLAIN, -just_in).any()
+    assert not is_in_image(PLAIN, np.array([[0.0, 0.0, 0.0]])).any()
+    assert is_in_image(PLAIN, just_in.reshape(2, 2, 3)).shape == (2, 2)
 
 
 def test_a_margin_is_kept_on_all_four_sides() -> None:
     kept = at(PLAIN, (10.001, 10.001), (308.999, 228.999))
     left_out = at(PLAIN, (9.999, 120), (160, 9.999), (309.001, 120), (160, 229.001))
-    assert in_image(PLAIN, kept, 10.0).all()
-    assert not in_image(PLAIN, left_out, 10.0).any()
-    assert in_image(PLAIN, left_out, 9.99).all()
+    assert is_in_image(PLAIN, kept, 10.0).all()
+    assert not is_in_image(PLAIN, left_out, 10.0).any()
+    assert is_in_image(PLAIN, left_out, 9.99).all()
 
 
 def test_where_a_lens_folds_back_into_the_picture_nothing_is_seen() -> None:
@@ -54,12 +54,12 @@ def test_where_a_lens_folds_back_into_the_picture_nothing_is_seen() -> None:
     beyond = np.array([[1.6 * fold, 0.0, 1.0], [0.0, 1.65 * fold, 1.0], [-1.6 * fold, 0.1, 1.0]])
     u, v = BARREL.project(beyond).T
     assert np.all((u > 0) & (u < 319) & (v > 0) & (v < 239)), "they fall into the picture"
-    assert not in_image(BARREL, beyond).any()
-    assert in_image(BARREL, at(BARREL, (1.0, 1.0), (318.0, 238.0))).all()
+    assert not is_in_image(BARREL, beyond).any()
+    assert is_in_image(BARREL, at(BARREL, (1.0, 1.0), (318.0, 238.0))).all()
 
 
 def test_rays_are_known_between_nodes_as_linearly_as_at_them() -> None:
-    places = nodes(320, 240)
+    places = node_pixels(320, 240)
     assert places.shape == (ROWS, COLUMNS, 2)
     assert places[0, 0].tolist() == [0.0, 0.0]
     assert places[-1, -1].tolist() == [319.0, 239.0]
@@ -71,7 +71,7 @@ def test_rays_are_known_between_nodes_as_linearly_as_at_them() -> None:
     v, u = np.indices((240, 320))
     # OpenCV interpolates in 1/32 of a node's distance, 16 px: 0.25 px on either side.
     np.testing.assert_allclose(image, 0.3 + 1e-3 * u + 2e-3 * v, atol=1e-3)
-    excess = known.with_excess(4.0)
+    excess = known.inflate_noise(4.0)
     np.testing.assert_allclose(excess.noise_px, 1.2 * rising)
     np.testing.assert_allclose(excess.lens_px, 0.8 * rising)
 
@@ -91,11 +91,11 @@ def test_covariances_of_pairs_are_those_of_motions_drawn_from_them() -> None:
         # 20,000 draws: correlations are known to 0.007 or better, variances to 1 %.
         assert np.abs((found - expected) / size).max() < 0.05
 
-    close(covariance.of("b"), drawn[:, 1])
-    close(covariance.among(["c", "a"]), drawn[:, [2, 0]].reshape(-1, 12))
-    close(covariance.between("c", "a"), drawn[:, 0] - drawn[:, 2])
-    close(covariance.between("a", "b"), drawn[:, 1] - drawn[:, 0])
-    close(point_covariance(covariance.of("c"), point), moved[:, 2])
+    close(covariance.marginal("b"), drawn[:, 1])
+    close(covariance.select(["c", "a"]), drawn[:, [2, 0]].reshape(-1, 12))
+    close(covariance.relative("c", "a"), drawn[:, 0] - drawn[:, 2])
+    close(covariance.relative("a", "b"), drawn[:, 1] - drawn[:, 0])
+    close(point_covariance(covariance.marginal("c"), point), moved[:, 2])
     np.testing.assert_allclose(
         position_sigma(covariance, "b", point), moved[:, 1].std(axis=0), rtol=0.03
     )
@@ -105,4 +105,4 @@ def test_covariances_of_pairs_are_those_of_motions_drawn_from_them() -> None:
 def test_a_pair_does_not_move_against_itself(name: str) -> None:
     mixed = np.random.default_rng(1).normal(size=(18, 18))
     covariance = PoseCovariance(("a", "b", "c"), mixed @ mixed.T)
-    np.testing.assert_allclose(covariance.between(name, name), 0.0, atol=1e-12)
+    np.testing.assert_allclose(covariance.relative(name, name), 0.0, atol=1e-12)

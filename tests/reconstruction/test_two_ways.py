@@ -13,7 +13,7 @@ from bodyscan.errors import BadInput
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.light_planes import Axis, LightPlanes
-from bodyscan.geometry.projector_sheets import sheets_of_projector
+from bodyscan.geometry.projector_sheets import sheets_from_projector
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.reconstruction.triangulation import reconstruct_range_image
@@ -32,7 +32,7 @@ FIELDS = (np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, np.float32))
 def pair(*, crossing: bool = True) -> PairCalibration:
     light = Camera(FOCAL, FOCAL, 0.0, *CENTRE, Radial(0.0, 0.0), *SIZE)
     columns, rows = (
-        sheets_of_projector(light, PLACE, np.array([0.0, 0.0, 700.0]), size, way)
+        sheets_from_projector(light, PLACE, np.array([0.0, 0.0, 700.0]), size, way)
         for size, way in zip(SIZE, WAYS, strict=True)
     )
     known = PairQuality(0.1, 5)
@@ -191,7 +191,7 @@ def test_sheets_that_meet_nowhere_are_refused(quality: PairQuality, remedy: str)
     """Rows' light that shines the other way has no sheet before the camera."""
     light = Camera(FOCAL, FOCAL, 0.0, *CENTRE, Radial(0.0, 0.0), *SIZE)
     away = RigidTransform(PLACE.rotation, np.array([0.0, 0.0, -9000.0]))
-    rows = sheets_of_projector(light, away, np.array([0.0, 0.0, 700.0]), SIZE[1], "horizontal")
+    rows = sheets_from_projector(light, away, np.array([0.0, 0.0, 700.0]), SIZE[1], "horizontal")
     with pytest.raises(BadInput, match=rf"does not fit these stripes.*meet at 0\n.*{remedy}"):
         reconstruct_range_image(replace(pair(), crossing=rows, quality=quality), stripes())
 

@@ -23,7 +23,7 @@ def calibrated() -> RigSolution:
 def drift_after(
     calibrated: RigSolution, moved: dict[str, RigidTransform], shots: int = 3, seed: int = 11
 ) -> Drift:
-    """Some boards later, seen by a rig of which `moved` pairs stand elsewhere."""
+    """Some boards later, seen by a rig of which `retract` pairs stand elsewhere."""
     now = {name: moved.get(name, RigidTransform.identity()) @ at for name, at in PLACINGS.items()}
     views, _ = ring_views(now, CAMERAS, shots=shots, noise_px=NOISE_PX, seed=seed)
     poses = [seen_pose(view, CAMERAS[view.pair], NOISE_PX) for view in views]

@@ -62,7 +62,7 @@ def each(names: list[Target]) -> list[list[Target]]:
 
 
 def of_b(found: HonestCovariance) -> np.ndarray:
-    return found.poses.of("b")
+    return found.poses.marginal("b")
 
 
 def test_noise_as_large_as_thought_has_no_excess() -> None:
@@ -72,7 +72,7 @@ def test_noise_as_large_as_thought_has_no_excess() -> None:
     assert 1.0 <= found.excess < 1.25
     independent = np.linalg.inv(equations.without_boards()[6:, 6:])
     np.testing.assert_allclose(np.diag(of_b(found)), np.diag(independent) * found.excess, rtol=0.35)
-    assert not found.poses.of("a").any(), "it holds the frame"
+    assert not found.poses.marginal("a").any(), "it holds the frame"
     assert found.cameras == {}
 
 

@@ -66,7 +66,7 @@ def test_a_camera_that_is_held_stays_to_the_last_digit(
         assert np.linalg.norm(place - rig_from_camera.translation) < 0.6
     # What is known of one camera tells more of where that stands than boards do by themselves.
     sigma = {
-        name: np.sqrt(np.trace(one.value.covariance.between(KNOWN, "p2-1")[3:, 3:]))
+        name: np.sqrt(np.trace(one.value.covariance.relative(KNOWN, "p2-1")[3:, 3:]))
         for name, one in (("held", found), ("free", free))
     }
     assert sigma["held"] < sigma["free"]

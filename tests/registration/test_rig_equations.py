@@ -55,14 +55,14 @@ def equations(
 def errors(seen: list[LocatedView], step: Array, free: bool) -> Array:
     """All reprojection errors (N,) px after a step in all unknowns."""
     pairs, boards, of_cameras = np.split(step, [12, 30])
-    placed = {n: PLACED[n].moved(t) for n, t in zip("ab", pairs.reshape(2, 6), strict=True)}
+    placed = {n: PLACED[n].retract(t) for n, t in zip("ab", pairs.reshape(2, 6), strict=True)}
     boarded = {
-        t: at.moved(s) for (t, at), s in zip(BOARDS.items(), boards.reshape(3, 6), strict=True)
+        t: at.retract(s) for (t, at), s in zip(BOARDS.items(), boards.reshape(3, 6), strict=True)
     }
     cameras = dict(CAMERAS)
     if free:
         for name, own in zip("ab", np.split(of_cameras, 2), strict=True):
-            cameras[name] = CAMERAS[name].moved(own)
+            cameras[name] = CAMERAS[name].retract(own)
     parts = []
     for view in seen:
         points = placed[view.pair].inverse().apply(boarded[view.target].apply(view.points))

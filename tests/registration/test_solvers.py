@@ -66,7 +66,7 @@ def test_the_full_solve_ends_at_the_minimum_from_afar() -> None:
     start = JointSolution(
         {n: p if n == ROOT else astray(p) for n, p in true.root_from_camera.items()},
         {target: astray(placing) for target, placing in true.root_from_board.items()},
-        {n: c.moved(np.array([8.0, 8.0, 0.0, 3.0, 3.0, 0, 0])) for n, c in CAMERAS.items()},
+        {n: c.retract(np.array([8.0, 8.0, 0.0, 3.0, 3.0, 0, 0])) for n, c in CAMERAS.items()},
     )
     found = solve_fully(views, start, root=ROOT, refine_cameras=True)
     for name, placing in true.root_from_camera.items():

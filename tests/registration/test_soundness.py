@@ -198,7 +198,7 @@ def calibration(**changes: Any) -> Any:
 
 def test_a_sound_calibration_has_no_fault_with_either_kind_of_light() -> None:
     assert said(find_faults(calibration())) == ""
-    for light in (PINHOLE, PINHOLE.with_lens(8), BowedSheets.of_pinhole(PINHOLE, 1)):
+    for light in (PINHOLE, PINHOLE.with_lens(8), BowedSheets.from_pinhole(PINHOLE, 1)):
         known = light.with_covariance(np.eye(len(light.covariance)))
         assert said(find_faults(calibration(sheets=known))) == ""
 

@@ -9,7 +9,7 @@ from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.geometry.visibility import in_image
+from bodyscan.geometry.visibility import is_in_image
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.report.sigma_map import draw_sigma_map, sigma_at
 
@@ -60,13 +60,13 @@ def test_sigma_is_that_of_drawn_placings() -> None:
     points = rng.uniform([-300, -300, 700], [300, 300, 1500], (20, 3))
     covariance = PoseCovariance(names, mixing @ mixing.T)
     sigma, seen = sigma_at(points, placings, cameras, covariance, names)
-    sights = np.array([in_image(cameras[n], placings[n].inverse().apply(points)) for n in names])
+    sights = np.array([is_in_image(cameras[n], placings[n].inverse().apply(points)) for n in names])
     assert np.array_equal(sights.sum(axis=0), seen)
     squared = np.zeros(len(points))
     for draw in rng.normal(size=(800, 36)):
         motions = (mixing @ draw).reshape(6, 6)
         moved = np.array(
-            [placings[n].moved(m).apply(placings[n].inverse().apply(points)) - points
+            [placings[n].retract(m).apply(placings[n].inverse().apply(points)) - points
              for n, m in zip(names, motions, strict=True)]
         )  # fmt: skip
         mean = np.sum(moved * sights[..., None], axis=0) / np.maximum(seen, 1)[:, None]
@@ -126,6 +126,6 @@ def test_points_that_the_lens_folds_back_are_not_seen() -> None:
     pixels = camera.project(points)
     folded = (pixels[:, 0] > 0) & (pixels[:, 0] < 1279) & (angles > 0.8)
     assert folded.any()
-    assert not in_image(camera, points)[folded].any()
-    assert in_image(camera, points)[angles < 0.38].all()
-    assert not in_image(camera, -points).any()
+    assert not is_in_image(camera, points)[folded].any()
+    assert is_in_image(camera, points)[angles < 0.38].all()
+    assert not is_in_image(camera, -points).any()

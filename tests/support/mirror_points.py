@@ -10,13 +10,13 @@ import numpy as np
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.calibration.boundary_points import BoundaryPoints, boundary_points, concatenate
-from bodyscan.geometry.camera_fields import from_fields
+from bodyscan.geometry.camera_fields import camera_from_fields
 from bodyscan.geometry.light_planes import LightPlanes
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.laboratory import apparatus
 from bodyscan.simulation.files import describe_camera
 
-LENS = from_fields(describe_camera(apparatus.CAMERA))
+LENS = camera_from_fields(describe_camera(apparatus.CAMERA))
 MIRROR = apparatus.chapter_setup(apparatus.ideal_settings(1)).projector
 TRUE_PLANES = apparatus.true_planes(apparatus.chapter_setup(apparatus.ideal_settings(1)))
 STRIPES = apparatus.PROJECTOR.stripes

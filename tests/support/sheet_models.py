@@ -17,14 +17,14 @@ DOWN, AXIS = np.array([0.02, 0.98, -0.2]), np.array([-0.01, 0.2, 0.98])
 MATRIX = np.stack(
     [300 * np.append(DOWN, 250.0) + 80 * np.append(AXIS, -20.0), np.append(AXIS, -20.0)]
 )
-PINHOLE = LensSheets.pinhole(MATRIX, MIDDLE, STRIPES, "horizontal")
+PINHOLE = LensSheets.from_matrix(MATRIX, MIDDLE, STRIPES, "horizontal")
 
 
 def models(seed: int) -> list[SmoothSheets]:
     """Each kind, moved a little away from a pinhole at random, with some covariance."""
     rng = np.random.default_rng(seed)
     made: list[SmoothSheets] = [PINHOLE.with_lens(terms) for terms in (0, 1, 2, 4)]
-    made += [BowedSheets.of_pinhole(PINHOLE, terms) for terms in (0, 1, 3)]
+    made += [BowedSheets.from_pinhole(PINHOLE, terms) for terms in (0, 1, 3)]
     made += [PINHOLE.with_lens(terms) for terms in (5, 8)]
     return [moved(model, rng) for model in made]
 

@@ -147,13 +147,13 @@ def test_pairs_of_a_repaired_pole_are_as_well_known_to_each_other_as_before() ->
     move = Move("pole p1", names[:2], motion, np.diag([1e-6] * 3 + [0.25] * 3), 5.0, 0.9, 0.0)
     mended = apply_moves(calibration, [move])
     after = mended.covariance
-    np.testing.assert_allclose(after.between("p1-1", "p1-2"), known.between("p1-1", "p1-2"))
+    np.testing.assert_allclose(after.relative("p1-1", "p1-2"), known.relative("p1-1", "p1-2"))
     for name in (*move.pairs, "p1-3"):
-        np.testing.assert_allclose(after.of(name), known.of(name) + move.covariance)
-        grown = after.between(name, "p2-1") - known.between(name, "p2-1")
+        np.testing.assert_allclose(after.marginal(name), known.marginal(name) + move.covariance)
+        grown = after.relative(name, "p2-1") - known.relative(name, "p2-1")
         np.testing.assert_allclose(grown, move.covariance, atol=1e-12)
         assert mended.rig_from_camera[name].translation.tolist() == [3.0, 0.0, 4.0]
-    np.testing.assert_array_equal(after.of("p2-1"), known.of("p2-1"))
+    np.testing.assert_array_equal(after.marginal("p2-1"), known.marginal("p2-1"))
     assert mended.rig_from_camera["p2-1"] is placing["p2-1"]
     assert mended.notes[0] == "as it was"
     assert "pole p1 moved by 5.00 mm" in mended.notes[1]

@@ -359,7 +359,7 @@ def test_a_parameter_moves_no_pixel_by_more_than_its_sigma() -> None:
     for k, sigma in enumerate(sigmas):
         step = np.zeros(len(sigmas))
         step[k] = 1e-3 * sigma
-        moved = np.linalg.norm(camera.moved(step).project(rays) - camera.project(rays), axis=1)
+        moved = np.linalg.norm(camera.retract(step).project(rays) - camera.project(rays), axis=1)
         assert moved.max() / 1e-3 == pytest.approx(0.5, rel=0.02)
 
 

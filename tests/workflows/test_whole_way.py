@@ -13,7 +13,7 @@ from small_workspace import Workspace
 from bodyscan.arrays import Array
 from bodyscan.evaluation.surface import deviation, normalized_errors, signed_distances
 from bodyscan.fusion.storage import load_scan
-from bodyscan.geometry.sheet_arrays import to_arrays
+from bodyscan.geometry.sheet_arrays import sheets_to_arrays
 from bodyscan.mesh.ply import read_ply_mesh
 from bodyscan.mesh.topology import compute_topology
 from bodyscan.registration.rig_calibration import RigCalibration
@@ -106,7 +106,7 @@ def test_calibration_reads_back_to_the_last_bit(
         sheets = again.pairs[name].sheets
         assert sheets is not None
         assert pair.sheets is not None
-        stored, original = to_arrays(sheets), to_arrays(pair.sheets)
+        stored, original = sheets_to_arrays(sheets), sheets_to_arrays(pair.sheets)
         for key, array in original.items():
             assert np.array_equal(stored[key], array, equal_nan=True)
     first = (tmp_path / "calibration.json").read_bytes()

@@ -11,10 +11,10 @@ from bodyscan.arrays import Array
 from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.lenses.polynomials import (
     DECENTRED,
-    decentred,
     decentring,
-    decentring_by_point,
-    scaled_by_point,
+    decentring_jacobian,
+    displace_by_decentring,
+    radial_jacobian,
     squared_radius,
 )
 
@@ -47,7 +47,7 @@ class Brown(Lens):
 
     def distort(self, ideal: Array) -> Array:
         factor = self._above(squared_radius(ideal)[..., None])
-        return ideal * factor + decentred(ideal, self.p1, self.p2)
+        return ideal * factor + displace_by_decentring(ideal, self.p1, self.p2)
 
     def by_coefficients(self, ideal: Array) -> Array:
         r2 = squared_radius(ideal)[..., None, None]
@@ -57,7 +57,7 @@ class Brown(Lens):
 
     def by_point(self, ideal: Array) -> Array:
         factor, slope = self._factor(squared_radius(ideal))
-        return scaled_by_point(ideal, factor, slope) + decentring_by_point(ideal, self.p1, self.p2)
+        return radial_jacobian(ideal, factor, slope) + decentring_jacobian(ideal, self.p1, self.p2)
 
     def opencv(self) -> Array:
         return self.coefficients

@@ -16,7 +16,7 @@ import numpy as np
 
 from bodyscan.arrays import Array
 from bodyscan.errors import BadInput
-from bodyscan.geometry.lenses.polynomials import apart, squared_radius
+from bodyscan.geometry.lenses.polynomials import split_coordinates, squared_radius
 
 NEWTON_STEPS = 20
 """Five or six reach rounding; close to where a lens folds it takes more."""
@@ -77,7 +77,7 @@ class Lens(ABC):
     def by_point(self, ideal: Array) -> Array:
         """Derivatives (..., 2, 2) of real points by the ideal ones (..., 2)."""
 
-    def nearest(self, other: Lens, ideal: Array) -> Self:
+    def fit_to(self, other: Lens, ideal: Array) -> Self:
         """Fit this kind of lens, starting here, to what `other` does to the points (N, 2)."""
         lens, wanted = self, other.distort(ideal)
         for _ in range(NEAREST_STEPS):
@@ -103,7 +103,7 @@ class Lens(ABC):
         Accurate to rounding within `fold_radius`; NaN where no ideal point within it maps to the
         real one.
         """
-        real = apart(real)
+        real = split_coordinates(real)
         with np.errstate(all="ignore"):
             ideal = _at_most(real, 0.9 * self.fold_radius)
             for _ in range(NEWTON_STEPS):
@@ -115,7 +115,7 @@ class Lens(ABC):
                 ideal = _at_most(
                     ideal - step, 0.5 * (self.fold_radius + np.sqrt(squared_radius(ideal)))
                 )
-                if settled(step):
+                if has_converged(step):
                     break
             return self.before_fold(ideal, real)
 
@@ -151,7 +151,7 @@ def _at_most(points: Array, radius: Array | float) -> Array:
     return points * np.where(beyond, radius / own, 1.0)[..., None]
 
 
-def settled(step: Array) -> bool:
+def has_converged(step: Array) -> bool:
     """Whether no Newton step moves anything any more; diverged (not finite) ones do not count."""
     return bool(np.max(np.abs(step), initial=0.0, where=np.isfinite(step)) < SETTLED)
 

@@ -18,7 +18,7 @@ def squared_radius(ideal: Array) -> Array:
     return np.asarray(x * x + y * y, np.float64)
 
 
-def apart(points: Array) -> Array:
+def split_coordinates(points: Array) -> Array:
     """A copy of points (..., 2) whose x lie side by side in memory, and so do their y: arithmetic on
     one coordinate is then several times faster."""
     return np.moveaxis(np.array([points[..., 0], points[..., 1]], np.float64), 0, -1)
@@ -29,7 +29,7 @@ def _matrices(shape: tuple[int, ...]) -> Array:
     return np.moveaxis(np.empty((2, 2, *shape)), (0, 1), (-2, -1))
 
 
-def scaled_by_point(ideal: Array, factor: Array, slope: Array) -> Array:
+def radial_jacobian(ideal: Array, factor: Array, slope: Array) -> Array:
     """Derivatives (..., 2, 2), by ideal points (..., 2), of `ideal` times a factor of r^2.
 
     factor: its values (...) at the points.
@@ -54,7 +54,7 @@ def decentring(ideal: Array) -> Array:
     return derivatives
 
 
-def decentred(ideal: Array, p1: float, p2: float) -> Array:
+def displace_by_decentring(ideal: Array, p1: float, p2: float) -> Array:
     """(..., 2): where p1 and p2 move the points (..., 2), `decentring(ideal) @ (p1, p2)`."""
     x, y = ideal[..., 0], ideal[..., 1]
     xx, xy, yy = x * x, 2.0 * x * y, y * y
@@ -64,7 +64,7 @@ def decentred(ideal: Array, p1: float, p2: float) -> Array:
     return moved
 
 
-def decentring_by_point(ideal: Array, p1: float, p2: float) -> Array:
+def decentring_jacobian(ideal: Array, p1: float, p2: float) -> Array:
     """Derivatives (..., 2, 2) of `decentring(ideal) @ (p1, p2)` by the points (..., 2)."""
     x, y = ideal[..., 0], ideal[..., 1]
     derivatives = _matrices(x.shape)

@@ -8,8 +8,8 @@ from typing import ClassVar, Self
 import numpy as np
 
 from bodyscan.arrays import Array
-from bodyscan.geometry.lenses.lens import NEWTON_STEPS, Lens, settled
-from bodyscan.geometry.lenses.polynomials import scaled_by_point, squared_radius
+from bodyscan.geometry.lenses.lens import NEWTON_STEPS, Lens, has_converged
+from bodyscan.geometry.lenses.polynomials import radial_jacobian, squared_radius
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Radial(Lens):
     def by_point(self, ideal: Array) -> Array:
         r2 = squared_radius(ideal)
         factor = 1.0 + r2 * (self.k1 + r2 * self.k2)
-        return scaled_by_point(ideal, factor, self.k1 + 2.0 * r2 * self.k2)
+        return radial_jacobian(ideal, factor, self.k1 + 2.0 * r2 * self.k2)
 
     @property
     def fold_radius(self) -> float:
@@ -63,7 +63,7 @@ class Radial(Lens):
                 value = ideal * (1.0 + r2 * (self.k1 + r2 * self.k2)) - radius
                 step = value / (1.0 + r2 * (3.0 * self.k1 + 5.0 * r2 * self.k2))
                 ideal -= step
-                if settled(step):
+                if has_converged(step):
                     break
             scale = np.divide(ideal, radius, out=np.ones_like(radius), where=radius > 0)
             return self.before_fold(real * scale, real)

@@ -9,7 +9,7 @@ import numpy as np
 
 from bodyscan.arrays import Array
 from bodyscan.geometry.lenses.brown import Brown
-from bodyscan.geometry.lenses.polynomials import decentred, decentring, squared_radius
+from bodyscan.geometry.lenses.polynomials import decentring, displace_by_decentring, squared_radius
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Rational(Brown):
     def distort(self, ideal: Array) -> Array:
         r2 = squared_radius(ideal)[..., None]
         radial = ideal * self._above(r2) / self._below(r2)
-        return radial + decentred(ideal, self.p1, self.p2)
+        return radial + displace_by_decentring(ideal, self.p1, self.p2)
 
     def by_coefficients(self, ideal: Array) -> Array:
         r2 = squared_radius(ideal)[..., None, None]
