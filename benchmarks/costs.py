@@ -136,8 +136,8 @@ def _write_figure(path: Path, size: float) -> None:
 def around(one: Path, count: int, folder: Path) -> Path:
     """A workspace in which the pair of another one stands in `count` places around the figure."""
     from bodyscan.captures.captures_file import CapturesFile, ShotEntry, write_captures_file
-    from bodyscan.geometry.pose_covariance import PoseCovariance
     from bodyscan.geometry.transforms import RigidTransform
+    from bodyscan.geometry.uncertainty import PoseCovariance
     from bodyscan.registration.storage import load_calibration, save_calibration
     from bodyscan.rig.rig_frame import RigFrame
 

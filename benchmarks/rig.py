@@ -14,8 +14,8 @@ from benchmarks.rivals import RIVALS, run_rival, with_lens
 from bodyscan.arrays import Array, Mask
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
-from bodyscan.geometry.pose_covariance import position_sigma
 from bodyscan.geometry.transforms import RigidTransform, fit_rigid_transform
+from bodyscan.geometry.uncertainty import position_sigma
 from bodyscan.registration.rig_solve import RigSolution, solve_rig
 from bodyscan.rig.board import Board
 from bodyscan.rig.rig import Rig

@@ -15,7 +15,7 @@ from bodyscan.arrays import Array
 from bodyscan.boards.board_layout import corner_points
 from bodyscan.evaluation.surface import signed_distances
 from bodyscan.fusion.storage import load_scan
-from bodyscan.geometry.camera_fields import camera_from_fields
+from bodyscan.geometry.camera import camera_from_fields
 from bodyscan.geometry.robust import rms
 from bodyscan.geometry.transforms import RigidTransform, fit_rigid_transform
 from bodyscan.registration.rig_calibration import RigCalibration

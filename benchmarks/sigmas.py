@@ -13,7 +13,7 @@ from scipy.spatial.distance import pdist
 from bodyscan.arrays import Array
 from bodyscan.boards.board_layout import corner_points
 from bodyscan.evaluation.spheres import centre_distances
-from bodyscan.geometry.camera_fields import camera_from_fields
+from bodyscan.geometry.camera import camera_from_fields
 from bodyscan.geometry.robust import rms
 from bodyscan.laboratory import apparatus
 from bodyscan.laboratory.approaches import calibrate_by_reference_plane

@@ -23,7 +23,7 @@ from bodyscan.captures.folder import open_scan
 from bodyscan.evaluation.body import sway_residual
 from bodyscan.evaluation.surface import signed_distances
 from bodyscan.fusion.scan import Scan
-from bodyscan.geometry.camera_fields import camera_from_fields
+from bodyscan.geometry.camera import camera_from_fields
 from bodyscan.geometry.robust import rms, robust_scale
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import DARK_CLOTH, HAIR, REGION_NAMES, SKIN, compute_region_shares

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from bodyscan.calibration.pair import PairCalibration, PairQuality
-from bodyscan.geometry.camera_fields import camera_from_fields
+from bodyscan.geometry.camera import camera_from_fields
 from bodyscan.geometry.light_planes import LightPlanes
-from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform, adjoint
+from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig import Rig

@@ -26,9 +26,9 @@ from bodyscan.alignment.overlaps import COARSE, OverlapPoints, each_overlap, mat
 from bodyscan.alignment.place_evidence import PlaceEvidence
 from bodyscan.alignment.sway_prior import SwayPrior, centre_shifts
 from bodyscan.arrays import Array, Indices, Mask
-from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.robust import rms, rms_length
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.mesh.body import BodyMesh, BreathAt
 from bodyscan.progress import THREADS
 from bodyscan.reconstruction.range_image import RangeImage

@@ -27,9 +27,9 @@ from bodyscan.alignment.overlaps import (
 )
 from bodyscan.alignment.sway_prior import SwayPrior, bound_motions, centre_shifts
 from bodyscan.arrays import Array
-from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.robust import rms
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.progress import THREADS
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.settings import AlignmentSettings

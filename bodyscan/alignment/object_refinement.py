@@ -9,8 +9,8 @@ from bodyscan.alignment.body_parts import PersonMotion
 from bodyscan.alignment.icp import Alignment, align
 from bodyscan.alignment.together import bring_together
 from bodyscan.errors import FailedWork
-from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.settings import AlignmentSettings
 

@@ -22,8 +22,8 @@ from bodyscan.alignment.overlaps import COARSE
 from bodyscan.alignment.sway_prior import SwayPrior
 from bodyscan.arrays import Array
 from bodyscan.geometry.linear_gaussian import solve_scaled
-from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.settings import AlignmentSettings
 
 registration = o3d.pipelines.registration

@@ -17,8 +17,8 @@ from bodyscan.alignment.body_motion import ARM_MM
 from bodyscan.alignment.moments import of_stance
 from bodyscan.alignment.sway_prior import SwayPrior, centre_shifts
 from bodyscan.arrays import Array
-from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.uncertainty import PoseCovariance
 
 FEWEST = 4
 """pairs: with two or three, any could be the one that moved."""

@@ -13,9 +13,9 @@ import numpy as np
 
 from bodyscan.arrays import Array
 from bodyscan.geometry.linear_gaussian import solve_scaled
-from bodyscan.geometry.pose_covariance import PoseCovariance, position_sigma
 from bodyscan.geometry.robust import rms
 from bodyscan.geometry.transforms import RigidTransform, adjoint
+from bodyscan.geometry.uncertainty import PoseCovariance, position_sigma
 from bodyscan.settings import BODY_CENTRE_MM, AlignmentSettings
 
 BODY_CENTRE = np.array(BODY_CENTRE_MM)

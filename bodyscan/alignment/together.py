@@ -18,8 +18,8 @@ from bodyscan.alignment.pole_steps import (
     motions_between,
 )
 from bodyscan.arrays import Array
-from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.settings import AlignmentSettings
 

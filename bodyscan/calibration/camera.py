@@ -20,8 +20,8 @@ from bodyscan.geometry.camera import MATRIX, Camera
 from bodyscan.geometry.least_squares import EXACT, Block, Noise, Solution, minimize
 from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.lenses.radial import Radial
-from bodyscan.geometry.ray_uncertainty import RayUncertainty
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
+from bodyscan.geometry.uncertainty import RayUncertainty
 
 FEWEST_POSES = 3
 SETTLED = 1e-6

@@ -27,8 +27,8 @@ from bodyscan.calibration.held_out import CLEARLY, Compared, gain, shared_weight
 from bodyscan.calibration.ray_uncertainty import ray_uncertainty
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.lens import Lens
-from bodyscan.geometry.ray_uncertainty import RayUncertainty
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.uncertainty import RayUncertainty
 
 FEWEST_PLACES = 4
 """With one place held out, a camera still has the three that it needs."""

@@ -28,7 +28,7 @@ from bodyscan.calibration.striped_view import StripedView, boundaries_on_boards
 from bodyscan.errors import PairFailed
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.light_planes import LightSheets
-from bodyscan.geometry.ray_uncertainty import RayUncertainty
+from bodyscan.geometry.uncertainty import RayUncertainty
 from bodyscan.outcome import Outcome
 from bodyscan.stripes.stripe_code import StripeCode
 

@@ -10,8 +10,8 @@ from bodyscan.arrays import Array, Mask
 from bodyscan.calibration.board_views import PlanarView
 from bodyscan.calibration.camera import CameraFit
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.ray_uncertainty import RayUncertainty, node_pixels
 from bodyscan.geometry.transforms import twist_jacobian
+from bodyscan.geometry.uncertainty import RayUncertainty, node_pixels
 
 MOST_CORNERS = 3000
 

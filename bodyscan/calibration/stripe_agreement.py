@@ -18,7 +18,7 @@ from bodyscan.calibration.sheet_fit import fit_sheets
 from bodyscan.errors import PairFailed
 from bodyscan.geometry.bowed_sheets import BowedSheets
 from bodyscan.geometry.light_planes import Axis, LightSheets
-from bodyscan.geometry.ray_depths import intersect_rays
+from bodyscan.geometry.light_sheets import intersect_rays
 
 FEW_POINTS = 1200
 STEPS = 12

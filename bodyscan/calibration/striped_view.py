@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bodyscan.arrays import Array, Indices, Mask
+from bodyscan.arrays import WHOLE, Array, Crop, Indices, Mask
 from bodyscan.boards.view import BoardView
 from bodyscan.calibration.board_form import BoardFace
 from bodyscan.calibration.board_views import LocatedView
@@ -22,7 +22,6 @@ from bodyscan.compiled import compiled
 from bodyscan.errors import PairFailed
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.camera_tables import ray_table
-from bodyscan.geometry.crop import WHOLE, Crop
 from bodyscan.geometry.light_planes import Axis
 from bodyscan.geometry.quadratic_table import Table, look_up
 from bodyscan.geometry.transforms import RigidTransform

@@ -11,7 +11,7 @@ from typing import cast
 import cv2
 import numpy as np
 
-from bodyscan.arrays import Bytes, Greys, whole_grey
+from bodyscan.arrays import WHOLE, Bytes, Crop, Greys, whole_grey
 from bodyscan.captures.exposures import merge_exposures
 from bodyscan.captures.folder import ImageSequence
 from bodyscan.captures.grey_levels import Raw, as_greys, full_scale
@@ -20,7 +20,6 @@ from bodyscan.captures.image_faults import header_fault, image_error, missing_er
 from bodyscan.captures.image_header import png_damage
 from bodyscan.errors import ImageError
 from bodyscan.files.regular import read_regular
-from bodyscan.geometry.crop import WHOLE, Crop
 from bodyscan.progress import THREADS
 from bodyscan.rig.pair import CameraSpec, Pair
 from bodyscan.stripes.decoding import images_by_kind

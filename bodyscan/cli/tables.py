@@ -9,7 +9,7 @@ import numpy as np
 from rich.table import Table
 
 from bodyscan.fusion.scan import Scan
-from bodyscan.geometry.pose_covariance import position_sigma
+from bodyscan.geometry.uncertainty import position_sigma
 from bodyscan.mesh.body import compute_cover_shares
 from bodyscan.registration.rig_calibration import RigCalibration
 

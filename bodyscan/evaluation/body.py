@@ -11,7 +11,7 @@ import open3d as o3d
 
 from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.evaluation.surface import covered_spots, sample_surface
-from bodyscan.geometry.camera_fields import camera_from_fields
+from bodyscan.geometry.camera import camera_from_fields
 from bodyscan.geometry.robust import rms
 from bodyscan.geometry.transforms import RigidTransform, fit_rigid_transform
 from bodyscan.measurement.measurements import Measurements, Slice, measure

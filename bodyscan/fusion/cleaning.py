@@ -12,10 +12,9 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from bodyscan.arrays import Array, Bytes, Floats, Mask
+from bodyscan.arrays import Array, Bytes, Floats, Mask, find_crop, pad_crop
 from bodyscan.compiled import compiled
 from bodyscan.errors import ScanFailed
-from bodyscan.geometry.crop import find_crop, pad_crop
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.progress import THREADS
 from bodyscan.reconstruction.range_image import RangeImage

@@ -22,8 +22,8 @@ from bodyscan.fusion.consistency import Consistency, Contradictions, compare_wit
 from bodyscan.fusion.quadratic_fit import NORMAL_MEDIAN
 from bodyscan.fusion.smoothing import Numbers, SmoothSurface, smooth
 from bodyscan.fusion.voxel_thinning import Samples, take_samples
-from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.mesh.body import BodyCloud
 from bodyscan.progress import THREADS
 from bodyscan.reconstruction.range_image import RangeImage

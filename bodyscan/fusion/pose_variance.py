@@ -11,8 +11,8 @@ import numpy as np
 from bodyscan.alignment.following import Followed
 from bodyscan.arrays import Array, Bytes, Floats, Mask
 from bodyscan.compiled import compiled
-from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.mesh.body import BodyCloud
 from bodyscan.progress import map_threads, split_range
 

@@ -15,11 +15,10 @@ import numpy as np
 from scipy import ndimage
 
 from bodyscan.alignment.part_names import NECK
-from bodyscan.arrays import Array, Bytes, Floats, Indices, Mask
+from bodyscan.arrays import Array, Bytes, Floats, Indices, Mask, find_crop
 from bodyscan.compiled import compiled
 from bodyscan.fusion.brightness import DARKEST
 from bodyscan.fusion.roughness import Misfits, misfits
-from bodyscan.geometry.crop import find_crop
 from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import DARK_CLOTH, HAIR, SKIN, UNSURE, BodyCloud

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bodyscan.arrays import Array, Floats
+from bodyscan.arrays import Array, Crop, Floats, crop_bounds
 from bodyscan.fusion.quadratic_fit import fit_full_windows, window_basis
 from bodyscan.fusion.smoothing import inverse_depths, pixel_size, window_reach
-from bodyscan.geometry.crop import Crop, crop_bounds
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
 

@@ -12,12 +12,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.arrays import Array, Bytes, Floats, Mask
+from bodyscan.arrays import Array, Bytes, Floats, Mask, crop_bounds, find_crop
 from bodyscan.compiled import compiled
 from bodyscan.fusion.quadratic_fit import QuadraticFit, fit_quadratics
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.camera_tables import projection_table
-from bodyscan.geometry.crop import crop_bounds, find_crop
 from bodyscan.geometry.quadratic_table import Table, look_up_derivatives
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
 from bodyscan.arrays import Array
+from bodyscan.geometry.lenses import LENSES
 from bodyscan.geometry.lenses.lens import Lens
+from bodyscan.geometry.lenses.radial import Radial
 
 MATRIX = ("alpha", "beta", "gamma", "u0", "v0")
 MATRIX_PRIOR_PX = (50.0, 50.0, 5.0, 50.0, 50.0)
@@ -145,3 +150,39 @@ class Camera:
         sheared = pixels.copy()
         sheared[..., 0] -= self.gamma / self.beta * (pixels[..., 1] - self.v0)
         return sheared
+
+
+SIZE = ("width", "height")
+
+
+def camera_to_fields(camera: Camera) -> dict[str, Any]:
+    """alpha, beta, gamma, u0, v0, the kind of lens, its coefficients by name, width and height."""
+    own = {name: getattr(camera, name) for name in (*MATRIX, *SIZE)}
+    lens = {name: getattr(camera.lens, name) for name in camera.lens.names}
+    kind = {} if camera.lens.kind == Radial.kind else {"lens": camera.lens.kind}
+    return own | lens | kind
+
+
+def camera_from_fields(content: Mapping[str, Any]) -> Camera:
+    """The camera whose fields `camera_to_fields` returned.
+
+    Raises ValueError for an unknown lens, a missing or surplus name, or a value that is not finite.
+    """
+    numbers = dict(content)
+    kind = numbers.pop("lens", Radial.kind)
+    if kind not in LENSES:
+        raise ValueError(f"a lens {kind!r} is unknown, there are {', '.join(LENSES)}")
+    lens = LENSES[kind]()
+    expected = {*MATRIX, *lens.names, *SIZE}
+    if numbers.keys() != expected:
+        odd = sorted(numbers.keys() ^ expected)
+        raise ValueError(f"a camera with a {kind} lens lacks or does not have {', '.join(odd)}")
+    for name, value in numbers.items():
+        if (
+            isinstance(value, bool)
+            or not isinstance(value, int | float)
+            or not math.isfinite(value)
+        ):
+            raise ValueError(f"{name} of a camera is {value!r}, not a number")
+    coefficients = {name: numbers.pop(name) for name in lens.names}
+    return Camera(lens=type(lens)(**coefficients), **numbers)

@@ -5,9 +5,12 @@ In the projector's frame x = X/Z along the stripes, y = Y/Z across them, r^2 = x
     s = c + f (y (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)
                + p1 (r^2 + 2 y^2) + 2 p2 x y),
 
-which is OpenCV's lens (Brown 1966, or rational) for the one coordinate that stripes carry. Our fits
-use k1, k2, p1, p2; the others occur in projectors calibrated elsewhere. Without k and p this is the
-2 x 4 matrix of Bolles 1981, which leaves the centre's place along the stripes unknown.
+which is OpenCV's lens (Brown 1966, or rational) for the one coordinate that stripes carry. Fits to
+boards use k1, k2, p1, p2; the others occur in projectors calibrated elsewhere. Without k and p this
+is the 2 x 4 matrix of Bolles 1981, which leaves the centre's position along the stripes unknown.
+
+Compiled functions take frame, projector_from_camera (3, 4), and lens, (10,): f, c, k1, k2, p1, p2,
+k3, k4, k5, k6.
 """
 
 from __future__ import annotations
@@ -17,7 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bodyscan.arrays import Array
-from bodyscan.geometry.lens_points import measure_rays, stripes_of_points
+from bodyscan.compiled import compiled
 from bodyscan.geometry.light_planes import Axis
 from bodyscan.geometry.smooth_sheets import Offset, SmoothSheets
 from bodyscan.geometry.transforms import RigidTransform, cross_matrix
@@ -152,3 +155,163 @@ def _frame_and_scale(above: Array, below: Array, x: float) -> tuple[RigidTransfo
     rotation = np.array([along, down, axis])
     translation = np.array([x, (above[3] - centre * below[3]) / focal, below[3]])
     return RigidTransform(rotation, translation), np.array([focal, centre])
+
+
+Vector = tuple[float, float, float]
+
+NEWTON_STEPS = 5
+EXACT, CONVERGED = 1e-7, 1e-6  # relative: the next step would be about the square of the last
+
+
+@compiled
+def stripes_of_points(
+    frame: Array,
+    lens: Array,
+    points: Array,
+    stripe: Array,
+    by_point: Array,
+    reach: Array,
+    by_freedom: Array,
+) -> None:
+    """Fill stripe coordinates and their derivatives at points (N, 3), camera frame.
+
+    stripe: (N,).
+    by_point: (N, 3), derivatives of the stripe coordinate by the point.
+    reach: (N,) mm, distance along the projector's axis.
+    by_freedom: (N, P), derivatives by the freedoms of a fit; skipped if it has no columns.
+    """
+    for n in range(len(points)):
+        seen = _seen(frame, points[n, 0], points[n, 1], points[n, 2])
+        bent = _bent(lens, seen[0], seen[1])
+        by_z = -(bent[1] * seen[0] + bent[2] * seen[1])
+        for k in range(3):
+            turned = bent[1] * frame[0, k] + bent[2] * frame[1, k] + by_z * frame[2, k]
+            by_point[n, k] = turned / seen[2]
+        stripe[n], reach[n] = lens[0] * bent[0] + lens[1], seen[2]
+        if by_freedom.shape[1]:
+            _by_freedom(lens, seen, bent, by_freedom[n])
+
+
+@compiled
+def measure_rays(
+    frame: Array,
+    lens: Array,
+    covariance: Array,
+    distance: float,
+    stripes: int,
+    rays: Array,
+    s: Array,
+    found: Array,
+) -> None:
+    """Fill `found` (3, N) with depth z, dz/ds and the variance of z for rays (N, 3) at s (N,).
+
+    NaN where a ray meets no sheet.
+    covariance: (P, P) of the freedoms of a fit.
+    distance: of the boards, mm.
+    """
+    jacobian = np.empty(len(covariance))
+    for n in range(len(s)):
+        found[:, n] = np.nan
+        x, y = rays[n, 0], rays[n, 1]
+        depth = _depth(frame, lens, distance, x, y, s[n])
+        if not (depth > 0.0 and 0.0 <= s[n] <= stripes):
+            continue
+        seen = _seen(frame, x * depth, y * depth, depth)
+        bent = _bent(lens, seen[0], seen[1])
+        per_stripe = seen[2] / _slope_times_reach(frame, seen, bent, x, y)
+        _by_freedom(lens, seen, bent, jacobian)
+        spread = 0.0
+        for i in range(len(jacobian)):
+            row = 0.5 * covariance[i, i] * jacobian[i]
+            for j in range(i):
+                row += covariance[i, j] * jacobian[j]
+            spread += 2.0 * row * jacobian[i]
+        found[0, n], found[1, n], found[2, n] = depth, per_stripe, spread * per_stripe**2
+
+
+@compiled
+def _depth(frame: Array, lens: Array, distance: float, x: float, y: float, s: float) -> float:
+    """Depth z where the ray (x, y, 1) meets the sheet at s; NaN where there is none.
+
+    Newton's method on the offset times the reach, which without a lens is linear along a ray. It
+    starts where the ray would meet the sheet without the lens, or at `distance` (mm) if nowhere.
+    Also NaN where the only solution lies beyond the fold of the lens, far outside its image.
+    """
+    forward = frame[2, 0] * x + frame[2, 1] * y + frame[2, 2]
+    across, slope = frame[1, 0] * x + frame[1, 1] * y + frame[1, 2], (s - lens[1]) / lens[0]
+    depth = (slope * frame[2, 3] - frame[1, 3]) / (across - slope * forward)
+    if not 0.0 < depth < np.inf:
+        depth = (distance - frame[2, 3]) / forward
+    step = reach = rise = np.nan
+    for _ in range(NEWTON_STEPS):
+        seen = _seen(frame, x * depth, y * depth, depth)
+        bent = _bent(lens, seen[0], seen[1])
+        reach, rise, off = seen[2], bent[2], lens[0] * bent[0] + lens[1] - s
+        step = off * reach / (_slope_times_reach(frame, seen, bent, x, y) + off * forward)
+        depth -= step
+        if not abs(step) > EXACT * abs(depth):
+            break
+    return depth if abs(step) < CONVERGED * depth and reach > 0.0 and rise > 0.0 else np.nan
+
+
+@compiled
+def _seen(frame: Array, x: float, y: float, z: float) -> Vector:
+    """X/Z, Y/Z and Z, in the projector's frame, of a point in the camera's."""
+    reach = frame[2, 0] * x + frame[2, 1] * y + frame[2, 2] * z + frame[2, 3]
+    return (
+        (frame[0, 0] * x + frame[0, 1] * y + frame[0, 2] * z + frame[0, 3]) / reach,
+        (frame[1, 0] * x + frame[1, 1] * y + frame[1, 2] * z + frame[1, 3]) / reach,
+        reach,
+    )
+
+
+@compiled
+def _bent(lens: Array, x: float, y: float) -> Vector:
+    """(s - c) / f at x = X/Z, y = Y/Z, and the derivatives of s by x and by y."""
+    focal, p1, p2 = lens[0], lens[4], lens[5]
+    r2 = x * x + y * y
+    radial, slope, _ = _radial(lens, r2)
+    by_x = focal * (2.0 * x * (y * slope + p1) + 2.0 * p2 * y)
+    by_y = focal * (radial + 2.0 * y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x)
+    return y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y, by_x, by_y
+
+
+@compiled
+def _radial(lens: Array, r2: float) -> Vector:
+    """The lens's radial factor at squared radius r2, its derivative by r2, and 1 / (1 + k4 r2 +
+    ...)."""
+    k1, k2, k3 = lens[2], lens[3], lens[6]
+    above, rise = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3)), k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3)
+    k4, k5, k6 = lens[7], lens[8], lens[9]
+    if k4 == 0.0 and k5 == 0.0 and k6 == 0.0:  # true of nearly all: no division
+        return above, rise, 1.0
+    share = 1.0 / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    radial = above * share
+    return radial, (rise - radial * (k4 + r2 * (2.0 * k5 + 3.0 * r2 * k6))) * share, share
+
+
+@compiled
+def _slope_times_reach(frame: Array, seen: Vector, bent: Vector, x: float, y: float) -> float:
+    """ds/dz along the ray (x, y, 1), times the reach."""
+    forward = frame[2, 0] * x + frame[2, 1] * y + frame[2, 2]
+    along = frame[0, 0] * x + frame[0, 1] * y + frame[0, 2] - seen[0] * forward
+    across = frame[1, 0] * x + frame[1, 1] * y + frame[1, 2] - seen[1] * forward
+    return bent[1] * along + bent[2] * across
+
+
+@compiled
+def _by_freedom(lens: Array, seen: Vector, bent: Vector, jacobian: Array) -> None:
+    """Fill ds (P,) by a small motion of the frame, f, c, and as many of k1, k2, p1, ... as fit."""
+    (x, y, reach), (slide, by_x, by_y) = seen, bent
+    by_z, r2 = -(by_x * x + by_y * y), x * x + y * y
+    jacobian[0], jacobian[1] = y * by_z - by_y, by_x - x * by_z
+    jacobian[2], jacobian[3] = x * by_y - y * by_x, by_x / reach
+    jacobian[4], jacobian[5] = by_y / reach, by_z / reach
+    jacobian[6], jacobian[7] = slide, 1.0
+    radial, _, share = _radial(lens, r2)
+    r4, above, below = r2 * r2, y * share, -y * radial * share
+    terms = (above * r2, above * r4, r2 + 2.0 * y * y, 2.0 * x * y, above * r2 * r4)
+    for k in range(min(len(jacobian) - 8, 5)):
+        jacobian[8 + k] = lens[0] * terms[k]
+    for k in range(13, len(jacobian)):
+        jacobian[k] = lens[0] * below * r2 ** (k - 12)

@@ -30,7 +30,7 @@ class LightSheets(Protocol):
 
     @property
     def kind(self) -> str:
-        """`planes`, `smooth-planes`, `bowed` or `lens`: see `sheet_arrays.sheets_from_arrays`."""
+        """`planes`, `smooth-planes`, `bowed` or `lens`: see `light_sheets.sheets_from_arrays`."""
         ...
 
     def depth(self, rays: Array, s: Array) -> Array:

@@ -19,7 +19,7 @@ from bodyscan.calibration.light_planes import PlaneFit, fit_light_planes
 from bodyscan.calibration.light_sheets import fit_light_sheets
 from bodyscan.calibration.refinement_choice import REFINED_BINS, refine_where_better
 from bodyscan.calibration.striped_view import BIN_PX
-from bodyscan.geometry.camera_fields import camera_from_fields
+from bodyscan.geometry.camera import camera_from_fields
 from bodyscan.laboratory import apparatus
 from bodyscan.laboratory.approaches import (
     Approach,

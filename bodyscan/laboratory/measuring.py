@@ -16,9 +16,9 @@ from bodyscan.evaluation.spheres import (
     centre_distances,
     measure_sphere,
 )
-from bodyscan.geometry.camera_fields import camera_from_fields
+from bodyscan.geometry.camera import camera_from_fields
 from bodyscan.geometry.light_planes import Axis, towards_camera
-from bodyscan.geometry.ray_depths import intersect_rays
+from bodyscan.geometry.light_sheets import intersect_rays
 from bodyscan.geometry.robust import rms
 from bodyscan.laboratory import apparatus
 from bodyscan.laboratory.apparatus import ChapterSetup

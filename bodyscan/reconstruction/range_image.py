@@ -6,9 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bodyscan.arrays import Bytes, Floats, Mask
+from bodyscan.arrays import Bytes, Crop, Floats, Mask
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.crop import Crop
 from bodyscan.reconstruction.two_ways import Agreement
 
 

@@ -9,7 +9,7 @@ from bodyscan.arrays import Array
 from bodyscan.calibration.pair import PairCalibration
 from bodyscan.compiled import compiled
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.ray_depths import intersect_rays
+from bodyscan.geometry.light_sheets import intersect_rays
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.rig.rig import Volume
 from bodyscan.stripes.stripe_limits import StripeLimits

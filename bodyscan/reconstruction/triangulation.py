@@ -6,13 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from bodyscan.arrays import Floats, Mask
+from bodyscan.arrays import Floats, Mask, crop_bounds, find_crop
 from bodyscan.calibration.pair import PairCalibration
 from bodyscan.compiled import compiled
 from bodyscan.errors import BadInput
-from bodyscan.geometry.crop import crop_bounds, find_crop
 from bodyscan.geometry.light_planes import LightSheets
-from bodyscan.geometry.ray_depths import (
+from bodyscan.geometry.light_sheets import (
     measure_stripe_residual,
     stripes_per_pixel,
     triangulate_image,

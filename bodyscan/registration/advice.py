@@ -10,7 +10,7 @@ from itertools import combinations
 import networkx as nx
 import numpy as np
 
-from bodyscan.geometry.pose_covariance import point_covariance, position_sigma
+from bodyscan.geometry.uncertainty import point_covariance, position_sigma
 from bodyscan.registration.more_shots import (
     MOST_SHOTS,
     BoardPlace,

@@ -17,8 +17,8 @@ from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.least_squares import EXACT, Block, minimize
-from bodyscan.geometry.pose_covariance import PoseCovariance, point_covariance
 from bodyscan.geometry.transforms import RigidTransform, adjoint, twist_jacobian
+from bodyscan.geometry.uncertainty import PoseCovariance, point_covariance
 from bodyscan.registration.view_graph import Target
 
 Group = tuple[str, tuple[str, ...]]

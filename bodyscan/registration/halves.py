@@ -12,9 +12,9 @@ import numpy as np
 from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.errors import BadInput, FailedWork
-from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.robust import rms_length
 from bodyscan.geometry.transforms import RigidTransform, adjoint, twist_jacobian
+from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.registration.rig_solve import RigSolution, solve_rig
 from bodyscan.registration.view_graph import view_graph
 from bodyscan.rig.rig import Rig

@@ -16,8 +16,8 @@ import numpy as np
 from bodyscan.arrays import Array, Indices
 from bodyscan.calibration.board_views import LocatedView, greatest_displacement
 from bodyscan.geometry.linear_gaussian import invert_scaled
-from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.registration.normal_equations import NormalEquations
 from bodyscan.registration.view_graph import Target
 

@@ -15,9 +15,9 @@ from bodyscan.arrays import Array
 from bodyscan.boards.board_layout import corner_points, corners_per_face
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.camera_tables import is_in_image
 from bodyscan.geometry.linear_gaussian import invert_scaled
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
-from bodyscan.geometry.visibility import is_in_image
 from bodyscan.registration.normal_equations import (
     NormalEquations,
     normal_equations,

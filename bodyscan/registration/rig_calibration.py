@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from bodyscan.arrays import Floats
 from bodyscan.calibration.pair import PairCalibration
-from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.rig.rig import Rig
 
 FLOOR_AXES = "origin on the floor at the rig's centre, x forward, y to the left, z up"

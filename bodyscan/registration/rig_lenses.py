@@ -21,8 +21,8 @@ from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses import family_up_to
 from bodyscan.geometry.lenses.brown import Brown
 from bodyscan.geometry.lenses.lens import Lens
-from bodyscan.geometry.ray_uncertainty import RayUncertainty
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.uncertainty import RayUncertainty
 from bodyscan.progress import map_threads
 from bodyscan.registration.joint_solve import JointSolution
 from bodyscan.rig.pair import AUTO

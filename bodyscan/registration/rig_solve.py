@@ -19,9 +19,8 @@ from bodyscan.calibration.board_views import LocatedView
 from bodyscan.calibration.camera import LensTrial
 from bodyscan.errors import RigDisconnected
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.pose_covariance import PoseCovariance
-from bodyscan.geometry.ray_uncertainty import RayUncertainty
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.uncertainty import PoseCovariance, RayUncertainty
 from bodyscan.outcome import Outcome
 from bodyscan.registration.board_shape import (
     BoardShape,

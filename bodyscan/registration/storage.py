@@ -24,12 +24,11 @@ from bodyscan.files.json_file import read_json_object
 from bodyscan.files.model import first_fault
 from bodyscan.files.npz_file import read_npz
 from bodyscan.files.regular import read_regular
-from bodyscan.geometry.camera_fields import camera_from_fields, camera_to_fields
+from bodyscan.geometry.camera import camera_from_fields, camera_to_fields
 from bodyscan.geometry.light_planes import LightSheets
-from bodyscan.geometry.pose_covariance import PoseCovariance
-from bodyscan.geometry.ray_uncertainty import COLUMNS, ROWS, RayUncertainty
-from bodyscan.geometry.sheet_arrays import sheets_from_arrays, sheets_to_arrays
+from bodyscan.geometry.light_sheets import sheets_from_arrays, sheets_to_arrays
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.uncertainty import COLUMNS, ROWS, PoseCovariance, RayUncertainty
 from bodyscan.registration.rig_calibration import RigCalibration, SeenCorners
 from bodyscan.registration.soundness import find_faults
 from bodyscan.rig.rig import Rig

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodyscan.calibration.coverage import covered_share
-from bodyscan.geometry.pose_covariance import position_sigma
+from bodyscan.geometry.uncertainty import position_sigma
 from bodyscan.registration.nominal_size import nominal_size
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.verdict import Grade, Verdict

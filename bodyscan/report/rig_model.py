@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from bodyscan.arrays import Array, Bytes
-from bodyscan.geometry.pose_covariance import point_covariance
+from bodyscan.geometry.uncertainty import point_covariance
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.report.calibration_charts import line_styles
 from bodyscan.report.canvas import round_down

@@ -12,9 +12,9 @@ from bodyscan.arrays import Array, Bytes, Indices
 from bodyscan.errors import BadInput
 from bodyscan.files.atomic import write_bytes
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.pose_covariance import PoseCovariance
+from bodyscan.geometry.camera_tables import is_in_image
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
-from bodyscan.geometry.visibility import is_in_image
+from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.storage import MAP_NAME, load_calibration
 from bodyscan.report.canvas import (

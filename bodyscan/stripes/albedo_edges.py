@@ -14,9 +14,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from bodyscan.arrays import Array, Floats, Greys, Indices, Mask
+from bodyscan.arrays import Array, Floats, Greys, Indices, Mask, find_crop
 from bodyscan.compiled import compiled
-from bodyscan.geometry.crop import find_crop
 from bodyscan.stripes.scan_lines import ScanLines
 
 UNEXPLAINED = 0.3

@@ -16,7 +16,7 @@ from bodyscan.calibration.pair import PairCalibration
 from bodyscan.calibration.striped_view import BoardBoundaries, StripedView, on_board
 from bodyscan.captures.folder import Captures
 from bodyscan.errors import BoardNotFound
-from bodyscan.geometry.ray_depths import intersect_rays
+from bodyscan.geometry.light_sheets import intersect_rays
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, silent
 from bodyscan.registration.drift import Drift, Move, find_drift, seen_pose

@@ -8,6 +8,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Se
 from dataclasses import dataclass, replace
 from itertools import groupby, islice
 
+from bodyscan.arrays import WHOLE, Crop
 from bodyscan.boards.view import BoardView, ViewKey
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.calibration.camera import CameraCalibration
@@ -27,7 +28,6 @@ from bodyscan.calibration.striped_view import (
 from bodyscan.captures.folder import Captures, ImageSequence
 from bodyscan.captures.images import read_sequence
 from bodyscan.errors import BodyscanError, DecodingFailed, ImageError, format_error
-from bodyscan.geometry.crop import WHOLE, Crop
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, iterate_threads, silent
 from bodyscan.rig.pair import Pair

@@ -95,7 +95,7 @@ def load_truth(folder: Path) -> Truth:
 
 def compare_rig(calibration: RigCalibration, truth: Truth) -> RigDeviation:
     """Compare camera poses with the truth. Raises BadInput for a rig the truth does not know."""
-    from bodyscan.geometry.pose_covariance import position_sigma
+    from bodyscan.geometry.uncertainty import position_sigma
 
     names = tuple(sorted(calibration.rig_from_camera))
     unknown = [name for name in names if name not in truth.facts["pairs"]]

@@ -27,8 +27,8 @@ from bodyscan.fusion.verdict.evidence import Coverage, ImageEvidence, RigEvidenc
 from bodyscan.fusion.verdict.floor import find_floor
 from bodyscan.fusion.verdict.overlaps import find_seams
 from bodyscan.fusion.verdict.rig import find_silent_poles
-from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, background, silent, step

@@ -12,8 +12,8 @@ from bodyscan.calibration.known_pair import KnownPair, parameter_sigmas, read_kn
 from bodyscan.calibration.pair import PairCalibration, PairQuality
 from bodyscan.errors import BadInput, BodyscanError, CalibrationFileError
 from bodyscan.files.relative_text import relative_text
-from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform, adjoint
+from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.rig_frame import rig_from_world
 from bodyscan.registration.storage import keep_former, save_calibration

@@ -16,8 +16,8 @@ from bodyscan.alignment.sway_prior import SwayPrior
 from bodyscan.errors import FailedWork
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
-from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.reconstruction.triangulation import grid_normals
 from bodyscan.settings import AlignmentSettings

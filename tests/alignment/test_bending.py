@@ -13,9 +13,9 @@ from ring import looking_at
 from bodyscan.alignment.bending import _bend, _one_in_each_block, bend
 from bodyscan.alignment.body_cells import BodyCells, modulated, rigid_fields
 from bodyscan.alignment.matching import alignment_points, match_projected
+from bodyscan.arrays import WHOLE, find_crop, pad_crop
 from bodyscan.fusion.smoothing import smooth
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.crop import WHOLE, find_crop, pad_crop
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage

@@ -23,8 +23,8 @@ from bodyscan.alignment.pole_steps import (
 )
 from bodyscan.alignment.sway_prior import BODY_CENTRE, centre_shifts
 from bodyscan.arrays import Array
-from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
+from bodyscan.geometry.uncertainty import PoseCovariance
 
 NAMES = [f"p{pole}-{k}" for pole in (1, 2, 3) for k in (1, 2, 3, 4)]
 POLES = {name: name[:2] for name in NAMES}

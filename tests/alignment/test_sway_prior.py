@@ -11,8 +11,8 @@ from bodyscan.alignment.sway_prior import (
     bound_motions,
     centre_shifts,
 )
-from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.settings import BODY_CENTRE_MM
 
 PAIRS = ("p1", "p2")

@@ -16,8 +16,8 @@ from bodyscan.alignment.icp import Alignment, align
 from bodyscan.alignment.pole_steps import PoleStep
 from bodyscan.alignment.together import Together, _search, bring_together
 from bodyscan.arrays import Array
-from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.settings import AlignmentSettings
 
 RIG = load_rig("four-pole-16")

@@ -15,7 +15,7 @@ from bodyscan.calibration.pair import PairCalibration, PlacedPair, calibrate_pai
 from bodyscan.calibration.striped_view import BoardBoundaries, StripedView
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
-from bodyscan.geometry.ray_depths import intersect_rays
+from bodyscan.geometry.light_sheets import intersect_rays
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.outcome import Outcome
 from bodyscan.rig.board import Board

@@ -25,7 +25,7 @@ from bodyscan.calibration.sheet_fit import _blocks, fit_sheets
 from bodyscan.errors import PairFailed
 from bodyscan.geometry.lens_sheets import LensSheets
 from bodyscan.geometry.light_planes import LightPlanes
-from bodyscan.geometry.ray_depths import intersect_rays
+from bodyscan.geometry.light_sheets import intersect_rays
 from bodyscan.geometry.smooth_sheets import SmoothSheets
 
 

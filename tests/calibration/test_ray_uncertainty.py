@@ -18,8 +18,8 @@ from bodyscan.geometry.lenses import FAMILY
 from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.lenses.rational import Rational
-from bodyscan.geometry.ray_uncertainty import RayUncertainty, node_pixels
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
+from bodyscan.geometry.uncertainty import RayUncertainty, node_pixels
 
 FOCAL = 1400.0  # 30 degrees from the axis to the corner
 DEPTH_MM = 900.0

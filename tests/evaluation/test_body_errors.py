@@ -11,8 +11,7 @@ import pytest
 from made_bodies import mesh_of
 
 from bodyscan.evaluation.body import coverage_of_seen, girth_errors, sway_residual
-from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.camera_fields import camera_to_fields
+from bodyscan.geometry.camera import Camera, camera_to_fields
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyMesh, BreathAt

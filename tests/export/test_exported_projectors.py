@@ -20,9 +20,9 @@ from bodyscan.geometry.lens_sheets import LensSheets
 from bodyscan.geometry.lenses import lens_from_opencv
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.light_planes import LightSheets
-from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.projector_sheets import sheets_from_projector
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.interchange.rig_format import RIG_FORMATS
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.rig.rig import Rig

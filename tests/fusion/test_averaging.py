@@ -15,8 +15,8 @@ from bodyscan.fusion.consistency import Consistency, compare_with_surface
 from bodyscan.fusion.merging import average, estimate_excess
 from bodyscan.fusion.smoothing import SmoothSurface
 from bodyscan.fusion.voxel_thinning import Samples, take_samples
-from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.mesh.body import BodyCloud
 
 

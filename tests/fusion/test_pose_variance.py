@@ -10,8 +10,8 @@ from scipy.linalg import block_diag
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.fusion.pose_variance import add_motion_variance, add_pose_variance
-from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.mesh.body import BodyCloud
 
 

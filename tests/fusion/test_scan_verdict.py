@@ -17,8 +17,8 @@ from bodyscan.fusion.cleaning import apply_mask
 from bodyscan.fusion.meshing import closed_surface
 from bodyscan.fusion.scan import Scan
 from bodyscan.fusion.verdict.floor import find_floor
-from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.outcome import Outcome
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.registration.rig_calibration import RigCalibration

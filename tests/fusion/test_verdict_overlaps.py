@@ -20,8 +20,8 @@ from bodyscan.fusion.verdict.overlaps import (
     find_seams,
     patch_medians,
 )
-from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.settings import AlignmentSettings
 

@@ -10,8 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bodyscan.errors import BadInput
-from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.camera_fields import camera_from_fields, camera_to_fields
+from bodyscan.geometry.camera import Camera, camera_from_fields, camera_to_fields
 from bodyscan.geometry.lenses import LENSES, lens_from_opencv
 from bodyscan.geometry.lenses.brown import Brown
 from bodyscan.geometry.lenses.lens import Lens

@@ -12,8 +12,7 @@ from bodyscan.arrays import Array
 from bodyscan.geometry.bowed_sheets import BowedSheets
 from bodyscan.geometry.lens_sheets import LensSheets
 from bodyscan.geometry.light_planes import LightPlanes, LightSheets
-from bodyscan.geometry.ray_depths import intersect_rays
-from bodyscan.geometry.sheet_arrays import sheets_from_arrays, sheets_to_arrays
+from bodyscan.geometry.light_sheets import intersect_rays, sheets_from_arrays, sheets_to_arrays
 from bodyscan.geometry.smooth_sheets import SmoothSheets
 
 

@@ -7,11 +7,10 @@ import pytest
 from sheet_models import MIDDLE, STRIPES, models
 
 from bodyscan.arrays import Array
-from bodyscan.geometry.bowed_sheets import BowedSheets
+from bodyscan.geometry.bowed_sheets import BowedSheets, SheetTable
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
-from bodyscan.geometry.ray_depths import MOST_SIGMA, intersect_rays, triangulate_image
-from bodyscan.geometry.sheet_table import SheetTable
+from bodyscan.geometry.light_sheets import MOST_SIGMA, intersect_rays, triangulate_image
 
 
 @pytest.fixture(params=[(3, 0), (4, 0), (5, 0), (3, 1), (4, 3)], ids=str)

@@ -8,7 +8,11 @@ import pytest
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.light_planes import LightPlanes
-from bodyscan.geometry.ray_depths import intersect_rays, measure_stripe_residual, stripes_per_pixel
+from bodyscan.geometry.light_sheets import (
+    intersect_rays,
+    measure_stripe_residual,
+    stripes_per_pixel,
+)
 from bodyscan.reconstruction.range_image import RangeImage
 
 CAMERA = Camera(400.0, 400.0, 0.0, 79.5, 59.5, Radial(), 160, 120)

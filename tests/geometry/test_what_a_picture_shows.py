@@ -5,12 +5,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from bodyscan.arrays import crop_bounds, find_crop, pad_crop
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.crop import crop_bounds, find_crop, pad_crop
+from bodyscan.geometry.camera_tables import is_in_image
 from bodyscan.geometry.lenses.radial import Radial
-from bodyscan.geometry.pose_covariance import PoseCovariance, point_covariance, position_sigma
-from bodyscan.geometry.ray_uncertainty import COLUMNS, ROWS, RayUncertainty, node_pixels
-from bodyscan.geometry.visibility import is_in_image
+from bodyscan.geometry.uncertainty import (
+    COLUMNS,
+    ROWS,
+    PoseCovariance,
+    RayUncertainty,
+    node_pixels,
+    point_covariance,
+    position_sigma,
+)
 
 PLAIN = Camera(500.0, 510.0, 0.0, 159.5, 119.5, Radial(0.0, 0.0), 320, 240)
 BARREL = Camera(300.0, 300.0, 0.0, 159.5, 119.5, Radial(-0.3, 0.0), 320, 240)

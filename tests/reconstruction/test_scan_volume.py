@@ -15,7 +15,7 @@ from bodyscan.arrays import Floats
 from bodyscan.calibration.pair import PairCalibration
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
-from bodyscan.geometry.ray_depths import triangulate_image
+from bodyscan.geometry.light_sheets import triangulate_image
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.scan_volume import (
     LAYER_MM,

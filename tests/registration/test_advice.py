@@ -6,8 +6,8 @@ from bodyscan.boards.board_layout import corner_points, corners_per_face
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.linear_gaussian import invert_scaled
-from bodyscan.geometry.pose_covariance import position_sigma
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.uncertainty import position_sigma
 from bodyscan.registration.advice import advise, crucial_shots
 from bodyscan.registration.more_shots import BoardPlace, RigInformation
 from bodyscan.registration.normal_equations import NormalEquations, normal_equations

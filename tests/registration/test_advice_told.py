@@ -8,8 +8,8 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.registration import advice as advice_file
 from bodyscan.registration.advice import (
     Advice,

@@ -11,8 +11,8 @@ from seen_boards import seen_boards
 
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.errors import FailedWork
-from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.registration import halves
 from bodyscan.registration.halves import (
     _centre_sigmas,

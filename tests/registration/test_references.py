@@ -11,8 +11,8 @@ from ring import CHARUCO, ring_of_cameras, ring_rig, ring_views
 from bodyscan.boards.board_layout import corner_points
 from bodyscan.boards.view import BoardView
 from bodyscan.errors import FailedWork
-from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.registration.references import (
     Size,
     _along,

@@ -9,8 +9,8 @@ import pytest
 
 from bodyscan.calibration.board_views import board_symmetries
 from bodyscan.errors import BadInput
-from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.registration.rig_calibration import FLOOR_AXES, RigCalibration
 from bodyscan.registration.rig_frame import (
     frame_board_turn,

@@ -19,8 +19,8 @@ from bodyscan.geometry.lenses.brown import Brown
 from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.lenses.rational import Rational
-from bodyscan.geometry.pose_covariance import position_sigma
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.uncertainty import position_sigma
 from bodyscan.registration.rig_lenses import _decentred_together
 from bodyscan.registration.rig_solve import RigSolution, solve_rig
 from bodyscan.rig.rig import Rig

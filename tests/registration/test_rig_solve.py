@@ -7,8 +7,8 @@ from ring import CHARUCO, ring_of_cameras, ring_rig, ring_views
 
 from bodyscan.arrays import Array
 from bodyscan.errors import RigDisconnected
-from bodyscan.geometry.pose_covariance import position_sigma
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.uncertainty import position_sigma
 from bodyscan.registration.rig_solve import RigSolution, _robust_rms, solve_rig
 from bodyscan.rig.board import Board
 from bodyscan.rig.pair import NominalPose

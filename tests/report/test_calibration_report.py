@@ -14,8 +14,8 @@ from ring import ring_of_cameras, ring_rig
 from bodyscan.calibration.camera import LensTrial
 from bodyscan.calibration.pair import PairCalibration, PairQuality
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.registration.rig_calibration import RigCalibration, SeenCorners
 from bodyscan.registration.storage import load_calibration, save_calibration
 from bodyscan.report.calibration_charts import shared_boards

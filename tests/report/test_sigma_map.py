@@ -6,10 +6,10 @@ from ring import ring_of_cameras, ring_rig
 from bodyscan.calibration.pair import PairCalibration, PairQuality
 from bodyscan.errors import BadInput
 from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.camera_tables import is_in_image
 from bodyscan.geometry.lenses.radial import Radial
-from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.geometry.visibility import is_in_image
+from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.report.sigma_map import draw_sigma_map, sigma_at
 

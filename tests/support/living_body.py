@@ -17,8 +17,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from bodyscan.arrays import Array, Bytes, Mask
-from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig import Rig

@@ -10,7 +10,7 @@ import numpy as np
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.calibration.boundary_points import BoundaryPoints, boundary_points, concatenate
-from bodyscan.geometry.camera_fields import camera_from_fields
+from bodyscan.geometry.camera import camera_from_fields
 from bodyscan.geometry.light_planes import LightPlanes
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.laboratory import apparatus

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from bodyscan.errors import FailedWork
-from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.registration.drift import Move
 from bodyscan.workflows.check_boards import apply_moves
 from bodyscan.workflows.check_rig import (

@@ -25,7 +25,7 @@ from bodyscan.errors import BadInput, CalibrationFileError, RigFileError
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lens_sheets import LensSheets
 from bodyscan.geometry.lenses import lens_from_opencv
-from bodyscan.geometry.ray_depths import triangulate_image
+from bodyscan.geometry.light_sheets import triangulate_image
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.storage import load_calibration
 from bodyscan.report.calibration_verdict import grade_calibration

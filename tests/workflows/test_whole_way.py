@@ -13,7 +13,7 @@ from small_workspace import Workspace
 from bodyscan.arrays import Array
 from bodyscan.evaluation.surface import deviation, normalized_errors, signed_distances
 from bodyscan.fusion.storage import load_scan
-from bodyscan.geometry.sheet_arrays import sheets_to_arrays
+from bodyscan.geometry.light_sheets import sheets_to_arrays
 from bodyscan.mesh.ply import read_ply_mesh
 from bodyscan.mesh.topology import compute_topology
 from bodyscan.registration.rig_calibration import RigCalibration

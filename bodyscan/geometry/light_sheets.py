@@ -1,23 +1,61 @@
-"""What a pixel's ray and its stripe coordinate say about depth, whatever the projector's model."""
+"""Light sheets of any kind: as arrays for files, and the depths at which rays meet them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
 from bodyscan.arrays import Array, Floats, Mask
 from bodyscan.compiled import compiled
-from bodyscan.geometry.bowed_sheets import BowedSheets
+from bodyscan.geometry.bowed_sheets import BOW_DEGREE, PLANE_DEGREE, BowedSheets, SheetTable
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.camera_tables import ray_table
+from bodyscan.geometry.camera_tables import look_up_rays, ray_table
 from bodyscan.geometry.lens_sheets import LensSheets
-from bodyscan.geometry.light_planes import LightSheets
-from bodyscan.geometry.pixel_rays import look_up_rays
-from bodyscan.geometry.sheet_table import SheetTable
+from bodyscan.geometry.light_planes import Axis, LightPlanes, LightSheets
 from bodyscan.geometry.smooth_sheets import SmoothSheets
+from bodyscan.geometry.transforms import RigidTransform
+
+KINDS = ("planes", "smooth-planes", "bowed", "lens")
+
+
+def sheets_to_arrays(sheets: LightSheets) -> dict[str, Array]:
+    """Arrays that, with `sheets.kind` and `sheets.direction`, describe the sheets completely."""
+    if isinstance(sheets, LightPlanes):
+        return {"planes": sheets.coefficients, "covariance": sheets.covariance}
+    if isinstance(sheets, SmoothSheets):
+        return {
+            "projector_from_camera": sheets.projector_from_camera.matrix,
+            "middle": sheets.middle,
+            "stripes": np.array(float(sheets.stripes)),
+            "parameters": sheets.parameters,
+            "covariance": sheets.covariance,
+        }
+    raise TypeError(f"no sheets of light: {type(sheets).__name__}")
+
+
+def sheets_from_arrays(kind: str, arrays: Mapping[str, Any], direction: Axis) -> LightSheets:
+    """Rebuild the sheets from what `sheets_to_arrays` returned.
+
+    Raises ValueError for an unknown kind or arrays of the wrong size, KeyError for a missing one.
+    """
+    if kind not in KINDS:
+        raise ValueError(f"sheets of light of an unknown kind, {kind!r}")
+    if kind == "planes":
+        return LightPlanes(arrays["planes"], arrays["covariance"], direction)
+    matrix, parameters = arrays["projector_from_camera"], arrays["parameters"]
+    frame = RigidTransform(matrix[:3, :3].copy(), matrix[:3, 3].copy())
+    stripes, middle, covariance = int(arrays["stripes"]), arrays["middle"], arrays["covariance"]
+    if kind == "lens":
+        return LensSheets(frame, middle, stripes, direction, parameters, covariance)
+    bow, over = divmod(len(parameters) - 3 * (PLANE_DEGREE + 1), BOW_DEGREE + 1)
+    if bow < 0 or over != (kind == "bowed") or (bow > 0) != (kind == "bowed"):
+        raise ValueError(f"{len(parameters)} parameters do not make {kind} sheets of light")
+    return BowedSheets(frame, middle, stripes, direction, parameters, covariance, bow)
+
 
 Way = Callable[[Array, Array], tuple[Array, Array, Array]]
 
