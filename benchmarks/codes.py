@@ -20,7 +20,7 @@ from bodyscan.simulation.render import PixelTruth, pixel_truth, render_pair
 from bodyscan.simulation.scene import Scene, grid_surface
 from bodyscan.simulation.sensor import expose, exposure
 from bodyscan.simulation.settings import SimulationSettings
-from bodyscan.stripes.codes import stripe_code
+from bodyscan.stripes.codes import parse_stripe_code
 from bodyscan.stripes.decoding import decode_stripes
 from bodyscan.stripes.stripe_code import StripeCode
 
@@ -66,7 +66,7 @@ def report() -> str:
         rows.append(f"| **{group}** | | | | | | | |")
         for name in names:
             same = {"stripes": projector.stripes, "direction": projector.direction}
-            spec = stripe_code({**same, **CODES[name]})
+            spec = parse_stripe_code({**same, **CODES[name]})
             rows.append(f"| {name} | {_row(spec, scene, pair, truth, chosen)} |")
     return f"""## Every code on one scene
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from bodyscan.arrays import Array, Floats, Greys, Indices, Mask, find_crop
+from bodyscan.arrays import Array, Floats, Indices, Mask, find_crop
 from bodyscan.compiled import compiled
 from bodyscan.stripes.scan_lines import ScanLines
 
@@ -46,9 +46,11 @@ class Brightness:
         usable: (L, P) pixels on a lit surface.
         """
         if images.lit.dtype == np.uint8:
-            logarithm, noise2 = np.empty((2, *images.lit.shape), np.float32)
+            contrast = cv2.max(cv2.subtract(images.lit, images.dark), 1)
             logarithms = np.log(np.maximum(np.arange(256), 1)).astype(np.float32)
-            _measure(images.lit, images.dark, variance, logarithms, logarithm, noise2)
+            logarithm = np.asarray(cv2.LUT(contrast, logarithms), np.float32)
+            noise2 = cv2.LUT(images.lit, variance) + cv2.LUT(images.dark, variance)
+            noise2 /= np.square(contrast.astype(np.float32))
         else:
             contrast = np.maximum(images.lit - images.dark, 0.02).astype(np.float32)
             at_lit, at_dark = (variance[g.astype(np.uint8)] for g in (images.lit, images.dark))
@@ -178,25 +180,6 @@ def _shrink(gradient: float, variance: float) -> float:
     """A gradient, shrunk towards zero if it is no more than some 2.5 sigmas."""
     square = gradient * gradient
     return gradient * square / (square + 2.5**2 * variance + 1e-12)
-
-
-@compiled
-def _measure(
-    lit: Greys,
-    dark: Greys,
-    variance: Floats,
-    logarithms: Floats,
-    logarithm: Floats,
-    noise2: Floats,
-) -> None:
-    """Write the logarithm of lit minus dark (L, P), and its variance."""
-    for line in range(lit.shape[0]):
-        for x in range(lit.shape[1]):
-            light, black = lit[line, x], dark[line, x]
-            contrast = max(np.int32(light) - np.int32(black), np.int32(1))
-            logarithm[line, x] = logarithms[contrast]
-            square = np.float32(contrast * contrast)
-            noise2[line, x] = (variance[light] + variance[black]) / square
 
 
 @compiled

@@ -32,10 +32,7 @@ MIN_SCATTER = 1.2
 
 
 def interpolate_stripes(
-    boundaries: Boundaries,
-    codes: NDArray[np.int32],
-    usable: Mask,
-    rough: Mask | None = None,
+    boundaries: Boundaries, codes: NDArray[np.int32], usable: Mask, rough: Mask | None = None
 ) -> tuple[Floats, Floats]:
     """Interpolate s and its standard deviation, (L, P) each, NaN where there is none.
 
@@ -213,12 +210,7 @@ def smooth_runs(boundaries: Boundaries, joined: Mask) -> tuple[Array, Array]:
 
 @compiled
 def _smooth(
-    measured: Array,
-    sigma_px: Array,
-    joined: Mask,
-    weights: Array,
-    position: Array,
-    sigma: Array,
+    measured: Array, sigma_px: Array, joined: Mask, weights: Array, position: Array, sigma: Array
 ) -> None:
     """Apply one filter of `smooth_runs`; overwrites position and sigma (N,) where it fits."""
     half = weights.size // 2

@@ -43,7 +43,11 @@ class StripeLimits:
         transposed: the lines are the camera image's columns.
         """
         limits = np.stack([self.near, self.far, self.standing])
-        limits = np.ascontiguousarray(limits.transpose(0, 2, 1)) if transposed else limits
+        limits = limits.transpose(0, 2, 1) if transposed else limits
+        column = np.arange(s.shape[1]) // self.block_px
+        share = ((np.arange(s.shape[1]) + 0.5) / self.block_px - column).astype(np.float32)
+        left, right = (np.take(limits, column + k, axis=2) for k in (0, 1))
+        limits = left + share * (right - left)
         middle = 0.5 if s.dtype.kind == "i" else 0.0
         there, deep = np.empty(s.shape, np.bool_), np.empty(s.shape, np.bool_)
         rows, columns = (-(-size // TILE_PX) for size in s.shape)
@@ -74,68 +78,19 @@ def _split(
     """Fill, in arrays of at least the image's size, what lies in the volume (`there`), in its
     lowest layer or beyond (`deep`), and higher than that layer (`standing`), (L, P) each.
 
-    limits: (3, rows, columns), near, far, standing.
+    limits: (3, rows, P), near, far, standing at the upper and lower edges of blocks.
     """
     sign = np.float32(1.0 if rising else -1.0)
     offset = sign * np.float32(middle)
-    lines, width = s.shape
-    wide = np.empty((3, limits.shape[1], width), np.float32)
-    for kind in range(3):
-        for row in range(limits.shape[1]):
-            _widen(limits[kind, row], block_px, wide[kind, row])
-    for line in range(lines):
+    for line in range(s.shape[0]):
         row = line // block_px
         share = np.float32((line + 0.5) / block_px - row)
-        near = _blend(wide[0, row], wide[0, row + 1], share)
-        far = _blend(wide[1, row], wide[1, row + 1], share)
-        low = _blend(wide[2, row], wide[2, row + 1], share)
-        depth = _depths(s[line], sign, offset)
-        _split_line(depth, usable[line], near, far, low, there[line], deep[line])
-        _stand(there[line], deep[line], standing[line])
-
-
-# One line at a time, one array filled per loop: otherwise the compiler does not vectorise.
-
-
-@compiled
-def _blend(one: Floats, other: Floats, share: np.float32) -> Floats:
-    between = np.empty(one.size, np.float32)
-    for x in range(one.size):
-        between[x] = one[x] + share * (other[x] - one[x])
-    return between
-
-
-@compiled
-def _depths(s: NDArray[np.int32] | Floats, sign: np.float32, offset: np.float32) -> Floats:
-    depth = np.empty(s.size, np.float32)
-    for x in range(s.size):
-        depth[x] = sign * np.float32(s[x]) + offset
-    return depth
-
-
-@compiled
-def _split_line(
-    depth: Floats, usable: Mask, near: Floats, far: Floats, low: Floats, there: Mask, deep: Mask
-) -> None:
-    for x in range(depth.size):
-        there[x] = usable[x] & (depth[x] >= near[x]) & (depth[x] <= far[x])
-    for x in range(depth.size):
-        deep[x] = usable[x] & (depth[x] > low[x]) & (far[x] > near[x])
-
-
-@compiled
-def _stand(there: Mask, deep: Mask, standing: Mask) -> None:
-    for x in range(there.size):
-        standing[x] = there[x] & (not deep[x])
-
-
-@compiled
-def _widen(edges: Floats, block_px: int, values: Floats) -> None:
-    """Fill values (P,) at pixel centres, linear between those at the edges of blocks (columns,)."""
-    for x in range(values.size):
-        column = x // block_px
-        share = np.float32((x + 0.5) / block_px - column)
-        values[x] = edges[column] + share * (edges[column + 1] - edges[column])
+        line_limits = limits[:, row] + share * (limits[:, row + 1] - limits[:, row])
+        near, far, low = line_limits[0], line_limits[1], line_limits[2]
+        depth = sign * s[line].astype(np.float32) + offset
+        there[line] = usable[line] & (depth >= near) & (depth <= far)
+        deep[line] = usable[line] & (depth > low) & (far > near)
+        standing[line, : s.shape[1]] = there[line] & ~deep[line]
 
 
 @compiled

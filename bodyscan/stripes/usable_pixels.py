@@ -25,11 +25,7 @@ def min_contrast(dtype: np.dtype[Any]) -> float:
 
 
 def find_usable_pixels(
-    images: ScanLines,
-    codes: NDArray[np.int32],
-    variance: Floats,
-    stripes: int,
-    fine_bit: int,
+    images: ScanLines, codes: NDArray[np.int32], variance: Floats, stripes: int, fine_bit: int
 ) -> tuple[Mask, Mask]:
     """Find the pixels (L, P) whose stripes `codes` can be relied on, and all that are lit well.
 

@@ -18,7 +18,7 @@ from bodyscan.captures.images import read_sequence
 from bodyscan.errors import ImageError, RigFileError
 from bodyscan.geometry.robust import robust_scale
 from bodyscan.rig.rig_file import load_rig
-from bodyscan.stripes.codes import stripe_code
+from bodyscan.stripes.codes import parse_stripe_code
 from bodyscan.stripes.decoding import decode_stripes
 from bodyscan.stripes.stripe_map import StripeMap
 
@@ -55,7 +55,7 @@ def exposed(code: dict[str, Any], times: float) -> tuple[np.ndarray, np.ndarray]
 
 def decoded(code: dict[str, Any], images: np.ndarray) -> StripeMap:
     named = {k: list(v) if isinstance(v, tuple) else v for k, v in code.items()}
-    spec = stripe_code({**named, "stripes": STRIPES, "direction": "vertical"})
+    spec = parse_stripe_code({**named, "stripes": STRIPES, "direction": "vertical"})
     return decode_stripes(spec, images[0], images[1], np.ascontiguousarray(images[2:]))
 
 

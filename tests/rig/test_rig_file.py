@@ -20,7 +20,7 @@ from bodyscan.rig.board import MARKERS_IN, Board
 from bodyscan.rig.frame_names import FrameNames
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_file import load_rig, write_rig
-from bodyscan.stripes.codes import stripe_code
+from bodyscan.stripes.codes import parse_stripe_code
 from bodyscan.stripes.codes.gray import INVERSE, PATTERN, Gray
 
 RIGS = Path(__file__).parents[2] / "rigs"
@@ -181,8 +181,8 @@ def test_keys_without_a_value_are_keys_not_given() -> None:
     """As calibrations have them that were written when every code had every key."""
     keys: dict[str, Any] = {"stripes": 12, "direction": "vertical"}
     nothing = {"inverses": None, "steps": None, "period": None}
-    assert stripe_code({"code": "gray", **keys, **nothing}) == Gray(**keys)
-    assert stripe_code({"code": "stripe-index", **keys, **nothing}).code == "stripe-index"
+    assert parse_stripe_code({"code": "gray", **keys, **nothing}) == Gray(**keys)
+    assert parse_stripe_code({"code": "stripe-index", **keys, **nothing}).code == "stripe-index"
 
 
 CHARUCO = "square_mm: 30, kind: charuco"
@@ -328,7 +328,7 @@ def test_a_code_without_inverses_needs_a_dark_image(tmp_path: Path) -> None:
     ],
 )  # fmt: skip
 def test_each_code_has_its_images(code: dict[str, Any], names: str) -> None:
-    spec = stripe_code({**code, "stripes": 5, "direction": "vertical"})
+    spec = parse_stripe_code({**code, "stripes": 5, "direction": "vertical"})
     assert FrameNames().of_code(spec) == tuple(names.split())
 
 
@@ -398,7 +398,7 @@ def test_crossing_stripes_are_of_the_same_code_unless_said(tmp_path: Path) -> No
     waves = CROSSED.replace("{stripes: 20}", "{stripes: 20, code: phase-shift, steps: 3}")
     second = load_rig(write(tmp_path / "rig.yaml", waves)).pairs[0].projector
     assert second is not None
-    assert second.crossing == stripe_code(
+    assert second.crossing == parse_stripe_code(
         {"code": "phase-shift", "stripes": 20, "direction": "vertical", "steps": 3}
     )
 

@@ -12,7 +12,7 @@ from stripe_rendering import code_light, render
 from bodyscan.arrays import Array, Bytes, Indices
 from bodyscan.errors import DecodingFailed
 from bodyscan.geometry.light_planes import Axis
-from bodyscan.stripes.codes import stripe_code
+from bodyscan.stripes.codes import parse_stripe_code
 from bodyscan.stripes.codes.phase_shift import PhaseShift
 from bodyscan.stripes.codes.stripe_index import StripeIndex
 from bodyscan.stripes.decoding import decode_stripes
@@ -30,7 +30,7 @@ Read = Callable[..., StripeMap]
 
 def rendered(**code: Any) -> Read:
     """A function that reads a good sequence after `change` has been at its images."""
-    spec = stripe_code({**code, "stripes": STRIPES, "direction": "horizontal"})
+    spec = parse_stripe_code({**code, "stripes": STRIPES, "direction": "horizontal"})
     lights = code_light(stripes=STRIPES, **code)
     lit, dark, coded, _ = render(
         lambda u, v: 1.2 + (v + 0.1 * u + 2 * np.sin(u / 20)) / 2.3,
@@ -120,9 +120,7 @@ def test_exchanged_images_of_a_sweep_are_named(section: Read, one: int, other: i
         section(exchanged(one, other))
 
 
-def test_images_of_a_sweep_that_are_missing_or_double_are_named(
-    section: Read,
-) -> None:
+def test_images_of_a_sweep_that_are_missing_or_double_are_named(section: Read) -> None:
     with pytest.raises(DecodingFailed, match="stripe 25 shows no line"):
         section(replaced(25, "dark"))
     with pytest.raises(DecodingFailed, match="stripe 26 shows no line"):

@@ -11,7 +11,7 @@ from stripe_rendering import Field, checkered, code_light, render, white
 from bodyscan.arrays import Array, Bytes, Indices
 from bodyscan.errors import BadInput, DecodingFailed
 from bodyscan.geometry.light_planes import Axis
-from bodyscan.stripes.codes import stripe_code
+from bodyscan.stripes.codes import parse_stripe_code
 from bodyscan.stripes.decoding import decode_stripes
 from bodyscan.stripes.stripe_code import StripeCode
 from bodyscan.stripes.stripe_limits import StripeLimits
@@ -37,7 +37,7 @@ def name(value: object) -> str | None:
 
 
 def spec_of(code: Code, stripes: int, direction: Axis = "horizontal") -> StripeCode:
-    return stripe_code({**code, "stripes": stripes, "direction": direction})
+    return parse_stripe_code({**code, "stripes": stripes, "direction": direction})
 
 
 def wavy(stripe_px: float) -> Field:

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from stripe_rendering import checkered, code_light, render
 
 from bodyscan.errors import DecodingFailed
-from bodyscan.stripes.codes import stripe_code
+from bodyscan.stripes.codes import parse_stripe_code
 from bodyscan.stripes.codes.phase_shift import PhaseShift
 from bodyscan.stripes.decoding import decode_stripes
 from bodyscan.stripes.stripe_map import StripeMap
@@ -55,7 +55,7 @@ def described(keys: Keys) -> PhaseShift:
     if named.pop("backward", False):
         named["shift"] = "backward"
     common = {"code": "phase-shift", "stripes": STRIPES, "direction": "vertical"}
-    code = stripe_code({**common, **named})
+    code = parse_stripe_code({**common, **named})
     assert isinstance(code, PhaseShift)
     return code
 
@@ -243,7 +243,7 @@ def test_a_depth_jump_gives_no_values_in_between() -> None:
 
     lights = code_light("phase-shift", 280, period=(20, 280), steps=3)
     lit, _, coded, _ = render(jump, lights, stripes=280, shape=(160, 200))
-    code = stripe_code({"code": "phase-shift", "stripes": 280, "direction": "vertical",
+    code = parse_stripe_code({"code": "phase-shift", "stripes": 280, "direction": "vertical",
                         "period": [20, 280], "steps": 3})  # fmt: skip
     seen = decode_stripes(code, lit, None, coded)
     v, u = np.nonzero(np.isfinite(seen.s))
@@ -292,7 +292,7 @@ def test_images_in_another_order_are_refused(change: str, said: str) -> None:
 @pytest.mark.parametrize(
     ("projected", "said"),
     [
-        ({"start_deg": -90.0}, "would fit `start_deg: -90`"),
+        ({"start_deg": -90.0}, "or `start_deg: -90`"),
         ({"backward": True, "start_deg": -90.0}, "`shift: backward` with `start_deg: -90`"),
     ],
 )
@@ -328,29 +328,9 @@ def test_other_periods_than_said_are_noticed() -> None:
 )
 def test_waves_that_do_not_tell_all_stripes_apart_are_refused(keys: Keys, said: str) -> None:
     with pytest.raises(ValidationError) as refused:
-        stripe_code({"code": "phase-shift", "stripes": 240, "direction": "vertical", **keys})
+        parse_stripe_code({"code": "phase-shift", "stripes": 240, "direction": "vertical", **keys})
     assert said in str(refused.value)
 
 
 def test_periods_may_be_counted() -> None:
     assert described({"periods": (12, 1)}).waves == described({"period": (20, 240)}).waves
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("taken", "given", "named"),
-    [
-        ({"period": (15, 240)}, {"periods": (15, 1)}, "`periods` with 16 in place of 15"),
-        ({"period": (18, 20, 23)}, {"period": (18, 21, 23)}, "`period` with 20 in place of 21"),
-        ({"period": (30, 240)}, {"periods": (16, 1)}, "`periods` with 8 in place of 16"),
-        ({"period": (20, 240)}, {"periods": (6, 1)}, "`periods` with 12 in place of 6"),
-    ],
-)
-def test_a_period_that_is_wrong_is_told_with_the_one_that_fits(
-    taken: Keys, given: Keys, named: str
-) -> None:
-    lit, coded, _ = captured({"steps": 4, **taken})
-    with pytest.raises(DecodingFailed) as error:
-        read({"steps": 4, **given}, lit, coded)
-    assert error.value.remedy is not None
-    assert named in error.value.remedy

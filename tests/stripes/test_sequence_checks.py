@@ -171,7 +171,7 @@ def check_pairs(patterns: np.ndarray, inverses: np.ndarray) -> None:
 def test_a_pattern_with_the_inverse_of_another_bit_is_refused() -> None:
     patterns, inverses = frame_pairs()
     check_pairs(patterns, inverses)
-    with pytest.raises(DecodingFailed, match=r"differ clearly: bit 2 \(\d\d% of the pixels\)"):
+    with pytest.raises(DecodingFailed, match=r"differ clearly: bit 1 \(\d\d% of the pixels\)"):
         check_pairs(patterns, inverses[[0, 2, 1, 3, 4, 5]])
     with pytest.raises(DecodingFailed, match="differ clearly: bit 0"):  # moved up by one
         check_pairs(patterns[1:], np.vstack([inverses[:1], inverses[2:]]))

@@ -118,13 +118,8 @@ def test_most_pixels_agree_and_waves_are_not_shifted_as_a_whole(
     assert is_consistent(order) == consistent
 
 
-def test_other_periods_starts_and_shifts_are_tried() -> None:
-    """Of 240 stripes twelve periods of twenty: four more and fewer, twice and half of either."""
-    found = dict(list_other_keys((Wave(20.0, 3), Wave(240.0, 3)), 240))
-    for count in (8, 16, 24, 6):
-        assert found[f"`periods` with {count} in place of 12"][0].period == 240.0 / count
-    assert found["`period` with 10 in place of 20"][0].period == 10.0
-    assert "`periods` with 12 in place of 12" not in found
+def test_other_starts_and_shifts_are_tried() -> None:
+    found = dict(list_other_keys((Wave(20.0, 3), Wave(240.0, 3))))
     assert found["`shift: backward`"][1].shift == "backward"
     assert found["`start_deg: -90`"][0].start == pytest.approx(np.radians(270.0))
-    assert all(wave.period <= 240.0 for waves in found.values() for wave in waves)
+    assert len(found) == 2 * 11 + 1

@@ -115,12 +115,6 @@ def test_waves_are_alike_again_after_what_they_have_in_common(
     assert find_repetition(periods, stripes, 0.05) == again
 
 
-def test_how_nearly_alike_is_for_the_caller_to_say() -> None:
-    # After three periods of 10 a wave of 28 is 30 / 28 = 1.0714 turns on.
-    assert find_repetition((10.0, 28.0), 35, 0.08) == 30.0
-    assert find_repetition((10.0, 28.0), 35, 0.07) is None
-
-
 def test_a_wave_finer_than_a_stripe_is_followed_over_all_stripes() -> None:
     # Alike again after eight periods of half a stripe: more of them than stripes.
     assert find_repetition((0.5, 4.0), 5, 0.05) == 4.0

@@ -22,9 +22,6 @@ from bodyscan.files.model import (
 )
 from bodyscan.stripes.stripe_code import DEFAULT_CODE, ImageKind, StripeCode
 
-NOT_SHARED = ("stripes", "direction", "first_code")
-"""Keys that stripes and those that cross them do not have in common."""
-
 _CODES: dict[str, type[StripeCode]] = {}
 
 
@@ -43,12 +40,12 @@ def register(*codes: type[StripeCode]) -> None:
 
 
 def image_kinds() -> tuple[ImageKind, ...]:
-    """The kinds of images of all codes."""
+    """List the kinds of images of all codes."""
     return tuple(dict.fromkeys(kind for code in _CODES.values() for kind in code.kinds))
 
 
-def stripe_code(keys: Any) -> Any:
-    """The StripeCode that a rig file's `projector` describes; returns what is not a mapping
+def parse_stripe_code(keys: Any) -> Any:
+    """Parse the StripeCode that a rig file's `projector` describes; anything but a mapping is returned
     unchanged.
 
     Keys without a value (null) count as not given. Raises pydantic's ValidationError.
@@ -60,20 +57,20 @@ def stripe_code(keys: Any) -> Any:
     errors = [] if code else [choice_error("code", str(name), _CODES)]
     fields = (code or StripeCode).model_fields
     common = StripeCode.model_fields
-    keys, crossing, amiss = _with_crossing(keys)
-    errors += amiss
+    keys, crossing, crossing_errors = _split_crossing(keys)
+    errors += crossing_errors
     for key, value in keys.items():
         if key not in fields and value is not None:
             errors += _key_errors(key, code, fields)
-    own = {
+    values = {
         key: value
         for key, value in keys.items()
         if key in fields and (key in common or value is not None)
     }
     if code is None:
-        code, own["code"] = _CODES[DEFAULT_CODE], DEFAULT_CODE
+        code, values["code"] = _CODES[DEFAULT_CODE], DEFAULT_CODE
     try:
-        found = code.model_validate_json(json.dumps(own), strict=True)
+        found = code.model_validate_json(json.dumps(values), strict=True)
         if crossing is not None:
             found = code.model_validate({**dict(found), "crossing": crossing})
     except ValidationError as refused:
@@ -83,37 +80,40 @@ def stripe_code(keys: Any) -> Any:
     return found
 
 
-def _with_crossing(
+def _split_crossing(
     keys: dict[str, Any],
 ) -> tuple[dict[str, Any], StripeCode | None, list[InitErrorDetails]]:
-    """A projector's keys without `crossing`, the code it describes, and what is wrong with it.
+    """Split off `crossing` from a projector's keys; returns the others, the code that it describes,
+    and its errors.
 
-    Crossing stripes of the same code share its keys, except those in NOT_SHARED.
+    Crossing stripes of the same code share its keys, except those that no two directions share.
     """
-    own = {key: value for key, value in keys.items() if key != "crossing"}
+    others = {key: value for key, value in keys.items() if key != "crossing"}
     given = keys.get("crossing")
     if given is None or isinstance(given, StripeCode):
-        return own, given, []
+        return others, given, []
     if not isinstance(given, dict):
-        wrong = "must be a mapping (key: value): those of the projector's keys that are others"
-        return own, None, [problem_error((("crossing",), wrong))]
-    name = own.get("code", DEFAULT_CODE)
-    alike = given.get("code", name) == name
-    shared = {key: value for key, value in own.items() if key not in NOT_SHARED} if alike else {}
-    across = "vertical" if own.get("direction") == "horizontal" else "horizontal"
+        wrong = "must be a mapping (key: value): those of the projector's keys that differ"
+        return others, None, [problem_error((("crossing",), wrong))]
+    name, shared = others.get("code", DEFAULT_CODE), {}
+    if given.get("code", name) == name:
+        not_shared = ("stripes", "direction", "first_code")
+        shared = {key: value for key, value in others.items() if key not in not_shared}
+    across = "vertical" if others.get("direction") == "horizontal" else "horizontal"
     try:
-        return own, stripe_code({"direction": across, **shared, **given}), []
+        return others, parse_stripe_code({"direction": across, **shared, **given}), []
     except ValidationError as refused:
         errors = repeated_errors(refused)
-        its_own = [error for error in errors if error["loc"][:1] not in [(k,) for k in shared]]
-        told = its_own or errors  # a mistake in both is reported for the first
-        return own, None, [{**error, "loc": ("crossing", *error["loc"])} for error in told]
+        specific = [error for error in errors if error["loc"][:1] not in [(k,) for k in shared]]
+        # A mistake in both is reported for the first direction.
+        errors = specific or errors
+        return others, None, [{**error, "loc": ("crossing", *error["loc"])} for error in errors]
 
 
 def _key_errors(
     key: str, code: type[StripeCode] | None, fields: dict[str, Any]
 ) -> list[InitErrorDetails]:
-    """Why a key does not belong to a code; nothing for a key that an unknown code may take."""
+    """Explain why a key does not belong to a code; nothing for a key that an unknown code may take."""
     takers = [name for name, other in _CODES.items() if key in other.model_fields]
     if not takers:
         return [unknown_key_error(key, fields)]
@@ -124,7 +124,7 @@ def _key_errors(
     return [problem_error(((key,), f"is for code: {wanted} (the code here is {here})"))]
 
 
-AnyStripeCode = Annotated[SerializeAsAny[StripeCode], BeforeValidator(stripe_code)]
+AnyStripeCode = Annotated[SerializeAsAny[StripeCode], BeforeValidator(parse_stripe_code)]
 """A model field that holds any of the codes."""
 
 for _module in pkgutil.iter_modules(__path__, f"{__name__}."):

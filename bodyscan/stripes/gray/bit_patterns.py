@@ -147,6 +147,7 @@ def read_words(
     return words
 
 
+@compiled
 def fill_from_codes(s: Floats, sigma: Floats, codes: NDArray[np.int32], coded: Mask) -> None:
     """Write s and its standard deviation (L, P) into `coded` pixels that have none, from a line
     fitted to the codes of the pixels around.
@@ -156,11 +157,6 @@ def fill_from_codes(s: Floats, sigma: Floats, codes: NDArray[np.int32], coded: M
     Codes are still right to about a stripe, and a line through several of them to a fraction. A
     pixel whose code is a stripe off the line of its neighbours gets none.
     """
-    _fill_from_codes(s, sigma, codes, coded)
-
-
-@compiled
-def _fill_from_codes(s: Floats, sigma: Floats, codes: NDArray[np.int32], coded: Mask) -> None:
     for row in range(codes.shape[0]):
         for x in range(codes.shape[1]):
             if coded[row, x] and math.isnan(s[row, x]):

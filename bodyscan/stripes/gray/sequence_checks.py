@@ -136,21 +136,22 @@ def _check_pairs(patterns: Greys, inverses: Greys, variance: Floats) -> Mask:
     clear = contrast >= CLEAR_SIGMAS * sigma
     if contrast.shape[1] >= 200:
         _check_visibility(patterns, inverses, contrast, clear)
-    finer, strong = contrast[-1], contrast[-1] >= 8.0 * sigma[-1]
+    finer, strong, wrong = contrast[-1], contrast[-1] >= 8.0 * sigma[-1], ""
     for bit in range(bits - 2, -1, -1):
         # Blurred stripes of the finest bit are a quarter as strong or less in a seventh of their
         # width (2 asin(1/4) / pi), next to their boundaries; coarser ones in half as much.
         weak = contrast[bit][strong] < 0.25 * finer[strong]
         max_share = 0.35 if bit >= bits - FINE_BITS else 0.15
         if weak.size >= 200 and np.mean(weak) > max_share:
-            raise DecodingFailed(
-                f"pattern and inverse look alike where finer ones differ clearly: bit {bit} "
-                f"({np.mean(weak):.0%} of the pixels)",
-                remedy="check whether a frame is missing, so that those behind it moved up, or "
-                "stands in another's place",
-            )
+            wrong = f"bit {bit} ({np.mean(weak):.0%} of the pixels)"
         finer = np.maximum(finer, contrast[bit])
         strong = strong | (contrast[bit] >= 8.0 * sigma[bit])
+    if wrong:  # the coarsest: frames behind it may have moved up
+        raise DecodingFailed(
+            f"pattern and inverse look alike where finer ones differ clearly: {wrong}",
+            remedy="check whether a frame is missing, so that those behind it moved up, or stands in "
+            "another's place",
+        )
     return np.asarray(clear[: max(bits - FINE_BITS, 1)].all(axis=0))
 
 

@@ -76,8 +76,8 @@ def decode_wave(
     check_wave_images(images, phases, usable)
     measured = measure_wave(phases, wave)
     noise = np.sqrt(variance[np.clip(measured.mean, 0, 255).astype(np.uint8)])
-    least = min_contrast(phases.dtype) / 2.0
-    usable &= measured.amplitude >= np.maximum(least, MIN_CONTRAST_TO_NOISE * noise)
+    floor = min_contrast(phases.dtype) / 2.0
+    usable &= measured.amplitude >= np.maximum(floor, MIN_CONTRAST_TO_NOISE * noise)
     coarse = (halves.astype(np.float32) + 0.5) / 2.0
     check_phase(measured.turn, coarse, usable)
     error = estimate_error(measured, usable, stripes)
@@ -288,10 +288,10 @@ def _explain_inconsistency(
 ) -> DecodingFailed:
     """The error to raise if the waves of most pixels do not agree, with keys that would fit."""
     rows = np.flatnonzero(read.bright.sum(axis=1) > 0)
-    some = lines[:, rows[:: max(1, len(rows) // 20)]]  # enough to try some sixty descriptions
+    some = lines[:, rows[:: max(1, len(rows) // 20)]]  # enough to tell
     orders = (
         (key, WaveReading.from_images(some, tried, stripes).order)
-        for key, tried in list_other_keys(waves, stripes)
+        for key, tried in list_other_keys(waves)
     )
     fitting = [(order.misfit, key) for key, order in orders if is_consistent(order)]
     best = min((misfit for misfit, _ in fitting), default=0.0)
@@ -307,13 +307,11 @@ def _explain_inconsistency(
     )
 
 
-def list_other_keys(
-    waves: tuple[Wave, ...], stripes: int
-) -> Iterator[tuple[str, tuple[Wave, ...]]]:
+def list_other_keys(waves: tuple[Wave, ...]) -> Iterator[tuple[str, tuple[Wave, ...]]]:
     """List other values of the keys in the rig file, as people mistake them, and their waves.
 
     Starts in steps of 30 degrees are for waves that are written as sines, or begin in the middle of a
-    step; both shifts; periods near the given ones, twice and half of them.
+    step.
     """
     other: Shift = "backward" if waves[0].shift == "forward" else "forward"
     for start in range(30, 360, 30):
@@ -323,23 +321,3 @@ def list_other_keys(
         back = tuple(replace(wave, shift=other) for wave in moved)
         yield f"`shift: {other}` with `start_deg: {degrees:g}`", back
     yield f"`shift: {other}`", tuple(replace(wave, shift=other) for wave in waves)
-    for k, wave in enumerate(waves):
-        for key, period in _list_other_periods(wave.period, stripes):
-            yield key, (*waves[:k], replace(wave, period=period), *waves[k + 1 :])
-
-
-def _list_other_periods(period: float, stripes: int) -> Iterator[tuple[str, float]]:
-    """Periods near the given one, twice and half of it, as people write them: whole numbers of
-    periods in all stripes, or of stripes in a period."""
-    for key, given in (("periods", stripes / period), ("period", period)):
-        whole = round(given)
-        if whole < 2 or abs(given - whole) > 1e-6 * given:
-            continue
-        reach = max(4, round(0.1 * whole))
-        near = range(max(2, whole - reach), min(whole + reach, stripes // 2) + 1)
-        twice = 2 * whole if 2 * whole <= stripes // 2 else whole
-        half = whole // 2 if whole % 2 == 0 and whole > 2 else whole
-        for other in dict.fromkeys((*near, twice, half)):
-            if other != whole:
-                length = stripes / other if key == "periods" else float(other)
-                yield f"`{key}` with {other} in place of {whole}", length

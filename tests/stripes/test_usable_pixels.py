@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 
 from bodyscan.arrays import Greys
-from bodyscan.errors import DecodingFailed, WrongDirection
-from bodyscan.stripes.numbered_stripes import check_order
 from bodyscan.stripes.scan_lines import ScanLines
 from bodyscan.stripes.stripe_map import find_whole_numbers
 from bodyscan.stripes.usable_pixels import (
@@ -121,86 +119,6 @@ def test_a_whole_number_is_known_as_well_as_the_pixels_beside_it() -> None:
         np.array([[0.9, 1.1]], np.float32), np.full((1, 2), 0.1, np.float32), 0
     )
     assert gentle.sigma_px[0] == pytest.approx(0.1 * np.sqrt(0.5) / 0.2, rel=1e-3)
-
-
-STRIPES = 12
-
-
-def shown_in_order(width: int = 4, lines: int = 30) -> np.ndarray:
-    return np.tile(np.repeat(np.arange(STRIPES), width), (lines, 1))
-
-
-def check(numbers: np.ndarray, good: np.ndarray | None = None, *, transposed: bool = False) -> None:
-    known = np.ones(numbers.shape, bool) if good is None else good
-    check_order(numbers, known, transposed, STRIPES)
-
-
-def exchanged(first: int, second: int) -> np.ndarray:
-    swapped = np.arange(STRIPES)
-    swapped[[first, second]] = second, first
-    return swapped[shown_in_order()]
-
-
-def test_stripes_that_follow_each_other_are_in_order_either_way() -> None:
-    check(shown_in_order())
-    check(shown_in_order()[:, ::-1])
-    check(np.zeros((30, 40), int))
-
-
-def test_two_exchanged_images_are_named() -> None:
-    with pytest.raises(DecodingFailed) as caught:
-        check(exchanged(3, 8))
-    assert "the lines of stripes 3, 8 are not next" in str(caught.value)
-    with pytest.raises(DecodingFailed) as caught:
-        check(exchanged(9, 2)[:, ::-1])
-    assert "the lines of stripes 2, 9 are not next" in str(caught.value)
-
-
-def test_a_missing_image_is_named() -> None:
-    without = shown_in_order()
-    without = without[:, without[0] != 5]
-    with pytest.raises(DecodingFailed, match="stripe 5 shows no line"):
-        check(without)
-    # Seen by one in ten of those that see its neighbours, it is there: they lie at a rim.
-    few = np.vstack([without[:27, :44], shown_in_order()[:4, :44]])
-    check(few)
-    # Seen by one in twenty it is there as well.
-    check(np.vstack([np.tile(without[0], (40, 1)), shown_in_order(lines=1)[:, :44]]))
-    # In fewer than 20 lines nothing is said.
-    check(without[:19])
-
-
-def test_images_in_any_order_are_refused_and_rims_are_not() -> None:
-    with pytest.raises(DecodingFailed, match="in 0% of the cases only"):
-        check(np.array([0, 6, 1, 7, 3, 9, 4, 10, 5, 11, 8, 2])[shown_in_order()][:, :48])
-    broken = shown_in_order()
-    broken[:, 20:] = np.roll(broken[:, 20:], 8, axis=1)  # one leap, the same everywhere
-    check(broken)
-    # Of few changes nothing is said: here one, in 19 lines.
-    check(np.tile([2, 2, 9, 9], (19, 1)))
-    with pytest.raises(DecodingFailed, match="in 0% of the cases only"):
-        check(np.tile([2, 2, 9, 9], (20, 1)))
-
-
-def test_three_of_five_changes_in_step_are_enough() -> None:
-    line = np.array([0, 1, 2, 5, 6, 9])
-    check(np.tile(np.repeat(line, 4), (30, 1)))
-    with pytest.raises(DecodingFailed, match="in 50% of the cases only"):
-        check(np.tile(np.repeat(line[1:], 4), (30, 1)))
-
-
-def test_what_is_not_good_does_not_count() -> None:
-    numbers, good = shown_in_order(), np.ones((30, 48), bool)
-    numbers[:, 21], good[:, 21] = 11, False
-    check(numbers, good)
-
-
-def test_stripes_that_run_along_the_lines_are_of_another_direction() -> None:
-    along = np.repeat(np.arange(STRIPES), 4)[:, None] * np.ones((1, 40), int)
-    with pytest.raises(WrongDirection, match="run horizontally in the picture, not vertically"):
-        check(along)
-    with pytest.raises(WrongDirection, match="run vertically in the picture, not horizontally"):
-        check(along, transposed=True)
 
 
 def test_pixels_beside_a_jump_show_a_code_that_cannot_be_relied_on() -> None:
