@@ -16,8 +16,7 @@ from bodyscan.calibration.board_views import LocatedView
 from bodyscan.calibration.boundary_points import BoundaryPoints, concatenate
 from bodyscan.calibration.camera import CameraCalibration
 from bodyscan.calibration.light_sheets import fit_light_sheets, fit_planes
-from bodyscan.calibration.pinhole_projector import fit_pinhole
-from bodyscan.calibration.sheet_fit import fit_sheets
+from bodyscan.calibration.sheet_fit import fit_pinhole, fit_sheets
 from bodyscan.calibration.striped_view import BoardBoundaries, StripedView, on_board
 from bodyscan.captures.folder import Captures
 from bodyscan.errors import PairFailed

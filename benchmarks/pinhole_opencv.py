@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from bodyscan.arrays import Array
-from bodyscan.calibration.pinhole_projector import PinholeProjector
+from bodyscan.calibration.sheet_fit import PinholeProjector
 from bodyscan.geometry.camera import Camera
 
 

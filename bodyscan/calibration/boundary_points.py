@@ -1,4 +1,4 @@
-"""Stripe boundaries seen on boards of known pose: what light sheets are fitted to (Eq. 18)."""
+"""Stripe boundaries on boards of known pose: the points that light sheets are fitted to (Eq. 18)."""
 
 from __future__ import annotations
 
@@ -13,21 +13,13 @@ from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.light_planes import Axis
 from bodyscan.geometry.transforms import RigidTransform
 
-BENDS = 2
-"""Iterations that lift a ray's point to a bent board's surface; the first alone is off by how much
-the board rises over a few tenths of a millimetre."""
-
-FEWEST_BOUNDARIES = 10
-"""A projector with a lens has eleven unknowns, of which one boundary on tilted boards determines
-three. Large images have thousands of points a boundary: of whole ones two were left to start from."""
-
 Height = Callable[[Array], Array]
-"""Maps places (..., 2) mm of a board to heights (...) mm above its plane."""
+"""Maps (..., 2) mm of a board to heights (...) mm above its plane."""
 
 
 @dataclass(frozen=True, eq=False)
 class BoundaryPoints:
-    """Stripe boundaries of one pair carried onto its boards, camera frame.
+    """Stripe boundaries of one pair, intersected with its boards, camera frame.
 
     index: boundary i, where s = i, (N,).
     board: number of the shot, (N,).
@@ -51,9 +43,9 @@ class BoundaryPoints:
 def points_on_board(
     camera: Camera, camera_from_board: RigidTransform, pixels: Array, height: Height | None = None
 ) -> Array:
-    """Carry pixels (N, 2) onto a board, camera frame (N, 3) mm (Eq. 18).
+    """Intersect the rays of pixels (N, 2) with a board, camera frame (N, 3) mm (Eq. 18).
 
-    Onto the board's plane z = 0, or onto its surface if `height` is given.
+    With the board's plane z = 0, or with its surface if `height` is given.
     """
     return rays_on_board(camera.rays(pixels), camera_from_board, height)
 
@@ -61,23 +53,23 @@ def points_on_board(
 def rays_on_board(
     rays: Array, camera_from_board: RigidTransform, height: Height | None = None
 ) -> Array:
-    """Where rays (..., 3), camera frame, meet a board, (..., 3) mm.
-
-    They meet its plane z = 0, or its surface if `height` is given.
+    """Intersect rays (..., 3), camera frame, with a board: with its plane z = 0, or with its surface
+    if `height` is given; (..., 3) mm.
     """
     normal = camera_from_board.rotation[:, 2]
     flat = rays * (normal @ camera_from_board.translation / (rays @ normal))[..., None]
     if height is None:
         return flat
     points, board_from_camera = flat, camera_from_board.inverse()
-    for _ in range(BENDS):
-        here = height(board_from_camera.apply(points)[..., :2])
-        points = flat + lifts(rays, camera_from_board, here)
+    # One iteration errs by how much the board rises over a few tenths of a millimetre.
+    for _ in range(2):
+        heights = height(board_from_camera.apply(points)[..., :2])
+        points = flat + lifts(rays, camera_from_board, heights)
     return points
 
 
 def lifts(rays: Array, camera_from_board: RigidTransform, height: Array) -> Array:
-    """How far points move along their rays (..., 3) for a board `height` mm above its plane."""
+    """Displacement of points along their rays (..., 3) for a board `height` mm above its plane."""
     return np.asarray(rays * (height / (rays @ camera_from_board.rotation[:, 2]))[..., None])
 
 
@@ -92,14 +84,14 @@ def boundary_points(
     direction: Axis,
     height: Height | None = None,
 ) -> BoundaryPoints:
-    """Carry boundary pixels (N, 2) of one shot onto its board, flat unless `height` is given."""
+    """Intersect boundary pixels (N, 2) of one shot with its board, flat unless `height` is given."""
     rays, across = camera.rays(pixels), 1 if direction == "horizontal" else 0
     half = np.zeros_like(rays)
     half[:, :2] = 0.5 * camera.rays_by_pixels(rays)[..., across]
-    here, after, before = (
+    points, after, before = (
         rays_on_board(rays + step, camera_from_board, height) for step in (0.0 * half, half, -half)
     )
-    return BoundaryPoints(index, np.full(len(index), board), here, after - before, sigma_px)
+    return BoundaryPoints(index, np.full(len(index), board), points, after - before, sigma_px)
 
 
 def concatenate(parts: Sequence[BoundaryPoints]) -> BoundaryPoints:
@@ -113,19 +105,22 @@ def concatenate(parts: Sequence[BoundaryPoints]) -> BoundaryPoints:
 
 
 def select(data: BoundaryPoints, kept: Mask | Indices) -> BoundaryPoints:
-    """The points where `kept` (N,) is true, or of these numbers."""
+    """Select the points where `kept` (N,) is true, or with these indices."""
     return BoundaryPoints(*(getattr(data, field.name)[kept] for field in fields(data)))
 
 
-def subsample(data: BoundaryPoints, most: int) -> BoundaryPoints:
-    """Keep about `most` points: every n-th boundary, whole unless that would leave fewer than
-    FEWEST_BOUNDARIES."""
-    every = -(-len(data.index) // most)
+def subsample(data: BoundaryPoints, max_points: int) -> BoundaryPoints:
+    """Keep about `max_points` points: every n-th boundary, as a whole if at least ten are left.
+
+    A projector with a lens has eleven unknowns, of which one boundary on tilted boards determines
+    three; large images have thousands of points a boundary.
+    """
+    every = -(-len(data.index) // max_points)
     if every <= 1:
         return data
     _, rank = np.unique(data.index, return_inverse=True)
     boundaries = int(rank.max()) + 1
-    step = min(every, max(boundaries // FEWEST_BOUNDARIES, 1))
+    step = min(every, max(boundaries // 10, 1))
     kept = np.flatnonzero(rank % step == min(step // 2, boundaries - 1))
     return select(data, kept[:: -(-every // step)])
 
@@ -134,8 +129,8 @@ def subsample(data: BoundaryPoints, most: int) -> BoundaryPoints:
 class BoardErrors:
     """How a small error of a board's pose moves its points.
 
-    effects: (N, 3): 1 for the board's shift, and a point's place on it (of unit variance) for its
-        two tilts.
+    effects: (N, 3): 1 for the board's shift, and a point's two coordinates on it (of unit variance)
+        for its tilts.
     along_ray: (N, 3) mm by which a point moves along its ray per mm of an effect along the normal.
     facing: (N,) |normal . ray|: mm from the board per mm of depth.
     """
@@ -150,17 +145,17 @@ def _board_errors(data: BoundaryPoints) -> BoardErrors:
     count = np.bincount(board)[:, None]
     centred = data.points - (_by_board(data.points, board) / count)[board]
     products = (centred[:, :, None] * centred[:, None]).reshape(-1, 9)
-    squares, axes = np.linalg.eigh(_by_board(products, board).reshape(-1, 3, 3))
-    size = np.sqrt(np.maximum(squares[:, 1:] / count, 1e-18))
-    place = np.einsum("ni,nij->nj", centred, axes[board][..., 1:]) / size[board]
+    eigenvalues, axes = np.linalg.eigh(_by_board(products, board).reshape(-1, 3, 3))
+    size = np.sqrt(np.maximum(eigenvalues[:, 1:] / count, 1e-18))
+    scaled = np.einsum("ni,nij->nj", centred, axes[board][..., 1:]) / size[board]
     outward = np.einsum("ni,ni->n", axes[board][..., 0], data.points)
     return BoardErrors(
-        np.column_stack([np.ones(len(place)), place]),
+        np.column_stack([np.ones(len(scaled)), scaled]),
         data.points / outward[:, None],
         np.abs(outward / data.points[:, 2]),
     )
 
 
 def _by_board(values: Array, board: Indices) -> Array:
-    """Sums (B, K) of values (N, K) over each board's points."""
+    """Sum values (N, K) over each board's points, (B, K)."""
     return np.stack([np.bincount(board, column) for column in values.T], axis=-1)

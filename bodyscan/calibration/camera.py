@@ -1,4 +1,4 @@
-"""Maximum-likelihood calibration of a camera and its board poses, with covariance (3.1)."""
+"""Calibrate a camera and its board poses by maximum likelihood, with covariance (3.1)."""
 
 from __future__ import annotations
 
@@ -23,10 +23,8 @@ from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 from bodyscan.geometry.uncertainty import RayUncertainty
 
-FEWEST_POSES = 3
-SETTLED = 1e-6
-DAMPING = 1e-3
-CHAPTERS_LENS = Radial()
+MIN_POSES = 3
+CHAPTER_LENS = Radial()
 CORNERS = Noise("corners", group=2, cauchy=4.0)
 
 
@@ -67,7 +65,7 @@ class CameraCalibration:
 
 @dataclass(frozen=True, eq=False)
 class CameraFit:
-    """A camera with `camera_from_board` of each view, as fitted to them."""
+    """A camera and `camera_from_board` of each view, fitted to them by least squares."""
 
     solution: Solution[_State]
 
@@ -81,14 +79,14 @@ class CameraFit:
 
     @property
     def residuals(self) -> tuple[Array, ...]:
-        """Of each view, (N, 2) px."""
+        """Reprojection errors of each view, (N, 2) px."""
         corners = self.solution.blocks[0]
-        return _by_view(corners.residuals.reshape(-1, 2), corners)
+        return _split_by_view(corners.residuals.reshape(-1, 2), corners)
 
     @property
     def weights(self) -> tuple[Array, ...]:
         """Robust weights of each view's corners, (N,)."""
-        return _by_view(self.solution.weights[0][::2], self.solution.blocks[0])
+        return _split_by_view(self.solution.weights[0][::2], self.solution.blocks[0])
 
     @cached_property
     def covariance(self) -> Array:
@@ -102,7 +100,7 @@ class CameraFit:
         return weighted_rms(self.residuals, self.weights)
 
     def calibration(self, views: Sequence[PlanarView]) -> CameraCalibration:
-        """The calibration that this fit gives; views: those it was fitted to."""
+        """Convert to a CameraCalibration; views: those it was fitted to."""
         shots = [view.shot for view in views]
         return CameraCalibration(
             self.camera,
@@ -118,19 +116,19 @@ class _State:
     camera: Camera
     poses: tuple[RigidTransform, ...]
 
-    def moved(self, step: Array) -> _State:
+    def retract(self, step: Array) -> _State:
         size = len(self.camera.parameters)
-        return _State(self.camera.retract(step[:size]), self.boards_moved(step[size:]).poses)
+        return _State(self.camera.retract(step[:size]), self.retract_poses(step[size:]).poses)
 
-    def boards_moved(self, step: Array) -> _State:
+    def retract_poses(self, step: Array) -> _State:
         twists = zip(self.poses, step.reshape(-1, 6), strict=True)
         return _State(self.camera, tuple(pose.retract(twist) for pose, twist in twists))
 
 
 def calibrate_camera(
-    views: Sequence[PlanarView], width: int, height: int, lens: Lens = CHAPTERS_LENS
+    views: Sequence[PlanarView], width: int, height: int, lens: Lens = CHAPTER_LENS
 ) -> CameraCalibration:
-    """Zhang's method with skew, and a lens of the same kind as `lens`, which is the start.
+    """Calibrate a camera by Zhang's method, with skew and a lens of the kind of `lens`, the start.
 
     Raises DegeneratePoses for fewer than three poses, or poses that differ only by a translation.
     """
@@ -144,7 +142,7 @@ def calibrate_known_camera(views: Sequence[PlanarView], camera: Camera) -> Camer
     """
     if not views:
         raise DegeneratePoses(
-            "no board was seen well enough by a camera that is known",
+            "no board view of a camera that is known has enough corners",
             remedy="show it the board in a shot that others see too",
         )
     poses = [locate_board(camera, view)[0] for view in views]
@@ -152,12 +150,12 @@ def calibrate_known_camera(views: Sequence[PlanarView], camera: Camera) -> Camer
 
 
 def fit_from_scratch(
-    views: Sequence[PlanarView], width: int, height: int, lens: Lens = CHAPTERS_LENS
+    views: Sequence[PlanarView], width: int, height: int, lens: Lens = CHAPTER_LENS
 ) -> CameraFit:
-    """The fit behind `calibrate_camera`."""
-    if len(views) < FEWEST_POSES:
+    """Fit camera and board poses as `calibrate_camera` does."""
+    if len(views) < MIN_POSES:
         raise DegeneratePoses(
-            f"{len(views)} usable board poses, at least {FEWEST_POSES} are needed",
+            f"{len(views)} usable board poses, at least {MIN_POSES} are needed",
             remedy="capture the board in more poses, tilted differently, well inside the image",
         )
     homographies = [homography(view.points[:, :2], view.pixels) for view in views]
@@ -176,72 +174,65 @@ def fit_camera(
     poses: Sequence[RigidTransform],
     views: Sequence[PlanarView],
     *,
-    settled: float = SETTLED,
-    damping: float = DAMPING,
+    tolerance: float = 1e-6,
+    damping: float = 1e-3,
 ) -> CameraFit:
     """Fit camera and board poses by least squares, starting from those given.
 
     poses: `camera_from_board` of each view.
-    settled, damping: see `minimize`.
+    tolerance, damping: see `minimize`.
     """
     size = len(camera.parameters)
     solution = minimize(
         _State(camera, tuple(poses)),
         lambda state: [
-            _corners_of_all(state, views),
-            known_beforehand(state.camera, np.arange(size)),
+            _corner_block(state, views),
+            camera_prior(state.camera, np.arange(size)),
         ],
-        _State.moved,
+        _State.retract,
         unknowns=size + 6 * len(views),
-        tolerance=settled,
+        tolerance=tolerance,
         damping=damping,
     )
     return CameraFit(solution)
 
 
 def weighted_rms(residuals: Sequence[Array], weights: Sequence[Array]) -> float:
-    """Weighted RMS of distances (N, 2) px with weights (N,), given view by view."""
+    """Compute the weighted RMS length of residuals (N, 2) px, given view by view."""
     weight = np.concatenate(weights)
     squared = np.sum(np.concatenate(residuals) ** 2, axis=1)
     return float(np.sqrt(np.sum(weight * squared) / np.sum(weight)))
 
 
-def known_beforehand(camera: Camera, columns: Indices) -> Block:
-    """The prior on a camera: its own if it has one, otherwise that its lens bends little.
+def camera_prior(camera: Camera, columns: Indices) -> Block:
+    """Residuals of the prior of a camera: the one it has, otherwise that its lens distorts little.
 
-    columns: indices of the camera's parameters among the unknowns.
+    The latter keeps coefficients that the boards do not determine, or only their sum, from growing
+    without limit. columns: indices of the camera's parameters among the unknowns.
     """
     if camera.prior is None:
-        return lens_prior(camera, columns[len(MATRIX) :])
-    known = 1.0 / camera.prior.sigmas
-    away = known * (camera.parameters - camera.prior.parameters)
-    return Block(away, lambda: np.diag(known), columns, EXACT)
-
-
-def lens_prior(camera: Camera, columns: Indices) -> Block:
-    """The prior on the lens: that it bends little.
-
-    It keeps coefficients that the boards leave open, or of which they give only the sum, from
-    running away. columns: indices of the coefficients among the unknowns.
-    """
-    known = 1.0 / camera.lens.prior_sigmas
-    return Block(known * camera.lens.coefficients, lambda: np.diag(known), columns, EXACT)
+        weights = 1.0 / camera.lens.prior_sigmas
+        residuals = weights * camera.lens.coefficients
+        return Block(residuals, lambda: np.diag(weights), columns[len(MATRIX) :], EXACT)
+    weights = 1.0 / camera.prior.sigmas
+    residuals = weights * (camera.parameters - camera.prior.parameters)
+    return Block(residuals, lambda: np.diag(weights), columns, EXACT)
 
 
 def locate_board(
     camera: Camera, view: PlanarView, start: RigidTransform | None = None
 ) -> tuple[RigidTransform, Array]:
-    """`camera_from_board` of one view for a known camera, and the residuals (N, 2) px."""
-    begun = roughly_located(camera, view) if start is None else start
-    (pose,), (residuals,) = locate_boards(camera, [view], [begun])
+    """Fit `camera_from_board` of one view with a known camera; also return residuals (N, 2) px."""
+    start = pose_from_homography(camera, view) if start is None else start
+    (pose,), (residuals,) = locate_boards(camera, [view], [start])
     return pose, residuals
 
 
-def roughly_located(camera: Camera, view: PlanarView) -> RigidTransform:
-    """`camera_from_board` of one view from its homography: a start for `locate_boards`."""
+def pose_from_homography(camera: Camera, view: PlanarView) -> RigidTransform:
+    """Estimate `camera_from_board` of one view linearly: a start for `locate_boards`."""
     # Where the lens folds there is no ray: use the pixel with the lens ignored.
-    seen = camera.rays(view.pixels)[:, :2]
-    normalized = np.where(np.isfinite(seen), seen, camera.normalized_from_pixels(view.pixels))
+    rays = camera.rays(view.pixels)[:, :2]
+    normalized = np.where(np.isfinite(rays), rays, camera.normalized_from_pixels(view.pixels))
     return camera_from_plane(homography(view.points[:, :2], normalized), float(view.points[0, 2]))
 
 
@@ -250,22 +241,22 @@ def locate_boards(
     views: Sequence[PlanarView],
     starts: Sequence[RigidTransform],
     *,
-    settled: float = SETTLED,
+    tolerance: float = 1e-6,
 ) -> tuple[tuple[RigidTransform, ...], tuple[Array, ...]]:
-    """`camera_from_board` of each view for a known camera, and residuals (N, 2) px of each.
+    """Fit `camera_from_board` of each view with a known camera; also return residuals (N, 2) px.
 
     All corners share one noise level.
     """
     solution = minimize(
         _State(camera, tuple(starts)),
-        lambda state: [_corners_of_all(state, views, camera_free=False)],
-        _State.boards_moved,
+        lambda state: [_corner_block(state, views, camera_free=False)],
+        _State.retract_poses,
         unknowns=6 * len(views),
         steps=30,
-        tolerance=settled,
+        tolerance=tolerance,
     )
     corners = solution.blocks[0]
-    return solution.state.poses, _by_view(corners.residuals.reshape(-1, 2), corners)
+    return solution.state.poses, _split_by_view(corners.residuals.reshape(-1, 2), corners)
 
 
 def _camera(matrix: Array, lens: Lens, width: int, height: int) -> Camera:
@@ -281,15 +272,14 @@ def _camera(matrix: Array, lens: Lens, width: int, height: int) -> Camera:
     )
 
 
-def _corners_of_all(
-    state: _State, views: Sequence[PlanarView], *, camera_free: bool = True
-) -> Block:
+def _corner_block(state: _State, views: Sequence[PlanarView], *, camera_free: bool = True) -> Block:
     """Reprojection errors, px, one run for each view.
 
     Derivatives are by the camera's parameters, which come first if free, and by the board's pose.
     """
-    placed = zip(state.poses, views, strict=True)
-    points = np.concatenate([pose.apply(view.points) for pose, view in placed])
+    points = np.concatenate(
+        [pose.apply(view.points) for pose, view in zip(state.poses, views, strict=True)]
+    )
     pixels = np.concatenate([view.pixels for view in views])
     camera = state.camera
     size = len(camera.parameters) if camera_free else 0
@@ -309,7 +299,7 @@ def _corners_of_all(
     )
 
 
-def _by_view(values: Array, corners: Block) -> tuple[Array, ...]:
-    """Split the values of a block's corners by view."""
+def _split_by_view(values: Array, corners: Block) -> tuple[Array, ...]:
+    """Split values of a block's corners by view."""
     assert corners.runs is not None
     return tuple(np.split(values, np.cumsum(corners.runs)[:-1] // 2))

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bodyscan.arrays import Array, Indices
-from bodyscan.calibration.pinhole_projector import fit_pinhole
+from bodyscan.calibration.sheet_fit import fit_pinhole
 from bodyscan.errors import BadInput
 from bodyscan.geometry.camera import MATRIX, Camera
 from bodyscan.geometry.least_squares import EXACT, Block, minimize

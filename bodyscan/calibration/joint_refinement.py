@@ -1,100 +1,224 @@
-"""Refine camera, board poses and light sheets of one pair together, on corners and stripes.
+"""Refine camera, board poses, board shapes and light sheets of one pair in a single solve.
 
-Stripes are straight-edged light on a flat board: they fix how boards lie relative to each other far
-more finely than 48 corners do, and corners fix the scale. Only for sheets that are smooth in s,
-whose few parameters are unknowns like any other.
+Stripes are straight-edged light on a nearly flat board: they determine how boards lie relative to
+each other far more finely than 48 corners do, and corners determine the scale. Boards are neither
+flat nor printed exactly: their warp and print are unknowns with priors, so that whatever a few poses
+leave open enters every covariance. Only for sheets that are smooth in s.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, Generic, TypeVar
 
 import numpy as np
 
 from bodyscan.arrays import Array, Indices
-from bodyscan.calibration.board_form import POWERS, BoardForm, PrintSpread
-from bodyscan.calibration.board_views import PlanarView
-from bodyscan.calibration.boundary_points import (
-    BoundaryPoints,
-    boundary_points,
-    lifts,
-    rays_on_board,
-)
-from bodyscan.calibration.camera import known_beforehand
-from bodyscan.calibration.held_out import CLEARLY
+from bodyscan.calibration.board_views import BoardFace, PlanarView, corner_keys, match_corners
+from bodyscan.calibration.boundary_points import BoundaryPoints, lifts, rays_on_board
+from bodyscan.calibration.camera import camera_prior
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.least_squares import EXACT, Block, Noise, Solution, minimize
-from bodyscan.geometry.light_planes import Axis
-from bodyscan.geometry.linear_gaussian import invert_scaled
 from bodyscan.geometry.smooth_sheets import SmoothSheets
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 
 Sheets = TypeVar("Sheets", bound=SmoothSheets)
 
-STEPS = 20
-SETTLED = 1e-2
-"""Convergence, in variances: a tenth of a sigma in every unknown makes no difference."""
+WARP_POWERS = ((2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
 CORNERS = Noise("corners, px", group=2, cauchy=4.0, min_scale=1e-3)
 STRIPES = Noise("stripes, in sigmas", cauchy=4.0, min_scale=1e-2)
-FLOOR_PX = 0.02
-LEAST_SHOWN = 1e-6
-"""Information on a print below this share of the best-known direction's counts as none."""
-SPREADS_MM = np.append(0.0, np.geomspace(1e-3, 1.0, 121))
-AS_WELL = 1e-7
-"""Relative change of depth at which the sheets' prior takes effect when they stand in for rays."""
-TWIST_STEPS = (*[1e-6] * 3, *[1e-3] * 3)
-"""Radians and mm: steps for derivatives of a boundary point by its board's motion."""
 
 
 @dataclass(frozen=True, eq=False)
 class StripedBoard:
-    """One shot: its corners and the stripe boundaries on it.
+    """One observation of a board: its corners, and the stripe boundaries on it, if any.
 
-    pixels: boundary points, (N, 2) px.
+    board: its name.
+    pixels: of boundary points, (N, 2) px.
     index: their boundaries, s = i, (N,).
     sigma_px: (N,).
     across: unit vector across the stripes in the image, (2,).
-    board: the board's name.
+    face: the face that was seen, if corners alone already gave it a shape.
     """
 
+    board: str
     view: PlanarView
     pixels: Array
     index: Array
     sigma_px: Array
     across: Array
-    board: str
+    face: BoardFace | None = None
+
+    @staticmethod
+    def from_points(
+        board: str,
+        view: PlanarView,
+        camera: Camera,
+        points: BoundaryPoints,
+        face: BoardFace | None = None,
+    ) -> StripedBoard:
+        """Turn the boundary points of one board, on it by `camera`, into pixels again."""
+        pixels = camera.project(points.points)
+        across = np.array([1.0, 0.0])
+        if len(pixels):
+            across = np.median(camera.project(points.points + points.per_pixel) - pixels, axis=0)
+            across /= np.linalg.norm(across)
+        sigma_px = np.hypot(points.sigma_px, 0.02)  # no lens is known better than that
+        return StripedBoard(board, view, pixels, points.index.astype(float), sigma_px, across, face)
+
+    @cached_property
+    def board_from_face(self) -> RigidTransform:
+        z_mm = self.face.z_mm if self.face else self.view.points[0, 2]
+        return RigidTransform.from_translation([0.0, 0.0, z_mm])
+
+
+@dataclass(frozen=True, eq=False)
+class BoardWarp:
+    """Deviation of a board from its description, as unknowns with a Gaussian prior.
+
+    points: corners as described, (N, 3) mm.
+    heights: coefficients of WARP_POWERS, each less its best plane, (7,) mm; x and y are -1 and 1 at
+        the outermost corners.
+    printed: displacement of corners within the sheet, (N, 2) mm.
+    flatness_mm, print_mm: prior standard deviations of heights and printed.
+    """
+
+    points: Array
+    heights: Array
+    printed: Array
+    flatness_mm: float
+    print_mm: float
+
+    @staticmethod
+    def flat(points: Array, flatness_mm: float, print_mm: float) -> BoardWarp:
+        """Describe a board without deviation; points (M, 3) are the corners of any views given."""
+        known = np.unique(corner_keys(points), axis=0)
+        heights, printed = np.zeros(len(WARP_POWERS)), np.zeros((len(known), 2))
+        return BoardWarp(known, heights, printed, flatness_mm, print_mm)
+
+    @property
+    def count(self) -> int:
+        """Number of unknowns: heights, then the corners' x and y."""
+        return len(self.heights) + self.printed.size
+
+    @property
+    def prior(self) -> tuple[Array, Array]:
+        """Residuals of the prior, (count,), and their derivatives by the unknowns, (count, count).
+
+        Terms of third degree are expected to be three tenths of those of second degree.
+        """
+        heights = [self.flatness_mm * (1.0 if sum(power) == 2 else 0.3) for power in WARP_POWERS]
+        sigmas = np.append(heights, np.full(self.printed.size, self.print_mm))
+        sigmas = np.maximum(sigmas, 1e-6)  # a nanometre where a board is said to be exact
+        unknowns = np.append(self.heights, self.printed.ravel())
+        return unknowns / sigmas, np.diag(1.0 / sigmas)
+
+    @property
+    def out_of_plane_mm(self) -> float:
+        """Height from the lowest to the highest corner, mm."""
+        return float(np.ptp(self.basis(self.points[:, :2]) @ self.heights))
+
+    def retract(self, step: Array) -> BoardWarp:
+        """Add a step (count,) to the unknowns."""
+        heights, printed = np.split(step, [len(WARP_POWERS)])
+        return replace(
+            self, heights=self.heights + heights, printed=self.printed + printed.reshape(-1, 2)
+        )
+
+    def basis(self, xy: Array) -> Array:
+        """Height at (..., 2) mm of the board per unit of each of `heights`, (..., 7)."""
+        powers, plane = self._powers(xy)
+        return np.asarray(powers - plane @ self._best_planes, np.float64)
+
+    def height(self, xy: Array) -> Array:
+        """Heights (...) mm above the described surface at (..., 2) mm of the board."""
+        powers, plane = self._powers(xy)
+        return np.asarray(powers @ self.heights - plane @ (self._best_planes @ self.heights))
+
+    def apply(self, points: Array) -> Array:
+        """Displace described corners (M, 3) mm to where they lie."""
+        shift = self.printed[match_corners(points, self.points)]
+        return points + np.column_stack([shift, self.height(points[:, :2])])
+
+    @cached_property
+    def _best_planes(self) -> Array:
+        """Best plane of each power at the corners, (3, 7)."""
+        powers, plane = self._powers(self.points[:, :2])
+        return np.asarray(np.linalg.lstsq(plane, powers, rcond=None)[0])
+
+    def _powers(self, xy: Array) -> tuple[Array, Array]:
+        """WARP_POWERS (..., 7) and 1, x, y (..., 3) at (..., 2) mm."""
+        low, high = self.points[:, :2].min(axis=0), self.points[:, :2].max(axis=0)
+        x, y = np.moveaxis((xy - (low + high) / 2.0) / ((high - low) / 2.0), -1, 0)
+        powers = np.stack([x**i * y**j for i, j in WARP_POWERS], axis=-1)
+        return powers, np.stack([np.ones_like(x), x, y], axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
 class JointFit(Generic[Sheets]):
     """The fit to corners and stripes together.
 
+    camera_from_board: of each board, in the order given.
     camera_covariance: (P, P).
     corners_rms_px: robustly weighted.
-    forms: of the boards, by name.
+    warps: of the boards, by name.
     """
 
     camera: Camera
-    camera_from_board: dict[str, RigidTransform]
+    camera_from_board: tuple[RigidTransform, ...]
     sheets: Sheets
     camera_covariance: Array
     corners_rms_px: float
-    forms: dict[str, BoardForm]
+    warps: dict[str, BoardWarp]
+
+
+def refine_jointly(
+    camera: Camera,
+    camera_from_board: Sequence[RigidTransform],
+    sheets: Sheets,
+    boards: Sequence[StripedBoard],
+    flatness_mm: Mapping[str, float],
+    *,
+    print_mm: float = 0.05,
+) -> JointFit[Sheets]:
+    """Refine camera, board poses and shapes, and sheets by maximum a posteriori estimation.
+
+    camera, camera_from_board, sheets: found one after the other, where the solve starts.
+    boards: every observation that the camera is calibrated from, with stripes or without.
+    flatness_mm: prior standard deviation of the warp of each board, by name.
+    print_mm: of each printed corner, per axis: what office printers and plotters do.
+    """
+    points = {
+        name: np.concatenate([one.view.points for one in boards if one.board == name])
+        for name in flatness_mm
+    }
+    warps = {name: BoardWarp.flat(points[name], mm, print_mm) for name, mm in flatness_mm.items()}
+    start = _State(camera, tuple(camera_from_board), sheets, warps)
+    solution = minimize(
+        start,
+        lambda state: _blocks(state, boards),
+        lambda state, step: state.retract(step),
+        unknowns=start.count,
+        steps=20,
+        tolerance=1e-2,  # within a tenth of a sigma in every unknown
+        damping=1e-6,
+    )
+    return _fit(solution, boards)
 
 
 @dataclass(frozen=True, eq=False)
 class _State(Generic[Sheets]):
+    """Camera, poses, sheets and warps; their unknowns follow one another in this order."""
+
     camera: Camera
     poses: tuple[RigidTransform, ...]
     sheets: Sheets
-    forms: dict[str, BoardForm]
+    warps: dict[str, BoardWarp]
 
     @property
     def first_pose(self) -> int:
-        """Index of the first pose among the unknowns; the camera's parameters come before."""
         return len(self.camera.parameters)
 
     @property
@@ -102,396 +226,205 @@ class _State(Generic[Sheets]):
         return self.first_pose + 6 * len(self.poses)
 
     @property
-    def first_form(self) -> int:
+    def first_warp(self) -> int:
         return self.first_sheet + self.sheets.prior()[1].shape[1]
 
     @property
-    def of_form(self) -> dict[str, Indices]:
-        """Indices of the unknowns that are each board's form."""
-        found, first = {}, self.first_form
-        for name, form in self.forms.items():
-            found[name] = np.arange(first, first + form.count)
-            first += form.count
-        return found
+    def count(self) -> int:
+        return self.first_warp + sum(warp.count for warp in self.warps.values())
 
     @property
-    def unknowns(self) -> int:
-        return self.first_form + sum(form.count for form in self.forms.values())
+    def warp_columns(self) -> dict[str, Indices]:
+        """Indices of each board's warp among the unknowns."""
+        ends = np.cumsum([warp.count for warp in self.warps.values()])
+        parts = np.split(np.arange(self.first_warp, self.count), ends[:-1])
+        return dict(zip(self.warps, parts, strict=True))
 
-    def moved(self, step: Array) -> _State[Sheets]:
+    def retract(self, step: Array) -> _State[Sheets]:
+        """Move the state by a step (count,) of the unknowns."""
         twists = step[self.first_pose : self.first_sheet].reshape(-1, 6)
-        poses = tuple(p.retract(twist) for p, twist in zip(self.poses, twists, strict=True))
-        camera = self.camera.retract(step[: self.first_pose])
-        sheets = self.sheets.retract(step[self.first_sheet : self.first_form])
-        of_form = self.of_form
-        forms = {name: form.moved(step[of_form[name]]) for name, form in self.forms.items()}
-        return _State(camera, poses, sheets, forms)
+        columns = self.warp_columns
+        return _State(
+            self.camera.retract(step[: self.first_pose]),
+            tuple(pose.retract(twist) for pose, twist in zip(self.poses, twists, strict=True)),
+            self.sheets.retract(step[self.first_sheet : self.first_warp]),
+            {name: warp.retract(step[columns[name]]) for name, warp in self.warps.items()},
+        )
 
 
-def striped_board(
-    view: PlanarView, camera: Camera, data: BoundaryPoints, number: int, board: str
-) -> StripedBoard:
-    """The (binned) boundary points of one board, as image measurements again; board: its name."""
-    own = data.board == number
-    across = np.median(
-        camera.project(data.points[own] + data.per_pixel[own]) - camera.project(data.points[own]),
-        axis=0,
-    )
-    return StripedBoard(
-        view,
-        camera.project(data.points[own]),
-        data.index[own].astype(float),
-        np.hypot(data.sigma_px[own], FLOOR_PX),
-        across / np.linalg.norm(across),
-        board,
-    )
-
-
-def carried(
-    camera: Camera,
-    camera_from_board: RigidTransform,
-    board: StripedBoard,
-    number: int,
-    direction: Axis,
-) -> BoundaryPoints:
-    """The boundary points of a flat board, for a given camera and pose."""
-    index, place = board.index.astype(np.int64), camera_from_board @ _face(board)
-    return boundary_points(
-        camera, place, index, board.pixels, board.sigma_px, board=number, direction=direction
-    )
-
-
-def refine_jointly(
-    camera: Camera,
-    camera_from_board: Mapping[str, RigidTransform],
-    sheets: Sheets,
-    boards: Sequence[StripedBoard],
-    forms: Mapping[str, BoardForm],
-    *,
-    bent: bool = True,
-    steps: int = STEPS,
-) -> JointFit[Sheets]:
-    """Least squares, starting from camera, poses and sheets that were found one after the other.
-
-    boards: those without stripes, known by corners alone, take part with empty pixels.
-    bent: whether the forms of the boards are fitted; if not, their uncertainty only enters the
-        covariance.
-    """
-    poses = tuple(camera_from_board[b.view.shot] for b in boards)
-    fitted = forms if bent else {name: form.exact for name, form in forms.items()}
-    state = _solve(_State(camera, poses, sheets, dict(fitted)), boards, steps).state
-    if not bent:
-        state = replace(state, forms=dict(forms))
-    solution = _solve(state, boards, 0)
-    return _fit(solution, boards, solution.covariance)
-
-
-def known_apart(
-    camera: Camera,
-    camera_from_board: Mapping[str, RigidTransform],
-    sheets: Sheets,
-    boards: Sequence[StripedBoard],
-    forms: Mapping[str, BoardForm],
-) -> JointFit[Sheets]:
-    """The given solution unchanged, with the covariance of solving for corners and stripes in turn.
-
-    Camera and boards are known by corners alone, sheets by the stripes on those boards; the
-    former's uncertainty is carried into the latter's covariance.
-    """
-    poses = tuple(camera_from_board[b.view.shot] for b in boards)
-    solution = _solve(_State(camera, poses, sheets, dict(forms)), boards, 0)
-    state = solution.state
-    of_sheets = np.arange(state.first_sheet, state.first_form)
-    others = np.setdiff1d(np.arange(state.unknowns), of_sheets)
-    first = invert_scaled(solution.normal([CORNERS, EXACT])[np.ix_(others, others)])
-    striped = solution.normal([STRIPES, EXACT])
-    own = invert_scaled(striped[np.ix_(of_sheets, of_sheets)])
-    follow = -own @ striped[np.ix_(of_sheets, others)]
-    covariance = np.zeros((state.unknowns, state.unknowns))
-    covariance[np.ix_(others, others)] = first
-    covariance[np.ix_(of_sheets, others)] = follow @ first
-    covariance[np.ix_(others, of_sheets)] = (follow @ first).T
-    covariance[np.ix_(of_sheets, of_sheets)] = own + follow @ first @ follow.T
-    return _fit(solution, boards, covariance)
-
-
-def print_errors(fit: JointFit[Sheets], boards: Sequence[StripedBoard]) -> dict[str, PrintSpread]:
-    """Maximum-likelihood spread of each board's print errors, given what `fit` found.
-
-    In each direction in which corners and stripes determine the corners' places, the places found
-    scatter by print errors and noise together.
-    """
-    poses = tuple(fit.camera_from_board[b.view.shot] for b in boards)
-    state = _State(fit.camera, poses, fit.sheets, fit.forms)
-    normal = _solve(state, boards, 0).normal([CORNERS, STRIPES, EXACT])
-    found = {}
-    for name, own in state.of_form.items():
-        form, of_print = fit.forms[name], own[len(POWERS) :]
-        rest = np.setdiff1d(np.arange(state.unknowns), of_print)
-        whitening = form.print_whitening
-        cross = normal[np.ix_(of_print, rest)]
-        both = normal[np.ix_(of_print, of_print)]
-        both = both - cross @ invert_scaled(normal[np.ix_(rest, rest)]) @ cross.T
-        values, vectors = np.linalg.eigh(both - whitening.T @ whitening)
-        shown = values > LEAST_SHOWN * values[-1]
-        values, vectors = values[shown], vectors[:, shown]
-        # Without their prior the places would be these.
-        places = vectors.T @ both @ form.printed.ravel() / values
-        slow = vectors.T @ np.kron(form.slow, np.eye(2))
-        found[name] = _likeliest_spread(places, 1.0 / values, slow)
-    return found
-
-
-def _likeliest_spread(values: Array, variances: Array, slow: Array) -> PrintSpread:
-    """Of values (N,) seen with noise of `variances` (N,): of each one's own part, and of unknowns
-    that `slow` (N, K) adds to them, if they are clearly there."""
-    stretch = SPREADS_MM[:, None] ** 2
-    misfit = np.empty((len(SPREADS_MM), len(SPREADS_MM)))
-    for row, corner in zip(misfit, SPREADS_MM, strict=True):
-        total = corner**2 + variances
-        white = values / np.sqrt(total)
-        gains, modes = np.linalg.eigh(slow.T @ (slow / total[:, None]))
-        along = modes.T @ (slow.T @ (white / np.sqrt(total)))
-        grown = 1.0 + stretch * gains
-        row[:] = np.sum(np.log(grown) - stretch * along**2 / grown, axis=1)
-        row += np.sum(np.log(total)) + np.sum(white**2)
-    # Twice a log likelihood is a squared number of standard errors.
-    if misfit[:, 0].min() - misfit.min() < CLEARLY**2:
-        return PrintSpread(float(SPREADS_MM[np.argmin(misfit[:, 0])]))
-    corner, shared = np.unravel_index(np.argmin(misfit), misfit.shape)
-    return PrintSpread(float(SPREADS_MM[corner]), float(SPREADS_MM[shared]))
-
-
-def _solve(
-    state: _State[Sheets], boards: Sequence[StripedBoard], steps: int
-) -> Solution[_State[Sheets]]:
-    return minimize(
-        state,
-        lambda state: _blocks(state, boards),
-        lambda state, step: state.moved(step),
-        unknowns=state.unknowns,
-        steps=steps,
-        tolerance=SETTLED,
-        damping=1e-6,
-    )
-
-
-def _fit(
-    solution: Solution[_State[Sheets]], boards: Sequence[StripedBoard], covariance: Array
-) -> JointFit[Sheets]:
-    state = solution.state
-    first = state.first_pose
-    corners = np.concatenate([_corner_residuals(state, k, b) for k, b in enumerate(boards)])
+def _fit(solution: Solution[_State[Sheets]], boards: Sequence[StripedBoard]) -> JointFit[Sheets]:
+    state, covariance = solution.state, solution.covariance
+    corners = np.concatenate([_corner_residuals(state, k, one) for k, one in enumerate(boards)])
     return JointFit(
         state.camera,
-        {b.view.shot: pose for b, pose in zip(boards, state.poses, strict=True)},
-        state.sheets.with_covariance(_of_depths(state, boards, covariance)),
-        covariance[:first, :first],
+        state.poses,
+        state.sheets.with_covariance(_depth_covariance(state, boards, covariance)),
+        covariance[: state.first_pose, : state.first_pose],
         float(np.sqrt(CORNERS.mean_square(corners)) * np.sqrt(2.0)),
-        state.forms,
+        state.warps,
     )
 
 
 def _blocks(state: _State[Sheets], boards: Sequence[StripedBoard]) -> Iterator[Block]:
-    """Corners and stripes of each board, then the priors on camera, sheets and boards."""
-    camera, sheets = np.arange(state.first_pose), np.arange(state.first_sheet, state.first_form)
-    of_form = state.of_form
+    """Residuals of each board's corners and stripes, then the priors of camera, sheets, warps."""
+    camera, sheets = np.arange(state.first_pose), np.arange(state.first_sheet, state.first_warp)
+    columns = state.warp_columns
     with np.errstate(all="ignore"):
         for k, board in enumerate(boards):
-            pose, form = state.first_pose + 6 * k + np.arange(6), of_form[board.board]
-            corners, rays = _corner_residuals(state, k, board), _rays(state.camera, board)
-            stripes = _offsets(state, k, board, rays)
-            of_corners = partial(_corner_jacobian, state, k, board)
-            of_stripes = partial(_stripe_jacobian, state, k, board, rays)
-            yield Block(corners, of_corners, np.concatenate([camera, pose, form]), CORNERS)
-            bent = form[: len(POWERS)]
-            yield Block(stripes, of_stripes, np.concatenate([camera, pose, sheets, bent]), STRIPES)
-    if state.camera.prior is not None:
-        yield known_beforehand(state.camera, camera)
-    known, jacobian = state.sheets.prior()
-    yield Block(known, lambda: jacobian, sheets, EXACT)
-    for name, own in state.forms.items():
-        yield _known_of_form(own, of_form[name])
+            pose, warp = state.first_pose + 6 * k + np.arange(6), columns[board.board]
+            yield Block(
+                _corner_residuals(state, k, board),
+                partial(_corner_jacobian, state, k, board),
+                np.concatenate([camera, pose, warp]),
+                CORNERS,
+            )
+            rays = _boundary_rays(state.camera, board)
+            heights = warp[: len(WARP_POWERS)]
+            yield Block(
+                _stripe_residuals(state, k, board, rays),
+                partial(_stripe_jacobian, state, k, board, rays),
+                np.concatenate([camera, pose, sheets, heights]),
+                STRIPES,
+            )
+    yield camera_prior(state.camera, camera)
+    yield _prior_block(state.sheets.prior(), sheets)
+    for name, one in state.warps.items():
+        yield _prior_block(one.prior, columns[name])
 
 
-def _known_of_form(form: BoardForm, own: Indices) -> Block:
-    known, jacobian = form.prior
-    return Block(known, lambda: jacobian, own, EXACT)
+def _prior_block(prior: tuple[Array, Array], columns: Indices) -> Block:
+    residuals, jacobian = prior
+    return Block(residuals, lambda: jacobian, columns, EXACT)
 
 
-def _corners_of(state: _State[Sheets], k: int, board: StripedBoard) -> Array:
-    """Where the corners of the k-th board lie, camera frame, (N, 3) mm."""
-    form = state.forms[board.board]
-    points = board.view.points
-    return state.poses[k].apply(form.applied(points, form.numbers(points)))
+def _corner_points(state: _State[Sheets], k: int, board: StripedBoard) -> Array:
+    """Corners of the k-th board as warped, camera frame, (N, 3) mm."""
+    return state.poses[k].apply(state.warps[board.board].apply(board.view.points))
 
 
 def _corner_residuals(state: _State[Sheets], k: int, board: StripedBoard) -> Array:
-    seen = state.camera.project(_corners_of(state, k, board))
-    return (seen - board.view.pixels).ravel()
+    return (state.camera.project(_corner_points(state, k, board)) - board.view.pixels).ravel()
 
 
-def _rays(camera: Camera, board: StripedBoard) -> Array:
+def _corner_jacobian(state: _State[Sheets], k: int, board: StripedBoard) -> Array:
+    """Derivatives (2N, ...) by camera, this board's pose, and its warp."""
+    points, warp = _corner_points(state, k, board), state.warps[board.board]
+    by_parameter, by_point = state.camera.jacobians(points)
+    in_board = by_point @ state.poses[k].rotation
+    by_heights = in_board[:, :, 2:] * warp.basis(board.view.points[:, :2])[:, None, :]
+    by_print = np.zeros((len(points), 2, len(warp.points), 2))
+    corner = match_corners(board.view.points, warp.points)
+    by_print[np.arange(len(points)), :, corner] = in_board[:, :, :2]
+    parts = [by_parameter, by_point @ twist_jacobian(points), by_heights]
+    jacobian = np.concatenate([*parts, by_print.reshape(len(points), 2, -1)], axis=2)
+    return jacobian.reshape(-1, jacobian.shape[2])
+
+
+def _boundary_rays(camera: Camera, board: StripedBoard) -> Array:
     """Rays (2, N, 3), z = 1: through boundary pixels, and half a pixel across from them."""
     return camera.rays(np.stack([board.pixels, board.pixels + 0.5 * board.across]))
 
 
-def _ray_slopes(camera: Camera, rays: Array) -> Array:
-    """(2, N, 2, P): how the rays of fixed pixels turn with the camera's parameters.
-
-    The turn undoes what the parameters do to the pixels of fixed rays.
-    """
+def _rays_by_camera(camera: Camera, rays: Array) -> Array:
+    """Derivatives of the rays (..., 3) of fixed pixels by the camera's parameters, (..., 2, P)."""
     by_parameter, _ = camera.jacobians(rays.reshape(-1, 3))
-    return -(camera.rays_by_pixels(rays) @ by_parameter.reshape(*rays.shape[:2], 2, -1))
+    by_parameter = by_parameter.reshape(*rays.shape[:-1], 2, -1)
+    return -(camera.rays_by_pixels(rays) @ by_parameter)
 
 
-def _offsets(state: _State[Sheets], k: int, board: StripedBoard, rays: Array) -> Array:
-    """Offsets of the k-th board's boundaries from their sheets, over their sigma, (N,)."""
-    points, across = _on_board(state, k, board, rays)
-    return _over_sigma(state.sheets, state.sheets.at(board.index), board, points, across)
+def _height(state: _State[Sheets], board: StripedBoard, xy: Array) -> Array:
+    """Height of a board's surface above the plane of its face at (..., 2) mm."""
+    height = state.warps[board.board].height(xy)
+    return height + board.face.height(xy) if board.face else height
 
 
-def _over_sigma(
-    sheets: SmoothSheets, at: Any, board: StripedBoard, points: Array, across: Array
-) -> Array:
-    offset = sheets.offset(points, at)
-    return np.asarray(offset.value / _sigma(board, points, across, offset.by_point), np.float64)
+def _stripe_residuals(state: _State[Sheets], k: int, board: StripedBoard, rays: Array) -> Array:
+    """Offsets of the k-th board's boundaries from their sheets, in sigmas, (N,)."""
+    camera_from_face = state.poses[k] @ board.board_from_face
+    points = rays_on_board(rays, camera_from_face, partial(_height, state, board))
+    return _whitened_offsets(state.sheets, state.sheets.at(board.index), board, points)
 
 
-def _on_board(state: _State[Sheets], k: int, board: StripedBoard, rays: Array) -> Array:
-    """Where rays meet the face on which the stripes were seen, (2, N, 3) mm."""
-    camera_from_face = state.poses[k] @ _face(board)
-    form = state.forms[board.board]
-    return rays_on_board(rays, camera_from_face, form.height if form.heights.any() else None)
+def _whitened_offsets(sheets: SmoothSheets, at: Any, board: StripedBoard, points: Array) -> Array:
+    offset = sheets.offset(points[0], at)
+    return np.asarray(offset.value / _offset_sigma(board, points, offset.by_point), np.float64)
 
 
-def _face(board: StripedBoard) -> RigidTransform:
-    return RigidTransform.from_translation([0.0, 0.0, board.view.points[0, 2]])
-
-
-def _sigma(board: StripedBoard, points: Array, across: Array, by_point: Array) -> Array:
-    """One sigma_px across the stripe, in the offset's unit, (N,)."""
-    leverage = np.abs(np.sum(by_point * (across - points), axis=1)) / 0.5
-    return np.maximum(leverage, 1e-12) * board.sigma_px
-
-
-def _corner_jacobian(state: _State[Sheets], k: int, board: StripedBoard) -> Array:
-    """Derivatives (2N, ...) by camera, this board's pose, and its form."""
-    points, form = _corners_of(state, k, board), state.forms[board.board]
-    by_parameter, by_point = state.camera.jacobians(points)
-    in_board = by_point @ state.poses[k].rotation
-    lifted = in_board[:, :, 2:] * form.basis(board.view.points[:, :2])[:, None, :]
-    printed = np.zeros((len(points), 2, len(form.points), 2))
-    each = np.arange(len(points))
-    printed[each, :, form.numbers(board.view.points)] = in_board[:, :, :2]
-    parts = [by_parameter, by_point @ twist_jacobian(points), lifted]
-    jacobian = np.concatenate([*parts, printed.reshape(len(points), 2, -1)], axis=2)
-    return jacobian.reshape(-1, jacobian.shape[2])
+def _offset_sigma(board: StripedBoard, points: Array, by_point: Array) -> Array:
+    """Standard deviation of the offsets for that of the pixels, (N,), in the offsets' unit."""
+    per_pixel = np.abs(np.sum(by_point * (points[1] - points[0]), axis=1)) / 0.5
+    return np.maximum(per_pixel, 1e-12) * board.sigma_px
 
 
 def _stripe_jacobian(state: _State[Sheets], k: int, board: StripedBoard, rays: Array) -> Array:
-    """Derivatives (N, ...) of offsets over sigma, by camera, board pose, sheets and board heights.
+    """Derivatives (N, ...) by camera, board pose, sheets and board heights.
 
     Camera and pose by finite differences, because the sigma changes too: without its derivative,
     noise would push the focal lengths up.
     """
-    pose, slopes, face = state.poses[k], _ray_slopes(state.camera, rays), _face(board)
-    points, across = both = _on_board(state, k, board, rays)
+    pose, by_camera = state.poses[k], _rays_by_camera(state.camera, rays)
+    camera_from_face = pose @ board.board_from_face
+    points = rays_on_board(rays, camera_from_face, partial(_height, state, board))
     at = state.sheets.at(board.index)
-    offset = state.sheets.offset(points, at, parameters=True)
+    offset = state.sheets.offset(points[0], at, parameters=True)
     assert offset.by_parameter is not None
-    sigma = _sigma(board, points, across, offset.by_point)
-    # The height of a board changes by a thousandth of a step along it, so it may be held constant
-    # here.
-    height = state.forms[board.board].height((pose @ face).inverse().apply(both)[..., :2])
+    sigma = _offset_sigma(board, points, offset.by_point)
+    # The height of a board changes by a thousandth of a step along it: it is held constant here.
+    height = _height(state, board, camera_from_face.inverse().apply(points)[..., :2])
 
-    def there(rays: Array, pose: RigidTransform) -> Array:
-        place = pose @ face
-        found = rays_on_board(rays, place) + lifts(rays, place, height)
-        return _over_sigma(state.sheets, at, board, found[0], found[1])
+    def residuals(rays: Array, pose: RigidTransform) -> Array:
+        camera_from_face = pose @ board.board_from_face
+        points = rays_on_board(rays, camera_from_face) + lifts(rays, camera_from_face, height)
+        return _whitened_offsets(state.sheets, at, board, points)
 
-    def turned(column: int, step: float) -> Array:
+    def by_parameter(column: int, step: float) -> Array:
         turn = np.zeros_like(rays)
-        turn[..., :2] = step * slopes[..., column]
-        return there(rays + turn, pose)
+        turn[..., :2] = step * by_camera[..., column]
+        return residuals(rays + turn, pose) - residuals(rays - turn, pose)
 
-    def moved(column: int, step: float) -> Array:
-        return there(rays, pose.retract(step * np.eye(6)[column]))
+    def by_twist(column: int, step: float) -> Array:
+        twist = step * np.eye(6)[column]
+        return residuals(rays, pose.retract(twist)) - residuals(rays, pose.retract(-twist))
 
-    by_place = [
-        (change(column, size) - change(column, -size)) / (2.0 * size)
-        for change, sizes in ((turned, state.camera.difference_steps), (moved, TWIST_STEPS))
-        for column, size in enumerate(sizes)
+    camera_steps, twist_steps = state.camera.difference_steps, [1e-6] * 3 + [1e-3] * 3  # rad, mm
+    differences = [
+        *(by_parameter(c, step) / (2.0 * step) for c, step in enumerate(camera_steps)),
+        *(by_twist(c, step) / (2.0 * step) for c, step in enumerate(twist_steps)),
     ]
-    along = np.sum(offset.by_point * rays[0], axis=1) / (rays[0] @ pose.rotation[:, 2])
-    basis = state.forms[board.board].basis(pose.inverse().apply(points)[:, :2])
-    by_height = (along / sigma)[:, None] * basis
-    return np.column_stack([*by_place, offset.by_parameter / sigma[:, None], by_height])
+    along_ray = np.sum(offset.by_point * rays[0], axis=1) / (rays[0] @ pose.rotation[:, 2])
+    basis = state.warps[board.board].basis(pose.inverse().apply(points[0])[:, :2])
+    by_heights = (along_ray / sigma)[:, None] * basis
+    return np.column_stack([*differences, offset.by_parameter / sigma[:, None], by_heights])
 
 
-def allowing_for(
-    fit: JointFit[Sheets], other: JointFit[Sheets], boards: Sequence[StripedBoard]
-) -> JointFit[Sheets]:
-    """The fit with covariances enlarged by its difference from another fit, which may be right."""
-    there = _depths_by_sheets(fit.camera, fit.sheets, boards)
-    rays = other.camera.rays(np.concatenate([board.pixels for board in boards]))
-    depth = other.sheets.depth(rays, np.concatenate([board.index for board in boards]))
-    motion = _motion_of_sheets(fit.sheets, there.by_sheets, depth[:, None] / there.depth - 1.0)
-    changed = (other.camera.parameters - fit.camera.parameters)[:, None]
-    return replace(
-        fit,
-        sheets=fit.sheets.with_covariance(fit.sheets.covariance + motion @ motion.T),
-        camera_covariance=fit.camera_covariance + changed @ changed.T,
-    )
-
-
-@dataclass(frozen=True, eq=False)
-class _Depths:
-    """Depths (N, 1) mm of boundary points on boards, and their relative derivatives.
-
-    by_sheets: (N, P), by the sheets' unknowns.
-    by_camera: (N, C), by the camera's parameters, which turn the rays of fixed pixels.
-    """
-
-    depth: Array
-    by_sheets: Array
-    by_camera: Array
-
-
-def _depths_by_sheets(
-    camera: Camera, sheets: SmoothSheets, boards: Sequence[StripedBoard]
-) -> _Depths:
-    index = np.concatenate([board.index for board in boards])
-    rays = camera.rays(np.concatenate([board.pixels for board in boards]))[None]
-    with np.errstate(all="ignore"):
-        depth = sheets.depth(rays[0], index)[:, None]
-        offset = sheets.offset(rays[0] * depth, sheets.at(index), parameters=True)
-        assert offset.by_parameter is not None
-        along = np.sum(offset.by_point * rays[0], axis=1)[:, None]
-        turned = np.einsum("nk,nkp->np", offset.by_point[:, :2], _ray_slopes(camera, rays)[0])
-        return _Depths(depth, -offset.by_parameter / along / depth, -turned / along)
-
-
-def _motion_of_sheets(sheets: SmoothSheets, by_sheets: Array, changes: Array) -> Array:
-    """(P, K): motions of the sheets' unknowns for relative changes of depth (N, K), nearly."""
-    known = np.isfinite(by_sheets).all(axis=1) & np.isfinite(changes).all(axis=1)
-    prior = AS_WELL * np.sqrt(np.count_nonzero(known)) * sheets.prior()[1]
-    matrix = np.concatenate([by_sheets[known], prior])
-    right = np.concatenate([changes[known], np.zeros((len(prior), changes.shape[1]))])
-    return np.asarray(np.linalg.lstsq(matrix, right, rcond=None)[0], np.float64)
-
-
-def _of_depths(state: _State[Sheets], boards: Sequence[StripedBoard], covariance: Array) -> Array:
+def _depth_covariance(
+    state: _State[Sheets], boards: Sequence[StripedBoard], covariance: Array
+) -> Array:
     """Covariance (P, P) of the sheets together with the rays that meet them, as it affects depths.
 
-    A camera error turns rays and sheets together. The rays' part is expressed as the motion of the
-    sheets that changes depths on the boards equally, so that both add with their signs. What no
-    motion expresses, a lens, is in the rays' own sigma.
+    A camera error turns rays and sheets together. The rays' part is expressed as the change of the
+    sheets that changes depths on the boards equally (by least squares), so that both add with their
+    signs. What no such change expresses, a lens, is in the rays' own sigma.
     """
-    own = np.arange(state.first_sheet, state.first_form)
-    there = _depths_by_sheets(state.camera, state.sheets, boards)
-    motion = _motion_of_sheets(state.sheets, there.by_sheets, there.by_camera)
-    carried = np.concatenate([motion, np.eye(len(own))], axis=1)
-    columns = np.concatenate([np.arange(state.first_pose), own])
-    total = carried @ covariance[np.ix_(columns, columns)] @ carried.T
+    index = np.concatenate([board.index for board in boards])
+    rays = state.camera.rays(np.concatenate([board.pixels for board in boards]))
+    with np.errstate(all="ignore"):
+        depth = state.sheets.depth(rays, index)[:, None]
+        offset = state.sheets.offset(rays * depth, state.sheets.at(index), parameters=True)
+        assert offset.by_parameter is not None
+        along_ray = np.sum(offset.by_point * rays, axis=1)[:, None]
+        # Relative changes of depth by the sheets' unknowns, and by the camera's parameters.
+        by_sheets = -offset.by_parameter / along_ray / depth
+        by_rays = _rays_by_camera(state.camera, rays)
+        by_camera = -np.einsum("nk,nkp->np", offset.by_point[:, :2], by_rays) / along_ray
+    valid = np.isfinite(by_sheets).all(axis=1) & np.isfinite(by_camera).all(axis=1)
+    # A weak prior, at relative changes of 1e-7, keeps unobserved directions of the sheets at zero.
+    prior = 1e-7 * np.sqrt(np.count_nonzero(valid)) * state.sheets.prior()[1]
+    matrix = np.concatenate([by_sheets[valid], prior])
+    right = np.concatenate([by_camera[valid], np.zeros((len(prior), by_camera.shape[1]))])
+    equivalent = np.linalg.lstsq(matrix, right, rcond=None)[0]
+    columns = np.arange(state.first_sheet, state.first_warp)
+    transfer = np.concatenate([equivalent, np.eye(len(columns))], axis=1)
+    columns = np.concatenate([np.arange(state.first_pose), columns])
+    total = transfer @ covariance[np.ix_(columns, columns)] @ transfer.T
     return np.asarray(0.5 * (total + total.T), np.float64)

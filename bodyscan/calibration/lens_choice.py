@@ -1,8 +1,8 @@
-"""Choose the lens that a camera needs by held-out boards.
+"""Choose the lens that a camera needs by held-out boards, and estimate how well its rays are known.
 
-A richer lens is taken where it predicts held-out boards better than the simpler one by more than
+A richer lens is chosen where it predicts held-out boards better than the simpler one by more than
 chance. Poses of held-out boards are fitted with either lens, so that only the lens differs; boards
-near one another are held out together.
+near one another are held out in one group.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bodyscan.arrays import Array, Indices
-from bodyscan.calibration.board_views import PlanarView
+from bodyscan.arrays import Array, Indices, Mask
+from bodyscan.calibration.board_views import PlanarView, match_corners
 from bodyscan.calibration.camera import (
     CameraCalibration,
     CameraFit,
@@ -23,24 +23,20 @@ from bodyscan.calibration.camera import (
     locate_boards,
     weighted_rms,
 )
-from bodyscan.calibration.held_out import CLEARLY, Compared, gain, shared_weights
-from bodyscan.calibration.ray_uncertainty import ray_uncertainty
+from bodyscan.calibration.model_selection import (
+    MAX_FOLDS,
+    MIN_GAIN,
+    ResidualPair,
+    gain,
+    shared_weights,
+)
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.lens import Lens
-from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.geometry.uncertainty import RayUncertainty
+from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
+from bodyscan.geometry.uncertainty import RayUncertainty, node_pixels
 
-FEWEST_PLACES = 4
-"""With one place held out, a camera still has the three that it needs."""
-MOST_FOLDS = 6
-SETTLED = 1e-2
-"""Convergence, in variances: a tenth of a standard deviation changes nothing on held-out boards."""
-UNDAMPED = 1e-9
-"""Fits without a fold start close to their minimum, where full steps are right; damped ones creep
-along directions in which boards hardly determine a lens."""
-NEAR = 0.05
-"""Boards share a place if corners moved by less than this share of the board's own size in the
-image: they test the lens where it was tested before."""
+MIN_CLUSTERS = 4
+"""Clusters of poses: with one held out, a camera still has the three that it needs."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +44,7 @@ class ChosenLens:
     """The chosen lens.
 
     fit: the camera fitted with it.
-    trials: how each lens did; () if there were too few places, or one lens only.
+    trials: how each lens did; () if there were too few clusters of poses, or one lens only.
     rays: how well the boards determine each pixel's ray.
     refused: the fit with the lens tried last, if it was not taken.
     """
@@ -57,18 +53,6 @@ class ChosenLens:
     trials: tuple[LensTrial, ...]
     rays: RayUncertainty
     refused: CameraFit | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class _HeldOut:
-    """Residuals (N, 2) px of each view, from fits without it."""
-
-    residuals: tuple[Array, ...]
-
-    @property
-    def stacked(self) -> Array:
-        """(N, 2) of all views."""
-        return np.concatenate(self.residuals)
 
 
 def calibrate_with_lenses(
@@ -91,38 +75,36 @@ def choose_lens(
     poses: Sequence[RigidTransform],
     views: Sequence[PlanarView],
 ) -> ChosenLens:
-    """The simplest lens that no richer one clearly beats.
+    """Choose the simplest lens that no richer one clearly beats.
 
     kinds: simplest first, each with all coefficients of the one before and more.
     camera: a start, with the last kind of lens.
     poses: approximate `camera_from_board` of each view.
     """
     chosen = _fit(kinds[0], camera, poses, views)
-    place = places(views)
-    if len(kinds) == 1 or len(set(place.tolist())) < FEWEST_PLACES:
+    cluster = cluster_poses(views)
+    if len(kinds) == 1 or len(set(cluster.tolist())) < MIN_CLUSTERS:
         richest = chosen if len(kinds) == 1 else _fit(kinds[1], camera, poses, views)
         return ChosenLens(chosen, (), ray_uncertainty(chosen.camera, richest, views))
-    held = _hold_out(chosen, views, place)
-    trials: list[tuple[CameraFit, _HeldOut, float | None]] = [(chosen, held, None)]
-    of_corner = np.repeat(place, [len(view.points) for view in views])
+    residuals = _hold_out(chosen, views, cluster)
+    trials: list[tuple[CameraFit, Array, float | None]] = [(chosen, residuals, None)]
+    corner_cluster = np.repeat(cluster, [len(view.points) for view in views])
     for kind in kinds[1:]:
         tried = _fit(kind, camera, poses, views)
-        out = _hold_out(tried, views, place)
-        better_by = gain(Compared(held.stacked, out.stacked, of_corner))
-        trials.append((tried, out, better_by))
-        if better_by < CLEARLY:
+        richer = _hold_out(tried, views, cluster)
+        better_by = gain(ResidualPair(residuals, richer, corner_cluster))
+        trials.append((tried, richer, better_by))
+        if better_by < MIN_GAIN:
             break  # the next has all coefficients of this one, and more
-        chosen, held = tried, out
-    weights = [shared_weights([out.stacked for _, out, _ in trials])]
-    told = tuple(
-        LensTrial(
-            fit.camera.lens.kind, weighted_rms([out.stacked], weights), better_by, fit is chosen
-        )
-        for fit, out, better_by in trials
+        chosen, residuals = tried, richer
+    weights = [shared_weights([one for _, one, _ in trials])]
+    figures = tuple(
+        LensTrial(fit.camera.lens.kind, weighted_rms([one], weights), better_by, fit is chosen)
+        for fit, one, better_by in trials
     )
     last = trials[-1][0]
     rays = ray_uncertainty(chosen.camera, last, views)
-    return ChosenLens(chosen, told, rays, None if last is chosen else last)
+    return ChosenLens(chosen, figures, rays, None if last is chosen else last)
 
 
 def _fit(
@@ -135,47 +117,104 @@ def _fit(
     return fit_camera(replace(camera, lens=lens), poses, views)
 
 
-def places(views: Sequence[PlanarView]) -> Indices:
-    """Number (V,) of the place in the image at which each view shows its board; views of one shot
-    share theirs."""
+def cluster_poses(views: Sequence[PlanarView]) -> Indices:
+    """Number (V,) the clusters of views that show their board at nearly the same pixels; views of
+    one shot share theirs."""
     found: list[PlanarView] = []
     number = np.zeros(len(views), np.int64)
-    of_shot: dict[str, int] = {}
+    by_shot: dict[str, int] = {}
     for k, view in enumerate(views):
         near = (n for n, first in enumerate(found) if _near(first, view))
-        number[k] = of_shot.get(view.shot, next(near, len(found)))
-        of_shot.setdefault(view.shot, int(number[k]))
+        number[k] = by_shot.get(view.shot, next(near, len(found)))
+        by_shot.setdefault(view.shot, int(number[k]))
         found += [view] if number[k] == len(found) else []
     return number
 
 
 def _near(first: PlanarView, second: PlanarView) -> bool:
-    """Whether most of the corners seen in both views hardly moved."""
-    number = {tuple(point): k for k, point in enumerate(np.round(first.points, 6).tolist())}
-    both = [(number.get(tuple(p)), k) for k, p in enumerate(np.round(second.points, 6).tolist())]
-    shared = np.array([pair for pair in both if pair[0] is not None])
-    if not len(shared):
+    """Whether corners in both views moved by less than 5 % of the board's size in the image, in the
+    median: they test the lens at the same pixels."""
+    index = match_corners(second.points, first.points)
+    if not np.any(index >= 0):
         return False
-    moved = np.linalg.norm(first.pixels[shared[:, 0]] - second.pixels[shared[:, 1]], axis=1)
-    return bool(np.median(moved) < NEAR * np.linalg.norm(np.ptp(first.pixels, axis=0)))
+    moved = np.linalg.norm(first.pixels[index[index >= 0]] - second.pixels[index >= 0], axis=1)
+    return bool(np.median(moved) < 0.05 * np.linalg.norm(np.ptp(first.pixels, axis=0)))
 
 
-def _hold_out(fit: CameraFit, views: Sequence[PlanarView], place: Indices) -> _HeldOut:
-    """Leave out each place, or one of MOST_FOLDS groups of them, in turn; fits start from `fit`."""
+def _hold_out(fit: CameraFit, views: Sequence[PlanarView], cluster: Indices) -> Array:
+    """Residuals (N, 2) px of all views, from fits without their cluster, or one of MAX_FOLDS groups
+    of clusters, that start from `fit`."""
     residuals: list[Array] = [np.empty(0)] * len(views)
-    fold = place % MOST_FOLDS
+    fold = cluster % MAX_FOLDS
     for number in np.unique(fold):
         rest = np.flatnonzero(fold != number).tolist()
+        # A tenth of a standard deviation changes nothing on held-out boards. Fits start close to
+        # their minimum, where full steps are right; damped ones creep along directions in which
+        # boards hardly determine a lens.
         others = fit_camera(
             fit.camera,
             [fit.poses[k] for k in rest],
             [views[k] for k in rest],
-            settled=SETTLED,
-            damping=UNDAMPED,
+            tolerance=1e-2,
+            damping=1e-9,
         ).camera
-        held = np.flatnonzero(fold == number).tolist()
-        own, starts = [views[k] for k in held], [fit.poses[k] for k in held]
-        found = locate_boards(others, own, starts, settled=SETTLED)[1]
-        for k, left in zip(held, found, strict=True):
-            residuals[k] = left
-    return _HeldOut(tuple(residuals))
+        held_out = np.flatnonzero(fold == number).tolist()
+        found = locate_boards(
+            others, [views[k] for k in held_out], [fit.poses[k] for k in held_out], tolerance=1e-2
+        )
+        for k, remaining in zip(held_out, found[1], strict=True):
+            residuals[k] = remaining
+    return np.concatenate(residuals)
+
+
+def ray_uncertainty(
+    chosen: Camera, richest: CameraFit, views: Sequence[PlanarView]
+) -> RayUncertainty:
+    """Estimate the uncertainty of the rays of the camera `chosen`, also where boards did not reach.
+
+    richest: a fit to the same views with the richest lens that held-out boards cannot distinguish
+        from the chosen one, or the chosen fit itself.
+
+    Its covariance contains what the boards leave open, even far from them, where the chosen lens
+    would extrapolate; and the chosen lens may be wrong by as much as the two differ. A motion of the
+    camera relative to its boards is removed from both: it belongs to the pose and is in the pose's
+    covariance.
+    """
+    camera = richest.camera
+    corners = np.concatenate(
+        [pose.apply(view.points) for pose, view in zip(richest.poses, views, strict=True)]
+    )
+    corners = corners[:: -(-len(corners) // 3000)]
+    rays = chosen.rays(node_pixels(camera.width, camera.height))
+    valid: Mask = np.asarray(np.isfinite(rays).all(axis=-1))
+    points = rays[valid] * np.median(corners[:, 2])
+    by_nodes, by_corners = _changes(chosen, camera, points), _changes(chosen, camera, corners)
+    change, motion = (part.reshape(-1, part.shape[2]) for part in by_corners)
+    remaining = by_nodes[0] - by_nodes[1] @ np.linalg.lstsq(motion, change, rcond=None)[0]
+    by_parameter, difference = remaining[..., :-1], remaining[..., -1]
+    noise = np.einsum("npi,ij,npj->n", by_parameter, richest.covariance, by_parameter) / 2.0
+    lens = np.sum(difference**2, axis=1) / 2.0
+    return RayUncertainty(
+        *(_on_all_nodes(np.sqrt(np.maximum(part, 0.0)), valid) for part in (noise, lens))
+    )
+
+
+def _changes(chosen: Camera, camera: Camera, points: Array) -> tuple[Array, Array]:
+    """Changes of pixels at points (N, 3), camera frame.
+
+    (N, 2, P + 1): by the parameters of `camera`, and its difference from `chosen`.
+    (N, 2, 6): by a motion of the points.
+    """
+    by_parameter, by_point = camera.jacobians(points)
+    difference = camera.project(points) - chosen.project(points)
+    return (
+        np.concatenate([by_parameter, difference[..., None]], axis=2),
+        by_point @ twist_jacobian(points),
+    )
+
+
+def _on_all_nodes(values: Array, valid: Mask) -> Array:
+    """Spread values over all nodes; those without rays, where the lens folds, get the largest."""
+    filled = np.full(valid.shape, values.max(initial=0.0))
+    filled[valid] = values
+    return filled

@@ -1,4 +1,4 @@
-"""Light planes from stripe boundaries on boards of known pose (3.2, Eq. 15-18)."""
+"""Fit one free light plane to each stripe boundary on boards of known pose (3.2, Eq. 15-18)."""
 
 from __future__ import annotations
 
@@ -7,30 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodyscan.arrays import Array, Indices
-from bodyscan.calibration.boundary_points import (
-    BoundaryPoints,
-    boundary_points,
-    concatenate,
-    points_on_board,
-)
+from bodyscan.calibration.boundary_points import BoundaryPoints
 from bodyscan.geometry.light_planes import Axis, LightPlanes
 from bodyscan.geometry.linear_gaussian import invert_scaled
 from bodyscan.geometry.robust import cauchy_weights, robust_scale
-
-__all__ = [
-    "BoundaryPoints",
-    "PlaneFit",
-    "boundary_points",
-    "concatenate",
-    "fit_light_planes",
-    "points_on_board",
-]
-
-
-FEWEST_POINTS = 12
-LEAST_OPENING = 1e-4
-REWEIGHTINGS = 4
-CAUCHY_SIGMAS = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,49 +32,51 @@ def fit_light_planes(
     direction: Axis,
     *,
     board_error_mm: float = 0.0,
-    fewest_points: int = FEWEST_POINTS,
+    min_points: int = 12,
 ) -> PlaneFit:
-    """Fit one plane to each boundary seen on at least two boards, by weighted least squares.
+    """Fit one plane to each boundary on at least two boards, by weighted least squares.
 
     board_error_mm: how well the boards' poses are known, for the covariance (see `board_errors`).
-    fewest_points: points from which a board counts.
+    min_points: number of points from which a board counts.
 
     A point is weighted by how far one pixel of error moves it off the plane; outliers lose weight
-    (Cauchy). A boundary seen on a single board, or whose points lie on a line, gets no plane.
+    (Cauchy). A boundary on a single board, or whose points lie on a line, gets no plane.
     """
     count = stripes + 1
-    enough = _boards_seen(data, count, fewest_points) >= 2
-    spread_mm = np.linalg.norm(data.per_pixel, axis=1) * data.sigma_px
+    enough = _count_boards(data, count, min_points) >= 2
+    sigma_mm = np.linalg.norm(data.per_pixel, axis=1) * data.sigma_px
     robust = np.ones(len(data.index))
-    for _ in range(REWEIGHTINGS):
-        planes, opening, scatter = _weighted_planes(data, robust / spread_mm**2, count)
+    for _ in range(4):
+        planes, opening, scatter = _weighted_planes(data, robust / sigma_mm**2, count)
         distances = np.sum(data.points * planes[data.index, :3], axis=1) + planes[data.index, 3]
         leverage = np.abs(np.sum(data.per_pixel * planes[data.index, :3], axis=1))
-        spread_mm = np.maximum(leverage, 1e-6) * data.sigma_px
-        normalized = distances / spread_mm
+        sigma_mm = np.maximum(leverage, 1e-6) * data.sigma_px
+        normalized = distances / sigma_mm
         scale = robust_scale(normalized[np.isfinite(normalized)], 1e-9)
-        robust = np.nan_to_num(cauchy_weights(normalized, 1, CAUCHY_SIGMAS * scale))
-    bad = ~enough | (opening < LEAST_OPENING)
+        robust = np.nan_to_num(cauchy_weights(normalized, 1, 3.0 * scale))
+    bad = ~enough | (opening < 1e-4)  # on a line, for all their noise
     planes = np.where(bad[:, None], np.nan, planes)
     distances = np.where(bad[data.index], np.nan, distances)
     used = np.isfinite(distances)
     total = float(np.sum(robust[used]))
     rms = float(np.sqrt(np.sum((robust * distances**2)[used]) / total)) if total else np.nan
-    weights = robust / (spread_mm * scale) ** 2
+    weights = robust / (sigma_mm * scale) ** 2
     covariance = _covariance(planes, scatter / scale**2, data, weights, board_error_mm)
     return PlaneFit(LightPlanes(planes, covariance, direction), distances, rms)
 
 
-def _boards_seen(data: BoundaryPoints, count: int, fewest: int) -> Indices:
+def _count_boards(data: BoundaryPoints, count: int, min_points: int) -> Indices:
+    """Number of boards with enough points of each boundary, (count,)."""
     boards = int(data.board.max()) + 1 if len(data.board) else 1
     points = np.bincount(data.index * boards + data.board, minlength=count * boards)
-    return np.sum(points.reshape(count, boards) >= fewest, axis=1)
+    return np.sum(points.reshape(count, boards) >= min_points, axis=1)
 
 
 def _weighted_planes(
     data: BoundaryPoints, weights: Array, count: int
 ) -> tuple[Array, Array, Array]:
-    """Planes (count, 4), how far their points extend off a line, and moments (count, 4, 4)."""
+    """Fit planes (count, 4); also return the ratio of the two variances of the points within each
+    (0 on a line), and the moments (count, 4, 4)."""
     homogeneous = np.column_stack([data.points, np.ones(len(data.points))])
     moments = np.empty((count, 4, 4))
     for i in range(4):
@@ -133,22 +115,21 @@ def _covariance(
     inverse = inverse @ transposed
     covariance[known] = inverse
     if board_error_mm > 0.0:
-        pulled = inverse[:, None] @ _board_pull(planes, data, weights)[known]
-        spread = np.einsum("nbik,nbjk->nij", pulled, pulled)
-        covariance[known] += board_error_mm**2 * spread
+        change = inverse[:, None] @ _board_gradients(planes, data, weights)[known]
+        covariance[known] += board_error_mm**2 * np.einsum("nbik,nbjk->nij", change, change)
     return covariance
 
 
-def _board_pull(planes: Array, data: BoundaryPoints, weights: Array) -> Array:
-    """(S + 1, boards, 4, 3): how 1 mm of each board error pulls on each plane."""
+def _board_gradients(planes: Array, data: BoundaryPoints, weights: Array) -> Array:
+    """Change of each plane's right-hand side per mm of each board error, (S + 1, boards, 4, 3)."""
     errors = data.board_errors
-    off = np.sum(planes[data.index, :3] * errors.along_ray, axis=1)
-    effects = np.nan_to_num(off * weights)[:, None] * errors.effects
+    residual = np.sum(planes[data.index, :3] * errors.along_ray, axis=1)
+    effects = np.nan_to_num(residual * weights)[:, None] * errors.effects
     homogeneous = np.column_stack([data.points, np.ones(len(data.points))])
     boards = int(data.board.max()) + 1
     cell, cells = data.index * boards + data.board, len(planes) * boards
-    pull = np.empty((cells, 4, 3))
+    gradient = np.empty((cells, 4, 3))
     for i in range(4):
         for j in range(3):
-            pull[:, i, j] = np.bincount(cell, homogeneous[:, i] * effects[:, j], cells)
-    return pull.reshape(len(planes), boards, 4, 3)
+            gradient[:, i, j] = np.bincount(cell, homogeneous[:, i] * effects[:, j], cells)
+    return gradient.reshape(len(planes), boards, 4, 3)

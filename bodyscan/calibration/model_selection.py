@@ -1,4 +1,10 @@
-"""Choose the model of the light that a pair needs, by held-out boards."""
+"""Choose models by held-out boards: compare two models, and select the light model of a pair.
+
+With residuals r of the richer model and r + d of the simpler one, squares differ by d^2 + 2 r d:
+the first term is the difference of the models, the second is due to noise, and its standard error
+follows from its sums over independent parts. Models are compared by differences at the same points,
+never by a ratio of noisy totals.
+"""
 
 from __future__ import annotations
 
@@ -9,36 +15,65 @@ import numpy as np
 
 from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.calibration.boundary_points import BoundaryPoints, select
-from bodyscan.calibration.held_out import CLEARLY, Compared, gain
 from bodyscan.geometry.light_planes import LightSheets
-from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN, rms, robust_scale
+from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN, cauchy_weights, rms, robust_scale
 
-MOST_FOLDS = 6
-CAP = 30.0
-"""No point counts for more than this many times the best model's median distance."""
-THIRDS = (-0.6, 0.6)
-"""Cuts a board into thirds along an axis, in standard deviations of its points' places there."""
+MIN_GAIN = 3.0
+"""Standard errors by which a richer model must be better: by chance once in 700 times."""
+MAX_FOLDS = 6
 OUTLIER = 4.0 * SIGMAS_PER_MEDIAN
-TRIMS = 3
-LEAST_SHARE = 0.01
-"""Boards are never assumed to be known so well that they account for less than this share of the
-squared held-out distances."""
+
+
+@dataclass(frozen=True, eq=False)
+class ResidualPair:
+    """Residuals (N, D) of the same points in two models, simple and rich.
+
+    cluster: (N,) number of the cluster of each point, such as its board. Errors are correlated
+        within a cluster and independent between clusters.
+    """
+
+    simple: Array
+    rich: Array
+    cluster: Indices
+
+
+def shared_weights(tried: Sequence[Array]) -> Array:
+    """Robust weights (N,) of points with residuals (N, D) in each model: low where none fits."""
+    size = tried[0].shape[1]
+    smallest = np.min([np.sum(residuals**2, axis=1) for residuals in tried], axis=0)
+    sigma = min(robust_scale(residuals.ravel()) for residuals in tried)
+    scaled = np.repeat(np.sqrt(smallest / size), size) / sigma
+    return np.asarray(cauchy_weights(scaled, size, 4.0)[::size], np.float64)
+
+
+def gain(*kinds: ResidualPair) -> float:
+    """Compute by how many standard errors the richer model lowers held-out squared residuals.
+
+    Each kind of points is scaled by its own robust sigma.
+    """
+    gained, variance = 0.0, 0.0
+    for pair in kinds:
+        sigma = min(robust_scale(residuals.ravel()) for residuals in (pair.simple, pair.rich))
+        weights = shared_weights([pair.simple, pair.rich]) / sigma**2
+        gained += float(np.sum(weights * np.sum(pair.simple**2 - pair.rich**2, axis=1)))
+        noise = weights * np.sum(2.0 * pair.rich * (pair.simple - pair.rich), axis=1)
+        variance += float(np.sum(np.bincount(pair.cluster, noise) ** 2))
+    return gained / max(float(np.sqrt(variance)), 1e-12)
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A model to try; candidates are listed simplest first.
+    """A light model to try; candidates are listed simplest first.
 
-    fit: sheets from points, with the covariance for boards 1 mm out of place.
-    everywhere: gives sheets for every s, so that a ray it cannot measure counts against it.
-    whole: has all terms that such devices have, and may be chosen; others are tried for
-        information.
+    fit: sheets from points, with the covariance for boards displaced by 1 mm.
+    complete: gives sheets for every s, so that a ray it cannot measure counts against it.
+    selectable: has all terms that such devices have; others are tried for information.
     """
 
     name: str
     fit: Callable[[BoundaryPoints], LightSheets]
-    everywhere: bool = True
-    whole: bool = True
+    complete: bool = True
+    selectable: bool = True
 
 
 @dataclass(frozen=True)
@@ -77,9 +112,9 @@ class Fold:
 
 @dataclass(frozen=True, eq=False)
 class HeldOutErrors:
-    """Distances measured with sheets that were fitted without the measured points.
+    """Distances of held-out points from their boards, as measured by sheets fitted without them.
 
-    distances: of the points from their boards, (N,) mm, NaN where not measured.
+    distances: (N,) mm, NaN where not measured.
     sheets: those fitted without each fold.
     """
 
@@ -87,20 +122,20 @@ class HeldOutErrors:
     sheets: tuple[LightSheets, ...]
 
     def unit_variance(self, data: BoundaryPoints, folds: Sequence[Fold]) -> Array:
-        """(N,) mm^2: variance of the distances if boards were known to 1 mm (see `BoardErrors`)."""
+        """Variance (N,) mm^2 of the distances if boards were known to 1 mm (see `BoardErrors`)."""
         errors = data.board_errors
         variance = np.sum(errors.effects**2, axis=1)
         for fold, sheets in zip(folds, self.sheets, strict=True):
-            rays, s, _ = _measured(data, fold)
-            own = sheets.variance_mm2(rays, s, sheets.depth(rays, s))
-            variance[fold.left_out] += own * errors.facing[fold.left_out] ** 2
+            rays, s, _ = _held_out_rays(data, fold)
+            of_depth = sheets.variance_mm2(rays, s, sheets.depth(rays, s))
+            variance[fold.left_out] += of_depth * errors.facing[fold.left_out] ** 2
         return variance
 
     def board_error_mm(self, data: BoundaryPoints, folds: Sequence[Fold]) -> float:
-        """Error of the boards' poses, mm, that would explain distances as large as these.
+        """Estimate the error of the boards' poses, mm, that explains distances as large as these.
 
-        data: the points that were held out. Their own noise, seen in the differences of neighbours
-            on a boundary, is subtracted.
+        data: the points that were held out. Their noise, by the differences of neighbours on a
+            boundary, is subtracted.
         """
         unit_variance = self.unit_variance(data, folds)
         known = np.isfinite(self.distances) & np.isfinite(unit_variance)
@@ -109,23 +144,24 @@ class HeldOutErrors:
             return 0.0
         limit = OUTLIER**2 * np.median(squared)
         total = np.minimum(squared, limit).mean()
-        together = (np.diff(data.index) == 0) & (np.diff(data.board) == 0)
-        steps = np.diff(self.distances)[together]
+        neighbours = (np.diff(data.index) == 0) & (np.diff(data.board) == 0)
+        steps = np.diff(self.distances)[neighbours]
         steps = steps[np.isfinite(steps)]
         noise = 0.5 * robust_scale(steps) ** 2 if steps.size else 0.0
-        left = max(total - noise, LEAST_SHARE * total)
+        # Boards are never assumed to account for less than a hundredth.
+        left = max(total - noise, 0.01 * total)
         return float(np.sqrt(left / unit_variance[known].mean()))
 
 
 def split(data: BoundaryPoints) -> list[Fold]:
     """Split the points so that each is left out once.
 
-    They are left out by boards, in MOST_FOLDS groups at most; with only two boards, by halves of
+    They are left out by boards, in MAX_FOLDS groups at most; with only two boards, by halves of
     one.
     """
     boards, number = np.unique(data.board, return_inverse=True)
     if len(boards) > 2:
-        group = number % MOST_FOLDS
+        group = number % MAX_FOLDS
     else:
         group = 2 * number + (data.board_errors.effects[:, 2] > 0.0)
     return [Fold(group == k, select(data, group != k)) for k in np.unique(group)]
@@ -136,14 +172,14 @@ def hold_out(candidate: Candidate, data: BoundaryPoints, folds: Sequence[Fold]) 
     distances, fitted = np.full(len(data.index), np.nan), []
     for fold in folds:
         sheets = candidate.fit(fold.rest)
-        rays, s, depth = _measured(data, fold)
+        rays, s, depth = _held_out_rays(data, fold)
         facing = data.board_errors.facing[fold.left_out]
         distances[fold.left_out] = (sheets.depth(rays, s) - depth) * facing
         fitted.append(sheets)
     return HeldOutErrors(distances, tuple(fitted))
 
 
-def _measured(data: BoundaryPoints, fold: Fold) -> tuple[Array, Array, Array]:
+def _held_out_rays(data: BoundaryPoints, fold: Fold) -> tuple[Array, Array, Array]:
     """Rays (n, 3) with z = 1, s (n,) and true depths (n,) mm of the points left out."""
     points, s = data.points[fold.left_out], data.index[fold.left_out].astype(float)
     return points / points[:, 2:], s, points[:, 2]
@@ -152,38 +188,38 @@ def _measured(data: BoundaryPoints, fold: Fold) -> tuple[Array, Array, Array]:
 def select_model(
     candidates: Sequence[Candidate], tried: Sequence[HeldOutErrors], data: BoundaryPoints
 ) -> tuple[int, tuple[HeldOutModel, ...]]:
-    """Choose a model; return its number and the figures of all that measured anything.
+    """Select a model; return its index and the figures of all that measured anything.
 
     data: the points held out.
 
-    Each model is compared with the one chosen so far, and taken if clearly better. The pose of a
-    held-out board is fitted with either model, so that only the light differs. Models that give no
-    depth where a stripe was seen too seldom are compared only where they give one.
+    Each model is compared with the one selected so far, and replaces it if clearly better. The pose
+    of a held-out board is fitted with either model, so that only the light differs. Models that give
+    no depth where a stripe was seen too seldom are compared only where they give one.
     """
     medians = [_median(np.abs(errors.distances)) for errors in tried]
-    cap = CAP * min(medians)
-    part, effects, board = parts_of_boards(data), data.board_errors.effects, data.board
-    seen = [
-        np.isfinite(errors.distances) | candidate.everywhere
+    cap = 30.0 * min(medians)
+    cluster, effects, board = _board_ninths(data), data.board_errors.effects, data.board
+    counted = [
+        np.isfinite(errors.distances) | candidate.complete
         for candidate, errors in zip(candidates, tried, strict=True)
     ]
-    chosen = next(i for i, candidate in enumerate(candidates) if candidate.whole)
+    chosen = next(i for i, candidate in enumerate(candidates) if candidate.selectable)
     gains: list[float | None] = [None] * len(candidates)
     for i in range(chosen + 1, len(candidates)):
-        known = seen[i]
-        if not (candidates[i].whole and np.isfinite(medians[i])):
+        known = counted[i]
+        if not (candidates[i].selectable and np.isfinite(medians[i])):
             continue
         rich, simple = (
-            without_motion(capped(tried[k].distances[known], cap), effects[known], board[known])
+            _without_motion(_clip(tried[k].distances[known], cap), effects[known], board[known])
             for k in (i, chosen)
         )
-        better_by = gain(Compared(simple[:, None], rich[:, None], part[known]))
+        better_by = gain(ResidualPair(simple[:, None], rich[:, None], cluster[known]))
         gains[i] = better_by
-        chosen = i if better_by >= CLEARLY else chosen
+        chosen = i if better_by >= MIN_GAIN else chosen
     figures = tuple(
         HeldOutModel(
             candidate.name,
-            _mean_of_boards(np.abs(capped(errors.distances, cap)), board, seen[i]),
+            _mean_of_boards(np.abs(_clip(errors.distances, cap)), board, counted[i]),
             medians[i],
             _rms(np.abs(errors.distances)),
             float(np.isfinite(errors.distances).mean()),
@@ -196,29 +232,31 @@ def select_model(
     return chosen, figures
 
 
-def parts_of_boards(data: BoundaryPoints) -> Indices:
+def _board_ninths(data: BoundaryPoints) -> Indices:
     """Number (N,) of the ninth of its board in which each point lies."""
-    across, down = (np.digitize(place, THIRDS) for place in data.board_errors.effects[:, 1:].T)
+    # Thirds along an axis, in standard deviations of the points there.
+    across, down = (np.digitize(xy, (-0.6, 0.6)) for xy in data.board_errors.effects[:, 1:].T)
     _, board = np.unique(data.board, return_inverse=True)
     return np.asarray(9 * board + 3 * across + down, np.int64)
 
 
-def without_motion(distances: Array, effects: Array, board: Indices) -> Array:
-    """Distances (N,) less the shift and tilts (`BoardErrors.effects`) that fit each board best."""
-    left = distances.copy()
+def _without_motion(distances: Array, effects: Array, board: Indices) -> Array:
+    """Subtract from distances (N,) the shift and tilts that fit each board best, by trimmed least
+    squares; effects: see `BoardErrors`."""
+    remaining = distances.copy()
     for number in np.unique(board):
-        own = board == number
-        kept = np.ones(np.count_nonzero(own), bool)
-        for _ in range(TRIMS):
-            motion = np.linalg.lstsq(effects[own][kept], distances[own][kept], rcond=None)[0]
-            left[own] = distances[own] - effects[own] @ motion
-            off = np.abs(left[own])
-            kept = off <= OUTLIER * max(float(np.median(off)), 1e-9)
-    return left
+        points = board == number
+        kept = np.ones(np.count_nonzero(points), bool)
+        for _ in range(3):
+            motion = np.linalg.lstsq(effects[points][kept], distances[points][kept], rcond=None)[0]
+            remaining[points] = distances[points] - effects[points] @ motion
+            size = np.abs(remaining[points])
+            kept = size <= OUTLIER * max(float(np.median(size)), 1e-9)
+    return remaining
 
 
-def capped(distances: Array, cap: float) -> Array:
-    """Clip distances; points that were not measured count as far off."""
+def _clip(distances: Array, cap: float) -> Array:
+    """Clip distances at `cap`; points that were not measured count as that far off."""
     return np.asarray(np.clip(np.nan_to_num(distances, nan=cap), -cap, cap), np.float64)
 
 

@@ -8,17 +8,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from bodyscan.arrays import Array
-from bodyscan.calibration.board_views import PlanarView
-from bodyscan.calibration.boundary_points import BoundaryPoints, subsample
-from bodyscan.calibration.camera import CameraCalibration, LensTrial
-from bodyscan.calibration.joint_refinement import striped_board
+from bodyscan.calibration.board_views import LocatedView, PlanarView
+from bodyscan.calibration.boundary_points import BoundaryPoints, select, subsample
+from bodyscan.calibration.camera import LensTrial
+from bodyscan.calibration.joint_refinement import JointFit, StripedBoard, refine_jointly
 from bodyscan.calibration.light_sheets import fit_light_sheets
 from bodyscan.calibration.model_selection import HeldOutModel
-from bodyscan.calibration.refinement_choice import (
-    REFINED_BINS,
-    RefinementTrial,
-    refine_where_better,
-)
 from bodyscan.calibration.stripe_agreement import (
     ProjectorMotion,
     board_offsets,
@@ -28,8 +23,11 @@ from bodyscan.calibration.striped_view import StripedView, boundaries_on_boards
 from bodyscan.errors import PairFailed
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.light_planes import LightSheets
+from bodyscan.geometry.smooth_sheets import SmoothSheets
+from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import RayUncertainty
 from bodyscan.outcome import Outcome
+from bodyscan.rig.board import Board
 from bodyscan.stripes.stripe_code import StripeCode
 
 
@@ -43,16 +41,12 @@ class PairQuality:
     stripe_shots: number of boards with stripes.
     stripes_calibrated, stripes_projected: boundaries with a sheet, and all that are projected.
     held_out: every model of the light tried on held-out boards, simplest first.
-    refinement: for a pair by itself, whether camera, boards and light were refined together and
-        why.
-    flatness_mm: RMS distance of held-out boards' stripes from the boards, before refinement and as
-        chosen.
-    ways: every refinement tried on held-out boards.
-    bent_mm: height from the lowest to the highest corner of each board found to be bent, mm.
+    refinement: for a pair by itself, how camera, boards and light were solved for; "" if in turn.
+    bent_mm: height from the lowest to the highest corner of each board, by that solve, mm.
     boards_mm: mean and RMS over the boards of the offset at which stripes measure them, relative to
-        where the corners of all cameras put them.
+        the corners of all cameras.
     lenses: every lens tried on held-out boards, simplest first; empty if the lens was given or the
-        boards stood in too few places.
+        boards stood at too few positions.
     imported: the file of another program that the calibration was taken from, "" if it is our own.
     imported_sigma_px: sigma of its pixels, None if unknown.
     """
@@ -65,8 +59,6 @@ class PairQuality:
     stripes_projected: int = 0
     held_out: tuple[HeldOutModel, ...] = ()
     refinement: str = ""
-    flatness_mm: tuple[float, float] | None = None
-    ways: tuple[RefinementTrial, ...] = ()
     bent_mm: dict[str, float] = field(default_factory=dict)
     boards_mm: tuple[float, float] | None = None
     lenses: tuple[LensTrial, ...] = ()
@@ -106,79 +98,160 @@ class PairCalibration:
 
 
 @dataclass(frozen=True, eq=False)
-class PlacedPair:
+class LocatedPair:
     """A pair whose camera and boards are known: the input for fitting its light sheets.
 
     camera, camera_covariance: the camera after the joint solve of the rig's corners, and the
         covariance (P, P) of its parameters.
-    own: the camera as calibrated by itself.
-    lenses: those that were tried.
-    views: number of board views that it contributed.
-    shots: those with decoded stripes, with `camera_from_board` from the joint solve.
-    alone: whether no other pair fixes the boards.
     rays: how well each pixel's ray is known.
+    lenses: those that were tried.
+    views: every board view that the camera contributed, with `camera_from_board` from that solve.
+    shots: those with decoded stripes.
+    boards: of the rig.
+    alone: whether no other pair constrains the boards.
     """
 
     name: str
     camera: Camera
     camera_covariance: Array
-    own: CameraCalibration
+    rays: RayUncertainty | None
     lenses: tuple[LensTrial, ...]
-    projector: StripeCode | None
     rms_px: float
-    views: int
+    projector: StripeCode | None
+    views: tuple[LocatedView, ...]
     shots: tuple[StripedView, ...]
+    boards: tuple[Board, ...]
     alone: bool
-    rays: RayUncertainty | None = None
 
 
-def calibrate_pair(pair: PlacedPair) -> Outcome[PairCalibration]:
+def calibrate_pair(pair: LocatedPair) -> Outcome[PairCalibration]:
     """Fit the light sheets of one pair. Raises PairFailed if its stripes do not give any."""
-    quality = PairQuality(pair.rms_px, pair.views, lenses=pair.lenses)
-    camera, projector = pair.camera, pair.projector
-    if projector is None:
-        return Outcome(
-            PairCalibration(
-                pair.name, camera, pair.camera_covariance, None, quality, rays=pair.rays
-            ),
-        )
-    notes: tuple[str, ...] = ()
-    shots = pair.shots
-    points = boundaries_on_boards(pair.name, camera, projector, shots)
-    disagreement = find_projector_motion(points, projector.stripes, projector.direction)
-    if disagreement is not None:
-        agreed = drop_disagreeing(pair.name, shots, disagreement)
-        shots, notes = agreed.value, agreed.notes
-        points = boundaries_on_boards(pair.name, camera, projector, shots)
-    fit = fit_light_sheets(points, projector.stripes, projector.direction)
+    calibration = PairCalibration(
+        pair.name,
+        pair.camera,
+        pair.camera_covariance,
+        None,
+        PairQuality(pair.rms_px, len(pair.views), lenses=pair.lenses),
+        rays=pair.rays,
+    )
+    code = pair.projector
+    if code is None:
+        return Outcome(calibration)
+    consistent = drop_inconsistent(pair.name, pair.camera, code, pair.shots)
+    shots, notes = consistent.value, consistent.notes
+    points = boundaries_on_boards(pair.name, pair.camera, code, shots)
+    fit = fit_light_sheets(points, code.stripes, code.direction)
     quality = replace(
-        quality,
+        calibration.quality,
         planes_rms_mm=fit.rms_mm,
         stripe_shots=len(shots),
         stripes_calibrated=fit.stripes_calibrated,
-        stripes_projected=projector.stripes - 1,
+        stripes_projected=code.stripes - 1,
         held_out=fit.held_out,
         boards_mm=_mean_and_rms(board_offsets(points, fit.sheets)),
     )
-    found = PairCalibration(
-        pair.name, camera, pair.camera_covariance, fit.sheets, quality, rays=pair.rays
-    )
-    if pair.alone:
-        # In a rig of several pairs all cameras together fix the boards, far better than the stripes
-        # of one pair could.
-        found, shots = _refined(found, pair.own, shots, points)
-    crossed = _with_crossing(found, projector, shots)
-    return Outcome(crossed.value, (*notes, *crossed.notes))
+    calibration = replace(calibration, sheets=fit.sheets, quality=quality)
+    if pair.alone and isinstance(fit.sheets, SmoothSheets):
+        # In a rig of several pairs all cameras together constrain the boards, far better than the
+        # stripes of one pair could.
+        joint = _refine(pair, fit.sheets, shots, points)
+        calibration = _with_joint_fit(calibration, joint)
+        poses = dict(zip((view.key for view in pair.views), joint.camera_from_board, strict=True))
+        shots = tuple(_with_pose(shot, poses[shot.view.key]) for shot in shots)
+    crossing = _fit_crossing(calibration, code, shots)
+    return replace(crossing, notes=(*notes, *crossing.notes))
 
 
-def _with_crossing(
-    pair: PairCalibration, projector: StripeCode, shots: Sequence[StripedView]
-) -> Outcome[PairCalibration]:
-    """The pair with sheets of its crossing stripes, if any were projected.
+def drop_inconsistent(
+    name: str, camera: Camera, code: StripeCode, shots: Sequence[StripedView]
+) -> Outcome[tuple[StripedView, ...]]:
+    """Drop shots whose stripes lie where the light of the others cannot put them.
 
-    If they give no sheets the pair does without, and a note says so.
+    Raises PairFailed if the projector moved between two shots.
     """
-    across = projector.crossing
+    points = boundaries_on_boards(name, camera, code, shots)
+    split = find_projector_motion(points, code.stripes, code.direction)
+    return Outcome(tuple(shots)) if split is None else _consistent_shots(name, shots, split)
+
+
+def _consistent_shots(
+    name: str, shots: Sequence[StripedView], split: ProjectorMotion
+) -> Outcome[tuple[StripedView, ...]]:
+    names = [shot.view.shot for shot in shots]
+    misfit = f"{split.joint_px:.1f} px RMS as one group, {split.separate_px:.1f} px as two"
+    others = ", ".join(names[k] for k in split.others)
+    if split.moved:
+        raise PairFailed(
+            f"the stripes changed between shots {names[split.kept[-1]]} and "
+            f"{names[split.others[0]]} ({misfit}). Possible causes: the projector moved; the images "
+            f"of {others} are mixed up",
+            where=f"pair {name}",
+            remedy="fasten it and capture the boards again, or delete the shots before it moved",
+        )
+    plural = "s" if len(split.others) > 1 else ""
+    note = (
+        f"{name}: the stripes of shot{plural} {others} do not fit the others' ({misfit}) and are not "
+        "used. Possible causes: the board or the projector moved during the sequence; images of "
+        "several shots are mixed up"
+    )
+    return Outcome(tuple(shot for k, shot in enumerate(shots) if k not in split.others), (note,))
+
+
+def _refine(
+    pair: LocatedPair,
+    sheets: SmoothSheets,
+    shots: Sequence[StripedView],
+    points: BoundaryPoints,
+) -> JointFit[SmoothSheets]:
+    """Refine camera, boards and sheets jointly, from all corners and a subset of the stripes."""
+    # 6000 bins determine camera, boards and sheets to a tenth as well as all bins do.
+    points = subsample(points, 6000)
+    number = {shot.view.key: k for k, shot in enumerate(shots)}
+    boards = []
+    for view in pair.views:
+        k = number.get(view.key, -1)
+        boards.append(
+            StripedBoard.from_points(
+                view.board,
+                PlanarView(view.shot, view.points, view.pixels),
+                pair.camera,
+                select(points, points.board == k),
+                shots[k].face if k >= 0 else None,
+            )
+        )
+    observed = {view.board for view in pair.views}
+    flatness = {
+        board.name: board.believed_flatness_mm for board in pair.boards if board.name in observed
+    }
+    poses = [view.camera_from_board for view in pair.views]
+    return refine_jointly(pair.camera, poses, sheets, boards, flatness)
+
+
+def _with_joint_fit(pair: PairCalibration, fit: JointFit[SmoothSheets]) -> PairCalibration:
+    quality = replace(
+        pair.quality,
+        refinement="joint solve of corners and stripes",
+        corners_rms_px=fit.corners_rms_px,
+        bent_mm={name: warp.out_of_plane_mm for name, warp in fit.warps.items()},
+    )
+    return replace(
+        pair,
+        camera=fit.camera,
+        camera_covariance=fit.camera_covariance,
+        sheets=fit.sheets,
+        quality=quality,
+    )
+
+
+def _with_pose(shot: StripedView, camera_from_board: RigidTransform) -> StripedView:
+    return replace(shot, view=replace(shot.view, camera_from_board=camera_from_board))
+
+
+def _fit_crossing(
+    pair: PairCalibration, code: StripeCode, shots: Sequence[StripedView]
+) -> Outcome[PairCalibration]:
+    """Add sheets of the crossing stripes, if any were projected; if they give none, say so."""
+    across = code.crossing
     if across is None:
         return Outcome(pair)
     crossed = [
@@ -191,84 +264,8 @@ def _with_crossing(
         fit = fit_light_sheets(points, across.stripes, across.direction)
     except PairFailed as error:
         return Outcome(pair, (f"{pair.name}: crossing stripes are not used: {error.what}",))
-    said = f"{pair.name}: crossing stripes: {fit.model}, {fit.rms_mm:.3f} mm from their sheets"
-    return Outcome(replace(pair, crossing=fit.sheets), (said,))
-
-
-def drop_disagreeing(
-    name: str, shots: Sequence[StripedView], found: ProjectorMotion
-) -> Outcome[tuple[StripedView, ...]]:
-    """The shots without those that do not fit. Raises PairFailed if the projector moved."""
-    names = [shot.view.shot for shot in shots]
-    misfit = f"{found.together_px:.1f} px off together, {found.apart_px:.1f} px apart"
-    if found.moved:
-        before, after = names[found.kept[-1]], names[found.others[0]]
-        raise PairFailed(
-            f"the projector moved between shots {before} and {after} (stripes are {misfit}), or the "
-            f"images of {', '.join(names[k] for k in found.others)} are mixed up",
-            where=f"pair {name}",
-            remedy="fasten it and capture the boards again, or delete the shots before it moved",
-        )
-    odd = ", ".join(names[k] for k in found.others)
-    said = f"the stripes of shot{'s' if len(found.others) > 1 else ''} {odd} do not fit the others'"
-    note = (
-        f"{name}: {said} ({misfit}): the board or the projector moved meanwhile, or images of several "
-        "shots are mixed up; these stripes are not used"
-    )
-    kept = tuple(shot for k, shot in enumerate(shots) if k not in found.others)
-    return Outcome(kept, (note,))
-
-
-def _refined(
-    pair: PairCalibration,
-    own: CameraCalibration,
-    shots: Sequence[StripedView],
-    points: BoundaryPoints,
-) -> tuple[PairCalibration, tuple[StripedView, ...]]:
-    """Solve for camera, boards and light of a pair by itself together, if held-out boards gain.
-
-    Also returns its shots, with the boards' poses from that solve.
-    """
-    assert pair.sheets is not None
-    data = subsample(points, REFINED_BINS)
-    boards = [
-        striped_board(
-            PlanarView(shot.view.shot, shot.view.points, shot.view.pixels),
-            pair.camera,
-            data,
-            k,
-            shot.view.board,
-        )
-        for k, shot in enumerate(shots)
-    ]
-    flatness = {shot.view.board: shot.board.believed_flatness_mm for shot in shots}
-    choice = refine_where_better(own, pair.sheets, boards, data, flatness)
-    quality = replace(
-        pair.quality,
-        refinement=choice.reason,
-        flatness_mm=choice.flatness_mm,
-        ways=choice.trials,
-    )
-    fit = choice.fit
-    if fit is None:
-        return replace(pair, quality=quality), tuple(shots)
-    bent = {name: form.out_of_plane_mm for name, form in fit.forms.items() if form.heights.any()}
-    refined = replace(
-        pair,
-        camera=fit.camera,
-        camera_covariance=fit.camera_covariance,
-        sheets=fit.sheets,
-        quality=replace(quality, bent_mm=bent),
-    )
-    if not choice.taken:
-        return refined, tuple(shots)
-    poses = fit.camera_from_board
-    placed = (
-        replace(shot, view=replace(shot.view, camera_from_board=poses[shot.view.shot]))
-        for shot in shots
-    )
-    quality = replace(refined.quality, corners_rms_px=fit.corners_rms_px)
-    return replace(refined, quality=quality), tuple(placed)
+    note = f"{pair.name}: crossing stripes: {fit.model}, {fit.rms_mm:.3f} mm from their sheets"
+    return Outcome(replace(pair, crossing=fit.sheets), (note,))
 
 
 def _mean_and_rms(values: Array) -> tuple[float, float] | None:

@@ -1,4 +1,4 @@
-"""Check that all boards of a pair saw the same light: its projector must not move between shots."""
+"""Check that the stripes on all boards of a pair are consistent with one projector at rest."""
 
 from __future__ import annotations
 
@@ -8,144 +8,137 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodyscan.arrays import Array, Indices
-from bodyscan.calibration.boundary_points import (
-    BoundaryPoints,
-    select,
-    subsample,
-)
-from bodyscan.calibration.pinhole_projector import fit_pinhole
-from bodyscan.calibration.sheet_fit import fit_sheets
+from bodyscan.calibration.boundary_points import BoundaryPoints, select, subsample
+from bodyscan.calibration.sheet_fit import fit_pinhole, fit_sheets
 from bodyscan.errors import PairFailed
 from bodyscan.geometry.bowed_sheets import BowedSheets
 from bodyscan.geometry.light_planes import Axis, LightSheets
 from bodyscan.geometry.light_sheets import intersect_rays
 
-FEW_POINTS = 1200
-STEPS = 12
-SUSPECT_PX = 0.4
+MAX_MISFIT_PX = 0.4
 """Boards that agree this well are not examined further."""
-FEWEST_AGREEING = 3
+MIN_GROUP = 3
 """Two boards agree on nearly any light."""
-CLEARLY = 3.0
-"""Boards are split if that improves their agreement by this factor."""
 
 
 @dataclass(frozen=True, eq=False)
 class ProjectorMotion:
-    """A split of the boards into two groups, each of which agrees on the light.
+    """A split of the boards into two groups, each of which is consistent with one light.
 
     kept, others: numbers of the boards in each group, in the order of the shots; `others` are a few
         that do not fit or, where the projector `moved`, all that were taken afterwards.
-    together_px, apart_px: how well stripes fit one light for all boards, and one for each group.
+    joint_px, separate_px: RMS misfit of the stripes with one light for all boards, and with one for
+        each group.
     """
 
     kept: Indices
     others: Indices
-    together_px: float
-    apart_px: float
+    joint_px: float
+    separate_px: float
     moved: bool = False
 
 
 def find_projector_motion(
     data: BoundaryPoints, stripes: int, direction: Axis
 ) -> ProjectorMotion | None:
-    """Find boards that saw different light; None if all agree or there are fewer than three.
+    """Split the boards into groups with different light; None if all agree or there are fewer than
+    three.
 
     data: its `board` counts in the order of the shots.
 
-    Raises PairFailed if stripes lie farther off than their width and most boards agree on no light:
-    images of different shots are mixed up, or the stripes are not those described.
+    Raises PairFailed if the misfit is larger than a stripe and no split explains it.
     """
-    few = subsample(data, FEW_POINTS)
+    few = subsample(data, 1200)
     boards = np.unique(few.board)
     if len(boards) < 3:
         return None
-    together = _misfit(few, [boards], stripes, direction)
-    if together < SUSPECT_PX:
+    joint = _misfit(few, [boards], stripes, direction)
+    if joint < MAX_MISFIT_PX:
         return None
-    best, apart = None, together
-    for kept, others, misfit, moved in _told_apart(
+    best, separate = None, joint
+    for kept, others, misfit, moved in _candidate_splits(
         boards, lambda groups: _misfit(few, groups, stripes, direction)
     ):
-        if CLEARLY * misfit < apart:
-            best, apart = ProjectorMotion(kept, others, together, misfit, moved), misfit
-        if apart < SUSPECT_PX:
+        if 3.0 * misfit < separate:
+            best, separate = ProjectorMotion(kept, others, joint, misfit, moved), misfit
+        if separate < MAX_MISFIT_PX:
             break
     if best is not None:
         return best
     width = _stripe_width(few)
-    if together > width:
+    if joint > width:
         raise PairFailed(
-            f"the stripes of {len(boards)} boards fit no light together, nor do those of most of "
-            f"them: they are {together:.1f} px off, a stripe is {width:.1f} px wide",
-            remedy="see whether the images of these shots are mixed up (the lit image of one, the "
-            "patterns of another), and whether `stripes` and `direction` are right",
+            f"no projector explains the stripes on {len(boards)} boards, nor those on most of them: "
+            f"the misfit is {joint:.1f} px, a stripe is {width:.1f} px wide. Possible causes: images "
+            "of several shots are mixed up; `stripes` or `direction` is wrong",
+            remedy="check that the lit image and the patterns of each shot belong together, and "
+            "`stripes` and `direction` in the rig file",
         )
     return None
 
 
 def board_offsets(data: BoundaryPoints, sheets: LightSheets) -> Array:
-    """Offsets (B,) mm of boards as measured by the stripes from where corners put them.
+    """Compute the offset (B,) mm of each board as the stripes measure it from its pose by corners.
 
     Median along the board's normal, positive away from the camera.
     """
     rays = data.points / data.points[:, 2:]
     depth = intersect_rays(sheets, rays, data.index.astype(float)).depth
-    off = (depth - data.points[:, 2]) * data.board_errors.facing
-    known = np.isfinite(off)
-    off, board = off[known], data.board[known]
-    return np.array([np.median(off[board == k]) for k in np.unique(board)], np.float64)
+    offset = (depth - data.points[:, 2]) * data.board_errors.facing
+    known = np.isfinite(offset)
+    offset, board = offset[known], data.board[known]
+    return np.array([np.median(offset[board == k]) for k in np.unique(board)], np.float64)
 
 
 Misfit = Callable[[Sequence[Indices]], float]
+Split = tuple[Indices, Indices, float, bool]
+"""Boards kept, the others, misfit in px, and whether the projector moved."""
 
 
-def _told_apart(boards: Indices, misfit: Misfit) -> Iterator[tuple[Indices, Indices, float, bool]]:
-    """Possible splits, simplest first: kept, others, misfit in px, whether the projector moved."""
-    left_out = _left_out(boards, misfit)
-    yield next(left_out)
-    yield from _before_and_after(boards, misfit)
-    yield from left_out
+def _candidate_splits(boards: Indices, misfit: Misfit) -> Iterator[Split]:
+    """Yield possible splits, simplest first."""
+    drops = _drop_boards(boards, misfit)
+    yield next(drops)
+    yield from _split_in_time(boards, misfit)
+    yield from drops
 
 
-def _left_out(boards: Indices, misfit: Misfit) -> Iterator[tuple[Indices, Indices, float, bool]]:
+def _drop_boards(boards: Indices, misfit: Misfit) -> Iterator[Split]:
     """Drop one board after another, each time the one without which the others agree best.
 
     Stops while most boards are left and their agreement still means something.
     """
-    kept, fewest = boards, max(FEWEST_AGREEING, len(boards) // 2 + 1)
-    while len(kept) > fewest or kept is boards:
-        apart, out = min((misfit([kept[kept != board]]), board) for board in kept)
-        kept = kept[kept != out]
-        yield kept, np.setdiff1d(boards, kept), apart, False
+    kept, min_kept = boards, max(MIN_GROUP, len(boards) // 2 + 1)
+    while len(kept) > min_kept or kept is boards:
+        separate, dropped = min((misfit([kept[kept != board]]), board) for board in kept)
+        kept = kept[kept != dropped]
+        yield kept, np.setdiff1d(boards, kept), separate, False
 
 
-def _before_and_after(
-    boards: Indices, misfit: Misfit
-) -> Iterator[tuple[Indices, Indices, float, bool]]:
+def _split_in_time(boards: Indices, misfit: Misfit) -> Iterator[Split]:
     """Split all boards before a shot from all after it, where the groups agree best.
 
-    If only two boards come first, their agreement means nothing, and the projector stands where the
-    others saw it: the two are left out.
+    If only two boards come first, their agreement means nothing: they are dropped, and the others
+    determine the projector.
     """
     cuts = range(2, len(boards) - 1)
     if cuts:
-        apart, first = min((misfit([boards[:cut], boards[cut:]]), cut) for cut in cuts)
+        separate, first = min((misfit([boards[:cut], boards[cut:]]), cut) for cut in cuts)
         before, after = boards[:first], boards[first:]
-        if first < FEWEST_AGREEING <= len(after):
-            yield after, before, apart, False
+        if first < MIN_GROUP <= len(after):
+            yield after, before, separate, False
         else:
-            yield before, after, apart, True
+            yield before, after, separate, True
 
 
 def _stripe_width(data: BoundaryPoints) -> float:
-    """Width of a stripe, px: distance of neighbouring boundaries, median over the boards."""
+    """Estimate the width of a stripe, px: distance of neighbouring boundaries, median over boards."""
     widths = []
     for board in np.unique(data.board):
-        own = data.board == board
-        across = np.sum(data.points[own] * data.per_pixel[own], axis=1)
-        across /= np.sum(data.per_pixel[own] ** 2, axis=1)
-        slope = np.polyfit(data.index[own].astype(float), across, 1)[0]
+        rows = data.board == board
+        across = np.sum(data.points[rows] * data.per_pixel[rows], axis=1)
+        across /= np.sum(data.per_pixel[rows] ** 2, axis=1)
+        slope = np.polyfit(data.index[rows].astype(float), across, 1)[0]
         widths.append(abs(float(slope)))
     return float(np.median(widths))
 
@@ -153,17 +146,16 @@ def _stripe_width(data: BoundaryPoints) -> float:
 def _misfit(
     data: BoundaryPoints, groups: Sequence[Indices], stripes: int, direction: Axis
 ) -> float:
-    """RMS over boards of the median distance (px) of a board's stripes from its group's sheets.
+    """Compute the RMS over boards of the median distance (px) of stripes from their group's sheets.
 
     The sheets may bow, so that no kind of projector is mistaken for one that moved.
     """
     medians = []
     for group in groups:
-        own = select(data, np.isin(data.board, group))
-        plain = fit_pinhole(own.points, own.index.astype(float)).sheets(
-            own.points, stripes, direction
-        )
-        fit = fit_sheets(BowedSheets.from_pinhole(plain, 1), own, most_steps=STEPS)
-        off = np.abs(fit.distances_mm) / np.linalg.norm(own.per_pixel, axis=1)
-        medians += [float(np.median(off[own.board == board])) for board in group]
+        points = select(data, np.isin(data.board, group))
+        pinhole = fit_pinhole(points.points, points.index.astype(float))
+        plain = pinhole.sheets(points.points, stripes, direction)
+        fit = fit_sheets(BowedSheets.from_pinhole(plain, 1), points, max_steps=12)
+        distance = np.abs(fit.distances_mm) / np.linalg.norm(points.per_pixel, axis=1)
+        medians += [float(np.median(distance[points.board == board])) for board in group]
     return float(np.sqrt(np.mean(np.square(medians))))

@@ -1,4 +1,4 @@
-"""The stripes of one pair on its boards: decoded near each, averaged, and carried onto it."""
+"""The stripes of one pair on its boards: select those near each, average, intersect with it."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ import numpy as np
 
 from bodyscan.arrays import WHOLE, Array, Crop, Indices, Mask
 from bodyscan.boards.view import BoardView
-from bodyscan.calibration.board_form import BoardFace
-from bodyscan.calibration.board_views import LocatedView
+from bodyscan.calibration.board_views import BoardFace, LocatedView
 from bodyscan.calibration.boundary_points import (
     BoundaryPoints,
     Height,
@@ -30,21 +29,11 @@ from bodyscan.rig.pair import CameraSpec
 from bodyscan.stripes.stripe_code import StripeCode
 from bodyscan.stripes.stripe_map import StripeMap
 
-FEWEST_STRIPE_SHOTS = 2
-RIM_SQUARES = 0.1
-"""Share of the outermost squares left out: beside the print a board may be cut unevenly."""
 BIN_PX = 16
 """Length of a bin along a boundary, which is straight over so short a piece: its sagitta is below a
 thousandth of a pixel. Ten times fewer points remain."""
-
-FEWEST_BANDS = 4
-"""Fewest such bins across a board: sheets bow across their width."""
-AROUND_PX = 16.0
-"""Decoding a boundary uses pixels up to 7 px beside it (`indirect_light`, `albedo_edges`) and
-boundaries of its run up to 6 px away, which in turn use pixels as far beside them."""
-
 Box = tuple[Array, Array]
-"""Least and greatest (u, v), px."""
+"""Smallest and largest (u, v), px."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,9 +54,9 @@ class BoardBoundaries:
 
 @dataclass(frozen=True, eq=False)
 class StripedView:
-    """A board that a pair saw, with its pose and the stripes decoded on it.
+    """A board that a pair observed, with its pose and the stripes decoded on it.
 
-    face: the face that was seen, if the board is known not to be flat.
+    face: the face observed, if the board is known not to be flat.
     """
 
     view: LocatedView
@@ -77,13 +66,13 @@ class StripedView:
 
     @property
     def camera_from_face(self) -> RigidTransform:
-        """Transform from the face that was seen; its corners lie at z = 0, or near it if bent."""
+        """Transform from the face observed; its corners lie at z = 0, or near it if not flat."""
         z_mm = self.face.z_mm if self.face else self.view.points[0, 2]
         return self.view.camera_from_board @ RigidTransform.from_translation([0.0, 0.0, z_mm])
 
 
 def boundaries_near(stripes: StripeMap, box: Box, crop: Crop = WHOLE) -> BoardBoundaries:
-    """The boundaries within a box around a view.
+    """Select the boundaries within a box around a view.
 
     crop: rows and columns of the image that the stripe map covers.
     """
@@ -100,7 +89,7 @@ def boundaries_near(stripes: StripeMap, box: Box, crop: Crop = WHOLE) -> BoardBo
 
 
 def crop_around(boxes: Sequence[Box]) -> Crop:
-    """Rows and columns that hold all boxes of an image."""
+    """Crop the rows and columns that hold all boxes of an image."""
     lows, highs = zip(*boxes, strict=True)
     left, top = np.floor(np.maximum(np.min(lows, axis=0), 0.0)).astype(int)
     right, bottom = np.ceil(np.max(highs, axis=0)).astype(int) + 1
@@ -108,14 +97,14 @@ def crop_around(boxes: Sequence[Box]) -> Crop:
 
 
 def box_around(view: BoardView | LocatedView) -> Box:
-    """A box around a view's board, of which some corners may not have been seen."""
+    """Compute a box around a view's board, of which some corners may not have been found."""
     low, high = view.pixels.min(axis=0), view.pixels.max(axis=0)
-    reach = 0.5 * (high - low)
-    return low - reach, high + reach
+    margin = 0.5 * (high - low)
+    return low - margin, high + margin
 
 
 def box_of_print(camera: Camera, board: Board, view: LocatedView) -> Box:
-    """A box around the print of a board of known pose, within the box around its view."""
+    """Compute a box around the print of a board of known pose, within the box around its view."""
     low, high = box_around(view)
     grid = np.indices((board.columns + 1, board.rows + 1)).reshape(2, -1).T * board.square_mm
     on_face = np.column_stack([grid, np.full(len(grid), view.points[0, 2])])
@@ -123,32 +112,36 @@ def box_of_print(camera: Camera, board: Board, view: LocatedView) -> Box:
     ideal = points[:, :2] / points[:, 2:]
     if np.any(points[:, 2] <= 0.0) or np.hypot(*ideal.T).max() >= camera.lens.fold_radius:
         return low, high
-    shown = camera.project(points)
+    pixels = camera.project(points)
+    # Decoding a boundary uses pixels up to 7 px from it (`indirect_light`, `albedo_edges`) and
+    # boundaries of its run up to 6 px away, which in turn use pixels as far from them.
+    margin = 16.0
     return (
-        np.maximum(low, shown.min(axis=0) - AROUND_PX),
-        np.minimum(high, shown.max(axis=0) + AROUND_PX),
+        np.maximum(low, pixels.min(axis=0) - margin),
+        np.minimum(high, pixels.max(axis=0) + margin),
     )
 
 
-def bands_apart(code: StripeCode, boxes: Sequence[Box]) -> int:
-    """Take one in this many bands of BIN_PX along the stripes for as many bins as a fit uses, even
-    if half of all stripes miss the boards."""
+def band_step(code: StripeCode, boxes: Sequence[Box]) -> int:
+    """Compute the step between bands of BIN_PX along the stripes that leaves as many bins as a fit
+    uses, even if half of all stripes miss the boards."""
     along = 0 if code.direction == "horizontal" else 1
     pieces = sum(float(high[along] - low[along]) / BIN_PX for low, high in boxes)
     return max(int(0.5 * code.stripes * pieces / FIT_BINS), 1)
 
 
-def most_apart(boxes: Sequence[Box], camera: CameraSpec) -> int:
-    """Largest band step that leaves FEWEST_BANDS across the visible part of every board."""
+def max_band_step(boxes: Sequence[Box], camera: CameraSpec) -> int:
+    """Compute the largest band step that leaves four bands across the visible part of every board:
+    sheets bow across their width."""
     size = np.array([camera.width, camera.height])
-    shown = [np.minimum(high, size) - np.maximum(low, 0.0) for low, high in boxes]
-    return max(int(np.min(shown) / (FEWEST_BANDS * BIN_PX)), 1)
+    visible = [np.minimum(high, size) - np.maximum(low, 0.0) for low, high in boxes]
+    return max(int(np.min(visible) / (4 * BIN_PX)), 1)
 
 
 def boundaries_on_boards(
     name: str, camera: Camera, projector: StripeCode, shots: Sequence[StripedView]
 ) -> BoundaryPoints:
-    """Carry the boundaries of all shots onto their boards; `board` counts the shots.
+    """Intersect the boundaries of all shots with their boards; `board` counts the shots.
 
     Raises PairFailed if fewer than two boards carry stripes.
     """
@@ -165,7 +158,7 @@ def boundaries_on_boards(
         for number, shot in enumerate(shots)
     ]
     striped = sum(len(part.index) > 0 for part in parts)
-    if striped < FEWEST_STRIPE_SHOTS:
+    if striped < 2:
         raise PairFailed(
             f"stripes were decoded on {striped} board poses, a light plane needs at least two",
             where=f"pair {name}",
@@ -185,7 +178,7 @@ def on_board(
     *,
     bin_px: int = BIN_PX,
 ) -> BoundaryPoints:
-    """Boundaries `on_print`, carried onto the board."""
+    """Intersect the boundaries on the board's print with the board, after averaging."""
     means = on_print(camera, projector, board, camera_from_face, boundaries, bin_px)
     return boundary_points(
         camera,
@@ -211,14 +204,13 @@ def on_print(
 
     Stripes on the wall and floor are dropped. Averaging a second time changes nothing.
     """
-    place = camera_from_face
     # A homography relates a ray to where it meets the board's plane: x ~ [r1 r2 t] (X, Y, 1).
-    plane = np.column_stack([place.rotation[:, :2], place.translation])
-    rim = RIM_SQUARES * board.square_mm
+    plane = np.column_stack([camera_from_face.rotation[:, :2], camera_from_face.translation])
+    rim = 0.1 * board.square_mm  # next to the print a board may be cut unevenly
     area = np.array(board.size_mm) - rim
     inside = np.zeros(len(boundaries.index), np.bool_)
     pixels = np.ascontiguousarray(boundaries.pixels)
-    _look_inside(ray_table(camera), np.linalg.inv(plane), np.append(area, rim), pixels, inside)
+    _mark_inside(ray_table(camera), np.linalg.inv(plane), np.append(area, rim), pixels, inside)
     means = bin_boundaries(boundaries, inside, code.direction, bin_px)
     if boundaries.crossing is None or code.crossing is None:
         return means
@@ -229,7 +221,7 @@ def on_print(
 def bin_boundaries(
     boundaries: BoardBoundaries, kept: Mask, direction: Axis, bin_px: int = BIN_PX
 ) -> BoardBoundaries:
-    """Weighted means over bin_px pixels along each boundary, of points that are `kept` (N,)."""
+    """Average the points that are `kept` (N,) over bin_px pixels along each boundary, weighted."""
     index, pixels = boundaries.index[kept], boundaries.pixels[kept]
     if not len(index):
         return BoardBoundaries(index, pixels, boundaries.sigma_px[kept])
@@ -241,15 +233,15 @@ def bin_boundaries(
     cell += index * pieces
     total = np.bincount(cell, weight)
     filled = np.flatnonzero(total)
-    means = [np.bincount(cell, weight * own)[filled] / total[filled] for own in pixels.T]
+    means = [np.bincount(cell, weight * uv)[filled] / total[filled] for uv in pixels.T]
     return BoardBoundaries(filled // pieces, np.stack(means, axis=1), 1.0 / np.sqrt(total[filled]))
 
 
 @compiled
-def _look_inside(
+def _mark_inside(
     rays: Table, board_from_ray: Array, area: Array, pixels: Array, inside: Mask
 ) -> None:
-    """Set inside (N,): whether the rays of pixels (N, 2) meet the board in its checkered area.
+    """Set inside (N,) where the rays of pixels (N, 2) meet the board in its checkered area.
 
     area: (3,) mm; x and y lie between its last entry and its first two.
     """

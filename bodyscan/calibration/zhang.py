@@ -13,11 +13,9 @@ from bodyscan.arrays import Array
 from bodyscan.errors import DegeneratePoses
 from bodyscan.geometry.transforms import RigidTransform
 
-LEAST_TURN_DEG = 3.0
-
 
 def homography(plane: Array, pixels: Array) -> Array:
-    """(3, 3) with pixels ~ H (x, y, 1), from plane points (N, 2) and pixels (N, 2), N > 4.
+    """Estimate H (3, 3), pixels ~ H (x, y, 1), from plane points and pixels (N, 2) each, N > 4.
 
     Normalised direct linear transformation (Hartley 1997).
     """
@@ -33,7 +31,7 @@ def homography(plane: Array, pixels: Array) -> Array:
 
 
 def matrix_from_homographies(homographies: Sequence[Array], width: int, height: int) -> Array:
-    """A of Eq. 1 with skew, (3, 3), from at least three homographies.
+    """Estimate A of Eq. 1 with skew, (3, 3), from at least three homographies.
 
     Falls back to a camera without skew and with a central principal point if noise leaves the full
     form without a real solution. Raises DegeneratePoses if the planes are (nearly) parallel.
@@ -59,17 +57,17 @@ def refuse_parallel(homographies: Sequence[Array], width: int, height: int) -> N
     lines = np.stack([np.linalg.inv(h).T[:, 2] for h in homographies])
     normals = lines @ rough
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    turns = np.degrees(np.arccos(np.clip(np.abs(normals @ normals.T), 0.0, 1.0)))
-    if np.max(turns) < LEAST_TURN_DEG:
+    angles = np.degrees(np.arccos(np.clip(np.abs(normals @ normals.T), 0.0, 1.0)))
+    if np.max(angles) < 3.0:
         raise DegeneratePoses(
             f"the {len(homographies)} board poses differ by a translation only "
-            f"(their orientations agree within {np.max(turns):.1f} degrees)",
+            f"(their orientations agree within {np.max(angles):.1f} degrees)",
             remedy="tilt the board by 15 to 35 degrees about different axes between the shots",
         )
 
 
 def camera_from_plane(normalized_homography: Array, plane_z: float = 0.0) -> RigidTransform:
-    """Pose of a plane from its homography to normalised image coordinates (A removed).
+    """Compute the pose of a plane from its homography to normalised image coordinates.
 
     Points (x, y, plane_z) of the plane's frame; the side with positive depth is taken.
     """
@@ -83,6 +81,7 @@ def camera_from_plane(normalized_homography: Array, plane_z: float = 0.0) -> Rig
 
 
 def _full_matrix(homographies: Sequence[Array]) -> Array | None:
+    """Solve for A with skew and principal point; None if the solution is no camera."""
     rows = [_constraint(h, 0, 1) for h in homographies]
     rows += [_constraint(h, 0, 0) - _constraint(h, 1, 1) for h in homographies]
     _, _, vt = np.linalg.svd(np.stack(rows))
@@ -98,6 +97,7 @@ def _full_matrix(homographies: Sequence[Array]) -> Array | None:
 
 
 def _central_matrix(homographies: Sequence[Array]) -> Array:
+    """Solve for A with a focal length only."""
     rows, right = [], []
     for h in homographies:
         for row in (_constraint(h, 0, 1), _constraint(h, 0, 0) - _constraint(h, 1, 1)):
@@ -109,6 +109,7 @@ def _central_matrix(homographies: Sequence[Array]) -> Array:
 
 
 def _constraint(h: Array, i: int, j: int) -> Array:
+    """Coefficients v_ij of h_i^T B h_j in (B11, B12, B22, B13, B23, B33) (Zhang 2000, Eq. 7)."""
     a, b = h[:, i], h[:, j]
     return np.array(
         [
@@ -123,10 +124,12 @@ def _constraint(h: Array, i: int, j: int) -> Array:
 
 
 def _normalization(points: Array) -> Array:
+    """Similarity (3, 3) that centres points (N, 2) and scales their mean distance to sqrt(2)."""
     mean = points.mean(axis=0)
     scale = np.sqrt(2.0) / max(float(np.mean(np.linalg.norm(points - mean, axis=1))), 1e-12)
     return np.array([[scale, 0, -scale * mean[0]], [0, scale, -scale * mean[1]], [0, 0, 1.0]])
 
 
 def homogeneous(points: Array) -> Array:
+    """Append ones to points (N, D)."""
     return np.column_stack([points, np.ones(len(points))])

@@ -72,7 +72,6 @@ def calibration_figures(calibration: RigCalibration) -> dict[str, Any]:
             "light_model": pair.quality.light_model,
             "light_tried": [asdict(tried) for tried in pair.quality.held_out],
             "solved": pair.quality.refinement or None,
-            "ways_tried": [asdict(tried) for tried in pair.quality.ways],
             "boards_bent_mm": pair.quality.bent_mm,
             "sheets_rms_mm": pair.quality.planes_rms_mm,
             "stripes_calibrated": pair.quality.stripes_calibrated,

@@ -9,17 +9,17 @@ import numpy as np
 from bodyscan.arrays import Array
 from bodyscan.boards.board_layout import corner_points
 from bodyscan.calibration.board_views import PlanarView, planar_view
-from bodyscan.calibration.boundary_points import subsample
+from bodyscan.calibration.boundary_points import select, subsample
 from bodyscan.calibration.camera import (
     CameraCalibration,
     calibrate_camera,
 )
-from bodyscan.calibration.joint_refinement import striped_board
+from bodyscan.calibration.joint_refinement import StripedBoard, refine_jointly
 from bodyscan.calibration.light_planes import PlaneFit, fit_light_planes
 from bodyscan.calibration.light_sheets import fit_light_sheets
-from bodyscan.calibration.refinement_choice import REFINED_BINS, refine_where_better
 from bodyscan.calibration.striped_view import BIN_PX
 from bodyscan.geometry.camera import camera_from_fields
+from bodyscan.geometry.smooth_sheets import SmoothSheets
 from bodyscan.laboratory import apparatus
 from bodyscan.laboratory.approaches import (
     Approach,
@@ -42,7 +42,7 @@ class Calibrations:
 
     reference: Zhang's camera.
     planes: the chapter's fit of its free planes.
-    ours: our approach, with the camera of the joint solve if held-out boards chose it.
+    ours: our approach, with the camera of the joint solve.
     camera_covariance: of our camera.
     model, refinement: what ours chose.
     approaches: (i), (i) mended, (ii), (ii) with skew, (iii), ours.
@@ -93,24 +93,30 @@ def calibrate_ours(
     captures: ChapterCaptures, reference: CameraCalibration, boards: LocatedBoards
 ) -> tuple[Approach, Array, str, str]:
     """Calibrate as `bodyscan calibrate-rig` does for a single pair: the light model that held-out
-    boards choose, and a joint solve where they gain by it."""
+    boards choose, and a joint solve of corners and stripes."""
     projector, board = TARGET.projector, TARGET.board
     bins = locate_boundaries(
         TARGET, captures.boards, boards.camera, boards.camera_from_board, bin_px=BIN_PX
     ).points
-    data = subsample(bins, REFINED_BINS)
+    data = subsample(bins, 6000)
     fit = fit_light_sheets(bins, projector.stripes, projector.direction)
+    if not isinstance(fit.sheets, SmoothSheets):
+        approach = Approach("ours", boards.camera, fit.sheets)
+        return approach, reference.covariance, fit.model, "corners, then stripes"
     striped = [
-        striped_board(planar_view(shot.view, board), boards.camera, data, number, board.name)
+        StripedBoard.from_points(
+            board.name,
+            planar_view(shot.view, board),
+            boards.camera,
+            select(data, data.board == number),
+        )
         for number, shot in enumerate(captures.boards)
     ]
+    poses = [reference.camera_from_board[shot.view.shot] for shot in captures.boards]
     flatness = {board.name: board.believed_flatness_mm}
-    refined = refine_where_better(reference, fit.sheets, striped, data, flatness)
-    if refined.fit is None:
-        approach = Approach("ours", boards.camera, fit.sheets)
-        return approach, reference.covariance, fit.model, refined.reason
-    approach = Approach("ours", refined.fit.camera, refined.fit.sheets)
-    return approach, refined.fit.camera_covariance, fit.model, refined.reason
+    refined = refine_jointly(boards.camera, poses, fit.sheets, striped, flatness)
+    approach = Approach("ours", refined.camera, refined.sheets)
+    return approach, refined.camera_covariance, fit.model, "joint solve"
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from scipy.optimize import least_squares
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.calibration.boundary_points import BoundaryPoints
-from bodyscan.calibration.pinhole_projector import fit_pinhole
+from bodyscan.calibration.sheet_fit import fit_pinhole
 from bodyscan.geometry.light_planes import Axis, LightPlanes
 from bodyscan.geometry.robust import cauchy_weights, robust_scale
 

@@ -12,9 +12,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bodyscan.arrays import Array, Indices
-from bodyscan.calibration.board_form import BoardFace, rounded
-from bodyscan.calibration.board_views import LocatedView
-from bodyscan.calibration.held_out import CLEARLY, Compared, gain
+from bodyscan.calibration.board_views import (
+    BoardFace,
+    LocatedView,
+    corner_keys,
+    match_corners,
+)
+from bodyscan.calibration.model_selection import MIN_GAIN, ResidualPair, gain
 from bodyscan.geometry.linear_gaussian import solve_scaled
 from bodyscan.geometry.robust import rms, rms_length
 from bodyscan.geometry.transforms import fit_rigid_transform
@@ -95,12 +99,11 @@ class BoardShape:
     def face(self, points: Array) -> BoardFace:
         """The face on which a view saw corners (M, 3), through every corner of it in any view."""
         away = np.abs(self.points[:, 2] - np.median(points[:, 2]))
-        return BoardFace.through((self.points + self.offsets)[away <= away.min() + 1e-3])
+        return BoardFace.fit((self.points + self.offsets)[away <= away.min() + 1e-3])
 
     def numbers(self, points: Array) -> Indices:
         """Indices (M,) of nominal points (M, 3) among its corners, -1 for unknown ones."""
-        number = {key: k for k, key in enumerate(_keys(self.points))}
-        return np.array([number.get(key, -1) for key in _keys(points)], np.int64)
+        return match_corners(points, self.points)
 
     def applied(self, points: Array) -> Array:
         """Where nominal points (M, 3) of this board lie; unknown ones stay."""
@@ -134,7 +137,7 @@ def with_board_shapes(
         f"boards held out fit to {_median(held_out.rich):.3f} px with it, "
         f"{_median(held_out.simple):.3f} without, by {better_by:.0f} standard errors"
     )
-    if better_by < CLEARLY:
+    if better_by < MIN_GAIN:
         return replace(plain, notes=(f"{sizes}: not used, {figures}",))
     return replace(shaped, notes=(f"{sizes}: used, {figures}",))
 
@@ -208,7 +211,7 @@ def _flat(views: Sequence[LocatedView]) -> dict[str, BoardShape]:
     """Flat shapes of all corners that any view shows, by board."""
     boards = sorted({view.board for view in views})
     seen = (np.concatenate([v.points for v in views if v.board == name]) for name in boards)
-    nominal = (np.unique(rounded(points), axis=0) for points in seen)
+    nominal = (np.unique(corner_keys(points), axis=0) for points in seen)
     return {n: BoardShape(p, np.zeros_like(p)) for n, p in zip(boards, nominal, strict=True)}
 
 
@@ -310,7 +313,7 @@ def _by_corner(views: Sequence[LocatedView], solution: JointSolution) -> tuple[A
 
 def _hold_out(
     views: Sequence[LocatedView], solution: JointSolution, root: str, refine_cameras: bool
-) -> Compared:
+) -> ResidualPair:
     """Residuals of held-out boards, flat and in the shape found from the rest, both posed by the
     rest's cameras."""
     targets = sorted({view.target for view in views})
@@ -330,27 +333,23 @@ def _hold_out(
             flat_ones.append(np.concatenate(fit_board(own, flat, placing).residuals))
             bent_ones.append(np.concatenate(fit_board(true, bent.solution, placing).residuals))
             part.append(np.full(len(flat_ones[-1]), targets.index(target)))
-    every = Compared(np.concatenate(flat_ones), np.concatenate(bent_ones), np.concatenate(part))
+    every = ResidualPair(np.concatenate(flat_ones), np.concatenate(bent_ones), np.concatenate(part))
     return _without_extremes(every)
 
 
-def _without_extremes(compared: Compared) -> Compared:
+def _without_extremes(compared: ResidualPair) -> ResidualPair:
     """Drop the board most in favour of the shape and the one most against it.
 
     Where half of the views leave a lens open beyond their boards, one board there would decide
     alone.
     """
     better = np.sum(compared.simple**2 - compared.rich**2, axis=1)
-    boards = np.unique(compared.part)
-    order = boards[np.argsort([better[compared.part == board].mean() for board in boards])]
-    kept = np.isin(compared.part, order[1:-1])
-    return Compared(compared.simple[kept], compared.rich[kept], compared.part[kept])
+    boards = np.unique(compared.cluster)
+    order = boards[np.argsort([better[compared.cluster == board].mean() for board in boards])]
+    kept = np.isin(compared.cluster, order[1:-1])
+    return ResidualPair(compared.simple[kept], compared.rich[kept], compared.cluster[kept])
 
 
 def _median(residuals: Array) -> float:
     """Median length, px, which a few wrong views do not change."""
     return float(np.sqrt(np.median(np.sum(residuals**2, axis=1))))
-
-
-def _keys(points: Array) -> list[tuple[float, ...]]:
-    return [tuple(point) for point in rounded(points).tolist()]

@@ -15,7 +15,7 @@ import numpy as np
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.calibration.board_views import LocatedView
-from bodyscan.calibration.camera import known_beforehand
+from bodyscan.calibration.camera import camera_prior
 from bodyscan.geometry.camera import MATRIX, Camera
 from bodyscan.geometry.least_squares import EXACT, Block, minimize
 from bodyscan.registration.joint_solve import JointSolution
@@ -130,7 +130,7 @@ def camera_priors(camera: Camera, own: Indices) -> Iterator[Block]:
     if camera.prior is None:
         known = np.diag(1.0 / camera.prior_sigmas[: len(MATRIX)])
         yield Block(np.zeros(len(MATRIX)), lambda: known, own[: len(MATRIX)], EXACT)
-    yield known_beforehand(camera, own)
+    yield camera_prior(camera, own)
 
 
 def _without_motion(linearize: Callable[[], Array]) -> Callable[[], Array]:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodyscan.arrays import Array, Indices
-from bodyscan.calibration.board_views import LocatedView, greatest_displacement
+from bodyscan.calibration.board_views import LocatedView, max_displacement_mm
 from bodyscan.geometry.linear_gaussian import invert_scaled
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance
@@ -83,7 +83,7 @@ def board_places(
         for place in found:
             first = rig_from_board[place[0]]
             if place[0][1] == target[1] and (
-                greatest_displacement(first, rig_from_board[target], size) < NEAR * size
+                max_displacement_mm(first, rig_from_board[target], size) < NEAR * size
             ):
                 place.append(target)
                 break

@@ -15,8 +15,8 @@ import numpy as np
 from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import LocatedView, PlanarView
 from bodyscan.calibration.camera import CameraFit, LensTrial
-from bodyscan.calibration.held_out import CLEARLY
 from bodyscan.calibration.lens_choice import ChosenLens, choose_lens
+from bodyscan.calibration.model_selection import MIN_GAIN
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses import family_up_to
 from bodyscan.geometry.lenses.brown import Brown
@@ -36,7 +36,7 @@ def lens_notes(trials: Mapping[str, Sequence[LensTrial]]) -> list[str]:
         f"{chosen.rms_px:.3f} px with it, {tried[0].rms_px:.3f} with {tried[0].kind}"
         for name, tried in trials.items()
         for chosen in tried
-        if chosen.chosen and chosen.gain is not None and chosen.gain >= CLEARLY
+        if chosen.chosen and chosen.gain is not None and chosen.gain >= MIN_GAIN
     ]
 
 
@@ -136,10 +136,10 @@ def _decentred_together(
     open_ = [
         name
         for name, lens in chosen.items()
-        if (gain := _gain(lens, Brown)) is not None and -CLEARLY < gain < CLEARLY
+        if (gain := _gain(lens, Brown)) is not None and -MIN_GAIN < gain < MIN_GAIN
     ]
     off = np.array([_decentring(chosen[name].refused) for name in open_]).ravel()
-    if not open_ or np.mean(off**2) < 1.0 + CLEARLY * np.sqrt(2.0 / len(off)):
+    if not open_ or np.mean(off**2) < 1.0 + MIN_GAIN * np.sqrt(2.0 / len(off)):
         return {}
     found = {}
     for name in open_:

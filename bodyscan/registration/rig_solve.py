@@ -249,7 +249,7 @@ def _frame_board_turned(
         key: placing @ turn.inverse() if key == target else placing
         for key, placing in solution.root_from_board.items()
     }
-    turned = [view.resolved(turn) if view.target == target else view for view in views]
+    turned = [view.resolve(turn) if view.target == target else view for view in views]
     return replace(solution, root_from_board=boards), turned
 
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 from bodyscan.boards.view import ViewKey
 from bodyscan.calibration.board_views import LocatedView, PlanarView
 from bodyscan.calibration.camera import CameraCalibration, locate_board
-from bodyscan.calibration.pair import PairCalibration, PlacedPair
+from bodyscan.calibration.pair import LocatedPair, PairCalibration
 from bodyscan.calibration.striped_view import BoardBoundaries, StripedView
 from bodyscan.registration.rig_frame import frame_target
 from bodyscan.registration.rig_solve import RigSolution
@@ -19,13 +19,14 @@ def solved_view(
     rig: Rig, solution: RigSolution, view: LocatedView, boundaries: BoardBoundaries
 ) -> StripedView:
     """A view with its stripes, and with the pose and shape of its board from the joint solve."""
-    camera_from_rig = solution.rig_from_camera[view.pair].inverse()
-    pose = camera_from_rig @ solution.rig_from_board[view.target]
     shape = solution.board_shapes.get(view.board)
     face = shape.face(view.points) if shape else None
-    return StripedView(
-        replace(view, camera_from_board=pose), rig.board(view.board), boundaries, face
-    )
+    return StripedView(_with_pose(solution, view), rig.board(view.board), boundaries, face)
+
+
+def _with_pose(solution: RigSolution, view: LocatedView) -> LocatedView:
+    camera_from_rig = solution.rig_from_camera[view.pair].inverse()
+    return replace(view, camera_from_board=camera_from_rig @ solution.rig_from_board[view.target])
 
 
 def solved_pair(
@@ -34,29 +35,29 @@ def solved_pair(
     name: str,
     single: CameraCalibration,
     boundaries: Mapping[ViewKey, BoardBoundaries],
-) -> PlacedPair:
+) -> LocatedPair:
     """A pair with the camera and boards of the joint solve.
 
     single: its camera as calibrated by itself.
-    boundaries: of stripes on the boards, by view; views without any are counted alone.
+    boundaries: of stripes on the boards, by view; views without any take part with their corners.
     """
     views = [view for view in solution.views if view.pair == name]
-    return PlacedPair(
+    return LocatedPair(
         name,
         solution.cameras[name],
         solution.camera_covariances.get(name, single.covariance),
-        single,
+        solution.rays.get(name, single.rays),
         solution.lenses.get(name, single.lenses),
-        rig.pair(name).projector,
         solution.rms_px[name],
-        len(views),
+        rig.pair(name).projector,
+        tuple(_with_pose(solution, view) for view in views),
         tuple(
             solved_view(rig, solution, view, boundaries[view.key])
             for view in views
             if view.key in boundaries
         ),
+        rig.boards,
         alone=len(solution.cameras) == 1,
-        rays=solution.rays.get(name, single.rays),
     )
 
 

@@ -12,7 +12,7 @@ import networkx as nx
 import numpy as np
 
 from bodyscan.arrays import Array
-from bodyscan.calibration.board_views import LocatedView, greatest_displacement
+from bodyscan.calibration.board_views import LocatedView, max_displacement_mm
 from bodyscan.errors import RigDisconnected
 from bodyscan.geometry.transforms import RigidTransform
 
@@ -170,10 +170,10 @@ def _readings(
     reach: float,
 ) -> list[tuple[float, LocatedView]]:
     """Every numbering of a view's board, with its distance (mm) from a given pose."""
-    readings = [view.resolved(choice) for choice in view.alternatives]
+    readings = [view.resolve(choice) for choice in view.alternatives]
     root = root_from_camera[view.pair]
     return [
-        (greatest_displacement(root @ one.camera_from_board, placing, BOARD_REACH * reach), one)
+        (max_displacement_mm(root @ one.camera_from_board, placing, BOARD_REACH * reach), one)
         for one in readings
     ]
 
@@ -242,7 +242,7 @@ def _tie(
     rivals = [
         count
         for count, candidate in zip(votes, candidates, strict=True)
-        if greatest_displacement(candidate, candidates[best], reach) > 4.0 * AGREEMENT * reach
+        if max_displacement_mm(candidate, candidates[best], reach) > 4.0 * AGREEMENT * reach
     ]
     return RelativePose(
         candidates[best],
@@ -259,7 +259,7 @@ def _size(view: LocatedView) -> int:
 
 
 def _gaps(candidate: RigidTransform, others: Sequence[RigidTransform], reach: float) -> Array:
-    """`greatest_displacement` between one transform and many others, (N,) mm."""
+    """`max_displacement_mm` between one transform and many others, (N,) mm."""
     rotations = np.array([other.rotation for other in others])
     shifts = np.array([other.translation for other in others]) - candidate.translation
     cosines = (np.einsum("ij,nij->n", candidate.rotation, rotations) - 1.0) / 2.0

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from bodyscan.calibration.camera import LensTrial
-from bodyscan.calibration.lens_choice import FEWEST_PLACES
+from bodyscan.calibration.lens_choice import MIN_CLUSTERS
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.storage import FILE_NAME, calibration_id, load_calibration
 from bodyscan.report import calibration_charts as draw
@@ -167,7 +167,7 @@ def _lens_lines(calibration: RigCalibration) -> Iterator[str]:
         if not tried:
             yield (
                 f"{name}: lens {pair.camera.lens.kind}; none was tried on held-out boards (it was "
-                f"given, or boards stood in fewer than {FEWEST_PLACES} places of the picture)"
+                f"given, or boards stood in fewer than {MIN_CLUSTERS} places of the picture)"
             )
             continue
         figures = "; ".join(_lens_figure(one) for one in tried)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bodyscan.calibration.coverage import covered_share
+from bodyscan.calibration.board_views import covered_share
 from bodyscan.geometry.uncertainty import position_sigma
 from bodyscan.registration.nominal_size import nominal_size
 from bodyscan.registration.rig_calibration import RigCalibration

@@ -17,12 +17,12 @@ from bodyscan.calibration.striped_view import (
     BoardBoundaries,
     Box,
     StripedView,
-    bands_apart,
+    band_step,
     boundaries_near,
     box_around,
     box_of_print,
     crop_around,
-    most_apart,
+    max_band_step,
     on_print,
 )
 from bodyscan.captures.folder import Captures, ImageSequence
@@ -154,7 +154,7 @@ class PrintAreas:
         """Use one in this many bands of BIN_PX along the stripes of a pair."""
         if pair.projector is None or len(self.cameras) < 2:
             return 1
-        return bands_apart(pair.projector, [self.box(view) for view in views])
+        return band_step(pair.projector, [self.box(view) for view in views])
 
 
 def decode_pairs(
@@ -183,7 +183,7 @@ def decode_pairs(
         boxes = [box(view) for view in group]
         crop = crop_around(boxes)
         corner = crop[0].start, crop[1].start
-        every = min(step[pair.name], most_apart(boxes, pair.camera))
+        every = min(step[pair.name], max_band_step(boxes, pair.camera))
         bands = LineBands(BIN_PX, every, turn[sequence], corner)
         stripes = decode_sequence(sequence, pair, crop=crop, bands=bands)
         near = {

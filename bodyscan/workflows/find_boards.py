@@ -22,12 +22,12 @@ from bodyscan.calibration.board_views import (
     planar_view,
 )
 from bodyscan.calibration.camera import (
-    FEWEST_POSES,
+    MIN_POSES,
     CameraCalibration,
     calibrate_camera,
     calibrate_known_camera,
     locate_boards,
-    roughly_located,
+    pose_from_homography,
 )
 from bodyscan.calibration.known_pair import read_known_camera
 from bodyscan.calibration.lens_choice import calibrate_with_lenses
@@ -163,7 +163,7 @@ def _look_closer(
     for pair in rig.pairs:
         images = [sequence for sequence in without if sequence.pair == pair.name]
         found = sum(view.pair == pair.name for view in views)
-        if found < FEWEST_POSES or len(images) <= LOOKED_AT:
+        if found < MIN_POSES or len(images) <= LOOKED_AT:
             chosen += images[:LOOKED_AT]
 
     def look(sequence: ImageSequence) -> str:
@@ -253,7 +253,7 @@ def require_cameras(
     for name in failures:
         taken = sum(sequence.pair == name for sequence in captures.sequences)
         errors = [error for sequence, error in boards.refused.items() if sequence.pair == name]
-        if errors and taken - len(errors) < FEWEST_POSES:
+        if errors and taken - len(errors) < MIN_POSES:
             # The most common error: when images are few, one may be bad for a reason of its own.
             common = Counter(error.what for error in errors).most_common(1)[0][0]
             error = next(error for error in errors if error.what == common)
@@ -295,7 +295,7 @@ def locate_views(
         # All at once: solving for one board's pose takes as many calls as for thirty.
         of_camera = [view for view in usable if view.pair == name]
         planar = [planar_view(view, rig.board(view.board)) for view in of_camera]
-        starts = [roughly_located(found.camera, view) for view in planar]
+        starts = [pose_from_homography(found.camera, view) for view in planar]
         poses = zip(*locate_boards(found.camera, planar, starts), strict=True) if planar else ()
         fitted |= zip((view.key for view in of_camera), poses, strict=True)
     located, notes = [], []

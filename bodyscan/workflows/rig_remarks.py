@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from bodyscan.boards.view import BoardView
-from bodyscan.calibration.coverage import coverage_notes
+from bodyscan.calibration.board_views import coverage_notes
 from bodyscan.calibration.pair import PairCalibration
 from bodyscan.optional import optional
 from bodyscan.progress import Progress, silent, step

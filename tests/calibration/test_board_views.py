@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -9,14 +11,19 @@ from bodyscan.arrays import Indices
 from bodyscan.boards.board_layout import corner_points
 from bodyscan.boards.view import BoardView
 from bodyscan.calibration.board_views import (
+    BoardFace,
     LocatedView,
     board_symmetries,
-    greatest_displacement,
+    coverage_notes,
+    covered_share,
     has_enough_corners,
+    match_corners,
+    max_displacement_mm,
     planar_view,
 )
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.rig.board import Board
+from bodyscan.rig.rig_file import load_rig
 
 BOARD = Board(name="b", kind="checkerboard", columns=9, rows=8, square_mm=30)
 WIDE = 8  # corners in a row
@@ -54,8 +61,8 @@ def test_corners_of_the_back_count_by_their_place_on_it() -> None:
 def test_poses_differ_by_how_far_they_carry_what_is_at_reach() -> None:
     one = RigidTransform.from_rotation_vector([0.2, 0.1, 0.0], [5.0, 6.0, 7.0])
     other = one @ RigidTransform.from_rotation_vector([0.0, 0.0, 0.01], [3.0, 0.0, 4.0])
-    assert greatest_displacement(one, other, 500.0) == pytest.approx(10.0)
-    assert greatest_displacement(one, one, 500.0) == pytest.approx(0.0, abs=1e-6)
+    assert max_displacement_mm(one, other, 500.0) == pytest.approx(10.0)
+    assert max_displacement_mm(one, one, 500.0) == pytest.approx(0.0, abs=1e-6)
 
 
 def test_corners_fall_on_corners_of_a_board_that_looks_the_same() -> None:
@@ -74,14 +81,78 @@ def test_corners_fall_on_corners_of_a_board_that_looks_the_same() -> None:
 
 def test_an_alternative_taken_for_true_shows_the_same_points_to_the_camera() -> None:
     even = Board(name="e", kind="checkerboard", columns=8, rows=6, square_mm=30)
-    ways = board_symmetries(even)
+    symmetries = board_symmetries(even)
     points = corner_points(even)
     at = RigidTransform.from_rotation_vector([0.2, -0.3, 0.1], [10.0, 20.0, 900.0])
-    seen = LocatedView("p", "s", "e", points, points[:, :2], at, ways)
+    seen = LocatedView("p", "s", "e", points, points[:, :2], at, symmetries)
     assert seen.ambiguous
-    turned = seen.resolved(ways[1])
-    assert not turned.ambiguous
+    resolved = seen.resolve(symmetries[1])
+    assert not resolved.ambiguous
     np.testing.assert_allclose(
-        turned.camera_from_board.apply(turned.points), at.apply(points), atol=1e-9
+        resolved.camera_from_board.apply(resolved.points), at.apply(points), atol=1e-9
     )
-    assert (turned.key, turned.target) == (("p", "s", "e"), ("s", "e"))
+    assert (resolved.key, resolved.target) == (("p", "s", "e"), ("s", "e"))
+
+
+def test_corners_are_matched_by_position() -> None:
+    points = corner_points(BOARD)
+    np.testing.assert_array_equal(match_corners(points[[7, 2]] + 1e-8, points), [7, 2])
+    assert match_corners(points[:1] + 0.1, points).tolist() == [-1]
+
+
+def test_a_face_fits_corners_that_lie_on_a_cubic() -> None:
+    points = corner_points(BOARD).copy()
+    x, y = ((points[:, :2] - [135.0, 120.0]) / [105.0, 90.0]).T
+    points[:, 2] = 7.0 + 0.3 * x**2 - 0.2 * x * y + 0.1 * y**3 + 0.05 * x * x * y
+    face = BoardFace.fit(points)
+    np.testing.assert_allclose(face.z_mm + face.height(points[:, :2]), points[:, 2], atol=1e-9)
+    assert face.z_mm == pytest.approx(np.median(points[:, 2]))
+
+
+def corners(left: float, top: float, width: float, height: float) -> np.ndarray:
+    u, v = np.meshgrid(np.linspace(left, left + width, 8), np.linspace(top, top + height, 6))
+    return np.column_stack([u.ravel(), v.ravel()])
+
+
+@pytest.mark.parametrize(("width", "height", "share"), [(320, 240, 0.25), (143, 107, 0.05)])
+def test_the_share_of_the_picture_is_that_of_the_hull(
+    width: int, height: int, share: float
+) -> None:
+    # The picture is divided into 64 cells each way: a rim of half a cell is in margin.
+    margin = (width / 640 + height / 480) / 64 + 0.001
+    assert covered_share([corners(100, 90, width, height)], 640, 480) == pytest.approx(
+        share, abs=margin
+    )
+
+
+def test_a_board_from_rim_to_rim_covers_all() -> None:
+    assert covered_share([corners(0, 0, 639, 479)], 640, 480) == 1.0
+
+
+def test_views_in_the_same_place_cover_no_more() -> None:
+    one, next_to = corners(0, 0, 320, 240), corners(320, 240, 319, 239)
+    assert covered_share([one, one], 640, 480) == covered_share([one], 640, 480)
+    assert covered_share([one, next_to], 640, 480) == pytest.approx(0.5, abs=0.04)
+
+
+@pytest.mark.parametrize(("size", "named"), [(0.22, True), (0.6, False)])
+def test_only_a_small_board_is_noted(tmp_path: Path, size: float, named: bool) -> None:
+    rig = load_rig(Path("rigs/one-pair.yaml"))
+    (pair,) = rig.pairs
+    width, height = pair.camera.width, pair.camera.height
+    views = [
+        BoardView(
+            pair=pair.name,
+            shot=f"shot{number}",
+            board=rig.boards[0].name,
+            corner_ids=np.arange(48),
+            pixels=corners(0.2 * width, 0.2 * height, size * width, size * height),
+        )
+        for number in range(3)
+    ]
+    notes = coverage_notes(rig, views)
+    assert bool(notes) == named
+    if named:
+        assert pair.name in notes[0]
+        assert "5 %" in notes[0]
+        assert "closer" in notes[0]

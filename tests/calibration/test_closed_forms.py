@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bodyscan.calibration.pinhole_projector import fit_pinhole
+from bodyscan.calibration.sheet_fit import fit_pinhole
 from bodyscan.calibration.zhang import (
     camera_from_plane,
     homogeneous,

@@ -11,7 +11,7 @@ from bodyscan.arrays import Array
 from bodyscan.boards.board_layout import corner_points
 from bodyscan.calibration.board_views import LocatedView, PlanarView
 from bodyscan.calibration.camera import calibrate_camera
-from bodyscan.calibration.pair import PairCalibration, PlacedPair, calibrate_pair
+from bodyscan.calibration.pair import LocatedPair, PairCalibration, calibrate_pair
 from bodyscan.calibration.striped_view import BoardBoundaries, StripedView
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
@@ -78,16 +78,17 @@ def calibrated(*, alone: bool, crossed: int = len(POSES)) -> Outcome[PairCalibra
             for shot in shots
         ]
     return calibrate_pair(
-        PlacedPair(
+        LocatedPair(
             "p",
             camera,
             own.covariance,
-            own,
+            own.rays,
             own.lenses,
-            COLUMNS,
             0.05,
-            len(shots),
+            COLUMNS,
+            tuple(shot.view for shot in shots),
             tuple(shots),
+            (BOARD,),
             alone,
         )
     )

@@ -9,7 +9,7 @@ import pytest
 
 from bodyscan.arrays import Array
 from bodyscan.calibration.fitted_projector import fit_projector
-from bodyscan.calibration.pinhole_projector import PinholeProjector
+from bodyscan.calibration.sheet_fit import PinholeProjector
 from bodyscan.errors import BadInput
 from bodyscan.geometry.bowed_sheets import PLANE_DEGREE, BowedSheets
 from bodyscan.geometry.camera import Camera

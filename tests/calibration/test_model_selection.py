@@ -9,16 +9,16 @@ import pytest
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.calibration.boundary_points import BoundaryPoints
-from bodyscan.calibration.held_out import Compared, gain, shared_weights
 from bodyscan.calibration.model_selection import (
     Candidate,
     HeldOutErrors,
     HeldOutModel,
+    ResidualPair,
+    gain,
     hold_out,
-    parts_of_boards,
     select_model,
+    shared_weights,
     split,
-    without_motion,
 )
 
 
@@ -88,7 +88,7 @@ def test_what_was_not_measured_counts_as_far_off_where_a_model_measures_everywhe
     assert found.mean_mm == pytest.approx(((34 * 2.0 + 2 * 60.0) / 36 + 6.0) / 2)
     assert found.rms_mm == pytest.approx(np.sqrt((34 * 4.0 + 9 * 36.0) / 43))  # outliers apart
     assert found.measured == pytest.approx(44 / 45)
-    found = figures_of(data, distances, everywhere=False)
+    found = figures_of(data, distances, complete=False)
     assert found.mean_mm == pytest.approx(((34 * 2.0 + 60.0) / 35 + 6.0) / 2)
 
 
@@ -99,7 +99,7 @@ def test_the_rms_leaves_out_what_is_more_than_four_sigmas_off() -> None:
     assert figures_of(data, distances).rms_mm == pytest.approx(np.sqrt((7 + 5.9**2) / 8))
 
 
-def bent(data: BoundaryPoints, amount: float, seed: int) -> Array:
+def warped(data: BoundaryPoints, amount: float, seed: int) -> Array:
     """Noise of 1 mm, and a bend of each board that no shift and no tilt makes up for."""
     _, across, down = data.board_errors.effects.T
     noise = np.random.default_rng(seed).normal(size=len(data.index))
@@ -108,7 +108,7 @@ def bent(data: BoundaryPoints, amount: float, seed: int) -> Array:
 
 def test_a_richer_model_is_taken_where_it_is_clearly_better_and_only_there() -> None:
     data = boards(12, 12, 12, 12)
-    plain, good = bent(data, 0.5, 0), bent(data, 0.0, 0)
+    plain, good = warped(data, 0.5, 0), warped(data, 0.0, 0)
     names = [model("plain"), model("good"), model("as good")]
     # As good: the difference is noise of its own, which is at no point better than chance.
     as_good = good + 0.02 * np.random.default_rng(1).normal(size=len(good))
@@ -121,69 +121,42 @@ def test_a_richer_model_is_taken_where_it_is_clearly_better_and_only_there() -> 
     assert third.gain is not None  # against the good one, not the plain one, which it beats
     assert abs(third.gain) < 3.0
     # The other way round nothing is gained by any.
-    chosen, told = select_model(names, errors(good, plain, as_good), data)
+    chosen, figures = select_model(names, errors(good, plain, as_good), data)
     assert chosen == 0
-    assert told[1].gain is not None
-    assert told[1].gain < -1.0
+    assert figures[1].gain is not None
+    assert figures[1].gain < -1.0
 
 
-def test_what_is_but_a_part_of_another_model_is_told_and_not_chosen() -> None:
+def test_models_that_lack_a_term_are_tried_and_not_selected() -> None:
     data = boards(12, 12, 12, 12)
-    plain, good = bent(data, 0.5, 0), bent(data, 0.0, 0)
-    part = [model("plain"), model("part", whole=False)]
-    chosen, told = select_model(part, errors(plain, good), data)
+    plain, good = warped(data, 0.5, 0), warped(data, 0.0, 0)
+    part = [model("plain"), model("part", selectable=False)]
+    chosen, figures = select_model(part, errors(plain, good), data)
     assert chosen == 0
-    assert told[1].gain is None
-    assert told[1].median_mm < told[0].median_mm
-    part = [model("part", whole=False), model("plain")]
+    assert figures[1].gain is None
+    assert figures[1].median_mm < figures[0].median_mm
+    part = [model("part", selectable=False), model("plain")]
     assert select_model(part, errors(good, plain), data)[0] == 1
 
 
-def test_a_model_that_measured_nothing_is_neither_chosen_nor_told() -> None:
+def test_a_model_that_measured_nothing_is_not_listed() -> None:
     data = boards(12, 12)
     nothing = np.full(len(data.index), np.nan)
-    chosen, told = select_model(
-        [model("plain"), model("empty")], errors(bent(data, 0.5, 0), nothing), data
+    chosen, figures = select_model(
+        [model("plain"), model("empty")], errors(warped(data, 0.5, 0), nothing), data
     )
     assert chosen == 0
-    assert [one.model for one in told] == ["plain"]
+    assert [one.model for one in figures] == ["plain"]
 
 
 def test_where_a_model_gives_nothing_for_seldom_stripes_others_are_compared_elsewhere() -> None:
     data = boards(12, 12, 12, 12)
-    plain, good = bent(data, 0.5, 0), bent(data, 0.0, 0)
+    plain, good = warped(data, 0.5, 0), warped(data, 0.0, 0)
     good[::3] = np.nan
-    seldom = [model("plain"), model("seldom", everywhere=False)]
+    seldom = [model("plain"), model("seldom", complete=False)]
     assert select_model(seldom, errors(plain, good), data)[0] == 1
     # Of one that should have measured these, each counts as far off.
     assert select_model([model("plain"), model("good")], errors(plain, good), data)[0] == 0
-
-
-def test_how_a_board_lies_is_fitted_though_points_on_it_are_wrong() -> None:
-    data = boards(8, 5)
-    effects, board = data.board_errors.effects, data.board
-    motion = np.array([[0.3, -0.2, 0.1], [-0.5, 0.05, 0.4]])
-    distances = np.einsum("ni,ni->n", effects, motion[board])
-    # A mistake hides smaller ones, so that they are found one after another.
-    for at, off in ((0, 900.0), (1, 900.0), (9, 30.0), (17, 30.0), (70, -50.0)):
-        distances[at] += off
-    left = without_motion(distances, effects, board)
-    wrong = np.isin(np.arange(len(left)), (0, 1, 9, 17, 70))
-    assert np.abs(left[~wrong]).max() < 1e-9
-    np.testing.assert_allclose(left[wrong], [900.0, 900.0, 30.0, 30.0, -50.0])
-
-
-def test_a_board_is_judged_in_ninths_cut_at_six_tenths_of_a_standard_deviation() -> None:
-    data = boards(3, 3, numbers=(4, 7))
-    assert len(np.unique(parts_of_boards(data))) == 18
-    data = boards(30, 30)
-    across, down = data.board_errors.effects[:, 1:].T
-    part = parts_of_boards(data)
-    for place in (across, down):
-        third = np.select([place < -0.6, place <= 0.6], [0, 1], 2)
-        # Whoever shares a part shares the third, along both axes.
-        assert all(len(set(third[part == one].tolist())) == 1 for one in np.unique(part))
-    assert len(np.unique(part)) == 18
 
 
 def test_boards_are_held_out_in_six_groups_and_two_boards_by_halves() -> None:
@@ -222,7 +195,7 @@ def test_what_is_left_out_is_measured_by_a_model_that_has_not_seen_it() -> None:
 
 @pytest.mark.parametrize("noise", [0.0, 0.15])
 @pytest.mark.parametrize("variance", [0.0, 2.0])
-def test_how_far_boards_are_out_of_place_is_told_from_the_points_own_noise(
+def test_the_boards_error_is_estimated_apart_from_the_points_noise(
     noise: float, variance: float
 ) -> None:
     data = boards(*[20] * 6, tilt=1.0)
@@ -251,38 +224,38 @@ def test_boards_are_never_taken_for_known_exactly() -> None:
     assert nothing.board_error_mm(data, split(data)) == 0.0
 
 
-def gains(part_size: int, sign: float, kinds: int = 1) -> Array:
-    """Of models that differ by a tenth of a sigma at each of 1,600 points, the nearer one right; what
-    is in one part errs alike."""
+def gains(cluster_size: int, sign: float, kinds: int = 1) -> Array:
+    """Of models that differ by a tenth of a sigma at each of 1,600 points, the nearer one right; errors
+    are equal within a cluster."""
     found = []
     for seed in range(150):
         rng = np.random.default_rng(seed)
         compared = []
         for kind in range(kinds):
-            noise = rng.normal(size=(1600 // part_size, 2)).repeat(part_size, axis=0)
+            noise = rng.normal(size=(1600 // cluster_size, 2)).repeat(cluster_size, axis=0)
             wrong = np.tile([0.1, 0.0], (1600, 1))
             simple, rich = (noise + wrong, noise) if sign > 0 else (noise, noise + wrong)
-            part = np.arange(1600) // part_size
+            cluster = np.arange(1600) // cluster_size
             # In other units nothing changes.
-            compared.append(Compared(10.0**kind * simple, 10.0**kind * rich, part))
+            compared.append(ResidualPair(10.0**kind * simple, 10.0**kind * rich, cluster))
         found.append(gain(*compared))
     return np.array(found)
 
 
 @pytest.mark.parametrize(
-    ("part_size", "sign", "kinds", "mean"),
+    ("cluster_size", "sign", "kinds", "mean"),
     [
         # d = 0.1 at 1,600 points: sum d^2 = 16, standard error 2 sqrt(16) = 8.
         (1, 1.0, 1, 2.0),
         (1, -1.0, 1, -2.0),
         # Two kinds of points: twice the sum, sqrt 2 times the error.
         (1, 1.0, 2, 2.0 * np.sqrt(2.0)),
-        # Sixteen err alike: the error is four times as large.
+        # Sixteen share their error: the error is four times as large.
         (16, 1.0, 1, 0.5),
     ],
 )
-def test_gains_are_standard_errors(part_size: int, sign: float, kinds: int, mean: float) -> None:
-    found = gains(part_size, sign, kinds)
+def test_gains_are_standard_errors(cluster_size: int, sign: float, kinds: int, mean: float) -> None:
+    found = gains(cluster_size, sign, kinds)
     # 150 of them: the mean is known to 0.08, their deviation to 6 %.
     assert np.mean(found) == pytest.approx(mean, abs=0.25)
     assert np.std(found) == pytest.approx(1.0, abs=0.15)

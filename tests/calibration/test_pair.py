@@ -1,15 +1,20 @@
 """What a pair's calibration does with shots whose stripes disagree."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
+from bodyscan.calibration import pair
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.calibration.model_selection import HeldOutModel
-from bodyscan.calibration.pair import PairQuality, drop_disagreeing
+from bodyscan.calibration.pair import PairQuality, drop_inconsistent
 from bodyscan.calibration.stripe_agreement import ProjectorMotion
 from bodyscan.calibration.striped_view import BoardBoundaries, StripedView
 from bodyscan.errors import PairFailed
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.outcome import Outcome
 from bodyscan.rig.board import Board
 
 NOTHING = np.zeros((0, 3))
@@ -25,22 +30,34 @@ SHOTS = [
 ]
 
 
-def test_one_shot_that_fits_no_other_is_left_out_and_named() -> None:
+def drop(
+    monkeypatch: pytest.MonkeyPatch, split: ProjectorMotion | None
+) -> Outcome[tuple[StripedView, ...]]:
+    """Drop shots of SHOTS as a split of their boards says."""
+    monkeypatch.setattr(pair, "boundaries_on_boards", lambda *_: None)
+    monkeypatch.setattr(pair, "find_projector_motion", lambda *_: split)
+    nothing: Any = SimpleNamespace(stripes=64, direction="vertical")
+    return drop_inconsistent("p1-1", nothing, nothing, SHOTS)
+
+
+def test_shots_that_do_not_fit_the_others_are_dropped_and_named(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     found = ProjectorMotion(np.array([0, 1, 3, 4]), np.array([2]), 2.5, 0.1)
-    kept = drop_disagreeing("p1-1", SHOTS, found)
+    kept = drop(monkeypatch, found)
     assert [shot.view.shot for shot in kept.value] == ["a", "b", "d", "e"]
     (note,) = kept.notes
     assert note.startswith("p1-1: the stripes of shot c do not fit the others'")
     assert "2.5 px" in note
     two = ProjectorMotion(np.array([0, 1, 3]), np.array([2, 4]), 2.5, 0.1)
-    (note,) = drop_disagreeing("p1-1", SHOTS, two).notes
+    (note,) = drop(monkeypatch, two).notes
     assert note.startswith("p1-1: the stripes of shots c, e do not fit the others'")
 
 
-def test_a_projector_that_moved_costs_the_pair_and_the_shots_are_named() -> None:
+def test_a_projector_that_moved_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     found = ProjectorMotion(np.array([0, 1, 2]), np.array([3, 4]), 2.5, 0.1, moved=True)
-    with pytest.raises(PairFailed, match="moved between shots c and d") as error:
-        drop_disagreeing("p1-1", SHOTS, found)
+    with pytest.raises(PairFailed, match="changed between shots c and d") as error:
+        drop(monkeypatch, found)
     assert error.value.where == "pair p1-1"
 
 

@@ -9,19 +9,16 @@ import pytest
 from lit_boards import CHAPTER_POSES, chapter_scene
 
 from bodyscan.arrays import Array
-from bodyscan.calibration.board_form import BoardFace
-from bodyscan.calibration.board_views import LocatedView
+from bodyscan.calibration.board_views import BoardFace, LocatedView
 from bodyscan.calibration.striped_view import (
-    AROUND_PX,
     BIN_PX,
-    RIM_SQUARES,
     BoardBoundaries,
     StripedView,
-    bands_apart,
+    band_step,
     boundaries_on_boards,
     box_around,
     box_of_print,
-    most_apart,
+    max_band_step,
     on_board,
 )
 from bodyscan.geometry.lenses.radial import Radial
@@ -88,10 +85,10 @@ def test_stripes_are_carried_onto_the_bent_face_that_was_seen(face_mm: float) ->
 
 
 def test_a_face_goes_through_its_corners_and_no_further_than_they_say() -> None:
-    face = BoardFace.through(FRONT + [0.0, 0.0, 2.0])
+    face = BoardFace.fit(FRONT + [0.0, 0.0, 2.0])
     beyond = np.array([[0.0, 0.0], [180.0, 140.0]])
     np.testing.assert_allclose(face.z_mm + face.height(beyond), 2.0, atol=1e-9)
-    few = BoardFace.through(FRONT[:6])  # one row, which says nothing of the other direction
+    few = BoardFace.fit(FRONT[:6])  # one row, which says nothing of the other direction
     np.testing.assert_allclose(few.height(beyond), 0.0, atol=1e-9)
 
 
@@ -107,10 +104,8 @@ def test_the_box_of_a_print_holds_it_all_and_little_else() -> None:
     corners = SCENE.camera.project(place.apply(FRONT))
     view = LocatedView("p1", "b1", "board", FRONT, corners, place, ())
     low, high = box_of_print(SCENE.camera, BOARD, view)
-    np.testing.assert_allclose(
-        low, print_px.min(axis=0) - AROUND_PX, atol=1.0
-    )  # the lens bends them
-    np.testing.assert_allclose(high, print_px.max(axis=0) + AROUND_PX, atol=1.0)
+    np.testing.assert_allclose(low, print_px.min(axis=0) - 16.0, atol=1.0)  # the lens bends them
+    np.testing.assert_allclose(high, print_px.max(axis=0) + 16.0, atol=1.0)
     folded = replace(SCENE.camera, lens=Radial(k1=-1.0 / 3.0 / 0.01))  # one to one up to 0.1 alone
     assert np.array_equal(box_of_print(folded, BOARD, view), box_around(view))
 
@@ -118,7 +113,7 @@ def test_the_box_of_a_print_holds_it_all_and_little_else() -> None:
 def test_boundaries_are_averaged_in_pieces_on_the_print_alone() -> None:
     code, place = Gray(stripes=254, direction="vertical"), SCENE.looking_at(*CHAPTER_POSES[0])
     index, pixels = SCENE.crossings(place, 1)
-    rim = RIM_SQUARES * BOARD.square_mm
+    rim = 0.1 * BOARD.square_mm
     area = np.array([BOARD.columns, BOARD.rows]) * BOARD.square_mm
     met = SCENE.on_board(pixels, place)
     inside = np.all((met > rim) & (met < area - rim), axis=1)
@@ -136,7 +131,7 @@ def test_more_boards_need_fewer_bands_of_each() -> None:
     code = Gray(stripes=640, direction="horizontal")
     box = np.array([100.0, 300.0]), np.array([580.0, 700.0])
     # 30 bins along each of 320 boundaries, and a fit takes 25,000.
-    assert [bands_apart(code, [box] * boards) for boards in (3, 10, 20)] == [1, 3, 7]
+    assert [band_step(code, [box] * boards) for boards in (3, 10, 20)] == [1, 3, 7]
 
 
 def test_small_boards_and_those_half_outside_are_not_missed_between_bands() -> None:
@@ -144,5 +139,5 @@ def test_small_boards_and_those_half_outside_are_not_missed_between_bands() -> N
     large = np.array([100.0, 300.0]), np.array([900.0, 900.0])
     small = np.array([1000.0, 0.0]), np.array([1140.0, 135.0])
     cut = np.array([1130.0, 0.0]), np.array([2000.0, 900.0])
-    assert [most_apart(boxes, camera) for boxes in ([large], [large, small], [cut])] == [9, 2, 2]
-    assert most_apart([(np.zeros(2), np.full(2, 50.0))], camera) == 1
+    assert [max_band_step(boxes, camera) for boxes in ([large], [large, small], [cut])] == [9, 2, 2]
+    assert max_band_step([(np.zeros(2), np.full(2, 50.0))], camera) == 1

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bodyscan.calibration.board_views import LocatedView, greatest_displacement
+from bodyscan.calibration.board_views import LocatedView, max_displacement_mm
 from bodyscan.errors import RigDisconnected
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.view_graph import (
@@ -58,7 +58,7 @@ def test_displacements_of_many_are_those_of_each() -> None:
         for _ in range(9)
     ]
     found = _gaps(several[0], several, 700.0)
-    truth = [greatest_displacement(several[0], other, 700.0) for other in several]
+    truth = [max_displacement_mm(several[0], other, 700.0) for other in several]
     np.testing.assert_allclose(found, truth, atol=0.1)
     assert found.max() > 900.0
 
@@ -111,7 +111,7 @@ def test_a_board_numbered_from_its_other_end_is_numbered_as_the_other_pairs_see_
     from_there = RigidTransform(np.diag([-1.0, -1.0, 1.0]), np.array([120.0, 80.0, 0.0]))
     either = RigidTransform.identity(), from_there
     views = [replace(view(pair, 1), alternatives=either) for pair in "abc"]
-    views[2] = replace(views[2].resolved(from_there), alternatives=either)
+    views[2] = replace(views[2].resolve(from_there), alternatives=either)
     kept, boards, doubtful = place_boards(views, PLACED)
     assert not doubtful
     for one in kept:

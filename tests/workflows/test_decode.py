@@ -162,7 +162,7 @@ def test_pairs_are_decoded_one_after_another_and_notes_are_in_the_order_of_shots
 
     monkeypatch.setattr(decode, "decode_sequence", decoded)
     monkeypatch.setattr(decode, "boundaries_near", lambda *_: "boundaries")
-    monkeypatch.setattr(decode, "most_apart", lambda *_: 1)
+    monkeypatch.setattr(decode, "max_band_step", lambda *_: 1)
     views = [BoardView(s.pair, s.shot, "board", np.arange(4), np.zeros((4, 2))) for s in sequences]
     found = list(decode.decode_pairs(rig, captures, views))
     assert [(one.name, sorted(shot for _, shot, _ in one.boundaries)) for one in found] == [
