@@ -124,7 +124,7 @@ def _row(
     seen = {name: expose(image * length, settings.noise, rng) for name, image in images.items()}
     if not spec.is_projected:
         seen = instrument_images(seen, spec, frames)
-    coded = np.stack([seen[name] for name in frames.of_code(spec)])
+    coded = np.stack([seen[name] for name in frames.code_names(spec)])
     found = decode_stripes(spec, seen["lit"], seen.get(frames.dark or ""), coded)
     lit = np.isfinite(truth.s)
     known = lit & np.isfinite(found.s)

@@ -228,7 +228,7 @@ def _changed(pair: str, change: Callable[[Path], None]) -> Callable[[Sound], Cas
             failed = {}
             try:
                 captures = open_scan(sound.calibration.rig, copy)
-                (sequence,) = captures.of_pair(pair)
+                (sequence,) = captures.pair_sequences(pair)
                 images[pair] = reconstruct_sequence(sound.calibration, captures, sequence)[0]
             except BodyscanError as error:
                 del images[pair]

@@ -22,7 +22,8 @@ import cv2
 import numpy as np
 
 from bodyscan.captures.captures_file import load_captures_file
-from bodyscan.captures.image_header import NoImage, png_damage, read_header
+from bodyscan.captures.grey_png import png_damage
+from bodyscan.captures.image_header import NotAnImage, read_header
 from bodyscan.errors import BodyscanError
 from bodyscan.evaluation.acceptance_file import load_acceptance
 from bodyscan.files.corners_vnl import read_corners
@@ -41,7 +42,7 @@ STORED = PROJECT / "tests" / "data" / "stored-0.1.0"
 COUNT = 100_000
 LONGEST_S = 20
 """A file that takes longer would hang its reader."""
-EXPECTED = (BodyscanError, NoImage)
+EXPECTED = (BodyscanError, NotAnImage)
 WORDS = (
     b"", b"- ", b": ", b"{", b"[", b"]", b"}", b"&a ", b"*a", b"<<: *a", b"null", b"-1", b"0",
     b".nan", b"NaN", b"1e999", b"99999999999999999999", b"\n  ", b"\n", b"\t", b"'", b'"', b"true",

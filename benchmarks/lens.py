@@ -192,7 +192,7 @@ def striped_shots(rig: Rig, workspace: Path) -> dict[str, list[str]]:
     """Shots in which each pair took stripes of a board."""
     captures = open_captures(rig, workspace / "rig.yaml")
     return {
-        pair.name: [s.shot for s in captures.of_pair(pair.name) if s.has_stripes]
+        pair.name: [s.shot for s in captures.pair_sequences(pair.name) if s.has_stripes]
         for pair in rig.pairs
     }
 

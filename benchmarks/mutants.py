@@ -57,8 +57,8 @@ ROOMS = (
     "evaluation",
 )
 BESIDE = (
-    "bodyscan/captures/exposures.py",
-    "bodyscan/captures/timing.py",
+    "bodyscan/captures/grey_levels.py",
+    "bodyscan/captures/captures_file.py",
     "bodyscan/export/defacing.py",
     "bodyscan/files/hashing.py",
     "bodyscan/report/calibration_verdict.py",

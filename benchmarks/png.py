@@ -16,8 +16,7 @@ import numpy as np
 
 from benchmarks import full_size
 from bodyscan.captures.folder import open_scan
-from bodyscan.captures.grey_png import decode_grey_png
-from bodyscan.captures.image_header import png_damage
+from bodyscan.captures.grey_png import decode_grey_png, png_damage
 from bodyscan.registration.storage import load_calibration
 
 RUNS, THREADS = 7, 2
@@ -30,7 +29,7 @@ def report(workspace: Path | None = None) -> str:
     workspace = workspace or Path(os.environ.get("BODYSCAN_BENCH", full_size.WORKSPACE))
     calibration = load_calibration(workspace / "calibration")
     first = open_scan(calibration.rig, workspace / "captures" / "person").sequences[0]
-    files = [Path(path).read_bytes() for path in (first.seen_in, *first.coded)]
+    files = [Path(path).read_bytes() for path in (first.board_path, *first.coded)]
     height, width = cv2.imdecode(np.frombuffer(files[0], np.uint8), cv2.IMREAD_GRAYSCALE).shape
     rows = []
     for name, of in READERS.items():

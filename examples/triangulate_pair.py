@@ -15,7 +15,7 @@ import bodyscan
 from bodyscan.boards.board_layout import corner_points
 from bodyscan.captures.folder import open_captures
 from bodyscan.reconstruction.triangulation import reconstruct_range_image
-from bodyscan.rig.capture_folder import CaptureFolder
+from bodyscan.rig.frame_names import CaptureFolder
 from bodyscan.simulation import simulate
 from bodyscan.workflows.decode import decode_sequence
 

@@ -55,7 +55,7 @@ def find_boards(image: Bytes, boards: Sequence[Board], *, pair: str, shot: str) 
         else:
             found = find_checkerboard(image, board)
         if found is not None and _determines_plane(found):
-            turnable = board.looks_same_turned
+            turnable = board.is_ambiguous
             views.append(
                 BoardView(
                     pair, shot, board.name, found.ids, found.pixels, turnable, found.appearance

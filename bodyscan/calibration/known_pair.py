@@ -13,10 +13,9 @@ from bodyscan.geometry.camera import Camera, CameraPrior
 from bodyscan.geometry.light_planes import LightSheets
 from bodyscan.geometry.projector_sheets import intersect_central_rays, sheets_from_projector
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.interchange.found_camera import FoundCamera, camera_named
+from bodyscan.interchange.found_camera import FoundCamera, find_camera
 from bodyscan.interchange.rig_format import MILLIMETRES, RIG_FORMATS
-from bodyscan.rig.known import Known, KnownCamera
-from bodyscan.rig.pair import Pair
+from bodyscan.rig.pair import Known, KnownCamera, Pair
 from bodyscan.stripes.stripe_code import StripeCode
 
 HELD_PX = 1e-6
@@ -138,7 +137,7 @@ def _find(known: Known, device: KnownCamera, name: str, folder: Path) -> FoundCa
         return next(iter(cameras.values()))
     if device.name is None and len(cameras) == 1 and device is known.camera:
         return next(iter(cameras.values()))
-    return camera_named(cameras, device.name or name, str(path))
+    return find_camera(cameras, device.name or name, str(path))
 
 
 def _pose(

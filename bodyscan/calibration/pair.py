@@ -221,7 +221,7 @@ def _refine(
         )
     observed = {view.board for view in pair.views}
     flatness = {
-        board.name: board.believed_flatness_mm for board in pair.boards if board.name in observed
+        board.name: board.flatness_sigma_mm for board in pair.boards if board.name in observed
     }
     poses = [view.camera_from_board for view in pair.views]
     return refine_jointly(pair.camera, poses, sheets, boards, flatness)

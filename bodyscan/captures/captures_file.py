@@ -1,22 +1,74 @@
-"""captures.yaml: what a capture folder says about itself; see docs/formats.md."""
+"""captures.yaml: what a capture folder says about itself, and the file of times that it may name.
+
+See docs/formats.md. A time is the middle of a frame's exposure (of several exposures, the middle of
+all), in ms since the first pair began with that shot.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import csv
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal, TypeAlias
 
-from bodyscan.captures.timing import Timing, timing_problems
+from pydantic import Field
+
 from bodyscan.errors import CaptureError
 from bodyscan.files.atomic import write_text
-from bodyscan.files.model import Model, Name, Problem, ShotName, did_you_mean, duplicates
-from bodyscan.files.model_file import load_model
-from bodyscan.files.yaml_file import dump_yaml
+from bodyscan.files.model import Model, Name, Problem, ShotName, did_you_mean, find_duplicates
+from bodyscan.files.model_file import combine_problems, load_model
+from bodyscan.files.reading import read_regular
+from bodyscan.files.yaml_file import Place, YamlProblem, dump_yaml
 from bodyscan.rig.rig import Rig
+from bodyscan.rig.templates import path_fault
 
 FILE_NAME = "captures.yaml"
 _REMEDY = "Correct captures.yaml; docs/formats.md explains every key."
+_TIMES_REMEDY = "Correct the file of times; docs/formats.md explains its columns."
+_COLUMNS = ("shot", "pair", "frame", "ms")
+
+Sequences: TypeAlias = Mapping[tuple[str, str], tuple[str, ...]]
+"""Names of the frames taken, by shot and pair, in the rig's order of pairs."""
+
+FrameTimes: TypeAlias = Mapping[tuple[str, str], Mapping[str, float]]
+"""Times in ms, by shot and pair, then by frame."""
+
+MAX_MS = 1e13  # milliseconds since 1970 are 2e12, and are accepted
+Milliseconds = Annotated[float, Field(ge=0.0, le=MAX_MS)]
+# At least a tenth of the fastest projectors', so that seconds are not mistaken for ms.
+FrameMilliseconds = Annotated[float, Field(ge=0.01, le=6e5)]
+Start = Literal["one-after-another", "together", "poles"] | dict[Name, Milliseconds]
+
+MAX_BYTES = 50_000_000  # of a file of times: a million frames
+
+
+class Timing(Model):
+    """The key `timing`: a steady rate, or a file of times.
+
+    frame_ms: from one frame to the next.
+    order: names of frames in the order taken; None: as `FrameNames.sequence_names` lists them.
+    start: when pairs begin in each shot; one-after-another: in the rig's order; together: all at
+        once; poles: pairs of one pole one after another, all poles at once.
+    times: a CSV file, relative to the capture folder.
+    """
+
+    frame_ms: FrameMilliseconds | None = None
+    order: tuple[str, ...] | None = None
+    start: Start | None = None
+    times: str | None = None
+
+    def problems(self) -> Iterator[Problem]:
+        if self.times is None and self.frame_ms is None:
+            yield ("frame_ms",), "is missing (or `times`, a file that has the time of each frame)"
+        steady = {"frame_ms": self.frame_ms, "order": self.order, "start": self.start}
+        for key in [key for key, value in steady.items() if value is not None and self.times]:
+            yield (key,), "is said twice: `times` has the time of each frame"
+        fault = path_fault(self.times) if self.times is not None else None
+        if fault:
+            yield ("times",), fault
+        for index, name in find_duplicates(self.order or ()):
+            yield ("order", index), f"lists a frame twice (got {name!r})"
 
 
 class ShotEntry(Model):
@@ -33,13 +85,15 @@ class ShotEntry(Model):
     lit: tuple[Name, ...] | None = None
 
     def problems(self) -> Iterator[Problem]:
-        for index, name in duplicates(self.stripes or ()):
+        for index, name in find_duplicates(self.stripes or ()):
             yield ("stripes", index), f"lists a pair twice (got {name!r})"
         named = (*(self.stripes or ()), *(self.lit or ()))
-        for index, name in duplicates(named):
+        for index, name in find_duplicates(named):
             if index >= len(self.stripes or ()):
-                place = index - len(self.stripes or ())
-                yield ("lit", place), f"lists a pair that is listed already (got {name!r})"
+                yield (
+                    ("lit", index - len(self.stripes or ())),
+                    f"lists a pair that is listed already (got {name!r})",
+                )
 
 
 class CapturesFile(Model):
@@ -60,7 +114,7 @@ class CapturesFile(Model):
     def problems(self) -> Iterator[Problem]:
         if self.subject is not None and self.kind != "scan":
             yield ("subject",), "is for kind: scan"
-        for index, name in duplicates(tuple(shot.name for shot in self.shots or ())):
+        for index, name in find_duplicates(tuple(shot.name for shot in self.shots or ())):
             yield ("shots", index, "name"), f"is given to two shots (got {name!r})"
 
 
@@ -75,7 +129,7 @@ def load_captures_file(folder: Path, rig: Rig) -> CapturesFile:
         CapturesFile,
         CaptureError,
         remedy=_REMEDY,
-        also=lambda file: (*_unknown_names(file, rig), *_wrong_timing(file, rig)),
+        also=lambda file: _misfits(file, rig),
     )
 
 
@@ -85,19 +139,170 @@ def write_captures_file(folder: Path, captures: CapturesFile) -> None:
     write_text(folder / FILE_NAME, dump_yaml(data))
 
 
-def _unknown_names(captures: CapturesFile, rig: Rig) -> Iterator[Problem]:
+def _misfits(captures: CapturesFile, rig: Rig) -> Iterator[Problem]:
+    """Find names that the rig does not have."""
     pairs = {pair.name: pair for pair in rig.pairs}
     for index, shot in enumerate(captures.shots or ()):
         for key in ("stripes", "lit"):
-            for place, name in enumerate(getattr(shot, key) or ()):
-                where = ("shots", index, key, place)
+            for k, name in enumerate(getattr(shot, key) or ()):
+                where = ("shots", index, key, k)
                 if name not in pairs:
                     hint = did_you_mean(name, pairs)
                     yield where, f"names no pair of rig {rig.name}{hint} (got {name!r})"
                 elif key == "stripes" and pairs[name].projector is None:
                     yield where, f"names a camera without projector (got {name!r}): list it in lit"
+    if captures.timing:
+        for inside, text in find_timing_problems(captures.timing, rig):
+            yield ("timing", *inside), text
 
 
-def _wrong_timing(captures: CapturesFile, rig: Rig) -> Iterator[Problem]:
-    for where, text in timing_problems(captures.timing, rig) if captures.timing else ():
-        yield ("timing", *where), text
+def find_timing_problems(timing: Timing, rig: Rig) -> Iterator[Problem]:
+    """Find frames or pairs that the rig does not have, or that are left out."""
+    known = [name for pair in rig.pairs for name in rig.frames.sequence_names(pair.projector)]
+    order = known if timing.order is None else timing.order
+    for index, name in enumerate(order):
+        if name not in known:
+            hint = did_you_mean(name, known)
+            yield ("order", index), f"names no frame of rig {rig.name}{hint} (got {name!r})"
+    left_out = [name for name in dict.fromkeys(known) if name not in order]
+    if left_out:
+        yield ("order",), f"leaves out {', '.join(left_out)}: every frame has its time"
+    names = [pair.name for pair in rig.pairs]
+    if timing.start is None and timing.times is None and len(names) > 1:
+        yield ("start",), "is missing: one-after-another, together, poles, or ms by pair"
+    if isinstance(timing.start, dict):
+        for name in timing.start:
+            if name not in names:
+                hint = did_you_mean(name, names)
+                yield ("start", name), f"names no pair of rig {rig.name}{hint}"
+        absent = [name for name in names if name not in timing.start]
+        if absent:
+            yield ("start",), f"leaves out {', '.join(absent)}: every pair has its start"
+
+
+def compute_frame_times(timing: Timing, rig: Rig, sequences: Sequences, folder: Path) -> FrameTimes:
+    """Times of all frames. Raises CaptureError, with the line, for a wrong file of times."""
+    if timing.times is not None:
+        return _read_times(folder / timing.times, rig, sequences)
+    times: dict[tuple[str, str], dict[str, float]] = {}
+    step = timing.frame_ms or 0.0
+    for shot in dict.fromkeys(shot for shot, _ in sequences):
+        taken = {pair: names for (one, pair), names in sequences.items() if one == shot}
+        starts = _compute_starts(timing, rig, {pair: len(names) for pair, names in taken.items()})
+        for pair, names in taken.items():
+            ordered = [name for name in timing.order if name in names] if timing.order else names
+            times[shot, pair] = {
+                name: starts[pair] + (k + 0.5) * step for k, name in enumerate(ordered)
+            }
+    return times
+
+
+def _compute_starts(timing: Timing, rig: Rig, counts: Mapping[str, int]) -> dict[str, float]:
+    """When each pair began, ms, given how many frames each took."""
+    if isinstance(timing.start, dict):
+        return dict(timing.start)
+    starts: dict[str, float] = {}
+    ended: dict[str | None, float] = {}  # when the pairs that take turns were done so far
+    for pair, count in counts.items():
+        pole = rig.pair(pair).pole or pair
+        turn = {"together": pair, "poles": pole}.get(timing.start or "")
+        starts[pair] = ended.get(turn, 0.0)
+        ended[turn] = starts[pair] + count * (timing.frame_ms or 0.0)
+    return starts
+
+
+def _read_times(path: Path, rig: Rig, sequences: Sequences) -> FrameTimes:
+    try:
+        content = read_regular(path, MAX_BYTES)
+        lines = content.decode("utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        what = f"the file of times cannot be read as text: {error}"
+        raise CaptureError(what, where=str(path), remedy=_TIMES_REMEDY) from None
+    if len(content) > MAX_BYTES:
+        what = f"is longer than {MAX_BYTES:,} bytes: this cannot be right"
+        raise CaptureError(what, where=str(path), remedy=_TIMES_REMEDY)
+    found: dict[tuple[str, str], dict[str, float]] = {}
+    problems = [
+        YamlProblem(Place(line, 1), "", text)
+        for line, text in _parse_rows(lines, rig, sequences, found)
+    ]
+    for (shot, pair), frames in sequences.items():
+        times = found.get((shot, pair), {})
+        absent = [name for name in frames if times and name not in times]
+        if absent:
+            text = f"has no time of {', '.join(absent)} (pair {pair}, shot {shot})"
+            problems.append(YamlProblem(Place(len(lines), 1), "", text))
+    if problems:
+        raise combine_problems(path, problems, CaptureError, _TIMES_REMEDY)
+    return found
+
+
+def _parse_rows(
+    lines: Sequence[str],
+    rig: Rig,
+    sequences: Sequences,
+    found: dict[tuple[str, str], dict[str, float]],
+) -> Iterator[tuple[int, str]]:
+    """Parse rows into `found`; yields line and text of what is wrong."""
+    rows = csv.reader(lines)
+    header = tuple(word.strip() for word in next(rows, []))
+    if header != _COLUMNS:
+        yield (
+            1,
+            f"must begin with the line {','.join(_COLUMNS)} (got {','.join(header) or 'nothing'})",
+        )
+        return
+    shots = list(dict.fromkeys(shot for shot, _ in sequences))
+    pairs = [pair.name for pair in rig.pairs]
+    for row in rows:
+        words = [word.strip() for word in row]
+        if not any(words):
+            continue
+        fault = _find_row_fault(words, shots, pairs, sequences, found)
+        if fault:
+            yield rows.line_num, fault
+        else:
+            shot, pair, frame, ms = words
+            found.setdefault((shot, pair), {})[frame] = float(ms)
+
+
+def _find_row_fault(
+    words: Sequence[str],
+    shots: Sequence[str],
+    pairs: Sequence[str],
+    sequences: Sequences,
+    found: Mapping[tuple[str, str], Mapping[str, float]],
+) -> str | None:
+    """What is wrong with one row, or None."""
+    if len(words) != len(_COLUMNS):
+        return f"has {len(words)} columns, not {len(_COLUMNS)}"
+    shot, pair, frame, ms = words
+    frames = sequences.get((shot, pair), ())
+    for what, name, known in (("shot", shot, shots), ("pair", pair, pairs)):
+        if name not in known:
+            return f"names no {what} of these captures{did_you_mean(name, known)} (got {name!r})"
+    if not frames:
+        return f"pair {pair} took nothing in shot {shot}"
+    if frame not in frames:
+        hint = did_you_mean(frame, frames)
+        return f"names no frame that pair {pair} took in shot {shot}{hint} (got {frame!r})"
+    times = found.get((shot, pair), {})
+    if frame in times:
+        return f"gives frame {frame} of pair {pair} a second time"
+    if not _is_time(ms):
+        return f"ms must be a number, 0 or more (got {ms!r})"
+    last = max(times, key=lambda name: times[name], default="")
+    if times and float(ms) <= times[last]:
+        return (
+            f"time runs backwards: frame {frame} of pair {pair} at {ms} ms, after {last} at"
+            f" {times[last]:g} ms (rows of a pair are in the order in which it took its frames)"
+        )
+    return None
+
+
+def _is_time(text: str) -> bool:
+    try:
+        value = float(text)
+    except ValueError:
+        return False
+    return 0.0 <= value <= MAX_MS

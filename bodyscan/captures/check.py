@@ -2,31 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import os
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from itertools import groupby
 from pathlib import Path
+from typing import TypeVar
 
-from bodyscan.captures.folder import Captures, ImageSequence, join_captures, open_folder, open_scan
-from bodyscan.captures.image_faults import NO_INVERSES, absence, header_fault
-from bodyscan.captures.image_header import NoImage, read_header
-from bodyscan.captures.unlisted_images import describe_unlisted_images
+from bodyscan.captures.folder import (
+    IMAGE_SUFFIXES,
+    Captures,
+    ImageSequence,
+    join_captures,
+    open_folder,
+    open_scan,
+)
+from bodyscan.captures.image_header import (
+    NO_INVERSES,
+    NotAnImage,
+    describe_missing,
+    find_header_fault,
+    read_header,
+)
 from bodyscan.errors import BadInput, CaptureError
 from bodyscan.rig.board import Board
 from bodyscan.rig.pair import Pair
-from bodyscan.rig.rig import Rig
+from bodyscan.rig.rig import Rig, find_unusual_lengths
 from bodyscan.rig.rig_file import load_rig
-from bodyscan.rig.sizes import odd_sizes
 
-FEWEST_SHOTS = 3
-ENOUGH_SHOTS = 6
-MANY_SHOTS = 3
-"""If more shots than this have the same fault, they share a line."""
-COARSE = 4.0
-"""Grey levels of rounding. Boundaries and corners rise by some 40 per pixel, so this moves them by
-0.1 px, several times the effect of a camera's own noise."""
-_READERS = 8  # threads that wait for a disk or a server, not for a processor
+MIN_SHOTS, ENOUGH_SHOTS = 3, 6
+
+T = TypeVar("T")
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
@@ -54,8 +63,8 @@ class PairCount:
 class CheckReport:
     """What `check` found.
 
-    errors: what must be mended, besides images.
-    warnings: what should be looked at.
+    errors: what must be corrected, besides images.
+    warnings: what should be checked.
     bad_images: missing or unusable, by pair, then shot.
     images: how many were examined.
     """
@@ -95,32 +104,20 @@ def check(
 
     sequences = [sequence for part in captures for sequence in part.sequences]
     known = {path for part in captures for path in part.corners}
-    with ThreadPoolExecutor(_READERS) as pool:
-        bad_of = dict(pool.map(lambda s: (s, _bad_images(rig, s, known)), sequences))
+    found = zip(sequences, _map(partial(_bad_images, rig, known), sequences), strict=True)
+    bad_of = dict(found)
     good = [s for s in (calibration.sequences if calibration else ()) if not bad_of[s]]
-    counts = tuple(_count(pair, good) for pair in rig.pairs)
-    place = {pair.name: index for index, pair in enumerate(rig.pairs)}
-    bad = sorted((bad for found in bad_of.values() for bad in found), key=lambda b: place[b.pair])
+    counts = tuple(_count_shots(pair, good) for pair in rig.pairs)
+    order = {pair.name: index for index, pair in enumerate(rig.pairs)}
+    bad = sorted((bad for some in bad_of.values() for bad in some), key=lambda b: order[b.pair])
     for part in captures:
-        errors += [f"{part.folders[0]}: shot {shot}: no image" for shot in _empty_shots(part)]
+        taken = {sequence.shot for sequence in part.sequences}
+        empty = [shot for shot in part.shots if shot not in taken]
+        errors += [f"{part.folders[0]}: shot {shot}: no image" for shot in empty]
     if calibration:
         errors += _frame_errors(calibration, good)
-        errors += _untied(rig, good)
-        too_few = [*filter(None, map(_too_few, rig.pairs, counts))]
-        errors += () if rig.is_known else too_few
-    silent = rig.calibration or rig.is_known
-    warnings = [] if silent else [f"{rig_path}: names no calibration captures"]
-    warnings += odd_sizes(rig)
-    if calibration and rig.is_known and too_few:
-        warnings += ["all pairs are `known`: `bodyscan import` takes them as they are"]
-    warnings += [NO_INVERSES] if any(map(_lacks_inverses, sequences)) else []
-    warnings += _coarse_images(sequences)
-    warnings += filter(None, map(describe_unlisted_images, captures))
-    if len(rig.pairs) > 1:  # a single camera cannot disagree
-        warnings += [_turned(board) for board in rig.boards if board.looks_same_turned]
-    warnings += (
-        filter(None, map(_few, rig.pairs, counts)) if calibration and not rig.is_known else ()
-    )
+        errors += _find_separate_groups(rig, good)
+        errors += () if rig.is_known else filter(None, map(_too_few_shots, rig.pairs, counts))
     return CheckReport(
         rig_path=Path(rig_path),
         rig=rig,
@@ -130,32 +127,34 @@ def check(
         pairs=counts,
         bad_images=tuple(bad),
         errors=tuple(errors),
-        warnings=tuple(warnings),
+        warnings=tuple(_warnings(Path(rig_path), rig, captures, calibration, counts)),
     )
 
 
-def report_lines(report: CheckReport) -> list[str]:
-    """The report as lines of text, with bad images grouped by pair, shot and fault."""
+def format_report(report: CheckReport) -> list[str]:
+    """Format the report as lines of text, with bad images grouped by pair, shot and fault."""
     rig = report.rig
-    lines = [
-        f"{report.rig_path}: rig {rig.name}: {_several(len(rig.pairs), 'pair')},"
-        f" {_several(len(rig.boards), 'board')}"
-    ]
-    shots = _several(len(report.shots), "calibration shot")
-    lines += [f"{folder}" for folder in report.folders]
-    lines.append(f"{shots}, {_several(report.images, 'image')}")
+    counts = f"{_count(len(rig.pairs), 'pair')}, {_count(len(rig.boards), 'board')}"
+    lines = [f"{report.rig_path}: rig {rig.name}: {counts}", *map(str, report.folders)]
+    shots = _count(len(report.shots), "calibration shot")
+    lines.append(f"{shots}, {_count(report.images, 'image')}")
     width = max(len(pair.pair) for pair in report.pairs)
     for count in report.pairs if report.folders else ():
-        stripes = (
-            f"{count.stripe_shots:4d} with stripes, " if rig.pair(count.pair).projector else ""
-        )
+        has_stripes = rig.pair(count.pair).projector
+        stripes = f"{count.stripe_shots:4d} with stripes, " if has_stripes else ""
         lines.append(f"  {count.pair:{width}}  {stripes}{count.lit_shots:4d} lit only")
-    lines += _bad_lines(report.bad_images)
+    lines += _format_bad_images(report.bad_images)
     lines += [f"error: {text}" for text in report.errors]
     lines += [f"warning: {text}" for text in report.warnings]
     faults = len(report.errors) + len(report.bad_images)
-    lines.append("good" if report.ok else f"{_several(faults, 'fault')} to correct")
+    lines.append("good" if report.ok else f"{_count(faults, 'fault')} to correct")
     return lines
+
+
+def _map(work: Callable[[T], Result], items: Iterable[T]) -> list[Result]:
+    """Results of several threads, which wait for a disk or a server, not for a processor."""
+    with ThreadPoolExecutor(8) as pool:
+        return list(pool.map(work, items))
 
 
 def _attempt(errors: list[str], work: Callable[..., Captures], *args: object) -> Captures | None:
@@ -167,103 +166,117 @@ def _attempt(errors: list[str], work: Callable[..., Captures], *args: object) ->
         return None
 
 
-def _bad_images(rig: Rig, sequence: ImageSequence, known: set[Path]) -> tuple[BadImage, ...]:
+def _bad_images(rig: Rig, known: set[Path], sequence: ImageSequence) -> tuple[BadImage, ...]:
     """The unusable images of a sequence; none is needed if its corners are `known`."""
-    camera = rig.pair(sequence.pair).camera
-    missing = set(sequence.missing)
-    faults = (
-        (
-            path,
-            absence(path) if path in missing else header_fault(path, camera.width, camera.height),
-        )
-        for path in sequence.paths
-        if path not in known
-    )
-    return tuple(
-        BadImage(path, sequence.pair, sequence.shot, fault) for path, fault in faults if fault
-    )
+    camera, missing = rig.pair(sequence.pair).camera, set(sequence.missing)
+    bad = []
+    for path in sequence.paths:
+        if path in known:
+            continue
+        if path in missing:
+            fault: str | None = describe_missing(path)
+        else:
+            fault = find_header_fault(path, camera.width, camera.height)
+        if fault:
+            bad.append(BadImage(path, sequence.pair, sequence.shot, fault))
+    return tuple(bad)
 
 
-def _count(pair: Pair, good: list[ImageSequence]) -> PairCount:
-    own = [sequence for sequence in good if sequence.pair == pair.name]
-    stripes = sum(sequence.has_stripes for sequence in own)
-    images = sum(len(sequence.paths) for sequence in own)
-    return PairCount(pair.name, pair.pole, stripes, len(own) - stripes, images)
+def _count_shots(pair: Pair, good: list[ImageSequence]) -> PairCount:
+    taken = [sequence for sequence in good if sequence.pair == pair.name]
+    stripes = sum(sequence.has_stripes for sequence in taken)
+    images = sum(len(sequence.paths) for sequence in taken)
+    return PairCount(pair.name, pair.pole, stripes, len(taken) - stripes, images)
 
 
-def _too_few(pair: Pair, count: PairCount) -> str | None:
-    """Why a pair has too few shots, or None. It needs three board poses with stripes, a camera
+def _count_poses(pair: Pair, count: PairCount) -> int:
+    return count.stripe_shots + (0 if pair.projector else count.lit_shots)
+
+
+def _too_few_shots(pair: Pair, count: PairCount) -> str | None:
+    """The error if a pair has too few shots. It needs three board poses with stripes, a camera
     alone three lit ones (Zhang 2000)."""
-    have = count.stripe_shots + (0 if pair.projector else count.lit_shots)
-    if have >= FEWEST_SHOTS:
+    have = _count_poses(pair, count)
+    if have >= MIN_SHOTS:
         return None
     kind = "whole stripe sequence" if pair.projector else "lit image"
     return (
-        f"pair {pair.name}: has {_several(have, kind)}; calibration needs {FEWEST_SHOTS} or more,"
+        f"pair {pair.name}: has {_count(have, kind)}; calibration needs {MIN_SHOTS} or more,"
         " with the board tilted differently in each"
     )
 
 
-def _few(pair: Pair, count: PairCount) -> str | None:
-    """A warning if there are enough shots to calibrate but
-    hardly enough to trust the result, or None."""
-    have = count.stripe_shots + (0 if pair.projector else count.lit_shots)
-    if not FEWEST_SHOTS <= have < ENOUGH_SHOTS:
-        return None
-    return f"pair {pair.name}: {have} board poses will do, {ENOUGH_SHOTS} or more are better"
+def _warnings(
+    rig_path: Path,
+    rig: Rig,
+    captures: list[Captures],
+    calibration: Captures | None,
+    counts: tuple[PairCount, ...],
+) -> Iterator[str]:
+    sequences = [sequence for part in captures for sequence in part.sequences]
+    if not (rig.calibration or rig.is_known):
+        yield f"{rig_path}: names no calibration captures"
+    yield from find_unusual_lengths(rig)
+    if calibration and rig.is_known and any(map(_too_few_shots, rig.pairs, counts)):
+        yield "all pairs are `known`: `bodyscan import` takes them as they are"
+    if any(s.missing and set(s.missing) == set(s.inverses) for s in sequences):
+        yield NO_INVERSES
+    yield from _warn_of_jpeg(sequences)
+    yield from filter(None, map(describe_unlisted_images, captures))
+    if len(rig.pairs) > 1:  # a single camera cannot disagree
+        yield from (_describe_symmetry(board) for board in rig.boards if board.is_ambiguous)
+    if calibration and not rig.is_known:
+        for pair, count in zip(rig.pairs, counts, strict=True):
+            have = _count_poses(pair, count)
+            if MIN_SHOTS <= have < ENOUGH_SHOTS:
+                enough = f"{ENOUGH_SHOTS} or more are better"
+                yield f"pair {pair.name}: {have} board poses will do, {enough}"
 
 
-def _lacks_inverses(sequence: ImageSequence) -> bool:
-    """Whether all inverses are missing, and nothing else."""
-    return bool(sequence.missing) and set(sequence.missing) == set(sequence.inverses)
+def _warn_of_jpeg(sequences: list[ImageSequence]) -> Iterator[str]:
+    """Warn of low-quality JPEG, judged by the first image of each pair.
 
-
-def _empty_shots(captures: Captures) -> list[str]:
-    taken = {sequence.shot for sequence in captures.sequences}
-    return [shot for shot in captures.shots if shot not in taken]
-
-
-def _coarse_images(sequences: list[ImageSequence]) -> list[str]:
-    """Warn of low-quality JPEG, judged by the first image of each pair."""
+    Boundaries and corners rise by some 40 grey levels per pixel, so four levels of rounding move
+    them by 0.1 px, several times the effect of a camera's own noise.
+    """
     firsts = {s.pair: path for s in reversed(sequences) for path in s.paths[:1]}
-    with ThreadPoolExecutor(_READERS) as pool:
-        rounded = dict(zip(firsts, pool.map(_rounding, firsts.values()), strict=True))
-    coarse = [pair for pair, grey in rounded.items() if grey > COARSE]
-    if not coarse:
-        return []
-    return [
-        f"images of {', '.join(sorted(coarse))} are JPEG of low quality: they err by up to "
-        f"{max(rounded.values()):.0f} grey levels, and stripes' boundaries with them; save PNG, or "
-        "JPEG of a quality of 95 or more"
-    ]
+    errors = dict(zip(firsts, _map(_read_rounding_error, firsts.values()), strict=True))
+    coarse = [pair for pair, grey in errors.items() if grey > 4.0]
+    if coarse:
+        yield (
+            f"images of {', '.join(sorted(coarse))} are JPEG of low quality: they err by up to "
+            f"{max(errors.values()):.0f} grey levels, and stripes' boundaries with them; save PNG, "
+            "or JPEG of a quality of 95 or more"
+        )
 
 
-def _rounding(path: Path) -> float:
-    """Rounding in grey levels; 0 if the file cannot be read, which is reported elsewhere."""
+def _read_rounding_error(path: Path) -> float:
+    """In grey levels; 0 if the file cannot be read, which is reported elsewhere."""
     try:
-        return read_header(path).rounded
-    except (NoImage, BadInput, OSError):
+        return read_header(path).rounding_error
+    except (NotAnImage, BadInput, OSError):
         return 0.0
 
 
-def _turned(board: Board) -> str:
+def _describe_symmetry(board: Board) -> str:
     count = f"{board.columns} x {board.rows} squares"
-    why = "its two faces are alike" if board.faces == 2 else f"it has {count}, an even sum"
+    why = "its two faces are equal" if board.faces == 2 else f"it has {count}, an even sum"
     return (
-        f"board {board.name} looks the same turned round ({why}): cameras may number its corners from "
-        "different ends; better is an odd number of columns with an even one of rows, or ChArUco"
+        f"board {board.name} looks the same rotated by 180 degrees ({why}): cameras may number its "
+        "corners from different ends; better is an odd number of columns with an even one of rows, "
+        "or ChArUco"
     )
 
 
-def _untied(rig: Rig, good: list[ImageSequence]) -> list[str]:
-    """Groups of pairs without a common shot: nothing can join them in one frame."""
+def _find_separate_groups(rig: Rig, good: list[ImageSequence]) -> list[str]:
+    """The error if there are groups of pairs without a common shot: nothing can join them."""
     groups: list[tuple[set[str], set[str]]] = []  # pairs and their shots
     for pair in rig.pairs:
         pairs, shots = {pair.name}, {s.shot for s in good if s.pair == pair.name}
         if not shots:
             continue
-        tied = [group for group in groups if group[1] & shots]
-        for group in tied:
+        connected = [group for group in groups if group[1] & shots]
+        for group in connected:
             groups.remove(group)
             pairs, shots = pairs | group[0], shots | group[1]
         groups.append((pairs, shots))
@@ -271,8 +284,8 @@ def _untied(rig: Rig, good: list[ImageSequence]) -> list[str]:
         return []
     named = " | ".join(", ".join(sorted(pairs)) for pairs, _ in groups)
     return [
-        f"nothing ties these groups of pairs together, for no shot is theirs in common: {named}; "
-        "take shots in which cameras of both see a board"
+        f"these groups of pairs have no shot in common, so that nothing joins them: {named}; take "
+        "shots in which cameras of both see a board"
     ]
 
 
@@ -285,16 +298,16 @@ def _frame_errors(calibration: Captures, good: list[ImageSequence]) -> list[str]
     return [f"rig_frame.shot: no pair has its images of '{frame.shot}', which fixes the rig frame"]
 
 
-def _bad_lines(bad: tuple[BadImage, ...]) -> list[str]:
+def _format_bad_images(bad: tuple[BadImage, ...]) -> list[str]:
     """One line per pair, shot and fault, with the first file of each; one per pair and fault if
-    many shots have it."""
+    more than three shots have it."""
     shots_of: dict[tuple[str, str], set[str]] = {}
     for image in bad:
         shots_of.setdefault((image.pair, image.what), set()).add(image.shot)
 
     def key(image: BadImage) -> tuple[str, str, str]:
         shots = shots_of[image.pair, image.what]
-        where = f"{len(shots)} shots" if len(shots) > MANY_SHOTS else f"shot {image.shot}"
+        where = f"{len(shots)} shots" if len(shots) > 3 else f"shot {image.shot}"
         return image.pair, where, image.what
 
     lines = []
@@ -305,5 +318,43 @@ def _bad_lines(bad: tuple[BadImage, ...]) -> list[str]:
     return lines
 
 
-def _several(count: int, noun: str) -> str:
+def _count(count: int, noun: str) -> str:
     return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
+def describe_unlisted_images(captures: Captures) -> str | None:
+    """Describe images that the rig file does not name, often in a renamed folder; None if none."""
+    found = _find_unlisted_images(captures)
+    if not found:
+        return None
+    number = "1 image belongs" if len(found) == 1 else f"{len(found)} images belong"
+    return (
+        f"{number} to no pair and frame of the rig file, such as {found[0]}: check the spelling of "
+        "its names"
+    )
+
+
+def _find_unlisted_images(captures: Captures) -> list[Path]:
+    """Images next to those of the captures' shots that belong to no pair and frame of the rig file.
+
+    Shots that are not wanted are ignored, unless nothing is left of one that is: it may have been
+    renamed.
+    """
+    complete = {s.shot for s in captures.sequences if len(s.missing) < len(s.paths)}
+    renamed = any(shot not in complete for shot in captures.shots)
+    wanted = {path for sequence in captures.sequences for path in sequence.paths}
+    folders = {path.parent.parent for path in wanted} | {path.parent for path in wanted}
+    named = {(len(path.parts), path.stem) for path in wanted}
+    suffixes = {path.suffix for path in wanted}
+    unlisted = []
+    for folder in captures.folders:
+        for root, _, names in os.walk(folder):
+            for path in (Path(root, name) for name in names):
+                if path.suffix.lower() not in IMAGE_SUFFIXES or path in wanted:
+                    continue
+                of_shot = set(path.relative_to(folder).parts[:-1]) & set(captures.shots)
+                # of another shot whose name differs only in its suffix
+                other = path.suffix not in suffixes and (len(path.parts), path.stem) in named
+                if renamed or of_shot or path.parent in folders or other:
+                    unlisted.append(path)
+    return sorted(unlisted)

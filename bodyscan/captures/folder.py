@@ -11,19 +11,25 @@ from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
-from bodyscan.captures.captures_file import FILE_NAME, ShotEntry, load_captures_file
+from bodyscan.captures.captures_file import (
+    FILE_NAME,
+    FrameTimes,
+    ShotEntry,
+    Timing,
+    compute_frame_times,
+    load_captures_file,
+)
 from bodyscan.captures.listing import Listing
-from bodyscan.captures.timing import FrameTimes, Timing, times_of_frames
 from bodyscan.errors import CaptureError
 from bodyscan.files.corners_vnl import Corners, read_corners
-from bodyscan.files.model import LONGEST_SHOT, SHOT
-from bodyscan.files.relative_text import relative_text
-from bodyscan.rig.capture_folder import CaptureFolder
+from bodyscan.files.messages import make_paths_relative
+from bodyscan.files.model import MAX_SHOT_LENGTH, SHOT
+from bodyscan.rig.frame_names import CaptureFolder
 from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.templates import fill, has_field, shot_pattern, with_exposure
 
-SUFFIXES = {".png", ".bmp", ".tif", ".tiff", ".jpg", ".jpeg", ".pgm", ".ppm"}
+IMAGE_SUFFIXES = {".png", ".bmp", ".tif", ".tiff", ".jpg", ".jpeg", ".pgm", ".ppm"}
 """Suffixes of image files, whatever program wrote them."""
 
 Kind = Literal["calibration", "scan"]
@@ -34,7 +40,7 @@ class ImageSequence:
     """The images that one pair took, or should have taken, in one shot.
 
     lit, dark, board: None if there is no such image.
-    coded: the images of the stripe code, in the order of `FrameNames.of_code`; () if only the lit
+    coded: the images of the stripe code, in the order of `FrameNames.code_names`; () if only the lit
         or the board image was taken.
     missing: the paths that do not exist.
     inverses: those among `coded`.
@@ -64,10 +70,10 @@ class ImageSequence:
     @property
     def without_crossing(self) -> ImageSequence:
         """The same sequence without its crossing stripes."""
-        own = {path for one in (self, *self.longer) for path in one.crossing}
+        crossing = {path for one in (self, *self.longer) for path in one.crossing}
 
         def rest(paths: tuple[Path, ...]) -> tuple[Path, ...]:
-            return tuple(path for path in paths if path not in own)
+            return tuple(path for path in paths if path not in crossing)
 
         return replace(
             self,
@@ -85,16 +91,14 @@ class ImageSequence:
 
     @property
     def paths(self) -> tuple[Path, ...]:
-        """Lit, dark and board image, as far as they exist, then the code's, then those of longer
-        exposures."""
+        """Lit, dark and board image if there are any, the code's, then those of longer exposures."""
         single = (self.lit, self.dark, self.board)
-        own = (*(path for path in single if path is not None), *self.coded)
-        return own + tuple(path for longer in self.longer for path in longer.paths)
+        paths = (*(path for path in single if path is not None), *self.coded)
+        return paths + tuple(path for longer in self.longer for path in longer.paths)
 
     @property
-    def seen_in(self) -> Path:
-        """The image in which boards are looked for; the code's
-        first if that image has to be made."""
+    def board_path(self) -> Path:
+        """The image in which boards are detected; the code's first if it has to be made of these."""
         return self.board or self.lit or self.coded[0]
 
 
@@ -143,12 +147,12 @@ class Captures:
         """What that pair took in that shot, or None."""
         return self._by_pair_and_shot.get((pair, shot))
 
-    def of_pair(self, pair: str) -> tuple[ImageSequence, ...]:
+    def pair_sequences(self, pair: str) -> tuple[ImageSequence, ...]:
         """That pair's sequences in the order of the shots."""
         return tuple(sequence for sequence in self.sequences if sequence.pair == pair)
 
-    def of_shot(self, shot: str) -> tuple[ImageSequence, ...]:
-        """What was taken in that shot, in the order of the rig's pairs."""
+    def shot_sequences(self, shot: str) -> tuple[ImageSequence, ...]:
+        """That shot's sequences in the order of the rig's pairs."""
         return tuple(sequence for sequence in self.sequences if sequence.shot == shot)
 
     def frame_ms(self, shot: str, pair: str) -> dict[str, float] | None:
@@ -161,7 +165,7 @@ class Captures:
 
     def relative(self, text: str) -> str:
         """A message with its paths relative to `base`, fit to be stored."""
-        return relative_text(text, self.base, self.folders)
+        return make_paths_relative(text, self.base, self.folders)
 
     def missing(self) -> tuple[MissingImage, ...]:
         """Every image that should exist and does not."""
@@ -195,20 +199,15 @@ def open_folder(rig: Rig, rig_path: Path, entry: CaptureFolder) -> Captures:
     if entry.corners is None:
         return _open(rig, folder, "calibration", template, entry.shots)
 
-    named = _corners_by_path(read_corners(Path(rig_path).parent / entry.corners), template)
+    # Wherever the images were for the other program, the last parts of their paths are the same.
+    last, corners = template.count("/") + 1, read_corners(Path(rig_path).parent / entry.corners)
+    named = {"/".join(name.split("/")[-last:]): pixels for name, pixels in corners.items()}
     captures = _open(rig, folder, "calibration", template, entry.shots, tuple(named))
-    return replace(captures, corners={folder / name: own for name, own in named.items()})
-
-
-def _corners_by_path(corners: Mapping[str, Corners], template: str) -> dict[str, Corners]:
-    """Corners by path as the template makes it: wherever the images were when another program found
-    the corners, the last parts of their paths are the same."""
-    parts = template.count("/") + 1
-    return {"/".join(name.split("/")[-parts:]): own for name, own in corners.items()}
+    return replace(captures, corners={folder / name: pixels for name, pixels in named.items()})
 
 
 def capture_path(rig_path: Path, entry: CaptureFolder) -> Path:
-    """Path of a folder in the rig file, with .. resolved where that leads to the same folder."""
+    """Path of a folder in the rig file, with .. resolved if that leads to the same folder."""
     path = Path(rig_path).parent / entry.folder
     short = os.path.normpath(path)  # differs if a symbolic link comes before ..
     return Path(short) if os.path.realpath(short) == os.path.realpath(path) else path
@@ -244,19 +243,19 @@ def join_captures(parts: tuple[Captures, ...]) -> Captures:
 
     Raises CaptureError if two folders hold the same shot of the same pair.
     """
-    seen: dict[tuple[str, str], Path] = {}
+    folder_of: dict[tuple[str, str], Path] = {}
     for part in parts:
         for sequence in part.sequences:
             key = (sequence.pair, sequence.shot)
-            if key in seen:
+            if key in folder_of:
                 raise CaptureError(
-                    f"shot {sequence.shot} of pair {sequence.pair} lies in {seen[key]} as well",
+                    f"shot {sequence.shot} of pair {sequence.pair} is in {folder_of[key]} as well",
                     where=str(part.folders[0]),
                     remedy="Rename one of the shots, or leave it out with `shots:` in rig.yaml.",
                 )
-            seen[key] = part.folders[0]
+            folder_of[key] = part.folders[0]
     shots = tuple(dict.fromkeys(shot for part in parts for shot in part.shots))
-    order = {pair.name: place for place, pair in enumerate(parts[0].rig.pairs)}
+    order = {pair.name: k for k, pair in enumerate(parts[0].rig.pairs)}
     sequences = [sequence for part in parts for sequence in part.sequences]
     sequences.sort(key=lambda sequence: (shots.index(sequence.shot), order[sequence.pair]))
     folders = tuple(folder for part in parts for folder in part.folders)
@@ -265,8 +264,8 @@ def join_captures(parts: tuple[Captures, ...]) -> Captures:
         folders=folders,
         shots=shots,
         sequences=tuple(sequences),
-        corners={path: own for part in parts for path, own in part.corners.items()},
-        times={key: own for part in parts for key, own in part.times.items()},
+        corners={path: pixels for part in parts for path, pixels in part.corners.items()},
+        times={key: times for part in parts for key, times in part.times.items()},
         described_in=tuple(path for part in parts for path in part.described_in),
     )
 
@@ -289,7 +288,7 @@ def _open(
         )
     first = with_exposure(template, rig.exposures[0]) if rig.exposures else template
     entries = {shot.name: shot for shot in (file.shots if file else None) or ()}
-    names = wanted or tuple(entries) or _discover(rig, listing, first)
+    names = wanted or tuple(entries) or _discover_shots(rig, listing, first)
     if not has_field(template, "shot") and len(names) > 1:
         raise CaptureError(
             f"holds one shot by the template {template}, but {len(names)} are listed",
@@ -318,18 +317,18 @@ def _open(
     captures = Captures(rig, (folder,), names, sequences, base=folder)
     if file is None:
         return captures
-    times, own_file = _times(captures, listing, file.timing)
+    times, times_file = _read_times(captures, listing, file.timing)
     return replace(
         captures,
         when=file.when,
         subject=file.subject,
         simulated=bool(file.simulated),
         times=times,
-        described_in=(folder / FILE_NAME, *own_file),
+        described_in=(folder / FILE_NAME, *times_file),
     )
 
 
-def _times(
+def _read_times(
     captures: Captures, listing: Listing, timing: Timing | None
 ) -> tuple[FrameTimes, tuple[Path, ...]]:
     """When frames were taken, and the file that says so if it is a separate one."""
@@ -337,19 +336,19 @@ def _times(
         return {}, ()
     if timing.times is not None and not listing.has(timing.times):
         raise CaptureError(
-            f"names the file of times {timing.times}, which is not there",
+            f"names the file of times {timing.times}, which does not exist",
             where=str(listing.root / FILE_NAME),
-            remedy="Copy it into the capture folder, or take `timing` out.",
+            remedy="Copy it into the capture folder, or remove `timing`.",
         )
     frames = captures.rig.frames
     taken = {
-        (one.shot, one.pair): frames.of_sequence(captures.rig.pair(one.pair).projector)
+        (one.shot, one.pair): frames.sequence_names(captures.rig.pair(one.pair).projector)
         if one.has_stripes
-        else frames.of_sequence(None)
+        else frames.sequence_names(None)
         for one in captures.sequences
     }
-    own_file = () if timing.times is None else (listing.root / timing.times,)
-    return times_of_frames(timing, captures.rig, taken, listing.root), own_file
+    times_file = () if timing.times is None else (listing.root / timing.times,)
+    return compute_frame_times(timing, captures.rig, taken, listing.root), times_file
 
 
 def _folder_above(rig: Rig, folder: Path, template: str) -> Path | None:
@@ -363,27 +362,27 @@ def _folder_above(rig: Rig, folder: Path, template: str) -> Path | None:
 
 def _some_image(folder: Path) -> str:
     """The name of some image in the folder, to compare with what was expected."""
-    for place, _, names in os.walk(folder):
+    for root, _, names in os.walk(folder):
         for name in sorted(names):
-            if Path(name).suffix.lower() in SUFFIXES:
-                return f", but one is named {os.path.relpath(os.path.join(place, name), folder)}"
+            if Path(name).suffix.lower() in IMAGE_SUFFIXES:
+                return f", but one is named {os.path.relpath(os.path.join(root, name), folder)}"
     return ""
 
 
 def _some_frame(rig: Rig) -> str:
     """The name of an image that every pair should have."""
     code = rig.pairs[0].projector
-    return rig.frames.board_image or (rig.frames.of_code(code)[0] if code else "")
+    return rig.frames.board_image or (rig.frames.code_names(code)[0] if code else "")
 
 
-def _discover(rig: Rig, listing: Listing, template: str) -> tuple[str, ...]:
+def _discover_shots(rig: Rig, listing: Listing, template: str) -> tuple[str, ...]:
     """Shots found in the names of files: those with a lit image or a code's first image."""
     if not has_field(template, "shot"):
         name = listing.root.resolve().name
-        if re.fullmatch(SHOT, name) and len(name) <= LONGEST_SHOT:
+        if re.fullmatch(SHOT, name) and len(name) <= MAX_SHOT_LENGTH:
             return (name,)
         raise CaptureError(
-            "cannot give its shot its own name, which is no valid name of a shot",
+            "the folder's name is not a valid shot name",
             where=str(listing.root),
             remedy="Rename the folder (a letter, a digit or '_' first), or list its shot.",
         )
@@ -391,13 +390,13 @@ def _discover(rig: Rig, listing: Listing, template: str) -> tuple[str, ...]:
     for pair in rig.pairs:
         frames = {rig.frames.lit, rig.frames.board} - {None}
         if pair.projector:
-            frames |= set(rig.frames.of_code(pair.projector)[:1])
+            frames |= set(rig.frames.code_names(pair.projector)[:1])
         for frame in filter(None, frames):
-            found |= _shots_matching(listing, shot_pattern(template, pair.name, frame), "", None)
-    return tuple(sorted((name for name in found if len(name) <= LONGEST_SHOT), key=_natural))
+            found |= _find_shots(listing, shot_pattern(template, pair.name, frame), "", None)
+    return tuple(sorted((name for name in found if len(name) <= MAX_SHOT_LENGTH), key=_natural_key))
 
 
-def _shots_matching(
+def _find_shots(
     listing: Listing, parts: tuple[re.Pattern[str], ...], folder: str, shot: str | None
 ) -> set[str]:
     """Names of shots for which a path below `folder` matches the patterns, part by part."""
@@ -406,17 +405,17 @@ def _shots_matching(
         match = parts[0].fullmatch(name)
         if match is None:
             continue
-        told = match.groupdict().get("shot", shot)
-        if shot is not None and told != shot:
+        named = match.groupdict().get("shot", shot)
+        if shot is not None and named != shot:
             continue
         if len(parts) > 1:
-            found |= _shots_matching(listing, parts[1:], f"{folder}/{name}".lstrip("/"), told)
-        elif told is not None:
-            found.add(told)
+            found |= _find_shots(listing, parts[1:], f"{folder}/{name}".lstrip("/"), named)
+        elif named is not None:
+            found.add(named)
     return found
 
 
-def _natural(name: str) -> tuple[tuple[int, int, str], ...]:
+def _natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
     """Sort key that puts b2 before b10."""
     pieces = re.findall(r"\d+|\D+", name)
     return tuple((0, int(p), p) if p.isdecimal() else (1, 0, p) for p in pieces)
@@ -431,8 +430,8 @@ def _sequences(
     for pair in rig.pairs:
         whole = _sequence(rig, listing, template, shot.name, pair)
         if whole.coded and templates:
-            whole = _exposed(whole, rig, listing, templates)
-        alone = _view_alone(rig, listing, template, shot.name, pair)
+            whole = _add_exposures(whole, rig, listing, templates)
+        alone = _board_image_alone(rig, listing, template, shot.name, pair)
         if look:
             if set(whole.coded) - set(whole.missing):
                 yield whole
@@ -465,27 +464,20 @@ def _sequence(rig: Rig, listing: Listing, template: str, shot: str, pair: Pair) 
     if code is None:
         return ImageSequence(pair.name, shot, None, None, (), ())
     files = _Files(listing, template, shot, pair.name)
-    dark_name = frames.dark if any(way.uses_dark for way in code.directions) else None
+    dark_name = frames.dark if any(one.uses_dark for one in code.directions) else None
     lit, dark, board = map(files.path, (frames.lit, dark_name, frames.board))
-    coded = tuple(filter(None, map(files.path, frames.of_code(code))))
-    counts = [each for way in code.directions for each in way.image_counts.items()]
+    coded = tuple(filter(None, map(files.path, frames.code_names(code))))
+    counts = [each for one in code.directions for each in one.image_counts.items()]
     kinds = [kind.name for kind, count in counts for _ in range(count)]
     inverses = tuple(p for p, kind in zip(coded, kinds, strict=True) if kind == "inverse")
     crossing = coded[sum(code.image_counts.values()) :]
+    missing = tuple(files.missing)
     return ImageSequence(
-        pair.name,
-        shot,
-        lit,
-        dark,
-        coded,
-        tuple(files.missing),
-        board,
-        inverses=inverses,
-        crossing=crossing,
+        pair.name, shot, lit, dark, coded, missing, board, inverses=inverses, crossing=crossing
     )
 
 
-def _exposed(
+def _add_exposures(
     whole: ImageSequence, rig: Rig, listing: Listing, templates: list[str]
 ) -> ImageSequence:
     """The sequence with its longer exposures added."""
@@ -498,7 +490,7 @@ def _exposed(
     return replace(whole, missing=missing, exposure=first[0], longer=longer)
 
 
-def _view_alone(
+def _board_image_alone(
     rig: Rig, listing: Listing, template: str, shot: str, pair: Pair
 ) -> ImageSequence | None:
     """The board image alone; None if none is taken."""

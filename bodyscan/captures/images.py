@@ -12,22 +12,15 @@ import cv2
 import numpy as np
 
 from bodyscan.arrays import WHOLE, Bytes, Crop, Greys, whole_grey
-from bodyscan.captures.exposures import merge_exposures
 from bodyscan.captures.folder import ImageSequence
-from bodyscan.captures.grey_levels import Raw, as_greys, full_scale
-from bodyscan.captures.grey_png import decode_grey_png
-from bodyscan.captures.image_faults import header_fault, image_error, missing_error
-from bodyscan.captures.image_header import png_damage
+from bodyscan.captures.grey_levels import Raw, convert_to_greys, find_full_scale, merge_exposures
+from bodyscan.captures.grey_png import decode_grey_png, png_damage
+from bodyscan.captures.image_header import find_header_fault, image_error, missing_error
 from bodyscan.errors import ImageError
-from bodyscan.files.regular import read_regular
+from bodyscan.files.reading import read_regular
 from bodyscan.progress import THREADS
 from bodyscan.rig.pair import CameraSpec, Pair
 from bodyscan.stripes.decoding import images_by_kind
-
-SHOWS_NOTHING_BELOW = 8
-"""Grey levels (sensor offset and noise): a lit image without a brighter pixel is black."""
-
-BLUE_GREEN_RED = ("blue", "green", "red")
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +28,7 @@ class StripeImages:
     """The images of one stripe sequence, grey levels 0 to 255.
 
     lit, dark: (H, W), None if not taken.
-    coded: (F, H, W), the code's images in the order of `FrameNames.of_code`.
+    coded: (F, H, W), the code's images in the order of `FrameNames.code_names`.
 
     All uint8, or float32 if files or exposures resolve more.
     """
@@ -54,10 +47,10 @@ def read_image(
 
     lit: the image should show something, and is refused if it is black.
 
-    Raises ImageError as `_read_raw` and `full_scale`.
+    Raises ImageError as `_read_raw` and `find_full_scale`.
     """
     raw = _read_raw(path, camera, pair, shot)
-    image = whole_grey(as_greys(raw, _scale([raw], camera, path, pair, shot)))
+    image = whole_grey(convert_to_greys(raw, _scale([raw], camera, path, pair, shot)))
     if lit:
         _refuse_black(image, path, pair, shot)
     return image
@@ -72,11 +65,11 @@ def read_board_image(sequence: ImageSequence, pair: Pair) -> Bytes:
     path = sequence.board or sequence.lit
     if path is not None or pair.projector is None:
         names = {"pair": sequence.pair, "shot": sequence.shot}
-        return read_image(sequence.seen_in, pair.camera, lit=True, **names)
+        return read_image(sequence.board_path, pair.camera, lit=True, **names)
     code = pair.projector.model_copy(update={"crossing": None})
     images = read_sequence(sequence.without_crossing, pair.camera)
     made = whole_grey(code.lit_from(images_by_kind(code, images.coded)[0]))
-    _refuse_black(made, sequence.seen_in, sequence.pair, sequence.shot)
+    _refuse_black(made, sequence.board_path, sequence.pair, sequence.shot)
     return made
 
 
@@ -109,8 +102,7 @@ def read_sequence(
 
 
 def _read_stack(sequence: ImageSequence, camera: CameraSpec, crop: Crop, workers: int) -> Greys:
-    """Grey levels (F, H, W) of one exposure: lit and dark,
-    if they exist, then the code's images."""
+    """Grey levels (F, H, W) of one exposure: lit and dark, if they exist, then the code's images."""
     taken = [path for path in (sequence.lit, sequence.dark) if path is not None]
     paths = (*taken, *sequence.coded)
     missing = [path for path in paths if path in sequence.missing]
@@ -125,25 +117,25 @@ def _read_stack(sequence: ImageSequence, camera: CameraSpec, crop: Crop, workers
     stack = np.empty((len(paths), *first[early].shape), first.dtype)
     stack[0] = first[early]
 
-    def read_into(place: int) -> None:
-        image = read(paths[place])
+    def read_into(k: int) -> None:
+        image = read(paths[k])
         if image.dtype != first.dtype:
             bits = (
                 f"{8 * image.itemsize} bits a sample, but {paths[0].name} has {8 * first.itemsize}"
             )
-            raise image_error(f"has {bits}", paths[place], sequence.pair, sequence.shot)
-        stack[place] = image[early]
+            raise image_error(f"has {bits}", paths[k], sequence.pair, sequence.shot)
+        stack[k] = image[early]
 
     with ThreadPoolExecutor(workers) as pool:
         list(pool.map(read_into, range(1, len(paths))))
     scale = _scale(list(stack), camera, paths[0], sequence.pair, sequence.shot)
-    return as_greys(np.ascontiguousarray(stack[(slice(None), *late)]), scale)
+    return convert_to_greys(np.ascontiguousarray(stack[(slice(None), *late)]), scale)
 
 
 def _scale(images: list[Raw], camera: CameraSpec, path: Path, pair: str, shot: str) -> float:
-    """See `full_scale`; its errors name the file."""
+    """See `find_full_scale`; its errors name the file."""
     try:
-        return full_scale(images, camera.bits)
+        return find_full_scale(images, camera.bits)
     except ImageError as error:
         raise image_error(error.what, path, pair, shot, remedy=error.remedy or "") from None
 
@@ -159,7 +151,7 @@ def _read_raw(path: Path, camera: CameraSpec, pair: str, shot: str, rows: int | 
     image, of the wrong size or depth, cut short, damaged, or without the channel.
     """
     width, height = camera.width, camera.height
-    fault = header_fault(path, width, height)
+    fault = find_header_fault(path, width, height)
     if fault:
         raise image_error(fault, path, pair, shot)
     data = read_regular(path)
@@ -170,11 +162,11 @@ def _read_raw(path: Path, camera: CameraSpec, pair: str, shot: str, rows: int | 
     image = decode_grey_png(data, width, height, rows) if is_png else None
     if image is not None and camera.channel == "grey":
         return image
-    found = _decoded(data, camera.channel)
+    found = _decode(data, camera.channel)
     if found is None or found.shape[:2] != (height, width):
         raise image_error("cannot be decoded", path, pair, shot)
     if found.ndim == 3:
-        found = found[:, :, BLUE_GREEN_RED.index(camera.channel)]
+        found = found[:, :, ("blue", "green", "red").index(camera.channel)]
     elif camera.channel != "grey":
         raise image_error(
             f"is grey, but the rig file says `channel: {camera.channel}`",
@@ -186,7 +178,7 @@ def _read_raw(path: Path, camera: CameraSpec, pair: str, shot: str, rows: int | 
     return cast(Raw, np.ascontiguousarray(found))
 
 
-def _decoded(data: bytes, channel: str) -> Raw | None:
+def _decode(data: bytes, channel: str) -> Raw | None:
     """(H, W) if the image or the channel is grey, else (H, W, 3); None if it cannot be decoded."""
     colour = cv2.IMREAD_GRAYSCALE if channel == "grey" else cv2.IMREAD_ANYCOLOR
     flags = colour | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
@@ -198,7 +190,7 @@ def _decoded(data: bytes, channel: str) -> Raw | None:
 
 def _refuse_black(image: Bytes, path: Path, pair: str, shot: str) -> None:
     brightest = int(image.max())
-    if brightest <= SHOWS_NOTHING_BELOW:
+    if brightest <= 8:  # the sensor's offset and noise
         raise image_error(
             f"shows nothing: its brightest pixel is {brightest} of 255",
             path,

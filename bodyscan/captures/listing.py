@@ -29,7 +29,7 @@ class Listing:
                 path = folder
         if not root.is_dir() and not (self._named and not root.exists()):
             what = "is not a folder" if root.exists() else "does not exist"
-            remedy = "Check the folder's name, and that the disk it lies on is there."
+            remedy = "Check the folder's name, and that its disk is connected."
             raise CaptureError(f"the capture folder {what}", where=str(root), remedy=remedy)
         self.root, self.follow_links = root, follow_links
         self._real_root = os.path.realpath(root)
@@ -49,21 +49,20 @@ class Listing:
         return path.exists()
 
     def find(self, relative: str) -> str:
-        """The path itself; if it contains `*`, the only file
-        that matches, provided there is just one."""
+        """The path itself; if it contains `*`, the file that matches if there is just one."""
         if ANYTHING not in relative:
             return relative
-        fitting = [""]
+        matches = [""]
         for part in relative.split("/"):
             wanted = names_pattern(part)
-            fitting = [
+            matches = [
                 f"{folder}/{name}".lstrip("/")
-                for folder in fitting
+                for folder in matches
                 for name in (self.names(folder) if ANYTHING in part else (part,))
                 if wanted.fullmatch(name)
             ]
-        there = [path for path in fitting if self.has(path)]
-        return there[0] if len(there) == 1 else relative
+        existing = [path for path in matches if self.has(path)]
+        return existing[0] if len(existing) == 1 else relative
 
     def names(self, relative: str) -> tuple[str, ...]:
         """Names in a folder, () if it does not exist. "" is the root."""
@@ -72,8 +71,8 @@ class Listing:
     def _read(self, relative: str) -> dict[str, bool]:
         """Names in a folder, and whether each is a symbolic link."""
         if relative not in self._entries:
-            there = relative == "" or self.has(relative)
-            found = self._scan(self.root / relative) if there else {}
+            exists = relative == "" or self.has(relative)
+            found = self._scan(self.root / relative) if exists else {}
             self._entries[relative] = self._named.get(relative, {}) | found
         return self._entries[relative]
 
@@ -86,7 +85,7 @@ class Listing:
         except FileNotFoundError:
             if self._named:
                 return {}
-            raise CaptureError("is not there any more", where=str(folder)) from None
+            raise CaptureError("has disappeared", where=str(folder)) from None
         except OSError as error:
             what = f"cannot be read: {error.strerror}"
             raise CaptureError(what, where=str(folder), remedy="Check its permissions.") from None

@@ -19,13 +19,13 @@ from bodyscan.stripes.stripe_code import StripeCode
 LIST_NAME = "patterns.json"
 
 
-def uneven_stripes(rig: Rig, width: int, height: int) -> tuple[str, ...]:
-    """A note on each kind of projector whose stripes cannot all have the same width.
+def find_uneven_stripes(rig: Rig, width: int, height: int) -> tuple[str, ...]:
+    """Note each kind of projector whose stripes cannot all have the same width.
 
-    Their boundaries lie up to half a projector pixel from those of even stripes: free planes absorb
+    Their boundaries are up to half a projector pixel from those of even stripes: free planes absorb
     that, models that are smooth in s do not. Waves of light need no whole pixels.
     """
-    kinds = {way for pair in rig.pairs if pair.projector for way in pair.projector.directions}
+    kinds = {one for pair in rig.pairs if pair.projector for one in pair.projector.directions}
     counts = {
         (kind.stripes, height if kind.direction == "horizontal" else width)
         for kind in kinds
@@ -52,7 +52,7 @@ def write_patterns(rig: Rig, out: Path, width: int, height: int) -> tuple[Path, 
             kinds.setdefault(pair.projector, []).append(pair)
     if not kinds:
         raise BadInput(
-            "none of its projectors shows images",
+            "none of its projectors displays images",
             where=f"rig {rig.name}",
             remedy="an instrument with code: stripe-index projects stripes of its own"
             if any(pair.projector for pair in rig.pairs)
@@ -71,8 +71,8 @@ def _folder_names(kinds: tuple[StripeCode, ...]) -> dict[StripeCode, str]:
     """Names such as gray-640-horizontal, numbered if they would be equal."""
     names: dict[StripeCode, str] = {}
     for kind in kinds:
-        ways = "-".join(f"{way.stripes}-{way.direction}" for way in kind.directions)
-        name = f"{kind.code}-{ways}"
+        directions = "-".join(f"{one.stripes}-{one.direction}" for one in kind.directions)
+        name = f"{kind.code}-{directions}"
         again = sum(taken.startswith(name) for taken in names.values())
         names[kind] = f"{name}-{again + 1}" if again else name
     return names
@@ -87,7 +87,7 @@ def _write_kind(
 ) -> Path:
     height, width = coded.shape[1:]
     order = []
-    for name, image in _in_order(frames, kind, coded):
+    for name, image in _ordered_images(frames, kind, coded):
         packed = cv2.imencode(".png", image)[1]
         write_bytes(folder / f"{name}.png", packed.tobytes())
         order.append({"file": f"{name}.png", "frame": name})
@@ -103,13 +103,15 @@ def _write_kind(
     return folder / LIST_NAME
 
 
-def _in_order(frames: FrameNames, kind: StripeCode, coded: Bytes) -> Iterator[tuple[str, Bytes]]:
+def _ordered_images(
+    frames: FrameNames, kind: StripeCode, coded: Bytes
+) -> Iterator[tuple[str, Bytes]]:
     """Name and image (H, W) in the best order to show: lit and dark if they are taken, then the
     code's."""
     blank = np.zeros(coded.shape[1:], np.uint8)
     if frames.lit is not None:
         yield frames.lit, blank + 255
-    if frames.dark is not None and any(way.uses_dark for way in kind.directions):
+    if frames.dark is not None and any(one.uses_dark for one in kind.directions):
         yield frames.dark, blank
-    images = dict(zip(frames.of_code(kind), coded, strict=True))
-    yield from ((name, images[name]) for name in frames.as_shown(kind))
+    images = dict(zip(frames.code_names(kind), coded, strict=True))
+    yield from ((name, images[name]) for name in frames.shown_names(kind))

@@ -17,7 +17,7 @@ from bodyscan.cli.options import (
     OverwriteCalibration,
     RigFile,
 )
-from bodyscan.files.os_errors import require_writable
+from bodyscan.files.messages import require_writable
 from bodyscan.settings import RigExportSettings
 
 if TYPE_CHECKING:  # loads Open3D
@@ -45,7 +45,7 @@ def register(app: typer.Typer) -> None:
 def check(output: Output, rig_file: RigFile) -> None:
     """Check a rig file and its capture folders, and list what is missing or wrong."""
     from bodyscan.captures.check import check as look_over
-    from bodyscan.captures.check import report_lines
+    from bodyscan.captures.check import format_report
     from bodyscan.rig.rig_file import load_rig
 
     known_errors: list[str] = []
@@ -54,7 +54,7 @@ def check(output: Output, rig_file: RigFile) -> None:
 
         known_errors = find_known_errors(rig_file)
     found = look_over(rig_file, known_errors=known_errors)
-    output.say(*report_lines(found), wrong=not found.ok)
+    output.say(*format_report(found), wrong=not found.ok)
     output.figures(images=found.images, shots=len(found.shots))
     output.exit_code = 0 if found.ok else 2
 
@@ -71,13 +71,13 @@ def patterns(
     ] = 1080,
 ) -> None:
     """Write the images that a rig's projectors must show, as PNG, with their order."""
-    from bodyscan.captures.pattern_files import uneven_stripes, write_patterns
+    from bodyscan.captures.pattern_files import find_uneven_stripes, write_patterns
     from bodyscan.rig.rig_file import load_rig
 
     require_writable(out)
     rig = load_rig(rig_file)
     orders = write_patterns(rig, out, width, height)
-    output.notes(uneven_stripes(rig, width, height))
+    output.notes(find_uneven_stripes(rig, width, height))
     for order in orders:
         output.made("patterns, in the order of", order)
 

@@ -27,7 +27,7 @@ from rich.text import Text
 
 from bodyscan.cli.options import SHARED
 from bodyscan.errors import BodyscanError, FailedWork
-from bodyscan.files.os_errors import in_words
+from bodyscan.files.messages import translate_os_error
 from bodyscan.optional import optional
 
 if TYPE_CHECKING:
@@ -271,7 +271,7 @@ def add_command(app: typer.Typer, panel: str, function: Callable[..., None]) -> 
             try:
                 function(output, **given)
             except OSError as error:
-                raise in_words(error) from error
+                raise translate_os_error(error) from error
             except MemoryError as error:
                 raise FailedWork(
                     "there is not enough memory", remedy="close other programs, or ask for less"

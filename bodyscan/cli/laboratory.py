@@ -10,7 +10,7 @@ import typer
 from bodyscan.cli.console import Output, add_command
 from bodyscan.cli.options import OutFolder, Overwrite, RigFile
 from bodyscan.errors import BadInput
-from bodyscan.files.os_errors import require_writable
+from bodyscan.files.messages import require_writable
 from bodyscan.progress import step
 
 PANEL = "Laboratory: simulate, measure against truth, accept"

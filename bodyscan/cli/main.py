@@ -17,7 +17,7 @@ from bodyscan.cli import builder, laboratory, operator
 from bodyscan.cli.console import complain
 from bodyscan.cli.interruption import run_interruptibly
 from bodyscan.errors import BodyscanError
-from bodyscan.files.os_errors import in_words
+from bodyscan.files.messages import translate_os_error
 from bodyscan.memory import collect_seldom, keep_freed_memory
 from bodyscan.version import __version__
 
@@ -67,7 +67,7 @@ def _run(arguments: list[str], *, debug: bool) -> int:
     except OSError as error:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # for what is flushed when Python ends
         code = code or 1
-        complain(f"error: {in_words(error)}")
+        complain(f"error: {translate_os_error(error)}")
     return code
 
 

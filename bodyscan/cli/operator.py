@@ -26,7 +26,7 @@ from bodyscan.cli.options import (
     ScanFolder,
 )
 from bodyscan.errors import BadInput, FailedWork
-from bodyscan.files.os_errors import require_writable
+from bodyscan.files.messages import require_writable
 from bodyscan.progress import step
 from bodyscan.settings import AlignmentSettings, ExportSettings, FusionSettings, ScanSettings
 

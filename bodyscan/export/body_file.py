@@ -11,7 +11,7 @@ import numpy as np
 
 from bodyscan.export.formats import BODY_FORMATS, BodyFormat
 from bodyscan.files.atomic import write_json
-from bodyscan.files.registry import unknown_format
+from bodyscan.files.registry import unknown_format_error
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import REGION_NAMES, BodyCloud, BodyMesh
 from bodyscan.mesh.repair import collapse_slivers
@@ -56,7 +56,9 @@ def _find_format(path: Path, body: BodyCloud | BodyMesh) -> BodyFormat:
     name = path.suffix.lower().removeprefix(".")
     able = [known for known in BODY_FORMATS.names() if kind in BODY_FORMATS.find(known).holds]
     if name not in able:
-        raise unknown_format(f"a {kind}", name or "a file without suffix", able, where=str(path))
+        raise unknown_format_error(
+            f"a {kind}", name or "a file without suffix", able, where=str(path)
+        )
     return BODY_FORMATS.find(name)
 
 

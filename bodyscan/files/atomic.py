@@ -1,17 +1,18 @@
-"""Files that are written completely or not at all, with the same bytes for the same content."""
+"""Files written completely or not at all, with the same bytes for the same content; locks."""
 
 from __future__ import annotations
 
 import json
 import os
 import secrets
+import socket
 import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-_ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)  # the earliest time a zip file can hold; any fixed one would do
+from bodyscan.errors import BadInput
 
 
 @contextmanager
@@ -33,7 +34,7 @@ def atomic_replacement(path: Path) -> Iterator[Path]:
         with suppress(OSError):
             temporary.unlink()
         if isinstance(error, OSError) and error.filename in (None, str(temporary)) and error.errno:
-            raise OSError(error.errno, error.strerror, str(path)) from error  # the name people know
+            raise OSError(error.errno, error.strerror, str(path)) from error  # the known name
         raise
     if os.name == "posix":  # the rename itself must survive a power cut too
         flush(path.parent)
@@ -56,7 +57,7 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def json_text(content: Any) -> str:
-    """JSON that is exact when read back (every float64 to the last bit) and easy to diff.
+    """Format as JSON that is exact when read back (float64 to the last bit) and easy to diff.
 
     Keys are sorted, indents are two spaces, a list of numbers takes one line (so a matrix takes one
     line per row). numpy arrays and scalars are written as lists and numbers. Raises ValueError for
@@ -74,7 +75,7 @@ def write_npz(path: Path, /, **arrays: Any) -> None:
 
     with atomic_replacement(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
         for name in sorted(arrays):
-            entry = zipfile.ZipInfo(f"{name}.npy", _ZIP_EPOCH)
+            entry = zipfile.ZipInfo(f"{name}.npy")  # of 1980: any fixed time would do
             entry.compress_type = zipfile.ZIP_DEFLATED
             entry.external_attr = 0o644 << 16
             entry.create_system = 3
@@ -112,3 +113,43 @@ def _json(value: Any, indent: str) -> str:
 
 def _is_container(value: Any) -> bool:
     return isinstance(value, Mapping | list | tuple) or getattr(value, "ndim", 0) > 0
+
+
+@contextmanager
+def lock_file(path: Path, *, wait: bool) -> Iterator[None]:
+    """Hold the lock on `path` (flock: the kernel releases it, even after `kill -9`).
+
+    wait: wait for the present holder; otherwise raise BadInput, which names the holder.
+    """
+    import fcntl  # POSIX only
+
+    try:
+        handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600)
+    except OSError as error:
+        raise BadInput(f"cannot be written: {error.strerror}", where=str(path)) from error
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+        except BlockingIOError:
+            holder = os.pread(handle, 200, 0).decode("utf-8", "replace").strip() or "someone"
+            raise BadInput(
+                f"another batch is running here ({holder})",
+                where=str(path.parent),
+                remedy="wait until it has ended, or give another --out",
+            ) from None
+        with suppress(OSError):  # good to know who holds it, but a full disk is no obstacle
+            os.ftruncate(handle, 0)
+            os.pwrite(handle, f"process {os.getpid()} on {socket.gethostname()}\n".encode(), 0)
+        yield
+    finally:
+        os.close(handle)
+
+
+@contextmanager
+def restrict_to_owner() -> Iterator[None]:
+    """Make files created inside readable only by their owner (0600), folders too (0700)."""
+    before = os.umask(0o077)
+    try:
+        yield
+    finally:
+        os.umask(before)

@@ -14,14 +14,12 @@ from typing import TypeAlias
 
 from bodyscan.errors import CaptureError
 from bodyscan.files.atomic import write_text
-from bodyscan.files.regular import read_regular
+from bodyscan.files.reading import read_regular
 
 Corners: TypeAlias = tuple[tuple[float, float], ...]
 """Corners of one image, px; NaN if not to be used. Plain numbers, since `check` loads no NumPy."""
 
-COLUMNS = ("filename", "x", "y", "level")
-MOST_BYTES = 200_000_000
-"""A thousand images of a board of two thousand corners."""
+_REMEDY = "A corners.vnl has a line `# filename x y level` and below it a line for each corner."
 
 
 def read_corners(path: Path) -> dict[str, Corners]:
@@ -30,10 +28,10 @@ def read_corners(path: Path) -> dict[str, Corners]:
     Raises CaptureError, with the line, if the file is not such a table.
     """
     try:
-        lines = read_regular(path, MOST_BYTES).decode("utf-8").splitlines()
+        lines = read_regular(path, 200_000_000).decode("utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise CaptureError(
-            f"cannot be read as text: {error}", where=str(path), remedy=_remedy()
+            f"cannot be read as text: {error}", where=str(path), remedy=_REMEDY
         ) from None
     order: list[int] = []
     found: dict[str, list[tuple[float, float]]] = {}
@@ -46,19 +44,21 @@ def read_corners(path: Path) -> dict[str, Corners]:
             order = order or _columns(line.lstrip("#").split(), where)
             continue
         if not order:
-            raise CaptureError("stands before the line of columns", where=where, remedy=_remedy())
+            raise CaptureError(
+                "comes before the line that names the columns", where=where, remedy=_REMEDY
+            )
         name, corner = _corner(words, order, where)
         corners = found.setdefault(name, [])
         if corner is not None:
             corners.append(corner)
     if not found:
-        raise CaptureError("holds no corner", where=str(path), remedy=_remedy())
+        raise CaptureError("holds no corner", where=str(path), remedy=_REMEDY)
     return {name: tuple(corners) for name, corners in found.items()}
 
 
 def write_corners(path: Path, corners: Iterable[tuple[str, Corners]]) -> None:
     """Write corners by image name; the file appears complete or not at all."""
-    lines = ["# " + " ".join(COLUMNS)]
+    lines = ["# filename x y level"]
     for name, pixels in corners:
         if any(letter.isspace() for letter in name):
             raise CaptureError(
@@ -74,35 +74,32 @@ def write_corners(path: Path, corners: Iterable[tuple[str, Corners]]) -> None:
 
 
 def _columns(names: list[str], where: str) -> list[int]:
-    """Positions of COLUMNS in a row; -1 for a level that the table does not have."""
-    if any(name not in names for name in COLUMNS[:3]):
-        raise CaptureError(f"has the columns {' '.join(names)}", where=where, remedy=_remedy())
-    return [names.index(name) if name in names else -1 for name in COLUMNS]
+    """Positions of filename, x, y, level in a row; -1 for a level that the table does not have."""
+    columns = ("filename", "x", "y", "level")
+    if any(name not in names for name in columns[:3]):
+        raise CaptureError(f"has the columns {' '.join(names)}", where=where, remedy=_REMEDY)
+    return [names.index(name) if name in names else -1 for name in columns]
 
 
 def _corner(
     words: list[str], order: list[int], where: str
 ) -> tuple[str, tuple[float, float] | None]:
     """An image's name and its next corner; None for an image without a board."""
-    name, x, y, level = (words[place] if 0 <= place < len(words) else None for place in order)
+    name, x, y, level = (words[k] if 0 <= k < len(words) else None for k in order)
     if name is None or x is None or y is None:
-        raise CaptureError(f"has {len(words)} columns, too few", where=where, remedy=_remedy())
+        raise CaptureError(f"has {len(words)} columns, too few", where=where, remedy=_REMEDY)
     if "-" in (x, y):
         return name, None
     try:
         corner, used = (float(x), float(y)), level in (None, "-") or float(level or 0) >= 0.0
     except ValueError:
         raise CaptureError(
-            f"holds what is no number: {' '.join(words)}", where=where, remedy=_remedy()
+            f"holds something that is not a number: {' '.join(words)}", where=where, remedy=_REMEDY
         ) from None
     if level == "-" or not used:
         return name, (math.nan, math.nan)
     if not all(map(math.isfinite, corner)):
         raise CaptureError(
-            f"holds what is no pixel: {' '.join(words)}", where=where, remedy=_remedy()
+            f"holds something that is not a pixel: {' '.join(words)}", where=where, remedy=_REMEDY
         )
     return name, corner
-
-
-def _remedy() -> str:
-    return "A corners.vnl has a line `# filename x y level` and below it a line for each corner."

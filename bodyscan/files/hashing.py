@@ -1,5 +1,4 @@
-"""Identity of files and settings: SHA-256 of their content,
-regardless of names, times and places."""
+"""Identity of files and settings: SHA-256 of their content, whatever their names and times."""
 
 from __future__ import annotations
 
@@ -10,10 +9,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from bodyscan.files.regular import open_regular
+from bodyscan.files.reading import open_regular
 from bodyscan.progress import map_threads
-
-_BLOCK = 1 << 20
 
 
 def file_hash(path: Path) -> str:
@@ -24,7 +21,7 @@ def file_hash(path: Path) -> str:
     """
     with open_regular(path) as stream:
         digest = hashlib.sha256()
-        while block := stream.read(_BLOCK):
+        while block := stream.read(1 << 20):
             digest.update(block)
     return digest.hexdigest()
 
@@ -36,17 +33,17 @@ def file_hashes(files: Mapping[str, Path]) -> dict[str, str]:
     return dict(zip(names, hashes, strict=True))
 
 
-def files_below(folder: Path) -> Iterator[Path]:
-    """Every file below `folder` in a fixed order; symbolic links are listed, never followed."""
+def list_files(folder: Path) -> Iterator[Path]:
+    """List every file below `folder` in a fixed order; symbolic links are listed, never followed."""
     for root, folders, files in os.walk(folder):
         links = [name for name in folders if os.path.islink(os.path.join(root, name))]
         folders[:] = sorted(set(folders) - set(links))
         yield from (Path(root, name) for name in sorted([*files, *links]))
 
 
-def named_below(folder: Path) -> dict[str, Path]:
-    """`files_below` by their paths relative to `folder`."""
-    return {path.relative_to(folder).as_posix(): path for path in files_below(folder)}
+def list_relative_files(folder: Path) -> dict[str, Path]:
+    """Every file below `folder` by its path relative to it."""
+    return {path.relative_to(folder).as_posix(): path for path in list_files(folder)}
 
 
 def content_hash(content: Any) -> str:

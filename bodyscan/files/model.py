@@ -14,26 +14,26 @@ Name = Annotated[str, Field(pattern=r"^[\w][\w.-]*$", max_length=64)]
 
 SHOT = r"\w(?:[^/\\*\x00-\x1f\x7f]*[^/\\*\x00-\x1f\x7f\s])?"
 """Names of shots, as a regular expression: they are part of other people's file names."""
-LONGEST_SHOT = 255
+MAX_SHOT_LENGTH = 255
 """The limit for a file's name on most disks."""
 
 
-def _as_shot(name: str) -> str:
-    if len(name) <= LONGEST_SHOT and re.fullmatch(SHOT, name):
+def _check_shot_name(name: str) -> str:
+    if len(name) <= MAX_SHOT_LENGTH and re.fullmatch(SHOT, name):
         return name
-    at_fault = [letter for letter in name if letter in "/\\*" or not letter.isprintable()]
-    met = f", not {', '.join(map(repr, dict.fromkeys(at_fault)))}" if at_fault else ""
+    wrong = [letter for letter in name if letter in "/\\*" or not letter.isprintable()]
+    found = f", not {', '.join(map(repr, dict.fromkeys(wrong)))}" if wrong else ""
     raise PydanticCustomError(
         "problem",
         "{text}",
         {
             "text": "must be a name of a shot: a letter, a digit or '_' first, then anything but '/', "
-            f"'\\' and '*', no space last, {LONGEST_SHOT} characters at most{met} (got {name!r})"
+            f"'\\' and '*', no space last, {MAX_SHOT_LENGTH} characters at most{found} (got {name!r})"
         },
     )
 
 
-ShotName = Annotated[str, AfterValidator(_as_shot)]
+ShotName = Annotated[str, AfterValidator(_check_shot_name)]
 
 Problem: TypeAlias = tuple[tuple[str | int, ...], str]
 """Where in the model (keys and indices from its root), and what, in words that follow the path."""
@@ -59,29 +59,29 @@ class Model(BaseModel):
 def problem_error(problem: Problem) -> InitErrorDetails:
     """A problem in the form that pydantic takes."""
     where, text = problem
-    said = PydanticCustomError("problem", "{text}", {"text": text})
-    return InitErrorDetails(type=said, loc=where, input=None)
+    kind = PydanticCustomError("problem", "{text}", {"text": text})
+    return InitErrorDetails(type=kind, loc=where, input=None)
 
 
 def unknown_key_error(key: str, known: Iterable[str]) -> InitErrorDetails:
-    """The error with which pydantic refuses a key, with the keys that may have been meant."""
-    said = PydanticCustomError("extra_forbidden", "is not a key known here", {"known": list(known)})
-    return InitErrorDetails(type=said, loc=(key,), input=None)
+    """pydantic's error for an unknown key, with the known ones."""
+    kind = PydanticCustomError("extra_forbidden", "is not a key known here", {"known": list(known)})
+    return InitErrorDetails(type=kind, loc=(key,), input=None)
 
 
 def choice_error(key: str, value: str, choices: Iterable[str]) -> InitErrorDetails:
-    """The error with which pydantic refuses a value that is none of the choices."""
+    """pydantic's error for a value that is none of the choices."""
     choices = list(choices)
-    wanted = alternatives(choices) + did_you_mean(value, choices)
-    said = PydanticCustomError("literal_error", "{expected}", {"expected": wanted})
-    return InitErrorDetails(type=said, loc=(key,), input=None)
+    wanted = format_alternatives(choices) + did_you_mean(value, choices)
+    kind = PydanticCustomError("literal_error", "{expected}", {"expected": wanted})
+    return InitErrorDetails(type=kind, loc=(key,), input=None)
 
 
-def repeated_errors(refused: ValidationError) -> list[InitErrorDetails]:
-    """The errors of one model, to be raised together with others."""
+def copy_errors(refused: ValidationError) -> list[InitErrorDetails]:
+    """Copy the errors of one model, to raise them together with others."""
     return [
         InitErrorDetails(
-            type=PydanticCustomError(e["type"], "{said}", {"said": e["msg"], **e.get("ctx", {})}),
+            type=PydanticCustomError(e["type"], "{text}", {"text": e["msg"], **e.get("ctx", {})}),
             loc=e["loc"],
             input=None,
         )
@@ -89,13 +89,13 @@ def repeated_errors(refused: ValidationError) -> list[InitErrorDetails]:
     ]
 
 
-def first_fault(refused: ValidationError) -> str:
+def describe_first_error(refused: ValidationError) -> str:
     """Where the first of a model's errors is, and what."""
     first = refused.errors(include_url=False)[0]
     return f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
 
 
-def duplicates(names: list[str | None] | tuple[str | None, ...]) -> Iterator[tuple[int, str]]:
+def find_duplicates(names: list[str | None] | tuple[str | None, ...]) -> Iterator[tuple[int, str]]:
     """Index and name of each name that occurred earlier in the list (None never counts)."""
     seen: set[str] = set()
     for index, name in enumerate(names):
@@ -105,7 +105,7 @@ def duplicates(names: list[str | None] | tuple[str | None, ...]) -> Iterator[tup
             seen.add(name)
 
 
-def alternatives(words: Iterable[str]) -> str:
+def format_alternatives(words: Iterable[str]) -> str:
     """`'a', 'b' or 'c'`."""
     *others, last = map(repr, words)
     return f"{', '.join(others)} or {last}" if others else last

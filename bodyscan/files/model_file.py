@@ -1,5 +1,4 @@
-"""A YAML file read into a model, with all its errors
-reported at once, by line and in plain words."""
+"""A YAML file read into a model, with all its errors reported at once, by line and in plain words."""
 
 from __future__ import annotations
 
@@ -23,11 +22,6 @@ from bodyscan.files.yaml_file import (
 )
 
 M = TypeVar("M", bound=Model)
-
-_MOST_SHOWN = 30
-
-_UNION_MEMBERS = ("tuple[", "dict[", "literal[")
-"""Beginnings of pydantic's names for the members of a union."""
 
 _MUST_BE = {
     "string_type": "text",
@@ -74,7 +68,7 @@ def load_model(
     try:
         document = read_yaml(path)
     except YamlError as unreadable:
-        raise report(path, [unreadable.problem], error, remedy) from None
+        raise combine_problems(path, [unreadable.problem], error, remedy) from None
     except FileNotFoundError:
         raise error("there is no such file", where=str(path), remedy="check the path") from None
     except OSError as fault:
@@ -85,11 +79,11 @@ def load_model(
         loaded = model.model_validate_json(json.dumps(document.data), strict=True)
         found: Iterable[Problem] = also(loaded)
     except ValidationError as refused:
-        problems += _translated(refused, document, model)
+        problems += _translate(refused, document, model)
         found = salvage(document.data)
-    problems += [_placed(problem, document) for problem in found]
+    problems += [_locate(problem, document) for problem in found]
     if problems:
-        raise report(path, problems, error, remedy)
+        raise combine_problems(path, problems, error, remedy)
     return loaded
 
 
@@ -99,7 +93,7 @@ def apply_settings(model: M, changes: Iterable[str], error: type[BadInput]) -> M
 
     Raises `error`, which names every wrong change by its path.
     """
-    return apply_changes(model, dict(_change(text, error) for text in changes), error)
+    return apply_changes(model, dict(_parse_change(text, error) for text in changes), error)
 
 
 def apply_changes(model: M, changes: Mapping[Where, Any], error: type[BadInput]) -> M:
@@ -113,18 +107,18 @@ def apply_changes(model: M, changes: Mapping[Where, Any], error: type[BadInput])
         for part in where[:-1]:
             deeper = inside.setdefault(part, {})
             if not isinstance(deeper, dict):
-                raise error(f"--set {dotted_path(where)}: {part} has nothing inside")
+                raise error(f"--set {dotted_path(where)}: {part} is a value, not a mapping")
             inside = deeper
         inside[where[-1]] = value
     try:
         return type(model).model_validate_json(json.dumps(data), strict=True)
     except ValidationError as refused:
-        problems = _translated(refused, Document(data), type(model))
-        told = "\n".join(f"--set {problem.path}: {problem.text}" for problem in problems)
-        raise error(told, remedy="docs/formats.md explains every key") from None
+        problems = _translate(refused, Document(data), type(model))
+        lines = [f"--set {problem.path}: {problem.text}" for problem in problems]
+        raise error("\n".join(lines), remedy="docs/formats.md explains every key") from None
 
 
-def _change(text: str, error: type[BadInput]) -> tuple[tuple[str, ...], Any]:
+def _parse_change(text: str, error: type[BadInput]) -> tuple[tuple[str, ...], Any]:
     """`fusion.points=2000000` as (("fusion", "points"), 2000000)."""
     key, equals, value = text.partition("=")
     if not equals or not key.strip():
@@ -142,10 +136,10 @@ def _change(text: str, error: type[BadInput]) -> tuple[tuple[str, ...], Any]:
     return where, value.strip()
 
 
-def report(
+def combine_problems(
     path: Path, problems: Iterable[YamlProblem], error: type[BadInput], remedy: str
 ) -> BadInput:
-    """All problems as one error, in the order of the file; one behind an alias is reported once."""
+    """Combine problems to one error, in the order of the file; one behind an alias is given once."""
     paths: dict[tuple[int, int, str], set[str]] = {}
     for problem in problems:
         place = problem.place
@@ -155,10 +149,10 @@ def report(
         first = min(sharing, key=lambda path: (len(path), path))
         more = f" (and so in {len(sharing) - 1} more places by alias)" if len(sharing) > 1 else ""
         lines.append((f"{path}:{line}:{column}", f"{first}: {text}{more}" if first else text))
-    told = [f"{place}: {text}" for place, text in lines[1:_MOST_SHOWN]]
-    if len(lines) > _MOST_SHOWN:
-        told.append(f"... and {len(lines) - _MOST_SHOWN} more")
-    return error("\n".join([lines[0][1], *told]), where=lines[0][0], remedy=remedy)
+    shown = [lines[0][1], *(f"{place}: {text}" for place, text in lines[1:30])]
+    if len(lines) > 30:
+        shown.append(f"... and {len(lines) - 30} more")
+    return error("\n".join(shown), where=lines[0][0], remedy=remedy)
 
 
 def validate(model: type[M], data: Any) -> M | None:
@@ -169,20 +163,20 @@ def validate(model: type[M], data: Any) -> M | None:
         return None
 
 
-def _placed(problem: Problem, document: Document) -> YamlProblem:
+def _locate(problem: Problem, document: Document) -> YamlProblem:
     where, text = problem
     return YamlProblem(document.place(where), dotted_path(where), text)
 
 
-def _translated(
+def _translate(
     refused: ValidationError, document: Document, model: type[BaseModel]
 ) -> list[YamlProblem]:
-    """pydantic's errors in plain words at their places in the file, those of one value joined."""
+    """pydantic's errors in plain words, located in the file; those of one value are joined."""
     wrong: dict[Where, list[str]] = {}
     other: list[YamlProblem] = []
     guessed: set[Where] = set()
     missing: list[Where] = []
-    for where, e in _located(refused, document):
+    for where, e in _locate_errors(refused, document):
         if e["type"] == "missing":
             missing.append(where)
         elif e["type"] == "extra_forbidden":
@@ -195,23 +189,25 @@ def _translated(
             limits = {key: _plain(value) for key, value in e.get("ctx", {}).items()}
             wrong.setdefault(where, []).append(_MUST_BE[e["type"]].format(**limits))
         else:
-            other.append(_placed((where, e["msg"]), document))
+            other.append(_locate((where, e["msg"]), document))
     for where, wanted in wrong.items():
         text = f"must be {' or '.join(dict.fromkeys(wanted))} ({_got(where, wanted, document)})"
-        other.append(_placed((where, text), document))
-    other += [_placed((w, "is missing"), document) for w in missing if w not in guessed]
+        other.append(_locate((where, text), document))
+    other += [_locate((w, "is missing"), document) for w in missing if w not in guessed]
     return other
 
 
-def _located(refused: ValidationError, document: Document) -> Iterator[tuple[Where, ErrorDetails]]:
-    """Errors with their true locations, without those that follow from others.
+def _locate_errors(
+    refused: ValidationError, document: Document
+) -> Iterator[tuple[Where, ErrorDetails]]:
+    """Errors with their paths in the file, without those that follow from others.
 
     For a value that may be text or a list pydantic reports both, with the name of the alternative
     in the location; a wrong item of a list says more than "is not text".
     """
     errors = []
     for e in refused.errors(include_url=False):
-        where = _true_location(e["loc"], document)
+        where = _find_path(e["loc"], document)
         counted = e.get("ctx", {}).get("min_length", 0)
         value = document.at(where)
         if e["type"] == "too_short" and isinstance(value, list) and len(value) >= counted:
@@ -224,13 +220,16 @@ def _located(refused: ValidationError, document: Document) -> Iterator[tuple[Whe
             yield where, e
 
 
-def _true_location(loc: Where, document: Document) -> Where:
-    """pydantic's location without the names it gives to the members of a union."""
+def _find_path(loc: Where, document: Document) -> Where:
+    """pydantic's path without the names that it gives to the members of a union."""
     where: Where = ()
     for part in loc:
         inside = document.at(where)
-        of_list = isinstance(inside, list) and isinstance(part, int)
-        if of_list or (isinstance(inside, dict) and not str(part).startswith(_UNION_MEMBERS)):
+        is_index = isinstance(inside, list) and isinstance(part, int)
+        is_key = isinstance(inside, dict) and not str(part).startswith(
+            ("tuple[", "dict[", "literal[")
+        )
+        if is_index or is_key:
             where = (*where, part)
     return where
 

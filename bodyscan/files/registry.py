@@ -1,4 +1,4 @@
-"""Formats by name: each is one file in a folder, imported when it is asked for."""
+"""Formats by name: each is one module of a package, imported when it is used."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Format = TypeVar("Format")
 
 @dataclass(frozen=True)
 class Registry(Generic[Format]):
-    """The modules of a package, each with a FORMAT, and the formats registered besides.
+    """The modules of a package, each with a FORMAT, and further registered formats.
 
     package: its dotted name.
     what: what its formats hold, such as "a mesh".
@@ -34,7 +34,7 @@ class Registry(Generic[Format]):
     def find(self, name: str) -> Format:
         """The format of that name. Raises BadInput, with the list, if there is none."""
         if name not in self.names():
-            raise unknown_format(self.what, name, self.names())
+            raise unknown_format_error(self.what, name, self.names())
         if name in self.registered:
             return self.registered[name]
         return cast(Format, import_module(f"{self.package}.{name}").FORMAT)
@@ -46,8 +46,8 @@ class Registry(Generic[Format]):
         self.registered[name] = format_
 
 
-def unknown_format(what: str, name: str, known: Iterable[str], where: str = "") -> BadInput:
-    """An error that names the formats there are."""
+def unknown_format_error(what: str, name: str, known: Iterable[str], where: str = "") -> BadInput:
+    """An error that lists the known formats."""
     known = tuple(known)
     return BadInput(
         f"{what} cannot be written as {name!r}{did_you_mean(name, known)}",

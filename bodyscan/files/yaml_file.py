@@ -14,27 +14,19 @@ from typing import Any, TypeAlias
 
 import yaml
 
-from bodyscan.files.regular import read_regular
+from bodyscan.files.reading import read_regular
 
-MOST_BYTES = 1_000_000
-MOST_NODES = 100_000  # counted after aliases are followed, which stops alias bombs
-MOST_DEPTH = 40
+MAX_BYTES = 1_000_000
+MAX_NODES = 100_000  # counted after aliases are followed, which stops alias bombs
+MAX_DEPTH = 40
 
 Where: TypeAlias = tuple[str | int, ...]
-
-_NULL = re.compile(r"(~|null|Null|NULL|)")
-_TRUE, _FALSE = re.compile(r"true|True|TRUE"), re.compile(r"false|False|FALSE")
-_INT = re.compile(r"[-+]?[0-9]{1,400}")
-_BASED_INT = re.compile(r"0o[0-7]{1,100}|0x[0-9a-fA-F]{1,100}")
-_FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
-_NOT_FINITE = re.compile(r"([-+]?)\.(inf|Inf|INF)|\.(nan|NaN|NAN)")
-_KINDS = {"str": yaml.ScalarNode, "seq": yaml.SequenceNode, "map": yaml.MappingNode}
 
 _Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 class _PlainLoader(_Loader):  # type: ignore[misc]  # the stubs know no CSafeLoader
-    """Resolves nothing by itself: `_scalar` decides what a plain scalar means."""
+    """Resolves nothing by itself: `_parse_scalar` decides what a plain scalar means."""
 
     yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012 (PyYAML's own name and type)
 
@@ -49,8 +41,7 @@ class Place:
 
 @dataclass(frozen=True)
 class YamlProblem:
-    """What is wrong with a file, and where; `path`, such as
-    `pairs[2].camera.width`, may be empty."""
+    """What is wrong with a file, and where; path: such as `pairs[2].camera.width`, or empty."""
 
     place: Place
     path: str
@@ -105,9 +96,9 @@ def read_yaml(path: Path) -> Document:
     Raises YamlError if it is unreadable, BadInput if it is not a regular file, OSError if it does
     not exist.
     """
-    content = read_regular(path, MOST_BYTES)
-    if len(content) > MOST_BYTES:
-        raise _error(Place(1, 1), f"is longer than {MOST_BYTES:,} bytes: this cannot be right")
+    content = read_regular(path, MAX_BYTES)
+    if len(content) > MAX_BYTES:
+        raise _error(Place(1, 1), f"is longer than {MAX_BYTES:,} bytes: this cannot be right")
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -118,7 +109,7 @@ def read_yaml(path: Path) -> Document:
         _refuse_deep(text)
         node = yaml.compose(text, Loader=_PlainLoader)
     except yaml.MarkedYAMLError as error:
-        raise _error(_mark(error.problem_mark or error.context_mark), _words(error)) from None
+        raise _error(_place(error.problem_mark or error.context_mark), _describe(error)) from None
     except yaml.YAMLError as error:
         raise _error(Place(1, 1), f"is not YAML: {error}".splitlines()[0]) from None
     document = Document()
@@ -146,7 +137,7 @@ class _Dumper(yaml.SafeDumper):
 
 
 def _represent_text(dumper: _Dumper, text: str) -> yaml.Node:
-    style = None if _scalar(text) == text and text.isprintable() else '"'
+    style = None if _parse_scalar(text) == text and text.isprintable() else '"'
     return dumper.represent_scalar("tag:yaml.org,2002:str", text, style=style)
 
 
@@ -161,21 +152,21 @@ class _Builder:
 
     def build(self, node: yaml.Node, where: Where, depth: int) -> Any:
         self.nodes += 1
-        place = _mark(node.start_mark)
-        if self.nodes > MOST_NODES:
+        place = _place(node.start_mark)
+        if self.nodes > MAX_NODES:
             raise _too_many(place)
-        if depth > MOST_DEPTH:
-            raise _error(place, f"is nested more than {MOST_DEPTH} deep")
+        if depth > MAX_DEPTH:
+            raise _error(place, f"is nested more than {MAX_DEPTH} deep")
         self.document.values[where] = place
-        kind = node.tag.removeprefix("tag:yaml.org,2002:")
-        if not isinstance(node, _KINDS.get(kind, ())):
+        kinds = {"str": yaml.ScalarNode, "seq": yaml.SequenceNode, "map": yaml.MappingNode}
+        if not isinstance(node, kinds.get(node.tag.removeprefix("tag:yaml.org,2002:"), ())):
             self._problem(place, where, f"has the tag {node.tag!r}: write the value without a tag")
             return None
         if isinstance(node, yaml.ScalarNode):
             if node.style:
                 return node.value
             self.document.raw[where] = node.value
-            return _scalar(node.value)
+            return _parse_scalar(node.value)
         if isinstance(node, yaml.MappingNode):
             return self._mapping(node, where, depth)
         items = enumerate(node.value)
@@ -185,7 +176,7 @@ class _Builder:
         entries: dict[str, tuple[yaml.Node, yaml.Node]] = {}
         merged: list[yaml.Node] = []
         for key, value in node.value:
-            place = _mark(key.start_mark)
+            place = _place(key.start_mark)
             if not isinstance(key, yaml.ScalarNode):
                 self._problem(place, where, "has a key that is not text")
             elif key.value in entries or (key.value == "<<" and merged):
@@ -200,10 +191,10 @@ class _Builder:
                 for name, entry in self._merge_entries(base, depth + 1).items():
                     entries.setdefault(name, entry)
             else:
-                self._problem(_mark(base.start_mark), where, "can merge (<<) only mappings")
+                self._problem(_place(base.start_mark), where, "can merge (<<) only mappings")
         result = {}
         for name, (key, value) in entries.items():
-            self.document.keys[*where, name] = _mark(key.start_mark)
+            self.document.keys[*where, name] = _place(key.start_mark)
             result[name] = self.build(value, (*where, name), depth + 1)
         return result
 
@@ -212,86 +203,85 @@ class _Builder:
     ) -> dict[str, tuple[yaml.Node, yaml.Node]]:
         """Keys and values of a mapping that another one merges, including what it merges itself."""
         self.nodes += 1 + len(node.value)
-        if depth > MOST_DEPTH or self.nodes > MOST_NODES:
-            raise _error(_mark(node.start_mark), "merges (<<) too much")
-        own = {key.value: (key, value) for key, value in node.value if _is_text(key)}
-        merge = own.pop("<<", None)
+        if depth > MAX_DEPTH or self.nodes > MAX_NODES:
+            raise _error(_place(node.start_mark), "merges (<<) too much")
+        entries: dict[str, tuple[yaml.Node, yaml.Node]] = {
+            k.value: (k, v) for k, v in node.value if isinstance(k, yaml.ScalarNode)
+        }
+        merge = entries.pop("<<", None)
         bases = [] if merge is None else [merge[1]]
         if bases and isinstance(bases[0], yaml.SequenceNode):
             bases = bases[0].value
         for base in bases:
             if isinstance(base, yaml.MappingNode):
-                own = self._merge_entries(base, depth + 1) | own
-        return own
+                entries = self._merge_entries(base, depth + 1) | entries
+        return entries
 
     def _problem(self, place: Place, where: Where, text: str) -> None:
         self.document.problems.append(YamlProblem(place, dotted_path(where), text))
 
 
-def _is_text(node: yaml.Node) -> bool:
-    return isinstance(node, yaml.ScalarNode)
-
-
-def _scalar(text: str) -> Any:
-    """The value of a plain scalar by the core schema of YAML 1.2."""
-    if _NULL.fullmatch(text):
+def _parse_scalar(text: str) -> Any:
+    """The value of a plain scalar by the core schema of YAML 1.2 (section 10.3.2)."""
+    if re.fullmatch(r"~|null|Null|NULL|", text):
         return None
-    if _TRUE.fullmatch(text) or _FALSE.fullmatch(text):
+    if re.fullmatch(r"true|True|TRUE|false|False|FALSE", text):
         return text.lower() == "true"
-    if _INT.fullmatch(text):
+    if re.fullmatch(r"[-+]?[0-9]{1,400}", text):
         return int(text)
-    if _BASED_INT.fullmatch(text):
+    if re.fullmatch(r"0o[0-7]{1,100}|0x[0-9a-fA-F]{1,100}", text):
         return int(text[2:], 8 if text[1] == "o" else 16)
-    if _FLOAT.fullmatch(text):
+    if re.fullmatch(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?", text):
         return float(text)
-    if _NOT_FINITE.fullmatch(text):
+    if re.fullmatch(r"[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)", text):
         return float(text.replace(".", "").lower())
     return text
 
 
 def _refuse_deep(text: str) -> None:
-    """Check depth by events first: composing is recursive,
-    and a deep file would exhaust the stack."""
+    """Check the depth by events: composing is recursive, and a deep file would exhaust the stack."""
     depth = 0
     for event in yaml.parse(text, Loader=_PlainLoader):
         depth += isinstance(event, yaml.CollectionStartEvent)
         depth -= isinstance(event, yaml.CollectionEndEvent)
-        if depth > MOST_DEPTH:
-            raise _error(_mark(event.start_mark), f"is nested more than {MOST_DEPTH} deep")
+        if depth > MAX_DEPTH:
+            raise _error(_place(event.start_mark), f"is nested more than {MAX_DEPTH} deep")
 
 
 def _refuse_many(node: yaml.Node, sizes: dict[int, int]) -> int:
-    """How many values a node stands for once aliases are followed, each counted once: building an
-    alias bomb until it is too large would take half a second, for every file of a batch."""
+    """Count the values of a node once aliases are followed, and raise if there are too many.
+
+    Each node is counted once: building an alias bomb until it is too large takes half a second.
+    """
     if id(node) in sizes:
         return sizes[id(node)]
-    sizes[id(node)] = 1  # one that contains itself is too deep, which is reported when it is built
+    sizes[id(node)] = 1  # one that contains itself is too deep, and reported when it is built
     parts: list[yaml.Node] = []
     if isinstance(node, yaml.MappingNode):
         parts = [value for key, value in node.value if key.value != "<<"]
     elif isinstance(node, yaml.SequenceNode):
         parts = node.value
     sizes[id(node)] += sum(_refuse_many(part, sizes) for part in parts)
-    if sizes[id(node)] > MOST_NODES:
-        raise _too_many(_mark(node.start_mark))
+    if sizes[id(node)] > MAX_NODES:
+        raise _too_many(_place(node.start_mark))
     return sizes[id(node)]
 
 
 def _too_many(place: Place) -> YamlError:
-    return _error(place, f"has more than {MOST_NODES:,} values once aliases are followed")
+    return _error(place, f"has more than {MAX_NODES:,} values once aliases are followed")
 
 
-def _mark(mark: Any) -> Place:
+def _place(mark: Any) -> Place:
     return Place(mark.line + 1, mark.column + 1) if mark else Place(1, 1)
 
 
-def _words(error: yaml.MarkedYAMLError) -> str:
-    said = ", ".join(part for part in (error.context, error.problem) if part)
-    if "nesting depth" in said:  # PyYAML 6.0.4 has a limit of its own, and reaches it first
-        return f"is nested more than {MOST_DEPTH} deep"
-    tab = "\\t" in said or "cannot start any token" in said
+def _describe(error: yaml.MarkedYAMLError) -> str:
+    text = ", ".join(part for part in (error.context, error.problem) if part)
+    if "nesting depth" in text:  # PyYAML 6.0.4 has a limit of its own, and reaches it first
+        return f"is nested more than {MAX_DEPTH} deep"
+    tab = "\\t" in text or "cannot start any token" in text
     advice = " (indent with spaces, never with tabs)" if tab else ""
-    return f"is not YAML: {said}{advice}"
+    return f"is not YAML: {text}{advice}"
 
 
 def _error(place: Place, text: str) -> YamlError:

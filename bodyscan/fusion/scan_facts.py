@@ -8,8 +8,8 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from bodyscan.errors import ResultError
-from bodyscan.files.json_file import read_json_object
-from bodyscan.files.model import first_fault
+from bodyscan.files.model import describe_first_error
+from bodyscan.files.reading import read_json_object
 from bodyscan.verdict import Verdict
 
 SCHEMA = "bodyscan-scan"
@@ -112,5 +112,5 @@ def told_verdict(facts: dict[str, Any]) -> Verdict | None:
 
 def _reason(error: Exception) -> str:
     if isinstance(error, ValidationError):
-        return first_fault(error)
+        return describe_first_error(error)
     return str(error)

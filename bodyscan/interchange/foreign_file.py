@@ -1,8 +1,9 @@
-"""A file written by another program: where its words are, and its numbers checked before use."""
+"""A file written by another program: its numbers checked before use, its errors by line."""
 
 from __future__ import annotations
 
 import re
+import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,35 +13,32 @@ import numpy as np
 
 from bodyscan.arrays import Array
 from bodyscan.errors import CalibrationFileError
-from bodyscan.files.regular import read_regular
+from bodyscan.files.reading import read_regular
+from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses import lens_from_opencv
 from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.interchange.found_camera import FoundCamera
+from bodyscan.interchange.rig_format import opencv_coefficients
 
-MOST_BYTES = 100_000_000
-"""mrcal's files hold all corners of a calibration as well, some megabytes."""
-ROTATION_TOLERANCE = 1e-3
-"""Deviation of R R^T from 1: a rotation written with four digits keeps it; a milliradian is a
-millimetre at a metre. What is within it is replaced by the nearest rotation."""
-SAME_UNIT = "the file as that program wrote it"
+MAX_BYTES = 100_000_000  # mrcal's files hold all corners of a calibration, some megabytes
 
 
 @dataclass(frozen=True)
 class ForeignFile:
-    """path: of the file. text: its content, "" if it has none."""
+    """A file and its text; its methods check values and raise CalibrationFileError, by line."""
 
     path: Path
     text: str = ""
 
     @staticmethod
     def read(path: Path) -> ForeignFile:
-        """Read a text file. Raises CalibrationFileError if it is
-        not text, BadInput for a folder or a pipe."""
+        """Read a text file. Raises CalibrationFileError if it is not text, BadInput for a pipe."""
         empty = ForeignFile(path)
         try:
-            data = read_regular(path, MOST_BYTES)
-            if len(data) > MOST_BYTES:
-                raise empty.error(f"is longer than {MOST_BYTES:,} bytes: this cannot be right")
+            data = read_regular(path, MAX_BYTES)
+            if len(data) > MAX_BYTES:
+                raise empty.error(f"is longer than {MAX_BYTES:,} bytes: this cannot be right")
             return ForeignFile(path, data.decode("utf-8-sig"))
         except FileNotFoundError:
             raise empty.error("there is no such file") from None
@@ -50,20 +48,22 @@ class ForeignFile:
             raise empty.error(f"cannot be read: {fault.strerror or fault}") from None
 
     def where(self, word: str = "", after: str = "") -> str:
-        """The file and the line in which a word occurs first, as a key if it does so anywhere;
-        after another word if one is given."""
-        place = 0
+        """The file and the line of the first occurrence of a word, preferably as a key.
+
+        after: another word, after which it occurs.
+        """
+        position = 0
         for part in filter(None, (after, word)):
             alone = rf"(?<![\w.-]){re.escape(part)}(?![\w-])"
             as_key = rf"{alone}(?=[\"']?\s*[:=\]>]|\s+type_id)"
             for pattern in (as_key, alone):
-                found = re.compile(pattern).search(self.text, place)
+                found = re.compile(pattern).search(self.text, position)
                 if found:
                     break
             else:
                 return str(self.path)
-            place = found.start()
-        line = self.text.count("\n", 0, place) + 1
+            position = found.start()
+        line = self.text.count("\n", 0, position) + 1
         return f"{self.path}:{line}" if after or word else str(self.path)
 
     def error(
@@ -74,7 +74,7 @@ class ForeignFile:
         return CalibrationFileError(
             named + what,
             where=self.where(word, after),
-            remedy=remedy or f"give {SAME_UNIT}",
+            remedy=remedy or "give the file as that program wrote it",
         )
 
     def require(self, table: Mapping[str, Any], words: Iterable[str], key: str) -> None:
@@ -109,12 +109,12 @@ class ForeignFile:
             )
         if matrix[1, 0] != 0.0 or not np.array_equal(matrix[2], [0.0, 0.0, 1.0]):
             raise self.error(
-                "is not a camera matrix: below its diagonal stand zeros, and 1 at its end", word,
-                "is it transposed, or a projection of three by four?", after=after,
+                "is not a camera matrix, which has zeros below its diagonal and 1 at its end", word,
+                "check that it is not transposed, nor a projection of three by four", after=after,
             )  # fmt: skip
         return matrix
 
-    def four(self, value: Any, word: str, *, after: str = "") -> Array:
+    def pinhole_matrix(self, value: Any, word: str, *, after: str = "") -> Array:
         """A of Eq. 1 from fx, fy, cx, cy."""
         fx, fy, cx, cy = self.numbers(value, word, (4,), after=after)
         return self.matrix([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0], word, after=after)
@@ -128,7 +128,7 @@ class ForeignFile:
             return lens_from_opencv(coefficients)
         except ValueError as error:
             raise self.error(
-                str(error), word, "calibrate it with a lens that there is here", after=after
+                str(error), word, "calibrate it with a supported lens", after=after
             ) from None
 
     def size(self, value: Any, word: str, *, after: str = "") -> tuple[int, int]:
@@ -143,24 +143,85 @@ class ForeignFile:
     def pose(
         self, rotation: Any, translation: Any, words: tuple[str, str], *, after: str = ""
     ) -> RigidTransform:
-        """A pose from a rotation matrix row by row, or a rotation vector, and a translation."""
+        """A pose from a rotation (vector, or matrix row by row) and a translation.
+
+        A matrix is replaced by the nearest rotation.
+        """
         given = self.numbers(rotation, words[0], (3, 9), after=after)
         shift = self.numbers(translation, words[1], (3,), after=after)
         if len(given) == 3:
             return RigidTransform.from_rotation_vector(given, shift)
         matrix = given.reshape(3, 3)
-        off = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
-        if off > ROTATION_TOLERANCE:
+        # Four digits suffice; a milliradian is a millimetre at a metre.
+        deviation = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
+        if deviation > 1e-3:
             raise self.error(
-                f"is not a rotation: R times its transpose is off the identity by {off:.2g}",
+                f"is not a rotation: R times its transpose differs from 1 by {deviation:.2g}",
                 words[0],
                 after=after,
             )
         if np.linalg.det(matrix) < 0.0:
             raise self.error(
-                "is mirrored (its determinant is -1): no camera stands so",
+                "is a reflection (its determinant is -1), which no camera's pose is",
                 words[0],
-                "is an axis turned round, such as y or z?",
+                "check whether an axis, such as y or z, has the opposite direction",
                 after=after,
             )
         return RigidTransform.from_matrix(np.column_stack([matrix, shift]))
+
+
+# What the TOML of caliscope and of aniposelib share: a table of OpenCV's numbers per camera.
+
+TOML_NOTE = (
+    "# Pixel centres at whole numbers; x_camera = R(rotation) x_rig + translation. matrix holds the\n"
+    "# skew, which OpenCV's functions ignore: use it with pixels sheared to\n"
+    "# u - skew / fy * (v - cy), v.\n"
+)
+
+
+def read_toml(file: ForeignFile) -> dict[str, Any]:
+    """Parse a TOML file. Raises CalibrationFileError, with the line, if it is not TOML."""
+    try:
+        return tomllib.loads(file.text)
+    except tomllib.TOMLDecodeError as error:
+        raise file.error(f"is not TOML: {error}") from None
+
+
+def read_camera_table(file: ForeignFile, table: dict[str, Any], key: str) -> FoundCamera:
+    """Read the camera in a table; key: of the table, as written in the file."""
+    file.require(table, ("size", "matrix", "distortions"), key)
+    if table.get("fisheye", False):
+        raise file.error(
+            "is OpenCV's fisheye lens, which is not supported", "fisheye",
+            "calibrate it with an ordinary lens", after=key,
+        )  # fmt: skip
+    pose = None
+    if "rotation" in table and "translation" in table:
+        words = "rotation", "translation"
+        pose = file.pose(table["rotation"], table["translation"], words, after=key)
+    return FoundCamera(
+        file.matrix(table["matrix"], "matrix", after=key),
+        file.lens(table["distortions"], "distortions", after=key),
+        file.size(table["size"], "size", after=key),
+        pose,
+        file.where(key),
+    )
+
+
+def format_camera_table(
+    name: str, camera: Camera, camera_from_rig: RigidTransform, mm_a_unit: float
+) -> str:
+    """Format the lines for size, matrix, distortions, rotation and translation.
+
+    Raises BadInput for a lens that OpenCV does not have.
+    """
+    return "".join(
+        f"{word} = {value!r}\n"
+        for word, value in (
+            ("size", [camera.width, camera.height]),
+            ("matrix", camera.matrix.tolist()),
+            ("distortions", opencv_coefficients(name, camera).tolist()),
+            ("rotation", camera_from_rig.rotation_vector.tolist()),
+            ("translation", (camera_from_rig.translation / mm_a_unit).tolist()),
+        )
+    )

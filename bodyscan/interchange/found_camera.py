@@ -14,13 +14,6 @@ from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.transforms import RigidTransform
 
-SHIFTED = 0.5
-"""How far outside its image the axis of a camera of known size may lie, in image sizes: a shift
-lens moves it by less."""
-STEPS = np.linspace(0.25, 0.75, 5)
-INNER = np.stack(np.meshgrid(STEPS, STEPS), axis=-1)
-"""Where every lens has rays; one fitted without boards in the corners may fold there."""
-
 
 @dataclass(frozen=True, eq=False)
 class FoundCamera:
@@ -44,25 +37,26 @@ class FoundCamera:
         Raises CalibrationFileError if the file gives another size, if its axis is outside such an
         image, or if its lens folds within it.
         """
-        told = "calibrate that camera as it is used now, or correct the size in the rig file"
+        remedy = "calibrate that camera as it is used now, or correct the size in the rig file"
         if self.size is not None and self.size != (width, height):
             raise CalibrationFileError(
                 f"is of a camera of {self.size[0]} x {self.size[1]} px, the rig file says "
                 f"{width} x {height} px",
                 where=self.where,
-                remedy=told,
+                remedy=remedy,
             )
         u0, v0 = float(self.matrix[0, 2]), float(self.matrix[1, 2])
-        aside = SHIFTED if self.size else 0.0
+        # Of a camera of known size: a shift lens moves its axis by less than half an image.
+        margin = 0.5 if self.size else 0.0
         if not (
-            -aside * width < u0 < (1.0 + aside) * width
-            and -aside * height < v0 < (1.0 + aside) * height
+            -margin * width < u0 < (1.0 + margin) * width
+            and -margin * height < v0 < (1.0 + margin) * height
         ):
             raise CalibrationFileError(
                 f"has its principal point at ({u0:.1f}, {v0:.1f}), outside of a picture of "
                 f"{width} x {height} px: it is of another camera, or of pictures of another size",
                 where=self.where,
-                remedy=told,
+                remedy=remedy,
             )
         return self.projector(width, height)
 
@@ -77,20 +71,22 @@ class FoundCamera:
             float(a[0, 0]), float(a[1, 1]), float(a[0, 1]), float(a[0, 2]), float(a[1, 2]),
             self.lens, width, height,
         )  # fmt: skip
-        inner = INNER * [width - 1.0, height - 1.0]
+        # Every lens has rays in the inner half; without boards in the corners it may fold there.
+        shares = np.linspace(0.25, 0.75, 5)
+        inner = np.stack(np.meshgrid(shares, shares), axis=-1) * [width - 1.0, height - 1.0]
         if not np.isfinite(camera.rays(inner)).all():
             raise CalibrationFileError(
                 f"has a lens that folds inside a picture of {width} x {height} px: distortion and "
-                "matrix do not belong together, or both to another device",
+                "matrix do not belong together, or both belong to another device",
                 where=self.where,
-                remedy="name each device's own matrix and distortion in the rig file: are camera and "
-                "projector exchanged?",
+                remedy="name each device's matrix and distortion in the rig file, and check that "
+                "camera and projector are not exchanged",
             )
         return camera
 
 
-def camera_named(cameras: Mapping[str, FoundCamera], name: str, where: str) -> FoundCamera:
-    """One of a file's cameras. Raises CalibrationFileError, which lists them, if there is none."""
+def find_camera(cameras: Mapping[str, FoundCamera], name: str, where: str) -> FoundCamera:
+    """The camera of that name. Raises CalibrationFileError, which lists them, if there is none."""
     if name not in cameras:
         raise CalibrationFileError(
             f"has no camera {name!r}{did_you_mean(name, cameras)}",

@@ -19,8 +19,7 @@ if TYPE_CHECKING:
 RigCameras: TypeAlias = "Mapping[str, tuple[Camera, RigidTransform]]"
 """Camera and `rig_from_camera` by the pair's name; projectors, as cameras, by `projector_name`."""
 Unit = Literal["mm", "cm", "m"]
-MILLIMETRES: dict[Unit, float] = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
-"""Millimetres per unit."""
+MILLIMETRES: dict[Unit, float] = {"mm": 1.0, "cm": 10.0, "m": 1000.0}  # per unit
 Nodes: TypeAlias = Mapping[str, str]
 """Names of a file's nodes, by what they hold: matrix, distortion, size or width and height,
 rotation, translation."""
@@ -51,7 +50,7 @@ def projector_name(pair: str) -> str:
     return f"{pair}-projector"
 
 
-def opencv_lens(name: str, camera: Camera) -> Array:
+def opencv_coefficients(name: str, camera: Camera) -> Array:
     """OpenCV's coefficients (5,) or more of a pair's camera. Raises BadInput, which names the pair,
     for a lens that OpenCV does not have."""
     try:

@@ -9,7 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from bodyscan.errors import BadInput, BodyscanError, FailedWork
-from bodyscan.files.locking import file_lock, for_owner_only
+from bodyscan.files.atomic import lock_file, restrict_to_owner
 from bodyscan.jobs.allocation import Allocation
 from bodyscan.jobs.job import BATCH_LOCK, STAGE, Job, write_job
 from bodyscan.jobs.supervision import (
@@ -36,12 +36,12 @@ def run_batch(
     A job that fails is set aside with its reason, and the others go on. Raises BadInput if another
     batch is working in `out`, or `out` is not writable.
     """
-    with for_owner_only():
+    with restrict_to_owner():
         try:
             out.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise BadInput(f"cannot be written: {error.strerror}", where=str(out)) from error
-        with file_lock(out / BATCH_LOCK, wait=False):
+        with lock_file(out / BATCH_LOCK, wait=False):
             sweep(out)
             listen({"event": "batch", "jobs": [job.name for job in jobs]})
             outcomes: dict[str, JobResult] = {}
@@ -127,7 +127,7 @@ def finish(jobs: Sequence[Job], outcomes: Sequence[JobResult], out: Path) -> dic
     )
 
     try:
-        with for_owner_only():
+        with restrict_to_owner():
             table = write_summary(jobs, outcomes, out)
             write_out_manifest(out)
     except OSError as error:

@@ -19,8 +19,7 @@ from typing import Any
 
 from bodyscan.captures.captures_file import FILE_NAME as CAPTURES
 from bodyscan.errors import BadInput
-from bodyscan.files.atomic import write_text
-from bodyscan.files.locking import file_lock, for_owner_only
+from bodyscan.files.atomic import lock_file, restrict_to_owner, write_text
 from bodyscan.files.yaml_file import YamlError, read_yaml
 from bodyscan.jobs.job import BATCH_LOCK, JOB, MANIFEST, SUMMARY
 from bodyscan.jobs.summary import write_out_manifest
@@ -74,10 +73,10 @@ def forget_subject(subject: str, workspace: Path) -> SubjectFiles:
     Raises BadInput if there is nothing of that subject, or a batch is working in the workspace.
     """
     with ExitStack() as locks:
-        locks.enter_context(for_owner_only())
+        locks.enter_context(restrict_to_owner())
         found = find_subject(subject, workspace)
         for out in found.tables:
-            locks.enter_context(file_lock(out / BATCH_LOCK, wait=False))
+            locks.enter_context(lock_file(out / BATCH_LOCK, wait=False))
         if not found.files and not found.rows:
             raise BadInput(
                 f"holds nothing of subject {subject!r}",

@@ -18,7 +18,7 @@ from bodyscan.captures.captures_file import FILE_NAME as CAPTURES
 from bodyscan.captures.folder import ImageSequence, open_scan
 from bodyscan.errors import BadInput, CaptureError
 from bodyscan.files.atomic import write_bytes
-from bodyscan.files.hashing import files_below
+from bodyscan.files.hashing import list_files
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.templates import ANYTHING, fill
 
@@ -122,7 +122,7 @@ class IncomingScan:
     def _look_for_changes(self, now_s: float) -> bool:
         """Check every file in the folder; returns whether one came, went or changed."""
         before, self._files = self._files, {}
-        for path in files_below(self.folder):
+        for path in list_files(self.folder):
             try:
                 found = os.stat(path)
             except OSError:

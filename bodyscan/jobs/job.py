@@ -12,7 +12,7 @@ from typing import Any
 
 from bodyscan.errors import BadInput, ResultError
 from bodyscan.files.atomic import write_json
-from bodyscan.files.hashing import named_below
+from bodyscan.files.hashing import list_relative_files
 from bodyscan.jobs.pipeline import Pipeline
 
 SCHEMA, VERSION = "bodyscan-job", 1
@@ -119,7 +119,7 @@ def results_in(folder: Path) -> dict[str, Path]:
     named = read_record(folder / STAGE).get("outputs")
     if not isinstance(named, dict):
         return {}
-    return {name: path for name, path in named_below(folder).items() if name in named}
+    return {name: path for name, path in list_relative_files(folder).items() if name in named}
 
 
 def _there(folder: Path, relative: str) -> Path:

@@ -16,7 +16,7 @@ from typing import Any
 
 from bodyscan.captures.captures_file import FILE_NAME as CAPTURES
 from bodyscan.errors import BadInput
-from bodyscan.files.hashing import files_below
+from bodyscan.files.hashing import list_files
 from bodyscan.jobs.discovery import find_jobs
 from bodyscan.jobs.job import KEPT, LOCK, MANIFEST, STAGE, SUMMARY, Job, write_job
 from bodyscan.jobs.pipeline import Pipeline
@@ -111,7 +111,7 @@ def _stages(folder: Path) -> dict[str, bytes]:
 
 def _put_back(folder: Path, there: _Files, was: dict[str, bytes], ran: tuple[str, ...]) -> None:
     """Put back results. was: the stages as fetched. ran: those made again, perhaps identical."""
-    for path in sorted(path for kept in folder.glob(f"{KEPT}*") for path in files_below(kept)):
+    for path in sorted(path for kept in folder.glob(f"{KEPT}*") for path in list_files(kept)):
         there.put(path, path.relative_to(folder).as_posix())  # before what it is taken from goes
     now = _stages(folder)
     for stage in was.keys() - now.keys():
@@ -119,7 +119,7 @@ def _put_back(folder: Path, there: _Files, was: dict[str, bytes], ran: tuple[str
     for stage in sorted(now):
         if stage in ran or now[stage] != was.get(stage):
             there.remove(stage)
-            paths = sorted(files_below(folder / stage), key=lambda path: path.name == STAGE)
+            paths = sorted(list_files(folder / stage), key=lambda path: path.name == STAGE)
             for path in paths:
                 there.put(path, path.relative_to(folder).as_posix())
     for path in sorted(folder.iterdir(), key=lambda path: path.name == MANIFEST):

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from bodyscan.errors import BadInput
 from bodyscan.export.formats import BODY_FORMATS
-from bodyscan.files.model import Model, Name, Problem, alternatives, did_you_mean
+from bodyscan.files.model import Model, Name, Problem, did_you_mean, format_alternatives
 from bodyscan.files.model_file import apply_settings, load_model
 from bodyscan.interchange.rig_format import RIG_FORMATS
 from bodyscan.settings import (
@@ -79,7 +79,9 @@ def _unknown_formats(
 ) -> Iterator[Problem]:
     for index, name in enumerate(formats):
         if name not in known:
-            wrong = f"must be {alternatives(known)}{did_you_mean(name, known)} (got {name!r})"
+            wrong = (
+                f"must be {format_alternatives(known)}{did_you_mean(name, known)} (got {name!r})"
+            )
             yield (section, "formats", index), wrong
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bodyscan.errors import BadInput, BodyscanError
-from bodyscan.files.hashing import content_hash, file_hash, files_below
+from bodyscan.files.hashing import content_hash, file_hash, list_files
 from bodyscan.jobs.job import MANIFEST, STAGE, read_job, read_record, results_in
 from bodyscan.jobs.stages import KINDS, Kinds
 
@@ -74,7 +74,7 @@ def _added(folder: Path) -> Iterator[Path]:
     """Files that people put among a batch's results, or a job's."""
     for record in sorted((*folder.glob(f"*/{STAGE}"), *folder.glob(f"*/*/{STAGE}"))):
         own = {record, *results_in(record.parent).values()}
-        yield from (path for path in files_below(record.parent) if path not in own)
+        yield from (path for path in list_files(record.parent) if path not in own)
 
 
 def _inputs(folder: Path, inputs: Mapping[str, str], kinds: Kinds) -> Iterator[tuple[Path, str]]:

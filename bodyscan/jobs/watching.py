@@ -18,7 +18,7 @@ from queue import Empty, SimpleQueue
 from typing import Any
 
 from bodyscan.errors import BadInput, BodyscanError, FailedWork
-from bodyscan.files.locking import file_lock, for_owner_only
+from bodyscan.files.atomic import lock_file, restrict_to_owner
 from bodyscan.jobs.batch import finish, sweep
 from bodyscan.jobs.discovery import RESULTS, job_of
 from bodyscan.jobs.inbox import IncomingScan
@@ -78,9 +78,9 @@ def watch(
     if not watched.inbox.is_dir():
         raise BadInput("there is no such folder", where=str(watched.inbox), remedy="make it first")
     rig = rig_of(watched.calibration)
-    with for_owner_only():
+    with restrict_to_owner():
         watched.out.mkdir(parents=True, exist_ok=True)
-        with file_lock(watched.out / BATCH_LOCK, wait=False):
+        with lock_file(watched.out / BATCH_LOCK, wait=False):
             sweep(watched.out)
             watching = _Watching(watched, listen)
             try:

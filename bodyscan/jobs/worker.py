@@ -23,9 +23,14 @@ from pathlib import Path
 from typing import Any
 
 from bodyscan.errors import BodyscanError, CaptureError
-from bodyscan.files.atomic import flush, json_text, write_json
-from bodyscan.files.hashing import content_hash, file_hash, file_hashes, files_below, named_below
-from bodyscan.files.locking import file_lock, for_owner_only
+from bodyscan.files.atomic import flush, json_text, lock_file, restrict_to_owner, write_json
+from bodyscan.files.hashing import (
+    content_hash,
+    file_hash,
+    file_hashes,
+    list_files,
+    list_relative_files,
+)
 from bodyscan.jobs.job import KEPT, LOCK, MANIFEST, STAGE, Job, read_job, results_in
 from bodyscan.jobs.plan import Origin, origin_of, reason_to_run
 from bodyscan.jobs.stages import KINDS, Kinds, Stage, stages_until
@@ -59,7 +64,7 @@ class Failure:
 def attempt(folder: Path, kinds: Kinds, tell: Tell) -> Failure | None:
     """Do `work`; None if all went well."""
     try:
-        with for_owner_only():
+        with restrict_to_owner():
             work(folder, kinds, tell)
     except BodyscanError as error:
         return Failure(str(error), error.exit_code)
@@ -84,7 +89,7 @@ def become_worker() -> Tell:
 
 def work(folder: Path, kinds: Kinds, tell: Tell) -> None:
     """Bring a job's results up to date, waiting for anyone else at work on it."""
-    with file_lock(folder / LOCK, wait=True):
+    with lock_file(folder / LOCK, wait=True):
         _tidy(folder, tell)
         job = read_job(folder)
         every = kinds[job.pipeline.kind]
@@ -119,7 +124,7 @@ def _perform(job: Job, stage: Stage, before: Origin, tell: Tell) -> None:
                 where=str(job.source),
                 remedy="start the batch again when the folder is complete",
             )
-        write_json(made / STAGE, before.record(file_hashes(named_below(made))))
+        write_json(made / STAGE, before.record(file_hashes(list_relative_files(made))))
         _flush_all(made)
     except BaseException:
         shutil.rmtree(made, ignore_errors=True)
@@ -152,7 +157,7 @@ def _remove_results(old: Path, tell: Tell) -> None:
     if old.is_dir() and not old.is_symlink():
         # Without a record (an upload that was cut short) the new result tells what stages write.
         ours = results_in(old) or results_in(old.with_name(stage))
-        for name, path in named_below(old).items():
+        for name, path in list_relative_files(old).items():
             if name in ours:
                 path.unlink()
         (old / STAGE).unlink(missing_ok=True)
@@ -218,7 +223,7 @@ def _remove(path: Path) -> None:
 
 def _flush_all(folder: Path) -> None:
     """Flush to the disk, before a name says that it is there."""
-    for path in (*files_below(folder), folder):
+    for path in (*list_files(folder), folder):
         flush(path)
 
 

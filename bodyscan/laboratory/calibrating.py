@@ -113,7 +113,7 @@ def calibrate_ours(
         for number, shot in enumerate(captures.boards)
     ]
     poses = [reference.camera_from_board[shot.view.shot] for shot in captures.boards]
-    flatness = {board.name: board.believed_flatness_mm}
+    flatness = {board.name: board.flatness_sigma_mm}
     refined = refine_jointly(boards.camera, poses, fit.sheets, striped, flatness)
     approach = Approach("ours", refined.camera, refined.sheets)
     return approach, refined.camera_covariance, fit.model, "joint solve"

@@ -78,7 +78,7 @@ def expose_scene(
 
 def _read(frames: dict[str, Bytes]) -> Exposure:
     code = apparatus.PROJECTOR
-    coded = np.stack([frames[name] for name in FrameNames().of_code(code)])
+    coded = np.stack([frames[name] for name in FrameNames().code_names(code)])
     stripes = decode_stripes(code, frames["lit"], frames["dark"], coded)
     return Exposure(frames["lit"], stripes)
 

@@ -10,12 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyscan.arrays import Array, Bytes, Floats, Indices, Mask
-from bodyscan.mesh.topology import (
-    drop_unused_vertices,
-    face_areas,
-    face_normals,
-    label_components,
-)
+from bodyscan.mesh.topology import drop_unused_vertices, face_areas, face_normals, label_components
 
 UNSURE, SKIN, HAIR, DARK_CLOTH = range(4)
 REGION_NAMES = ("unsure", "skin", "hair", "dark cloth")

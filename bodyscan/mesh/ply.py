@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from bodyscan.arrays import Array, Bytes, Floats
 from bodyscan.errors import ResultError
 from bodyscan.files.atomic import atomic_replacement
-from bodyscan.files.regular import read_regular
+from bodyscan.files.reading import read_regular
 from bodyscan.mesh.body import REGION_NAMES, BodyCloud, BodyMesh, BreathAt
 
 Records = NDArray[np.void]

@@ -21,8 +21,8 @@ from bodyscan.outcome import Outcome
 from bodyscan.registration.nominal_size import OTHER_SIZE, REFUSED_SIZE
 from bodyscan.registration.rig_solve import RigSolution
 from bodyscan.rig.board import Board
-from bodyscan.rig.reference import Reference
 from bodyscan.rig.rig import Rig
+from bodyscan.rig.rig_frame import Reference
 
 FEWEST = 6
 """Corners of a board that two cameras must see: fewer give its middle poorly, and hide a wrong

@@ -20,10 +20,8 @@ from bodyscan.calibration.pair import PairCalibration, PairQuality
 from bodyscan.errors import CalibrationFileError
 from bodyscan.files.atomic import json_text, write_bytes, write_json, write_npz
 from bodyscan.files.hashing import content_hash, file_hash
-from bodyscan.files.json_file import read_json_object
-from bodyscan.files.model import first_fault
-from bodyscan.files.npz_file import read_npz
-from bodyscan.files.regular import read_regular
+from bodyscan.files.model import describe_first_error
+from bodyscan.files.reading import read_json_object, read_npz, read_regular
 from bodyscan.geometry.camera import camera_from_fields, camera_to_fields
 from bodyscan.geometry.light_planes import LightSheets
 from bodyscan.geometry.light_sheets import sheets_from_arrays, sheets_to_arrays
@@ -224,7 +222,7 @@ def _refuse_changed(content: dict[str, Any], file: Path, arrays_file: Path) -> N
 
 def _reason(error: Exception) -> str:
     if isinstance(error, ValidationError):
-        return first_fault(error)
+        return describe_first_error(error)
     if isinstance(error, KeyError):
         return f"{error.args[0]} is missing"
     return str(error)

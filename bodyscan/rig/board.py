@@ -26,21 +26,13 @@ MARKERS_IN = {
 """Number of markers in each of OpenCV's dictionaries: a rig file is checked without OpenCV."""
 
 LARGEST_DICTIONARIES = (
-    "DICT_4X4_1000",
-    "DICT_5X5_1000",
-    "DICT_6X6_1000",
-    "DICT_7X7_1000",
+    *(f"DICT_{bits}X{bits}_1000" for bits in (4, 5, 6, 7)),
     "DICT_ARUCO_ORIGINAL",
     "DICT_APRILTAG_36h11",
     "DICT_ARUCO_MIP_36h12",
 )
-"""One dictionary per family, used to find out which one a board was printed with. Those of few bits
-are
+"""One dictionary per family, to find out which one a board was printed with. Those of few bits are
 left out: their markers are found in any texture."""
-
-FLATNESS = 5e-4
-"""Default flatness as a share of the diagonal: half a millimetre per metre, as of a print glued to
-a sheet of aluminium composite."""
 
 
 class Board(Model):
@@ -73,18 +65,20 @@ class Board(Model):
         return self.columns * self.square_mm, self.rows * self.square_mm
 
     @property
-    def believed_flatness_mm(self) -> float:
-        """Standard deviation, before any image, of the height difference between the board's lowest
-        and highest corners: `flatness_mm`, or FLATNESS times its diagonal."""
+    def flatness_sigma_mm(self) -> float:
+        """Prior standard deviation of the height difference between the lowest and highest corners.
+
+        By default 0.5 mm per metre of the diagonal, as of a print glued to aluminium composite.
+        """
         if self.flatness_mm is not None:
             return self.flatness_mm
-        return FLATNESS * self.square_mm * math.hypot(self.columns, self.rows)
+        return 5e-4 * self.square_mm * math.hypot(self.columns, self.rows)
 
     @property
-    def looks_same_turned(self) -> bool:
-        """Whether an image leaves open which end, or which face, of the print it shows."""
-        alike = self.faces == 2 or (self.columns + self.rows) % 2 == 0
-        return self.kind == "checkerboard" and alike
+    def is_ambiguous(self) -> bool:
+        """Whether the print looks the same rotated by 180 degrees, or from its other face."""
+        symmetric = self.faces == 2 or (self.columns + self.rows) % 2 == 0
+        return self.kind == "checkerboard" and symmetric
 
     @property
     def marker_count(self) -> int:
@@ -133,16 +127,14 @@ def _problems(board: Board) -> Iterator[Problem]:
             f"is not one of OpenCV's dictionaries{hint} (got {board.dictionary!r})",
         )
     elif board.first_marker + board.marker_count > MARKERS_IN[board.dictionary]:
-        end = board.first_marker + board.marker_count - 1
-        held = MARKERS_IN[board.dictionary]
+        last, end = MARKERS_IN[board.dictionary] - 1, board.first_marker + board.marker_count - 1
         yield (
             ("dictionary",),
-            f"holds markers 0 to {held - 1}, but this board needs {board.first_marker} to {end}",
+            f"holds markers 0 to {last}, but this board needs {board.first_marker} to {end}",
         )
 
 
-def family(dictionary: str) -> str:
-    """The dictionary's family, whose members share their first markers: DICT_4X4_50 begins
-    DICT_4X4_1000."""
+def dictionary_family(dictionary: str) -> str:
+    """The family of a dictionary, which shares its first markers: DICT_4X4 of DICT_4X4_50."""
     head, _, count = dictionary.rpartition("_")
     return head if count.isdigit() else dictionary

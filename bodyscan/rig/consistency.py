@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from bodyscan.files.model import Problem, did_you_mean, duplicates
-from bodyscan.rig.board import Board, family
-from bodyscan.rig.capture_folder import CaptureFolder
-from bodyscan.rig.frame_names import FrameNames, ImageNames
+from bodyscan.files.model import Problem, did_you_mean, find_duplicates
+from bodyscan.rig.board import Board, dictionary_family
+from bodyscan.rig.frame_names import CaptureFolder, FrameNames, ImageNames
 from bodyscan.rig.pair import Pair
-from bodyscan.rig.reference import Reference
-from bodyscan.rig.rig_frame import RigFrame
+from bodyscan.rig.rig_frame import Reference, RigFrame
 from bodyscan.rig.templates import template_faults
 from bodyscan.stripes.codes import image_kinds
 from bodyscan.stripes.stripe_code import StripeCode
@@ -36,7 +34,7 @@ class RigParts:
 def rig_problems(parts: RigParts) -> Iterator[Problem]:
     """Find the parts of a rig file that do not fit together."""
     for key, names in (("boards", parts.board_names), ("pairs", parts.pair_names)):
-        for index, name in duplicates(names):
+        for index, name in find_duplicates(names):
             yield (key, index, "name"), f"is given to two {key}: every name once (got {name!r})"
     if parts.folders and not parts.boards:
         yield ("boards",), "is missing: calibration captures show a board"
@@ -52,17 +50,20 @@ def _marker_overlaps(boards: Sequence[Board | None]) -> Iterator[Problem]:
     for index, board in enumerate(boards):
         if board is None or board.kind == "checkerboard":
             continue
-        own = range(board.first_marker, board.first_marker + board.marker_count)
+        ids = range(board.first_marker, board.first_marker + board.marker_count)
         for other, theirs in taken:
-            shared = range(max(own.start, theirs.start), min(own.stop, theirs.stop))
-            if family(other.dictionary) == family(board.dictionary) and shared:
+            shared = range(max(ids.start, theirs.start), min(ids.stop, theirs.stop))
+            if (
+                dictionary_family(other.dictionary) == dictionary_family(board.dictionary)
+                and shared
+            ):
                 yield (
                     ("boards", index, "first_marker"),
-                    f"gives board {board.name} markers {own.start} to {own.stop - 1}, of which"
+                    f"gives board {board.name} markers {ids.start} to {ids.stop - 1}, of which"
                     f" board {other.name} has {shared.start} to {shared.stop - 1} as well:"
                     f" print it with first_marker {theirs.stop} or more",
                 )
-        taken.append((board, own))
+        taken.append((board, ids))
 
 
 def _wrong_frames(parts: RigParts) -> Iterator[Problem]:
@@ -76,14 +77,14 @@ def _wrong_frames(parts: RigParts) -> Iterator[Problem]:
     yield from _wrong_counts(frames.crossing, ("frames", "crossing"), across)
     if frames.crossing.model_extra and not across and len(pairs) == len(parts.pairs):
         yield ("frames", "crossing"), "is for a projector with `crossing`: no pair has one"
-    ways = [(name, way) for name, code in codes for way in code.directions]
+    directions = [(name, one) for name, code in codes for one in code.directions]
     if frames.dark is None:
-        lacking = next((name for name, way in ways if way.needs_dark), None)
+        lacking = next((name for name, one in directions if one.needs_dark), None)
         if lacking:
             wrong = f"is needed: pair {lacking} takes no inverses, so only it shows what black is"
             yield ("frames", "dark"), wrong
     if frames.lit is None:
-        lacking = next((name for name, way in ways if way.needs_lit), None)
+        lacking = next((name for name, one in directions if one.needs_lit), None)
         if lacking:
             wrong = (
                 f"is needed: the images of pair {lacking} do not show the scene under full light"
@@ -100,7 +101,7 @@ def _wrong_counts(
 ) -> Iterator[Problem]:
     """Find lists of names that are longer or shorter than a pair's code requires."""
     for kind in image_kinds():
-        given = names.given(kind)
+        given = names.templates(kind)
         if isinstance(given, str):
             continue
         for pair, code in codes:
@@ -121,23 +122,21 @@ def _template_problems(parts: RigParts) -> Iterator[Problem]:
     stripes = any(pair and pair.projector for pair in parts.pairs)
     if len(parts.exposures) == 1:
         yield ("exposures",), "names one exposure: name two or more, the shortest first, or none"
-    for index, name in duplicates(parts.exposures):
+    for index, name in find_duplicates(parts.exposures):
         yield ("exposures", index), f"is named twice (got {name!r})"
-    if parts.files is not None:
-        several = bool(parts.exposures)
-        for fault in template_faults(
-            parts.files, many_pairs=many, needs_frame=stripes, exposures=several
-        ):
-            yield ("files",), fault
-    for index, folder in enumerate(parts.folders):
-        if folder and folder.files is not None:
-            for fault in template_faults(
-                folder.files, many_pairs=many, needs_frame=False, exposures=bool(parts.exposures)
-            ):
-                yield ("calibration", index, "files"), fault
-    places = tuple(folder.folder.rstrip("/") if folder else None for folder in parts.folders)
-    for index, place in duplicates(places):
-        yield ("calibration", index, "folder"), f"is listed twice (got {place!r})"
+    templates = [(("files",), parts.files, stripes)] + [
+        (("calibration", index, "files"), folder.files if folder else None, False)
+        for index, folder in enumerate(parts.folders)
+    ]
+    for where, template, needs_frame in templates:
+        if template is not None:
+            faults = template_faults(
+                template, many_pairs=many, needs_frame=needs_frame, exposures=bool(parts.exposures)
+            )
+            yield from ((where, fault) for fault in faults)
+    paths = tuple(folder.folder.rstrip("/") if folder else None for folder in parts.folders)
+    for index, path in find_duplicates(paths):
+        yield ("calibration", index, "folder"), f"is listed twice (got {path!r})"
 
 
 def _unknown_references(parts: RigParts) -> Iterator[Problem]:
@@ -155,7 +154,7 @@ def _unknown_references(parts: RigParts) -> Iterator[Problem]:
 
 def _wrong_references(parts: RigParts) -> Iterator[Problem]:
     names = tuple(reference.name if reference else None for reference in parts.references)
-    for index, name in duplicates(names):
+    for index, name in find_duplicates(names):
         yield ("references", index, "name"), f"is given to two references (got {name!r})"
     boards = {board.name: board for board in parts.boards if board}
     frame = parts.rig_frame
@@ -165,19 +164,19 @@ def _wrong_references(parts: RigParts) -> Iterator[Problem]:
         where = ("references", index, "boards")
         if len(set(reference.boards)) < len(reference.boards):
             yield where, f"names a board twice (got {reference.boards[0]!r})"
-        for place, name in enumerate(reference.boards):
+        for k, name in enumerate(reference.boards):
             if name not in parts.board_names:
                 hint = did_you_mean(name, filter(None, parts.board_names))
-                yield (*where, place), f"names no board of this file{hint} (got {name!r})"
+                yield (*where, k), f"names no board of this file{hint} (got {name!r})"
             elif name in boards and boards[name].kind == "checkerboard":
                 yield (
-                    (*where, place),
+                    (*where, k),
                     f"must have markers, which tell its corners apart from every side: board {name} "
                     "is a plain checkerboard",
                 )
             elif frame and name == frame.board and len(parts.boards) > len(reference.boards):
                 yield (
-                    (*where, place),
+                    (*where, k),
                     f"must not fix the rig frame as well: board {name} of a reference takes no part "
                     "in placing the rig",
                 )

@@ -1,10 +1,10 @@
-"""Names of the images of a stripe sequence."""
+"""Names of capture folders and of the images of a stripe sequence."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from itertools import islice
-from typing import Any, Self
+from typing import Annotated, Any, Self
 
 from pydantic import (
     ConfigDict,
@@ -14,7 +14,14 @@ from pydantic import (
     model_validator,
 )
 
-from bodyscan.files.model import Model, Problem, duplicates, repeated_errors, unknown_key_error
+from bodyscan.files.model import (
+    Model,
+    Problem,
+    ShotName,
+    copy_errors,
+    find_duplicates,
+    unknown_key_error,
+)
 from bodyscan.rig.templates import frame_name_faults, path_fault
 from bodyscan.stripes.codes import image_kinds
 from bodyscan.stripes.stripe_code import ImageKind, StripeCode
@@ -22,13 +29,25 @@ from bodyscan.stripes.stripe_code import ImageKind, StripeCode
 Names = str | tuple[str, ...]
 
 
-def _numbered(template: str, kind: ImageKind, count: int) -> tuple[str, ...]:
-    if kind.number is None:
-        return (template,)
-    return tuple(template.format(**{kind.number: number}) for number in range(count))
+class CaptureFolder(Model):
+    """A folder of captures, relative to the rig file.
+
+    shots: overrides those of its captures.yaml.
+    corners: a corners.vnl, relative to the rig file. Its corners of the rig's only board replace
+        those of the images that it names; the images themselves need not exist.
+    """
+
+    folder: Annotated[str, Field(min_length=1)]
+    files: str | None = None
+    shots: tuple[ShotName, ...] | None = None
+    corners: Annotated[str, Field(min_length=1)] | None = None
+
+    def problems(self) -> Iterator[Problem]:
+        for index, name in find_duplicates(self.shots or ()):
+            yield ("shots", index), f"is a shot named twice ({name})"
 
 
-def _name_faults(kind: ImageKind, names: str | tuple[str, ...]) -> Iterator[Problem]:
+def _name_faults(kind: ImageKind, names: Names) -> Iterator[Problem]:
     if isinstance(names, str):
         numbering = frame_name_faults(names, kind.number) if kind.number else ()
         for fault in [*numbering, *filter(None, [path_fault(names)])]:
@@ -57,17 +76,17 @@ class ImageNames(Model):
             return handler(keys)
         known = [*cls.model_fields, *(kind.name for kind in image_kinds())]
         errors = [unknown_key_error(key, known) for key in keys if key not in known]
-        # Strict validation accepts JSON's lists as tuples, but no longer knows that this was JSON.
-        own = {k: tuple(v) if isinstance(v, list) else v for k, v in keys.items() if k in known}
+        # Strict validation takes JSON's lists as tuples, but does not know that this was JSON.
+        named = {k: tuple(v) if isinstance(v, list) else v for k, v in keys.items() if k in known}
         try:
-            names = handler(own)
+            names = handler(named)
         except ValidationError as refused:
-            errors += repeated_errors(refused)
+            errors += copy_errors(refused)
         if errors:
             raise ValidationError.from_exception_data(cls.__name__, errors)
         return names
 
-    def given(self, kind: ImageKind) -> Names:
+    def templates(self, kind: ImageKind) -> Names:
         """The template or list of names for one kind of image."""
         return (self.model_extra or {}).get(kind.name, self.default(kind))
 
@@ -75,19 +94,23 @@ class ImageNames(Model):
         """The template of a kind of image that the rig file does not name."""
         return kind.template
 
-    def of_kind(self, kind: ImageKind, count: int) -> tuple[str, ...]:
+    def kind_names(self, kind: ImageKind, count: int) -> tuple[str, ...]:
         """Names of `count` images of one kind, in the code's order."""
-        names = self.given(kind)
-        return _numbered(names, kind, count) if isinstance(names, str) else names
+        names = self.templates(kind)
+        if not isinstance(names, str):
+            return names
+        if kind.number is None:
+            return (names,)
+        return tuple(names.format(**{kind.number: number}) for number in range(count))
 
-    def of_one_way(self, code: StripeCode) -> tuple[str, ...]:
+    def direction_names(self, code: StripeCode) -> tuple[str, ...]:
         """Names of a code's images in the order of its `image_counts`, without crossing stripes."""
         counts = code.image_counts.items()
-        return tuple(name for kind, count in counts for name in self.of_kind(kind, count))
+        return tuple(name for kind, count in counts for name in self.kind_names(kind, count))
 
     def problems(self) -> Iterator[Problem]:
         for kind in image_kinds():
-            yield from _name_faults(kind, self.given(kind))
+            yield from _name_faults(kind, self.templates(kind))
 
 
 class CrossingNames(ImageNames):
@@ -117,20 +140,18 @@ class FrameNames(ImageNames):
         images."""
         return self.board or self.lit
 
-    def of_code(self, code: StripeCode) -> tuple[str, ...]:
+    def code_names(self, code: StripeCode) -> tuple[str, ...]:
         """Names of a code's images, without lit and dark, in the order of its `image_counts`, then
         those of the crossing stripes."""
-        names = (self, self.crossing)
-        return tuple(
-            name
-            for own, way in zip(names, code.directions, strict=False)
-            for name in own.of_one_way(way)
-        )
+        by_direction = zip((self, self.crossing), code.directions, strict=False)
+        return tuple(name for names, one in by_direction for name in names.direction_names(one))
 
-    def as_shown(self, code: StripeCode) -> tuple[str, ...]:
-        """Names as `of_code`, in the best order to show them (`StripeCode.show_order`)."""
-        ways = zip((self, self.crossing), code.directions, strict=False)
-        return tuple(own.of_one_way(way)[k] for own, way in ways for k in way.show_order)
+    def shown_names(self, code: StripeCode) -> tuple[str, ...]:
+        """Names as `code_names`, in the best order to show them (`StripeCode.show_order`)."""
+        by_direction = zip((self, self.crossing), code.directions, strict=False)
+        return tuple(
+            names.direction_names(one)[k] for names, one in by_direction for k in one.show_order
+        )
 
     def moment_ms(self, code: StripeCode, frame_ms: Mapping[str, float]) -> float:
         """Compute the time at which a code's stripe map holds (`StripeCode.moment`), ms.
@@ -142,18 +163,18 @@ class FrameNames(ImageNames):
         counts = code.image_counts.items()
         return code.moment(
             {
-                kind.name: np.array([frame_ms[name] for name in self.of_kind(kind, count)])
+                kind.name: np.array([frame_ms[name] for name in self.kind_names(kind, count)])
                 for kind, count in counts
             }
         )
 
-    def of_sequence(self, code: StripeCode | None) -> tuple[str, ...]:
+    def sequence_names(self, code: StripeCode | None) -> tuple[str, ...]:
         """Names of all images of a sequence in the default order in which they are taken; for a
         camera without a projector, the board image alone."""
         if code is None:
             return tuple(filter(None, [self.board_image]))
-        dark = self.dark if any(way.uses_dark for way in code.directions) else None
-        return (*filter(None, (self.lit, dark, self.board)), *self.of_code(code))
+        dark = self.dark if any(one.uses_dark for one in code.directions) else None
+        return (*filter(None, (self.lit, dark, self.board)), *self.code_names(code))
 
     def problems(self) -> Iterator[Problem]:
         wrong = list(super().problems())
@@ -165,9 +186,9 @@ class FrameNames(ImageNames):
         yield from wrong
         refused = {where[0] for where, _ in wrong}
         names = [*single.values()]
-        for own in (self, self.crossing):
+        for one in (self, self.crossing):
             for kind in image_kinds():
                 if kind.name not in refused:
-                    names += own.of_kind(kind, kind.max_count)
-        for _, twice in islice(duplicates(names), 1):  # of a kind, all named alike
+                    names += one.kind_names(kind, kind.max_count)
+        for _, twice in islice(find_duplicates(names), 1):  # not one error for each of a kind
             yield (), f"gives two images the same name ({twice!r})"

@@ -1,22 +1,19 @@
-"""A pair: its camera, its projector, and where both are meant to stand."""
+"""A pair: its camera, its projector, their nominal poses, and what another program calibrated."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, PositiveFloat
 
-from bodyscan.files.model import Model, Name, Problem
-from bodyscan.rig.known import Known
+from bodyscan.files.model import Model, Name, Problem, did_you_mean
+from bodyscan.interchange.rig_format import RIG_FORMATS, Unit
 from bodyscan.rig.rig_frame import Vector
 from bodyscan.stripes.codes import AnyStripeCode
 
 Pixels = Annotated[int, Field(gt=0, le=32767)]
-
-
-AUTO = "auto"
-"""Lets held-out boards choose the lens."""
+AUTO = "auto"  # held-out boards choose the lens
 
 
 class CameraSpec(Model):
@@ -43,7 +40,7 @@ class CameraSpec(Model):
 
 
 class NominalPose(Model):
-    """Where something is meant to stand, rig frame: at `position_mm`, looking at `look_at_mm`."""
+    """A nominal pose in the rig frame: at `position_mm`, looking at `look_at_mm`."""
 
     position_mm: Vector
     look_at_mm: Vector
@@ -51,6 +48,87 @@ class NominalPose(Model):
     def problems(self) -> Iterator[Problem]:
         if self.position_mm == self.look_at_mm:
             yield ("look_at_mm",), "must differ from position_mm, or it looks nowhere"
+
+
+Text = Annotated[str, Field(min_length=1)]
+
+
+_WITH_NODES = "opencv"  # its files leave names to the user, so the rig file must give them
+
+
+class KnownCamera(Model):
+    """A camera, or a projector described as one, in another program's file.
+
+    file: if it differs from the pair's.
+    name: the camera's name in the file.
+    matrix, distortion, size (or width and height), rotation, translation: names of OpenCV's nodes.
+    inverse: rotation and translation take the camera's coordinates to the world's, not the reverse.
+    """
+
+    file: Text | None = None
+    name: Text | None = None
+    matrix: Text | None = None
+    distortion: Text | None = None
+    size: Text | None = None
+    width: Text | None = None
+    height: Text | None = None
+    rotation: Text | None = None
+    translation: Text | None = None
+    inverse: bool = False
+
+    @property
+    def nodes(self) -> dict[str, str]:
+        """Names of nodes, by what they hold."""
+        keys = ("matrix", "distortion", "size", "width", "height", "rotation", "translation")
+        return {key: getattr(self, key) for key in keys if getattr(self, key) is not None}
+
+    def problems(self) -> Iterator[Problem]:
+        for keys, what in (
+            (("rotation", "translation"), "a pose is a rotation and a translation"),
+            (("width", "height"), "a picture has a width and a height"),
+        ):
+            absent = [key for key in keys if getattr(self, key) is None]
+            if len(absent) == 1:
+                yield (absent[0],), f"is missing: {what}"
+        if self.size is not None and self.width is not None:
+            yield ("size",), "is said twice: give it, or width and height"
+        if self.nodes and self.matrix is None:
+            yield ("matrix",), "is missing: the node that holds the camera matrix"
+        if self.nodes and self.name is not None:
+            yield ("name",), "is for files that name their cameras: give it, or names of nodes"
+
+
+class Known(Model):
+    """A calibration by another program.
+
+    file: relative to the rig file.
+    units: of its lengths, where the format leaves that open.
+    camera: if left out, the one named as the pair is.
+    projector: if left out, nothing is known of it.
+    sigma_px: standard deviation of pixels due to this calibration; None: it is used as it is, and
+        its accuracy is unknown.
+    """
+
+    file: Text
+    format: str
+    units: Unit | None = None
+    camera: KnownCamera = KnownCamera()
+    projector: KnownCamera | None = None
+    sigma_px: PositiveFloat | None = None
+
+    def problems(self) -> Iterator[Problem]:
+        names = RIG_FORMATS.names()
+        if self.format not in names:
+            known = f"{', '.join(names)} are"
+            hint = did_you_mean(self.format, names)
+            yield ("format",), f"is not a format known here, {known}{hint} (got {self.format!r})"
+        elif self.format != _WITH_NODES:
+            for key, device in (("camera", self.camera), ("projector", self.projector)):
+                for node in device.nodes if device else ():
+                    yield (key, node), f"is for format: {_WITH_NODES}; name the camera instead"
+        named = self.projector
+        if named and not (named.name or named.nodes or named.file):
+            yield ("projector",), "does not say which of the file's cameras the projector is"
 
 
 class Pair(Model):

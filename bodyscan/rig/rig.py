@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Annotated, Literal
 
@@ -9,12 +10,10 @@ from pydantic import Field, PositiveFloat
 
 from bodyscan.files.model import Model, Name, Problem
 from bodyscan.rig.board import Board
-from bodyscan.rig.capture_folder import CaptureFolder
 from bodyscan.rig.consistency import RigParts, rig_problems
-from bodyscan.rig.frame_names import FrameNames
+from bodyscan.rig.frame_names import CaptureFolder, FrameNames
 from bodyscan.rig.pair import Pair
-from bodyscan.rig.reference import Reference
-from bodyscan.rig.rig_frame import RigFrame
+from bodyscan.rig.rig_frame import Reference, RigFrame
 
 
 class Volume(Model):
@@ -68,8 +67,9 @@ class Rig(Model):
     @property
     def is_known(self) -> bool:
         """Whether another program calibrated all of it, including the projectors."""
-        known = [(pair.known, pair.projector) for pair in self.pairs]
-        return all(own and (own.projector or not projector) for own, projector in known)
+        return all(
+            pair.known and (pair.known.projector or not pair.projector) for pair in self.pairs
+        )
 
     @property
     def poles(self) -> dict[str, str]:
@@ -105,3 +105,23 @@ class Rig(Model):
                 rig_frame=self.rig_frame,
             )
         )
+
+
+def find_unusual_lengths(rig: Rig) -> Iterator[str]:
+    """Warn of lengths that a body scanner is unlikely to have, such as metres instead of mm."""
+    lengths = [(f"board {one.name}: square_mm", one.square_mm, 2.0, 500.0) for one in rig.boards]
+    lengths += [
+        ("volume: radius_mm", rig.volume.radius_mm, 50.0, 5000.0),
+        ("volume: its height", rig.volume.top_mm - rig.volume.bottom_mm, 50.0, 5000.0),
+    ]
+    for pair in rig.pairs:
+        if pair.nominal is not None:
+            distance = math.dist(pair.nominal.position_mm, pair.nominal.look_at_mm)
+            what = f"pair {pair.name}: nominal, from what it looks at"
+            lengths.append((what, distance, 50.0, 20_000.0))
+    for what, value, low, high in lengths:
+        if not low <= value <= high:
+            yield (
+                f"{what} is {value:g} mm, but {low:g} to {high:g} mm is usual: check that it is in "
+                "mm, as all lengths of a rig file are"
+            )

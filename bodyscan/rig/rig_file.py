@@ -12,13 +12,11 @@ from bodyscan.files.model import Problem
 from bodyscan.files.model_file import load_model, validate
 from bodyscan.files.yaml_file import dump_yaml
 from bodyscan.rig.board import Board
-from bodyscan.rig.capture_folder import CaptureFolder
 from bodyscan.rig.consistency import RigParts, rig_problems
-from bodyscan.rig.frame_names import FrameNames
+from bodyscan.rig.frame_names import CaptureFolder, FrameNames
 from bodyscan.rig.pair import Pair
-from bodyscan.rig.reference import Reference
 from bodyscan.rig.rig import Rig
-from bodyscan.rig.rig_frame import RigFrame
+from bodyscan.rig.rig_frame import Reference, RigFrame
 
 _REMEDY = "Correct the rig file; docs/formats.md explains every key."
 

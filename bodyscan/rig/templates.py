@@ -12,9 +12,7 @@ from string import Formatter
 
 from bodyscan.files.model import SHOT
 
-_FIELDS = ("shot", "pair", "frame", "exposure")
-_SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg")
-_VIDEOS = (".mp4", ".m4v", ".avi", ".mov", ".mkv", ".webm", ".wmv", ".mpg", ".mpeg")
+ANYTHING = "*"
 
 
 def fill(template: str, *, shot: str, pair: str, frame: str) -> str:
@@ -29,9 +27,6 @@ def with_exposure(template: str, exposure: str) -> str:
 
 def has_field(template: str, field: str) -> bool:
     return field in _fields(template)
-
-
-ANYTHING = "*"
 
 
 def names_pattern(name: str) -> re.Pattern[str]:
@@ -64,15 +59,17 @@ def template_faults(
         yield "needs {exposure}, since every image is taken with several exposures"
     if "exposure" in fields and not exposures:
         yield "holds {exposure}, but the rig file names no `exposures`"
-    if template.lower().endswith(_VIDEOS):
+    videos = (".mp4", ".m4v", ".avi", ".mov", ".mkv", ".webm", ".wmv", ".mpg", ".mpeg")
+    suffixes = (".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg")
+    if template.lower().endswith(videos):
         images = f"{template.rpartition('.')[0]}/%04d.png"
         yield (
             "names a video: unpack each with `ffmpeg -i VIDEO -fps_mode passthrough -start_number 0"
             f" FOLDER/%04d.png`, write {images.replace('%04d', '{frame}')!r} here, and under `frames`"
             " the numbers of the images, such as '0000'"
         )
-    elif not template.lower().endswith(_SUFFIXES):
-        yield f"must end in {', '.join(_SUFFIXES)}: only PNG, TIFF, BMP and JPEG images are read"
+    elif not template.lower().endswith(suffixes):
+        yield f"must end in {', '.join(suffixes)}: only PNG, TIFF, BMP and JPEG images are read"
     fault = path_fault(template)
     if fault:
         yield fault
@@ -106,12 +103,12 @@ def path_fault(path: str) -> str | None:
 
 
 def _fields(template: str) -> set[str]:
-    fields = set()
+    known, fields = ("shot", "pair", "frame", "exposure"), set()
     for _, field, spec, conversion in Formatter().parse(template):
         if field is None:
             continue
-        if field not in _FIELDS or spec or conversion:
-            allowed = ", ".join(f"{{{name}}}" for name in _FIELDS)
+        if field not in known or spec or conversion:
+            allowed = ", ".join(f"{{{name}}}" for name in known)
             raise ValueError(f"it may hold {allowed}, not {{{field}}}")
         fields.add(field)
     return fields

@@ -13,10 +13,15 @@ import cv2
 import numpy as np
 
 from bodyscan.arrays import Bytes
-from bodyscan.captures.captures_file import CapturesFile, ShotEntry, write_captures_file
-from bodyscan.captures.timing import Timing, times_of_frames
+from bodyscan.captures.captures_file import (
+    CapturesFile,
+    ShotEntry,
+    Timing,
+    compute_frame_times,
+    write_captures_file,
+)
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.rig.capture_folder import CaptureFolder
+from bodyscan.rig.frame_names import CaptureFolder
 from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig import Rig
 from bodyscan.simulation.board import MadeBoard
@@ -83,8 +88,8 @@ def timing_of(pace: Pace) -> Timing:
 
 def times_of_person(rig: Rig, shot: str, pace: Pace) -> dict[str, dict[str, float]]:
     """Times by pair, then by frame, ms since the first pair began."""
-    taken = {(shot, pair.name): rig.frames.of_sequence(pair.projector) for pair in rig.pairs}
-    times = times_of_frames(timing_of(pace), rig, taken, Path())
+    taken = {(shot, pair.name): rig.frames.sequence_names(pair.projector) for pair in rig.pairs}
+    times = compute_frame_times(timing_of(pace), rig, taken, Path())
     return {pair: dict(times[shot, pair]) for shot, pair in taken}
 
 

@@ -192,7 +192,7 @@ def _bit_images(frames: FrameNames, bits: Array, inverses: bool) -> dict[str, Ar
 
 
 def _name_images(frames: FrameNames, kind: ImageKind, images: Array) -> dict[str, Array]:
-    return dict(zip(frames.of_kind(kind, len(images)), images, strict=True))
+    return dict(zip(frames.kind_names(kind, len(images)), images, strict=True))
 
 
 def instrument_images(
@@ -215,5 +215,5 @@ def instrument_images(
     index = number[words]
     index[lit.astype(int) - dark < 12] = 0  # grey levels: too dark for a stripe
     index[lit == 255] = 255  # saturated
-    (name,) = frames.of_kind(INDEX, 1)
+    (name,) = frames.kind_names(INDEX, 1)
     return {lit_name: lit, name: index}

@@ -10,7 +10,7 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 
 from bodyscan.errors import BadInput
-from bodyscan.files.model import alternatives, did_you_mean
+from bodyscan.files.model import did_you_mean, format_alternatives
 from bodyscan.simulation.settings import SimulationSettings
 
 SUBJECTS: Mapping[str, Mapping[str, Any]] = {
@@ -128,7 +128,8 @@ def settings_for(
     ):
         if name not in known:
             raise BadInput(
-                f"there is no {what} {name!r} to simulate", remedy=f"Choose {alternatives(known)}."
+                f"there is no {what} {name!r} to simulate",
+                remedy=f"Choose {format_alternatives(known)}.",
             )
     if sway_mm and SUBJECTS[subject]:
         raise BadInput(

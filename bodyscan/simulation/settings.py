@@ -224,8 +224,8 @@ class Pace:
 
     frame_ms: from one frame to the next; by default 120 per second.
     start: of the pairs; as `timing` of captures.yaml.
-    order: names of frames as they are taken, () as `FrameNames.of_sequence` lists them: patterns, then
-        inverses, which is not the order that `bodyscan patterns` proposes.
+    order: names of frames as they are taken, () as `FrameNames.sequence_names` lists them: patterns,
+        then inverses, which is not the order that `bodyscan patterns` proposes.
     """
 
     frame_ms: float = 1000.0 / 120.0

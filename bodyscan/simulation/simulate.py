@@ -277,7 +277,7 @@ def render_task(
     scene, moving = _scenes(pair, room, task)
     light = settings.lighting
     code = rig.pair(pair.name).projector
-    taken = settings.pace.order or rig.frames.of_sequence(code)
+    taken = settings.pace.order or rig.frames.sequence_names(code)
     flicker = draw_flicker(taken, settings, rng.spawn(1)[0])
     images = render_pair(
         scene,

@@ -27,7 +27,7 @@ from bodyscan.evaluation.acceptance_readings import (
     grade_acceptance,
 )
 from bodyscan.files.atomic import write_json, write_text
-from bodyscan.files.os_errors import require_writable
+from bodyscan.files.messages import require_writable
 from bodyscan.fusion.cleaning import clean
 from bodyscan.fusion.merging import merge
 from bodyscan.optional import optional
@@ -214,7 +214,7 @@ def _clouds(
 
     Raises ScanFailed.
     """
-    one = replace(captures, shots=(shot,), sequences=captures.of_shot(shot))
+    one = replace(captures, shots=(shot,), sequences=captures.shot_sequences(shot))
     images = reconstruct_range_images(calibration, one, progress).value
     cleaned = clean(images, calibration.rig_from_camera, calibration.rig.volume)
     measured = [image for image in cleaned if image.valid.any()]

@@ -13,8 +13,8 @@ from bodyscan.calibration.board_views import LocatedView
 from bodyscan.calibration.camera import CameraCalibration
 from bodyscan.calibration.pair import PairCalibration, calibrate_pair
 from bodyscan.calibration.striped_view import BoardBoundaries
+from bodyscan.captures.check import describe_unlisted_images
 from bodyscan.captures.folder import Captures, open_captures
-from bodyscan.captures.unlisted_images import describe_unlisted_images
 from bodyscan.errors import BadInput, BodyscanError, FailedWork, format_error
 from bodyscan.optional import optional
 from bodyscan.outcome import Outcome

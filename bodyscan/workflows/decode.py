@@ -176,7 +176,9 @@ def decode_pairs(
     for name in {s.pair for s in sequences}:
         of_pair = [v for (pair, _), group in wanted.items() if pair == name for v in group]
         step[name] = prints.band_step(rig.pair(name), of_pair) if prints else 1
-    turn = {s: captures.of_pair(s.pair).index(s) for s in sequences}  # shots take turns in bands
+    turn = {
+        s: captures.pair_sequences(s.pair).index(s) for s in sequences
+    }  # shots take turns in bands
 
     def decode(sequence: ImageSequence) -> BoardStripes:
         pair, group = rig.pair(sequence.pair), wanted[sequence.pair, sequence.shot]
@@ -253,7 +255,9 @@ def _without_stripes(
     shots = dict(wanted)
     return {
         pair.name: "no stripe sequence was found in any shot of the board: there is no image such as "
-        + fill(rig.files, shot=shots[pair.name], pair=pair.name, frame=rig.frames.of_code(code)[0])
+        + fill(
+            rig.files, shot=shots[pair.name], pair=pair.name, frame=rig.frames.code_names(code)[0]
+        )
         for pair in rig.pairs
         for code in [pair.projector]
         if code is not None and pair.name in shots and pair.name not in decoded

@@ -43,8 +43,7 @@ from bodyscan.progress import Progress, attempt_each, map_threads, silent
 from bodyscan.registration.board_appearance import appearance_notes, without_odd_mirrored
 from bodyscan.registration.board_checks import describe_findings
 from bodyscan.registration.soundness import camera_faults
-from bodyscan.rig.known import Known
-from bodyscan.rig.pair import AUTO
+from bodyscan.rig.pair import AUTO, Known
 from bodyscan.rig.rig import Rig
 
 HERE = Path()
@@ -74,7 +73,7 @@ def find_all_boards(rig: Rig, captures: Captures, progress: Progress = silent) -
 
     def find(sequence: ImageSequence) -> tuple[list[BoardView], BodyscanError | None]:
         try:
-            if sequence.seen_in in captures.corners:
+            if sequence.board_path in captures.corners:
                 return _given_view(rig, captures, sequence), None
             image = read_board_image(sequence, rig.pair(sequence.pair))
             found = find_boards(image, rig.boards, pair=sequence.pair, shot=sequence.shot)
@@ -87,11 +86,11 @@ def find_all_boards(rig: Rig, captures: Captures, progress: Progress = silent) -
     without = [
         sequence
         for sequence, (found, error) in zip(captures.sequences, results, strict=True)
-        if not found and error is None and sequence.seen_in not in captures.corners
+        if not found and error is None and sequence.board_path not in captures.corners
     ]
     looked_at = _look_closer(rig, views, without)
     missing = [
-        f"{s.seen_in} (pair {s.pair}, shot {s.shot}): no board found"
+        f"{s.board_path} (pair {s.pair}, shot {s.shot}): no board found"
         + (f": {looked_at[s]}" if s in looked_at else "")
         for s in without
     ]
@@ -116,14 +115,14 @@ def _given_view(rig: Rig, captures: Captures, sequence: ImageSequence) -> list[B
             remedy="Corners found elsewhere are those of one board: describe that one alone.",
         )
     camera = rig.pair(sequence.pair).camera
-    pixels = np.array(captures.corners[sequence.seen_in]).reshape(-1, 2)
+    pixels = np.array(captures.corners[sequence.board_path]).reshape(-1, 2)
     view = number_corners(
         pixels,
         rig.boards[0],
         (camera.width, camera.height),
         pair=sequence.pair,
         shot=sequence.shot,
-        where=str(sequence.seen_in),
+        where=str(sequence.board_path),
     )
     return [] if view is None else [view]
 
@@ -142,7 +141,7 @@ def write_found_corners(
     by_sequence = {(view.pair, view.shot): view for view in views}
 
     def row(sequence: ImageSequence) -> tuple[str, Corners]:
-        image = sequence.seen_in
+        image = sequence.board_path
         inside = [folder for folder in captures.folders if image.is_relative_to(folder)]
         name = image.relative_to(inside[0]).as_posix() if inside else image.name
         view = by_sequence.get((sequence.pair, sequence.shot))

@@ -11,7 +11,7 @@ from bodyscan.arrays import Array
 from bodyscan.calibration.known_pair import KnownPair, parameter_sigmas, read_known_pair
 from bodyscan.calibration.pair import PairCalibration, PairQuality
 from bodyscan.errors import BadInput, BodyscanError, CalibrationFileError
-from bodyscan.files.relative_text import relative_text
+from bodyscan.files.messages import make_paths_relative
 from bodyscan.geometry.transforms import RigidTransform, adjoint
 from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.registration.rig_calibration import RigCalibration
@@ -65,7 +65,7 @@ def import_rig(rig: Rig, folder: Path, sigma_px: float | None = None) -> RigCali
         rig_from_camera,
         _covariance(known, rig_from_camera),
         {},
-        {name: relative_text(str(error), folder) for name, error in failed.items()},
+        {name: make_paths_relative(str(error), folder) for name, error in failed.items()},
         tuple(_note(name, one) for name, one in known.items()),
     )
 

@@ -78,7 +78,7 @@ def reconstruct_range_images(
         for pair in calibration.rig.pairs
         if pair.projector
         and pair.name not in failed
-        and not any(s.has_stripes for s in captures.of_pair(pair.name))
+        and not any(s.has_stripes for s in captures.pair_sequences(pair.name))
     }
     sequences = [s for s in captures.sequences if s.has_stripes and s.pair not in failed]
 

@@ -1,4 +1,4 @@
-"""`bodyscan check`: every fault of a rig's captures found and told, without decoding an image."""
+"""`bodyscan check`: every fault of a rig's captures found and reported, without decoding an image."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 from real_captures import real_rig_file
 from small_captures import FRAMES, RIG, encoded, picture, write, write_small_captures
 
-from bodyscan.captures.check import check, report_lines
+from bodyscan.captures.check import check, format_report
 from bodyscan.captures.image_header import read_header
 from bodyscan.errors import RigFileError
 
@@ -28,10 +28,10 @@ def image(rig_path: Path, shot: str, pair: str, frame: str) -> Path:
 
 
 def lines_with(rig_path: Path, word: str) -> list[str]:
-    return [line for line in report_lines(check(rig_path)) if word in line]
+    return [line for line in format_report(check(rig_path)) if word in line]
 
 
-def test_good_captures_are_good(rig_path: Path) -> None:
+def test_complete_captures_are_good(rig_path: Path) -> None:
     report = check(rig_path)
     assert report.ok
     assert report.images == 3 * (2 * len(FRAMES) + 1)
@@ -40,7 +40,7 @@ def test_good_captures_are_good(rig_path: Path) -> None:
         ("p2", 3, 0),
         ("cam", 0, 3),
     ]
-    assert report_lines(report)[-1] == "good"
+    assert format_report(report)[-1] == "good"
 
 
 def test_missing_images_are_grouped_by_pair_and_shot(rig_path: Path) -> None:
@@ -71,9 +71,7 @@ def test_missing_images_are_grouped_by_pair_and_shot(rig_path: Path) -> None:
           "phase00", "phase01", "phase02"]),
     ],
 )  # fmt: skip
-def test_the_images_that_a_code_takes_are_known(
-    tmp_path: Path, code: str, frames: list[str]
-) -> None:
+def test_each_code_needs_its_images(tmp_path: Path, code: str, frames: list[str]) -> None:
     rig_path = write(tmp_path / "rig.yaml", RIG.replace("code: gray", code))
     for shot in ("b1", "b2", "b3"):
         write(image(rig_path, shot, "cam", "lit"), picture("lit"))
@@ -94,7 +92,7 @@ def test_the_images_that_a_code_takes_are_known(
     ("content", "what"),
     [
         (b"", "is an empty file"),
-        (b"text", "is no PNG, JPEG, BMP or TIFF image"),
+        (b"text", "is not a PNG, JPEG, BMP or TIFF image"),
         (encoded(picture("lit"))[:-12], "is cut short"),
         (encoded(picture("lit")[:-1]), "is 40 x 29 pixels, but the rig file says 40 x 30"),
         (encoded(picture("lit").astype("float32"), ".tif"), "has 32 bits a sample"),
@@ -117,7 +115,7 @@ def test_too_few_shots(tmp_path: Path) -> None:
     ]
 
 
-def test_unknown_pairs_and_shots_that_are_not_there(rig_path: Path) -> None:
+def test_unknown_pairs_and_missing_shots_are_reported(rig_path: Path) -> None:
     file = rig_path.parent / "captures" / "captures.yaml"
     write(file, "kind: calibration\nshots: [{name: b1, stripes: [p7]}]")
     (line,) = lines_with(rig_path, "names no pair of rig small")
@@ -163,7 +161,7 @@ def test_scans_are_checked_with_the_rig(rig_path: Path, tmp_path: Path) -> None:
     assert report.pairs[0].stripe_shots == 3  # a scan calibrates nothing
 
 
-def test_a_wrong_rig_file_is_told_by_line(rig_path: Path) -> None:
+def test_mistakes_in_the_rig_file_are_reported_by_line(rig_path: Path) -> None:
     write(rig_path, RIG.replace("width: 40", "width: 0"))
     with pytest.raises(RigFileError, match=r":7:29: pairs\[0\]\.camera\.width: must be greater"):
         check(rig_path)
@@ -186,38 +184,38 @@ def test_real_captures_are_read_where_they_lie(
     captures: Path, tmp_path: Path, rig: str, images: int
 ) -> None:
     report = check(real_rig_file(rig, captures, tmp_path))
-    assert report.ok, report_lines(report)
+    assert report.ok, format_report(report)
     assert report.images == images
 
 
-def test_a_renamed_folder_is_not_passed_over_in_silence(rig_path: Path) -> None:
+def test_images_in_a_renamed_folder_are_reported(rig_path: Path) -> None:
     folder = image(rig_path, "b2", "p1", "lit").parent
     folder.rename(folder.with_name("P1"))
-    (warning,) = lines_with(rig_path, "spelt differently")
+    (warning,) = lines_with(rig_path, "check the spelling")
     assert f"{len(FRAMES)} images belong to no pair" in warning
     assert str(folder.with_name("P1")) in warning
 
 
-def test_a_listed_shot_whose_folder_was_renamed_is_not_passed_over(rig_path: Path) -> None:
+def test_a_renamed_folder_of_a_listed_shot_is_reported(rig_path: Path) -> None:
     folder = rig_path.parent / "captures"
     shots = [f"{{name: b{k}, stripes: [p1, p2], lit: [cam]}}" for k in (1, 2, 3)]
     (folder / "captures.yaml").write_text(
         f"version: 1\nkind: calibration\nshots: [{', '.join(shots)}]\n"
     )
-    assert lines_with(rig_path, "spelt differently") == []
+    assert lines_with(rig_path, "check the spelling") == []
     (folder / "b2").rename(folder / "pose-2")
-    (warning,) = lines_with(rig_path, "spelt differently")
+    (warning,) = lines_with(rig_path, "check the spelling")
     assert f"{2 * len(FRAMES) + 1} images belong to no pair" in warning
     assert str(folder / "pose-2") in warning
 
 
-def test_images_of_shots_that_are_not_wanted_are_left_alone(rig_path: Path) -> None:
+def test_images_of_unwanted_shots_are_ignored(rig_path: Path) -> None:
     folder = rig_path.parent / "captures"
     shutil.copytree(folder / "b2", rig_path.parent / "captures" / "elsewhere" / "b9")
-    assert lines_with(rig_path, "spelt differently") == []
+    assert lines_with(rig_path, "check the spelling") == []
 
 
-def test_few_poses_are_warned_of(rig_path: Path) -> None:
+def test_few_poses_give_a_warning(rig_path: Path) -> None:
     warnings = lines_with(rig_path, "or more are better")
     assert len(warnings) == 3
     assert "pair p1: 3 board poses" in warnings[0]
@@ -244,47 +242,43 @@ def test_the_same_fault_in_many_shots_is_one_line(rig_path: Path) -> None:
         ("kind: charuco, columns: 9, rows: 7, marker_mm: 20", False),
     ],
 )
-def test_a_board_that_looks_the_same_turned_round_is_named(
-    rig_path: Path, board: str, turned: bool
-) -> None:
+def test_a_symmetric_board_gives_a_warning(rig_path: Path, board: str, turned: bool) -> None:
     write(rig_path, RIG.replace("columns: 5, rows: 4", board))
-    assert len(lines_with(rig_path, "board board looks the same turned round")) == turned
+    assert len(lines_with(rig_path, "board board looks the same rotated")) == turned
 
 
-@pytest.mark.parametrize(("quality", "told"), [(40, True), (96, False)])
-def test_jpeg_of_low_quality_is_named_with_its_pair(
-    rig_path: Path, quality: int, told: bool
-) -> None:
+@pytest.mark.parametrize(("quality", "warned"), [(40, True), (96, False)])
+def test_low_jpeg_quality_gives_a_warning(rig_path: Path, quality: int, warned: bool) -> None:
     for path in sorted(rig_path.parent.rglob("p2/*.png")):
         content = cv2.imencode(".jpg", picture("lit"), [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
         write(path, content.tobytes())
     found = lines_with(rig_path, "JPEG of low quality")
-    assert len(found) == told
-    assert not told or "images of p2 are" in found[0]
+    assert len(found) == warned
+    assert not warned or "images of p2 are" in found[0]
 
 
-def test_what_jpeg_leaves_is_as_its_tables_say(tmp_path: Path) -> None:
+def test_the_rounding_error_of_jpeg_follows_from_its_tables(tmp_path: Path) -> None:
     """Of noise, which has everything in it that rounding can take."""
     noise = np.random.default_rng(0).integers(0, 256, (256, 256)).astype(np.uint8)
     path = tmp_path / "noise.jpg"
     for quality in (50, 80, 95):
         cv2.imwrite(str(path), noise, [cv2.IMWRITE_JPEG_QUALITY, quality])
-        off = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE).astype(float) - noise
+        error = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE).astype(float) - noise
         # Grey levels beyond 0 and 255 are cut, which takes some of the error.
-        assert read_header(path).rounded == pytest.approx(off.std(), rel=0.15)
+        assert read_header(path).rounding_error == pytest.approx(error.std(), rel=0.15)
 
 
-def test_pairs_that_no_shot_ties_together_are_named(rig_path: Path) -> None:
+def test_groups_of_pairs_without_a_common_shot_are_reported(rig_path: Path) -> None:
     for shot in ("b1", "b2", "b3"):
         folder = rig_path.parent / "captures" / shot / "p2"
         shutil.copytree(folder, rig_path.parent / "captures" / f"c{shot}" / "p2")
         shutil.rmtree(folder)
-    (line,) = lines_with(rig_path, "nothing ties")
+    (line,) = lines_with(rig_path, "no shot in common")
     assert "p2 | cam, p1;" in line
     assert not check(rig_path).ok
 
 
-def test_a_shot_that_is_to_fix_the_rig_frame_must_be_whole(rig_path: Path) -> None:
+def test_the_shot_that_fixes_the_rig_frame_must_be_complete(rig_path: Path) -> None:
     write(rig_path, RIG + "rig_frame: {shot: b2}\n")
     assert check(rig_path).ok
     for pair in ("p1", "p2", "cam"):
@@ -292,7 +286,7 @@ def test_a_shot_that_is_to_fix_the_rig_frame_must_be_whole(rig_path: Path) -> No
     assert lines_with(rig_path, "no pair has its images of 'b2', which fixes the rig frame")
 
 
-def test_names_whose_capitals_differ_are_told(rig_path: Path) -> None:
+def test_names_that_differ_in_capitals_are_reported(rig_path: Path) -> None:
     wanted = image(rig_path, "b2", "p1", "bit02")
     wanted.rename(wanted.with_suffix(".PNG"))
     if wanted.exists():
@@ -301,7 +295,7 @@ def test_names_whose_capitals_differ_are_told(rig_path: Path) -> None:
     assert str(wanted) in line
 
 
-def test_captures_that_are_named_otherwise_are_shown(rig_path: Path) -> None:
+def test_an_image_with_another_name_is_shown(rig_path: Path) -> None:
     for path in (rig_path.parent / "captures").rglob("*.png"):
         path.rename(path.with_suffix(".PNG"))
     if image(rig_path, "b1", "p1", "lit").exists():
@@ -312,7 +306,7 @@ def test_captures_that_are_named_otherwise_are_shown(rig_path: Path) -> None:
     assert ".PNG" in line
 
 
-def test_a_shot_with_another_suffix_is_not_passed_over_in_silence(tmp_path: Path) -> None:
+def test_images_with_another_suffix_are_reported(tmp_path: Path) -> None:
     rig_path = write_small_captures(tmp_path)
     images = sorted((tmp_path / "captures" / "b2").rglob("*.png"))
     for path in images:
@@ -322,8 +316,8 @@ def test_a_shot_with_another_suffix_is_not_passed_over_in_silence(tmp_path: Path
     assert ".PNG" in warning
 
 
-def test_a_rig_that_is_known_needs_no_poses(captures: Path, tmp_path: Path) -> None:
+def test_a_known_rig_needs_no_poses(captures: Path, tmp_path: Path) -> None:
     report = check(real_rig_file("two-frequency", captures, tmp_path))
-    assert report.ok, report_lines(report)
+    assert report.ok, format_report(report)
     assert sum("bodyscan import" in warning for warning in report.warnings) == 1
     assert not any("poses" in warning or "sequences" in warning for warning in report.warnings)

@@ -12,8 +12,8 @@ import yaml
 from small_captures import encoded, write
 from stripe_rendering import code_light, render
 
-from bodyscan.captures.exposures import merge_exposures
 from bodyscan.captures.folder import open_scan
+from bodyscan.captures.grey_levels import merge_exposures
 from bodyscan.captures.images import read_sequence
 from bodyscan.errors import ImageError, RigFileError
 from bodyscan.geometry.robust import robust_scale
@@ -120,7 +120,7 @@ def test_exchanged_exposures_are_named() -> None:
     with pytest.raises(ImageError) as refused:
         merge_exposures([long, short], ["short", "long"], "pair a, shot b")
     # A sixth, fitted to what is white in neither.
-    said = r"long is 0\.1[678] times as bright as short, which is said to be the shorter one"
+    said = r"long is 0\.1[678] times as bright as short, which is listed as the shorter one"
     assert re.search(said, str(refused.value))
     assert "`exposures: [long, short]`" in str(refused.value)
 
@@ -157,7 +157,7 @@ def test_a_rig_file_names_its_exposures(tmp_path: Path) -> None:
     rig = load_rig(rig_file(tmp_path))
     projector = rig.pairs[0].projector
     assert projector is not None
-    frames = ("lit", "dark", *rig.frames.of_code(projector))
+    frames = ("lit", "dark", *rig.frames.code_names(projector))
     (tmp_path / "scan/a").mkdir(parents=True)
     for name, times in (("short", 1.0), ("long", 8.0)):
         images, _ = exposed(GRAY, times)

@@ -67,8 +67,8 @@ def test_files_tell_what_each_pair_took(tmp_path: Path) -> None:
     assert camera is not None
     assert not camera.has_stripes
     assert camera.paths == (tmp_path / "captures" / "b1" / "cam" / "lit.png",)
-    assert [s.shot for s in captures.of_pair("cam")] == ["b1", "b2", "b3"]
-    assert [s.pair for s in captures.of_shot("b2")] == ["p1", "p2", "cam"]
+    assert [s.shot for s in captures.pair_sequences("cam")] == ["b1", "b2", "b3"]
+    assert [s.pair for s in captures.shot_sequences("b2")] == ["p1", "p2", "cam"]
     assert captures.missing() == ()
 
 
@@ -133,7 +133,7 @@ def test_the_rig_file_chooses_shots_over_captures_yaml(tmp_path: Path) -> None:
     )
     captures = opened(rig_path)
     assert captures.shots == ("b3", "b1")
-    assert [s.pair for s in captures.of_shot("b1")] == ["p1"]
+    assert [s.pair for s in captures.shot_sequences("b1")] == ["p1"]
 
 
 @pytest.mark.parametrize(
@@ -180,7 +180,7 @@ def test_a_template_without_shot_makes_a_folder_one_shot(tmp_path: Path) -> None
     assert scan.shots == ("scan7",)
     assert scan.missing() == ()
     (tmp_path / "scan7").rename(tmp_path / "(Eve)")
-    with pytest.raises(CaptureError, match="cannot give its shot its own name"):
+    with pytest.raises(CaptureError, match=r"the folder.s name is not a valid shot name"):
         open_scan(rig, tmp_path / "(Eve)")
     write(tmp_path / "(Eve)" / "captures.yaml",
           "kind: scan\nsubject: S-1\nshots: [{name: still}]")  # fmt: skip
@@ -197,10 +197,10 @@ def test_folders_are_joined_and_shots_of_one_name_are_one_moment(tmp_path: Path)
     rig_path = with_rig(tmp_path, RIG + "  - folder: other\n")
     joined = opened(rig_path)
     assert joined.folders == (captures, tmp_path / "other")
-    assert [s.pair for s in joined.of_shot("b1")] == ["p1", "p2", "cam"]
+    assert [s.pair for s in joined.shot_sequences("b1")] == ["p1", "p2", "cam"]
     assert joined.missing() == ()
     write(tmp_path / "other" / "b1" / "p1" / "lit.png", picture("lit"))
-    with pytest.raises(CaptureError, match=r"shot b1 of pair p1 lies in .*captures as well"):
+    with pytest.raises(CaptureError, match=r"shot b1 of pair p1 is in .*captures as well"):
         opened(rig_path)
 
 

@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from small_captures import write_small_captures
 
-from bodyscan.captures.check import check, report_lines
+from bodyscan.captures.check import check, format_report
 from bodyscan.captures.folder import open_captures
 from bodyscan.captures.images import read_sequence
 from bodyscan.errors import BodyscanError
@@ -64,7 +64,7 @@ def test_nothing_but_our_own_errors(whole: Path, data: st.DataObject) -> None:
     (folder / name).write_bytes(damaged)
     rig_path = folder / "rig.yaml"
     with suppress(BodyscanError):
-        report_lines(check(rig_path))
+        format_report(check(rig_path))
     with suppress(BodyscanError):
         rig = load_rig(rig_path)
         for sequence in open_captures(rig, rig_path).sequences:

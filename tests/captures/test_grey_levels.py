@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from small_captures import encoded, write
 
-from bodyscan.captures.grey_levels import as_greys, full_scale
+from bodyscan.captures.grey_levels import convert_to_greys, find_full_scale
 from bodyscan.captures.images import read_image
 from bodyscan.errors import ImageError
 from bodyscan.rig.pair import CameraSpec
@@ -58,8 +58,8 @@ def test_one_channel_of_a_colour_image_can_be_chosen(
 def test_no_bit_is_lost_wherever_it_stands(
     numbers: np.ndarray, bits: int | None, white: int
 ) -> None:
-    assert full_scale([numbers], bits) == white
-    grey = as_greys(numbers, full_scale([numbers], bits))
+    assert find_full_scale([numbers], bits) == white
+    grey = convert_to_greys(numbers, find_full_scale([numbers], bits))
     assert grey.dtype == np.float32
     np.testing.assert_allclose(grey, numbers * (255.0 / white), rtol=1e-6)
     assert len(np.unique(grey)) == len(np.unique(numbers))

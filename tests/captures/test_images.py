@@ -16,9 +16,10 @@ from hypothesis import strategies as st
 from small_captures import BITS, FRAMES, HEIGHT, STRIPES, WIDTH, encoded, picture, write
 from small_captures import write_small_captures as small
 
-from bodyscan.captures.check import check, report_lines
+from bodyscan.captures.check import check, format_report
 from bodyscan.captures.folder import ImageSequence, open_captures
-from bodyscan.captures.image_header import NoImage, png_damage, read_header
+from bodyscan.captures.grey_png import png_damage
+from bodyscan.captures.image_header import NotAnImage, read_header
 from bodyscan.captures.images import read_board_image, read_image, read_sequence
 from bodyscan.errors import BadInput, ImageError
 from bodyscan.rig.pair import CameraSpec
@@ -78,7 +79,7 @@ def test_colour_becomes_grey_and_exif_turns_are_not_applied(tmp_path: Path) -> N
     [
         (None, "is missing"),
         (b"", "is an empty file"),
-        (b"this is text", "is no PNG, JPEG, BMP or TIFF image"),
+        (b"this is text", "is not a PNG, JPEG, BMP or TIFF image"),
         (encoded(NOISE, ".bmp")[:-20], "is cut short"),
         (encoded(NOISE, ".bmp")[:20], "is cut short"),
         (encoded(NOISE, ".tif")[:-20], "is cut short"),
@@ -95,7 +96,10 @@ def test_colour_becomes_grey_and_exif_turns_are_not_applied(tmp_path: Path) -> N
         (encoded(NOISE, ".jpg")[:30], "is cut short"),
         (png(WIDTH, HEIGHT), "cannot be decoded"),
         (b"\x89PNG\r\n\x1a\n" + bytes(50), "is damaged (its PNG header is wrong)"),
-        (b"\xff\xd8\xff\xe0\x00\x01" + bytes(50), "is damaged (its JPEG header is wrong)"),
+        (
+            b"\xff\xd8\xff\xe0\x00\x01" + bytes(50),
+            "is cut short or damaged (its JPEG header cannot be read)",
+        ),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
@@ -150,7 +154,7 @@ def test_any_bytes_give_a_header_or_a_reason(
 ) -> None:
     path = tmp_path_factory.getbasetemp() / "any.png"
     path.write_bytes(start + tail)
-    with suppress(NoImage):  # anything else that is raised would reach the user as a traceback
+    with suppress(NotAnImage):  # anything else that is raised would reach the user as a traceback
         assert read_header(path).width >= 0
 
 
@@ -233,7 +237,7 @@ def test_a_black_sequence_is_refused_and_a_lit_image_is_no_sequence(tmp_path: Pa
     sequence = first_sequence(tmp_path)
     pair = load_rig(tmp_path / "rig.yaml").pair("p1")
     np.testing.assert_array_equal(read_board_image(sequence, pair), picture("lit"))
-    write(sequence.seen_in, picture("dark"))
+    write(sequence.board_path, picture("dark"))
     with pytest.raises(ImageError, match="shows nothing"):
         read_sequence(sequence, CAMERA)
     with pytest.raises(ImageError, match="shows nothing"):
@@ -258,7 +262,7 @@ def test_boards_are_looked_for_in_the_image_taken_for_them(tmp_path: Path) -> No
         sequence = captures.sequence(name, "b1")
         assert sequence is not None
         assert len(sequence.paths) == frames
-        assert sequence.seen_in.name == "room.png"
+        assert sequence.board_path.name == "room.png"
         assert read_board_image(sequence, rig.pair(name)).max() == 90
     sequence = captures.sequence("p1", "b1")
     assert sequence is not None
@@ -280,7 +284,7 @@ def test_the_lit_image_is_made_where_none_was_taken(tmp_path: Path) -> None:
     sequence = captures.sequence("p1", "b1")
     assert sequence is not None
     assert sequence.lit is None
-    assert sequence.seen_in.name == "bit00.png"
+    assert sequence.board_path.name == "bit00.png"
     assert read_sequence(sequence, CAMERA).lit is None
     # Every pixel is bright, 200, in one of a pattern and its inverse.
     np.testing.assert_array_equal(read_board_image(sequence, rig.pair("p1")), picture("lit"))
@@ -298,11 +302,13 @@ def test_a_star_in_a_name_stands_for_what_differs(tmp_path: Path) -> None:
     sequence = captures.sequence("p2", "b1")
     assert sequence is not None
     np.testing.assert_array_equal(read_sequence(sequence, CAMERA).lit, picture("lit"))
-    lit = sequence.seen_in
+    lit = sequence.board_path
     write(lit.with_name("1_[lit]_again.png"), picture("lit"))
     again = open_captures(rig, rig_path).sequence("p2", "b1")
     assert again is not None
-    with pytest.raises(ImageError, match=r"fits 2 files, 1481.*lit.*_again\.png") as caught:
+    with pytest.raises(
+        ImageError, match=r"matches 2 files, such as 1481.*lit.*_again\.png"
+    ) as caught:
         read_sequence(again, CAMERA)
     assert caught.value.where.endswith("*_[lit]_*.png (pair p2, shot b1)")
     lit.unlink()
@@ -323,7 +329,7 @@ def test_a_named_pipe_among_the_images_is_not_waited_for(tmp_path: Path) -> None
     os.mkfifo(tmp_path / "pipe.yaml")
     with pytest.raises(BadInput, match="is not a regular file"):
         load_rig(tmp_path / "pipe.yaml")
-    assert "is not a regular file" in "".join(report_lines(check(tmp_path / "rig.yaml")))
+    assert "is not a regular file" in "".join(format_report(check(tmp_path / "rig.yaml")))
 
 
 def test_all_that_is_missing_is_counted_and_absent_inverses_are_told(tmp_path: Path) -> None:
@@ -335,7 +341,7 @@ def test_all_that_is_missing_is_counted_and_absent_inverses_are_told(tmp_path: P
         read_sequence(reopened(tmp_path), CAMERA)
     assert str(sequence.inverses[0]) in caught.value.where
     assert "`inverses: false`" in caught.value.remedy
-    assert any("`inverses: false`" in line for line in report_lines(check(tmp_path / "rig.yaml")))
+    assert any("`inverses: false`" in line for line in format_report(check(tmp_path / "rig.yaml")))
     sequence.coded[0].unlink()
     with pytest.raises(ImageError, match=f"and {BITS} more") as caught:
         read_sequence(reopened(tmp_path), CAMERA)

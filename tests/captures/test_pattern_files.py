@@ -71,7 +71,7 @@ def test_each_kind_has_its_folder_and_its_images(tmp_path: Path) -> None:
     [
         (RIG, "10", "12 stripes do not fit on 10 projector pixels"),
         (RIG.replace("stripes: 12", "code: stripe-index, stripes: 12").replace("code: gray, ", ""),
-         "24", "none of its projectors shows images"),
+         "24", "none of its projectors displays images"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_shown_is_said_and_nothing_written(

@@ -84,7 +84,7 @@ def rows(change: dict[str, str] | None = None) -> str:
 def test_a_file_of_times_may_be_as_long_as_a_million_frames_need(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, more: int
 ) -> None:
-    monkeypatch.setattr("bodyscan.captures.timing.MOST_BYTES", len(rows()) - more)
+    monkeypatch.setattr("bodyscan.captures.captures_file.MAX_BYTES", len(rows()) - more)
     if not more:
         assert taken(tmp_path, "  times: times.csv\n", times=rows()).frame_ms("b1", "p1")
         return
@@ -144,7 +144,7 @@ def test_mistakes_in_a_file_of_times(tmp_path: Path, change: dict[str, str], mes
         ("  frame_ms: 10\n  start: together\n  order: [lit, lit]", "timing.order[1]: lists a frame"),
         ("  frame_ms: 10\n  times: times.csv", "timing.frame_ms: is said twice"),
         ("  times: ../times.csv", "timing.times: must not climb out"),
-        ("  times: none.csv", "names the file of times none.csv, which is not there"),
+        ("  times: none.csv", "names the file of times none.csv, which does not exist"),
         ("  times: captures.yaml", "captures.yaml:1:1: must begin with the line shot,pair,frame,ms"),
         ("  frame: 10", "timing.frame: is not a key known here (did you mean"),
     ],

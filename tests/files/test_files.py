@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bodyscan.files.atomic import atomic_replacement, json_text, write_bytes, write_json, write_npz
-from bodyscan.files.hashing import content_hash, file_hash, file_hashes, files_below
+from bodyscan.files.hashing import content_hash, file_hash, file_hashes, list_files
 
 
 def test_a_failed_write_leaves_the_old_file_and_no_litter(tmp_path: Path) -> None:
@@ -41,7 +41,7 @@ def test_a_block_that_writes_nothing_is_an_error(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == []
 
 
-def test_folders_are_made_and_the_umask_is_kept(tmp_path: Path) -> None:
+def test_folders_are_created_and_the_umask_applies(tmp_path: Path) -> None:
     path = tmp_path / "a" / "b" / "c.bin"
     before = os.umask(0o027)
     try:
@@ -57,24 +57,18 @@ def test_json_keeps_every_bit_of_a_float(values: list[float]) -> None:
     assert [v.hex() for v in back] == [v.hex() for v in values]
 
 
-def test_json_is_sorted_indented_and_a_matrix_takes_a_line_a_row() -> None:
+def test_json_is_sorted_and_indented_with_a_line_per_row_of_a_matrix() -> None:
     content = {"b": np.eye(2), "a": [{"n": np.int64(3)}], "c": {}, "d": [], "e": None, "f": "é"}
     text = json_text(content)
-    assert json.loads(text) == {
-        "a": [{"n": 3}],
-        "b": [[1, 0], [0, 1]],
-        "c": {},
-        "d": [],
-        "e": None,
-        "f": "é",
-    }
+    expected = {"a": [{"n": 3}], "b": [[1, 0], [0, 1]], "c": {}, "d": [], "e": None, "f": "é"}
+    assert json.loads(text) == expected
     assert text.startswith(
         '{\n  "a": [\n    {\n      "n": 3\n    }\n  ],\n  "b": [\n    [1.0, 0.0],\n'
     )
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, np.array([1.0, math.nan])])
-def test_json_refuses_what_json_does_not_have(tmp_path: Path, value: object) -> None:
+def test_json_refuses_nan_and_infinity(tmp_path: Path, value: object) -> None:
     with pytest.raises(ValueError, match="not JSON compliant"):
         write_json(tmp_path / "x.json", {"value": value})
     assert os.listdir(tmp_path) == []
@@ -111,7 +105,7 @@ def test_every_byte_of_a_large_file_is_hashed(tmp_path: Path) -> None:
     assert file_hash(path) != whole
 
 
-def test_plain_data_is_what_it_holds_in_whatever_order() -> None:
+def test_the_hash_of_data_does_not_depend_on_the_order_of_keys() -> None:
     one = {"a": [1, 2], "b": {"c": None, "d": 0.5}}
     other = {"b": {"d": 0.5, "c": None}, "a": [1, 2]}
     assert content_hash(one) == content_hash(other)
@@ -122,12 +116,12 @@ def test_plain_data_is_what_it_holds_in_whatever_order() -> None:
         content_hash({"a": float("nan")})
 
 
-def test_files_are_what_they_hold_and_listed_in_one_order(tmp_path: Path) -> None:
+def test_files_are_listed_in_a_fixed_order_and_hashed_by_content(tmp_path: Path) -> None:
     for name in ("b/2", "b/1", "a/3", "c"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text(name, "utf-8")
     (tmp_path / "b" / "0").symlink_to(tmp_path / "a", target_is_directory=True)
-    found = [path.relative_to(tmp_path).as_posix() for path in files_below(tmp_path)]
+    found = [path.relative_to(tmp_path).as_posix() for path in list_files(tmp_path)]
     assert found == ["c", "a/3", "b/0", "b/1", "b/2"]  # the link is named and not followed
     hashes = file_hashes({"z": tmp_path / "c", "y": tmp_path / "a" / "3"})
     assert list(hashes) == ["y", "z"]

@@ -245,9 +245,9 @@ def spoilt(kind: str, old: str, new: str) -> str:
 
 WRONG = [
     ("kalibr", "radtan", "equidistant", r":12: cam1.distortion_model: 'equidistant' is a lens"),
-    ("kalibr", "pinhole", "ds", r":2: cam0.camera_model: 'ds' is a model that there is not here"),
+    ("kalibr", "pinhole", "ds", r":2: cam0.camera_model: 'ds' is a model that is not supported"),
     ("kalibr", "cam0", "camera0", r"it has no cam0"),
-    ("kalibr", "[1.0, 0.0, 0.0, -0.2]", "[-1.0, 0.0, 0.0, -0.2]", r"T_cn_cnm1: is mirrored"),
+    ("kalibr", "[1.0, 0.0, 0.0, -0.2]", "[-1.0, 0.0, 0.0, -0.2]", r"T_cn_cnm1: is a reflection"),
     ("kalibr", "[1.0, 0.0, 0.0, -0.2]", "[1.1, 0.0, 0.0, -0.2]", r"T_cn_cnm1: is not a rotation"),
     ("kalibr", "1280, 720", "1280", r":6: cam0.resolution: holds 1 numbers, not 2"),
     ("kalibr", "  intrinsics", "\tintrinsics", r"is not YAML"),
@@ -261,7 +261,7 @@ WRONG = [
     ("aniposelib", "size", "sizes", r":1: cam_0: has no size"),
     ("aniposelib", "[metadata]", "fisheye = true\n[metadata]", r":9: cam_0.fisheye: is OpenCV's f"),
     ("aniposelib", "0.05, 0.0", "0.05, 0, 0.0", r":5: cam_0.distortions: holds 6 numbers, not"),
-    ("caliscope", "rotation_count = 0", "rotation_count = 1", r":4: cameras.3.rotation_count: turns"),
+    ("caliscope", "rotation_count = 0", "rotation_count = 1", r":4: cameras.3.rotation_count: rotates"),
     ("caliscope", "[cameras.3]", "[camera.3]", r"holds no cameras"),
     ("caliscope", "1280, 720]", "1280, 720", r"is not TOML: .*line"),
     ("caliscope", "0.0, 0.0, 1.0", "0.0, 1.0, 0.0", r":6: cameras.3.matrix: is not a camera matrix"),
@@ -456,7 +456,7 @@ def test_a_colmap_model_of_others(tmp_path: Path) -> None:
     strange.add_camera(fisheye)
     (tmp_path / "fisheye").mkdir()
     strange.write(tmp_path / "fisheye")
-    with pytest.raises(CalibrationFileError, match="OPENCV_FISHEYE, which there is not here"):
+    with pytest.raises(CalibrationFileError, match="OPENCV_FISHEYE, which is not supported"):
         RIG_FORMATS.find("colmap").read(tmp_path / "fisheye")
 
 

@@ -37,7 +37,7 @@ def rig() -> Rig:
 def frames(rig: Rig) -> list[str]:
     projector = rig.pairs[0].projector
     assert projector is not None
-    return ["lit", "dark", *rig.frames.of_code(projector)]
+    return ["lit", "dark", *rig.frames.code_names(projector)]
 
 
 def test_pairs_are_whole_one_by_one_and_then_the_scan(rig: Rig, tmp_path: Path) -> None:

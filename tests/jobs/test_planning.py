@@ -13,7 +13,7 @@ import cheap_job
 import pytest
 from cheap_batch import jobs_of, run_cheap
 
-from bodyscan.files.hashing import files_below
+from bodyscan.files.hashing import list_files
 from bodyscan.jobs.plan import Step, plan
 
 PERHAPS = "scan runs before it, and may give another result"
@@ -103,7 +103,7 @@ def test_files_that_a_person_added_are_kept_when_a_stage_runs_again(day: Path) -
     (day / "scans" / "anna" / "image.txt").write_text("other")
     told = run_cheap(day / "scans", day / "out").events
     (kept,) = (day / "out" / "anna").glob("kept-scan-*")
-    assert {path.relative_to(kept).as_posix() for path in files_below(kept)} == {
+    assert {path.relative_to(kept).as_posix() for path in list_files(kept)} == {
         "measurements.json",
         "export/body.ply",
     }
@@ -119,7 +119,7 @@ def test_files_that_a_person_added_outlive_a_kill(day: Path) -> None:
     (job / "scan").rename(job / ".old-scan-0123")
     assert run_cheap(day / "scans", day / "out").endings()["anna"]["stages"] == ["scan"]
     assert (job / "kept-scan-0123" / "measurements.json").read_text() == "mine"
-    assert len(list(files_below(job / "kept-scan-0123"))) == 2
+    assert len(list(list_files(job / "kept-scan-0123"))) == 2
     assert not list(job.glob(".old-*"))
 
 

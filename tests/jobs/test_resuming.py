@@ -13,7 +13,7 @@ from pathlib import Path
 from cheap_batch import batch_command, jobs_of, results, run_cheap
 
 from bodyscan.errors import BadInput
-from bodyscan.files.locking import file_lock
+from bodyscan.files.atomic import lock_file
 
 
 def test_ten_kills_leave_the_same_bytes_as_none(
@@ -54,7 +54,7 @@ def test_the_processes_of_a_killed_batch_end_with_it(
     process.kill()
     process.wait()
     _wait_for(lambda: not _is_alive(child))
-    with file_lock(tmp_path / "out" / "batch.lock", wait=False):  # kill let it go
+    with lock_file(tmp_path / "out" / "batch.lock", wait=False):  # kill let it go
         pass
 
 
@@ -102,7 +102,7 @@ def _is_held(lock: Path) -> bool:
     if not lock.exists():
         return False
     try:
-        with file_lock(lock, wait=False):
+        with lock_file(lock, wait=False):
             return False
     except BadInput:
         return True

@@ -12,8 +12,8 @@ import pytest
 from cheap_batch import jobs_of, run_cheap, write_scans
 
 from bodyscan.errors import BadInput
-from bodyscan.files.hashing import files_below
-from bodyscan.files.locking import file_lock
+from bodyscan.files.atomic import lock_file
+from bodyscan.files.hashing import list_files
 from bodyscan.jobs.forgetting import find_subject, forget_subject
 from bodyscan.jobs.verification import verify
 
@@ -85,10 +85,10 @@ def test_what_a_person_added_is_named_and_no_fault(day: Path) -> None:
 
 def test_forget_removes_a_subject_and_nothing_else(day: Path) -> None:
     (day / "scans" / "m1" / "link").symlink_to(day / "elder.obj")
-    before = set(files_below(day))
+    before = set(list_files(day))
     others = {path: path.read_bytes() for path in before if "e1" in path.parts}
     found = forget_subject("mallow", day)
-    after = set(files_below(day))
+    after = set(list_files(day))
     assert before - after == set(found.files)
     gone = {path.relative_to(day).parts[:2] for path in found.files}
     assert gone == {
@@ -114,12 +114,12 @@ def test_a_forgetting_that_was_cut_short_can_be_taken_up(day: Path) -> None:
         path.unlink()
     rest = forget_subject("mallow", day)
     assert set(rest.files) == set(files[len(files) // 2 :])
-    assert not any("mallow" in path.read_text(errors="replace") for path in files_below(day))
+    assert not any("mallow" in path.read_text(errors="replace") for path in list_files(day))
 
 
 def test_a_batch_at_work_is_not_disturbed(day: Path) -> None:
     with (
-        file_lock(day / "out" / "batch.lock", wait=False),
+        lock_file(day / "out" / "batch.lock", wait=False),
         pytest.raises(BadInput, match="at work"),
     ):
         forget_subject("mallow", day)

@@ -21,7 +21,7 @@ from small_workspace import run
 from bodyscan.errors import BodyscanError, CalibrationFileError
 from bodyscan.files.atomic import write_npz
 from bodyscan.files.hashing import file_hash
-from bodyscan.files.npz_file import read_npz
+from bodyscan.files.reading import read_npz
 from bodyscan.registration.storage import (
     accept_calibration,
     calibration_id,

@@ -15,7 +15,7 @@ from bodyscan.errors import CalibrationFileError
 from bodyscan.interchange.rig_format import RIG_FORMATS
 from bodyscan.outcome import Outcome
 from bodyscan.registration.rig_solve import RigSolution, solve_rig
-from bodyscan.rig.known import Known, KnownCamera
+from bodyscan.rig.pair import Known, KnownCamera
 from bodyscan.rig.rig import Rig
 from bodyscan.workflows.find_boards import calibrate_cameras, locate_views
 

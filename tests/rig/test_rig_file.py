@@ -9,6 +9,7 @@ from typing import Any
 
 import cv2
 import pytest
+import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 from small_captures import RIG, write
@@ -18,7 +19,7 @@ from bodyscan.files import yaml_file
 from bodyscan.files.yaml_file import dump_yaml, read_yaml
 from bodyscan.rig.board import MARKERS_IN, Board
 from bodyscan.rig.frame_names import FrameNames
-from bodyscan.rig.rig import Rig
+from bodyscan.rig.rig import Rig, find_unusual_lengths
 from bodyscan.rig.rig_file import load_rig, write_rig
 from bodyscan.stripes.codes import parse_stripe_code
 from bodyscan.stripes.codes.gray import INVERSE, PATTERN, Gray
@@ -48,6 +49,7 @@ def test_the_rig_files_of_the_project_load_and_survive_writing(path: Path, tmp_p
     rig = load_rig(path)
     write_rig(tmp_path / "again.yaml", rig)
     assert load_rig(tmp_path / "again.yaml") == rig
+    assert not list(find_unusual_lengths(rig))
 
 
 def test_a_rig_file_is_read_as_meant(tmp_path: Path) -> None:
@@ -167,17 +169,17 @@ def test_one_mistake_is_one_line(tmp_path: Path, old: str, new: str, line: str) 
     assert line in lines[0]
 
 
-def test_what_is_wrong_with_codes_and_names_is_said_at_once(tmp_path: Path) -> None:
+def test_all_mistakes_of_codes_and_names_are_reported_at_once(tmp_path: Path) -> None:
     text = changed("code: gray, stripes: 12", "code: grey, stripes: 1, steps: 4, colour: red")
     lines = refused(tmp_path, text + "frames: {patern: x, phase: '{bit}', lit: ../up, dark: 7}\n")
-    told = "\n".join(lines)
+    joined = "\n".join(lines)
     for part in ("code: must be", "stripes: must be 2", "colour: is not a key", "frames.patern: is not",
                  "frames.dark: must be text"):  # fmt: skip
-        assert part in told
+        assert part in joined
     assert len(lines) == 5, "steps may be right for the code that was meant"
 
 
-def test_keys_without_a_value_are_keys_not_given() -> None:
+def test_keys_without_a_value_are_ignored() -> None:
     """As calibrations have them that were written when every code had every key."""
     keys: dict[str, Any] = {"stripes": 12, "direction": "vertical"}
     nothing = {"inverses": None, "steps": None, "period": None}
@@ -224,13 +226,13 @@ def test_all_mistakes_are_reported_at_once_in_order(tmp_path: Path) -> None:
     text = changed("square_mm: 30", "square_mm: 0, colour: red").replace("name: p2", "name: p1")
     text = text.replace("height: 30", 'height: "30"') + "rig_frame: {pair: p7}\nfiles: nothing\n"
     lines = refused(tmp_path, text)
-    places = [int(line.split(":")[1]) for line in lines]
-    assert places == sorted(places)
-    told = "\n".join(lines)
+    numbers = [int(line.split(":")[1]) for line in lines]
+    assert numbers == sorted(numbers)
+    joined = "\n".join(lines)
     for part in ("square_mm: must be", "colour: is no", "height: must", "given to two pairs",
                  "names no pair", "needs {pair}", "must end in"):  # fmt: skip
-        assert part in told
-    # p2's and cam's camera are aliases of p1's: one mistake, told once, where it is written.
+        assert part in joined
+    # p2's and cam's camera are aliases of p1's: one mistake, reported once, where it is written.
     (height,) = (line for line in lines if "camera.height" in line)
     assert height.startswith("rig.yaml:7:")
     assert height.endswith("(and so in 2 more places by alias)")
@@ -255,11 +257,11 @@ def test_all_mistakes_are_reported_at_once_in_order(tmp_path: Path) -> None:
         ("x" * 1_000_001, "is longer than 1,000,000 bytes"),
     ],
 )
-def test_files_that_are_no_rig_files(tmp_path: Path, content: str | bytes, line: str) -> None:
+def test_files_that_are_not_rig_files(tmp_path: Path, content: str | bytes, line: str) -> None:
     assert any(line in text for text in refused(tmp_path, content))
 
 
-def test_alias_bombs_are_refused_before_they_go_off(
+def test_alias_bombs_are_refused_before_they_are_expanded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     levels = ["a0: &a0 [x, x, x, x, x, x, x, x, x]"]
@@ -303,7 +305,7 @@ def test_marker_count_is_that_of_opencv(columns: int, rows: int) -> None:
 
 
 @given(st.integers(2, 65535))
-def test_bits_are_enough_for_the_stripes_and_not_one_too_many(stripes: int) -> None:
+def test_bits_are_as_few_as_the_stripes_need(stripes: int) -> None:
     bits = Gray(stripes=stripes, direction="vertical").bits
     assert 2 ** (bits - 1) < stripes <= 2**bits
 
@@ -329,13 +331,13 @@ def test_a_code_without_inverses_needs_a_dark_image(tmp_path: Path) -> None:
 )  # fmt: skip
 def test_each_code_has_its_images(code: dict[str, Any], names: str) -> None:
     spec = parse_stripe_code({**code, "stripes": 5, "direction": "vertical"})
-    assert FrameNames().of_code(spec) == tuple(names.split())
+    assert FrameNames().code_names(spec) == tuple(names.split())
 
 
 def test_frame_names() -> None:
     names = FrameNames.model_validate({"inverse": ("a", "b", "c")})
-    assert names.of_kind(PATTERN, 3) == ("bit00", "bit01", "bit02")
-    assert names.of_kind(INVERSE, 3) == ("a", "b", "c")
+    assert names.kind_names(PATTERN, 3) == ("bit00", "bit01", "bit02")
+    assert names.kind_names(INVERSE, 3) == ("a", "b", "c")
 
 
 @pytest.mark.slow
@@ -356,7 +358,7 @@ def test_written_yaml_reads_back_as_it_was(
     assert document.data == data
 
 
-def test_words_that_old_yaml_misreads_stay_words(tmp_path: Path) -> None:
+def test_words_that_yaml_1_1_misreads_stay_words(tmp_path: Path) -> None:
     path = write(tmp_path / "x.yaml", "[no, on, 1:30, 010, 2026-11-21, 1_000, 1e3, 0o10, '5']")
     assert read_yaml(path).data == [
         "no", "on", "1:30", 10, "2026-11-21", "1_000", 1000.0, 8, "5",
@@ -372,7 +374,7 @@ def test_reading_rig_files_imports_nothing_heavy() -> None:
     assert done.stdout.strip() == "[]"
 
 
-def test_a_rig_made_in_python_is_checked_too(tmp_path: Path) -> None:
+def test_a_rig_built_in_python_is_checked_too(tmp_path: Path) -> None:
     rig = load_rig(write(tmp_path / "rig.yaml", RIG))
     with pytest.raises(ValueError, match="names no pair"):
         Rig.model_validate({**rig.model_dump(), "rig_frame": {"pair": "p9"}})
@@ -384,13 +386,13 @@ CROSSED = changed(
 )
 
 
-def test_crossing_stripes_are_of_the_same_code_unless_said(tmp_path: Path) -> None:
+def test_crossing_stripes_have_the_same_code_by_default(tmp_path: Path) -> None:
     rig = load_rig(write(tmp_path / "rig.yaml", CROSSED))
     first = rig.pair("p1").projector
     assert first is not None
     assert first.crossing == Gray(stripes=20, direction="vertical")
     assert first.directions == (first, first.crossing)
-    names = rig.frames.of_code(first)
+    names = rig.frames.code_names(first)
     assert len(names) == 2 * 4 + 2 * 5
     assert (names[0], names[8], names[-1]) == ("bit00", "crossing-bit00", "crossing-bit04-inverse")
     write_rig(tmp_path / "again.yaml", rig)
@@ -425,16 +427,16 @@ def test_crossing_stripes_are_of_the_same_code_unless_said(tmp_path: Path) -> No
         ("version: 1", "version: 1\nframes: {board: dark}", "the same name ('dark')"),
     ],
 )  # fmt: skip
-def test_what_is_wrong_with_crossing_stripes_is_one_line(
+def test_one_mistake_in_crossing_stripes_is_one_line(
     tmp_path: Path, old: str, new: str, line: str
 ) -> None:
     assert old in CROSSED
-    told = refused(tmp_path, CROSSED.replace(old, new, 1))
-    assert len(told) == 1, told
-    assert line in told[0]
+    lines = refused(tmp_path, CROSSED.replace(old, new, 1))
+    assert len(lines) == 1, lines
+    assert line in lines[0]
 
 
-def test_lit_or_crossing_that_no_pair_can_do_with_is_named(tmp_path: Path) -> None:
+def test_missing_lit_and_useless_crossing_names_are_refused(tmp_path: Path) -> None:
     (line,) = refused(tmp_path, RIG + "frames: {crossing: {pattern: 'c{bit}'}}\n")
     assert "frames.crossing: is for a projector with `crossing`" in line
     text = changed("code: gray", "code: gray, inverses: false")
@@ -446,7 +448,17 @@ def test_boards_are_needed_for_calibration_captures_only(tmp_path: Path) -> None
     text = changed("boards:\n  - {name: board, columns: 5, rows: 4, square_mm: 30}\n", "")
     (line,) = refused(tmp_path, text)
     assert "boards: is missing: calibration captures show a board" in line
-    rig = load_rig(
-        write(tmp_path / "r.yaml", text.replace("calibration:\n  - folder: captures", ""))
-    )
-    assert rig.boards == ()
+    text = text.replace("calibration:\n  - folder: captures", "")
+    assert load_rig(write(tmp_path / "r.yaml", text)).boards == ()
+
+
+def test_lengths_in_metres_are_warned_of() -> None:
+    content = yaml.safe_load((RIGS / "three-pole-12.yaml").read_text())
+    content["boards"][0] |= {"square_mm": 0.07, "marker_mm": 0.05}
+    content["volume"] = {"radius_mm": 0.7, "bottom_mm": 0.0, "top_mm": 2.2}
+    content["pairs"][0]["nominal"] = {"position_mm": [0.65, 1.1, 0.7], "look_at_mm": [0, 0, 0.3]}
+    warnings = list(find_unusual_lengths(Rig.model_validate(content)))
+    assert len(warnings) == 4
+    assert "square_mm is 0.07 mm" in warnings[0]
+    assert "radius_mm is 0.7 mm" in warnings[1]
+    assert "pair p1-1" in warnings[3]

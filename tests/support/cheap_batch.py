@@ -13,7 +13,7 @@ from typing import Any
 import cheap_job
 
 from bodyscan.errors import BodyscanError
-from bodyscan.files.hashing import file_hash, files_below
+from bodyscan.files.hashing import file_hash, list_files
 from bodyscan.jobs.discovery import find_jobs
 from bodyscan.jobs.job import Job
 from bodyscan.jobs.pipeline import load_pipeline
@@ -66,5 +66,5 @@ def jobs_of(scans: Path, out: Path, *changes: str) -> list[Job]:
 def results(out: Path) -> dict[str, str]:
     """The hash of every result and manifest; states, logs and locks tell of times and attempts."""
     running = {"state.json", "log.txt", "lock", "batch.lock", "summary.csv", "job.json", "was here"}
-    paths = [path for path in files_below(out) if path.name not in running]
+    paths = [path for path in list_files(out) if path.name not in running]
     return {str(path.relative_to(out)): file_hash(path) for path in paths}

@@ -151,7 +151,7 @@ def test_any_subset_of_images_with_stripes_does_too(
                     for view in wanted
                     if (view.pair, view.shot) == (name, sequence.shot) and view.key in striped
                 })
-                for sequence in captures.of_pair(name)
+                for sequence in captures.pair_sequences(name)
             })  # fmt: skip
 
     with pytest.MonkeyPatch.context() as patched:

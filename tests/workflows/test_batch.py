@@ -14,7 +14,7 @@ import pytest
 from small_workspace import PROJECT, Workspace, run
 from typer.testing import Result
 
-from bodyscan.files.hashing import file_hash, files_below
+from bodyscan.files.hashing import file_hash, list_files
 
 SMALL = ("--set", "fusion.points=20000", "--set", "mesh.depth=6", "--set", "export.formats=glb")
 ODD = "б 'q\"\n"
@@ -131,7 +131,7 @@ def test_the_same_images_give_the_same_bytes(day: Path, night: tuple[Result, Res
     odd = next((day / "out").glob("q-*"))
     for stage in ("scan", "export", "report"):
         one, other = (
-            {p.name: file_hash(p) for p in files_below(day / "out" / job / stage)}
+            {p.name: file_hash(p) for p in list_files(day / "out" / job / stage)}
             for job in ("anna", odd.name)
         )
         assert one == other
@@ -161,7 +161,7 @@ def test_a_subject_is_forgotten(day: Path, night: tuple[Result, Result], tmp_pat
     result = run("forget", "sim-woman-average", "--workspace", tmp_path / "day", "--yes")
     assert result.exit_code == 0
     assert "anna/scan/cloud.ply" in result.output
-    left = {path.relative_to(tmp_path / "day").parts[:2] for path in files_below(tmp_path / "day")}
+    left = {path.relative_to(tmp_path / "day").parts[:2] for path in list_files(tmp_path / "day")}
     assert ("scans", "anna") not in left
     assert ("out", "anna") not in left
     assert ("calibration", "calibration.json") in left

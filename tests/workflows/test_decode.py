@@ -104,7 +104,7 @@ def a_scan_one_way(tmp_path: Path) -> tuple[Rig, ImageSequence, Array]:
     lit, dark, coded, s = render(s_at, code_light("gray", 64), stripes=64, shape=(160, 200))
     projector = rig.pairs[0].projector
     assert projector is not None
-    names = ["lit", "dark", *rig.frames.of_code(projector)]  # those of rows follow
+    names = ["lit", "dark", *rig.frames.code_names(projector)]  # those of rows follow
     for name, image in zip(names, [lit, dark, *coded], strict=False):
         cv2.imwrite(str(scan / f"{name}.png"), image)
     (sequence,) = open_scan(rig, scan).sequences
@@ -122,7 +122,7 @@ def test_a_shot_without_its_crossing_images_keeps_the_others(tmp_path: Path) -> 
     assert "row0.png" in note
     scan, projector = tmp_path / "scan", rig.pairs[0].projector
     assert projector is not None
-    files = [scan / f"{name}.png" for name in rig.frames.of_code(projector)]
+    files = [scan / f"{name}.png" for name in rig.frames.code_names(projector)]
     for file in files:
         if not file.exists():
             file.write_bytes(b"not an image")

@@ -32,7 +32,7 @@ def test_a_range_image_holds_at_the_time_of_the_finest_pattern(
     code = Gray(stripes=4, direction="vertical")
     frames = FrameNames()
     # Two bits: pattern and inverse of the finer one are taken at 20 and 50 ms.
-    frame_ms = dict(zip(frames.of_code(code), (10.0, 20.0, 30.0, 50.0), strict=True))
+    frame_ms = dict(zip(frames.code_names(code), (10.0, 20.0, 30.0, 50.0), strict=True))
     found = range_image()
     monkeypatch.setattr(range_images, "decode_sequence", lambda *_, **__: STRIPES)
     monkeypatch.setattr(range_images, "reconstruct_range_image", lambda *_: found)

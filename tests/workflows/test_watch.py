@@ -16,7 +16,7 @@ from small_workspace import run
 
 from bodyscan.captures.folder import ImageSequence, open_scan
 from bodyscan.errors import ImageError
-from bodyscan.files.hashing import file_hash, files_below
+from bodyscan.files.hashing import file_hash, list_files
 from bodyscan.workflows.preparation import Preparation
 
 SMALL = ("--set", "fusion.points=20000", "--set", "mesh.depth=6", "--set", "export.formats=glb")
@@ -95,7 +95,7 @@ def test_what_arrives_is_fused_as_a_batch_would_and_never_twice(example: Path, d
 
 
 def _bytes(folder: Path) -> dict[str, str]:
-    paths = [path for path in files_below(folder) if path.name not in OWN | {"job.json"}]
+    paths = [path for path in list_files(folder) if path.name not in OWN | {"job.json"}]
     return {str(path.relative_to(folder)): file_hash(path) for path in paths}
 
 

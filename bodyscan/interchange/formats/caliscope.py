@@ -6,10 +6,15 @@ import json
 from pathlib import Path
 
 from bodyscan.files.atomic import write_text
-from bodyscan.interchange.foreign_file import ForeignFile
+from bodyscan.interchange.foreign_file import (
+    TOML_NOTE,
+    ForeignFile,
+    format_camera_table,
+    read_camera_table,
+    read_toml,
+)
 from bodyscan.interchange.found_camera import FoundCamera
 from bodyscan.interchange.rig_format import RigCameras, RigFormat
-from bodyscan.interchange.toml_cameras import NOTE, camera_of_table, read_toml, table_of_camera
 
 
 def write_caliscope(cameras: RigCameras, path: Path) -> Path:
@@ -18,11 +23,11 @@ def write_caliscope(cameras: RigCameras, path: Path) -> Path:
 
     Returns `path`. Raises BadInput for a lens that OpenCV does not have.
     """
-    text = "# Lengths in metres.\n" + NOTE
+    text = "# Lengths in metres.\n" + TOML_NOTE
     for number, (name, (camera, rig_from_camera)) in enumerate(cameras.items()):
         text += f"\n[cameras.{number}]\ncam_id = {number}\nname = {json.dumps(name)}\n"
         text += "rotation_count = 0\nfisheye = false\n"
-        text += table_of_camera(name, camera, rig_from_camera.inverse(), 1000.0)
+        text += format_camera_table(name, camera, rig_from_camera.inverse(), 1000.0)
     write_text(Path(path), text)
     return Path(path)
 
@@ -34,16 +39,16 @@ def read_caliscope(path: Path) -> dict[str, FoundCamera]:
     if not isinstance(tables, dict) or not tables:
         raise file.error("holds no cameras: it is not a camera_array.toml of caliscope's")
     found: dict[str, FoundCamera] = {}
-    for key, own in tables.items():
-        if not isinstance(own, dict):
+    for key, table in tables.items():
+        if not isinstance(table, dict):
             raise file.error("is not a camera as caliscope writes it", f"cameras.{key}")
-        if own.get("rotation_count", 0):
+        if table.get("rotation_count", 0):
             raise file.error(
-                "turns the pictures before they are used; bodyscan takes them as they are",
-                "rotation_count", "turn the pictures, or calibrate without", after=f"cameras.{key}",
+                "rotates the pictures before they are used; bodyscan takes them as they are",
+                "rotation_count", "rotate the pictures, or calibrate without", after=f"cameras.{key}",
             )  # fmt: skip
-        found[key] = camera_of_table(file, own, f"cameras.{key}")
-    named = {str(own["name"]): found[key] for key, own in tables.items() if "name" in own}
+        found[key] = read_camera_table(file, table, f"cameras.{key}")
+    named = {str(table["name"]): found[key] for key, table in tables.items() if "name" in table}
     return found | named
 
 

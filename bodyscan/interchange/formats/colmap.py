@@ -21,10 +21,9 @@ from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.interchange.foreign_file import ForeignFile
 from bodyscan.interchange.found_camera import FoundCamera
-from bodyscan.interchange.rig_format import RigCameras, RigFormat, opencv_lens
+from bodyscan.interchange.rig_format import RigCameras, RigFormat, opencv_coefficients
 
-PIXEL_CENTRE = 0.5
-"""COLMAP's pixels have their centres at + 0.5, ours at whole numbers."""
+PIXEL_CENTRE = 0.5  # COLMAP's pixels have their centres at + 0.5, ours at whole numbers
 SKEW_FILE = "bodyscan.json"
 NO_SKEW = (
     "Cameras here have no skew. Shear an image point (u, v) of the pair (pixel centres at whole "
@@ -76,27 +75,27 @@ def read_colmap(folder: Path) -> dict[str, FoundCamera]:
         # Names are decoded only when accessed.
         names_of = {image.image_id: image.name for image in images}
     except (OSError, ValueError, RuntimeError, IndexError, MemoryError) as error:
-        said = str(error).strip().splitlines() or [type(error).__name__]
+        reason = str(error).strip().splitlines() or [type(error).__name__]
         raise CalibrationFileError(
-            f"is not a COLMAP model ({said[-1]})",
+            f"is not a COLMAP model ({reason[-1]})",
             where=str(folder),
             remedy="give the folder that holds cameras, images and points3D, .bin or .txt",
         ) from error
     gammas = _gammas(folder)
     found: dict[str, FoundCamera] = {}
     for number, camera in sorted(model.cameras.items()):
-        own = [image for image in images if image.camera_id == number]
-        names = {str(number), *_common_folder([names_of[image.image_id] for image in own])}
-        rig_pose = _place_in_rig(model, number)
-        for name in names - {image.name for image in own}:
-            found[name] = _found(folder, camera, 0.0, rig_pose)
-        for image in own:
+        taken = [image for image in images if image.camera_id == number]
+        names = {str(number), *_common_folder([names_of[image.image_id] for image in taken])}
+        rig_pose = _pose_in_rig(model, number)
+        for name in names - {image.name for image in taken}:
+            found[name] = _read_camera(folder, camera, 0.0, rig_pose)
+        for image in taken:
             gamma = gammas.get(image.name, 0.0)
-            found[image.name] = _found(folder, camera, gamma, _place_of(image))
+            found[image.name] = _read_camera(folder, camera, gamma, _image_pose(image))
     for name in gammas:
         if name not in found:
             raise CalibrationFileError(
-                f"tells of a pair {name!r} that the model does not have",
+                f"names a pair {name!r} that the model does not have",
                 where=str(folder / SKEW_FILE),
                 remedy="give both as `bodyscan export-rig --format colmap` wrote them",
             )
@@ -114,7 +113,7 @@ def _gammas(folder: Path) -> dict[str, float]:
         raise CalibrationFileError(
             f"is not what bodyscan writes beside a COLMAP model ({type(error).__name__}: {error})",
             where=str(file),
-            remedy="write it again with `bodyscan export-rig --format colmap`, or take it away",
+            remedy="write it again with `bodyscan export-rig --format colmap`, or remove it",
         ) from error
 
 
@@ -123,16 +122,15 @@ def _common_folder(names: list[str]) -> set[str]:
     return set(folders) - {""} if len(folders) == 1 else set()
 
 
-def _place_of(image: Any) -> RigidTransform | None:
-    """The pose of an image; None if it has none, or its rig
-    has one and its camera none in the rig."""
+def _image_pose(image: Any) -> RigidTransform | None:
+    """The pose of an image; None if it has none, or its camera has none in its rig."""
     try:
         return _transform(image.cam_from_world()) if image.has_pose else None
     except RuntimeError:
         return None
 
 
-def _place_in_rig(model: Any, number: int) -> RigidTransform | None:
+def _pose_in_rig(model: Any, number: int) -> RigidTransform | None:
     sensor = pycolmap.sensor_t(pycolmap.SensorType.CAMERA, number)
     for rig in model.rigs.values():
         if rig.num_sensors() > 1 and rig.has_sensor(sensor):
@@ -143,26 +141,27 @@ def _place_in_rig(model: Any, number: int) -> RigidTransform | None:
     return None
 
 
-def _found(folder: Path, camera: Any, gamma: float, pose: RigidTransform | None) -> FoundCamera:
+def _read_camera(
+    folder: Path, camera: Any, gamma: float, pose: RigidTransform | None
+) -> FoundCamera:
     file = ForeignFile(folder)
     model = camera.model.name
     if model not in LENSES:
         raise file.error(
-            f"has a camera of COLMAP's model {model}, which there is not here",
+            f"has a camera of COLMAP's model {model}, which is not supported",
             remedy=f"calibrate it with one of {', '.join(LENSES)}",
         )
     params = [float(value) for value in camera.params]
     fx, fy, cx, cy = (params[k] for k in LENSES[model])
     four = [fx, fy, cx - PIXEL_CENTRE, cy - PIXEL_CENTRE]
-    matrix = file.four(four, f"camera {camera.camera_id}")
+    matrix = file.pinhole_matrix(four, f"camera {camera.camera_id}")
     matrix[0, 1] = gamma
     lens = file.lens(params[max(LENSES[model]) + 1 :], f"camera {camera.camera_id}")
     return FoundCamera(matrix, lens, (camera.width, camera.height), pose, str(folder))
 
 
 def _colmap_model(cameras: Mapping[str, tuple[Camera, RigidTransform]]) -> pycolmap.Reconstruction:
-    """Build COLMAP's model; the first pair is the reference
-    sensor, whose frame is the rig's own."""
+    """Build COLMAP's model; the first pair is the reference sensor, whose frame is the rig's."""
     model, rig = pycolmap.Reconstruction(), pycolmap.Rig(rig_id=1)
     frame = pycolmap.Frame(frame_id=1, rig_id=1)
     reference = next(iter(cameras.values()))[1]
@@ -188,7 +187,7 @@ def _colmap_model(cameras: Mapping[str, tuple[Camera, RigidTransform]]) -> pycol
 def _colmap_camera(name: str, camera: Camera, camera_id: int) -> pycolmap.Camera:
     centre = [camera.u0 + PIXEL_CENTRE, camera.v0 + PIXEL_CENTRE]
     # COLMAP's OPENCV is a prefix of its FULL_OPENCV, which has OpenCV's first eight coefficients.
-    lens = np.append(opencv_lens(name, camera), np.zeros(8))[:8]
+    lens = np.append(opencv_coefficients(name, camera), np.zeros(8))[:8]
     model = "FULL_OPENCV" if lens[4:].any() else "OPENCV"
     return pycolmap.Camera(
         model=model,

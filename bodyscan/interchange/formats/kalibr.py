@@ -1,6 +1,6 @@
 """Kalibr's camchain.yaml: a chain of cameras, each with its pose in the frame of the one before.
 
-Metres, as Kalibr's targets are. The format has no frame of its own: the first camera's is the
+Metres, as Kalibr's targets are. The format has no frame of its entry: the first camera's is the
 world.
 """
 
@@ -17,7 +17,7 @@ from bodyscan.files.yaml_file import YamlError, dump_yaml, read_yaml
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.interchange.foreign_file import ForeignFile
 from bodyscan.interchange.found_camera import FoundCamera
-from bodyscan.interchange.rig_format import RigCameras, RigFormat, opencv_lens
+from bodyscan.interchange.rig_format import RigCameras, RigFormat, opencv_coefficients
 
 NOTE = """\
 # Metres. Pixel centres at whole numbers. `name` is the pair's. Kalibr's cameras have no skew: shear
@@ -33,14 +33,14 @@ def write_kalibr(cameras: RigCameras, path: Path) -> Path:
     content: dict[str, Any] = {}
     before: RigidTransform | None = None
     for number, (name, (camera, rig_from_camera)) in enumerate(cameras.items()):
-        coefficients = opencv_lens(name, camera)
+        coefficients = opencv_coefficients(name, camera)
         if np.any(coefficients[4:]):
             raise BadInput(
                 f"Kalibr has no lens like {camera.lens.kind!r}: its radtan ends with k1, k2, p1, p2",
                 where=f"pair {name}",
                 remedy="choose another format, such as opencv, colmap or mrcal",
             )
-        own: dict[str, Any] = {
+        entry: dict[str, Any] = {
             "camera_model": "pinhole",
             "intrinsics": [camera.alpha, camera.beta, camera.u0, camera.v0],
             "distortion_model": "radtan",
@@ -53,9 +53,9 @@ def write_kalibr(cameras: RigCameras, path: Path) -> Path:
         if before is not None:
             chain = (rig_from_camera.inverse() @ before).matrix
             chain[:3, 3] /= 1000.0
-            own["T_cn_cnm1"] = chain.tolist()
+            entry["T_cn_cnm1"] = chain.tolist()
         before = rig_from_camera
-        content[f"cam{number}"] = own
+        content[f"cam{number}"] = entry
     write_text(Path(path), NOTE + dump_yaml(content))
     return Path(path)
 
@@ -68,7 +68,7 @@ def read_kalibr(path: Path) -> dict[str, FoundCamera]:
     except YamlError as error:
         raise file.error(error.problem.text) from None
     chain = data if isinstance(data, dict) else {}
-    cameras = {key: own for key, own in chain.items() if isinstance(own, dict)}
+    cameras = {key: entry for key, entry in chain.items() if isinstance(entry, dict)}
     if "cam0" not in cameras:
         raise file.error(
             "is not a camchain of Kalibr's: it has no cam0",
@@ -80,49 +80,49 @@ def read_kalibr(path: Path) -> dict[str, FoundCamera]:
         key = f"cam{number}"
         if key not in cameras:
             break
-        own = cameras[key]
+        entry = cameras[key]
         if number > 0:
-            pose = _next_pose(file, key, own, pose)
-        one = _camera(file, key, own, pose)
+            pose = _next_pose(file, key, entry, pose)
+        one = _camera(file, key, entry, pose)
         found[key] = one
-        if isinstance(own.get("name"), str):
-            found[own["name"]] = one
+        if isinstance(entry.get("name"), str):
+            found[entry["name"]] = one
     return found
 
 
 def _next_pose(
-    file: ForeignFile, key: str, own: dict[str, Any], before: RigidTransform | None
+    file: ForeignFile, key: str, entry: dict[str, Any], before: RigidTransform | None
 ) -> RigidTransform | None:
     """The next camera's pose; a broken chain leaves the cameras after the gap without one."""
-    if "T_cn_cnm1" not in own or before is None:
+    if "T_cn_cnm1" not in entry or before is None:
         return None
-    matrix = file.numbers(own["T_cn_cnm1"], "T_cn_cnm1", (16,), after=key).reshape(4, 4)
+    matrix = file.numbers(entry["T_cn_cnm1"], "T_cn_cnm1", (16,), after=key).reshape(4, 4)
     step = file.pose(matrix[:3, :3], matrix[:3, 3], ("T_cn_cnm1", "T_cn_cnm1"), after=key)
     return step @ before
 
 
 def _camera(
-    file: ForeignFile, key: str, own: dict[str, Any], pose: RigidTransform | None
+    file: ForeignFile, key: str, entry: dict[str, Any], pose: RigidTransform | None
 ) -> FoundCamera:
     words = ("camera_model", "intrinsics", "distortion_model", "resolution")
-    file.require(own, words, key)
-    if own["camera_model"] != "pinhole":
+    file.require(entry, words, key)
+    if entry["camera_model"] != "pinhole":
         raise file.error(
-            f"{own['camera_model']!r} is a model that there is not here, pinhole is",
+            f"{entry['camera_model']!r} is a model that is not supported, pinhole is",
             "camera_model", "calibrate it with pinhole-radtan", after=key,
         )  # fmt: skip
-    if own["distortion_model"] not in ("radtan", "none"):
+    if entry["distortion_model"] not in ("radtan", "none"):
         raise file.error(
-            f"{own['distortion_model']!r} is a lens that there is not here, radtan is",
+            f"{entry['distortion_model']!r} is a lens that is not supported, radtan is",
             "distortion_model", "calibrate it with pinhole-radtan", after=key,
         )  # fmt: skip
-    lens = own.get("distortion_coeffs", []) if own["distortion_model"] == "radtan" else []
-    matrix = file.four(own["intrinsics"], "intrinsics", after=key)
-    matrix[0, 1] = file.numbers(own.get("skew", 0.0), "skew", (1,), after=key)[0]
+    lens = entry.get("distortion_coeffs", []) if entry["distortion_model"] == "radtan" else []
+    matrix = file.pinhole_matrix(entry["intrinsics"], "intrinsics", after=key)
+    matrix[0, 1] = file.numbers(entry.get("skew", 0.0), "skew", (1,), after=key)[0]
     return FoundCamera(
         matrix,
         file.lens(lens, "distortion_coeffs", after=key),
-        file.size(own["resolution"], "resolution", after=key),
+        file.size(entry["resolution"], "resolution", after=key),
         pose,
         file.where(key),
     )

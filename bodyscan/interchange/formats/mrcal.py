@@ -17,7 +17,7 @@ from bodyscan.errors import BadInput, CalibrationFileError
 from bodyscan.files.atomic import write_text
 from bodyscan.interchange.foreign_file import ForeignFile
 from bodyscan.interchange.found_camera import FoundCamera
-from bodyscan.interchange.rig_format import RigCameras, RigFormat, opencv_lens
+from bodyscan.interchange.rig_format import RigCameras, RigFormat, opencv_coefficients
 
 COEFFICIENTS = {"PINHOLE": 0, "OPENCV4": 4, "OPENCV5": 5, "OPENCV8": 8, "OPENCV12": 12}
 SUFFIX = ".cameramodel"
@@ -29,7 +29,7 @@ def write_mrcal(cameras: RigCameras, folder: Path) -> Path:
 
     Raises BadInput for a lens that mrcal does not have, before anything is written.
     """
-    texts = {name: _text(name, *own) for name, own in cameras.items()}
+    texts = {name: _format_model(name, *camera) for name, camera in cameras.items()}
     for name, text in texts.items():
         write_text(Path(folder) / f"{name}{SUFFIX}", text)
     return Path(folder)
@@ -45,8 +45,8 @@ def read_mrcal(path: Path) -> dict[str, FoundCamera]:
     return {file.stem: _read_model(file) for file in files}
 
 
-def _text(name: str, camera: Any, rig_from_camera: Any) -> str:
-    coefficients = opencv_lens(name, camera)
+def _format_model(name: str, camera: Any, rig_from_camera: Any) -> str:
+    coefficients = opencv_coefficients(name, camera)
     rest = np.flatnonzero(coefficients)
     used = int(rest[-1]) + 1 if len(rest) else 0
     model = next((m for m, count in COEFFICIENTS.items() if count >= used), None)
@@ -85,11 +85,11 @@ def _read_model(path: Path) -> FoundCamera:
             raise file.error(f"has no {word!r}", remedy=f"it has {', '.join(map(str, content))}")
     if kind not in COEFFICIENTS:
         raise file.error(
-            f"{model!r} is a lens that there is not here", "lensmodel",
+            f"{model!r} is a lens that is not supported", "lensmodel",
             f"mrcal-convert-lensmodel makes one of LENSMODEL_{', LENSMODEL_'.join(COEFFICIENTS)}",
         )  # fmt: skip
     numbers = file.numbers(content["intrinsics"], "intrinsics", (4 + COEFFICIENTS[kind],))
-    matrix = file.four(numbers[:4], "intrinsics")
+    matrix = file.pinhole_matrix(numbers[:4], "intrinsics")
     skew = re.search(rf"^# {SKEW}(\S+)$", file.text, re.MULTILINE)
     if skew:
         matrix[0, 1] = file.numbers(skew[1], "skew", (1,))[0]

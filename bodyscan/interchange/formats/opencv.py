@@ -25,7 +25,7 @@ from bodyscan.interchange.rig_format import (
     Nodes,
     RigCameras,
     RigFormat,
-    opencv_lens,
+    opencv_coefficients,
     projector_name,
 )
 
@@ -35,8 +35,6 @@ NOTE = (
     "u - skew / fy * (v - cy), v, which a camera without skew would have seen. Of a projector, "
     "x_projector = R x_camera + T, as stereoCalibrate has it; the middle of its first column is 0."
 )
-HEADER = "%YAML:1.0\n---\n"
-"""OpenCV reads no YAML without it, such as that of ROS."""
 
 
 def write_opencv(cameras: RigCameras, path: Path) -> Path:
@@ -77,7 +75,7 @@ def _write_camera(store: Any, name: str, camera: Camera, pose: RigidTransform) -
     store.write("image_height", camera.height)
     store.write("camera_matrix", camera.matrix)
     store.write("skew", camera.gamma)
-    store.write("distortion_coefficients", opencv_lens(name, camera)[None])
+    store.write("distortion_coefficients", opencv_coefficients(name, camera)[None])
     store.write("R", pose.rotation)
     store.write("T", pose.translation.reshape(3, 1))
 
@@ -85,7 +83,7 @@ def _write_camera(store: Any, name: str, camera: Camera, pose: RigidTransform) -
 def read_opencv(path: Path) -> dict[str, FoundCamera]:
     """The cameras of a file that `write_opencv` wrote, and their projectors by `projector_name`."""
     file = ForeignFile.read(path)
-    store = _opened(file)
+    store = _open_storage(file)
     pairs = store.getNode("pairs")
     if not pairs.isSeq():
         raise file.error(
@@ -97,13 +95,13 @@ def read_opencv(path: Path) -> dict[str, FoundCamera]:
     for k in range(int(pairs.size())):
         entry, name = pairs.at(k), f"pairs/{k}"
         label = _below(file, entry, "name", name).string()
-        own = found[label] = _read_camera(file, entry, name, label)
+        camera = found[label] = _read_camera(file, entry, name, label)
         if "projector" in entry.keys():  # noqa: SIM118 (it is no dict)
             light = _below(file, entry, "projector", name)
             inner = _read_camera(file, light, f"{name}/projector", label)
             assert inner.camera_from_world is not None
-            assert own.camera_from_world is not None
-            from_rig = inner.camera_from_world @ own.camera_from_world
+            assert camera.camera_from_world is not None
+            from_rig = inner.camera_from_world @ camera.camera_from_world
             found[projector_name(label)] = replace(inner, camera_from_world=from_rig)
     return found
 
@@ -126,7 +124,7 @@ def read_nodes(path: Path, nodes: Nodes) -> FoundCamera:
     """The camera whose numbers are in these nodes: matrix; distortion, size (or width and height),
     rotation and translation if given."""
     file = ForeignFile.read(path)
-    store = _opened(file)
+    store = _open_storage(file)
 
     def values(what: str) -> Any:
         return _values(file, _node(file, store, nodes[what]), nodes[what])
@@ -146,11 +144,11 @@ def read_nodes(path: Path, nodes: Nodes) -> FoundCamera:
     return FoundCamera(matrix, lens, size, pose, file.where(nodes["matrix"].split("/")[-1]))
 
 
-def _opened(file: ForeignFile) -> Any:
+def _open_storage(file: ForeignFile) -> Any:
     """The open storage; its nodes live only as long as it does."""
     text = file.text.lstrip()
     if not text.startswith(("%YAML", "<?xml", "{")):
-        text = HEADER + text
+        text = "%YAML:1.0\n---\n" + text  # OpenCV needs it, ROS leaves it out
     read = cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY
     try:
         store = cv2.FileStorage(text, read)
@@ -172,9 +170,9 @@ def _node(file: ForeignFile, store: Any, name: str) -> Any:
 def _below(file: ForeignFile, node: Any, name: str, passed: str) -> Any:
     keys = list(node.keys()) if node.isMap() else []
     if name not in keys:
-        place = f"below {passed}" if passed else "in it"
+        parent = f"below {passed}" if passed else "in it"
         raise CalibrationFileError(
-            f"has no node {name!r} {place}{did_you_mean(name, keys)}",
+            f"has no node {name!r} {parent}{did_you_mean(name, keys)}",
             where=file.where(passed.split("/")[-1]) if passed else str(file.path),
             remedy=f"there is {', '.join(keys) or 'none'}",
         )

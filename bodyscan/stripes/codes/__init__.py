@@ -14,10 +14,10 @@ from pydantic import BeforeValidator, SerializeAsAny, ValidationError
 from pydantic_core import InitErrorDetails
 
 from bodyscan.files.model import (
-    alternatives,
     choice_error,
+    copy_errors,
+    format_alternatives,
     problem_error,
-    repeated_errors,
     unknown_key_error,
 )
 from bodyscan.stripes.stripe_code import DEFAULT_CODE, ImageKind, StripeCode
@@ -74,7 +74,7 @@ def parse_stripe_code(keys: Any) -> Any:
         if crossing is not None:
             found = code.model_validate({**dict(found), "crossing": crossing})
     except ValidationError as refused:
-        errors += repeated_errors(refused)
+        errors += copy_errors(refused)
     if errors:
         raise ValidationError.from_exception_data(code.__name__, errors)
     return found
@@ -103,7 +103,7 @@ def _split_crossing(
     try:
         return others, parse_stripe_code({"direction": across, **shared, **given}), []
     except ValidationError as refused:
-        errors = repeated_errors(refused)
+        errors = copy_errors(refused)
         specific = [error for error in errors if error["loc"][:1] not in [(k,) for k in shared]]
         # A mistake in both is reported for the first direction.
         errors = specific or errors
@@ -120,7 +120,7 @@ def _key_errors(
     if code is None:
         return []
     here = code.model_fields["code"].default
-    wanted = alternatives(takers).replace("'", "")
+    wanted = format_alternatives(takers).replace("'", "")
     return [problem_error(((key,), f"is for code: {wanted} (the code here is {here})"))]
 
 

@@ -1,4 +1,4 @@
-"""What the operating system refuses is a line that says where and what to do."""
+"""Errors of the operating system in plain words with path and remedy; paths made relative."""
 
 from __future__ import annotations
 
@@ -11,15 +11,14 @@ import pytest
 from small_workspace import run
 
 from bodyscan.errors import BadInput, BodyscanError, FailedWork
-from bodyscan.files import os_errors
 from bodyscan.files.atomic import write_text
-from bodyscan.files.os_errors import in_words, require_writable
+from bodyscan.files.messages import make_paths_relative, require_writable, translate_os_error
 
 STORED = Path(__file__).parents[1] / "data" / "stored-0.1.0"
 
 
 @pytest.mark.parametrize(
-    ("number", "kind", "said"),
+    ("number", "kind", "what"),
     [
         (errno.ENOSPC, FailedWork, "the disk is full"),
         (errno.EROFS, BadInput, "is not allowed here"),
@@ -28,20 +27,17 @@ STORED = Path(__file__).parents[1] / "data" / "stored-0.1.0"
         (errno.EIO, FailedWork, "error"),
     ],
 )
-def test_each_kind_has_its_words(number: int, kind: type[BodyscanError], said: str) -> None:
-    told = in_words(OSError(number, os.strerror(number), "some/where"))
-    assert type(told) is kind
-    assert told.where == "some/where"
-    assert said in told.what
-    assert told.remedy
+def test_an_os_error_is_translated(number: int, kind: type[BodyscanError], what: str) -> None:
+    error = translate_os_error(OSError(number, os.strerror(number), "some/where"))
+    assert type(error) is kind
+    assert error.where == "some/where"
+    assert what in error.what
+    assert error.remedy
 
 
-def test_a_folder_that_is_not_there_yet_is_none_the_worse(tmp_path: Path) -> None:
+def test_a_folder_need_not_exist_to_be_writable(tmp_path: Path) -> None:
     require_writable(tmp_path / "a" / "b")
     assert not list(tmp_path.iterdir())
-
-
-def test_a_place_where_nothing_can_be_written_is_refused() -> None:
     with pytest.raises(BodyscanError) as refused:
         require_writable(Path("/proc/results"))  # not even root can
     assert refused.value.where == "/proc/results"
@@ -51,17 +47,17 @@ def refuse(*_: Any, **__: Any) -> Any:
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
-def test_room_is_looked_for_before_the_work(
+def test_a_full_disk_is_found_before_the_work(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(os_errors, "TemporaryFile", refuse)
+    monkeypatch.setattr("bodyscan.files.messages.TemporaryFile", refuse)
     monkeypatch.setattr("bodyscan.fusion.storage.load_scan", None)  # any work would fail otherwise
     result = run("export", STORED / "scan", "--out", tmp_path / "out")
     assert isinstance(result.exception, FailedWork)
     assert result.exception.where == str(tmp_path / "out")
 
 
-def test_a_disk_that_fills_up_meanwhile_is_told_with_the_file(
+def test_a_disk_that_fills_up_is_reported_with_the_final_name_of_the_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("bodyscan.files.atomic.flush", refuse)
@@ -69,17 +65,11 @@ def test_a_disk_that_fills_up_meanwhile_is_told_with_the_file(
     assert isinstance(result.exception, FailedWork)
     assert result.exception.where == str(tmp_path / "body.stl")
     assert not list(tmp_path.iterdir())
-
-
-def test_the_file_is_named_as_people_know_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("bodyscan.files.atomic.flush", refuse)
     with pytest.raises(OSError, match=r"a\.txt"):
         write_text(tmp_path / "a.txt", "text")
 
 
-def test_memory_that_does_not_suffice_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_little_memory_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     def take_all(folder: Path) -> None:
         raise MemoryError
 
@@ -87,3 +77,20 @@ def test_memory_that_does_not_suffice_is_told(monkeypatch: pytest.MonkeyPatch) -
     result = run("measure", STORED / "scan")
     assert isinstance(result.exception, FailedWork)
     assert "memory" in result.exception.what
+
+
+@pytest.mark.parametrize(
+    ("text", "base", "below", "expected"),
+    [
+        ("/h/s/a/lit.png: gone; so is /h/s/b.png", "/h/s", ["/h/s/a"],
+         "a/lit.png: gone; so is b.png"),
+        ("/a/boards/b01/lit.png: is black", "/a/rig", ["/a/boards"],
+         "../boards/b01/lit.png: is black"),
+        ("data/x.png, a/y.png", "a", [], "data/x.png, y.png"),  # not the end of another path
+        ("captures/b01/lit.png", ".", [], "captures/b01/lit.png"),
+    ],
+)  # fmt: skip
+def test_paths_in_stored_messages_are_relative(
+    text: str, base: str, below: list[str], expected: str
+) -> None:
+    assert make_paths_relative(text, Path(base), map(Path, below)) == expected

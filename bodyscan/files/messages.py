@@ -1,0 +1,68 @@
+"""Messages about files: errors of the operating system in plain words, paths made relative."""
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+from collections.abc import Iterable
+from pathlib import Path
+from tempfile import TemporaryFile
+
+from bodyscan.errors import BadInput, BodyscanError, FailedWork
+
+
+def translate_os_error(error: OSError) -> BodyscanError:
+    """BadInput if another file or folder would do, FailedWork if the machine has to change."""
+    where = "" if error.filename is None else os.fsdecode(error.filename)
+    what = error.strerror or str(error)
+    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        remedy = "make room, then start again"
+        return FailedWork(f"the disk is full ({what})", where=where, remedy=remedy)
+    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+        remedy = "give it the right permissions, or name another path"
+        return BadInput(f"is not allowed here ({what})", where=where, remedy=remedy)
+    if error.errno in (
+        errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP
+    ):  # fmt: skip
+        return BadInput(what, where=where, remedy="name one that exists")
+    if error.errno == errno.EPIPE:
+        return FailedWork("the program that read the output has closed it")
+    return FailedWork(what, where=where, remedy="check the disk or the network, then start again")
+
+
+def require_writable(folder: Path) -> None:
+    """Raise BadInput or FailedWork if nothing can be written into `folder`, which need not exist.
+
+    It is tested before the work, not after: by writing to the nearest existing folder above.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise BadInput(
+            "is a file; results go into a folder", where=str(folder), remedy="give another --out"
+        )
+    parent = folder.absolute()
+    try:
+        while not parent.is_dir():
+            parent = parent.parent
+        with TemporaryFile(dir=parent) as probe:
+            probe.write(bytes(65536))  # less than any result takes, and written in no time
+            probe.flush()
+    except OSError as error:
+        raise translate_os_error(OSError(error.errno, error.strerror, str(folder))) from error
+
+
+def make_paths_relative(text: str, base: Path, below: Iterable[Path] = ()) -> str:
+    """`text` with every path that begins with `base`, or with a folder of `below`, made relative to
+    `base`.
+
+    For stored messages: folders are named after people, and the same work in another folder must
+    give the same bytes.
+    """
+    for folder in (*below, base):
+        short = os.path.relpath(folder, base)
+        to = "" if short == os.curdir else f"{Path(short).as_posix()}/"
+        for known in {str(folder), os.path.abspath(folder)} - {os.curdir}:
+            # Not in the middle of another path.
+            pattern = rf"(?<![\w./-]){re.escape(known.rstrip('/'))}/"
+            text = re.sub(pattern, to.replace("\\", "/"), text)
+    return text
