@@ -457,9 +457,9 @@ def _scan_of(workspace: Path) -> tuple[Any, Any]:
 
 def _spacing(cloud: BodyCloud) -> float:
     """Voxel size that gives about as many points as ours."""
-    from bodyscan.fusion.voxel_thinning import voxel_size_for
+    from bodyscan.fusion.voxel_thinning import find_voxel_size
 
-    return voxel_size_for(cloud.points.astype(np.float32), len(cloud.points))
+    return find_voxel_size(cloud.points.astype(np.float32), len(cloud.points))
 
 
 def _near(workspace: Path, points: Any, vertices: Any, faces: Any) -> Figures:

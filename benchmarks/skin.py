@@ -22,7 +22,7 @@ from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.captures.folder import open_scan
 from bodyscan.evaluation.body import sway_residual
 from bodyscan.evaluation.surface import signed_distances
-from bodyscan.fusion.scan import Scan
+from bodyscan.fusion.storage import Scan
 from bodyscan.geometry.camera import camera_from_fields
 from bodyscan.geometry.robust import rms, robust_scale
 from bodyscan.geometry.transforms import RigidTransform

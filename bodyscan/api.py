@@ -48,8 +48,7 @@ from bodyscan.verdict import Verdict
 
 if TYPE_CHECKING:
     from bodyscan.arrays import Bytes
-    from bodyscan.fusion.scan import Scan
-    from bodyscan.fusion.storage import StoredScan
+    from bodyscan.fusion.storage import Scan, StoredScan
     from bodyscan.measurement.measurements import Measurements
     from bodyscan.mesh.body import BodyCloud, BodyMesh
     from bodyscan.reconstruction.range_image import RangeImage
@@ -65,7 +64,7 @@ _HOMES = {
     "RangeImage": "bodyscan.reconstruction.range_image",
     "Rig": "bodyscan.rig.rig",
     "RigCalibration": "bodyscan.registration.rig_calibration",
-    "Scan": "bodyscan.fusion.scan",
+    "Scan": "bodyscan.fusion.storage",
     "StoredScan": "bodyscan.fusion.storage",
 }
 """Where each type lives: it is imported on first use, since importing it takes time."""

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from bodyscan.fusion.scan import Scan
+from bodyscan.fusion.storage import Scan
 from bodyscan.geometry.uncertainty import position_sigma
 from bodyscan.mesh.body import compute_cover_shares
 from bodyscan.registration.rig_calibration import RigCalibration

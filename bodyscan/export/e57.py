@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from bodyscan.errors import BadInput
 from bodyscan.files.atomic import atomic_replacement, write_json
-from bodyscan.fusion.scan import Scan
+from bodyscan.fusion.storage import Scan
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.version import __version__

@@ -20,63 +20,59 @@ from bodyscan.fusion.consistency import Consistency
 from bodyscan.fusion.smoothing import SmoothSurface
 from bodyscan.fusion.voxel_thinning import Samples
 
-DARKEST, BRIGHTEST = 8, 250
-"""Grey levels beyond which a pixel says nothing about the light."""
-FEWEST = 200
-SPOTS = 5000  # spots of an overlap that suffice to compare exposures
-HOLD = 1e-3  # relative to an overlap's weight: pairs without overlap keep their own brightness
-FLATTEST = 0.1  # cosine: surfaces lit at a flatter angle are mostly lit by the room
+MIN_GREY = 8
+"""Grey level below which a pixel carries no information about the light."""
 
 
 @dataclass(frozen=True, eq=False)
-class EvenGrey:
-    """Evened grey levels, float32: of the samples, (N,), and of each surface's points."""
+class EqualizedGrey:
+    """Equalized grey levels, float32: of the samples, (N,), and of each surface's points."""
 
     samples: Floats
     surfaces: list[Floats]
 
 
-def even_brightness(
+def equalize_brightness(
     samples: Samples, surfaces: Sequence[SmoothSurface], consistency: Sequence[Consistency]
-) -> EvenGrey:
-    """Grey levels as if all pairs were exposed alike and lit the body evenly."""
+) -> EqualizedGrey:
+    """Correct grey levels to equal exposure of all pairs and even light on the body."""
     centres = [surface.rig_from_camera.translation for surface in surfaces]
     of_surfaces = [
-        _shades(surface.points, surface.normals, centre)
+        log_irradiance(surface.points, surface.normals, centre)
         for surface, centre in zip(surfaces, centres, strict=True)
     ]
-    own = [slice(start, end) for start, end in pairwise(samples.starts)]
+    parts = [slice(start, end) for start, end in pairwise(samples.starts)]
     of_samples = np.concatenate(
         [
-            _shades(samples.points[part], samples.normals[part], centre)
-            for part, centre in zip(own, centres, strict=True)
+            log_irradiance(samples.points[part], samples.normals[part], centre)
+            for part, centre in zip(parts, centres, strict=True)
         ]
     )
-    overlaps = _overlaps(samples, surfaces, consistency, of_samples, of_surfaces)
-    power = light_power([(overlap.ratio, overlap.shade) for overlap in overlaps])
+    overlaps = find_overlaps(samples, surfaces, consistency, of_samples, of_surfaces)
+    power = estimate_light_power([(overlap.ratio, overlap.shade) for overlap in overlaps])
     ratios = [(o.a, o.b, float(np.median(o.ratio - power * o.shade)), o.spots) for o in overlaps]
-    gain = gains(ratios, len(surfaces))
+    gain = solve_gains(ratios, len(surfaces))
     typical = float(np.mean(of_samples)) if len(of_samples) else 0.0
 
-    def evened(colours: Bytes, shades: Floats, factor: float) -> Floats:
+    def normalize(colours: Bytes, shades: Floats, factor: float) -> Floats:
         return colours * (factor * np.exp(np.float32(-power) * (shades - np.float32(typical))))
 
-    return EvenGrey(
+    return EqualizedGrey(
         np.concatenate(
             [
-                evened(samples.colours[part], of_samples[part], factor)
-                for part, factor in zip(own, gain, strict=True)
+                normalize(samples.colours[part], of_samples[part], factor)
+                for part, factor in zip(parts, gain, strict=True)
             ]
         ),
         [
-            evened(surface.colours, shades, factor)
+            normalize(surface.colours, shades, factor)
             for surface, shades, factor in zip(surfaces, of_surfaces, gain, strict=True)
         ],
     )
 
 
 @dataclass(frozen=True, eq=False)
-class _Overlap:
+class Overlap:
     """Spots shown by both surfaces a and b.
 
     ratio: logarithm of b's grey level over a's, (N,).
@@ -91,31 +87,35 @@ class _Overlap:
     spots: int
 
 
-def _overlaps(
+def find_overlaps(
     samples: Samples,
     surfaces: Sequence[SmoothSurface],
     consistency: Sequence[Consistency],
     of_samples: Floats,
     of_surfaces: Sequence[Floats],
-) -> list[_Overlap]:
+) -> list[Overlap]:
+    """Compare grey levels where surfaces agree with samples of others, in up to 5000 spots a pair.
+
+    of_samples, of_surfaces: logarithms of irradiance.
+    """
     found = []
     for b, (surface, one) in enumerate(zip(surfaces, consistency, strict=True)):
         starts = np.searchsorted(one.index, samples.starts)
         for a, (start, end) in enumerate(pairwise(starts)):
-            step = 1 + (end - start) // SPOTS
+            step = 1 + (end - start) // 5000
             here, there = one.index[start:end:step], one.at[start:end:step]
             ours, theirs = samples.colours[here], surface.colours[there]
-            clear = (np.minimum(ours, theirs) > DARKEST) & (np.maximum(ours, theirs) < BRIGHTEST)
-            if np.count_nonzero(clear) < FEWEST:
+            clear = (np.minimum(ours, theirs) > MIN_GREY) & (np.maximum(ours, theirs) < 250)
+            if np.count_nonzero(clear) < 200:
                 continue
             ratio = np.log(theirs[clear] / ours[clear].astype(np.float32))
             shade = of_surfaces[b][there[clear]] - of_samples[here[clear]]
-            found.append(_Overlap(a, b, ratio, shade, step * len(ratio)))
+            found.append(Overlap(a, b, ratio, shade, step * len(ratio)))
     return found
 
 
-def light_power(overlaps: Sequence[tuple[Floats, Floats]]) -> float:
-    """The power, 0 to 1, with which the grey level of a spot rises with the light that falls on it.
+def estimate_light_power(overlaps: Sequence[tuple[Floats, Floats]]) -> float:
+    """Estimate the power, 0 to 1, of irradiance to which grey levels are proportional.
 
     overlaps: logarithms (N,) of one camera's grey levels over another's, and of the light's.
 
@@ -125,7 +125,9 @@ def light_power(overlaps: Sequence[tuple[Floats, Floats]]) -> float:
     if not overlaps:
         return 0.0
     ratio, shade = (
-        np.concatenate([own[k] - np.median(own[k]) for own in overlaps]).astype(np.float64)
+        np.concatenate([overlap[k] - np.median(overlap[k]) for overlap in overlaps]).astype(
+            np.float64
+        )
         for k in range(2)
     )
     some = np.abs(shade) > 1e-6
@@ -139,14 +141,15 @@ def _weighted_median(values: Array, weights: Array) -> float:
     return float(values[order][np.searchsorted(below, 0.5 * below[-1])])
 
 
-def gains(ratios: Sequence[tuple[int, int, float, int]], count: int) -> Floats:
-    """Factors (count,) that bring the pairs' grey levels together, with geometric mean 1.
+def solve_gains(ratios: Sequence[tuple[int, int, float, int]], count: int) -> Floats:
+    """Solve for the factors (count,) that bring the pairs' grey levels together, with geometric mean 1.
 
     ratios: (a, b, log of b's grey level over a's at common spots, number of spots).
 
     Least squares in logarithms, so that the factors go round the ring without a step.
     """
-    normal, right = HOLD * np.eye(count), np.zeros(count)
+    # Pairs without overlap keep their brightness.
+    normal, right = 1e-3 * np.eye(count), np.zeros(count)
     for a, b, ratio, spots in ratios:
         weight = spots / sum(n for *_, n in ratios)
         normal[[a, b], [a, b]] += weight
@@ -158,10 +161,11 @@ def gains(ratios: Sequence[tuple[int, int, float, int]], count: int) -> Floats:
 
 
 @compiled
-def _shades(points: Floats, normals: Floats, centre: Array) -> Floats:
-    """Logarithm (N,) of the light that a surface gets from beside a camera, up to a constant.
+def log_irradiance(points: Floats, normals: Floats, centre: Array) -> Floats:
+    """Logarithm (N,) of a surface's irradiance from a lamp at a camera's centre, up to a constant.
 
-    That is the cosine of its incidence over the squared distance.
+    That is the cosine of incidence over the squared distance. Below a cosine of 0.1 the room's light
+    prevails.
     """
     shades = np.empty(len(points), np.float32)
     for n in range(len(points)):
@@ -170,6 +174,6 @@ def _shades(points: Floats, normals: Floats, centre: Array) -> Floats:
             away = centre[k] - points[n, k]
             towards += normals[n, k] * away
             distance2 += away * away
-        cosine = max(towards / np.sqrt(distance2), FLATTEST)
+        cosine = max(towards / np.sqrt(distance2), 0.1)
         shades[n] = np.log(cosine / distance2)
     return shades

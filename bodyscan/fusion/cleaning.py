@@ -20,16 +20,8 @@ from bodyscan.progress import THREADS
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.rig.rig import Volume
 
-STEEPEST = 5.0  # depth per sideways step on the steepest useful surface: tan 79 degrees
-DISTANCES_PX = np.hypot(*np.mgrid[-2:3, -2:3])  # of a pixel's neighbours
-BACKGROUND_MM = 4.0  # a subject stands out from the background by more than this
-QUANTUM_MM = 0.25  # cv2.filterSpeckles works on 16-bit integers: +-8 m in steps of this
-# Of dark gaps:
-WIDEST_GAP_PX = 7  # width of the gap and half of its slopes: several times the blur
-DARKER = 2.0  # times darker than the surfaces around
-ROOM_PX = 8  # around a kept part: farther than any later window reaches beyond a rim
-GAP_MARGIN_PX = 1  # beside such dark pixels, where the two mix
-LEAST_STEP = 30  # grey levels; less may be noise on a dark surface
+MAX_SLOPE = 5.0
+"""Depth per sideways step on the steepest useful surface: tan 79 degrees."""
 
 
 def clean(
@@ -47,38 +39,38 @@ def clean(
     smallest_patch_mm2: smaller disconnected patches are removed.
 
     Removed are: everything outside the scan volume (floor, walls), what `empty` shows, flying
-    pixels at silhouettes, grazing surfaces, narrow dark gaps (see `dark_gaps`), and small patches.
+    pixels at silhouettes, grazing surfaces, narrow dark gaps (see `find_dark_gaps`), and small patches.
     """
-    nobody = {image.pair: image for image in empty}
+    background = {image.pair: image for image in empty}
 
-    def one(image: RangeImage) -> RangeImage:
-        kept = inside(image, rig_from_camera[image.pair], volume)
-        if image.pair in nobody:
-            kept &= in_front_of(image, nobody[image.pair])
+    def clean_one(image: RangeImage) -> RangeImage:
+        kept = find_inside(image, rig_from_camera[image.pair], volume)
+        if image.pair in background:
+            kept &= find_foreground(image, background[image.pair])
         box = find_crop(kept)
         if box is not None:
-            kept[box] &= ~dark_gaps(image.colours[box])
+            kept[box] &= ~find_dark_gaps(image.colours[box])
         if box is not None and kept.any():
             depth = np.where(kept[box], image.points[box][..., 2], np.float32(np.nan))
             pixel_mm = float(np.median(depth[kept[box]])) / image.camera.alpha
-            solid = drop_flying_pixels(depth, STEEPEST * pixel_mm)
-            kept[box] = drop_speckles(solid, STEEPEST * pixel_mm, smallest_patch_mm2 / pixel_mm**2)
+            solid = drop_flying_pixels(depth, MAX_SLOPE * pixel_mm)
+            kept[box] = drop_speckles(solid, MAX_SLOPE * pixel_mm, smallest_patch_mm2 / pixel_mm**2)
         return apply_mask(image, kept)
 
     with ThreadPoolExecutor(workers) as pool:
-        return list(pool.map(one, range_images))
+        return list(pool.map(clean_one, range_images))
 
 
 def require_subject(cleaned: Sequence[RangeImage]) -> list[RangeImage]:
     """The images that show some of the subject. Raises ScanFailed if none does."""
-    seen = [image for image in cleaned if image.valid.any()]
-    if not seen:
+    valid = [image for image in cleaned if image.valid.any()]
+    if not valid:
         raise ScanFailed(
             "nobody stands in the scan volume",
             remedy="look at the lit images; check `volume` in the calibration's calibration.json, and "
             "that a folder given with --empty shows the rig without anybody",
         )
-    return seen
+    return valid
 
 
 def apply_mask(image: RangeImage, kept: Mask) -> RangeImage:
@@ -88,11 +80,11 @@ def apply_mask(image: RangeImage, kept: Mask) -> RangeImage:
 
 def cut_to_volume(image: RangeImage, rig_from_camera: RigidTransform, volume: Volume) -> RangeImage:
     """Crop to what lies inside the scan volume; cleaning leaves nothing else."""
-    box = find_crop(inside(image, rig_from_camera, volume)) or (slice(0, 1), slice(0, 1))
-    return image.cut(pad_crop(box, ROOM_PX))
+    box = find_crop(find_inside(image, rig_from_camera, volume)) or (slice(0, 1), slice(0, 1))
+    return image.cut(pad_crop(box, 8))  # farther than any later window reaches beyond a rim
 
 
-def inside(image: RangeImage, rig_from_camera: RigidTransform, volume: Volume) -> Mask:
+def find_inside(image: RangeImage, rig_from_camera: RigidTransform, volume: Volume) -> Mask:
     """(h, w): where a point was measured inside the upright cylinder of the scan volume."""
     within = np.empty(image.sigma_mm.shape, np.bool_)
     size = (volume.radius_mm, volume.bottom_mm, volume.top_mm)
@@ -100,15 +92,15 @@ def inside(image: RangeImage, rig_from_camera: RigidTransform, volume: Volume) -
     return within
 
 
-def in_front_of(image: RangeImage, empty: RangeImage) -> Mask:
-    """(h, w): where a point was measured in front of what the camera sees without a subject.
+def find_foreground(image: RangeImage, empty: RangeImage) -> Mask:
+    """(h, w): where a point was measured 4 mm or more in front of the scene without a subject.
 
     The nearest background among neighbouring pixels counts, because of edges of things in the room.
     """
     window = np.ones((3, 3), np.uint8)
     far = np.where(empty.open_depth > 0.0, empty.open_depth, np.float32(np.inf))
     with np.errstate(invalid="ignore"):
-        return image.points[..., 2] < cv2.erode(far, window)[image.part] - BACKGROUND_MM
+        return image.points[..., 2] < cv2.erode(far, window)[image.part] - 4.0
 
 
 def drop_flying_pixels(depth: Floats, step_mm: float, *, supporters: int = 13) -> Floats:
@@ -118,7 +110,8 @@ def drop_flying_pixels(depth: Floats, step_mm: float, *, supporters: int = 13) -
     front and back, and has few within `step_mm` per step. A second pass no longer counts what the
     first removed.
     """
-    limits = np.where(DISTANCES_PX > 0, step_mm * DISTANCES_PX, -1.0).astype(np.float32)
+    distances_px = np.hypot(*np.mgrid[-2:3, -2:3])
+    limits = np.where(distances_px > 0, step_mm * distances_px, -1.0).astype(np.float32)
     for _ in range(2):
         padded, depth = np.pad(depth, 2, constant_values=np.nan), np.empty_like(depth)
         _keep_supported(padded, limits, supporters, depth)
@@ -127,12 +120,13 @@ def drop_flying_pixels(depth: Floats, step_mm: float, *, supporters: int = 13) -
 
 def drop_speckles(depth: Floats, step_mm: float, smallest_px: float) -> Mask:
     """(h, w): pixels in connected patches of at least `smallest_px`, split at jumps in depth."""
-    quanta = np.clip(np.nan_to_num(depth) / QUANTUM_MM, 0, 32767).astype(np.int16)
-    patches, _ = cv2.filterSpeckles(quanta, 0, int(smallest_px), step_mm / QUANTUM_MM)
+    quantum_mm = 0.25  # of 16-bit integers: 8 m
+    quanta = np.clip(np.nan_to_num(depth) / quantum_mm, 0, 32767).astype(np.int16)
+    patches, _ = cv2.filterSpeckles(quanta, 0, int(smallest_px), step_mm / quantum_mm)
     return patches > 0
 
 
-def dark_gaps(grey: Bytes) -> Mask:
+def find_dark_gaps(grey: Bytes) -> Mask:
     """(height, width): pixels in a narrow dark gap of an image (height, width), or at its rim.
 
     Hardly any light falls into the gap between two toes. What a camera sees there is the blur of
@@ -142,11 +136,12 @@ def dark_gaps(grey: Bytes) -> Mask:
     A morphological closing fills what is narrower than its window with brighter surfaces on both
     sides; dark and wide things (hair, cloth, the background beside a silhouette) stay.
     """
-    window = np.ones((WIDEST_GAP_PX, WIDEST_GAP_PX), np.uint8)
+    # 7 pixels: the gap and half of its slopes, several times the blur.
+    window = np.ones((7, 7), np.uint8)
     around = cv2.morphologyEx(grey, cv2.MORPH_CLOSE, window).astype(np.float32)
-    dark = (around > DARKER * grey) & (around >= grey + np.float32(LEAST_STEP))
-    margin = np.ones((2 * GAP_MARGIN_PX + 1, 2 * GAP_MARGIN_PX + 1), np.uint8)
-    return cv2.dilate(dark.view(np.uint8), margin).view(bool)
+    # Less than 30 grey levels may be noise on a dark surface.
+    dark = (around > 2.0 * grey) & (around >= grey + np.float32(30))
+    return cv2.dilate(dark.view(np.uint8), np.ones((3, 3), np.uint8)).view(bool)
 
 
 @compiled

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from bodyscan.arrays import Array, Bytes, Floats
 from bodyscan.compiled import compiled
-from bodyscan.fusion.brightness import EvenGrey, even_brightness
+from bodyscan.fusion.brightness import EqualizedGrey, equalize_brightness
 from bodyscan.fusion.consistency import Consistency, Contradictions, compare_with_surface
 from bodyscan.fusion.quadratic_fit import NORMAL_MEDIAN
 from bodyscan.fusion.smoothing import Numbers, SmoothSurface, smooth
@@ -68,7 +68,7 @@ def merge(
             range(len(surfaces)),
         )
         consistency = list(compared)
-    grey = even_brightness(samples, surfaces, consistency)
+    grey = equalize_brightness(samples, surfaces, consistency)
     cloud = average(samples, surfaces, consistency, grey, poses, workers)
     pairs = [surface.pair for surface in surfaces]
     contradictions = Contradictions.count(
@@ -81,7 +81,7 @@ def average(
     samples: Samples,
     surfaces: Sequence[SmoothSurface],
     consistency: Sequence[Consistency],
-    grey: EvenGrey,
+    grey: EqualizedGrey,
     poses: PoseCovariance | None = None,
     workers: int = THREADS,
 ) -> BodyCloud:

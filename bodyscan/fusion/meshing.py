@@ -8,9 +8,14 @@ import numpy as np
 
 from bodyscan.arrays import Array, Floats, Indices
 from bodyscan.errors import ScanFailed
-from bodyscan.fusion.hole_filling import crossed, interpolated, likely_distances
-from bodyscan.fusion.signed_distances import splat, touched
-from bodyscan.fusion.support import fit_to_points, support
+from bodyscan.fusion.hole_filling import fill_distances
+from bodyscan.fusion.signed_distances import (
+    find_crossed_bricks,
+    find_near_bricks,
+    interpolate_distances,
+    splat_planes,
+)
+from bodyscan.fusion.support import fit_to_points, measure_support
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud, BodyMesh, select_regions
 from bodyscan.mesh.repair import extract_largest_piece
@@ -19,11 +24,6 @@ from bodyscan.mesh.topology import check_manifold, compute_topology, vertex_norm
 from bodyscan.progress import THREADS
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.settings import MeshSettings
-
-FEWEST_POINTS = 1000
-TELLING = 20_000
-"""Approximate number of points that decide which piece of a surface is the subject."""
-GUESS_WEIGHT = np.float32(0.1)  # relative to the points': matters in a seam, where they become few
 
 
 def mesh(
@@ -55,18 +55,18 @@ def closed_surface(
     workers: int = THREADS,
 ) -> tuple[Array, Indices]:
     """Vertices (V, 3) mm and faces (F, 3) of the mesh, only as exact as the grid; see `mesh`."""
-    if len(cloud.points) < FEWEST_POINTS:
+    if len(cloud.points) < 1000:
         raise ScanFailed(
             f"a cloud of {len(cloud.points)} points is too small for a mesh",
             remedy="Look at the range images; is the subject inside the scan volume?",
         )
-    bricks, distances = signed_distances(
+    bricks, distances = compute_distances(
         cloud, settings.cell_mm, range_images, rig_from_camera or {}, workers=workers
     )
     vertices, faces = extract_surface(bricks, distances)
     if not len(faces):
         raise ScanFailed("no surface came out of the cloud: its points contradict each other")
-    some = cloud.points[:: -(-len(cloud.points) // TELLING)]
+    some = cloud.points[:: -(-len(cloud.points) // 20_000)]
     vertices, faces = extract_largest_piece(vertices, faces, some)
     if not check_manifold(faces, len(vertices))[1]:
         found = compute_topology(vertices, faces)
@@ -74,7 +74,7 @@ def closed_surface(
     return vertices, faces
 
 
-def signed_distances(
+def compute_distances(
     cloud: BodyCloud,
     cell_mm: float,
     range_images: Sequence[RangeImage],
@@ -82,19 +82,20 @@ def signed_distances(
     *,
     workers: int,
 ) -> tuple[Bricks, Floats]:
-    """A sparse grid around a closed surface, and the signed distances at its nodes, mm.
+    """Compute signed distances (mm) of a closed surface at the nodes of a sparse grid around it.
 
     Near the cloud they follow its points, elsewhere `hole_filling`, with a blend in between, so
-    that there is no seam and every place has a side.
+    that there is no seam and every node has a side.
     """
-    likely = likely_distances(cloud, cell_mm, range_images, rig_from_camera, workers=workers)
-    extent = likely.cell_mm * np.array(likely.values.shape)
+    coarse = fill_distances(cloud, cell_mm, range_images, rig_from_camera, workers=workers)
+    extent = coarse.cell_mm * np.array(coarse.values.shape)
     shape = tuple(np.ceil(extent / cell_mm / SIDE).astype(int))
-    wanted = touched(cloud.points, likely.origin, cell_mm, shape)
-    bricks = Bricks.from_mask(wanted | crossed(likely, cell_mm, shape), likely.origin, cell_mm)
-    measured, weight = splat(cloud, bricks)
-    guessed = interpolated(likely, bricks)
-    return bricks, (weight * measured + GUESS_WEIGHT * guessed) / (weight + GUESS_WEIGHT)
+    occupied = find_near_bricks(cloud.points, coarse.origin, cell_mm, shape)
+    occupied |= find_crossed_bricks(coarse, cell_mm, shape)
+    bricks = Bricks.from_mask(occupied, coarse.origin, cell_mm)
+    measured, weight = splat_planes(cloud, bricks)
+    filled, blend = interpolate_distances(coarse, bricks), np.float32(0.1)
+    return bricks, (weight * measured + blend * filled) / (weight + blend)
 
 
 def attach_attributes(
@@ -102,11 +103,11 @@ def attach_attributes(
 ) -> BodyMesh:
     """Fit the mesh to the points, with normals, the points' attributes, and what was filled.
 
-    A grid's vertices are only as exact as its cells are small; they move along their normals to
-    where the points around are, by less the farther away those are.
+    A grid's vertices are only as exact as its cells are small: they move along their normals to the
+    points around, by less the farther away those are.
     """
     normals = vertex_normals(vertices, faces)
-    around = support(vertices, normals, cloud, reach_mm)
+    around = measure_support(vertices, normals, cloud, reach_mm)
     vertices = fit_to_points(vertices, faces, normals, around)
     sigma_mm = np.where(around.measured, around.sigma_mm, np.float32(np.nan))
     return BodyMesh(

@@ -1,4 +1,4 @@
-"""What the pairs' poses, and the following of a moving person, add to each point's sigma."""
+"""Add the uncertainty of the pairs' poses, and of a person's motion, to the points' sigmas."""
 
 from __future__ import annotations
 
@@ -16,56 +16,52 @@ from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.mesh.body import BodyCloud
 from bodyscan.progress import map_threads, split_range
 
-FACING = 0.2
-"""Cosine below which a pair sees a surface too flat to have measured it."""
-
 
 def add_pose_variance(
     cloud: BodyCloud,
     rig_from_camera: Mapping[str, RigidTransform],
     prior: PoseCovariance,
 ) -> BodyCloud:
-    """The cloud with the pairs' pose errors included in its sigmas along the normals.
+    """Add the variance of the pairs' poses along the normals to a cloud's sigmas.
 
-    A small motion (w, t) of a pair moves a point p along its normal n by (p x n).w + n.t. A point
-    is the mean of as many pairs as saw it, of those that face it: what is each pair's own averages
-    out, what they share does not.
+    A small motion (w, t) of a pair moves a point p along its normal n by (p x n).w + n.t. A point is
+    the mean of `pairs_seen` of the pairs that face it: their independent errors average out, their
+    covariances do not.
     """
-    centres = np.array([placing.translation for placing in rig_from_camera.values()])
+    centres = np.array([pose.translation for pose in rig_from_camera.values()])
     size = len(centres)
     joint = prior.select(tuple(rig_from_camera)).reshape(size, 6, size, 6).swapaxes(1, 2)
     rows, columns = np.triu_indices(6)
     packed = joint[..., rows, columns] + np.where(rows < columns, joint[..., columns, rows], 0.0)
-    placing_mm = np.empty(len(cloud.points))
+    sigma_mm = np.empty(len(cloud.points))
 
     def fill(part: slice) -> None:
         surface = cloud.points[part], cloud.normals[part], cloud.pairs_seen[part]
-        _placing(*surface, centres, packed, placing_mm[part])
+        _pose_sigmas(*surface, centres, packed, sigma_mm[part])
 
-    map_threads(fill, split_range(len(placing_mm)), stage="sigmas of places")
-    return replace(cloud, sigma_mm=np.hypot(cloud.sigma_mm, placing_mm).astype(np.float32))
+    map_threads(fill, split_range(len(sigma_mm)), stage="sigmas of poses")
+    return replace(cloud, sigma_mm=np.hypot(cloud.sigma_mm, sigma_mm).astype(np.float32))
 
 
-def add_motion_variance(cloud: BodyCloud, placed: BodyCloud, followed: Followed) -> BodyCloud:
-    """The cloud with the uncertainty of the person's motion included in its sigmas.
+def add_motion_variance(cloud: BodyCloud, with_poses: BodyCloud, followed: Followed) -> BodyCloud:
+    """Add the variance of the person's motion to a cloud's sigmas.
 
-    placed: the cloud with the pairs' pose errors, as known from the boards, in its sigmas.
-        Following leaves out motions of the body as a whole, which these include: the larger of both
-            counts.
+    with_poses: the cloud from `add_pose_variance`. Following leaves out motions of the body as a
+        whole, which its sigmas include: the larger of both counts.
     """
     cell = followed.cells.find_many(cloud.points, cloud.normals.astype(np.float64))
     sigma_mm = np.hypot(cloud.sigma_mm, followed.sigma_mm[cell])
-    return replace(cloud, sigma_mm=np.maximum(sigma_mm, placed.sigma_mm).astype(np.float32))
+    return replace(cloud, sigma_mm=np.maximum(sigma_mm, with_poses.sigma_mm).astype(np.float32))
 
 
 @compiled
-def _placing(
+def _pose_sigmas(
     points: Array,
     normals: Floats,
     pairs_seen: Bytes,
     centres: Array,
     joint: Array,
-    placing_mm: Array,
+    sigma_mm: Array,
 ) -> None:
     """Write standard deviations (N,) mm along the normals due to pose errors.
 
@@ -73,7 +69,7 @@ def _placing(
     triangle, with what lies below it added.
     """
     lever, products, facing = np.empty(6), np.empty(21), np.zeros(len(centres), np.bool_)
-    own, between = np.zeros(21), np.zeros(21)
+    alone, between = np.zeros(21), np.zeros(21)
     for n in range(len(points)):
         (x, y, z), (a, b, c) = points[n], normals[n]
         lever[0], lever[1], lever[2] = y * c - z * b, z * a - x * c, x * b - y * a
@@ -83,33 +79,33 @@ def _placing(
             for column in range(row, 6):
                 products[k] = lever[row] * lever[column]
                 k += 1
-        count, others = 0, False
+        count, changed = 0, False
         for pair in range(len(centres)):
             dx, dy, dz = centres[pair, 0] - x, centres[pair, 1] - y, centres[pair, 2] - z
             towards = a * dx + b * dy + c * dz
-            faces = towards > FACING * math.sqrt(dx * dx + dy * dy + dz * dz)
-            others |= faces != facing[pair]
+            faces = towards > 0.2 * math.sqrt(dx * dx + dy * dy + dz * dz)
+            changed |= faces != facing[pair]
             facing[pair] = faces
             count += faces
-        if others:  # most points face the same pairs as the one before
-            _sum_up(joint, facing, own, between)
-        mean, shared = 0.0, 0.0
+        if changed:  # most points face the same pairs as the one before
+            _sum_covariances(joint, facing, alone, between)
+        variance, covariance = 0.0, 0.0
         for k in range(21):
-            mean += own[k] * products[k] / max(count, 1)
-            shared += between[k] * products[k] / max(count * (count - 1) / 2, 1.0)
-        alone = 1.0 / max(min(pairs_seen[n], count), 1)
-        placing_mm[n] = math.sqrt(max(alone * mean + (1.0 - alone) * shared, 0.0))
+            variance += alone[k] * products[k] / max(count, 1)
+            covariance += between[k] * products[k] / max(count * (count - 1) / 2, 1.0)
+        share = 1.0 / max(min(pairs_seen[n], count), 1)
+        sigma_mm[n] = math.sqrt(max(share * variance + (1.0 - share) * covariance, 0.0))
 
 
 @compiled
-def _sum_up(joint: Array, facing: Mask, own: Array, between: Array) -> None:
-    """Write the sums of the facing pairs' own covariances, and of those of each two of them."""
-    own[:], between[:] = 0.0, 0.0
+def _sum_covariances(joint: Array, facing: Mask, alone: Array, between: Array) -> None:
+    """Write the sums of the facing pairs' covariances, and of those of each two of them."""
+    alone[:], between[:] = 0.0, 0.0
     for i in range(len(facing)):
         if not facing[i]:
             continue
         for k in range(21):
-            own[k] += joint[i, i, k]
+            alone[k] += joint[i, i, k]
         for j in range(i):
             if facing[j]:
                 for k in range(21):

@@ -1,9 +1,9 @@
-"""Label the points of a cloud as skin, hair or dark cloth by darkness, roughness and place.
+"""Label the points of a cloud as skin, hair or dark cloth by darkness, roughness and position.
 
 One person's skin varies in brightness by a factor of two, moles, lips and remaining shading
-included. Black cloth and dark hair are darker than a third of that; anything in between is
-undecided. Hair and cloth differ in place first: hair grows on the head and hangs from there. And
-hair is rough because its strands and locks stand apart, where noise lets that be seen at all.
+included. Black cloth and dark hair are darker than a third of that; anything in between is unsure.
+Hair and cloth differ in position first: hair grows on the head and hangs from there. And strands
+and locks make hair rougher than cloth, where noise lets that be measured at all.
 """
 
 from __future__ import annotations
@@ -15,10 +15,11 @@ import numpy as np
 from scipy import ndimage
 
 from bodyscan.alignment.part_names import NECK
-from bodyscan.arrays import Array, Bytes, Floats, Indices, Mask, find_crop
+from bodyscan.arrays import Array, Bytes, Crop, Floats, Indices, Mask, crop_bounds, find_crop
 from bodyscan.compiled import compiled
-from bodyscan.fusion.brightness import DARKEST
-from bodyscan.fusion.roughness import Misfits, misfits
+from bodyscan.fusion.brightness import MIN_GREY
+from bodyscan.fusion.quadratic_fit import fit_full_windows, window_basis
+from bodyscan.fusion.smoothing import estimate_pixel_size, inverse_depths, window_reach
 from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import DARK_CLOTH, HAIR, SKIN, UNSURE, BodyCloud
@@ -26,23 +27,12 @@ from bodyscan.progress import map_threads
 from bodyscan.reconstruction.range_image import RangeImage
 
 DARK, DIM = 1 / 3, 1 / 2
-"""Relative to the subject's usual brightness. Moles have 0.45 of the skin around; black hair and
+"""Relative to the subject's median brightness. Moles have 0.45 of the skin around; black hair and
 cloth reflect 3 to 6 % of the light, skin 10 (very dark) to 65 %."""
-SOME_BRIGHTER = 0.1
-"""Share of points so bright that the usual ones would be dark beside them: it is then not known
-which of the two is skin, under black clothes or white ones."""
 CELL_MM = 30.0
 """Smaller than the distance of hair and a collar; some hundred pixels."""
-SMALLEST = 3e-4
-"""Share of the points: 5 cm2 of a person, too little to affect any girth."""
-MOST = 0.5
-"""Share of a cell's points: dim points among dark ones are dark, and bright ones highlights."""
-ROUGH, ROUGH_MM = 3.0, 0.2
-"""ROUGH: times what sigmas predict. Those of dark cloth are right to a third; where several exposures
-show relief they carry it, so that only what is coarser than the stripes counts.
-ROUGH_MM: half of what locks of hair stand apart, as far as a window of 7 mm preserves it."""
-FEWEST = 50  # pixels needed to tell how rough a cell is
-HEAD_WIDE = 0.12  # of the stature: around the axis, for heads that lean forward and long hair
+ROUGH_MM = 0.2
+"""Half of what locks of hair are apart in depth, as far as a window of 7 mm preserves it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,8 +40,8 @@ class Regions:
     """Of N points.
 
     numbers: (N,) uint8, each point's region in `REGION_NAMES`.
-    relief_mm: (N,) float32, how far strands and locks of hair stand off a smooth surface, standard
-        deviation; 0 elsewhere. Smoothing flattens it.
+    relief_mm: (N,) float32, standard deviation of strands and locks of hair about the smoothed
+        surface; 0 elsewhere.
     """
 
     numbers: Bytes
@@ -59,18 +49,18 @@ class Regions:
 
 
 @dataclass(frozen=True, eq=False)
-class _Cells:
+class _Grid:
     """A grid of cubes around the body: its lowest corner, mm, and its size along each axis."""
 
     origin: Array
     shape: tuple[int, ...]
 
     @staticmethod
-    def around(points: Array) -> _Cells:
+    def from_points(points: Array) -> _Grid:
         low, high = points.min(axis=0), points.max(axis=0)
         # One more layer on all sides, so that every cell has neighbours.
         shape = np.floor((high - low) / CELL_MM).astype(int) + 3
-        return _Cells(low - CELL_MM, tuple(shape.tolist()))
+        return _Grid(low - CELL_MM, tuple(shape.tolist()))
 
     @property
     def count(self) -> int:
@@ -79,26 +69,26 @@ class _Cells:
     @property
     def centres(self) -> Array:
         """Centres of the cells, (count, 3) mm."""
-        place = np.stack(np.unravel_index(np.arange(self.count), self.shape), axis=-1)
-        return self.origin + CELL_MM * (place + 0.5)
+        index = np.stack(np.unravel_index(np.arange(self.count), self.shape), axis=-1)
+        return self.origin + CELL_MM * (index + 0.5)
 
     def find(self, points: Array) -> Indices:
         """Number (N,) of the cell of each point (N, 3); the nearest cell for points outside."""
-        place = np.floor((points - self.origin) / CELL_MM).astype(np.int64)
-        return np.ravel_multi_index(tuple(place.T), self.shape, mode="clip")
+        index = np.floor((points - self.origin) / CELL_MM).astype(np.int64)
+        return np.ravel_multi_index(tuple(index.T), self.shape, mode="clip")
 
-    def patches(self, taken: Mask) -> Indices:
-        """Number (count,) of the patch of neighbours that each cell belongs to, 0 if not taken."""
-        label = ndimage.label(taken.reshape(self.shape), np.ones((3, 3, 3)))[0]
+    def label_patches(self, occupied: Mask) -> Indices:
+        """Number (count,) of the connected patch of each cell, 0 if it is not occupied."""
+        label = ndimage.label(occupied.reshape(self.shape), np.ones((3, 3, 3)))[0]
         return np.asarray(label.ravel(), np.int64)
 
-    def mostly(self, said: Mask, among: Mask) -> Mask:
-        """(count,): cells around which most of the `among` cells are `said` too."""
+    def find_majority(self, mask: Mask, among: Mask) -> Mask:
+        """(count,): cells around which more than half of the `among` cells are in `mask` too."""
         counts = [
             ndimage.uniform_filter(some.reshape(self.shape).astype(float), 3).ravel()
-            for some in (said & among, among)
+            for some in (mask & among, among)
         ]
-        return np.asarray(counts[0] > MOST * counts[1] + 1e-9)
+        return np.asarray(counts[0] > 0.5 * counts[1] + 1e-9)
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +98,7 @@ class _Texture:
     known: whether enough pixels were examined.
     rough: whether it is rough beyond noise.
     smooth: whether it is smooth, noise included.
-    relief_mm: standard deviation of what lies off the smooth surface beyond noise.
+    relief_mm: standard deviation about the smooth surface, noise subtracted.
     """
 
     known: Mask
@@ -128,55 +118,61 @@ def label_regions(
     range_images: those that the cloud was merged from.
     window_mm: window over which they were smoothed.
 
-    All points are unsure if the images are too dark, or if so much is so bright that it is open
-    which part is skin.
+    All points are unsure if the images are too dark, or if more than a tenth is so bright that the
+    rest would be dark beside it: it is then open which part is skin.
     """
     grey = cloud.colours[:, 0].astype(np.float32)
-    usual = float(np.median(grey))
-    if DARK * usual < DARKEST or np.mean(grey > usual / DARK) > SOME_BRIGHTER:
+    typical = float(np.median(grey))
+    if DARK * typical < MIN_GREY or np.mean(grey > typical / DARK) > 0.1:
         unsure = np.full(len(grey), UNSURE, np.uint8)
         return Regions(unsure, np.zeros(len(grey), np.float32))
-    cells = _Cells.around(cloud.points)
-    cell, dark = cells.find(cloud.points), grey < DARK * usual
-    own, darks = (np.bincount(some, minlength=cells.count) for some in (cell, cell[dark]))
-    covered = darks > MOST * own
-    patch = cells.patches(darks > 0)
-    head = _head(cloud.points, cells.centres)
-    texture = _texture(cells, patch > 0, head, range_images, rig_from_camera, window_mm)
-    told = texture.known & covered
-    rough, smooth = cells.mostly(texture.rough, told), cells.mostly(texture.smooth, told)
+    cells = _Grid.from_points(cloud.points)
+    cell, dark = cells.find(cloud.points), grey < DARK * typical
+    # Dim points among dark ones are dark, and bright ones highlights.
+    total, darks = (np.bincount(some, minlength=cells.count) for some in (cell, cell[dark]))
+    covered = darks > 0.5 * total
+    patch = cells.label_patches(darks > 0)
+    head = find_head(cloud.points, cells.centres)
+    texture = _measure_texture(cells, patch > 0, head, range_images, rig_from_camera, window_mm)
+    known = texture.known & covered
+    rough = cells.find_majority(texture.rough, known)
+    smooth = cells.find_majority(texture.smooth, known)
 
-    large = np.bincount(patch, darks) >= SMALLEST * len(grey)
+    # 5 cm2 of a person are too little to affect any girth.
+    large = np.bincount(patch, darks) >= 3e-4 * len(grey)
     on_head = np.isin(patch, patch[head & covered])
-    kind = np.where(large[patch], _coverings(head, on_head, rough, smooth), UNSURE)
+    kind = np.where(large[patch], _label_coverings(head, on_head, rough, smooth), UNSURE)
     # Fair hair is as bright as skin.
     bare = head & (darks == 0)
-    shaggy = bare & cells.mostly(texture.rough, texture.known & bare)
+    shaggy = bare & cells.find_majority(texture.rough, texture.known & bare)
     bright = np.where(covered | shaggy, UNSURE, SKIN)
     dim = np.where(covered, kind, UNSURE)
-    found = np.where(dark, kind[cell], np.where(grey < DIM * usual, dim[cell], bright[cell]))
+    found = np.where(dark, kind[cell], np.where(grey < DIM * typical, dim[cell], bright[cell]))
     relief_mm = np.where(found == HAIR, texture.relief_mm[cell], 0.0)
     return Regions(found.astype(np.uint8), relief_mm.astype(np.float32))
 
 
-def _coverings(head: Mask, on_head: Mask, rough: Mask, smooth: Mask) -> Indices:
-    """What dark cells (count,) are: on the head, in one patch with it, and elsewhere."""
+def _label_coverings(head: Mask, on_head: Mask, rough: Mask, smooth: Mask) -> Indices:
+    """Label dark cells (count,): on the head, in one patch with it, and elsewhere."""
     hanging = np.where(rough, HAIR, np.where(smooth, DARK_CLOTH, UNSURE))
     elsewhere = np.where(rough, UNSURE, DARK_CLOTH)
     worn = np.where(smooth, DARK_CLOTH, HAIR)
     return np.where(head, worn, np.where(on_head, hanging, elsewhere))
 
 
-def _head(points: Array, places: Array) -> Mask:
-    """Which places (M, 3) lie on the head of a standing body, (M,)."""
+def find_head(points: Array, queries: Array) -> Mask:
+    """Find which queries (M, 3) lie on the head of a standing body with points (N, 3), (M,).
+
+    Within 0.12 of the stature around the upper body's axis: heads lean forward, and hair is long.
+    """
     top = points[:, 2].max()
     above = points[points[:, 2] > 0.5 * top, :2]
-    across = np.linalg.norm(places[:, :2] - np.median(above, axis=0), axis=1)
-    return np.asarray((places[:, 2] > NECK * top) & (across < HEAD_WIDE * top))
+    across = np.linalg.norm(queries[:, :2] - np.median(above, axis=0), axis=1)
+    return np.asarray((queries[:, 2] > NECK * top) & (across < 0.12 * top))
 
 
-def _texture(
-    cells: _Cells,
+def _measure_texture(
+    cells: _Grid,
     dark: Mask,
     head: Mask,
     range_images: Sequence[RangeImage],
@@ -184,67 +180,68 @@ def _texture(
     window_mm: float,
 ) -> _Texture:
     """Texture of dark cells and of the head; elsewhere it is not known."""
-    asked = dark | head
+    mask = (dark | head).reshape(cells.shape)
 
-    def looked_at(image: RangeImage) -> Misfits | None:
-        at, wanted = rig_from_camera[image.pair], np.zeros(image.sigma_mm.shape, np.bool_)
-        matrix, grid = at.matrix[:3], asked.reshape(cells.shape)
-        lies_in(image.points, image.sigma_mm, matrix, cells.origin, grid, wanted)
-        box = find_crop(wanted)
-        return None if box is None else misfits(image, at, box, window_mm)
+    def measure(image: RangeImage) -> Roughness | None:
+        pose, inside = rig_from_camera[image.pair], np.zeros(image.sigma_mm.shape, np.bool_)
+        find_in_cells(image.points, image.sigma_mm, pose.matrix[:3], cells.origin, mask, inside)
+        box = find_crop(inside)
+        return None if box is None else measure_roughness(image, pose, box, window_mm)
 
-    each = map_threads(looked_at, range_images, stage="naming regions")
+    each = map_threads(measure, range_images, stage="naming regions")
     found = [one for one in each if one is not None]
     if not found:
         nowhere = np.zeros(cells.count, bool)
         return _Texture(nowhere, nowhere, nowhere, np.zeros(cells.count))
-    return _told(cells, found)
+    return _summarize_by_cell(cells, found)
 
 
 @compiled
-def lies_in(
+def find_in_cells(
     points: Floats,
     sigma_mm: Floats,
     rig_from_camera: Array,
     origin: Array,
-    asked: Mask,
-    wanted: Mask,
+    cells: Mask,
+    inside: Mask,
 ) -> None:
-    """Set wanted (H, W): which points (H, W, 3) with a sigma lie in the cells that are asked for.
+    """Write inside (H, W): which points (H, W, 3) with a sigma lie in the cells of a mask (a, b, c).
 
     rig_from_camera: (3, 4).
-    origin: lowest corner of the cells (a, b, c), (3,) mm; points outside count for the nearest
-        cell.
+    origin: lowest corner of the cells, (3,) mm; points outside count for the nearest cell.
     """
     m, low = rig_from_camera, origin
-    for v in range(wanted.shape[0]):
-        for u in range(wanted.shape[1]):
+    for v in range(inside.shape[0]):
+        for u in range(inside.shape[1]):
             if not np.isfinite(sigma_mm[v, u]):
                 continue
             x, y, z = points[v, u, 0], points[v, u, 1], points[v, u, 2]
             a = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3] - low[0]) / CELL_MM
             b = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3] - low[1]) / CELL_MM
             c = (m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3] - low[2]) / CELL_MM
-            i = min(max(int(np.floor(a)), 0), asked.shape[0] - 1)
-            j = min(max(int(np.floor(b)), 0), asked.shape[1] - 1)
-            k = min(max(int(np.floor(c)), 0), asked.shape[2] - 1)
-            wanted[v, u] = asked[i, j, k]
+            i = min(max(int(np.floor(a)), 0), cells.shape[0] - 1)
+            j = min(max(int(np.floor(b)), 0), cells.shape[1] - 1)
+            k = min(max(int(np.floor(c)), 0), cells.shape[2] - 1)
+            inside[v, u] = cells[i, j, k]
 
 
-def _told(cells: _Cells, found: Sequence[Misfits]) -> _Texture:
+def _summarize_by_cell(cells: _Grid, found: Sequence[Roughness]) -> _Texture:
+    """Texture of each cell with 50 pixels or more, by the medians of their residuals."""
     cell = np.concatenate([cells.find(one.points) for one in found])
-    off = np.concatenate([one.misfit_mm for one in found])
+    residual = np.concatenate([one.residual_mm for one in found])
     expected_mm = np.concatenate([one.expected_mm for one in found])
-    known = np.bincount(cell, minlength=cells.count) >= FEWEST
-    seen_mm = SIGMAS_PER_MEDIAN * _medians(off, cell, cells.count)
-    sigmas = SIGMAS_PER_MEDIAN * _medians(off / expected_mm, cell, cells.count)
-    noise_mm = _medians(expected_mm, cell, cells.count)
-    relief_mm = np.sqrt(np.maximum(seen_mm**2 - noise_mm**2, 0.0))
-    rough = known & (sigmas > ROUGH) & (seen_mm > ROUGH_MM)
-    return _Texture(known, rough, known & (seen_mm < ROUGH_MM), relief_mm)
+    known = np.bincount(cell, minlength=cells.count) >= 50
+    scatter_mm = SIGMAS_PER_MEDIAN * _group_medians(residual, cell, cells.count)
+    sigmas = SIGMAS_PER_MEDIAN * _group_medians(residual / expected_mm, cell, cells.count)
+    noise_mm = _group_medians(expected_mm, cell, cells.count)
+    relief_mm = np.sqrt(np.maximum(scatter_mm**2 - noise_mm**2, 0.0))
+    # Sigmas of dark cloth are right to a third; where several exposures show relief they include
+    # it, so that only what is coarser than the stripes counts.
+    rough = known & (sigmas > 3.0) & (scatter_mm > ROUGH_MM)
+    return _Texture(known, rough, known & (scatter_mm < ROUGH_MM), relief_mm)
 
 
-def _medians(values: Floats, group: Indices, count: int) -> Array:
+def _group_medians(values: Floats, group: Indices, count: int) -> Array:
     """Median of each group's values (N,), none of them negative; 0 for an empty group."""
     # The bits of non-negative floats sort like the floats: one sort of plain integers.
     bits = np.asarray(values, np.float32).view(np.uint32)
@@ -254,3 +251,38 @@ def _medians(values: Floats, group: Indices, count: int) -> Array:
     found = np.zeros(count)
     found[sizes > 0] = keys[middle].astype(np.uint32).view(np.float32)
     return found
+
+
+@dataclass(frozen=True, eq=False)
+class Roughness:
+    """Residuals of N pixels that have a full window around them.
+
+    points: (N, 3) mm, rig frame.
+    residual_mm: distance along the ray from the quadratic through the window, (N,).
+    expected_mm: its standard deviation by noise alone, (N,).
+    """
+
+    points: Array
+    residual_mm: Floats
+    expected_mm: Floats
+
+
+def measure_roughness(
+    image: RangeImage, rig_from_camera: RigidTransform, box: Crop, window_mm: float
+) -> Roughness:
+    """Compare the pixels in a box with quadratics in windows of about `window_mm`."""
+    sigma_mm, points = image.sigma_mm[box], image.points[box]
+    common = np.zeros_like(sigma_mm) if image.common_mm is None else image.common_mm[box]
+    whole = (slice(0, sigma_mm.shape[0]), slice(0, sigma_mm.shape[1]))
+    inverse, noise = inverse_depths(points, sigma_mm, common, crop_bounds(whole))
+    reach = window_reach(estimate_pixel_size(inverse, image.camera), window_mm)
+    fit, full = fit_full_windows(inverse, noise, reach)
+    residual = (inverse - fit.value)[full]
+    points = points[full]
+    # Along the ray a point moves by its length over z times dz, and dz is z squared times d(1/z).
+    length = np.linalg.norm(points, axis=1) * points[:, 2]
+    basis = window_basis(reach)
+    absorbed = np.linalg.inv(basis.T @ basis)[0, 0]  # share of a pixel's variance in its fit
+    left = np.float32(np.sqrt(1.0 - absorbed))
+    points_rig = rig_from_camera.apply(points.astype(np.float64))
+    return Roughness(points_rig, np.abs(residual) * length, left * noise[full] * length)

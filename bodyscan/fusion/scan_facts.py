@@ -104,10 +104,10 @@ def read_facts(folder: Path) -> dict[str, Any]:
     return facts
 
 
-def told_verdict(facts: dict[str, Any]) -> Verdict | None:
+def stored_verdict(facts: dict[str, Any]) -> Verdict | None:
     """The stored verdict; None for scans from before there were verdicts."""
-    told = facts.get("verdict")
-    return Verdict(told["grade"], tuple(told["reasons"])) if told else None
+    verdict = facts.get("verdict")
+    return Verdict(verdict["grade"], tuple(verdict["reasons"])) if verdict else None
 
 
 def _reason(error: Exception) -> str:

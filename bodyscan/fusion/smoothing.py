@@ -23,11 +23,6 @@ from bodyscan.reconstruction.range_image import RangeImage
 
 Numbers = NDArray[np.int32]
 
-JUMP_PX = 8.0  # jump in depth between neighbours, in pixel widths: steeper than STEEPEST_COSINE
-STEEPEST_COSINE = 0.17  # a surface seen at more than 80 degrees is useless
-OWN_SHARE = np.float32(0.01)  # least share of its sigma that is a pixel's own: rounding
-EVERY = 4  # one row in this many is used to find the size of a pixel
-
 
 @dataclass(frozen=True, eq=False)
 class SmoothSurface:
@@ -42,7 +37,7 @@ class SmoothSurface:
     rim: (n,) float32, rises from near 0 at the rim to 1 well inside.
     weight: (n,) float32, rim/sigma^2.
     colours: (n,) uint8.
-    bent: whether points were carried away from the pixels that show them.
+    bent: whether points were moved off the rays of their pixels.
     """
 
     pair: str
@@ -72,16 +67,16 @@ def smooth(
     common = np.zeros((1, 1), np.float32) if image.common_mm is None else image.common_mm
     common = np.broadcast_to(common, image.sigma_mm.shape)
     inverse, noise = inverse_depths(image.points, image.sigma_mm, common, crop_bounds(box))
-    pixel_mm = pixel_size(inverse, image.camera)
+    pixel_mm = estimate_pixel_size(inverse, image.camera)
     reach = window_reach(pixel_mm, window_mm)
     fit, fitted = fit_quadratics(inverse, noise, reach, pixel_mm, image.alike_px)
-    return _surface(image, common, rig_from_camera, box, fit, fitted, reach)
+    return _build_surface(image, common, rig_from_camera, box, fit, fitted, reach)
 
 
-def pixel_size(inverse: Floats, camera: Camera) -> float:
-    """Size of a pixel at the median depth, mm; inverse: 1/z, 0 where nothing was measured."""
-    some = inverse[::EVERY]
-    return float(np.median(1.0 / some[some > 0])) / camera.alpha
+def estimate_pixel_size(inverse: Floats, camera: Camera) -> float:
+    """Width of a pixel at the median depth, mm; inverse: 1/z, 0 where nothing was measured."""
+    rows = inverse[::4]
+    return float(np.median(1.0 / rows[rows > 0])) / camera.alpha
 
 
 def window_reach(pixel_mm: float, window_mm: float) -> int:
@@ -89,7 +84,7 @@ def window_reach(pixel_mm: float, window_mm: float) -> int:
     return int(np.clip(round(0.5 * window_mm / pixel_mm), 2, 6))
 
 
-def _surface(
+def _build_surface(
     image: RangeImage,
     common: Floats,
     rig_from_camera: RigidTransform,
@@ -99,10 +94,10 @@ def _surface(
     reach: int,
 ) -> SmoothSurface:
     depth, number = np.zeros_like(fit.value), np.full(fitted.shape, -1, np.int32)
-    most = int(np.count_nonzero(fitted))
-    points, normals = np.empty((most, 3), np.float32), np.empty((most, 3), np.float32)
-    sigma = np.empty(most, np.float32)
-    count = _lay_out(
+    size = int(np.count_nonzero(fitted))
+    points, normals = np.empty((size, 3), np.float32), np.empty((size, 3), np.float32)
+    sigma = np.empty(size, np.float32)
+    count = _compute_points(
         (image.points, common),
         crop_bounds(box),
         (fit.value, fit.slope_u, fit.slope_v, fit.sigma),
@@ -113,7 +108,8 @@ def _surface(
         (points, normals, sigma),
     )
     there = number >= 0
-    distance = _distance_to_rim(depth, JUMP_PX / image.camera.alpha)[there]
+    # A jump of 8 pixel widths between neighbours is steeper than any useful surface.
+    distance = distance_to_rim(depth, 8.0 / image.camera.alpha)[there]
     rim, sigma = np.minimum(distance / np.float32(2 * reach), np.float32(1.0)), sigma[:count]
     return SmoothSurface(
         image.pair,
@@ -131,7 +127,7 @@ def _surface(
     )
 
 
-def _distance_to_rim(depth: Floats, jump: float) -> Floats:
+def distance_to_rim(depth: Floats, jump: float) -> Floats:
     """Distance in pixels, from 1, to the nearest rim.
 
     A rim is a pixel without depth (0), or one in front of another by `jump` of its depth.
@@ -145,7 +141,7 @@ def _distance_to_rim(depth: Floats, jump: float) -> Floats:
 def inverse_depths(
     points: Floats, sigma_mm: Floats, common_mm: Floats, ends: tuple[int, int, int, int]
 ) -> tuple[Floats, Floats]:
-    """1/z and its standard deviation (h, w) within `ends`, without what neighbours share.
+    """Inverse depth 1/z and its sigma (h, w) within `ends`, without the part common to neighbours.
 
     0 where nothing was measured.
     """
@@ -158,15 +154,18 @@ def inverse_depths(
             if np.isfinite(sigma):
                 x, y, z = points[row, column, 0], points[row, column, 1], points[row, column, 2]
                 # Along the ray a point moves by its length over z times dz.
-                own = max(sigma**2 - common_mm[row, column] ** 2, (OWN_SHARE * sigma) ** 2)
-                share = np.sqrt(own / (x * x + y * y + z * z))
+                # A hundredth of sigma is left at least: rounding.
+                variance = max(
+                    sigma**2 - common_mm[row, column] ** 2, (np.float32(0.01) * sigma) ** 2
+                )
+                share = np.sqrt(variance / (x * x + y * y + z * z))
                 inverse[row - top, column - left] = 1.0 / z
                 noise[row - top, column - left] = share / z
     return inverse, noise
 
 
 @compiled
-def _lay_out(
+def _compute_points(
     measured: tuple[Floats, Floats],
     ends: tuple[int, int, int, int],
     fit: tuple[Floats, Floats, Floats, Floats],
@@ -183,7 +182,7 @@ def _lay_out(
     rig_from_camera: rotation and translation.
     """
     value, slope_u, slope_v, fit_sigma = fit
-    seen, common_mm = measured
+    measured_points, common_mm = measured
     rotation, translation = rig_from_camera
     depth, number = images
     points, normals, sigma = surface
@@ -193,11 +192,12 @@ def _lay_out(
             if not fitted[row, column]:
                 continue
             i, j, inverse = ends[0] + row, ends[2] + column, value[row, column]
-            x, y, z = seen[i, j, 0] / seen[i, j, 2], seen[i, j, 1] / seen[i, j, 2], 1.0 / inverse
+            x = measured_points[i, j, 0] / measured_points[i, j, 2]
+            y, z = measured_points[i, j, 1] / measured_points[i, j, 2], 1.0 / inverse
             a, b, c = _normal(x, y, inverse, slope_u[row, column], slope_v[row, column], projection)
             length = np.sqrt(x * x + y * y + 1.0)
             cosine = -(a * x + b * y + c) / length
-            if cosine <= STEEPEST_COSINE:
+            if cosine <= 0.17:  # seen at more than 80 degrees
                 continue
             depth[row, column], number[row, column] = z, n
             for k in range(3):
@@ -205,8 +205,8 @@ def _lay_out(
                 points[n, k] = along * z + translation[k]
                 normals[n, k] = rotation[k, 0] * a + rotation[k, 1] * b + rotation[k, 2] * c
             # Along the ray a point moves by length * dz, along the normal by the cosine of that.
-            own, shared = fit_sigma[row, column] * z * z * length, common_mm[i, j]
-            sigma[n] = np.sqrt(own * own + shared * shared) * cosine
+            noise, common = fit_sigma[row, column] * z * z * length, common_mm[i, j]
+            sigma[n] = np.sqrt(noise * noise + common * common) * cosine
             n += 1
     return n
 

@@ -1,9 +1,12 @@
-"""A scan's result on disk: `cloud.ply`, `mesh.ply`, and `scan.json`, written last."""
+"""One scan: the body model, how it was made, and its files on disk.
+
+These are `cloud.ply`, `mesh.ply`, and `scan.json`, written last.
+"""
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from pathlib import Path
@@ -11,10 +14,11 @@ from typing import Any
 
 import numpy as np
 
+from bodyscan.alignment.body_parts import PersonMotion
+from bodyscan.alignment.icp import Alignment
 from bodyscan.errors import FailedWork, ResultError, ScanFailed
 from bodyscan.files.atomic import write_json
 from bodyscan.files.hashing import file_hash
-from bodyscan.fusion.scan import Scan
 from bodyscan.fusion.scan_facts import (
     CLOUD_NAME,
     FILE_NAME,
@@ -24,12 +28,47 @@ from bodyscan.fusion.scan_facts import (
     VERSION,
     read_facts,
 )
+from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.mesh.ply import read_ply_cloud, read_ply_mesh, write_ply
 from bodyscan.progress import map_threads
+from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.registration.rig_calibration import FLOOR_AXES
 from bodyscan.verdict import Verdict
 from bodyscan.version import __version__
+
+Made = Callable[[BodyCloud | BodyMesh], None]
+"""Called with a scan's cloud, and then with its mesh, as soon as each exists; from any thread."""
+
+
+def no_use(body: BodyCloud | BodyMesh) -> None:
+    """A `Made` that does nothing."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """A body model, how it was made, and whether it is good.
+
+    measured: number of points in each pair's cleaned range image.
+    failed: pairs that gave none, with the reason.
+    range_images: cleaned, of the pairs that saw the subject, cropped to it and carried to one
+        moment.
+    rig_from_camera: each pair's pose relative to the subject, after alignment.
+    person: how a moving body moved, part by part.
+    notes: on the range images, such as stripes that were not used.
+    """
+
+    cloud: BodyCloud
+    mesh: BodyMesh
+    alignment: Alignment | None
+    measured: dict[str, int]
+    failed: dict[str, str]
+    verdict: Verdict
+    range_images: tuple[RangeImage, ...]
+    rig_from_camera: dict[str, RigidTransform]
+    person: PersonMotion | None = None
+    notes: tuple[str, ...] = ()
+
 
 DERIVED = (
     *(CLOUD_NAME, MESH_NAME, "raw.e57", "report.html", "measurements.json", "export", "shared"),
@@ -162,8 +201,9 @@ def load_scan(folder: Path) -> StoredScan:
         try:
             same = file_hash(file) == digest
         except OSError as error:
-            said = "there is no such file" if isinstance(error, FileNotFoundError) else str(error)
-            raise ResultError(said, where=str(file), remedy=REMEDY) from error
+            missing = isinstance(error, FileNotFoundError)
+            reason = "there is no such file" if missing else str(error)
+            raise ResultError(reason, where=str(file), remedy=REMEDY) from error
         if not same:
             raise ResultError("was changed or cut short", where=str(file), remedy=REMEDY)
     cloud, mesh = read_ply_cloud(folder / CLOUD_NAME), read_ply_mesh(folder / MESH_NAME)

@@ -1,4 +1,4 @@
-"""What the points of a cloud say about each vertex of a surface laid through them.
+"""How well the points of a cloud support each vertex of a surface laid through them.
 
 Every point contributes its tangent plane. Around a measured vertex there are enough points, their
 planes agree with each other, and they pass close to the vertex.
@@ -12,19 +12,12 @@ import numpy as np
 
 from bodyscan.arrays import Array, Floats, Indices, Mask
 from bodyscan.compiled import compiled
-from bodyscan.fusion.point_columns import PointColumns
 from bodyscan.mesh.body import BodyCloud
 from bodyscan.mesh.topology import face_normals
+from bodyscan.progress import map_threads, split_range
 
-NEIGHBOURS = 8
-# Shares of the reach: 2, 1 and 0.5 mm of 4.
-RANGE = 0.5
-LIFTED = 0.25
-TORN = 0.125
-LEAST_WEIGHT = 0.3  # relative to a point right at the vertex: one point 3 mm away
-LEAST_SHARE = 1 / 6  # of the median vertex's weight: at a straight rim it is a half
-
-STEEPEST_TURN = 0.3  # cosine of the largest angle by which a face may turn
+MAX_SHIFT = 0.25
+"""Share of the reach by which a vertex may be off its points."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,62 +29,64 @@ class Support:
     weight: of the nearest points together, (V,): 1 for one at the vertex itself that faces like it,
         0 if there is none.
     shift_mm: from the vertex along its normal to the mean of those points' tangent planes, (V,).
-    spread_mm: RMS of the planes about that mean, (V,).
+    scatter_mm: RMS of the planes about that mean, (V,).
     """
 
     nearest: Indices
     sigma_mm: Floats
     weight: Array
     shift_mm: Array
-    spread_mm: Array
+    scatter_mm: Array
     reach_mm: float
 
     @property
     def measured(self) -> Mask:
-        """(V,): whether a vertex lies where the points are, and these agree.
+        """(V,): whether a vertex lies on its points, and these agree.
 
         False beyond the rim of what was seen (too little weight), where the grid's cells lift the
         surface off the points (fingertips), and where points of different surfaces meet (between
         toes, at the corner of an eye).
         """
-        lifted = np.abs(self.shift_mm) > np.maximum(LIFTED * self.reach_mm, 4.0 * self.sigma_mm)
-        torn = self.spread_mm > np.maximum(TORN * self.reach_mm, 2.0 * self.sigma_mm)
-        enough = max(LEAST_WEIGHT, LEAST_SHARE * float(np.median(self.weight)))
-        return np.asarray((self.weight > enough) & ~lifted & ~torn)
+        lifted = np.abs(self.shift_mm) > np.maximum(MAX_SHIFT * self.reach_mm, 4.0 * self.sigma_mm)
+        torn = self.scatter_mm > np.maximum(0.125 * self.reach_mm, 2.0 * self.sigma_mm)
+        # One point 3 mm away, or a sixth of the median vertex: a straight rim has a half of that.
+        min_weight = max(0.3, float(np.median(self.weight)) / 6.0)
+        return np.asarray((self.weight > min_weight) & ~lifted & ~torn)
 
 
-def support(vertices: Array, normals: Floats, cloud: BodyCloud, reach_mm: float) -> Support:
-    """Support of vertices (V, 3) with unit normals (V, 3) by a cloud."""
-    distance, near = PointColumns.of(cloud.points, reach_mm).nearest(vertices, NEIGHBOURS)
-    weight, shift, spread = _average_planes(
+def measure_support(vertices: Array, normals: Floats, cloud: BodyCloud, reach_mm: float) -> Support:
+    """Support of vertices (V, 3) with unit normals (V, 3) by the 8 nearest points within the reach."""
+    distance, near = PointColumns.from_points(cloud.points, reach_mm).find_nearest(vertices, 8)
+    weight, shift, scatter = _average_planes(
         np.ascontiguousarray(vertices),
         np.ascontiguousarray(normals),
         distance,
         near,
         cloud.points,
         cloud.normals,
-        RANGE * reach_mm,
+        0.5 * reach_mm,
     )
     nearest = np.minimum(near[:, 0], len(cloud.points) - 1)  # for those without: any
-    return Support(nearest, cloud.sigma_mm[nearest], weight, shift, spread, reach_mm)
+    return Support(nearest, cloud.sigma_mm[nearest], weight, shift, scatter, reach_mm)
 
 
 def fit_to_points(vertices: Array, faces: Indices, normals: Floats, around: Support) -> Array:
     """Move the vertices (V, 3) along their normals to where the points around are.
 
-    The move is smaller if their weight is, so that there is no step where the points end. Where a
-    face would fold over, its corners move by half of that, then a quarter, then not at all.
+    The smaller their weight, the smaller the move, so that there is no step where the points end.
+    Where a face would fold over, its corners move by half of that, then a quarter, then not at all.
     """
-    farthest = LIFTED * around.reach_mm
+    farthest = MAX_SHIFT * around.reach_mm
     move = np.minimum(around.weight, 1.0) * np.clip(around.shift_mm, -farthest, farthest)
     concerned = np.arange(len(faces))
+    min_cosine = 0.3  # of the angle by which a face may turn
     for share in (0.5, 0.5, 0.0):
         some = faces[concerned]
         moved = vertices + move[:, None] * normals
         before, after = face_normals(vertices, some), face_normals(moved, some)
         cosine = np.einsum("fc,fc->f", before, after)
         lengths = np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)
-        folded = np.unique(some[cosine < STEEPEST_TURN * lengths])
+        folded = np.unique(some[cosine < min_cosine * lengths])
         move[folded] *= share
         touched = np.zeros(len(vertices), bool)
         touched[folded] = True
@@ -109,27 +104,27 @@ def _average_planes(
     point_normals: Floats,
     scale_mm: float,
 ) -> tuple[Array, Array, Array]:
-    """Weight, shift and spread as in `Support`, from the nearest points.
+    """Weight, shift and scatter as in `Support`, from the nearest points.
 
     distance, near: (V, k), sorted by distance, infinite where there are no more points.
 
     A point's weight falls off as a Gaussian of its distance; a point that faces another direction
-    counts for the spread but not for the shift.
+    counts for the scatter but not for the shift.
     """
-    count, most = near.shape
-    weight, shift, spread = np.zeros(count), np.zeros(count), np.zeros(count)
-    planes, weights = np.empty(most), np.empty(most)
+    count, neighbours = near.shape
+    weight, shift, scatter = np.zeros(count), np.zeros(count), np.zeros(count)
+    planes, weights = np.empty(neighbours), np.empty(neighbours)
     for v in range(count):
         known, total, mean = 0, 0.0, 0.0
-        while known < most and distance[v, known] < np.inf:
+        while known < neighbours and distance[v, known] < np.inf:
             p = near[v, known]
-            plane, alike = 0.0, 0.0
+            plane, cosine = 0.0, 0.0
             for k in range(3):
                 plane += (points[p, k] - vertices[v, k]) * point_normals[p, k]
-                alike += normals[v, k] * point_normals[p, k]
+                cosine += normals[v, k] * point_normals[p, k]
             one = np.exp(-0.5 * (distance[v, known] / scale_mm) ** 2)
             planes[known], weights[known] = plane, one
-            facing = one * max(alike, 0.0) ** 2
+            facing = one * max(cosine, 0.0) ** 2
             total += one
             mean += facing * plane
             weight[v] += facing
@@ -137,7 +132,112 @@ def _average_planes(
         if weight[v] > 0.0:
             shift[v] = mean / weight[v]
         for j in range(known):
-            spread[v] += weights[j] * (planes[j] - shift[v]) ** 2
+            scatter[v] += weights[j] * (planes[j] - shift[v]) ** 2
         if known > 0:
-            spread[v] = np.sqrt(spread[v] / total)
-    return weight, shift, spread
+            scatter[v] = np.sqrt(scatter[v] / total)
+    return weight, shift, scatter
+
+
+@dataclass(frozen=True, eq=False)
+class PointColumns:
+    """Points (N, 3) in columns along x, `reach_mm` wide, for searches within that reach.
+
+    All points of a body lie on its skin, and all queries have the same reach of a few millimetres:
+    sorting into columns takes a tenth of the time of building a tree, and a query half.
+
+    order: indices of the points, column after column, (N,).
+    start: where each column begins, by (y, z); columns at the rim are empty.
+    low: y and z where the columns begin, (2,) mm.
+    """
+
+    points: Array
+    order: Indices
+    start: Indices
+    low: Array
+    reach_mm: float
+
+    @staticmethod
+    def from_points(points: Array, reach_mm: float) -> PointColumns:
+        """Columns for a cloud and the reach of all queries."""
+        low = points[:, 1:].min(axis=0) - reach_mm
+        across = ((points[:, 1:] - low) / reach_mm).astype(np.int64)
+        shape = across.max(axis=0) + 2
+        column = across[:, 0] * shape[1] + across[:, 1]
+        start = np.concatenate([[0], np.cumsum(np.bincount(column, minlength=shape.prod()))])
+        order = _sort(column, start)
+        return PointColumns(points[order], order, start[:-1].reshape(shape), low, reach_mm)
+
+    def find_nearest(self, queries: Array, count: int) -> tuple[Array, Indices]:
+        """Find the nearest points to queries (M, 3).
+
+        Distances (M, count) mm, ascending, infinite if fewer points lie within the reach; and their
+        indices (M, count), N for missing ones.
+        """
+        distance = np.full((len(queries), count), np.inf)
+        near = np.full((len(queries), count), len(self.points))
+
+        def find(part: slice) -> None:
+            some = np.ascontiguousarray(queries[part])
+            _find(
+                some,
+                self.points,
+                self.start,
+                self.low,
+                self.reach_mm,
+                distance[part],
+                near[part],
+            )
+
+        map_threads(find, split_range(len(queries)), stage="nearest points")
+        return distance, np.append(self.order, len(self.points))[near]
+
+
+@compiled
+def _sort(column: Indices, start: Indices) -> Indices:
+    """Indices (N,) of points by column, in their own order within each."""
+    free, order = start.copy(), np.empty(len(column), np.int64)
+    for n in range(len(column)):
+        order[free[column[n]]] = n
+        free[column[n]] += 1
+    return order
+
+
+@compiled
+def _find(
+    queries: Array,
+    points: Array,
+    start: Indices,
+    low: Array,
+    reach_mm: float,
+    distance: Array,
+    near: Indices,
+) -> None:
+    """Fill in distances (M, k) and positions (M, k) in `order` of the nearest points, ascending."""
+    wanted = distance.shape[1]
+    height, width = start.shape
+    for v in range(len(queries)):
+        x, y, z = queries[v, 0], queries[v, 1], queries[v, 2]
+        row, column = int(np.floor((y - low[0]) / reach_mm)), int(np.floor((z - low[1]) / reach_mm))
+        farthest = reach_mm**2
+        found = 0
+        for j in range(max(row - 1, 0), min(row + 2, height - 1)):
+            first, last = max(column - 1, 0), min(column + 2, width - 1)
+            if first >= last:
+                continue
+            for p in range(start[j, first], start[j, last]):
+                along = points[p, 0] - x
+                if along * along >= farthest:
+                    continue
+                squared = along * along + (points[p, 1] - y) ** 2 + (points[p, 2] - z) ** 2
+                if squared >= farthest:
+                    continue
+                rank = min(found, wanted - 1)
+                while rank > 0 and distance[v, rank - 1] > squared:
+                    distance[v, rank], near[v, rank] = distance[v, rank - 1], near[v, rank - 1]
+                    rank -= 1
+                distance[v, rank], near[v, rank] = squared, p
+                found = min(found + 1, wanted)
+                if found == wanted:
+                    farthest = distance[v, wanted - 1]
+        for n in range(found):
+            distance[v, n] = np.sqrt(distance[v, n])

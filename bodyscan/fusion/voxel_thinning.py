@@ -18,15 +18,6 @@ from bodyscan.progress import THREADS
 
 Numbers = NDArray[np.uint32]
 
-FEWEST_POINTS = 1000
-FIRST_GUESS_MM = 1.2
-CLOSE_ENOUGH = 0.05  # to the wanted number; the last correction settles the rest
-ROUNDS = 4
-SOME_LAYERS, MANY = 4, 300_000  # with many points, one layer of blocks in so many is counted
-MOST_BLOCKS = 1 << 28  # in the box around all points
-BADNESS_STEPS = np.float32(1 << 29)
-EMPTY = np.int64((1 << 63) - 1)
-
 
 @dataclass(frozen=True, eq=False)
 class Samples:
@@ -50,7 +41,7 @@ def take_samples(surfaces: Sequence[SmoothSurface], points: int) -> Samples:
     Raises ScanFailed if there are next to no points.
     """
     ends = np.cumsum([0, *(len(surface.points) for surface in surfaces)])
-    if ends[-1] < FEWEST_POINTS:
+    if ends[-1] < 1000:
         raise ScanFailed(
             f"the range images show next to nothing of a subject ({ends[-1]} points)",
             remedy="Look at the range images; is the subject inside the scan volume?",
@@ -60,7 +51,7 @@ def take_samples(surfaces: Sequence[SmoothSurface], points: int) -> Samples:
     if ends[-1] > points:
         every = np.concatenate([surface.points for surface in surfaces])
         at_rim = np.concatenate([surface.rim < 0.5 for surface in surfaces])
-        chosen = one_per_voxel(every, at_rim, voxel_size_for(every, points))
+        chosen = select_per_voxel(every, at_rim, find_voxel_size(every, points))
         parts = np.split(chosen, np.searchsorted(chosen, ends[1:-1]))
         pixels = [part - start for part, start in zip(parts, ends, strict=False)]
 
@@ -79,27 +70,27 @@ def take_samples(surfaces: Sequence[SmoothSurface], points: int) -> Samples:
     )
 
 
-def voxel_size_for(points: Floats, wanted: int) -> float:
-    """Edge (mm) of voxels of which about `wanted` are occupied; points (N, 3) mm.
+def find_voxel_size(points: Floats, wanted: int) -> float:
+    """Find the edge (mm) of voxels of which about `wanted` are occupied by points (N, 3) mm.
 
     The number of voxels that a surface occupies is inversely proportional to the square of their
-    edge, as long as points are closer than that; corrections settle the rest. If there are many
-    points, only part of them is counted.
+    edge, as long as points are closer than that; up to four corrections settle the rest. Of more
+    than 300,000 points one layer of blocks in four is counted.
     """
-    size = FIRST_GUESS_MM
+    size = 1.2
     box = _bounds(points)
-    layers = SOME_LAYERS if len(points) > MANY else 1
-    for _ in range(ROUNDS):
-        found = _Voxels.of(points, box, size, layers)
+    layers = 4 if len(points) > 300_000 else 1
+    for _ in range(4):
+        found = _Voxels.from_points(points, box, size, layers)
         ratio = layers * _count_occupied(found.number, found.count) / wanted
         size *= float(np.clip(np.sqrt(ratio), 0.25, 4.0))
-        if abs(ratio - 1.0) < CLOSE_ENOUGH:
+        if abs(ratio - 1.0) < 0.05:
             break
     return size
 
 
-def one_per_voxel(points: Floats, second_rate: Mask, voxel_mm: float) -> NDArray[np.intp]:
-    """Indices of one point in each occupied voxel: the nearest to its centre.
+def select_per_voxel(points: Floats, second_rate: Mask, voxel_mm: float) -> NDArray[np.intp]:
+    """Select one point in each occupied voxel, the nearest to its centre; return their indices.
 
     second_rate: points taken only where a voxel has no other, (N,).
     """
@@ -107,8 +98,10 @@ def one_per_voxel(points: Floats, second_rate: Mask, voxel_mm: float) -> NDArray
     chosen = np.zeros(len(points), np.bool_)
 
     def choose(layer: int) -> None:
-        found = _Voxels.of(points, box, voxel_mm, THREADS, layer)
-        _choose(points, second_rate, box[0], scale, found.point, found.number, found.count, chosen)
+        found = _Voxels.from_points(points, box, voxel_mm, THREADS, layer)
+        _select_best(
+            points, second_rate, box[0], scale, found.point, found.number, found.count, chosen
+        )
 
     with ThreadPoolExecutor(THREADS) as pool:
         list(pool.map(choose, range(THREADS)))
@@ -129,7 +122,7 @@ class _Voxels:
     count: int
 
     @staticmethod
-    def of(
+    def from_points(
         points: Floats, box: tuple[Floats, Floats], voxel_mm: float, layers: int, layer: int = 0
     ) -> _Voxels:
         """Voxels of the points in every `layers`-th layer of blocks, starting from `layer`."""
@@ -137,7 +130,7 @@ class _Voxels:
         scale = np.float32(1.0 / voxel_mm)
         across = np.floor((high - low) * scale).astype(int) + 1
         bits = 2  # blocks of 4 x 4 x 4, or larger for a box that would have too many
-        while np.prod((across >> bits) + 1.0) > MOST_BLOCKS:
+        while np.prod((across >> bits) + 1.0) > 1 << 28:
             bits += 1
         blocks = np.zeros((across >> bits) + 1, np.int32)
         point, number = np.empty((2, len(points)), np.uint32)
@@ -185,8 +178,8 @@ def _number(
         if block == 0:
             met += 1
             block = blocks[x >> bits, y >> bits, z >> bits] = met
-        place = ((x & within) << bits | y & within) << bits | z & within
-        point[kept], number[kept] = n, (block - 1) << 3 * bits | place
+        local = ((x & within) << bits | y & within) << bits | z & within
+        point[kept], number[kept] = n, (block - 1) << 3 * bits | local
         kept += 1
     return kept, met
 
@@ -203,7 +196,7 @@ def _count_occupied(voxels: Numbers, count: int) -> int:
 
 
 @compiled
-def _choose(
+def _select_best(
     points: Floats,
     second_rate: Mask,
     low: Floats,
@@ -214,16 +207,17 @@ def _choose(
     chosen: Mask,
 ) -> None:
     """Mark the best point of each voxel in chosen (N,); see `_Voxels`."""
-    # Badness and index share one integer, so that each voxel is one place in memory.
-    best = np.full(count, EMPTY)
+    # Badness and index share one integer, so that each voxel takes one memory access.
+    empty = np.int64((1 << 63) - 1)
+    best = np.full(count, empty)
     for m in range(len(point)):
         n = np.int64(point[m])
         bad = np.float32(1.0) if second_rate[n] else np.float32(0.0)
         for k in range(3):
-            place = (points[n, k] - low[k]) * scale
-            off_centre = place - np.floor(place) - np.float32(0.5)
-            bad += off_centre * off_centre  # at most 0.75 in all
-        best[number[m]] = min(best[number[m]], int(bad * BADNESS_STEPS) << 32 | n)
+            position = (points[n, k] - low[k]) * scale
+            offset = position - np.floor(position) - np.float32(0.5)
+            bad += offset * offset  # at most 0.75 in all
+        best[number[m]] = min(best[number[m]], int(bad * np.float32(1 << 29)) << 32 | n)
     for key in best:
-        if key != EMPTY:
+        if key != empty:
             chosen[key & 0xFFFFFFFF] = True

@@ -12,7 +12,7 @@ import numpy as np
 
 from bodyscan.alignment.body_parts import PartMotion, PersonMotion
 from bodyscan.evaluation.comparison import Comparison, compare_surfaces
-from bodyscan.fusion.scan_facts import read_facts, told_verdict
+from bodyscan.fusion.scan_facts import read_facts, stored_verdict
 from bodyscan.fusion.storage import StoredScan, load_scan
 from bodyscan.fusion.verdict.coverage import MAX_FILLED
 from bodyscan.fusion.verdict.motion import MAX_MOTION_MM, MAX_RESIDUAL_MM
@@ -62,7 +62,7 @@ def scan_page(folder: Path, other: Path | None = None) -> Page:
         sections = _sections(scan, found)
     return Page(
         f"Scan of {subject}" if subject else f"Scan {folder.resolve().name}",
-        told_verdict(facts) or Verdict("usable", (NO_VERDICT,)),
+        stored_verdict(facts) or Verdict("usable", (NO_VERDICT,)),
         is_synthetic(folder) or facts.get("simulated", False),
         (
             ("taken", _in_words(facts.get("when"))),

@@ -20,7 +20,7 @@ from bodyscan.fusion.merging import MergedCloud, merge
 from bodyscan.fusion.meshing import attach_attributes, closed_surface
 from bodyscan.fusion.pose_variance import add_motion_variance, add_pose_variance
 from bodyscan.fusion.regions import label_regions
-from bodyscan.fusion.scan import Made, Scan, no_use
+from bodyscan.fusion.storage import Made, Scan, no_use
 from bodyscan.fusion.verdict import grade_scan
 from bodyscan.fusion.verdict.coverage import measure_coverage
 from bodyscan.fusion.verdict.evidence import Coverage, ImageEvidence, RigEvidence

@@ -9,8 +9,7 @@ from types import MappingProxyType
 
 from bodyscan.captures.folder import Captures, ImageSequence, open_scan
 from bodyscan.errors import ScanFailed
-from bodyscan.fusion.scan import Made, Scan, no_use
-from bodyscan.fusion.storage import Origin, clear, save_failure, save_scan
+from bodyscan.fusion.storage import Made, Origin, Scan, clear, no_use, save_failure, save_scan
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, background, silent, step

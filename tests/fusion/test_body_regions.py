@@ -10,7 +10,7 @@ import pytest
 from ray_cast_scan import Scan, cast_scan, load_body, load_rig
 
 from bodyscan.arrays import Bytes, Mask
-from bodyscan.fusion.regions import CELL_MM, Regions, label_regions, lies_in
+from bodyscan.fusion.regions import CELL_MM, Regions, find_in_cells, label_regions
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import DARK_CLOTH, HAIR, SKIN, UNSURE, BodyCloud, compute_cover_shares
 from bodyscan.reconstruction.range_image import RangeImage
@@ -240,7 +240,7 @@ def test_pixels_that_are_looked_at_lie_in_the_cells_asked_about() -> None:
     asked = rng.random((10, 12, 14)) < 0.5
     low = np.array([-150.0, -180.0, 700.0])
     wanted = np.zeros(sigma_mm.shape, np.bool_)
-    lies_in(points, sigma_mm, at.matrix[:3], low, asked, wanted)
+    find_in_cells(points, sigma_mm, at.matrix[:3], low, asked, wanted)
 
     cell = np.floor((at.apply(points.astype(np.float64)) - low) / CELL_MM).astype(int)
     nearest = np.clip(cell, 0, np.array(asked.shape) - 1)

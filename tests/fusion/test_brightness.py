@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from ray_cast_scan import Scan
 
-from bodyscan.fusion.brightness import gains, light_power
+from bodyscan.fusion.brightness import estimate_light_power, solve_gains
 from bodyscan.fusion.merging import merge
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.settings import FusionSettings
@@ -20,11 +20,13 @@ def test_gains_undo_known_exposures() -> None:
     ring = [
         (a, b, float(np.log(true[b] / true[a])), 500) for a, b in [(0, 1), (1, 2), (2, 3), (3, 0)]
     ]
-    np.testing.assert_allclose(gains(ring, 4) * true, 1.0, rtol=0.01)  # held back by a thousandth
+    np.testing.assert_allclose(
+        solve_gains(ring, 4) * true, 1.0, rtol=0.01
+    )  # held back by a thousandth
 
 
 def test_a_pair_without_overlap_keeps_its_brightness() -> None:
-    assert gains([], 3) == pytest.approx(np.ones(3))
+    assert solve_gains([], 3) == pytest.approx(np.ones(3))
 
 
 def test_the_power_of_light_is_told_whatever_the_exposures_and_some_stains() -> None:
@@ -36,19 +38,19 @@ def test_the_power_of_light_is_told_whatever_the_exposures_and_some_stains() -> 
         ratio[::10] += 1.0  # highlights
         overlaps.append((ratio.astype(np.float32), shade))
     # Where light falls off to a third, 0.05 of the power is 5 % of grey, which nobody sees.
-    assert light_power(overlaps) == pytest.approx(0.8, abs=0.05)
-    assert light_power([]) == 0.0
+    assert estimate_light_power(overlaps) == pytest.approx(0.8, abs=0.05)
+    assert estimate_light_power([]) == 0.0
 
 
 def test_light_that_the_room_gives_is_not_taken_for_more_than_matt() -> None:
     shade = np.linspace(-1.0, 1.0, 500).astype(np.float32)
-    assert light_power([(-0.5 * shade, shade)]) == 0.0
-    assert light_power([(3.0 * shade, shade)]) == 1.0
+    assert estimate_light_power([(-0.5 * shade, shade)]) == 0.0
+    assert estimate_light_power([(3.0 * shade, shade)]) == 1.0
 
 
 def test_one_grey_under_light_that_falls_alike_tells_no_power() -> None:
     ratio, shade = np.full((2, 500), 0.3, np.float32)
-    assert light_power([(ratio, shade)]) == 0.0
+    assert estimate_light_power([(ratio, shade)]) == 0.0
 
 
 def test_no_seams_between_exposures(scan: Scan, cleaned: list[RangeImage]) -> None:

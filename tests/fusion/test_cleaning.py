@@ -9,7 +9,7 @@ import pytest
 from ray_cast_scan import Scan, load_rig
 
 from bodyscan.evaluation.surface import signed_distances
-from bodyscan.fusion.cleaning import _inside, clean, cut_to_volume, drop_flying_pixels, inside
+from bodyscan.fusion.cleaning import _inside, clean, cut_to_volume, drop_flying_pixels, find_inside
 from bodyscan.fusion.verdict.coverage import measure_coverage
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyMesh
@@ -55,7 +55,7 @@ def test_inside_is_what_lies_in_the_cylinder(scan: Scan) -> None:
         with np.errstate(invalid="ignore"):
             expected = np.hypot(x, y) < volume.radius_mm
             expected &= (z > volume.bottom_mm) & (z < volume.top_mm) & image.valid
-        found = inside(image, placing, volume)
+        found = find_inside(image, placing, volume)
         assert 0.05 < found.mean() < 0.95
         assert np.count_nonzero(found != expected) <= 2  # rounding, right at the boundary
 

@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 
 from bodyscan.arrays import Array
-from bodyscan.fusion.hole_filling import Distances, _grid_around, _mirror, crossed, interpolated
+from bodyscan.fusion.hole_filling import _grid_around, _mirror
+from bodyscan.fusion.signed_distances import (
+    Distances,
+    find_crossed_bricks,
+    interpolate_distances,
+)
 from bodyscan.mesh.surface_nets import SIDE, Bricks
 
 CELL_MM, FINE_MM = 7.0, 3.0
@@ -32,7 +37,7 @@ def test_between_nodes_it_is_linear_and_beyond_the_grid_as_at_its_rim() -> None:
         return np.asarray(0.3 * x - 0.2 * y + 0.1 * z + 4.0)
 
     bricks = fine((6, 5, 7))
-    found = interpolated(distances(field(nodes(SHAPE, CELL_MM))), bricks)
+    found = interpolate_distances(distances(field(nodes(SHAPE, CELL_MM))), bricks)
     index = SIDE * bricks.indices[:, None, None, None] + np.moveaxis(np.indices((SIDE,) * 3), 0, -1)
     last = ORIGIN + CELL_MM * (np.array(SHAPE) - 1.0)
     truth = field(np.minimum(ORIGIN + FINE_MM * index, last))
@@ -45,7 +50,7 @@ def test_a_twist_is_told_between_eight_nodes() -> None:
         x, y, z = np.moveaxis((places - ORIGIN) / CELL_MM, -1, 0)
         return np.asarray(x * y * z - 2.0 * x * z)
 
-    found = interpolated(distances(field(nodes(SHAPE, CELL_MM))), fine((5, 4, 6)))
+    found = interpolate_distances(distances(field(nodes(SHAPE, CELL_MM))), fine((5, 4, 6)))
     index = np.stack(np.unravel_index(np.arange(120), (5, 4, 6)), axis=-1)
     index = SIDE * index[:, None, None, None] + np.moveaxis(np.indices((SIDE,) * 3), 0, -1)
     inside = (FINE_MM * index <= CELL_MM * (np.array(SHAPE) - 1.0)).all(axis=-1)
@@ -62,7 +67,7 @@ def test_the_surface_passes_through_the_bricks_that_it_does_and_some_beside() ->
     def ball(places: Array) -> Array:
         return np.asarray(np.linalg.norm(places - centre, axis=-1) - 33.0)
 
-    found = crossed(distances(ball(nodes(SHAPE, CELL_MM))), FINE_MM, shape)
+    found = find_crossed_bricks(distances(ball(nodes(SHAPE, CELL_MM))), FINE_MM, shape)
     inside = np.zeros(shape, bool)
     clear = np.zeros(shape, bool)
     for brick in np.ndindex(shape):

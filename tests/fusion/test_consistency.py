@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from flat_walls import ASIDE, WALL_MM, wall
 
-from bodyscan.fusion.brightness import EvenGrey
+from bodyscan.fusion.brightness import EqualizedGrey
 from bodyscan.fusion.consistency import Consistency, compare_with_surface
 from bodyscan.fusion.merging import average
 from bodyscan.fusion.smoothing import SmoothSurface
@@ -59,7 +59,7 @@ def test_means_by_weight() -> None:
     samples, surfaces, consistency = seen_beside(0.8)
     nothing = compare_with_surface(samples, surfaces[0], 0, 0.0, 0.0)
     own = [surface.colours.astype(np.float32) for surface in surfaces]
-    grey = EvenGrey(samples.colours.astype(np.float32), own)
+    grey = EqualizedGrey(samples.colours.astype(np.float32), own)
     cloud = average(samples, surfaces, [nothing, consistency], grey)
     assert len(cloud.points) == len(samples.points)
     inner = np.zeros(len(cloud.points), bool)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from bodyscan.fusion.cleaning import dark_gaps
+from bodyscan.fusion.cleaning import find_dark_gaps
 
 SKIN, DARK = 150, 12
 
@@ -29,7 +29,7 @@ def skin_with_a_band(width: int, level: int = DARK) -> np.ndarray:
 @pytest.mark.parametrize("width", [2, 3, 5])
 def test_a_narrow_gap_is_found(width: int, turned: bool) -> None:
     grey = skin_with_a_band(width)
-    found = dark_gaps(photographed(grey.T if turned else grey))
+    found = find_dark_gaps(photographed(grey.T if turned else grey))
     found = found.T if turned else found
     assert found[10:-10, 40].all()
     # The skin on both sides stays, but for the two pixels into which the dark is blurred.
@@ -39,21 +39,21 @@ def test_a_narrow_gap_is_found(width: int, turned: bool) -> None:
 
 @pytest.mark.parametrize("width", [12, 30])
 def test_something_dark_and_wide_stays(width: int) -> None:
-    assert not dark_gaps(photographed(skin_with_a_band(width))).any()
+    assert not find_dark_gaps(photographed(skin_with_a_band(width))).any()
 
 
 def test_a_silhouette_before_a_dark_room_stays() -> None:
     grey = np.full((60, 80), DARK)
     grey[:, 30:] = SKIN
-    assert not dark_gaps(photographed(grey)).any()
+    assert not find_dark_gaps(photographed(grey)).any()
 
 
 def test_a_faint_line_stays() -> None:
-    assert not dark_gaps(photographed(skin_with_a_band(3, SKIN // 2 + 10))).any()
+    assert not find_dark_gaps(photographed(skin_with_a_band(3, SKIN // 2 + 10))).any()
 
 
 def test_noise_on_something_dark_stays() -> None:
-    assert not dark_gaps(photographed(np.full((200, 200), DARK), noise=5.0)).any()
+    assert not find_dark_gaps(photographed(np.full((200, 200), DARK), noise=5.0)).any()
 
 
 @pytest.mark.parametrize("turned", [False, True])
@@ -63,7 +63,7 @@ def test_a_gap_narrower_than_seven_pixels_is_found_with_one_more_on_either_side(
 ) -> None:
     grey = np.full((40, 50), 160, np.uint8)
     grey[:, 20 : 20 + width] = 20
-    found = dark_gaps(grey.T.copy()).T if turned else dark_gaps(grey)
+    found = find_dark_gaps(grey.T.copy()).T if turned else find_dark_gaps(grey)
     expected = np.zeros(grey.shape, bool)
     if gap:
         expected[:, 19 : 21 + width] = True
@@ -79,4 +79,4 @@ def test_a_gap_is_half_as_bright_and_thirty_levels_darker(
 ) -> None:
     grey = np.full((30, 30), bright, np.uint8)
     grey[:, 14:17] = dark
-    assert dark_gaps(grey).any() == gap
+    assert find_dark_gaps(grey).any() == gap

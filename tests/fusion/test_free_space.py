@@ -9,7 +9,7 @@ import open3d as o3d
 import pytest
 from ray_cast_scan import looking, nominal_camera
 
-from bodyscan.fusion.free_space import Guess, _within, gaps, sees_through
+from bodyscan.fusion.filling_bounds import PartialSurface, find_free_points, find_gaps
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.transforms import RigidTransform
@@ -38,31 +38,22 @@ def test_a_wall_and_something_beyond_the_volume_are_seen_through_alike() -> None
     far = replace(seen(np.where(beyond, np.nan, depth)), beyond=beyond)
     sheet = o3d.geometry.TriangleMesh.create_box(10.0, 900.0, 600.0).translate((0, -450, 600))
     vertices, faces = np.asarray(sheet.vertices), np.asarray(sheet.triangles).astype(np.int64)
-    guess = Guess.of(vertices, faces, np.ones(len(faces), bool))
+    guess = PartialSurface(vertices, faces, np.ones(len(faces), bool))
     places = np.random.default_rng(0).uniform([-50, -400, 650], [50, 400, 1150], (5000, 3))
     points = places.astype(np.float32)
-    through = sees_through(points, guess, wall, POSE, 10.0)
+    through = find_free_points(points, guess, wall, POSE, 10.0)
     assert 0.2 < through.mean() < 0.8
-    np.testing.assert_array_equal(sees_through(points, guess, far, POSE, 10.0), through)
+    np.testing.assert_array_equal(find_free_points(points, guess, far, POSE, 10.0), through)
     # Without a word of what is behind, only what lies between measured parts can be open.
-    blind = sees_through(points, guess, replace(far, beyond=None), POSE, 10.0)
+    blind = find_free_points(points, guess, replace(far, beyond=None), POSE, 10.0)
     assert blind.sum() < through.sum()
-
-
-def test_what_lies_to_the_left_is_looked_for_in_its_own_row_and_no_farther() -> None:
-    mask = np.zeros((3, 12), bool)
-    mask[0, 2], mask[1, [0, 6]] = True, True
-    found = _within(mask, 3)
-    assert np.flatnonzero(found[0]).tolist() == [2, 3, 4, 5]
-    assert np.flatnonzero(found[1]).tolist() == [0, 1, 2, 3, 6, 7, 8, 9]
-    assert not found[2].any()
 
 
 FLAT = Camera(100.0, 100.0, 0.0, 30.0, 10.0, Radial(), 60, 20)
 HERE = RigidTransform.identity()
 
 
-def plates(*parts: tuple[float, float, float, bool]) -> Guess:
+def plates(*parts: tuple[float, float, float, bool]) -> PartialSurface:
     """Upright rectangles across all rows, from one column to another, at a depth; filled or not."""
     vertices, faces, filled = [], [], []
     for k, (left, right, depth, fill) in enumerate(parts):
@@ -71,7 +62,7 @@ def plates(*parts: tuple[float, float, float, bool]) -> Guess:
         vertices += [depth * np.array(ray) for ray in rays]
         faces += [[4 * k, 4 * k + 1, 4 * k + 2], [4 * k, 4 * k + 2, 4 * k + 3]]
         filled += [fill, fill]
-    return Guess.of(np.array(vertices), np.array(faces), np.array(filled))
+    return PartialSurface(np.array(vertices), np.array(faces), np.array(filled))
 
 
 def shown(columns: np.ndarray) -> RangeImage:
@@ -86,9 +77,9 @@ COLUMN, COLUMN_OF_160 = np.arange(60), np.arange(160)
 BETWEEN = (0.5, 20.5, 1000.0, False), (20.5, 39.5, 1000.0, True), (39.5, 59.5, 1000.0, False)
 
 
-def open_columns(guess: Guess, columns: np.ndarray, stride: int = 1) -> list[int]:
+def open_columns(guess: PartialSurface, columns: np.ndarray, stride: int = 1) -> list[int]:
     blocks = np.s_[0 : 20 // stride], np.s_[0 : 60 // stride]
-    found = gaps(guess, shown(columns), HERE, stride, blocks)
+    found = find_gaps(guess, shown(columns), HERE, stride, blocks)
     assert (found == found[0]).all(), "all rows are alike"
     return np.flatnonzero(found[0]).tolist()
 
@@ -99,7 +90,7 @@ def test_a_gap_is_what_is_made_up_between_what_was_measured_but_for_its_rims() -
     # Blocks of three by their middles 1, 4, ..., and no closer to what was measured than one block.
     assert open_columns(plates(*BETWEEN), measured, stride=3) == list(range(8, 12))
     # Of a window the same blocks.
-    some = gaps(plates(*BETWEEN), shown(measured), HERE, 1, np.s_[5:9, 12:45])
+    some = find_gaps(plates(*BETWEEN), shown(measured), HERE, 1, np.s_[5:9, 12:45])
     assert some.shape == (4, 33)
     assert np.flatnonzero(some[0]).tolist() == list(range(10, 27))
 
@@ -113,7 +104,7 @@ def test_what_was_measured_on_one_side_only_leaves_no_gap() -> None:
 def test_a_single_pixel_that_was_measured_closes_a_gap_around_it() -> None:
     image = shown((COLUMN < 21) | (COLUMN > 39))
     image.points[10, 30, 2], image.sigma_mm[10, 30] = 1000.0, 0.1
-    found = gaps(plates(*BETWEEN), image, HERE, 1, np.s_[0:20, 0:60])
+    found = find_gaps(plates(*BETWEEN), image, HERE, 1, np.s_[0:20, 0:60])
     closed = np.argwhere(~found[:, 22:39]) + [0, 22]
     assert closed.tolist() == [[row, column] for row in (9, 10, 11) for column in (29, 30, 31)]
 
@@ -137,7 +128,7 @@ def test_no_gap_is_wider_than_two_hands() -> None:
         grey = np.zeros((20, 160), np.uint8)
         nothing = np.full((20, 160, 3), np.nan, np.float32)
         image = RangeImage("p", wide, nothing, nothing, nothing[..., 0], grey)
-        found = gaps(guess, image, HERE, 1, np.s_[0:20, 0:160])[0]
+        found = find_gaps(guess, image, HERE, 1, np.s_[0:20, 0:160])[0]
         reached = COLUMN_OF_160[found]
         assert bool(len(reached)) is some
         if some:  # within 66 of both rims
@@ -160,7 +151,7 @@ def test_what_is_beside_or_behind_the_camera_was_not_seen_through() -> None:
         np.float32,
     )
     with np.errstate(all="raise"):  # nothing is divided by a depth of 0
-        through = sees_through(points, guess, shown(measured), HERE, 10.0)
+        through = find_free_points(points, guess, shown(measured), HERE, 10.0)
     assert through.tolist() == [True, True, False, False, False, False, False]
 
 
@@ -168,7 +159,7 @@ def test_the_pictures_outermost_pixels_see_as_well_as_others() -> None:
     guess = plates((0.5, 59.5, 500.0, True))
     pixels = np.array([[0, 0], [59, 0], [0, 19], [59, 19], [-1, 5], [60, 5], [5, -1], [5, 20]])
     points = 500.0 * np.column_stack([(pixels - [30, 10]) / 100.0, np.ones(len(pixels))])
-    through = sees_through(
+    through = find_free_points(
         points.astype(np.float32), guess, shown(np.ones(60, bool)), HERE, margin_mm=10.0
     )
     assert through.tolist() == [True] * 4 + [False] * 4

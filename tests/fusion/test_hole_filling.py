@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from ray_cast_scan import looking, nominal_camera
 
-from bodyscan.fusion.harmonic_filling import fill_harmonically
-from bodyscan.fusion.hole_filling import CELL_MM, likely_distances
+from bodyscan.fusion.hole_filling import CELL_MM, fill_distances, fill_harmonically
 from bodyscan.fusion.meshing import mesh
-from bodyscan.fusion.signed_distances import splat
+from bodyscan.fusion.signed_distances import splat_planes
 from bodyscan.mesh.body import BodyCloud
 from bodyscan.mesh.surface_nets import SIDE, Bricks, join_bricks
 from bodyscan.mesh.topology import compute_topology
@@ -45,7 +44,7 @@ def test_the_zero_set_of_a_linear_field_is_filled_exactly() -> None:
     fixed = np.ones(truth.shape, bool)
     fixed[4:28, 6:40, 8:50] = False
     nowhere = np.full(truth.shape, -np.inf, np.float32)
-    found = fill_harmonically(np.where(fixed, truth, 99.0), fixed, nowhere, sure=100.0)
+    found = fill_harmonically(np.where(fixed, truth, 99.0), fixed, nowhere, certain=100.0)
     near = np.abs(truth) < 0.4  # two nodes, at 0.2 a node
     # Sixteen sweeps after the coarser grids: a quarter of a node.
     assert np.abs(found - truth)[near].max() < 0.05
@@ -61,7 +60,7 @@ def test_bounds_hold_and_reach_no_farther_than_they_must() -> None:
     values = np.full(shape, -1.0, np.float32)
     least = np.full(shape, -np.inf, np.float32)
     least[12:20, 12:20, 12:20] = 0.5
-    found = fill_harmonically(values, fixed, least, sure=10.0)
+    found = fill_harmonically(values, fixed, least, certain=10.0)
     assert (found >= least).all()
     assert found.max() == pytest.approx(0.5, abs=1e-6)
     assert found[2, 2, 2] < -0.9
@@ -78,7 +77,7 @@ def test_a_bound_too_narrow_for_coarser_grids_pushes_the_surface_as_far_as_a_wid
     values = np.full(shape, -1.0, np.float32)
     least = np.full(shape, -np.inf, np.float32)
     least[1:-1, 32, 1:-1] = 1.0
-    found = fill_harmonically(values, fixed, least, sure=10.0)
+    found = fill_harmonically(values, fixed, least, certain=10.0)
     # Halfway it would be 8 nodes away; the rims, 16 away too, and sixteen sweeps alone leave four.
     # A surface that hugs the bound is less than one away.
     inside = np.flatnonzero(found[16, :, 16] > 0.0)
@@ -89,7 +88,7 @@ def test_a_bound_too_narrow_for_coarser_grids_pushes_the_surface_as_far_as_a_wid
 def test_splatted_distances_are_those_of_the_surface() -> None:
     bricks = Bricks.from_mask(np.ones((4, 4, 4), bool), np.full(3, -48.0), 3.0)
     cloud = ball((0.0, 0.0, 0.0), 30.0, 20_000)
-    values, weights = (join_bricks(part, (4, 4, 4)) for part in splat(cloud, bricks))
+    values, weights = (join_bricks(part, (4, 4, 4)) for part in splat_planes(cloud, bricks))
     index = np.moveaxis(np.indices(values.shape), 0, -1)
     truth = np.linalg.norm(bricks.origin + 3.0 * index, axis=-1) - 30.0
     near = np.abs(truth) < 2.0
@@ -145,7 +144,7 @@ def test_what_was_seen_through_is_half_a_cell_outside() -> None:
     sigma = np.where(between, np.float32(0.1), np.float32(np.nan))
     wall = RangeImage("p", camera, points, points, sigma, np.zeros(between.shape, np.uint8))
     guessed, seen = (
-        likely_distances(rods, 1.0, images, {"p": pose}, workers=1) for images in ([], [wall])
+        fill_distances(rods, 1.0, images, {"p": pose}, workers=1) for images in ([], [wall])
     )
     _, y, height = guessed.origin[:, None, None, None] + CELL_MM * np.indices(guessed.values.shape)
     gap = (np.abs(y) < 20.0) & (np.abs(height - 900.0) < 60.0) & (guessed.values < 0.0)
@@ -161,7 +160,7 @@ def test_a_grid_of_which_no_half_can_be_halved_is_filled_as_well() -> None:
     fixed = np.ones(truth.shape, bool)
     fixed[4:28, 6:28, 8:28] = False
     nowhere = np.full(truth.shape, -np.inf, np.float32)
-    found = fill_harmonically(np.where(fixed, truth, 99.0), fixed, nowhere, sure=100.0)
+    found = fill_harmonically(np.where(fixed, truth, 99.0), fixed, nowhere, certain=100.0)
     # As above.
     near = np.abs(truth) < 0.4
     assert np.abs(found - truth)[near].max() < 0.05
@@ -181,7 +180,7 @@ def test_a_point_says_the_more_the_better_it_is_known_but_nine_times_the_usual_a
         cloud_of(points, np.tile([0.0, 0.0, 1.0], (3, 1))),
         sigma_mm=np.array([*sigmas, usual], np.float32),
     )
-    values, weights = (join_bricks(part, (2, 2, 2)) for part in splat(cloud, bricks))
+    values, weights = (join_bricks(part, (2, 2, 2)) for part in splat_planes(cloud, bricks))
     more = times if times == 4.0 else times**2
     # 2 mm over the first, 2 mm under the other; single precision.
     assert values[5, 5, 5] == pytest.approx(2.0 * (more - 1.0) / (more + 1.0), rel=1e-5)

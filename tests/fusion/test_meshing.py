@@ -15,7 +15,7 @@ from benchmarks.self_intersections import self_intersections
 from bodyscan.errors import ScanFailed
 from bodyscan.evaluation.surface import deviation, signed_distances
 from bodyscan.fusion.meshing import mesh
-from bodyscan.fusion.signed_distances import REACH_CELLS, touched
+from bodyscan.fusion.signed_distances import REACH_CELLS, find_near_bricks
 from bodyscan.mesh.body import HAIR, SKIN, UNSURE, BodyCloud, BodyMesh
 from bodyscan.mesh.surface_nets import SIDE
 from bodyscan.mesh.topology import compute_topology, signed_volume
@@ -47,7 +47,7 @@ def test_bricks_are_wanted_that_hold_a_node_within_reach_or_next_to_one() -> Non
     first = SIDE * np.moveaxis(np.indices(shape), 0, -1)[..., None, :]
     inside = np.clip(places, first, first + SIDE - 1)
     far = np.abs(inside - places).max(axis=-1)
-    found = touched(origin + cell_mm * places, origin, cell_mm, shape)
+    found = find_near_bricks(origin + cell_mm * places, origin, cell_mm, shape)
     assert found[(far < REACH_CELLS + 2.0).any(axis=-1)].all()
     assert not found[(far > REACH_CELLS + 3.0).all(axis=-1)].any()
     assert 0.1 < found.mean() < 0.9

@@ -15,7 +15,7 @@ from bodyscan.arrays import Array, Indices
 from bodyscan.errors import ScanFailed
 from bodyscan.fusion.cleaning import apply_mask
 from bodyscan.fusion.meshing import closed_surface
-from bodyscan.fusion.scan import Scan
+from bodyscan.fusion.storage import Scan
 from bodyscan.fusion.verdict.floor import find_floor
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance

@@ -9,7 +9,12 @@ import numpy as np
 import pytest
 
 from bodyscan.arrays import Array
-from bodyscan.fusion.brightness import _overlaps, _shades, even_brightness, gains
+from bodyscan.fusion.brightness import (
+    equalize_brightness,
+    find_overlaps,
+    log_irradiance,
+    solve_gains,
+)
 
 
 def test_light_falls_off_with_the_square_of_the_distance_and_the_cosine() -> None:
@@ -20,7 +25,7 @@ def test_light_falls_off_with_the_square_of_the_distance_and_the_cosine() -> Non
         points = np.tile(centre - [0.0, 0.0, away], (4, 1)).astype(np.float32)
         # From 84 degrees on the room lights it.
         expected = np.log(np.maximum(np.cos(lean), 0.1) / away**2)
-        np.testing.assert_allclose(_shades(points, normals, centre), expected, rtol=1e-5)
+        np.testing.assert_allclose(log_irradiance(points, normals, centre), expected, rtol=1e-5)
 
 
 def overlap(ours: Array, theirs: Array, shade: float = 0.3) -> list[Any]:
@@ -35,7 +40,7 @@ def overlap(ours: Array, theirs: Array, shade: float = 0.3) -> list[Any]:
     seen: Any = [none, SimpleNamespace(index=np.arange(count), at=np.arange(count))]
     of_samples = np.full(count + 7, 0.1, np.float32)
     of_surfaces = [np.zeros(0, np.float32), np.full(count, 0.1 + shade, np.float32)]
-    return list(_overlaps(samples, surfaces, seen, of_samples, of_surfaces))
+    return list(find_overlaps(samples, surfaces, seen, of_samples, of_surfaces))
 
 
 def test_an_overlap_tells_how_much_brighter_one_pair_is_than_the_other() -> None:
@@ -64,14 +69,14 @@ def test_two_hundred_spots_make_an_overlap(count: int, told: bool) -> None:
 
 def test_an_overlap_counts_for_as_many_spots_as_it_stands_for() -> None:
     """Two pairs tied twice, saying 1 and 1.5, the first of three times as many spots: 1.107."""
-    found = gains([(0, 1, 0.0, 300), (0, 1, float(np.log(1.5)), 100)], 2)
+    found = solve_gains([(0, 1, 0.0, 300), (0, 1, float(np.log(1.5)), 100)], 2)
     assert found[0] / found[1] == pytest.approx(1.5**0.25, rel=1e-3)
 
 
 def test_a_pair_that_a_thousandth_of_the_overlaps_ties_is_held_by_as_much() -> None:
     """Two that are tied closely, and a third, each held by a thousandth: w / (w + 2/3 h) of the way. A
     pair that nothing ties keeps its own brightness, however bright the others are."""
-    found = gains([(0, 1, 0.0, 99_900), (1, 2, float(np.log(2.0)), 100)], 4)
+    found = solve_gains([(0, 1, 0.0, 99_900), (1, 2, float(np.log(2.0)), 100)], 4)
     assert found[1] / found[2] == pytest.approx(2.0**0.6, rel=0.01)
     assert found[0] == pytest.approx(found[1], rel=1e-3)
 
@@ -87,7 +92,7 @@ def test_two_exposures_of_a_matt_surface_come_out_alike() -> None:
     centres = np.array([[0.0, 0.0, 900.0], [800.0, 0.0, 500.0]])
     greys = []
     for centre, exposure in zip(centres, (1.0, 2.0), strict=True):
-        light = np.exp(_shades(points, normals, centre) + np.log(900.0**2))
+        light = np.exp(log_irradiance(points, normals, centre) + np.log(900.0**2))
         greys.append(np.rint(60.0 * exposure * light).astype(np.uint8))
     samples: Any = SimpleNamespace(
         points=points, normals=normals, colours=greys[0], starts=np.array([0, count, count])
@@ -101,7 +106,7 @@ def test_two_exposures_of_a_matt_surface_come_out_alike() -> None:
     ]  # fmt: skip
     none = SimpleNamespace(index=np.zeros(0, np.int64), at=np.zeros(0, np.int64))
     seen: Any = [none, SimpleNamespace(index=np.arange(count), at=np.arange(count))]
-    found = even_brightness(samples, surfaces, seen)
+    found = equalize_brightness(samples, surfaces, seen)
     assert np.median(found.surfaces[1] / found.samples) == pytest.approx(1.0, rel=0.02)
     assert np.std(np.log(found.samples)) < 0.03, "whichever part of it faces the light"
     assert np.std(np.log(greys[0])) > 0.05

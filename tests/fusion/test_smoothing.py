@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from bodyscan.fusion.smoothing import (
     SmoothSurface,
-    _distance_to_rim,
-    pixel_size,
+    distance_to_rim,
+    estimate_pixel_size,
     smooth,
     window_reach,
 )
@@ -234,7 +234,7 @@ def test_rims_are_where_nothing_lies_beside_or_something_behind(turns: int) -> N
     depth = np.full((20, 20), 1000.0, np.float32)
     depth[12:] = 1000.0 * (1.0 + np.float32(0.011))
     depth[3, 5] = 0.0
-    rims = np.rot90(_distance_to_rim(np.ascontiguousarray(np.rot90(depth, turns)), 0.01), -turns)
+    rims = np.rot90(distance_to_rim(np.ascontiguousarray(np.rot90(depth, turns)), 0.01), -turns)
     expected = np.minimum(np.arange(20)[:, None] + 1, np.arange(20) + 1).astype(float)
     expected = np.minimum(expected, expected[::-1, ::-1])
     assert rims[11, 9] == 1.0
@@ -246,7 +246,7 @@ def test_rims_are_where_nothing_lies_beside_or_something_behind(turns: int) -> N
     np.testing.assert_array_less(rims[13:], expected[13:] + 1.1)
     assert rims[15, 10] == pytest.approx(5.0, rel=0.05)
     depth[12:] = 1000.0 * (1.0 + np.float32(0.009))
-    flat = np.rot90(_distance_to_rim(np.ascontiguousarray(np.rot90(depth, turns)), 0.01), -turns)
+    flat = np.rot90(distance_to_rim(np.ascontiguousarray(np.rot90(depth, turns)), 0.01), -turns)
     assert flat[11, 9] > 5.0
 
 
@@ -265,4 +265,4 @@ def test_a_pixel_is_as_wide_as_it_appears_half_way_deep() -> None:
     depth = np.full((40, 40), 500.0)
     depth[:, :10] = 5000.0
     inverse = np.where(np.arange(40) > 35, 0.0, 1.0 / depth).astype(np.float32)
-    assert pixel_size(inverse, CAMERA) == pytest.approx(500.0 / CAMERA.alpha, rel=1e-6)
+    assert estimate_pixel_size(inverse, CAMERA) == pytest.approx(500.0 / CAMERA.alpha, rel=1e-6)

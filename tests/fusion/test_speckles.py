@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bodyscan.fusion.cleaning import BACKGROUND_MM, drop_speckles, in_front_of
+from bodyscan.fusion.cleaning import drop_speckles, find_foreground
 
 NAN = np.float32(np.nan)
 
@@ -48,16 +48,18 @@ def test_what_stands_before_the_nearest_of_an_empty_rooms_pixels_around_is_no_ba
     room[0, 0] = 0.0  # nothing was seen there
     empty: Any = SimpleNamespace(open_depth=room)
     points = np.zeros((5, 7, 3), np.float32)
-    points[..., 2] = 2000.0 - BACKGROUND_MM + 1.0
+    points[..., 2] = 1997.0
     image: Any = SimpleNamespace(points=points, part=np.s_[2:7, 2:9])
-    found = in_front_of(image, empty)
+    found = find_foreground(image, empty)
     assert not found[1:4, 2:5].any(), "beside the shelf"
     found[1:4, 2:5] = True
     assert found.all()
-    points[..., 2] = 2000.0 - BACKGROUND_MM - 1.0
-    assert in_front_of(image, empty).all()
+    points[..., 2] = 1995.0
+    assert find_foreground(image, empty).all()
     points[2, 3, 2] = NAN
-    assert not in_front_of(image, empty)[2, 3]
+    assert not find_foreground(image, empty)[2, 3]
     points[..., 2] = 4000.0
     nothing: Any = SimpleNamespace(open_depth=np.zeros((9, 11), np.float32))
-    assert in_front_of(image, nothing).all(), "where a room is seen nowhere, all stands before it"
+    assert find_foreground(image, nothing).all(), (
+        "where a room is seen nowhere, all stands before it"
+    )

@@ -6,7 +6,7 @@ import numpy as np
 import open3d as o3d
 import pytest
 
-from bodyscan.fusion.support import Support, fit_to_points, support
+from bodyscan.fusion.support import Support, fit_to_points, measure_support
 from bodyscan.mesh.body import BodyCloud
 from bodyscan.mesh.topology import vertex_normals
 
@@ -35,13 +35,13 @@ def asked(cloud: BodyCloud, vertices: list[list[float]]) -> Support:
     """Vertices that look up."""
     places = np.array(vertices, float)
     normals = np.broadcast_to(UP, places.shape).astype(np.float32)
-    return support(places, normals, cloud, REACH_MM)
+    return measure_support(places, normals, cloud, REACH_MM)
 
 
 def test_a_vertex_over_a_plane_knows_how_far() -> None:
     found = asked(cloud_of(sheet(), UP), [[-10.0, 0.0, 0.3], [-10.4, 2.0, -0.5], [-8.0, 1.0, 0.0]])
     np.testing.assert_allclose(found.shift_mm, [-0.3, 0.5, 0.0], atol=1e-6)
-    np.testing.assert_allclose(found.spread_mm, 0.0, atol=1e-6)
+    np.testing.assert_allclose(found.scatter_mm, 0.0, atol=1e-6)
     assert found.measured.all()
 
 
@@ -109,7 +109,7 @@ def test_a_surface_settles_on_its_points() -> None:
     cloud = cloud_of(50.0 * ways, ways)
     bumpy = vertices * (1.0 + 0.01 * np.sin(vertices[:, :1] / 3.0))
     normals = vertex_normals(bumpy, faces)
-    around = support(bumpy, normals, cloud, REACH_MM)
+    around = measure_support(bumpy, normals, cloud, REACH_MM)
     moved = fit_to_points(bumpy, faces, normals, around)
     off = np.abs(np.linalg.norm(bumpy, axis=1) - 50.0).max()
     assert off > 0.4
@@ -170,7 +170,7 @@ def test_shift_and_spread_are_weighted_means_of_the_planes_around() -> None:
     assert found.weight[0] == pytest.approx(np.sum(facing), rel=1e-5)
     assert found.shift_mm[0] == pytest.approx(shift, rel=1e-5)
     spread = np.sqrt(np.sum(near * (plane - shift) ** 2) / np.sum(near))
-    assert found.spread_mm[0] == pytest.approx(spread, rel=1e-5)
+    assert found.scatter_mm[0] == pytest.approx(spread, rel=1e-5)
     assert found.nearest[0] == 0
 
 
@@ -186,7 +186,7 @@ def test_a_vertex_takes_after_the_point_nearest_to_it() -> None:
 def told(**values: list[float]) -> Support:
     """Vertices whose weight is 1, and that lie on points of no noise, but for `values`."""
     count = len(next(iter(values.values())))
-    given = {"sigma_mm": 0.0, "weight": 1.0, "shift_mm": 0.0, "spread_mm": 0.0}
+    given = {"sigma_mm": 0.0, "weight": 1.0, "shift_mm": 0.0, "scatter_mm": 0.0}
     all_ = {name: np.broadcast_to(values.get(name, usual), count) for name, usual in given.items()}
     return Support(np.zeros(count, np.int64), reach_mm=REACH_MM, **all_)
 
@@ -195,7 +195,7 @@ def test_noise_allows_for_four_sigmas_off_the_points_and_two_between_their_plane
     """Beyond a quarter and an eighth of the reach."""
     found = told(sigma_mm=[0.5] * 3, shift_mm=[1.95, -2.05, 2.05])
     assert found.measured.tolist() == [True, False, False]
-    found = told(sigma_mm=[0.0, 0.0, 0.5, 0.5], spread_mm=[0.49, 0.51, 0.98, 1.02])
+    found = told(sigma_mm=[0.0, 0.0, 0.5, 0.5], scatter_mm=[0.49, 0.51, 0.98, 1.02])
     assert found.measured.tolist() == [True, False, True, False]
 
 

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bodyscan.errors import ScanFailed
-from bodyscan.fusion.voxel_thinning import one_per_voxel, take_samples, voxel_size_for
+from bodyscan.fusion.voxel_thinning import find_voxel_size, select_per_voxel, take_samples
 from bodyscan.geometry.transforms import RigidTransform
 
 
@@ -28,8 +28,8 @@ def cells(points: np.ndarray, voxel_mm: float) -> np.ndarray:
 @pytest.mark.parametrize("wanted", [20_000, 100_000])
 def test_as_many_as_wanted(wanted: int) -> None:
     points = sphere(600_000)
-    size = voxel_size_for(points, wanted)
-    chosen = one_per_voxel(points, np.zeros(len(points), bool), size)
+    size = find_voxel_size(points, wanted)
+    chosen = select_per_voxel(points, np.zeros(len(points), bool), size)
     # One voxel in eight is counted: their number scatters by 1.5 %, and the law is not exact.
     assert abs(len(chosen) / wanted - 1.0) < 0.06
 
@@ -44,7 +44,7 @@ def test_one_from_each_voxel_and_the_best(count: int, size: float, seed: int) ->
     rng = np.random.default_rng(seed)
     points = rng.uniform(-40.0, 40.0, (count, 3)).astype(np.float32)
     poor = rng.random(count) < 0.5
-    chosen = one_per_voxel(points, poor, size)
+    chosen = select_per_voxel(points, poor, size)
     where = cells(points, size)
     mine = {tuple(cell) for cell in where[chosen]}
     assert len(mine) == len(chosen)
@@ -57,14 +57,14 @@ def test_one_from_each_voxel_and_the_best(count: int, size: float, seed: int) ->
 def test_small_voxels_in_a_large_box() -> None:
     """More blocks of voxels than a table holds: they become larger, and the choice stays."""
     points = np.concatenate([sphere(2000), sphere(2000, seed=1) + np.float32(3000.0)])
-    chosen = one_per_voxel(points, np.zeros(len(points), bool), 1.0)
+    chosen = select_per_voxel(points, np.zeros(len(points), bool), 1.0)
     assert len(chosen) == len(np.unique(cells(points, 1.0), axis=0))
 
 
 def test_evenly_spread() -> None:
     points = sphere(600_000)
-    size = voxel_size_for(points, 40_000)
-    thin = points[one_per_voxel(points, np.zeros(len(points), bool), size)]
+    size = find_voxel_size(points, 40_000)
+    thin = points[select_per_voxel(points, np.zeros(len(points), bool), size)]
     # The same number on each octant and each band of the sphere: cubes cut by a surface number
     # 1 to 1.5 times its area over theirs, as it runs along them or askew.
     octant = (thin > 0) @ [1, 2, 4]
