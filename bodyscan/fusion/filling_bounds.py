@@ -194,11 +194,11 @@ class Crown:
             half_width *= 0.3
         return max(0.0, top)
 
-    def compute_excess(self, points: Array) -> Array:
+    def compute_heights_above(self, points: Array) -> Array:
         """Height (N,) mm, at least 0, of points (N, 3) at the top of the head above its planes."""
         near = points[:, 2] > self.highest[2] - 60.0 / 3.0
         near &= np.hypot(*(points[:, :2] - self.highest[:2]).T) < CROWN_RADIUS_MM
-        excess = np.zeros(len(points))
+        above = np.zeros(len(points))
         if len(self.offsets):
-            excess[near] = np.max(points[near] @ self.normals.T - self.offsets, axis=1)
-        return np.maximum(excess, 0.0)
+            above[near] = np.max(points[near] @ self.normals.T - self.offsets, axis=1)
+        return np.maximum(above, 0.0)

@@ -88,11 +88,11 @@ def _bound_crown(
     low = bricks.origin + cell_mm * node
     up = np.array([0.0, 0.0, cell_mm])
     crossing = low + up * (below / np.minimum(below - above, -1e-6))[:, None]
-    bulges = crown.compute_excess(crossing) > Crown.NOISE_MM
+    bulges = crown.compute_heights_above(crossing) > Crown.NOISE_MM
     for position, at in ((low, node), (low + up, node + [0, 0, 1])):
         chosen = tuple(at[bulges].T)
-        excess = crown.compute_excess(position[bulges])
-        bound[chosen] = np.where(excess > 0.0, np.maximum(excess, bound[chosen]), bound[chosen])
+        height = crown.compute_heights_above(position[bulges])
+        bound[chosen] = np.where(height > 0.0, np.maximum(height, bound[chosen]), bound[chosen])
 
 
 def _mirror(values: Floats | Mask, below: int, where: Mask) -> None:

@@ -48,7 +48,7 @@ def merge(
 ) -> MergedCloud:
     """Merge aligned, cleaned range images into one even cloud of about `settings.points` points.
 
-    poses: how well the pairs' poses are known; None for exactly. See `estimate_excess`.
+    poses: how well the pairs' poses are known; None for exactly. See `estimate_sigma_inflation`.
 
     Surfaces of two pairs within `settings.agreement_mm` along the normal are averaged by weight;
     between that and `settings.double_mm` they are a double surface, of which the heavier one stays.
@@ -90,7 +90,7 @@ def average(
     poses: how well the pairs' poses are known, None for exactly.
     """
     block = 1 << 16  # samples whose sums fit into a processor's cache
-    excess = estimate_excess(samples, surfaces, consistency, poses) ** 2
+    inflation = estimate_sigma_inflation(samples, surfaces, consistency, poses) ** 2
 
     def part(start: int) -> tuple[NDArray[Any], ...]:
         some = slice(start, start + block)
@@ -104,14 +104,14 @@ def average(
             here = slice(*np.searchsorted(one.against_index, (some.start, some.stop)))
             weights = surface.weight[one.against_at[here]]
             sums.against[one.against_index[here] - start] += weights
-        return _average(samples.points[some], normals, sums, excess)
+        return _average(samples.points[some], normals, sums, inflation)
 
     with ThreadPoolExecutor(workers) as pool:
         parts = list(pool.map(part, range(0, len(samples.points), block)))
     return BodyCloud(*(np.concatenate(fields) for fields in zip(*parts, strict=True)))
 
 
-def estimate_excess(
+def estimate_sigma_inflation(
     samples: Samples,
     surfaces: Sequence[SmoothSurface],
     consistency: Sequence[Consistency],
@@ -211,11 +211,11 @@ def _add_surface(
 
 @compiled
 def _average(
-    points: Floats, normals: Floats, sums: _Sums, excess: float
+    points: Floats, normals: Floats, sums: _Sums, inflation: float
 ) -> tuple[Array, Floats, Floats, Bytes, Bytes]:
     """Points, normals, sigmas, colours and number of pairs of the samples that were not outvoted.
 
-    excess: variance of the pairs' differences over the predicted one. Sigmas are enlarged by it,
+    inflation: variance of the pairs' differences over the predicted one. Sigmas are enlarged by it,
         and by more where pairs differ by more than three of their sigmas.
     """
     kept = np.flatnonzero(sums.against < sums.weight)
@@ -227,7 +227,7 @@ def _average(
         mean = sums.shift[here] / weight
         squares = sums.square[here] - weight * mean * mean
         chi2 = squares / max(sums.pairs[here] - 1, 1)
-        sigma[n] = np.sqrt(sums.variance[here] * max(excess, chi2 / 9.0)) / weight
+        sigma[n] = np.sqrt(sums.variance[here] * max(inflation, chi2 / 9.0)) / weight
         x, y, z = sums.normal[here, 0], sums.normal[here, 1], sums.normal[here, 2]
         length = np.sqrt(x * x + y * y + z * z)
         for k in range(3):

@@ -12,7 +12,7 @@ from flat_walls import ASIDE, WALL_MM, wall
 
 from bodyscan.fusion.brightness import EqualizedGrey
 from bodyscan.fusion.consistency import Consistency, compare_with_surface
-from bodyscan.fusion.merging import average, estimate_excess
+from bodyscan.fusion.merging import average, estimate_sigma_inflation
 from bodyscan.fusion.smoothing import SmoothSurface
 from bodyscan.fusion.voxel_thinning import Samples, take_samples
 from bodyscan.geometry.transforms import RigidTransform
@@ -107,7 +107,7 @@ def test_the_mean_lies_where_the_weights_say() -> None:
 def test_pairs_that_disagree_everywhere_are_all_less_certain() -> None:
     cloud, samples, surfaces, consistency = fused(0.5, (0.1, 0.1))
     # 0.5 mm apart, with 0.14 expected: 3.5 times, over 0.6745 since a median is compared.
-    times = estimate_excess(samples, surfaces, consistency)
+    times = estimate_sigma_inflation(samples, surfaces, consistency)
     assert times == pytest.approx(0.5 / np.hypot(0.1, 0.1) / 0.6745, rel=0.01)
     both = cloud.pairs_seen == 2
     assert cloud.sigma_mm[both] == pytest.approx(times * 0.1 / np.sqrt(2.0), rel=0.01)
@@ -122,16 +122,16 @@ def test_pairs_that_stand_apart_as_their_poses_are_known_are_no_less_certain() -
     )
     along_z = np.diag([0.0, 0.0, 0.0, 0.0, 0.0, 0.48**2])
     about_z = np.diag([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
-    unknown = estimate_excess(samples, [first, second], consistency)
+    unknown = estimate_sigma_inflation(samples, [first, second], consistency)
     for turned, expected in ((along_z, 0.5 / 0.5 / 0.6745), (about_z, unknown)):
         both = np.zeros((12, 12))
         both[6:, 6:] = turned
         poses = PoseCovariance(("a", "b"), both)
-        found = estimate_excess(samples, [first, second], consistency, poses)
+        found = estimate_sigma_inflation(samples, [first, second], consistency, poses)
         assert found == pytest.approx(expected, rel=0.01)
     # Errors that both share set nothing apart.
     alike = PoseCovariance(("a", "b"), np.tile(along_z, (2, 2)))
-    assert estimate_excess(samples, [first, second], consistency, alike) == pytest.approx(
+    assert estimate_sigma_inflation(samples, [first, second], consistency, alike) == pytest.approx(
         unknown, rel=1e-6
     )
 
@@ -148,7 +148,7 @@ def test_a_place_where_pairs_disagree_by_more_than_elsewhere_is_less_certain() -
     consistency = [
         compare_with_surface(samples, surface, k, 1.5, 6.0) for k, surface in enumerate(surfaces)
     ]
-    assert estimate_excess(samples, surfaces, consistency) == 1.0
+    assert estimate_sigma_inflation(samples, surfaces, consistency) == 1.0
     cloud = average(samples, surfaces, consistency, as_seen(samples, surfaces), workers=1)
     both = cloud.pairs_seen == 2
     apart = np.isclose(np.abs(cloud.points[:, 2] - WALL_MM), 0.4, atol=0.01) & both
@@ -184,7 +184,7 @@ def test_how_far_pairs_scatter_is_told_against_their_sigmas_where_they_overlap()
         every = np.arange(some)
         return SimpleNamespace(index=every, at=every, shift_mm=mm * rng.standard_normal(some))
 
-    assert estimate_excess(samples, [surface], [seen(1.5)]) == pytest.approx(3.0, rel=0.05)
-    assert estimate_excess(samples, [surface], [seen(0.2)]) == 1.0
-    assert estimate_excess(samples, [surface], [seen(1.5, 0)]) == 1.0
-    assert estimate_excess(samples, [], []) == 1.0
+    assert estimate_sigma_inflation(samples, [surface], [seen(1.5)]) == pytest.approx(3.0, rel=0.05)
+    assert estimate_sigma_inflation(samples, [surface], [seen(0.2)]) == 1.0
+    assert estimate_sigma_inflation(samples, [surface], [seen(1.5, 0)]) == 1.0
+    assert estimate_sigma_inflation(samples, [], []) == 1.0
