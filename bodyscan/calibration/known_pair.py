@@ -1,4 +1,4 @@
-"""A pair calibrated by another program: read from its files, converted to our terms and checked."""
+"""Read a pair that another program calibrated, convert it to our terms and check it."""
 
 from __future__ import annotations
 
@@ -17,14 +17,6 @@ from bodyscan.interchange.found_camera import FoundCamera, find_camera
 from bodyscan.interchange.rig_format import MILLIMETRES, RIG_FORMATS
 from bodyscan.rig.pair import Known, KnownCamera, Pair
 from bodyscan.stripes.stripe_code import StripeCode
-
-HELD_PX = 1e-6
-"""px by which a camera that is held fixed may still move."""
-NEAREST_MM, FARTHEST_MM = 5.0, 2e4
-"""Plausible projector-to-camera distances: lenses are wider than the first, rooms no wider than the
-second."""
-GRID = 9
-"""Grid of image points, per axis, at which a parameter's effect on pixels is evaluated."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +38,7 @@ class KnownPair:
     source: str
 
     def sheets(self, code: StripeCode) -> LightSheets:
-        """Sheets of the stripes that the projector shows."""
+        """Compute the sheets of the stripes that the projector shows."""
         assert self.projector is not None
         assert self.projector_from_camera is not None
         middle = intersect_central_rays(self.camera, self.projector, self.projector_from_camera)
@@ -69,7 +61,7 @@ def read_known_camera(pair: Pair, folder: Path) -> Camera:
     assert pair.known is not None
     found = _find(pair.known, pair.known.camera, pair.name, folder)
     camera = found.camera(pair.camera.width, pair.camera.height)
-    sigmas = parameter_sigmas(camera, pair.known.sigma_px or HELD_PX)
+    sigmas = parameter_sigmas(camera, pair.known.sigma_px or 1e-6)
     return replace(camera, prior=CameraPrior(camera.parameters, sigmas))
 
 
@@ -105,26 +97,27 @@ def read_known_pair(pair: Pair, folder: Path) -> KnownPair:
 
 
 def _require_baseline(projector_from_camera: RigidTransform, where: str, known: Known) -> None:
+    """Refuse a projector nearer than a lens is wide, or farther away than a room is."""
     baseline = float(np.linalg.norm(projector_from_camera.translation))
-    if not NEAREST_MM < baseline < FARTHEST_MM:
+    if not 5.0 < baseline < 2e4:
         raise CalibrationFileError(
-            f"puts the projector {baseline:.3g} mm from its camera, which no scanner is like",
+            f"puts the projector {baseline:.3g} mm from its camera. Possible cause: its lengths are "
+            f"not in {known.units or 'the unit of its format'}",
             where=where,
-            remedy=f"see whether its lengths are in {known.units or 'the unit of its format'}, "
-            "as `units` below `known` in the rig file says",
+            remedy="correct `units` below `known` in the rig file",
         )
 
 
 def parameter_sigmas(camera: Camera, sigma_px: float) -> Array:
-    """Standard deviations (P,) of a camera's parameters for pixels with sigma_px.
+    """Compute standard deviations (P,) of a camera's parameters for pixels with sigma_px.
 
     Each parameter by itself moves the most affected image point by just sigma_px.
     """
-    u, v = (np.linspace(0.0, size - 1.0, GRID) for size in (camera.width, camera.height))
+    u, v = (np.linspace(0.0, size - 1.0, 9) for size in (camera.width, camera.height))
     rays = camera.rays(np.stack(np.meshgrid(u, v), axis=-1)).reshape(-1, 3)
     by_parameter, _ = camera.jacobians(rays[np.isfinite(rays).all(axis=1)])
-    most: Array = np.linalg.norm(by_parameter, axis=1).max(axis=0)
-    return sigma_px / most
+    largest: Array = np.linalg.norm(by_parameter, axis=1).max(axis=0)
+    return sigma_px / largest
 
 
 def _find(known: Known, device: KnownCamera, name: str, folder: Path) -> FoundCamera:
@@ -143,7 +136,7 @@ def _find(known: Known, device: KnownCamera, name: str, folder: Path) -> FoundCa
 def _pose(
     known: Known, device: KnownCamera, found: FoundCamera, name: str
 ) -> RigidTransform | None:
-    """`camera_from_world`, mm."""
+    """Convert `camera_from_world` to mm; None if the file has no pose."""
     pose = found.camera_from_world
     if pose is None:
         return None
@@ -154,23 +147,23 @@ def _pose(
             where=found.where,
             remedy=f"add `units: mm` (or cm, or m) to `known` of pair {name} in the rig file",
         )
-    placed = RigidTransform(pose.rotation, pose.translation * MILLIMETRES[unit])
-    return placed.inverse() if device.inverse else placed
+    scaled = RigidTransform(pose.rotation, pose.translation * MILLIMETRES[unit])
+    return scaled.inverse() if device.inverse else scaled
 
 
 def _projector(found: FoundCamera, code: StripeCode) -> Camera:
-    """The projector as a camera; if the file does not give its image size, a stripe is a pixel.
+    """Convert the projector to a camera; if the file gives no image size, a stripe is a pixel.
 
     Stripes must divide the image evenly, or they belong to another projector. The start of waves
     (`origin`) is counted in stripes, so another stripe width would move the waves.
     """
-    stripes = {way.direction: way.stripes for way in code.directions}
+    stripes = {one.direction: one.stripes for one in code.directions}
     if found.size is None:
         u0, v0 = float(found.matrix[0, 2]), float(found.matrix[1, 2])
         width = stripes.get("vertical", max(round(2.0 * u0), 1))
         return found.projector(width, stripes.get("horizontal", max(round(2.0 * v0), 1)))
-    for way in code.directions:
-        direction, count, origin = way.direction, way.stripes, getattr(way, "origin", None)
+    for one in code.directions:
+        direction, count, origin = one.direction, one.stripes, getattr(one, "origin", None)
         size = found.size[0 if direction == "vertical" else 1]
         if count < size and origin:
             raise CalibrationFileError(
@@ -181,7 +174,7 @@ def _projector(found: FoundCamera, code: StripeCode) -> Camera:
                 remedy=f"write `stripes: {size}` for {direction} stripes in the rig file, and `origin` "
                 "in pixels",
             )
-        if count < size and size % count and way.has_edges:
+        if count < size and size % count and one.has_edges:
             raise CalibrationFileError(
                 f"has a projector of {found.size[0]} x {found.size[1]} px, which {count} {direction} "
                 f"stripes do not divide evenly ({size / count:.4g} px each)",

@@ -68,7 +68,7 @@ def test_a_projector_stands_millimetres_to_metres_from_its_camera(
     if believed:
         _require_baseline(place, "theirs.json", known)
         return
-    with pytest.raises(CalibrationFileError, match="no scanner is like"):
+    with pytest.raises(CalibrationFileError, match="mm from its camera"):
         _require_baseline(place, "theirs.json", known)
 
 

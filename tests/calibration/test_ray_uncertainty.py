@@ -79,26 +79,6 @@ def test_boards_all_over_the_picture_know_it_all() -> None:
     assert 0.2 < np.sqrt(np.mean((errors / found.rays.sigma_px) ** 2)) < 1.6
 
 
-def test_an_excess_makes_the_noise_larger_and_not_the_choice() -> None:
-    _, found = calibrated(Radial(-0.25, 0.1), 0.3, 1)
-    assert found.rays is not None
-    larger = found.rays.inflate_noise(4.0)
-    np.testing.assert_allclose(larger.noise_px, 2.0 * found.rays.noise_px)
-    np.testing.assert_array_equal(larger.lens_px, found.rays.lens_px)
-
-
-def test_the_image_is_the_nodes_between_them() -> None:
-    _, found = calibrated(Radial(-0.25, 0.1), 0.3, 1)
-    assert found.rays is not None
-    image = found.rays.image(WIDTH, HEIGHT)
-    assert image.shape == (HEIGHT, WIDTH)
-    corners = image[[0, 0, -1, -1], [0, -1, 0, -1]]
-    np.testing.assert_allclose(
-        corners, found.rays.sigma_px[[0, 0, -1, -1], [0, -1, 0, -1]], rtol=1e-5
-    )
-    assert image.min() >= found.rays.sigma_px.min() * 0.9999
-
-
 CHOSEN = Camera(FOCAL, FOCAL + 1.0, -0.5, 645.0, 508.0, Radial(-0.2, 0.08), WIDTH, HEIGHT)
 K1 = CHOSEN.parameter_names.index("k1")
 OFF = 1e-3

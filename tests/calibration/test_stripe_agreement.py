@@ -153,28 +153,6 @@ def test_a_board_that_stands_elsewhere_is_measured_there() -> None:
     assert np.abs(np.delete(off, 2)).max() < 0.05
 
 
-def test_disagreement_is_told_in_pixels_whatever_the_unit_of_length() -> None:
-    scene = chapter_scene()
-    parts = []
-    for number, pose in enumerate(CHAPTER_POSES):
-        data = scene.boundaries([scene.looking_at(*pose)], seed=number)
-        parts.append(replace(data, board=np.full_like(data.board, number)))
-    parts[1] = replace(parts[1], index=parts[1].index + 3)
-    data = concatenate(parts)
-
-    def find(data: BoundaryPoints) -> ProjectorMotion:
-        found = find_projector_motion(data, scene.projector.stripes, scene.direction)
-        assert found is not None
-        return found
-
-    usual = find(data)
-    metres = find(replace(data, points=1e-3 * data.points, per_pixel=1e-3 * data.per_pixel))
-    assert metres.joint_px == pytest.approx(usual.joint_px, rel=0.02)
-    # A camera of pixels half as large is off by twice as many.
-    fine = find(replace(data, per_pixel=0.5 * data.per_pixel))
-    assert fine.joint_px == pytest.approx(2.0 * usual.joint_px, rel=0.02)
-
-
 def split_of(
     lights: Sequence[int],
     monkeypatch: pytest.MonkeyPatch,
@@ -222,16 +200,3 @@ def test_boards_are_split_in_the_simplest_way_that_explains_them(
     assert sorted([*found.kept.tolist(), *others]) == list(range(len(lights)))
     assert found.separate_px == pytest.approx(0.1)
     assert found.joint_px > 1.0
-
-
-@pytest.mark.parametrize(("width_px", "refused"), [(2.2, True), (2.6, False)])
-def test_boards_that_fit_no_light_are_refused_where_stripes_are_off_by_their_width(
-    width_px: float, refused: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Five boards, each with a light of its own but two."""
-    lights = [1, 2, 3, 4, 1]
-    if not refused:
-        assert split_of(lights, monkeypatch, width_px=width_px) is None
-        return
-    with pytest.raises(PairFailed, match=r"the stripes on 5 boards, .* a stripe is 2\.2 px"):
-        split_of(lights, monkeypatch, width_px=width_px)
