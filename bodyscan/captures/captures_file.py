@@ -26,7 +26,6 @@ from bodyscan.rig.templates import path_fault
 FILE_NAME = "captures.yaml"
 _REMEDY = "Correct captures.yaml; docs/formats.md explains every key."
 _TIMES_REMEDY = "Correct the file of times; docs/formats.md explains its columns."
-_COLUMNS = ("shot", "pair", "frame", "ms")
 
 Sequences: TypeAlias = Mapping[tuple[str, str], tuple[str, ...]]
 """Names of the frames taken, by shot and pair, in the rig's order of pairs."""
@@ -34,8 +33,8 @@ Sequences: TypeAlias = Mapping[tuple[str, str], tuple[str, ...]]
 FrameTimes: TypeAlias = Mapping[tuple[str, str], Mapping[str, float]]
 """Times in ms, by shot and pair, then by frame."""
 
-MAX_MS = 1e13  # milliseconds since 1970 are 2e12, and are accepted
-Milliseconds = Annotated[float, Field(ge=0.0, le=MAX_MS)]
+# Milliseconds since 1970 are 2e12, and are accepted.
+Milliseconds = Annotated[float, Field(ge=0.0, le=1e13)]
 # At least a tenth of the fastest projectors', so that seconds are not mistaken for ms.
 FrameMilliseconds = Annotated[float, Field(ge=0.01, le=6e5)]
 Start = Literal["one-after-another", "together", "poles"] | dict[Name, Milliseconds]
@@ -125,11 +124,7 @@ def load_captures_file(folder: Path, rig: Rig) -> CapturesFile:
     """
     path = folder / FILE_NAME
     return load_model(
-        path,
-        CapturesFile,
-        CaptureError,
-        remedy=_REMEDY,
-        also=lambda file: _misfits(file, rig),
+        path, CapturesFile, CaptureError, remedy=_REMEDY, also=lambda file: _misfits(file, rig)
     )
 
 
@@ -246,10 +241,11 @@ def _parse_rows(
     """Parse rows into `found`; yields line and text of what is wrong."""
     rows = csv.reader(lines)
     header = tuple(word.strip() for word in next(rows, []))
-    if header != _COLUMNS:
+    columns = ("shot", "pair", "frame", "ms")
+    if header != columns:
         yield (
             1,
-            f"must begin with the line {','.join(_COLUMNS)} (got {','.join(header) or 'nothing'})",
+            f"must begin with the line {','.join(columns)} (got {','.join(header) or 'nothing'})",
         )
         return
     shots = list(dict.fromkeys(shot for shot, _ in sequences))
@@ -274,8 +270,8 @@ def _find_row_fault(
     found: Mapping[tuple[str, str], Mapping[str, float]],
 ) -> str | None:
     """What is wrong with one row, or None."""
-    if len(words) != len(_COLUMNS):
-        return f"has {len(words)} columns, not {len(_COLUMNS)}"
+    if len(words) != 4:
+        return f"has {len(words)} columns, not 4"
     shot, pair, frame, ms = words
     frames = sequences.get((shot, pair), ())
     for what, name, known in (("shot", shot, shots), ("pair", pair, pairs)):
@@ -305,4 +301,4 @@ def _is_time(text: str) -> bool:
         value = float(text)
     except ValueError:
         return False
-    return 0.0 <= value <= MAX_MS
+    return 0.0 <= value <= 1e13

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import groupby
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from bodyscan.captures.folder import (
     IMAGE_SUFFIXES,
@@ -32,9 +32,6 @@ from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig import Rig, find_unusual_lengths
 from bodyscan.rig.rig_file import load_rig
 
-MIN_SHOTS, ENOUGH_SHOTS = 3, 6
-
-T = TypeVar("T")
 Result = TypeVar("Result")
 
 
@@ -151,7 +148,7 @@ def format_report(report: CheckReport) -> list[str]:
     return lines
 
 
-def _map(work: Callable[[T], Result], items: Iterable[T]) -> list[Result]:
+def _map(work: Callable[[Any], Result], items: Iterable[Any]) -> list[Result]:
     """Results of several threads, which wait for a disk or a server, not for a processor."""
     with ThreadPoolExecutor(8) as pool:
         return list(pool.map(work, items))
@@ -197,12 +194,12 @@ def _too_few_shots(pair: Pair, count: PairCount) -> str | None:
     """The error if a pair has too few shots. It needs three board poses with stripes, a camera
     alone three lit ones (Zhang 2000)."""
     have = _count_poses(pair, count)
-    if have >= MIN_SHOTS:
+    if have >= 3:
         return None
     kind = "whole stripe sequence" if pair.projector else "lit image"
     return (
-        f"pair {pair.name}: has {_count(have, kind)}; calibration needs {MIN_SHOTS} or more,"
-        " with the board tilted differently in each"
+        f"pair {pair.name}: has {_count(have, kind)}; calibration needs 3 or more, "
+        "with the board tilted differently in each"
     )
 
 
@@ -228,9 +225,8 @@ def _warnings(
     if calibration and not rig.is_known:
         for pair, count in zip(rig.pairs, counts, strict=True):
             have = _count_poses(pair, count)
-            if MIN_SHOTS <= have < ENOUGH_SHOTS:
-                enough = f"{ENOUGH_SHOTS} or more are better"
-                yield f"pair {pair.name}: {have} board poses will do, {enough}"
+            if 3 <= have < 6:
+                yield f"pair {pair.name}: {have} board poses will do, 6 or more are better"
 
 
 def _warn_of_jpeg(sequences: list[ImageSequence]) -> Iterator[str]:

@@ -103,18 +103,6 @@ class ImageSequence:
 
 
 @dataclass(frozen=True)
-class MissingImage:
-    """An image that should exist and does not."""
-
-    path: Path
-    pair: str
-    shot: str
-
-    def __str__(self) -> str:
-        return f"{self.path} (pair {self.pair}, shot {self.shot})"
-
-
-@dataclass(frozen=True)
 class Captures:
     """What one or more capture folders hold.
 
@@ -167,13 +155,9 @@ class Captures:
         """A message with its paths relative to `base`, fit to be stored."""
         return make_paths_relative(text, self.base, self.folders)
 
-    def missing(self) -> tuple[MissingImage, ...]:
+    def missing(self) -> tuple[Path, ...]:
         """Every image that should exist and does not."""
-        return tuple(
-            MissingImage(path, sequence.pair, sequence.shot)
-            for sequence in self.sequences
-            for path in sequence.missing
-        )
+        return tuple(path for sequence in self.sequences for path in sequence.missing)
 
 
 def open_captures(rig: Rig, rig_path: Path) -> Captures:

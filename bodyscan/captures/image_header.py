@@ -111,7 +111,8 @@ def _read_by_pillow(stream: BinaryIO, kind: str) -> ImageHeader:
 
     tags = TiffImageFile(stream).tag_v2
     size = stream.seek(0, 2)
-    starts, lengths = (tags.get(strips) or tags.get(tiles) or () for strips, tiles in _TIFF_PARTS)
+    # Offsets and byte counts, of strips or tiles (TIFF 6.0).
+    starts, lengths = (tags.get(k) or tags.get(m) or () for k, m in ((273, 324), (279, 325)))
     ends = [first + length for first, length in zip(starts, lengths, strict=False)]
     stream.seek(0)
     order, first = struct.unpack("2s2x4s", stream.read(8))
@@ -119,9 +120,6 @@ def _read_by_pillow(stream: BinaryIO, kind: str) -> ImageHeader:
     # Of a directory that is cut short, the next one is said to be itself.
     complete = tags.next != directory and max(ends, default=0) <= size
     return ImageHeader(tags[256], tags[257], max(tags.get(258, (1,))), complete)
-
-
-_TIFF_PARTS = (273, 324), (279, 325)  # offsets and byte counts, of strips or tiles (TIFF 6.0)
 
 
 def _ends_with(stream: BinaryIO, start: int, mark: bytes) -> bool:

@@ -16,8 +16,6 @@ from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig import Rig
 from bodyscan.stripes.stripe_code import StripeCode
 
-LIST_NAME = "patterns.json"
-
 
 def find_uneven_stripes(rig: Rig, width: int, height: int) -> tuple[str, ...]:
     """Note each kind of projector whose stripes cannot all have the same width.
@@ -79,11 +77,7 @@ def _folder_names(kinds: tuple[StripeCode, ...]) -> dict[StripeCode, str]:
 
 
 def _write_kind(
-    folder: Path,
-    frames: FrameNames,
-    kind: StripeCode,
-    pairs: list[Pair],
-    coded: Bytes,
+    folder: Path, frames: FrameNames, kind: StripeCode, pairs: list[Pair], coded: Bytes
 ) -> Path:
     height, width = coded.shape[1:]
     order = []
@@ -99,8 +93,8 @@ def _write_kind(
         "pairs": [pair.name for pair in pairs],
         "show": order,
     }
-    write_json(folder / LIST_NAME, content)
-    return folder / LIST_NAME
+    write_json(folder / "patterns.json", content)
+    return folder / "patterns.json"
 
 
 def _ordered_images(

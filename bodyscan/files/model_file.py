@@ -12,14 +12,7 @@ from pydantic_core import ErrorDetails
 
 from bodyscan.errors import BadInput
 from bodyscan.files.model import Model, Problem, did_you_mean
-from bodyscan.files.yaml_file import (
-    Document,
-    Where,
-    YamlError,
-    YamlProblem,
-    dotted_path,
-    read_yaml,
-)
+from bodyscan.files.yaml_file import Document, Where, YamlError, YamlProblem, dotted_path, read_yaml
 
 M = TypeVar("M", bound=Model)
 

@@ -139,9 +139,7 @@ def _vertex_records(element: Element, body: BodyCloud | BodyMesh, positions: Arr
     return records
 
 
-def _vertex_arrays(
-    records: Records,
-) -> tuple[Array, Floats, Floats, Bytes]:
+def _vertex_arrays(records: Records) -> tuple[Array, Floats, Floats, Bytes]:
     """Positions, normals, sigmas and colours."""
 
     def columns(*names: str) -> NDArray[Any]:

@@ -53,9 +53,6 @@ class NominalPose(Model):
 Text = Annotated[str, Field(min_length=1)]
 
 
-_WITH_NODES = "opencv"  # its files leave names to the user, so the rig file must give them
-
-
 class KnownCamera(Model):
     """A camera, or a projector described as one, in another program's file.
 
@@ -122,10 +119,10 @@ class Known(Model):
             known = f"{', '.join(names)} are"
             hint = did_you_mean(self.format, names)
             yield ("format",), f"is not a format known here, {known}{hint} (got {self.format!r})"
-        elif self.format != _WITH_NODES:
+        elif self.format != "opencv":  # whose files leave names to the user
             for key, device in (("camera", self.camera), ("projector", self.projector)):
                 for node in device.nodes if device else ():
-                    yield (key, node), f"is for format: {_WITH_NODES}; name the camera instead"
+                    yield (key, node), "is for format: opencv; name the camera instead"
         named = self.projector
         if named and not (named.name or named.nodes or named.file):
             yield ("projector",), "does not say which of the file's cameras the projector is"

@@ -172,7 +172,7 @@ def test_a_rig_file_names_its_exposures(tmp_path: Path) -> None:
     assert found.coded.dtype == np.float32
     (tmp_path / "scan/a/p1-long-bit02.png").unlink()
     gone = open_scan(rig, tmp_path / "scan").missing()
-    assert [missing.path.name for missing in gone] == ["p1-long-bit02.png"]
+    assert [path.name for path in gone] == ["p1-long-bit02.png"]
 
 
 @pytest.mark.parametrize(

@@ -12,11 +12,7 @@ import pytest
 from small_bodies import ball, points
 
 from bodyscan.errors import ResultError
-from bodyscan.mesh.body import (
-    BodyCloud,
-    BodyMesh,
-    BreathAt,
-)
+from bodyscan.mesh.body import BodyCloud, BodyMesh, BreathAt
 from bodyscan.mesh.ply import read_ply_cloud, read_ply_mesh, write_ply
 
 
