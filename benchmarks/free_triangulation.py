@@ -63,7 +63,7 @@ def triangulate_board(
     )
     squared = np.sum(residuals**2, axis=-1)
     observed = np.isfinite(squared)
-    true = shape.applied(corners) if shape else corners
+    true = shape.apply(corners) if shape else corners
     return FreeTriangulation(
         views[0].shot,
         int(known.sum()),

@@ -157,7 +157,7 @@ def check_calibration(
     overwrite: OverwriteCalibration = False,
 ) -> None:
     """Find out whether anything in the rig has moved: which pair or pole, and how far."""
-    from bodyscan.registration.storage import keep_former, load_calibration, save_calibration
+    from bodyscan.registration.storage import archive_previous, load_calibration, save_calibration
     from bodyscan.workflows.check_rig import check_rig
 
     if repair is not None:
@@ -169,7 +169,7 @@ def check_calibration(
     output.figures(valid=found.valid)
     if repair is not None:
         repaired = found.repair(rig)
-        keep_former(repair)
+        archive_previous(repair)
         output.made("repaired", save_calibration(repaired, repair))
     output.exit_code = 0 if found.valid else 1
 
@@ -196,14 +196,14 @@ def refine_rig(
 ) -> None:
     """Refine the poses of the pairs on a rigid object, within what the boards allow."""
     from bodyscan.captures.folder import open_scan
-    from bodyscan.registration.storage import keep_former, load_calibration, save_calibration
+    from bodyscan.registration.storage import archive_previous, load_calibration, save_calibration
     from bodyscan.workflows.refine_rig import refine_rig as refine
 
     _require_place(out, overwrite)
     rig = load_calibration(calibration)
     with output.stages() as progress:
         found = refine(rig, open_scan(rig.rig, folder), folder.name, progress)
-    keep_former(out)
+    archive_previous(out)
     saved = save_calibration(found.value, out)
     output.failures(found.failures, "left out")
     output.say(*found.notes)

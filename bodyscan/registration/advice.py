@@ -13,10 +13,10 @@ import numpy as np
 from bodyscan.geometry.uncertainty import point_covariance, position_sigma
 from bodyscan.registration.more_shots import (
     MOST_SHOTS,
-    BoardPlace,
+    BoardCandidate,
     RigInformation,
     SigmaReduction,
-    board_places,
+    propose_board_poses,
 )
 from bodyscan.registration.normal_equations import normal_equations
 from bodyscan.registration.rig_frame import frame_target
@@ -46,7 +46,7 @@ class Link:
 
 
 @dataclass(frozen=True, eq=False)
-class MoreShots:
+class ShotSuggestion:
     """How far `shots` more of the board at `place` reduce the sigma of `pair`.
 
     between: the two pairs whose common view of it matters most.
@@ -57,7 +57,7 @@ class MoreShots:
     pair: str
     shots: int
     between: tuple[str, str]
-    place: BoardPlace
+    place: BoardCandidate
     before_mm: float
     after_mm: float
     halves: bool
@@ -84,7 +84,7 @@ class Advice:
     crucial: tuple[Target, ...]
     worst: str
     worst_sigma_mm: float
-    more: MoreShots | None
+    more: ShotSuggestion | None
 
     @property
     def lines(self) -> list[str]:
@@ -110,10 +110,10 @@ class Advice:
 
 def advise(rig: Rig, placed: RigSolution) -> Advice:
     """Links, weak spots and the most useful further shots of a solved rig."""
-    links = links_of(placed)
+    links = find_links(placed)
     graph = view_graph(placed.views, sorted(placed.rig_from_camera))
     bridging = {frozenset(edge) for edge in nx.bridges(graph)}
-    chain = best_chain(links)
+    chain = minimum_spanning_links(links)
     usual = float(np.median([link.sigma_mm for link in chain])) if chain else 0.0
     sigmas = {
         name: float(np.linalg.norm(position_sigma(placed.covariance, name, t.translation)))
@@ -125,14 +125,14 @@ def advise(rig: Rig, placed: RigSolution) -> Advice:
         chain,
         tuple(link for link in links if {link.first, link.second} in bridging),
         tuple(link for link in chain if link.sigma_mm > WEAK_TIMES * usual),
-        crucial_shots(placed),
+        find_articulation_shots(placed),
         worst,
         sigmas[worst],
         more_shots(rig, placed, worst),
     )
 
 
-def links_of(placed: RigSolution) -> tuple[Link, ...]:
+def find_links(placed: RigSolution) -> tuple[Link, ...]:
     """Every two pairs that share a shot, least known first."""
     found = []
     graph = view_graph(placed.views, sorted(placed.rig_from_camera))
@@ -143,7 +143,7 @@ def links_of(placed: RigSolution) -> tuple[Link, ...]:
     return tuple(sorted(found, key=lambda link: (-link.sigma_mm, link.first, link.second)))
 
 
-def best_chain(links: Sequence[Link]) -> tuple[Link, ...]:
+def minimum_spanning_links(links: Sequence[Link]) -> tuple[Link, ...]:
     """The links that tie all pairs together best, a minimum spanning tree by sigma; least known
     first."""
     graph = nx.Graph()
@@ -154,7 +154,7 @@ def best_chain(links: Sequence[Link]) -> tuple[Link, ...]:
     return tuple(sorted((data["link"] for _, _, data in tree), key=lambda link: -link.sigma_mm))
 
 
-def crucial_shots(placed: RigSolution) -> tuple[Target, ...]:
+def find_articulation_shots(placed: RigSolution) -> tuple[Target, ...]:
     """Shots without which some pairs would share no view with the others."""
     graph = nx.Graph()
     graph.add_nodes_from(("pair", name) for name in placed.rig_from_camera)
@@ -162,13 +162,15 @@ def crucial_shots(placed: RigSolution) -> tuple[Target, ...]:
     return tuple(sorted(what for kind, what in nx.articulation_points(graph) if kind == "shot"))
 
 
-def more_shots(rig: Rig, placed: RigSolution, pair: str) -> MoreShots | None:
+def more_shots(rig: Rig, placed: RigSolution, pair: str) -> ShotSuggestion | None:
     """The place for a board at which the fewest further shots halve the sigma of `pair`'s position.
 
     None if no place in the scan volume is seen by two pairs, or no shot would add information.
     """
     usual, _ = Counter(view.board for view in placed.views).most_common(1)[0]
-    places = board_places(rig.board(usual), rig.volume, placed.cameras, placed.rig_from_camera)
+    places = propose_board_poses(
+        rig.board(usual), rig.volume, placed.cameras, placed.rig_from_camera
+    )
     if not places:
         return None
     equations = normal_equations(
@@ -190,7 +192,7 @@ def more_shots(rig: Rig, placed: RigSolution, pair: str) -> MoreShots | None:
     here = placed.rig_from_camera[pair].translation
     before = float(np.linalg.norm(position_sigma(placed.covariance, pair, here)))
     gained = float(np.sqrt(best.after_mm2[shots - 1] / best.before_mm2))
-    return MoreShots(
+    return ShotSuggestion(
         pair,
         shots,
         _between(knowledge, place, pair, shots),
@@ -208,15 +210,15 @@ def _preference(sharpening: SigmaReduction) -> tuple[int, float]:
 
 
 def _between(
-    knowledge: RigInformation, place: BoardPlace, pair: str, shots: int
+    knowledge: RigInformation, place: BoardCandidate, pair: str, shots: int
 ) -> tuple[str, str]:
     """The two pairs whose views of that board alone would add most."""
 
     def left(two: tuple[str, str]) -> float:
-        information = knowledge.information(place.seen_only_by(two))
+        information = knowledge.information(place.restrict_to(two))
         return float(knowledge.after(information, pair, shots).after_mm2[-1])
 
-    return min(combinations(place.seen_by, 2), key=left)
+    return min(combinations(place.visible_to, 2), key=left)
 
 
 def _facing(degrees: float) -> str:
@@ -238,7 +240,7 @@ def _shots(count: int) -> str:
     return "1 shot" if count == 1 else f"{count} shots"
 
 
-def _sentence(more: MoreShots) -> str:
+def _sentence(more: ShotSuggestion) -> str:
     if more.after_mm > WORTH * more.before_mm:
         return (
             f"further shots of this board would not help {more.pair} much: {more.shots} more bring its "
@@ -247,7 +249,7 @@ def _sentence(more: MoreShots) -> str:
     a, b = more.between
     place = more.place
     x, y, z = place.centre_mm
-    others = [name for name in place.seen_by if name not in more.between]
+    others = [name for name in place.visible_to if name not in more.between]
     also = f" (also by {', '.join(others)})" if others else ""
     effect = (
         f"would halve the sigma of {more.pair}"

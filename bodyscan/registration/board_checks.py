@@ -1,12 +1,13 @@
-"""Check the boards against the rig file, by how much of them is found."""
+"""Compare boards with their description in the rig file, by all views of them together."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
-from bodyscan.boards.board_layout import corners_per_face
+from bodyscan.boards.board_layout import corner_grid, corners_per_face
 from bodyscan.boards.view import BoardView
 from bodyscan.rig.board import Board
 from bodyscan.rig.rig import Rig
@@ -54,3 +55,104 @@ def describe_findings(rig: Rig, views: Sequence[BoardView], images: int) -> str:
                 )
             )
     return "\n  ".join(lines)
+
+
+LEAST_VIEWS = 3
+"""Views in which the neighbouring line must be seen before a last line never seen is doubted."""
+
+
+def drop_inconsistently_mirrored(views: Sequence[BoardView]) -> tuple[list[BoardView], list[str]]:
+    """Drop views that one camera saw mirrored unlike most of its images; also a line for each.
+
+    In those an image was flipped, or showed a mirror.
+    """
+    groups: dict[tuple[str, str], list[BoardView]] = defaultdict(list)
+    for view in views:
+        groups[view.pair, view.board].append(view)
+    odd: list[BoardView] = []
+    for group in groups.values():
+        mirrored = [view for view in group if view.appearance.mirrored]
+        usual = [view for view in group if not view.appearance.mirrored]
+        if mirrored and usual:
+            odd += mirrored if len(mirrored) <= len(usual) else usual
+    notes = [
+        f"{view.pair}: board {view.board} is {'' if view.appearance.mirrored else 'not '}mirrored in "
+        f"shot {view.shot}, unlike in most images of this camera: a flipped picture, or one with a "
+        "mirror; not used"
+        for view in odd
+    ]
+    dropped = set(map(id, odd))
+    return [view for view in views if id(view) not in dropped], notes
+
+
+def appearance_notes(rig: Rig, views: Sequence[BoardView]) -> list[str]:
+    """One line for each difference between a board and its description in the rig file."""
+    return [
+        line
+        for board in rig.boards
+        for line in _notes_of_board(board, [view for view in views if view.board == board.name])
+    ]
+
+
+def _notes_of_board(board: Board, views: Sequence[BoardView]) -> Iterator[str]:
+    def where(views: Iterable[BoardView]) -> str:
+        pairs = sorted({view.pair for view in views})
+        return f"{len(list(views))} views ({', '.join(pairs)})"
+
+    inverted = [view for view in views if view.appearance.inverted]
+    mirrored = [view for view in views if view.appearance.mirrored]
+    other = [view for view in views if view.appearance.other_layout]
+    beyond = [view for view in views if view.appearance.more_rows]
+    if inverted:
+        yield f"board {board.name} is white on black in {where(inverted)}; used so"
+    if mirrored:
+        cameras = {view.pair for view in mirrored} != {view.pair for view in views}
+        yield (
+            f"board {board.name} is mirrored in {where(mirrored)}, as in a mirror or through the "
+            "glass it is printed on; used so"
+            + (
+                ". Other cameras see it as printed: if none looks at it from behind, the pictures "
+                "of these are flipped"
+                if cameras
+                else ""
+            )
+        )
+    if other:
+        layout = "false" if board.legacy_layout else "true"
+        yield (
+            f"board {board.name} has the other of OpenCV's two layouts (legacy_layout: {layout}) in "
+            f"{where(other)}; used so"
+        )
+    if beyond:
+        yield (
+            f"board {board.name} has markers below its last row in {where(beyond)}: it seems to have "
+            f"more than {board.rows} rows of squares"
+        )
+    if board.kind != "checkerboard":
+        yield from _lines_never_seen(board, views)
+
+
+def _lines_never_seen(board: Board, views: Sequence[BoardView]) -> Iterator[str]:
+    """Lines on a last row or column of the described board that no view shows."""
+    columns, rows = corner_grid(board)
+    for face in range(board.faces):
+        seen = np.zeros((rows, columns), np.int64)
+        for view in views:
+            own = view.corner_ids[view.corner_ids // corners_per_face(board) == face]
+            np.add.at(seen.reshape(-1), own % corners_per_face(board), 1)
+        for name, described, counts in (
+            ("row", board.rows, seen.sum(axis=1)),
+            ("column", board.columns, seen.sum(axis=0)),
+        ):
+            used = np.flatnonzero(counts)
+            if not len(used):
+                continue
+            missing = len(counts) - 1 - used[-1]
+            beside = seen[used[-1]] if name == "row" else seen[:, used[-1]]
+            if missing and np.median(beside) >= LEAST_VIEWS:
+                lines = "line" if missing == 1 else f"{missing} lines"
+                yield (
+                    f"board {board.name}: the last {lines} of corners along its {name}s was never "
+                    f"found, though the one beside it was in {int(np.median(beside))} views: it seems "
+                    f"to have fewer than {described} {name}s"
+                )

@@ -22,10 +22,10 @@ from bodyscan.calibration.model_selection import MIN_GAIN, ResidualPair, gain
 from bodyscan.geometry.linear_gaussian import solve_scaled
 from bodyscan.geometry.robust import rms, rms_length
 from bodyscan.geometry.transforms import fit_rigid_transform
-from bodyscan.registration.full_solve import solve_fully
-from bodyscan.registration.inconsistent_views import fit_board
+from bodyscan.registration.bundle_adjustment import refine_solution
 from bodyscan.registration.joint_solve import JointSolution
 from bodyscan.registration.normal_equations import CORNERS, FreeShape, view_sigmas
+from bodyscan.registration.view_consistency import fit_board
 
 ROUNDS = 30
 HASTE = 1.6
@@ -105,7 +105,7 @@ class BoardShape:
         """Indices (M,) of nominal points (M, 3) among its corners, -1 for unknown ones."""
         return match_corners(points, self.points)
 
-    def applied(self, points: Array) -> Array:
+    def apply(self, points: Array) -> Array:
         """Where nominal points (M, 3) of this board lie; unknown ones stay."""
         chosen = self.numbers(points)
         return points + np.where(chosen[:, None] >= 0, self.offsets[chosen], 0.0)
@@ -121,7 +121,7 @@ class ShapedSolution:
     notes: tuple[str, ...]
 
 
-def with_board_shapes(
+def estimate_board_shapes(
     views: Sequence[LocatedView], solution: JointSolution, *, root: str, refine_cameras: bool
 ) -> ShapedSolution:
     """Estimate board shapes if the residuals call for it; keep them if held-out boards agree."""
@@ -142,7 +142,7 @@ def with_board_shapes(
     return replace(shaped, notes=(f"{sizes}: used, {figures}",))
 
 
-def with_same_shapes(
+def reestimate_board_shapes(
     views: Sequence[LocatedView], solution: JointSolution, found: ShapedSolution, *, root: str
 ) -> ShapedSolution:
     """Estimate the shapes in `found` again, for other lenses or other views."""
@@ -151,11 +151,11 @@ def with_same_shapes(
     return replace(_estimate(views, solution, root, True, found.shapes), notes=found.notes)
 
 
-def in_shape(view: LocatedView, shapes: Mapping[str, BoardShape]) -> LocatedView:
+def apply_shape(view: LocatedView, shapes: Mapping[str, BoardShape]) -> LocatedView:
     """The view with its corners where they lie on a board of that shape."""
     if view.board not in shapes:
         return view
-    return replace(view, points=shapes[view.board].applied(view.points))
+    return replace(view, points=shapes[view.board].apply(view.points))
 
 
 def _said(name: str, shape: BoardShape) -> str:
@@ -178,15 +178,15 @@ def _estimate(
 ) -> ShapedSolution:
     """Alternate between shapes and everything else until both settle.
 
-    start: shapes that the solution has; None for boards as described. alike: see `solve_fully`.
+    start: shapes that the solution has; None for boards as described. alike: see `refine_solution`.
     """
     shapes = _flat(views)
     if start:
         shapes = {
-            name: replace(shape, offsets=start[name].applied(shape.points) - shape.points)
+            name: replace(shape, offsets=start[name].apply(shape.points) - shape.points)
             for name, shape in shapes.items()
         }
-    shaped = [in_shape(view, shapes) for view in views]
+    shaped = [apply_shape(view, shapes) for view in views]
     numbers = [shapes[view.board].numbers(view.points) for view in views]
     for _ in range(ROUNDS):
         steps = _corner_steps(shaped, numbers, shapes, solution, alike)
@@ -198,7 +198,7 @@ def _estimate(
             replace(view, points=view.points + shapes[view.board].offsets[own])
             for view, own in zip(views, numbers, strict=True)
         ]
-        solution = solve_fully(
+        solution = refine_solution(
             shaped, solution, root=root, refine_cameras=refine_cameras, alike=alike
         )
         moved = (np.sqrt(np.mean(steps[name] ** 2)) / s.diagonal for name, s in shapes.items())
@@ -324,11 +324,11 @@ def _hold_out(
         kept = {t: p for t, p in solution.root_from_board.items() if t not in held}
         start = replace(solution, root_from_board=kept)
         # While it is open whether boards are as described, what they err by for that is no noise.
-        flat = solve_fully(others, start, root=root, refine_cameras=refine_cameras, alike=True)
+        flat = refine_solution(others, start, root=root, refine_cameras=refine_cameras, alike=True)
         bent = _estimate(others, flat, root, refine_cameras, alike=True)
         for target in sorted(held):
             own = [view for view in views if view.target == target]
-            true = [in_shape(view, bent.shapes) for view in own]
+            true = [apply_shape(view, bent.shapes) for view in own]
             placing = solution.root_from_board[target]
             flat_ones.append(np.concatenate(fit_board(own, flat, placing).residuals))
             bent_ones.append(np.concatenate(fit_board(true, bent.solution, placing).residuals))

@@ -35,7 +35,7 @@ CORRELATED = 3.0
 
 
 @dataclass(frozen=True, eq=False)
-class SeenPose:
+class ObservedPose:
     """A board as one pair sees it.
 
     covariance: (6, 6) of its motion in the camera frame (rotation vector in radians, translation in
@@ -52,14 +52,14 @@ class SeenPose:
         return _whitener(self.covariance)
 
 
-def seen_pose(view: LocatedView, camera: Camera, sigma_px: float) -> SeenPose:
+def observe_pose(view: LocatedView, camera: Camera, sigma_px: float) -> ObservedPose:
     """A board's pose from a view's corners, each off by `sigma_px`, correlated as in CORRELATED."""
     points = view.camera_from_board.apply(view.points)
     jacobian = camera.jacobians(points)[1] @ twist_jacobian(points)
     jacobian = jacobian.reshape(-1, 6)
     information = jacobian.T @ jacobian / (CORRELATED * sigma_px**2)
     covariance = np.linalg.inv(information)
-    return SeenPose(
+    return ObservedPose(
         view.pair, view.target, view.camera_from_board, np.asarray(covariance, np.float64)
     )
 
@@ -101,7 +101,7 @@ class Drift:
 
 
 def find_drift(
-    poses: Sequence[SeenPose],
+    poses: Sequence[ObservedPose],
     rig_from_camera: Mapping[str, RigidTransform],
     prior: PoseCovariance,
     poles: Mapping[str, str],
@@ -192,7 +192,7 @@ class _Placings:
 class _State:
     """prior_root: (6P, 6P), square root of the information on the pairs' twists."""
 
-    poses: tuple[SeenPose, ...]
+    poses: tuple[ObservedPose, ...]
     pairs: tuple[str, ...]
     rig_from_camera: Mapping[str, RigidTransform]
     prior_root: Array
@@ -200,7 +200,7 @@ class _State:
 
     @staticmethod
     def start(
-        poses: Sequence[SeenPose],
+        poses: Sequence[ObservedPose],
         pairs: tuple[str, ...],
         rig_from_camera: Mapping[str, RigidTransform],
         prior: PoseCovariance,
@@ -277,7 +277,7 @@ class _State:
 
 
 def _gap(
-    pose: SeenPose, rig_from_camera: RigidTransform, rig_from_board: RigidTransform
+    pose: ObservedPose, rig_from_camera: RigidTransform, rig_from_board: RigidTransform
 ) -> tuple[Array, Array]:
     """Offset of a view's board from its current pose, and how twists change it.
 
@@ -302,7 +302,7 @@ def _whitener(covariance: Array) -> Array:
 
 
 def _agreed(
-    poses: Sequence[SeenPose], rig_from_camera: Mapping[str, RigidTransform]
+    poses: Sequence[ObservedPose], rig_from_camera: Mapping[str, RigidTransform]
 ) -> RigidTransform:
     """A board's pose by majority: the view from which the others differ least."""
 

@@ -170,8 +170,8 @@ def _placed_by(
     to_rig = placed.rig_from_camera[holder] @ half.rig_from_camera[holder].inverse()
     carry = np.kron(np.eye(len(half.covariance.names)), adjoint(to_rig))
     placings = {name: to_rig @ t for name, t in half.rig_from_camera.items()}
-    # The excess over independent corners is better determined by all boards.
-    unseen = max(placed.excess / half.excess, 1.0)
+    # The variance_inflation over independent corners is better determined by all boards.
+    unseen = max(placed.variance_inflation / half.variance_inflation, 1.0)
     matrix = unseen * carry @ half.covariance.matrix @ carry.T
     return placings, PoseCovariance(half.covariance.names, matrix)
 

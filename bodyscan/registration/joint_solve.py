@@ -1,7 +1,7 @@
 """The rig in one solve (pycolmap): cameras are sensors of one rig, shots are frames, corners known.
 
 Ceres, behind pycolmap, does what it does best: thousands of corners, sparse, from a start that may
-be centimetres off. It knows neither skew nor non-square pixels, so `full_solve` follows it.
+be centimetres off. It knows neither skew nor non-square pixels, so `bundle_adjustment` follows it.
 """
 
 from __future__ import annotations
@@ -56,13 +56,13 @@ def solve_jointly(
         model.add_camera(colmap_camera(cameras[name], ids[name]))
     model.add_rig(_colmap_rig(names, start.root_from_camera))
     points = _add_points(model, views)
-    if not points:  # a single view of a known camera; `full_solve` needs no start
+    if not points:  # a single view of a known camera; `bundle_adjustment` needs no start
         return start
     seen = _seen_by_colmap(views, cameras)
     for number, target in enumerate(targets, start=1):
         group = [view for view in views if view.target == target]
         _add_frame(model, number, group, ids, seen, points, start.root_from_board[target])
-    # Ceres is not told of cameras' priors, so hold those cameras here; `full_solve` uses the
+    # Ceres is not told of cameras' priors, so hold those cameras here; `bundle_adjustment` uses the
     # priors.
     known = [ids[name] for name in names if cameras[name].prior is not None]
     _adjust(model, refine_cameras, loss_px, known)
@@ -220,7 +220,7 @@ def _adjust(
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = loss_px
     options.ceres.solver_options.gradient_tolerance = 1e-6
-    options.ceres.solver_options.function_tolerance = 1e-6  # `full_solve` finishes
+    options.ceres.solver_options.function_tolerance = 1e-6  # `bundle_adjustment` finishes
     options.ceres.solver_options.num_threads = 2
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in model.images:

@@ -37,7 +37,7 @@ STEP_DEG = 15.0
 
 
 @dataclass(frozen=True, eq=False)
-class BoardPlace:
+class BoardCandidate:
     """Where a board might be held: a few tilts of it at one place.
 
     height: name of the height, a key of HEIGHTS_MM.
@@ -54,22 +54,24 @@ class BoardPlace:
     views: tuple[tuple[LocatedView, ...], ...]
 
     @property
-    def seen_by(self) -> tuple[str, ...]:
+    def visible_to(self) -> tuple[str, ...]:
         """Pairs that see every tilt."""
         seen = [{view.pair for view in tilt} for tilt in self.views]
         return tuple(sorted(set.intersection(*seen)))
 
-    def seen_only_by(self, pairs: Sequence[str]) -> BoardPlace:
+    def restrict_to(self, pairs: Sequence[str]) -> BoardCandidate:
         views = tuple(tuple(v for v in tilt if v.pair in pairs) for tilt in self.views)
-        return BoardPlace(self.height, self.centre_mm, self.facing_deg, self.rig_from_board, views)
+        return BoardCandidate(
+            self.height, self.centre_mm, self.facing_deg, self.rig_from_board, views
+        )
 
 
-def board_places(
+def propose_board_poses(
     board: Board,
     volume: Volume,
     cameras: Mapping[str, Camera],
     rig_from_camera: Mapping[str, RigidTransform],
-) -> list[BoardPlace]:
+) -> list[BoardCandidate]:
     """Upright boards at knee, waist and chest height, facing between any two cameras.
 
     Only those that at least two pairs would see.
@@ -78,7 +80,7 @@ def board_places(
     for height, z in HEIGHTS_MM.items():
         if not volume.bottom_mm < z < volume.top_mm:
             continue
-        for azimuth in facings(rig_from_camera.values(), board.faces == 2):
+        for azimuth in candidate_azimuths(rig_from_camera.values(), board.faces == 2):
             ahead = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
             for share in (-APART, 0.0, APART):
                 centre = np.array([0.0, 0.0, z]) + share * volume.radius_mm * ahead
@@ -86,13 +88,13 @@ def board_places(
                 views = tuple(
                     tuple(_views(board, pose, cameras, rig_from_camera)) for pose in poses
                 )
-                place = BoardPlace(height, centre, float(np.degrees(azimuth)), poses, views)
-                if len(place.seen_by) >= 2:
+                place = BoardCandidate(height, centre, float(np.degrees(azimuth)), poses, views)
+                if len(place.visible_to) >= 2:
                     found.append(place)
     return found
 
 
-def facings(placings: Iterable[RigidTransform], two_faced: bool) -> list[float]:
+def candidate_azimuths(placings: Iterable[RigidTransform], two_faced: bool) -> list[float]:
     """Azimuths (radians) halfway between any two cameras, seen from the rig's axis."""
     places = np.array([placing.translation[:2] for placing in placings])
     towards = places / np.maximum(np.linalg.norm(places, axis=1, keepdims=True), 1e-9)
@@ -128,18 +130,17 @@ class RigInformation:
     ) -> None:
         self._equations = equations
         self._cameras, self._placings = cameras, rig_from_camera
-        information = equations.without_boards()
-        # A board that holds the frame has been eliminated already; a pair that does is removed
-        # here.
+        # A board that holds the frame has been eliminated already; a pair that does is removed here.
         held_pair = equations.held[equations.held < equations.first_board]
-        self._unknowns = len(information)
+        reduced = equations.without_boards()
+        self._unknowns = reduced.size
         self._free = np.setdiff1d(np.arange(self._unknowns), held_pair)
-        information = information[np.ix_(self._free, self._free)]
+        information = reduced.select(self._free).information
         self._scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
         scaled = information * np.outer(self._scale, self._scale)
         self._inverse = invert_scaled(scaled)
 
-    def information(self, place: BoardPlace) -> Array:
+    def information(self, place: BoardCandidate) -> Array:
         """Information in one shot there, averaged over its tilts; scaled, free unknowns only."""
         total = np.zeros((len(self._free), len(self._free)))
         for pose, views in zip(place.rig_from_board, place.views, strict=True):
@@ -155,7 +156,7 @@ class RigInformation:
                 cameras_free=self._equations.cameras_free,
                 camera_prior=False,
             )
-            total += shot.without_boards()[np.ix_(self._free, self._free)]
+            total += shot.without_boards().select(self._free).information
         return total * np.outer(self._scale, self._scale) / len(place.views)
 
     def after(self, information: Array, pair: str, most: int = MOST_SHOTS) -> SigmaReduction:

@@ -1,8 +1,8 @@
 """The size of a rig by references: certified lengths, measured by the cameras as boards place them.
 
 All lengths of a rig come from the `square_mm` of prints, which paper and printers change by parts
-in a thousand. Boards of references take no part in the solve; their corners are triangulated, and
-the ratio of their measured to their certified length shows how far off all prints are.
+in a thousand. Boards of references take no part in the solve; their corners are triangulated,
+and the ratio of their measured to their certified length shows how far off all prints are.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from bodyscan.boards.view import BoardView
 from bodyscan.errors import FailedWork
 from bodyscan.geometry.transforms import fit_rigid_transform
 from bodyscan.outcome import Outcome
-from bodyscan.registration.nominal_size import OTHER_SIZE, REFUSED_SIZE
+from bodyscan.registration.rig_calibration import OTHER_SIZE, REFUSED_SIZE
 from bodyscan.registration.rig_solve import RigSolution
 from bodyscan.rig.board import Board
 from bodyscan.rig.rig import Rig
@@ -51,7 +51,7 @@ class _Reading:
     sigma_mm: float
 
 
-def solving_views(rig: Rig, views: Sequence[BoardView]) -> list[BoardView]:
+def select_solving_views(rig: Rig, views: Sequence[BoardView]) -> list[BoardView]:
     """Views that place the rig: those of boards that are not references, if there are any."""
     certified = {name for reference in rig.references for name in reference.boards}
     if certified.issuperset(board.name for board in rig.boards):
@@ -59,7 +59,7 @@ def solving_views(rig: Rig, views: Sequence[BoardView]) -> list[BoardView]:
     return [view for view in views if view.board not in certified]
 
 
-def find_size(rig: Rig, placed: RigSolution, views: Sequence[BoardView]) -> Outcome[Size]:
+def find_rig_size(rig: Rig, placed: RigSolution, views: Sequence[BoardView]) -> Outcome[Size]:
     """The rig's size by all references together, with a note on each.
 
     Raises FailedWork for a size that no printer's error explains, or references that contradict
@@ -97,7 +97,7 @@ def find_size(rig: Rig, placed: RigSolution, views: Sequence[BoardView]) -> Outc
     return Outcome(size, tuple(notes))
 
 
-def resized(rig: Rig, factor: float) -> Rig:
+def rescale_boards(rig: Rig, factor: float) -> Rig:
     """The rig with the square sizes that its boards turned out to have."""
     certified = {name for reference in rig.references for name in reference.boards}
     alone = certified.issuperset(board.name for board in rig.boards)
@@ -154,18 +154,18 @@ def _readings(
         seen = []
         for name in reference.boards:
             own = [view for view in views if (view.shot, view.board) == (shot, name)]
-            ids, points = triangulated(placed, own)
+            ids, points = triangulate_corners(placed, own)
             if len(ids) >= FEWEST:
                 seen.append((rig.board(name), ids, points))
         if len(seen) < len(reference.boards):
             continue
         if len(seen) == 1:
-            yield _along(*seen[0], placed.excess)
+            yield _along(*seen[0], placed.variance_inflation)
         else:
-            yield _between([_Middle.of(*one) for one in seen], placed.excess)
+            yield _between([_Middle.of(*one) for one in seen], placed.variance_inflation)
 
 
-def triangulated(placed: RigSolution, views: Sequence[BoardView]) -> tuple[Indices, Array]:
+def triangulate_corners(placed: RigSolution, views: Sequence[BoardView]) -> tuple[Indices, Array]:
     """Triangulate the corners of one board that several solved cameras saw.
 
     Returns their numbers (N,) and positions (N, 3) mm, rig frame, nearest to all rays.
@@ -191,7 +191,7 @@ def triangulated(placed: RigSolution, views: Sequence[BoardView]) -> tuple[Indic
     return known[twice].astype(np.int64), found
 
 
-def _along(board: Board, ids: Indices, points: Array, excess: float) -> _Reading:
+def _along(board: Board, ids: Indices, points: Array, variance_inflation: float) -> _Reading:
     """The length of one board, from the scale of a similarity onto its layout."""
     layout = corner_points(board)
     length = board_length(board)
@@ -200,7 +200,9 @@ def _along(board: Board, ids: Indices, points: Array, excess: float) -> _Reading
     scale = float(np.sum(spread * found) / np.sum(spread**2))
     left = found - found.mean(axis=0) - scale * spread
     # Corners err less along the board than towards the cameras.
-    sigma = np.sqrt(excess * np.sum(np.sum(spread * left, axis=1) ** 2)) / np.sum(spread**2)
+    sigma = np.sqrt(variance_inflation * np.sum(np.sum(spread * left, axis=1) ** 2)) / np.sum(
+        spread**2
+    )
     return _Reading(scale * length, float(sigma) * length)
 
 
@@ -234,7 +236,7 @@ class _Middle:
         return _Middle(rig_from_board.apply(middle), left, float(lever))
 
 
-def _between(middles: Sequence[_Middle], excess: float) -> _Reading:
+def _between(middles: Sequence[_Middle], variance_inflation: float) -> _Reading:
     one, other = middles
     length = float(np.linalg.norm(one.place - other.place))
     along = (one.place - other.place) / length
@@ -242,4 +244,4 @@ def _between(middles: Sequence[_Middle], excess: float) -> _Reading:
         np.mean((each.left @ along) ** 2) * (1.0 + each.lever**2) / len(each.left)
         for each in middles
     )
-    return _Reading(length, float(np.sqrt(excess * variance)))
+    return _Reading(length, float(np.sqrt(variance_inflation * variance)))

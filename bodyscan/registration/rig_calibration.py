@@ -1,23 +1,28 @@
-"""A calibrated rig: every pair, its pose, and how well that is known."""
+"""A calibrated rig: every pair, its pose and covariance; its size against the nominal poses."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bodyscan.arrays import Floats
 from bodyscan.calibration.pair import PairCalibration
+from bodyscan.errors import FailedWork
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance
+from bodyscan.rig.board import Board
 from bodyscan.rig.rig import Rig
+from bodyscan.verdict import Mark
 
 FLOOR_AXES = "origin on the floor at the rig's centre, x forward, y to the left, z up"
 
 
 @dataclass(frozen=True, eq=False)
-class SeenCorners:
+class ObservedCorners:
     """Board corners that one camera saw and the joint solve used.
 
     pixels: where they were seen, (N, 2) float32.
@@ -53,7 +58,7 @@ class RigCalibration:
     failed: dict[str, str]
     notes: tuple[str, ...]
     advice: tuple[str, ...] = ()
-    seen: dict[str, SeenCorners] = field(default_factory=dict)
+    seen: dict[str, ObservedCorners] = field(default_factory=dict)
 
     @property
     def is_import(self) -> bool:
@@ -73,3 +78,68 @@ class RigCalibration:
         return (
             f"that of camera {pair.name}: x to the right in its picture, y down, z the way it looks"
         )
+
+
+OTHER_SIZE, REFUSED_SIZE = 0.03, 0.10
+"""Relative error of the distances between cameras, as measured with a tape. Girths are wrong by the
+same share: 27 mm of 900 at 3 %."""
+LEAST_APART_MM = 100.0
+
+
+@dataclass(frozen=True)
+class NominalSize:
+    """The rig's size relative to its nominal poses.
+
+    ratio: distances between cameras, divided by those between their nominal positions.
+    boards: those whose squares give the rig's lengths.
+    """
+
+    ratio: float
+    boards: tuple[Board, ...] = ()
+
+    @property
+    def mark(self) -> Mark:
+        """Bad if the ratio is off by more than any tape measure errs."""
+        off = abs(self.ratio - 1.0)
+        return "bad" if off > REFUSED_SIZE else "usable" if off > OTHER_SIZE else "good"
+
+    @property
+    def words(self) -> str:
+        return f"the cameras stand {self.ratio:.3f} times as far apart as their nominal poses"
+
+    @property
+    def remedy(self) -> str:
+        where = " of the boards"
+        if self.boards:
+            squares = ", ".join(f"{board.name}: {board.square_mm:g}" for board in self.boards)
+            fits = self.boards[0].square_mm / self.ratio
+            where = f" in the rig file ({squares}; {fits:.2f} would fit)"
+        return f"square_mm may be wrong{where}; or correct `nominal`, or leave it out"
+
+
+def nominal_size(rig: Rig, rig_from_camera: Mapping[str, RigidTransform]) -> NominalSize | None:
+    """The size by the median over all distances between cameras; None if fewer than two nominal
+    positions are known."""
+    nominal = {p.name: np.array(p.nominal.position_mm) for p in rig.pairs if p.nominal}
+    ratios = [
+        float(
+            np.linalg.norm(rig_from_camera[a].translation - rig_from_camera[b].translation)
+            / np.linalg.norm(nominal[a] - nominal[b])
+        )
+        for a, b in combinations(sorted(set(nominal) & set(rig_from_camera)), 2)
+        if np.linalg.norm(nominal[a] - nominal[b]) > LEAST_APART_MM
+    ]
+    return NominalSize(float(np.median(ratios)), rig.boards) if ratios else None
+
+
+def check_nominal_size(rig: Rig, rig_from_camera: Mapping[str, RigidTransform]) -> list[str]:
+    """A note if the cameras stand farther apart, or closer, than they are meant to.
+
+    Raises FailedWork if they are off by more than any tape measure errs.
+    """
+    size = nominal_size(rig, rig_from_camera)
+    if size is None or size.mark == "good":
+        return []
+    if size.mark == "bad":
+        raise FailedWork(size.words, where=f"rig {rig.name}", remedy=size.remedy)
+    return [f"{size.words}: {size.remedy}"]

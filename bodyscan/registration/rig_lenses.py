@@ -74,8 +74,8 @@ def choose_lenses(rig: Rig, views: Sequence[LocatedView], solution: JointSolutio
     names = list(looked)
     own = map_threads(lambda name: looked[name].choose(kinds[name]), names, stage="choosing lenses")
     chosen = dict(zip(names, own, strict=True))
-    for alike in _of_one_make(looked):
-        chosen |= _decentred_together({name: chosen[name] for name in alike}, looked, kinds)
+    for alike in _group_by_make(looked):
+        chosen |= _pool_decentring({name: chosen[name] for name in alike}, looked, kinds)
     cameras = {
         name: lens.fit.camera
         for name, lens in chosen.items()
@@ -114,14 +114,14 @@ class _Looked:
         return choose_lens(kinds, self.camera, self.poses, self.views)
 
 
-def _of_one_make(looked: Mapping[str, _Looked]) -> Iterator[list[str]]:
+def _group_by_make(looked: Mapping[str, _Looked]) -> Iterator[list[str]]:
     """Groups of cameras with images of one size, as far as images show which are of one make."""
     size = {name: (own.camera.width, own.camera.height) for name, own in looked.items()}
     for one in sorted(set(size.values())):
         yield [name for name in looked if size[name] == one]
 
 
-def _decentred_together(
+def _pool_decentring(
     chosen: Mapping[str, ChosenLens],
     looked: Mapping[str, _Looked],
     kinds: Mapping[str, Sequence[type[Lens]]],

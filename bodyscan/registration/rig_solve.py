@@ -1,14 +1,14 @@
 """From board views of many pairs to one solved rig: graph, joint solve, bad views out, rig frame.
 
 Two solvers follow each other. pycolmap's bundle adjustment (`joint_solve`) brings everything
-together from the graph's rough start; our own least squares (`full_solve`) finishes with every
+together from the graph's rough start; our own least squares (`bundle_adjustment`) finishes with every
 parameter of our cameras, and is repeated when views are dropped or boards found to be bent.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -25,26 +25,28 @@ from bodyscan.outcome import Outcome
 from bodyscan.registration.board_shape import (
     BoardShape,
     ShapedSolution,
-    in_shape,
-    with_board_shapes,
-    with_same_shapes,
+    apply_shape,
+    estimate_board_shapes,
+    reestimate_board_shapes,
 )
-from bodyscan.registration.consistent_solve import ConsistentSolve, solve_consistently
-from bodyscan.registration.honest_covariance import board_places, honest_covariance
-from bodyscan.registration.inconsistent_views import (
+from bodyscan.registration.cluster_covariance import cluster_board_poses, cluster_robust_covariance
+from bodyscan.registration.joint_solve import JointSolution, solve_jointly
+from bodyscan.registration.normal_equations import CORNERS, normal_equations
+from bodyscan.registration.rig_calibration import ObservedCorners
+from bodyscan.registration.rig_frame import frame_board_turn, frame_target, rig_from_root
+from bodyscan.registration.rig_lenses import ChosenLenses, choose_lenses, lens_notes
+from bodyscan.registration.view_consistency import (
+    ConsistentSolve,
     error_limit,
     find_inconsistent_views,
     single_view_errors,
+    solve_consistently,
 )
-from bodyscan.registration.joint_solve import JointSolution, solve_jointly
-from bodyscan.registration.normal_equations import CORNERS, normal_equations
-from bodyscan.registration.rig_frame import frame_board_turn, frame_target, rig_from_root
-from bodyscan.registration.rig_lenses import ChosenLenses, choose_lenses, lens_notes
 from bodyscan.registration.view_graph import (
     Target,
+    describe_unsynchronised,
     initial_poses,
-    not_together,
-    place_boards,
+    locate_boards_jointly,
     view_graph,
 )
 from bodyscan.rig.rig import Rig
@@ -67,8 +69,8 @@ class RigSolution:
     board_shapes: of boards that differ from their description, confirmed by held-out boards.
     lenses: by camera whose lens was open, those tried on held-out boards.
     camera_covariances: covariance (P, P) of each camera's parameters, where the solve refined them.
-    excess: factor by which variances exceed those of corners that err independently, judged by the
-        places of boards.
+    variance_inflation: factor by which variances exceed those of independent corners, estimated
+        from clusters of board poses.
     rays: by camera, how well each pixel's ray is known.
     """
 
@@ -81,7 +83,7 @@ class RigSolution:
     board_shapes: dict[str, BoardShape]
     lenses: dict[str, tuple[LensTrial, ...]] = field(default_factory=dict)
     camera_covariances: dict[str, Array] = field(default_factory=dict)
-    excess: float = 1.0
+    variance_inflation: float = 1.0
     rays: dict[str, RayUncertainty] = field(default_factory=dict)
 
 
@@ -123,11 +125,11 @@ def solve_rig(
             break
         if 2 * len(strangers) >= len(names):
             raise RigDisconnected(
-                not_together(names),
+                describe_unsynchronised(names),
                 remedy="synchronise the cameras, or hold the board still until all have taken "
                 "their picture; check the board's description in the rig file too",
             )
-        left_out |= {name: not_together([name]) for name in strangers}
+        left_out |= {name: describe_unsynchronised([name]) for name in strangers}
         start = {name: placing for name, placing in start.items() if name not in strangers}
     placed = _placed(rig, solved, len(start) > 1)
     notes = (*solved.judged.notes, *solved.shaped.notes, *lens_notes(placed.lenses))
@@ -148,7 +150,7 @@ def _solve(
     root = max(names, key=lambda name: (graph.degree(name), name))
     to_root = start[root].inverse()
     placed = {name: to_root @ placing for name, placing in start.items()}
-    resolved, boards, doubtful = place_boards(views, placed)
+    resolved, boards, doubtful = locate_boards_jointly(views, placed)
     solution = JointSolution(placed, boards, cameras)
     gross = find_inconsistent_views(
         [view for view in resolved if view.target in doubtful], solution, COARSE_PX
@@ -169,15 +171,19 @@ def _solve(
     lenses: ChosenLenses | None = None
     # If pairs are to be left out, the others are solved again anyway.
     if several and not _strangers(shaped.views, _dropped(resolved, judged)):
-        shaped = with_board_shapes(shaped.views, judged.solution, root=root, refine_cameras=True)
+        shaped = estimate_board_shapes(
+            shaped.views, judged.solution, root=root, refine_cameras=True
+        )
         solution = shaped.solution
         if choose:
             lenses = choose_lenses(rig, shaped.views, solution)
             solution = lenses.solution
         if shaped.shapes or solution.cameras != shaped.solution.cameras:
-            true = [in_shape(view, shaped.shapes) for view in resolved]
+            true = [apply_shape(view, shaped.shapes) for view in resolved]
             judged = solve(true, solution, wrong=judged.wrong)
-            shaped = with_same_shapes(judged.kept(resolved), judged.solution, shaped, root=root)
+            shaped = reestimate_board_shapes(
+                judged.kept(resolved), judged.solution, shaped, root=root
+            )
     return _Solved(judged, shaped, _dropped(resolved, judged), lenses)
 
 
@@ -211,7 +217,7 @@ def _placed(rig: Rig, solved: _Solved, refine: bool) -> RigSolution:
         cameras_free=refine,
         shapes={name: shape.free for name, shape in shaped.shapes.items()},
     )
-    known = honest_covariance(equations, board_places(kept, rig_from_board))
+    known = cluster_robust_covariance(equations, cluster_board_poses(kept, rig_from_board))
     rms = {
         name: _robust_rms(
             [
@@ -232,9 +238,9 @@ def _placed(rig: Rig, solved: _Solved, refine: bool) -> RigSolution:
         shaped.shapes,
         solved.lenses.trials if solved.lenses else {},
         known.cameras,
-        known.excess,
+        known.variance_inflation,
         {
-            name: rays.inflate_noise(known.excess)
+            name: rays.inflate_noise(known.variance_inflation)
             for name, rays in (solved.lenses.rays if solved.lenses else {}).items()
         },
     )
@@ -270,3 +276,25 @@ def _robust_rms(parts: Sequence[Array]) -> float:
         return float("nan")
     residuals = np.concatenate(parts).ravel()
     return float(np.sqrt(2.0 * CORNERS.mean_square(residuals)))
+
+
+def collect_corners(placed: RigSolution, names: Iterable[str]) -> dict[str, ObservedCorners]:
+    """The corners by pair, for those of `names` that were placed."""
+    number = {target: k for k, target in enumerate(sorted(placed.rig_from_board))}
+    found = {}
+    for name in sorted(set(names) & set(placed.rig_from_camera)):
+        own = [view for view in placed.views if view.pair == name]
+        if not own:
+            continue
+        residuals = [
+            corner_residuals(view, placed.cameras, placed.rig_from_camera, placed.rig_from_board)
+            for view in own
+        ]
+        found[name] = ObservedCorners(
+            np.concatenate([view.pixels for view in own]).astype(np.float32),
+            np.concatenate(residuals).astype(np.float32),
+            np.repeat([number[v.target] for v in own], [len(v.pixels) for v in own]).astype(
+                np.int16
+            ),
+        )
+    return found

@@ -17,7 +17,7 @@ from bodyscan.geometry.lens_sheets import FRAME, LENS_SPREAD, SCALE, LensSheets
 from bodyscan.geometry.light_planes import LightPlanes, LightSheets
 from bodyscan.geometry.smooth_sheets import SmoothSheets
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.registration.rig_calibration import RigCalibration, SeenCorners
+from bodyscan.registration.rig_calibration import ObservedCorners, RigCalibration
 from bodyscan.rig.pair import Pair
 from bodyscan.stripes.stripe_code import StripeCode
 
@@ -199,7 +199,7 @@ def _smooth(light: SmoothSheets, place: str) -> Iterator[Fault]:
         yield from covariance_faults(light.covariance, size, f"{place}: covariance")
 
 
-def _seen(seen: SeenCorners, boards: int, place: str) -> Iterator[Fault]:
+def _seen(seen: ObservedCorners, boards: int, place: str) -> Iterator[Fault]:
     count = len(seen.target)
     shapes = (seen.pixels.shape, seen.residuals_px.shape, seen.target.shape)
     if shapes != ((count, 2), (count, 2), (count,)):

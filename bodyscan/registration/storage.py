@@ -27,7 +27,7 @@ from bodyscan.geometry.light_planes import LightSheets
 from bodyscan.geometry.light_sheets import sheets_from_arrays, sheets_to_arrays
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import COLUMNS, ROWS, PoseCovariance, RayUncertainty
-from bodyscan.registration.rig_calibration import RigCalibration, SeenCorners
+from bodyscan.registration.rig_calibration import ObservedCorners, RigCalibration
 from bodyscan.registration.soundness import find_faults
 from bodyscan.rig.rig import Rig
 from bodyscan.version import __version__
@@ -61,7 +61,7 @@ def refuse_existing(folder: Path, overwrite: bool) -> None:
         )
 
 
-def keep_former(folder: Path) -> Path | None:
+def archive_previous(folder: Path) -> Path | None:
     """Copy the calibration in `folder` into its `history/HASH`, before it is replaced; what was made
     from it moves there.
 
@@ -84,7 +84,7 @@ def save_calibration(calibration: RigCalibration, folder: Path) -> Path:
 
     Reports and maps of what was there are removed: they would be taken for the new one's.
 
-    Until the JSON is replaced, which is atomic, the calibration that `keep_former` kept is loaded.
+    Until the JSON is replaced, which is atomic, the calibration that `archive_previous` kept is loaded.
     """
     arrays: dict[str, Any] = {"placing_covariance": calibration.covariance.matrix}
     for name, pair in calibration.pairs.items():
@@ -278,7 +278,7 @@ def _calibration(content: dict[str, Any], arrays: dict[str, Any]) -> RigCalibrat
         _texts(content["notes"]),
         _texts(content.get("advice", [])),
         {
-            name: SeenCorners(**_under(f"{name}/seen/", arrays))
+            name: ObservedCorners(**_under(f"{name}/seen/", arrays))
             for name in parts
             if f"{name}/seen/pixels" in arrays
         },

@@ -118,7 +118,7 @@ def initial_poses(
     return groups[0], {}
 
 
-def not_together(names: Iterable[str]) -> str:
+def describe_unsynchronised(names: Iterable[str]) -> str:
     """The message on pairs whose views agree with those of others in too few shots."""
     return (
         f"the relative pose of {', '.join(sorted(names))} that follows from shared boards differs "
@@ -133,14 +133,14 @@ def _most(groups: Sequence[Group], best: RelativePose) -> tuple[Group, dict[str,
     others = sorted(name for group in groups if group is not largest for name in group)
     if 2 * len(largest) <= len(largest) + len(others):
         raise RigDisconnected(
-            not_together([*largest, *others]),
+            describe_unsynchronised([*largest, *others]),
             remedy="synchronise the cameras, or hold the board still until all have taken their "
             f"picture (at best {best.votes} of {len(best.targets)} shots agree)",
         )
-    return largest, {name: not_together([name]) for name in others}
+    return largest, {name: describe_unsynchronised([name]) for name in others}
 
 
-def place_boards(
+def locate_boards_jointly(
     views: Sequence[LocatedView], root_from_camera: Mapping[str, RigidTransform]
 ) -> tuple[list[LocatedView], dict[Target, RigidTransform], set[Target]]:
     """Resolve every view's alternatives and place every board.

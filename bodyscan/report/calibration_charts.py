@@ -14,7 +14,7 @@ from matplotlib.collections import PolyCollection
 from bodyscan.arrays import Array
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.light_planes import baseline_angle_tilt
-from bodyscan.registration.rig_calibration import RigCalibration, SeenCorners
+from bodyscan.registration.rig_calibration import ObservedCorners, RigCalibration
 from bodyscan.report.canvas import round_down
 from bodyscan.report.charts import BLUE, GREY, INK, RED, grid_of, style, svg
 
@@ -185,7 +185,7 @@ def line_styles(calibration: RigCalibration) -> tuple[dict[str, str], dict[str, 
     return colour, dash
 
 
-def _residual_map(seen: SeenCorners, camera: Camera) -> tuple[Array, Array, Array]:
+def _residual_map(seen: ObservedCorners, camera: Camera) -> tuple[Array, Array, Array]:
     """RMS (rows, columns) and mean (rows, columns, 2) of residuals, px, and the cells' middles; NaN
     for fewer than three corners."""
     columns, rows = CELLS

@@ -9,8 +9,7 @@ import numpy as np
 
 from bodyscan.calibration.board_views import covered_share
 from bodyscan.geometry.uncertainty import position_sigma
-from bodyscan.registration.nominal_size import nominal_size
-from bodyscan.registration.rig_calibration import RigCalibration
+from bodyscan.registration.rig_calibration import RigCalibration, nominal_size
 from bodyscan.verdict import Grade, Verdict
 
 CORNERS_RMS_PX = 0.3

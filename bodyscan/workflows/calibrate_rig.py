@@ -19,15 +19,13 @@ from bodyscan.errors import BadInput, BodyscanError, FailedWork, format_error
 from bodyscan.optional import optional
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, attempt_each, background, silent, step
-from bodyscan.registration.nominal_size import check_nominal_size
-from bodyscan.registration.references import find_size, resized, solving_views
-from bodyscan.registration.rig_calibration import RigCalibration
+from bodyscan.registration.references import find_rig_size, rescale_boards, select_solving_views
+from bodyscan.registration.rig_calibration import RigCalibration, check_nominal_size
 from bodyscan.registration.rig_frame import refuse_without_frame_shot
-from bodyscan.registration.rig_solve import RigSolution, solve_rig
-from bodyscan.registration.seen_corners import seen_corners
+from bodyscan.registration.rig_solve import RigSolution, collect_corners, solve_rig
 from bodyscan.registration.solved_pairs import solved_pair, update_poses
 from bodyscan.registration.soundness import find_faults
-from bodyscan.registration.storage import CORNERS_NAME, keep_former, save_calibration
+from bodyscan.registration.storage import CORNERS_NAME, archive_previous, save_calibration
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_file import load_rig
 from bodyscan.workflows.decode import PairStripes, PrintAreas, collect_stripes, decode_pairs
@@ -73,7 +71,7 @@ def calibrate_folder(
     refuse_without_frame_shot(rig, captures.shots)
     boards = find_all_boards(rig, captures, progress)
     solved = solve_boards(rig, captures, boards, progress, folder=Path(rig_file).parent)
-    keep_former(folder)
+    archive_previous(folder)
     save_calibration(solved.calibration, folder)
     notes: list[str] = []
     with optional(CORNERS_NAME, notes.append):
@@ -96,7 +94,7 @@ def solve_boards(
     """Calibrate a rig from boards found in its images, without the remarks on it."""
     cameras = calibrate_cameras(rig, boards.value, progress, folder=folder)
     cameras = require_cameras(rig, captures, boards, cameras)
-    located = locate_views(rig, solving_views(rig, boards.value), cameras.value)
+    located = locate_views(rig, select_solving_views(rig, boards.value), cameras.value)
     solved, stripes, pairs = _solve_and_fit(rig, captures, boards, located, cameras, progress)
     solution = solved.solution.value
     stages = (boards, cameras, solved.located, stripes, pairs, solved.solution)
@@ -114,7 +112,7 @@ def solve_boards(
         solution.rig_from_board,
         {name: captures.relative(reason) for name, reason in failed.items()},
         tuple(captures.relative(note) for note in notes),
-        seen=seen_corners(solution, pairs.value),
+        seen=collect_corners(solution, pairs.value),
     )
     for where, what in find_faults(calibration):
         raise FailedWork(
@@ -194,10 +192,10 @@ def _bundle_adjust(
 ) -> _Adjusted:
     """Solve for all poses and cameras; if reference lengths correct the size, solve again."""
     solution = _solve_rig(rig, located.value, cameras)
-    size = find_size(rig, solution.value, boards)
+    size = find_rig_size(rig, solution.value, boards)
     if size.value.factor != 1.0:
-        rig = resized(rig, size.value.factor)
-        located = locate_views(rig, solving_views(rig, boards), cameras.value)
+        rig = rescale_boards(rig, size.value.factor)
+        located = locate_views(rig, select_solving_views(rig, boards), cameras.value)
         solution = _solve_rig(rig, located.value, cameras)
     notes = (*size.notes, *check_nominal_size(rig, solution.value.rig_from_camera))
     return _Adjusted(rig, notes, located, solution)

@@ -19,7 +19,7 @@ from bodyscan.errors import BoardNotFound
 from bodyscan.geometry.light_sheets import intersect_rays
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, silent
-from bodyscan.registration.drift import Drift, Move, find_drift, seen_pose
+from bodyscan.registration.drift import Drift, Move, find_drift, observe_pose
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.workflows.decode import decode_on_boards
 from bodyscan.workflows.find_boards import find_all_boards, locate_views
@@ -79,7 +79,7 @@ def check_boards(
     located = locate_views(calibration.rig, views.value, _cameras(calibration))
     unique = [view for view in located.value if not view.ambiguous]
     poses = [
-        seen_pose(view, calibration.pairs[view.pair].camera, _noise_px(calibration, view.pair))
+        observe_pose(view, calibration.pairs[view.pair].camera, _noise_px(calibration, view.pair))
         for view in unique
     ]
     drift = find_drift(

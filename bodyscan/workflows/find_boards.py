@@ -40,8 +40,11 @@ from bodyscan.geometry.robust import rms_length
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, attempt_each, map_threads, silent
-from bodyscan.registration.board_appearance import appearance_notes, without_odd_mirrored
-from bodyscan.registration.board_checks import describe_findings
+from bodyscan.registration.board_checks import (
+    appearance_notes,
+    describe_findings,
+    drop_inconsistently_mirrored,
+)
 from bodyscan.registration.soundness import camera_faults
 from bodyscan.rig.pair import AUTO, Known
 from bodyscan.rig.rig import Rig
@@ -82,7 +85,7 @@ def find_all_boards(rig: Rig, captures: Captures, progress: Progress = silent) -
         return found, None
 
     results = map_threads(find, captures.sequences, stage="finding boards", progress=progress)
-    views, odd = without_odd_mirrored([view for found, _ in results for view in found])
+    views, odd = drop_inconsistently_mirrored([view for found, _ in results for view in found])
     without = [
         sequence
         for sequence, (found, error) in zip(captures.sequences, results, strict=True)

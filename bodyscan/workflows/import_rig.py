@@ -16,7 +16,7 @@ from bodyscan.geometry.transforms import RigidTransform, adjoint
 from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.rig_frame import rig_from_world
-from bodyscan.registration.storage import keep_former, save_calibration
+from bodyscan.registration.storage import archive_previous, save_calibration
 from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_file import load_rig
@@ -28,7 +28,7 @@ def import_folder(
     """Import a rig as `import_rig` does and save it in `folder`; return it and its JSON's path."""
     rig = load_rig(rig_file)
     found = import_rig(rig, Path(rig_file).parent, sigma_px)
-    keep_former(folder)
+    archive_previous(folder)
     return found, save_calibration(found, folder)
 
 

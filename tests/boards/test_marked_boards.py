@@ -17,7 +17,7 @@ from bodyscan.boards.charuco import Markers, detect_markers, place_markers
 from bodyscan.boards.detection import find_boards
 from bodyscan.boards.unfound import describe_unfound
 from bodyscan.boards.view import BoardView
-from bodyscan.registration.board_appearance import appearance_notes, without_odd_mirrored
+from bodyscan.registration.board_checks import appearance_notes, drop_inconsistently_mirrored
 from bodyscan.rig.board import Board
 from bodyscan.rig.pair import CameraSpec, Pair
 from bodyscan.rig.rig import Rig
@@ -175,11 +175,13 @@ def test_another_grid_is_named() -> None:
 
 def test_a_flipped_picture_among_others_is_named_and_left_out(picture: Bytes) -> None:
     flipped = found(np.ascontiguousarray(picture[:, ::-1]), MARKED)
-    kept, notes = without_odd_mirrored([*found(picture, MARKED) * 2, *flipped])
+    kept, notes = drop_inconsistently_mirrored([*found(picture, MARKED) * 2, *flipped])
     assert len(kept) == 2
     (note,) = notes
     assert "is mirrored in shot s" in note
-    assert without_odd_mirrored(flipped * 3)[1] == [], "all of them mirrored: through a glass"
+    assert drop_inconsistently_mirrored(flipped * 3)[1] == [], (
+        "all of them mirrored: through a glass"
+    )
 
 
 def tag_picture(*, border_bits: int, turns: int, from_below: bool) -> tuple[Bytes, Array]:

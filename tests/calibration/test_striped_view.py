@@ -55,7 +55,7 @@ def striped(face_mm: float) -> list[StripedView]:
         places = rng.uniform([15.0, 15.0], [165.0, 125.0], (200, 2))
         points = np.column_stack([places, face_mm + bow(places)])
         pixels = SCENE.camera.project(camera_from_board.apply(points))
-        corners = shape().applied(CORNERS[CORNERS[:, 2] == face_mm])
+        corners = shape().apply(CORNERS[CORNERS[:, 2] == face_mm])
         view = LocatedView("p1", f"b{number}", "board", corners, pixels, camera_from_board, ())
         boundaries = BoardBoundaries(np.arange(200), pixels, np.full(200, 0.1))
         found.append(StripedView(view, BOARD, boundaries, shape(0.01).face(corners)))

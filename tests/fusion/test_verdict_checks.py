@@ -23,7 +23,7 @@ from bodyscan.fusion.verdict.evidence import Coverage, Seam, SeamReport
 from bodyscan.fusion.verdict.rig import find_silent_poles
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.reconstruction.two_ways import Agreement
-from bodyscan.registration.nominal_size import NominalSize
+from bodyscan.registration.rig_calibration import NominalSize
 from bodyscan.rig.rig import Volume
 from bodyscan.settings import UseLimits
 from bodyscan.verdict import Verdict

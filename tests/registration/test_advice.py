@@ -8,8 +8,8 @@ from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.linear_gaussian import invert_scaled
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import position_sigma
-from bodyscan.registration.advice import advise, crucial_shots
-from bodyscan.registration.more_shots import BoardPlace, RigInformation
+from bodyscan.registration.advice import advise, find_articulation_shots
+from bodyscan.registration.more_shots import BoardCandidate, RigInformation
 from bodyscan.registration.normal_equations import NormalEquations, normal_equations
 from bodyscan.registration.rig_solve import RigSolution, solve_rig
 from bodyscan.rig.rig import Rig
@@ -49,7 +49,7 @@ def equations_of(placed: RigSolution, *, by_board: bool = False) -> NormalEquati
 
 
 def captured(
-    place: BoardPlace,
+    place: BoardCandidate,
     count: int,
     placings: dict[str, RigidTransform],
     cameras: dict[str, Camera],
@@ -109,7 +109,7 @@ def test_the_worst_pair_is_that_of_the_covariance(ring: Ring) -> None:
     assert len(advice.chain) == len(sigmas) - 1
     assert not advice.bridges
     assert not advice.crucial
-    assert set(advice.more.between) <= set(advice.more.place.seen_by)
+    assert set(advice.more.between) <= set(advice.more.place.visible_to)
     assert f"seen by both {' and '.join(advice.more.between)}" in advice.lines[-1]
 
 
@@ -133,7 +133,7 @@ def test_links_that_nothing_doubles_are_named() -> None:
     # p3-1 hangs on p3-2 alone as well, by more shots.
     assert ("p1-2", "p3-2", 1) in [(link.first, link.second, link.shots) for link in advice.bridges]
     assert all({"p3-2"} & {link.first, link.second} for link in advice.bridges)
-    assert crucial_shots(placed) == ((bridge, "board"),)
+    assert find_articulation_shots(placed) == ((bridge, "board"),)
     # One shot ties it: by far the least known link, and the advice is to tie that pole again.
     assert {advice.links[0].first[:2], advice.links[0].second[:2]} == {"p1", "p3"}
     assert advice.weak[0].sigma_mm > 2 * np.median([link.sigma_mm for link in advice.chain])
@@ -151,11 +151,11 @@ def test_eliminating_boards_keeps_the_covariance(ring: Ring, by_board: bool) -> 
     placed = ring[-1]
     equations = equations_of(placed, by_board=by_board)
     held = equations.held[equations.held < equations.first_board]
-    information = equations.without_boards()
+    information = equations.without_boards().information
     free = np.setdiff1d(np.arange(len(information)), held)
     inverse = equations.variance_px2 * invert_scaled(information[np.ix_(free, free)])
     moving = free[free < equations.first_board]
-    every = invert_scaled(equations.matrix[np.ix_(equations.free, equations.free)])
+    every = invert_scaled(equations.system.information[np.ix_(equations.free, equations.free)])
     place = np.searchsorted(equations.free, moving)
     expected = equations.variance_px2 * every[np.ix_(place, place)]
     scale = np.sqrt(np.diag(expected))

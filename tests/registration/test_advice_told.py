@@ -14,29 +14,29 @@ from bodyscan.registration import advice as advice_file
 from bodyscan.registration.advice import (
     Advice,
     Link,
-    MoreShots,
+    ShotSuggestion,
     _preference,
     advise,
-    best_chain,
+    minimum_spanning_links,
 )
-from bodyscan.registration.more_shots import MOST_SHOTS, BoardPlace, SigmaReduction
+from bodyscan.registration.more_shots import MOST_SHOTS, BoardCandidate, SigmaReduction
 
 
-def more(**changes: Any) -> MoreShots:
+def more(**changes: Any) -> ShotSuggestion:
     views = tuple(
         tuple(cast(Any, type("Seen", (), {"pair": name})()) for name in names)
         for names in (("a", "b", "c"), ("c", "b", "a", "d"))
     )
-    place = BoardPlace(
+    place = BoardCandidate(
         "knee", np.array([10.0, -20.0, 499.6]), 91.0, (RigidTransform.identity(),), views
     )
     keys = {"pair": "a", "shots": 3, "between": ("a", "b"), "place": place, "before_mm": 0.5,
             "after_mm": 0.24, "halves": True}  # fmt: skip
-    return MoreShots(**cast(Any, keys | changes))
+    return ShotSuggestion(**cast(Any, keys | changes))
 
 
 def advice(
-    *bridges: Link, weak: tuple[Link, ...] = (), shots: MoreShots | None = None
+    *bridges: Link, weak: tuple[Link, ...] = (), shots: ShotSuggestion | None = None
 ) -> list[str]:
     crucial = (("s1", "b"), ("s4", "b")) if bridges else ()
     return Advice((), (), bridges, weak, crucial, "d", 0.3123, shots).lines
@@ -85,15 +85,17 @@ def test_further_shots_are_told_with_where_to_hold_the_board() -> None:
 )  # fmt: skip
 def test_ways_are_told_as_the_subject_has_them(degrees: float, way: str) -> None:
     place = more().place
-    turned = BoardPlace(place.height, place.centre_mm, degrees, place.rig_from_board, place.views)
+    turned = BoardCandidate(
+        place.height, place.centre_mm, degrees, place.rig_from_board, place.views
+    )
     assert f"facing the subject's {way}," in said(place=turned)
 
 
 def test_a_place_is_seen_by_those_who_see_every_tilt() -> None:
     place = more().place
-    assert place.seen_by == ("a", "b", "c")
-    two = place.seen_only_by(("a", "d"))
-    assert two.seen_by == ("a",)
+    assert place.visible_to == ("a", "b", "c")
+    two = place.restrict_to(("a", "d"))
+    assert two.visible_to == ("a",)
     assert [len(tilt) for tilt in two.views] == [1, 2]
 
 
@@ -101,8 +103,8 @@ def test_the_best_chain_leaves_out_what_others_do_better() -> None:
     links = [
         Link("a", "b", 3, 0.1), Link("b", "c", 3, 0.3), Link("a", "c", 9, 0.4), Link("c", "d", 1, 2.0),
     ]  # fmt: skip
-    assert best_chain(links) == (links[3], links[1], links[0])
-    assert best_chain([]) == ()
+    assert minimum_spanning_links(links) == (links[3], links[1], links[0])
+    assert minimum_spanning_links([]) == ()
 
 
 def test_a_sigma_is_halved_where_its_variance_is_a_quarter() -> None:

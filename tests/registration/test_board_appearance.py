@@ -9,7 +9,7 @@ import numpy as np
 
 from bodyscan.boards.board_layout import corner_grid
 from bodyscan.boards.view import Appearance, BoardView
-from bodyscan.registration.board_appearance import appearance_notes, without_odd_mirrored
+from bodyscan.registration.board_checks import appearance_notes, drop_inconsistently_mirrored
 from bodyscan.rig.board import Board
 from bodyscan.rig.rig import Rig
 
@@ -103,11 +103,14 @@ def test_where_a_camera_saw_a_board_both_ways_round_the_rarer_is_left_out() -> N
     for views, odd in (([usual] * 3 + [flipped], True), ([usual] + [flipped] * 3, False),
                        ([usual] * 2 + [flipped] * 2, True)):  # fmt: skip
         views = [replace(each) for each in views]  # each an image of its own
-        kept, notes = without_odd_mirrored(views)
+        kept, notes = drop_inconsistently_mirrored(views)
         assert all(one.appearance.mirrored is not odd for one in kept)
         assert len(kept) + len(notes) == len(views)
         assert ("is mirrored in shot s" in notes[0]) is odd
         assert ("is not mirrored in shot s" in notes[0]) is not odd
     # Another camera may stand behind the glass.
     elsewhere = replace(flipped, pair="q")
-    assert without_odd_mirrored([usual] * 3 + [elsewhere]) == ([usual] * 3 + [elsewhere], [])
+    assert drop_inconsistently_mirrored([usual] * 3 + [elsewhere]) == (
+        [usual] * 3 + [elsewhere],
+        [],
+    )

@@ -24,8 +24,8 @@ from bodyscan.files.hashing import file_hash
 from bodyscan.files.reading import read_npz
 from bodyscan.registration.storage import (
     accept_calibration,
+    archive_previous,
     calibration_id,
-    keep_former,
     load_calibration,
     save_calibration,
 )
@@ -332,7 +332,7 @@ def test_a_calibration_is_replaced_only_when_that_is_said(copy: Path, tmp_path: 
 
 def test_one_that_is_replaced_stays_by_the_hash_that_scans_know(copy: Path) -> None:
     known, former = calibration_id(copy), load_calibration(copy)
-    kept = keep_former(copy)
+    kept = archive_previous(copy)
     save_calibration(replace(former, notes=("new",)), copy)
     assert load_calibration(copy).notes == ("new",)
     assert kept == copy / "history" / known
@@ -344,7 +344,7 @@ def test_one_that_is_replaced_stays_by_the_hash_that_scans_know(copy: Path) -> N
 def test_what_was_made_from_it_goes_with_it(copy: Path, name: str) -> None:
     (copy / name).write_text("of the former")
     (copy / "mine.html").write_text("named by the user")
-    kept = keep_former(copy)
+    kept = archive_previous(copy)
     save_calibration(load_calibration(copy), copy)
     assert kept is not None
     assert (kept / name).read_text() == "of the former"
@@ -369,7 +369,7 @@ def test_a_kill_while_it_is_replaced_leaves_one_of_the_two(
     def killed(*_: Any) -> None:
         raise KeyboardInterrupt
 
-    keep_former(copy)
+    archive_previous(copy)
     monkeypatch.setattr("bodyscan.registration.storage.write_json", killed)
     with pytest.raises(KeyboardInterrupt):
         save_calibration(new, copy)

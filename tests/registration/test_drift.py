@@ -6,7 +6,7 @@ from ring import ring_of_cameras, ring_rig, ring_views
 
 from bodyscan.arrays import Array
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.registration.drift import Drift, _groups, find_drift, seen_pose
+from bodyscan.registration.drift import Drift, _groups, find_drift, observe_pose
 from bodyscan.registration.rig_solve import RigSolution, solve_rig
 
 NOISE_PX = 0.03
@@ -26,7 +26,7 @@ def drift_after(
     """Some boards later, seen by a rig of which `retract` pairs stand elsewhere."""
     now = {name: moved.get(name, RigidTransform.identity()) @ at for name, at in PLACINGS.items()}
     views, _ = ring_views(now, CAMERAS, shots=shots, noise_px=NOISE_PX, seed=seed)
-    poses = [seen_pose(view, CAMERAS[view.pair], NOISE_PX) for view in views]
+    poses = [observe_pose(view, CAMERAS[view.pair], NOISE_PX) for view in views]
     return find_drift(poses, calibrated.rig_from_camera, calibrated.covariance, POLES)
 
 
@@ -88,7 +88,7 @@ def test_a_pair_far_off_is_found_as_well_as_a_pole(calibrated: RigSolution) -> N
 
 def test_a_board_that_one_pair_alone_sees_says_nothing(calibrated: RigSolution) -> None:
     views, _ = ring_views(PLACINGS, CAMERAS, shots=3, noise_px=NOISE_PX, seed=1)
-    poses = [seen_pose(v, CAMERAS[v.pair], NOISE_PX) for v in views if v.pair == "p1-1"]
+    poses = [observe_pose(v, CAMERAS[v.pair], NOISE_PX) for v in views if v.pair == "p1-1"]
     drift = find_drift(poses, calibrated.rig_from_camera, calibrated.covariance, POLES)
     assert drift.moves == ()
     assert drift.lonely == ("p1-1",)

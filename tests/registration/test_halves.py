@@ -68,13 +68,17 @@ def test_errors_that_the_corners_of_a_view_share_are_in_the_covariance() -> None
         return replace(view, pixels=view.pixels + rng.normal(0.0, 0.1, 2))
 
     rig, placed = placed_ring(spoil=aside)
-    assert placed.excess > 9.0  # variances: the halves would lie three times as far apart
+    assert (
+        placed.variance_inflation > 9.0
+    )  # variances: the halves would lie three times as far apart
     ratios = [compare_halves(rig, placed, seed=seed).over_expected for seed in range(3)]
     assert 0.7 < np.sqrt(np.mean(np.square(ratios))) < 1.4  # cut in three ways, one set of errors
 
 
 def test_independent_corners_have_no_excess() -> None:
-    assert placed_ring()[1].excess < 1.3  # of 30 places with some 20 freedoms each: 1 +- 0.06
+    assert (
+        placed_ring()[1].variance_inflation < 1.3
+    )  # of 30 places with some 20 freedoms each: 1 +- 0.06
 
 
 def test_halves_are_seeded_disjoint_and_whole() -> None:

@@ -9,13 +9,13 @@ from bodyscan.calibration.board_views import LocatedView
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.registration.inconsistent_views import (
+from bodyscan.registration.joint_solve import JointSolution
+from bodyscan.registration.view_consistency import (
     InconsistentViews,
     _placing,
     find_inconsistent_views,
     single_view_errors,
 )
-from bodyscan.registration.joint_solve import JointSolution
 
 CAMERA = Camera(900.0, 900.0, 0.0, 320.0, 240.0, Radial(), 640, 480)
 PLACED = {

@@ -59,7 +59,7 @@ def test_a_camera_that_is_held_stays_to_the_last_digit(
     np.testing.assert_allclose(
         found.value.cameras[KNOWN].parameters, CAMERAS[KNOWN].parameters, rtol=0, atol=1e-6
     )
-    assert found.notes[0] == f"{KNOWN}: camera from told.yaml (opencv), held"
+    assert found.notes[0] == f"{KNOWN}: camera from told.yaml (opencv), fixed"
     free = solved(ring_rig(PLACINGS), views, tmp_path)
     for name, rig_from_camera in PLACINGS.items():
         place = found.value.rig_from_camera[name].translation
@@ -97,7 +97,7 @@ def test_a_start_is_left_as_far_as_its_sigma_lets_it(
     found = solved(rig_with(tmp_path, off_px=5.0, sigma_px=5.0), views, tmp_path)
     # 0.03 px of noise on some thousand corners: a principal point is known to a few tenths.
     assert found.value.cameras[KNOWN].u0 == pytest.approx(CAMERAS[KNOWN].u0, abs=0.6)
-    assert "a start that is right to 5 px" in found.notes[0]
+    assert "a prior of sigma 5 px" in found.notes[0]
 
 
 def test_another_cameras_file_is_told_by_the_boards(views: list[BoardView], tmp_path: Path) -> None:
@@ -105,7 +105,7 @@ def test_another_cameras_file_is_told_by_the_boards(views: list[BoardView], tmp_
     other = replace(CAMERAS[KNOWN], alpha=1700.0, beta=1400.0)
     RIG_FORMATS.find("opencv").write({KNOWN: (other, PLACINGS[KNOWN])}, tmp_path / "told.yaml")
     notes = calibrate_cameras(rig, views, folder=tmp_path).notes
-    assert "is it this camera's" in notes[1]
+    assert "another camera's" in notes[1]
 
 
 def test_a_file_that_is_wrong_costs_its_pair(views: list[BoardView], tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from bodyscan.errors import FailedWork
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.registration.nominal_size import check_nominal_size, nominal_size
+from bodyscan.registration.rig_calibration import check_nominal_size, nominal_size
 from bodyscan.rig.board import Board
 from bodyscan.rig.rig import Rig
 

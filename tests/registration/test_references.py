@@ -22,9 +22,9 @@ from bodyscan.registration.references import (
     _Reading,
     _words,
     board_length,
-    find_size,
-    resized,
-    solving_views,
+    find_rig_size,
+    rescale_boards,
+    select_solving_views,
 )
 from bodyscan.registration.rig_solve import RigSolution, solve_rig
 from bodyscan.rig.board import Board
@@ -94,7 +94,7 @@ def test_a_bar_gives_the_size_within_its_sigma() -> None:
     for seed in range(20):
         rng = np.random.default_rng(seed)
         certified = bar(BAR_MM + 0.01 * rng.standard_normal())
-        size = find_size(small_rig(certified), placed(SMALLER), bar_views(rng)).value
+        size = find_rig_size(small_rig(certified), placed(SMALLER), bar_views(rng)).value
         errors.append((size.factor - 1.0 / SMALLER) / size.sigma)
         assert size.sigma < 2e-4  # 0.05 px at 1.3 m over 400 mm
     # RMS of 20 standard normal numbers, four sigmas of it to either side; four shots each.
@@ -105,7 +105,7 @@ def test_one_certified_board_does_as_well() -> None:
     steel = Reference(name="steel", boards=("left",), length_mm=board_length(LEFT), sigma_mm=0.01)
     assert board_length(LEFT) == pytest.approx(90.0)
     views = bar_views(np.random.default_rng(0), noise_px=1e-6)
-    size = find_size(small_rig(steel), placed(SMALLER), views).value
+    size = find_rig_size(small_rig(steel), placed(SMALLER), views).value
     assert size.factor == pytest.approx(1.0 / SMALLER, abs=1e-6)
     assert size.sigma == pytest.approx(0.01 / 90.0, rel=0.01)  # the certificate's
 
@@ -115,23 +115,23 @@ def test_references_that_contradict_each_other_are_refused() -> None:
         name="steel", boards=("left",), length_mm=1.01 * board_length(LEFT), sigma_mm=0.01
     )
     with pytest.raises(FailedWork, match=r"contradict each other: bar: .*steel: "):
-        find_size(small_rig(bar(), steel), placed(1.0), bar_views(np.random.default_rng(0)))
+        find_rig_size(small_rig(bar(), steel), placed(1.0), bar_views(np.random.default_rng(0)))
 
 
 @pytest.mark.parametrize(("scale", "said"), [(0.95, "is square_mm right"), (0.9999, "size by ref")])
 def test_a_size_that_no_print_is_off_by_is_asked_about(scale: float, said: str) -> None:
-    found = find_size(small_rig(bar()), placed(scale), bar_views(np.random.default_rng(0)))
+    found = find_rig_size(small_rig(bar()), placed(scale), bar_views(np.random.default_rng(0)))
     assert any(said in note for note in found.notes)
     assert ("is square_mm right" in " ".join(found.notes)) == (scale < 0.97)
 
 
 def test_a_rig_in_centimetres_is_refused() -> None:
     with pytest.raises(FailedWork, match=r"10\.0\d\d times as large as square_mm says"):
-        find_size(small_rig(bar()), placed(0.1), bar_views(np.random.default_rng(0)))
+        find_rig_size(small_rig(bar()), placed(0.1), bar_views(np.random.default_rng(0)))
 
 
 def test_a_reference_that_nobody_saw_leaves_the_size_and_is_named() -> None:
-    found = find_size(small_rig(bar()), placed(1.0), [])
+    found = find_rig_size(small_rig(bar()), placed(1.0), [])
     assert found.value.factor == 1.0
     assert "reference bar was measured in no shot" in found.notes[0]
 
@@ -151,8 +151,8 @@ def test_the_rig_has_its_size_after_a_second_solve() -> None:
         for view in views
     ]
     first = solve_rig(rig, small, CAMERAS).value
-    size = find_size(rig, first, bar_views(np.random.default_rng(0))).value
-    second = resized(rig, size.factor)
+    size = find_rig_size(rig, first, bar_views(np.random.default_rng(0))).value
+    second = rescale_boards(rig, size.factor)
     assert second.board("left").square_mm == 30.0  # the bar's own boards are what they are
     ratio = second.board("board").square_mm / CHARUCO.square_mm
     # Nominal places hold one camera; the other's distance is 0.4 m away.
@@ -161,9 +161,9 @@ def test_the_rig_has_its_size_after_a_second_solve() -> None:
 
 def test_boards_of_references_do_not_place_the_rig() -> None:
     views = bar_views(np.random.default_rng(0), shots=1)
-    assert solving_views(small_rig(bar()), views) == []
+    assert select_solving_views(small_rig(bar()), views) == []
     alone = small_rig(bar()).model_copy(update={"boards": (LEFT, RIGHT)})
-    assert solving_views(alone, views) == views
+    assert select_solving_views(alone, views) == views
 
 
 def test_a_size_is_told_in_per_cent_with_its_sigma() -> None:
@@ -209,7 +209,10 @@ def test_the_less_of_a_board_was_seen_the_farther_off_its_middle_may_be() -> Non
 def test_the_length_of_one_board_is_as_uncertain_as_its_corners_make_it() -> None:
     layout, rng, every = corner_points(PLAIN), np.random.default_rng(0), np.arange(110)
     read = [
-        [_along(PLAIN, every, layout + noise, excess) for excess in (1.0, 4.0)]
+        [
+            _along(PLAIN, every, layout + noise, variance_inflation)
+            for variance_inflation in (1.0, 4.0)
+        ]
         for noise in rng.normal(0.0, 0.05, (300, 110, 3))
     ]
     lengths = [one.length_mm for one, _ in read]
@@ -247,9 +250,9 @@ def test_references_count_by_their_sigmas_and_may_differ_by_four(
     views = bar_views(np.random.default_rng(0), noise_px=1e-6)
     if refused:
         with pytest.raises(FailedWork, match="contradict each other"):
-            find_size(small_rig(bar(), steel), placed(1.0), views)
+            find_rig_size(small_rig(bar(), steel), placed(1.0), views)
         return
-    size = find_size(small_rig(bar(), steel), placed(1.0), views).value
+    size = find_rig_size(small_rig(bar(), steel), placed(1.0), views).value
     assert size.factor == pytest.approx(1.0 + share * longer, abs=1e-6)
     assert size.sigma == pytest.approx((one**-2 + other**-2) ** -0.5, rel=1e-3)
 
@@ -278,7 +281,7 @@ def test_two_cameras_have_to_see_six_corners_of_each_board(
     seen = cut(views, "right", dict(zip(("p1-1", "p1-2"), corners, strict=True)))
     if not any(corners):
         seen = [view for view in views if view.board == "left"]
-    found = find_size(small_rig(bar()), placed(SMALLER), seen)
+    found = find_rig_size(small_rig(bar()), placed(SMALLER), seen)
     assert ("measured in no shot" in found.notes[0]) != measured
     # From half of its corners, 30 mm off, a middle is reached by the size that is told of the print.
     assert found.value.factor == pytest.approx(1.0 / SMALLER if measured else 1.0, abs=3e-4)
@@ -292,15 +295,15 @@ def test_a_size_a_tenth_off_is_refused_and_less_is_not(scale: float, refused: bo
     views = bar_views(np.random.default_rng(0))
     if refused:
         with pytest.raises(FailedWork, match="times as large as square_mm says"):
-            find_size(small_rig(bar()), placed(scale), views)
+            find_rig_size(small_rig(bar()), placed(scale), views)
     else:
-        size = find_size(small_rig(bar()), placed(scale), views).value
+        size = find_rig_size(small_rig(bar()), placed(scale), views).value
         assert size.factor == pytest.approx(1.0 / scale, abs=1e-3)
 
 
 def test_a_board_is_resized_with_its_markers_and_a_certified_one_alone_as_well() -> None:
-    rig = resized(small_rig(bar()), 1.25)
+    rig = rescale_boards(small_rig(bar()), 1.25)
     assert [board.square_mm for board in rig.boards] == [87.5, 30.0, 30.0]
     assert [board.marker_mm for board in rig.boards] == [65.0, 22.0, 22.0]
-    alone = resized(small_rig(bar()).model_copy(update={"boards": (LEFT, RIGHT)}), 1.25)
+    alone = rescale_boards(small_rig(bar()).model_copy(update={"boards": (LEFT, RIGHT)}), 1.25)
     assert [(board.square_mm, board.marker_mm) for board in alone.boards] == [(37.5, 27.5)] * 2

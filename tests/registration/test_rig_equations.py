@@ -104,13 +104,13 @@ def test_they_are_those_of_all_errors_by_all_unknowns(free: bool) -> None:
     assert corner.max() < 4.0 * spread
     scale = np.sqrt(np.diag(by.T @ by))
     # Weights of corners two or three spreads off are 0.7 to 1, near them 1.
-    information = found.matrix / np.outer(scale, scale)
+    information = found.system.information / np.outer(scale, scale)
     truth = (by.T @ by) / np.outer(scale, scale)
     assert np.abs(information - truth).max() < 0.15
     # The noise of a view is known from 40 residuals, to 22 % of its variance.
     assert np.all(np.diag(information) <= 1.15)
     np.testing.assert_allclose(information[truth == 0.0], 0.0, atol=1e-12)
-    assert np.linalg.norm((found.gradient - by.T @ residuals) / scale) < 0.2 * np.linalg.norm(
+    assert np.linalg.norm((-found.system.vector - by.T @ residuals) / scale) < 0.2 * np.linalg.norm(
         by.T @ residuals / scale
     )
     assert found.held.tolist() == list(range(6))
@@ -126,8 +126,8 @@ def test_a_corner_that_is_far_off_counts_for_next_to_nothing() -> None:
     pixels = seen[0].pixels.copy()
     pixels[7] += 0.2  # two hundred times the noise
     after = equations([replace(seen[0], pixels=pixels), *seen[1:]])
-    scale = np.sqrt(np.diag(before.matrix))
-    change = (after.matrix - before.matrix) / np.outer(scale, scale)
+    scale = np.sqrt(np.diag(before.system.information))
+    change = (after.system.information - before.system.information) / np.outer(scale, scale)
     assert np.abs(change).max() < 0.12, "one corner of twenty of a board less"
     # At most 16 variances, as Cauchy's loss has it, of 200 residuals: all others count 8 % more.
     assert np.all(np.diag(change) < 0.1), "and its view not more"
@@ -135,15 +135,15 @@ def test_a_corner_that_is_far_off_counts_for_next_to_nothing() -> None:
 
 def test_without_boards_is_what_is_left_once_they_may_move() -> None:
     found = equations(views(1e-3))
-    left = found.without_boards()
-    whole = np.linalg.inv(found.matrix[6:, 6:])  # pair a held
+    left = found.without_boards().information
+    whole = np.linalg.inv(found.system.information[6:, 6:])  # pair a held
     np.testing.assert_allclose(np.linalg.inv(left[6:, 6:]), whole[:6, :6], rtol=1e-6)
 
 
 def test_what_is_known_of_cameras_beforehand_is_added_to_their_own_unknowns() -> None:
     seen = views(1e-3)
     bare, told = equations(seen, free=True), equations(seen, free=True, prior=True)
-    added = told.matrix - bare.matrix
+    added = told.system.information - bare.system.information
     own = np.concatenate(told.camera_columns)
     sigmas = np.concatenate([CAMERAS[name].prior_sigmas for name in "ab"])
     expected = np.zeros(len(added))

@@ -21,7 +21,7 @@ from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.lenses.rational import Rational
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import position_sigma
-from bodyscan.registration.rig_lenses import _decentred_together
+from bodyscan.registration.rig_lenses import _pool_decentring
 from bodyscan.registration.rig_solve import RigSolution, solve_rig
 from bodyscan.rig.rig import Rig
 from bodyscan.workflows.find_boards import calibrate_cameras, locate_views
@@ -137,7 +137,7 @@ def test_cameras_of_one_make_show_together_that_they_are_decentred(
 
         looked[name] = SimpleNamespace(choose=again)
     kinds: Any = {name: family_up_to(Rational) for name in chosen}
-    found = _decentred_together(chosen, cast(Any, looked), kinds)
+    found = _pool_decentring(chosen, cast(Any, looked), kinds)
     assert "".join(found) == changed
     for name in changed:
         first, second = chosen[name].trials

@@ -15,7 +15,7 @@ from bodyscan.geometry.lenses.brown import Brown
 from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.registration.full_solve import solve_fully
+from bodyscan.registration.bundle_adjustment import refine_solution
 from bodyscan.registration.joint_solve import (
     JointSolution,
     _refined,
@@ -68,7 +68,7 @@ def test_the_full_solve_ends_at_the_minimum_from_afar() -> None:
         {target: astray(placing) for target, placing in true.root_from_board.items()},
         {n: c.retract(np.array([8.0, 8.0, 0.0, 3.0, 3.0, 0, 0])) for n, c in CAMERAS.items()},
     )
-    found = solve_fully(views, start, root=ROOT, refine_cameras=True)
+    found = refine_solution(views, start, root=ROOT, refine_cameras=True)
     for name, placing in true.root_from_camera.items():
         off = found.root_from_camera[name].translation - placing.translation
         # One step of Gauss and Newton leaves some millimetres.

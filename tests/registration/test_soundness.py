@@ -16,7 +16,7 @@ from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.light_planes import LightPlanes
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance
-from bodyscan.registration.rig_calibration import SeenCorners
+from bodyscan.registration.rig_calibration import ObservedCorners
 from bodyscan.registration.soundness import (
     camera_faults,
     covariance_faults,
@@ -155,7 +155,7 @@ WITH_LIGHT = Pair.model_validate(
     }
 )
 TARGET = ("s1", "board")
-seen_corners: Any = SeenCorners  # of arrays of any kind
+collect_corners: Any = ObservedCorners  # of arrays of any kind
 
 
 def planes(what: str = "coefficients", place: Any = (), value: Any = None) -> LightPlanes:
@@ -178,7 +178,7 @@ def calibration(**changes: Any) -> Any:
     pair = SimpleNamespace(
         name="p", camera=SOUND, camera_covariance=np.eye(7), sheets=planes(), crossing=None
     )
-    seen = seen_corners(np.zeros((4, 2)), np.zeros((4, 2)), np.zeros(4, np.int16))
+    seen = collect_corners(np.zeros((4, 2)), np.zeros((4, 2)), np.zeros(4, np.int16))
     known = {
         "rig": SimpleNamespace(name="r", pairs=[WITH_LIGHT], boards=[SimpleNamespace(name="board")]),
         "pairs": {"p": pair},
@@ -294,21 +294,21 @@ def test_light_that_crosses_is_of_stripes_that_the_projector_shows() -> None:
 @pytest.mark.parametrize(
     ("seen", "message"),
     [
-        (seen_corners(np.zeros((4, 2)), np.zeros((3, 2)), np.zeros(4, np.int16)),
+        (collect_corners(np.zeros((4, 2)), np.zeros((3, 2)), np.zeros(4, np.int16)),
          "p/seen has arrays of shapes (4, 2), (3, 2), (4,)"),
-        (seen_corners(np.zeros((4, 2)), np.full((4, 2), np.nan), np.zeros(4, np.int16)),
+        (collect_corners(np.zeros((4, 2)), np.full((4, 2), np.nan), np.zeros(4, np.int16)),
          "p/seen holds what is not a number"),
-        (seen_corners(np.full((4, 2), np.inf), np.zeros((4, 2)), np.zeros(4, np.int16)),
+        (collect_corners(np.full((4, 2), np.inf), np.zeros((4, 2)), np.zeros(4, np.int16)),
          "p/seen holds what is not a number"),
-        (seen_corners(np.zeros((4, 2)), np.zeros((4, 2)), np.array([0, 0, 1, 0], np.int16)),
+        (collect_corners(np.zeros((4, 2)), np.zeros((4, 2)), np.array([0, 0, 1, 0], np.int16)),
          "p/seen names boards that there are not"),
-        (seen_corners(np.zeros((4, 2)), np.zeros((4, 2)), np.array([0, -1, 0, 0], np.int16)),
+        (collect_corners(np.zeros((4, 2)), np.zeros((4, 2)), np.array([0, -1, 0, 0], np.int16)),
          "p/seen names boards that there are not"),
-        (seen_corners(np.zeros((4, 2)), np.zeros((4, 2)), np.zeros(4)),
+        (collect_corners(np.zeros((4, 2)), np.zeros((4, 2)), np.zeros(4)),
          "p/seen names boards that there are not"),
     ],
 )  # fmt: skip
 def test_corners_that_were_seen_are_numbers_on_boards_that_there_are(
-    seen: SeenCorners, message: str
+    seen: ObservedCorners, message: str
 ) -> None:
     assert said(find_faults(calibration(seen={"p": seen}))) == message

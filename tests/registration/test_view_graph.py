@@ -15,7 +15,7 @@ from bodyscan.registration.view_graph import (
     _gaps,
     _open_tie,
     initial_poses,
-    place_boards,
+    locate_boards_jointly,
     view_graph,
 )
 
@@ -95,15 +95,15 @@ def test_a_board_stands_where_most_corners_say_and_a_view_far_off_is_doubtful() 
     """A twelfth of the distance, 80 mm, is doubtful; a twenty-fifth agrees."""
     for aside_mm, doubted in ((70.0, False), (90.0, True)):
         views = [view("a", 1), view("b", 1), view("c", 1, aside_mm), view("a", 2)]
-        kept, boards, doubtful = place_boards(views, PLACED)
+        kept, boards, doubtful = locate_boards_jointly(views, PLACED)
         assert len(kept) == 4
         np.testing.assert_allclose(boards["s1", "board"].matrix, board(1).matrix, atol=1e-6)
         assert doubtful == ({("s1", "board")} if doubted else set())
     few = [view("a", 1, 100.0, corners=8), view("b", 1), view("c", 1, 100.0, corners=3)]
-    _, boards, _ = place_boards(few, PLACED)
+    _, boards, _ = locate_boards_jointly(few, PLACED)
     assert np.linalg.norm(boards["s1", "board"].translation - board(1).translation) < 1e-6
     more = [view("a", 1, 100.0, corners=8), view("b", 1), view("c", 1, 130.0, corners=6)]
-    _, boards, _ = place_boards(more, PLACED)
+    _, boards, _ = locate_boards_jointly(more, PLACED)
     assert np.linalg.norm(boards["s1", "board"].translation - board(1).translation) > 90.0
 
 
@@ -112,7 +112,7 @@ def test_a_board_numbered_from_its_other_end_is_numbered_as_the_other_pairs_see_
     either = RigidTransform.identity(), from_there
     views = [replace(view(pair, 1), alternatives=either) for pair in "abc"]
     views[2] = replace(views[2].resolve(from_there), alternatives=either)
-    kept, boards, doubtful = place_boards(views, PLACED)
+    kept, boards, doubtful = locate_boards_jointly(views, PLACED)
     assert not doubtful
     for one in kept:
         assert not one.ambiguous

@@ -27,7 +27,7 @@ def test_of_a_free_shape_motion_is_known_and_size_as_little_as_said() -> None:
     x, y = np.meshgrid(np.arange(8) * 40.0, np.arange(6) * 40.0)
     points = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
     shape = FreeShape(points, sigma_mm=1.0, size_sigma=1e-4)
-    covariance = np.linalg.inv(shape.known)
+    covariance = np.linalg.inv(shape.prior_information)
     arms = points - points.mean(axis=0)
     size = arms.ravel() / np.linalg.norm(arms)
     expected = 1e-4 * float(np.linalg.norm(arms))

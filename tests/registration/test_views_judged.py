@@ -13,14 +13,18 @@ from bodyscan.boards.view import ViewKey
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.calibration.camera import LensTrial
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.registration import consistent_solve
-from bodyscan.registration.consistent_solve import ConsistentSolve, solve_consistently
-from bodyscan.registration.inconsistent_views import _wrong_squares, error_limit
+from bodyscan.registration import view_consistency
 from bodyscan.registration.joint_solve import JointSolution
 from bodyscan.registration.rig_lenses import (
     lens_notes,
 )
-from bodyscan.registration.seen_corners import seen_corners
+from bodyscan.registration.rig_solve import collect_corners
+from bodyscan.registration.view_consistency import (
+    ConsistentSolve,
+    _wrong_squares,
+    error_limit,
+    solve_consistently,
+)
 
 BEFORE = RigidTransform.from_rotation_vector([0.0, 0.1, 0.0], [10.0, 0.0, 900.0])
 
@@ -58,8 +62,8 @@ def solve(
         out = next(rounds)
         return SimpleNamespace(wrong=[VIEWS[k] for k in sorted(out)], notes=(f"{sorted(out)}",))
 
-    monkeypatch.setattr(consistent_solve, "solve_fully", fully)
-    monkeypatch.setattr(consistent_solve, "find_inconsistent_views", judge)
+    monkeypatch.setattr(view_consistency, "refine_solution", fully)
+    monkeypatch.setattr(view_consistency, "find_inconsistent_views", judge)
     found = solve_consistently(
         VIEWS, START, root="p", refine_cameras=True, limit_px=0.7, wrong=keys_of(wrong)
     )
@@ -168,7 +172,7 @@ def test_what_a_camera_saw_is_told_corner_by_corner_with_its_targets_number() ->
         rig_from_board=boards, views=views, cameras={"p": PinholeOfOne(), "q": PinholeOfOne()},
         rig_from_camera={"p": one, "q": one, "r": one},
     )  # fmt: skip
-    found = seen_corners(placed, ["q", "p", "r", "unplaced"])
+    found = collect_corners(placed, ["q", "p", "r", "unplaced"])
     assert list(found) == ["p", "q"], "r saw nothing"
     assert found["p"].target.tolist() == [1, 1]  # of (s0, a), (s0, b), (s1, b)
     assert found["q"].target.tolist() == [2, 2, 2, 0]

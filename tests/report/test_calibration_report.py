@@ -16,7 +16,7 @@ from bodyscan.calibration.pair import PairCalibration, PairQuality
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance
-from bodyscan.registration.rig_calibration import RigCalibration, SeenCorners
+from bodyscan.registration.rig_calibration import ObservedCorners, RigCalibration
 from bodyscan.registration.storage import load_calibration, save_calibration
 from bodyscan.report.calibration_charts import shared_boards
 from bodyscan.report.calibration_page import _lens_figure, calibration_page
@@ -29,12 +29,12 @@ SIGMA_MM = np.array([0.01, 0.02, 0.05])
 SHOTS = {("b1", "board"): 0, ("b2", "board"): 1, ("b3", "board"): 2}
 
 
-def corners(camera: Camera, targets: list[int], share: float = 0.9) -> SeenCorners:
+def corners(camera: Camera, targets: list[int], share: float = 0.9) -> ObservedCorners:
     """A grid over so much of the picture's width and height, in each of the shots."""
     x, y = np.meshgrid(np.linspace(0.5 - share / 2, 0.5 + share / 2, 9), np.linspace(0.1, 0.9, 7))
     pixels = np.stack([x.ravel() * camera.width, y.ravel() * camera.height], axis=1)
     residuals = np.random.default_rng(1).normal(0.0, 0.05, (len(targets) * len(pixels), 2))
-    return SeenCorners(
+    return ObservedCorners(
         np.tile(pixels, (len(targets), 1)).astype(np.float32),
         residuals.astype(np.float32),
         np.repeat(targets, len(pixels)).astype(np.int16),

@@ -15,8 +15,7 @@ from bodyscan.arrays import Array, Mask
 from bodyscan.fusion.consistency import Contradictions
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.reconstruction.two_ways import Agreement
-from bodyscan.registration.nominal_size import NominalSize, nominal_size
-from bodyscan.registration.rig_calibration import RigCalibration
+from bodyscan.registration.rig_calibration import NominalSize, RigCalibration, nominal_size
 from bodyscan.rig.rig import Volume
 from bodyscan.settings import UseLimits
 from bodyscan.verdict import Grade

@@ -19,7 +19,7 @@ from bodyscan.calibration.camera import camera_prior
 from bodyscan.geometry.camera import MATRIX, Camera
 from bodyscan.geometry.least_squares import EXACT, Block, minimize
 from bodyscan.registration.joint_solve import JointSolution
-from bodyscan.registration.normal_equations import CORNERS, corners_seen, view_sigmas
+from bodyscan.registration.normal_equations import CORNERS, reprojection_errors, view_sigmas
 
 MOST_STEPS = 12
 SETTLED = 1e-3
@@ -27,7 +27,7 @@ SETTLED = 1e-3
 of the minimum; that step leaves a few thousandths."""
 
 
-def solve_fully(
+def refine_solution(
     views: Sequence[LocatedView],
     solution: JointSolution,
     *,
@@ -97,7 +97,8 @@ def _blocks(
     """The corners of each pair's views, then the priors on the cameras."""
     placings = solution.cameras, solution.root_from_camera, solution.root_from_board
     seen = [
-        corners_seen(views, *placings, cameras_free=unknowns.refine_cameras) for views in of_pair
+        reprojection_errors(views, *placings, cameras_free=unknowns.refine_cameras)
+        for views in of_pair
     ]
     runs = [np.array([2 * len(view.points) for view in views]) for views in of_pair]
     apart = [

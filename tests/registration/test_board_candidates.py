@@ -11,7 +11,12 @@ from bodyscan.boards.board_layout import corner_points
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.registration.more_shots import _tilted, _views, board_places, facings
+from bodyscan.registration.more_shots import (
+    _tilted,
+    _views,
+    candidate_azimuths,
+    propose_board_poses,
+)
 from bodyscan.registration.rig_frame import nominal_pose
 from bodyscan.rig.board import Board
 from bodyscan.rig.pair import NominalPose
@@ -39,16 +44,18 @@ def facing(azimuth_deg: float, board: Board = BOARD, centre: Any = FACE) -> list
 
 
 def test_boards_face_halfway_between_any_two_cameras_in_steps_of_15_degrees() -> None:
-    found = np.degrees(facings([stood(0.0), stood(60.0), stood(130.0)], two_faced=False))
+    found = np.degrees(candidate_azimuths([stood(0.0), stood(60.0), stood(130.0)], two_faced=False))
     np.testing.assert_allclose(found, [30.0, 60.0, 90.0])  # 65 and 95 lie nearer to these
     # However far away either stands.
     apart = [stood(0.0), stood(60.0, away_mm=500.0)]
-    np.testing.assert_allclose(np.degrees(facings(apart, two_faced=False)), [30.0])
+    np.testing.assert_allclose(np.degrees(candidate_azimuths(apart, two_faced=False)), [30.0])
     # Opposite each other they have no way between; of two faces either will do.
-    np.testing.assert_allclose(facings([stood(0.0), stood(180.0)], two_faced=False), [])
+    np.testing.assert_allclose(candidate_azimuths([stood(0.0), stood(180.0)], two_faced=False), [])
     behind = [stood(200.0), stood(260.0)]
-    np.testing.assert_allclose(np.degrees(facings(behind, two_faced=False)), [225.0 + 0.0])
-    np.testing.assert_allclose(np.degrees(facings(behind, two_faced=True)), [45.0])
+    np.testing.assert_allclose(
+        np.degrees(candidate_azimuths(behind, two_faced=False)), [225.0 + 0.0]
+    )
+    np.testing.assert_allclose(np.degrees(candidate_azimuths(behind, two_faced=True)), [45.0])
 
 
 def test_boards_are_held_upright_about_a_place_a_little_tilted() -> None:
@@ -115,19 +122,19 @@ def test_a_board_is_seen_in_part_if_twelve_corners_are(rise_mm: float, corners: 
 
 def test_places_are_those_that_two_pairs_would_see_within_the_volume() -> None:
     placed = {"a": stood(-25.0), "b": stood(25.0), "c": stood(180.0)}
-    places = board_places(BOARD, Volume(), dict.fromkeys(placed, CAMERA), placed)
+    places = propose_board_poses(BOARD, Volume(), dict.fromkeys(placed, CAMERA), placed)
     assert places
     heights = {"knee": 500.0, "waist": 1000.0, "chest": 1350.0}
     assert {place.height for place in places} <= set(heights)
     for place in places:
-        assert set(place.seen_by) == {"a", "b"}
+        assert set(place.visible_to) == {"a", "b"}
         assert place.facing_deg == pytest.approx(0.0)
         assert place.centre_mm[2] == heights[place.height]
     radius = Volume().radius_mm
     along = sorted(place.centre_mm[0] for place in places if place.height == "waist")
     np.testing.assert_allclose(along, [-0.35 * radius, 0.0, 0.35 * radius])
     alone = {"a": placed["a"], "c": placed["c"]}
-    assert not board_places(BOARD, Volume(), dict.fromkeys(alone, CAMERA), alone)
+    assert not propose_board_poses(BOARD, Volume(), dict.fromkeys(alone, CAMERA), alone)
 
 
 @pytest.mark.parametrize(("columns", "rows", "whole"), [(5, 4, True), (12, 3, True), (3, 6, False)])

@@ -1,4 +1,4 @@
-"""How much more than independent corners boards err, seen from their pulls on what was solved."""
+"""How much more than independent corners boards err, seen from their vectors on what was solved."""
 
 from __future__ import annotations
 
@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 
 from bodyscan.calibration.board_views import LocatedView
+from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.registration.honest_covariance import (
-    HonestCovariance,
-    _excess,
-    board_places,
-    honest_covariance,
+from bodyscan.registration.cluster_covariance import (
+    ClusterRobustCovariance,
+    cluster_board_poses,
+    cluster_robust_covariance,
+    variance_inflations,
 )
-from bodyscan.registration.normal_equations import NormalEquations, OfTarget
+from bodyscan.registration.normal_equations import BoardContribution, NormalEquations
 from bodyscan.registration.view_graph import Target
 
 ROWS = 30
@@ -30,8 +31,8 @@ def solved(
     size = 12 + 6 * targets
     names = [(f"s{k:03d}", "board") for k in range(targets)]
     columns = [np.r_[6:12, 12 + 6 * k : 18 + 6 * k] for k in range(targets)]
-    places = rng.normal(size=(targets // alike, ROWS, 12))
-    jacobians = places.repeat(alike, axis=0)
+    clusters = rng.normal(size=(targets // alike, ROWS, 12))
+    jacobians = clusters.repeat(alike, axis=0)
     matrix, right = np.zeros((size, size)), np.zeros(size)
     for own, jacobian, off in zip(columns, jacobians, noise, strict=True):
         matrix[np.ix_(own, own)] += jacobian.T @ jacobian
@@ -41,12 +42,21 @@ def solved(
     found = np.zeros(size)
     found[free] = np.linalg.solve(matrix[np.ix_(free, free)], right[free])
     parts = tuple(
-        OfTarget(own, jacobian.T @ jacobian, jacobian.T @ (off - jacobian @ found[own]))
+        BoardContribution(
+            own,
+            LinearGaussianSystem(jacobian.T @ jacobian, jacobian.T @ (off - jacobian @ found[own])),
+        )
         for own, jacobian, off in zip(columns, jacobians, noise, strict=True)
     )
     held = np.arange(6)
     equations = NormalEquations(
-        ("a", "b"), tuple(names), (0, 0), matrix, np.zeros(size), held, 1.0, parts
+        ("a", "b"),
+        tuple(names),
+        (0, 0),
+        LinearGaussianSystem(matrix, np.zeros(size)),
+        held,
+        1.0,
+        parts,
     )
     return equations, names, found[6:12]
 
@@ -61,30 +71,34 @@ def each(names: list[Target]) -> list[list[Target]]:
     return [[name] for name in names]
 
 
-def of_b(found: HonestCovariance) -> np.ndarray:
+def of_b(found: ClusterRobustCovariance) -> np.ndarray:
     return found.poses.marginal("b")
 
 
 def test_noise_as_large_as_thought_has_no_excess() -> None:
     equations, names, _ = solved(60, draw(60, 1.0, 0))
-    found = honest_covariance(equations, each(names))
+    found = cluster_robust_covariance(equations, each(names))
     # Of 54 x 6 degrees of freedom: known to 8 %, and never less than 1.
-    assert 1.0 <= found.excess < 1.25
-    independent = np.linalg.inv(equations.without_boards()[6:, 6:])
-    np.testing.assert_allclose(np.diag(of_b(found)), np.diag(independent) * found.excess, rtol=0.35)
+    assert 1.0 <= found.variance_inflation < 1.25
+    independent = np.linalg.inv(equations.without_boards().information[6:, 6:])
+    np.testing.assert_allclose(
+        np.diag(of_b(found)), np.diag(independent) * found.variance_inflation, rtol=0.35
+    )
     assert not found.poses.marginal("a").any(), "it holds the frame"
     assert found.cameras == {}
 
 
 def test_noise_three_times_as_large_has_nine_times_the_variance() -> None:
     equations, names, _ = solved(60, draw(60, 3.0, 0))
-    assert honest_covariance(equations, each(names)).excess == pytest.approx(9.0, rel=0.25)
+    assert cluster_robust_covariance(equations, each(names)).variance_inflation == pytest.approx(
+        9.0, rel=0.25
+    )
 
 
 def test_what_the_solve_followed_of_few_boards_is_allowed_for() -> None:
-    """Of three boards' pulls the solve takes a third: without that the excess would be 6 of 9."""
+    """Of three boards' vectors the solve takes a third: without that the factor would be 6 of 9."""
     found = [
-        honest_covariance(equations, each(names)).excess
+        cluster_robust_covariance(equations, each(names)).variance_inflation
         for seed in range(120)
         for equations, names, _ in [solved(3, draw(3, 3.0, seed))]
     ]
@@ -95,7 +109,7 @@ def test_the_covariance_is_what_solutions_scatter_by() -> None:
     ratios = []
     for seed in range(60):
         equations, names, came_out = solved(24, draw(24, 2.0, seed))
-        covariance = of_b(honest_covariance(equations, each(names)))
+        covariance = of_b(cluster_robust_covariance(equations, each(names)))
         ratios.append(came_out @ np.linalg.solve(covariance, came_out) / 6.0)
     assert np.mean(ratios) == pytest.approx(1.0, abs=0.25)
 
@@ -103,22 +117,24 @@ def test_the_covariance_is_what_solutions_scatter_by() -> None:
 def test_boards_in_one_place_that_err_alike_are_one_piece_of_evidence() -> None:
     equations, names, _ = solved(90, draw(90, 1.0, 0, alike=3), alike=3)
     together = [names[k : k + 3] for k in range(0, 90, 3)]
-    # Their pulls add up: three times as much as if they erred by themselves.
-    assert honest_covariance(equations, each(names)).excess < 1.3
-    assert honest_covariance(equations, together).excess == pytest.approx(3.0, rel=0.2)
+    # Their vectors add up: three times as much as if they erred by themselves.
+    assert cluster_robust_covariance(equations, each(names)).variance_inflation < 1.3
+    assert cluster_robust_covariance(equations, together).variance_inflation == pytest.approx(
+        3.0, rel=0.2
+    )
 
 
 def test_one_place_alone_says_nothing_of_how_it_errs() -> None:
     equations, names, _ = solved(5, draw(5, 7.0, 0))
-    found = honest_covariance(equations, [names])
-    assert found.excess == 1.0
-    independent = np.linalg.inv(equations.without_boards()[6:, 6:])
+    found = cluster_robust_covariance(equations, [names])
+    assert found.variance_inflation == 1.0
+    independent = np.linalg.inv(equations.without_boards().information[6:, 6:])
     np.testing.assert_allclose(of_b(found), independent, rtol=1e-6, atol=1e-12)
 
 
 def test_a_prior_is_exact_and_does_not_err() -> None:
     equations, names, _ = solved(30, draw(30, 3.0, 0), prior=1e9)
-    found = honest_covariance(equations, each(names))
+    found = cluster_robust_covariance(equations, each(names))
     np.testing.assert_allclose(np.diag(of_b(found)), 1e-9, rtol=0.01)
 
 
@@ -138,7 +154,7 @@ def test_boards_that_nearly_stood_where_another_did_are_in_its_place() -> None:
         ("s5", "b"): stands(25.0),
     }  # fmt: skip
     # A twentieth of 300 mm is 15 mm; s5 is near s2, whose place s2 began.
-    assert board_places([view(*target) for target in poses], poses) == [
+    assert cluster_board_poses([view(*target) for target in poses], poses) == [
         [("s0", "b"), ("s1", "b"), ("s3", "b")],
         [("s0", "c")],
         [("s2", "b"), ("s5", "b")],
@@ -147,16 +163,17 @@ def test_boards_that_nearly_stood_where_another_did_are_in_its_place() -> None:
 
 
 def test_a_place_has_its_own_excess_as_far_as_it_is_known() -> None:
-    """Five places that say a fifth each of twenty unknowns: of what each saw the solve followed a
+    """Five clusters that say a fifth each of twenty unknowns: of what each saw the solve followed a
     fifth, so that 16 of 100 are left of each unknown, and twenty degrees of freedom of a place."""
     information = np.tile(0.2 * np.eye(20), (5, 1, 1))
-    pulls = np.zeros((5, 20))
-    pulls[:, 3] = np.sqrt(3.2 * 0.5)  # variance 0.5
-    pulls[0] *= 3.0
-    found = _excess(information, pulls, np.eye(20), 0.5)
-    assert found.pooled == pytest.approx((9.0 + 4.0) / 5.0)
+    vectors = np.zeros((5, 20))
+    vectors[:, 3] = np.sqrt(3.2 * 0.5)  # variance 0.5
+    vectors[0] *= 3.0
+    found, pooled = variance_inflations(LinearGaussianSystem(information, vectors), np.eye(20), 0.5)
+    assert pooled == pytest.approx((9.0 + 4.0) / 5.0)
     # Twenty degrees of freedom count twice as much as the ten from which a place is known by half.
-    own = (2.0 * 9.0 + found.pooled) / 3.0, (2.0 * 1.0 + found.pooled) / 3.0
-    np.testing.assert_allclose(found.of_place, [own[0], *[own[1]] * 4])
+    own = (2.0 * 9.0 + pooled) / 3.0, (2.0 * 1.0 + pooled) / 3.0
+    np.testing.assert_allclose(found, [own[0], *[own[1]] * 4])
     # Less than independent corners err promises nothing better.
-    assert _excess(information, 0.1 * pulls, np.eye(20), 0.5).pooled == 1.0
+    small = LinearGaussianSystem(information, 0.1 * vectors)
+    assert variance_inflations(small, np.eye(20), 0.5)[1] == 1.0

@@ -1,22 +1,26 @@
-"""Views of one board at one moment that cannot all be true: which they are, and why.
+"""Detect views of one board at one moment that cannot all be true, and solve the rig without them.
 
 Judged with the cameras as solved: every view by itself fits some pose of the board to within the
-corners' noise; together they must fit one.
+corners' noise; all views together must fit one. A view that was rejected takes no part, but each
+later solve judges it again: the reason may have been a lens that was too simple, a board thought to
+be flat, or another view.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from bodyscan.arrays import Array
+from bodyscan.boards.view import ViewKey
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.least_squares import Block, Noise, minimize
 from bodyscan.geometry.robust import rms_length
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
+from bodyscan.registration.bundle_adjustment import refine_solution
 from bodyscan.registration.joint_solve import JointSolution
 from bodyscan.registration.view_graph import by_target
 
@@ -235,3 +239,63 @@ def _placing(group: Sequence[LocatedView], solution: JointSolution) -> RigidTran
 
 def _names(views: Sequence[LocatedView]) -> str:
     return ", ".join(sorted(view.pair for view in views))
+
+
+ROUNDS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class ConsistentSolve:
+    """The joint solve of consistent views.
+
+    solution: of all views but the wrong ones.
+    wrong: keys of those.
+    notes: one line for each cause of being wrong.
+    """
+
+    solution: JointSolution
+    wrong: frozenset[ViewKey]
+    notes: tuple[str, ...] = ()
+
+    def kept(self, views: Sequence[LocatedView]) -> list[LocatedView]:
+        """The views that took part."""
+        return [view for view in views if view.key not in self.wrong]
+
+
+def solve_consistently(
+    views: Sequence[LocatedView],
+    solution: JointSolution,
+    *,
+    root: str,
+    refine_cameras: bool,
+    limit_px: float,
+    wrong: Collection[ViewKey] = (),
+) -> ConsistentSolve:
+    """Alternate between solving and judging until both settle; `wrong`: views to begin without."""
+    at = ConsistentSolve(solution, frozenset(wrong))
+    for turn in range(ROUNDS):
+        kept = at.kept(views)
+        solved = refine_solution(
+            kept, _boards_of(kept, at.solution), root=root, refine_cameras=refine_cameras
+        )
+        found = find_inconsistent_views(views, solved, limit_px)
+        now = frozenset(view.key for view in found.wrong)
+        if now == at.wrong:
+            return ConsistentSolve(solved, now, found.notes)
+        whole_cameras = 2 * len(now) > len(views)  # see `rig_solve`
+        last = whole_cameras or turn >= ROUNDS - 2  # so that no view leaves and returns for ever
+        at = ConsistentSolve(solved, now | at.wrong if last else now, found.notes)
+        if whole_cameras:
+            break
+    return at
+
+
+def _boards_of(views: Sequence[LocatedView], solution: JointSolution) -> JointSolution:
+    """The solution with poses of exactly those boards that the views show."""
+    own = {
+        view.target: solution.root_from_camera[view.pair] @ view.camera_from_board for view in views
+    }
+    return replace(
+        solution,
+        root_from_board={k: solution.root_from_board.get(k, start) for k, start in own.items()},
+    )
