@@ -13,9 +13,9 @@ meaning and the reason for it. What cannot be changed from outside is a constant
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from bodyscan.files.model import Model, Problem
 from bodyscan.progress import THREADS
@@ -29,7 +29,21 @@ and the subject turns about it, so that a turn does not look like a shift."""
 
 
 class AlignmentSettings(Model):
-    """How range images are aligned where they overlap (`alignment.icp`)."""
+    """How range images are aligned (`alignment.icp`, `motion`)."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _accept_old_names(cls, values: Any) -> Any:
+        """Files of release 0.1 call some fields by other names."""
+        old = {
+            "least_reach_mm": "min_reach_mm",
+            "fewest": "min_matches",
+            "least_sway": "min_sway",
+            "most_sway": "max_sway",
+        }
+        if not isinstance(values, dict):
+            return values
+        return {old.get(name, name): value for name, value in values.items()}
 
     matching: Literal["projected", "open3d", "none"] = "projected"
     """`projected`: project points into the other camera's pixels, all pairs in one solve; `open3d`:
@@ -37,20 +51,20 @@ class AlignmentSettings(Model):
     it."""
 
     spacing_mm: Millimetres = 3.0
-    """mm between the points that take part: about 10,000 a pair; more cost time and gain nothing."""
+    """mm between the matched points: about 10,000 a pair; more cost time and gain nothing."""
 
     reach_mm: Millimetres = 12.0
-    """mm, farthest match in the first round, halved every round: twice what people are seen to move
+    """mm, largest distance of a match in the first round, halved every round: twice what people move
     between pairs."""
 
-    least_reach_mm: Millimetres = 3.0
-    """mm, farthest match in the last rounds: well beyond the noise, less than a finger."""
+    min_reach_mm: Millimetres = 3.0
+    """mm, largest distance of a match in the last rounds: well beyond the noise, less than a finger."""
 
     rounds: int = Field(default=5, ge=1)
-    """number of times matches are searched for; after five nothing moves by 0.01 mm."""
+    """rounds of matching; after five nothing moves by 0.01 mm."""
 
-    fewest: int = Field(default=30, ge=6)
-    """matches: two pairs with fewer do not count as overlapping."""
+    min_matches: int = Field(default=30, ge=6)
+    """matches: two pairs with fewer do not overlap."""
 
     sway_mm: float = Field(default=1.0, ge=0)
     """mm, standard deviation of a person's shift between pairs; 0 for a rigid object."""
@@ -59,17 +73,17 @@ class AlignmentSettings(Model):
     """degrees, standard deviation of a person's turn between pairs, about the body's centre (0.8 mm
     at head and feet)."""
 
-    least_sway: float = Field(default=0.3, ge=0)
-    """times sway_mm and sway_deg: the least sway assumed after a round, the noise of a statue."""
+    min_sway: float = Field(default=0.3, ge=0)
+    """times sway_mm and sway_deg: the smallest sway assumed after a round, the noise of a statue."""
 
-    most_sway: float = Field(default=4.0, gt=0)
-    """times sway_mm and sway_deg: the most sway assumed; beyond it a scan must be repeated."""
+    max_sway: float = Field(default=4.0, gt=0)
+    """times sway_mm and sway_deg: the largest sway assumed; beyond it a scan must be repeated."""
 
     limit_sigmas: float = Field(default=5.0, gt=0)
-    """standard deviations: a pair that would move farther does not fit and stays where it was."""
+    """standard deviations: a pair that would move farther keeps its calibrated pose."""
 
     correlated: float = Field(default=5.0, ge=1)
-    """number of neighbouring points that count as one, because their errors are shared."""
+    """number of neighbouring matches that count as one, because their errors are correlated."""
 
 
 class FusionSettings(Model):

@@ -1,9 +1,8 @@
-"""Align range images where they overlap, with the boards' solution and covariance as prior.
+"""Multiway point-to-plane ICP of range images, with the calibration's poses and covariance as prior.
 
-A multiway ICP: find matches between all pairs, then solve for small motions of all of them together
-with the prior, so that the ring closes and only what the boards leave open changes. Pairs that
-share hardly more than a rim are tied by that rim, with less weight. Pairs without overlap stay
-where the boards put them.
+Each round matches all pairs of images and solves for the poses of all of them jointly, so that the
+ring closes and only what the calibration leaves open changes. Images without overlap keep their
+calibrated poses.
 """
 
 from __future__ import annotations
@@ -17,15 +16,17 @@ from typing import TypeVar
 import numpy as np
 
 from bodyscan.alignment.matching import Matches
-from bodyscan.alignment.overlap_equations import OverlapEquations, motion_covariance, solve_motions
 from bodyscan.alignment.overlaps import (
     COARSE,
+    OverlapEquations,
     OverlapPoints,
-    each_overlap,
+    find_connected_groups,
+    map_overlaps,
     match_overlap,
-    tied_groups,
+    motion_covariance,
+    solve_motions,
 )
-from bodyscan.alignment.sway_prior import SwayPrior, bound_motions, centre_shifts
+from bodyscan.alignment.sway_prior import SwayPrior, centre_shifts, reject_large_motions
 from bodyscan.arrays import Array
 from bodyscan.geometry.robust import rms
 from bodyscan.geometry.transforms import RigidTransform
@@ -36,17 +37,14 @@ from bodyscan.settings import AlignmentSettings
 
 Result = TypeVar("Result")
 
-FINE_ROUNDS = 2  # the last rounds use all points
-UNKNOWN = 0, float("nan"), float("nan")
-
 
 @dataclass(frozen=True)
 class Overlap:
     """An overlap of two pairs.
 
     source, target: names of the pairs.
-    points: approximate number of points that they share.
-    rms_before_mm, rms_after_mm: RMS distance of those before and after alignment.
+    points: approximate number of matched points.
+    rms_before_mm, rms_after_mm: their RMS distance before and after alignment.
     expected_mm: RMS distance due to noise alone.
     """
 
@@ -63,19 +61,18 @@ class Alignment:
     """The result of an alignment.
 
     rig_from_camera: the aligned poses.
-    motion_mm: motion at the body's centre of each pair that overlaps tie to the largest group; how
-        far others moved is not observed.
+    motion_mm: displacement at the body's centre of each pair in the largest group connected by
+        overlaps; the displacement of others is not observed.
     refused: pairs that would have moved farther than the prior allows, with their motion in sigmas.
-    overlaps: all overlaps.
-    poses: covariance of the aligned poses, given the prior (boards, and a sway of the size found)
-        and the overlaps; None if a pair was refused, or Open3D aligned.
+    covariance: posterior covariance of the aligned poses; None if a pair was refused, or Open3D
+        aligned.
     """
 
     rig_from_camera: dict[str, RigidTransform]
     motion_mm: dict[str, float]
     refused: dict[str, float]
     overlaps: tuple[Overlap, ...]
-    poses: PoseCovariance | None = None
+    covariance: PoseCovariance | None = None
 
     @property
     def rms_before_mm(self) -> float:
@@ -87,7 +84,7 @@ class Alignment:
 
     @property
     def expected_mm(self) -> float:
-        """The value of `rms_after_mm` for noise alone."""
+        """Expected `rms_after_mm` from noise alone."""
         return _pool_rms([(o.points, o.expected_mm) for o in self.overlaps])
 
 
@@ -99,42 +96,49 @@ def align(
     *,
     workers: int = THREADS,
 ) -> Alignment:
-    """Find small motions of all range images that bring their overlaps together.
+    """Align range images by small rigid motions that minimize the distances in their overlaps.
 
-    Each round assumes the sway found by the last one, within the bounds of the settings.
+    rig_from_camera, prior: calibrated poses and their covariance, to which the subject's sway is
+        added. Each round assumes a sway of the size that the last one found, within the bounds of
+        the settings.
     """
     names = [image.pair for image in images]
     start = [rig_from_camera[name] for name in names]
-    sway = SwayPrior.of(settings)
+    sway = SwayPrior.from_settings(settings)
     with ThreadPoolExecutor(workers) as pool:
-        clouds = list(pool.map(lambda image: OverlapPoints.of(image, settings.spacing_mm), images))
-        coarse = [seen.some(COARSE) for seen in clouds]
+        clouds = list(
+            pool.map(lambda image: OverlapPoints.from_image(image, settings.spacing_mm), images)
+        )
+        coarse = [cloud.select(COARSE) for cloud in clouds]
         if settings.matching == "open3d":
             from bodyscan.alignment.open3d_registration import register  # Open3D loads for a second
 
-            inner = [seen.inner for seen in clouds]
-            motion, left = register(inner, start, names, prior, settings), None
+            inner = [cloud.inner for cloud in clouds]
+            motion, covariance = register(inner, start, names, prior, settings), None
         else:
-            motion, left = _register(pool, (coarse, clouds), start, names, prior, settings)
-        widest = sway.covariance(names, prior, sway.most)
-        motion, refused = bound_motions(names, motion, widest, settings.limit_sigmas)
+            motion, covariance = _register(pool, (coarse, clouds), start, names, prior, settings)
+        widest = sway.covariance(names, prior, sway.max_scale)
+        motion, refused = reject_large_motions(names, motion, widest, settings.limit_sigmas)
         moved = [t.retract(m) for t, m in zip(start, motion, strict=True)]
-        # Measure both with the same reach, so that they can be compared.
-        was, now = (
-            _each_overlap(_gap, pool, coarse, placings, settings.least_reach_mm, settings)
-            for placings in (start, moved)
+        # Both with the same reach, so that they can be compared.
+        before, after = (
+            _map_matches(_measure_distances, pool, coarse, poses, settings.min_reach_mm, settings)
+            for poses in (start, moved)
         )
     shift = np.linalg.norm(centre_shifts(motion), axis=1).tolist()
-    tied = _largest_group(now)
+    connected = _find_largest_group(after)
+    unknown = 0, np.nan, np.nan
     return Alignment(
         dict(zip(names, moved, strict=True)),
-        {name: shift[k] for k, name in enumerate(names) if k in tied},
+        {name: shift[k] for k, name in enumerate(names) if k in connected},
         refused,
         tuple(
-            Overlap(names[i], names[j], COARSE.step * count, was.get((i, j), UNKNOWN)[1], *apart)
-            for (i, j), (count, *apart) in now.items()
+            Overlap(
+                names[i], names[j], COARSE.step * count, before.get((i, j), unknown)[1], *rms_mm
+            )
+            for (i, j), (count, *rms_mm) in after.items()
         ),
-        None if left is None or refused else PoseCovariance(tuple(names), left),
+        None if covariance is None or refused else PoseCovariance(tuple(names), covariance),
     )
 
 
@@ -146,58 +150,57 @@ def _register(
     prior: PoseCovariance,
     settings: AlignmentSettings,
 ) -> tuple[Array, Array]:
-    """Motions (P, 6), rig frame, by rounds of new matches and one joint step of all pairs; and their
-    covariance (6P, 6P).
+    """Estimate the twists (P, 6), rig frame, of all pairs, and their covariance (6P, 6P).
 
-    clouds: coarse, and fine for the last rounds.
+    clouds: coarse, and fine ones for the last two rounds.
     """
-    motion, sway = np.zeros((len(start), 6)), SwayPrior.of(settings)
+    motion, sway = np.zeros((len(start), 6)), SwayPrior.from_settings(settings)
     reach, scale = settings.reach_mm, 1.0
-    equations = partial(OverlapEquations.of, correlated=settings.correlated)
+    linearize = partial(OverlapEquations.from_matches, correlated=settings.correlated)
     coarse, fine = clouds
-    for left in range(settings.rounds, 0, -1):
+    for remaining in range(settings.rounds, 0, -1):
         moved = [t.retract(m) for t, m in zip(start, motion, strict=True)]
-        taken = fine if left <= FINE_ROUNDS else coarse
-        overlaps = _each_overlap(equations, pool, taken, moved, reach, settings)
-        known = sway.covariance(names, prior, scale)
-        motion = solve_motions(overlaps, motion, known)
-        reach, scale = max(reach / 2.0, settings.least_reach_mm), sway.scale(motion)
-    return motion, motion_covariance(overlaps, known)
+        points = fine if remaining <= 2 else coarse
+        overlaps = _map_matches(linearize, pool, points, moved, reach, settings)
+        covariance = sway.covariance(names, prior, scale)
+        motion = solve_motions(overlaps, motion, covariance)
+        reach, scale = max(reach / 2.0, settings.min_reach_mm), sway.scale(motion)
+    return motion, motion_covariance(overlaps, covariance)
 
 
-def _each_overlap(
+def _map_matches(
     measure: Callable[[Matches], Result],
     pool: ThreadPoolExecutor,
     clouds: Sequence[OverlapPoints],
-    placings: Sequence[RigidTransform],
+    poses: Sequence[RigidTransform],
     reach_mm: float,
     settings: AlignmentSettings,
 ) -> dict[tuple[int, int], Result]:
-    """Measure the matches of every two pairs that have enough of them."""
+    """Call `measure` with the matches of each ordered pair of images that overlap."""
 
-    def of_two(i: int, j: int) -> Result | None:
+    def measure_two(i: int, j: int) -> Result | None:
         matches = match_overlap(
-            clouds[i], clouds[j], placings[i], placings[j], reach_mm, settings.fewest
+            clouds[i], clouds[j], poses[i], poses[j], reach_mm, settings.min_matches
         )
         return None if matches is None else measure(matches)
 
-    return each_overlap(pool, len(clouds), of_two)
+    return map_overlaps(pool, len(clouds), measure_two)
 
 
-def _largest_group(overlaps: Iterable[tuple[int, int]]) -> set[int]:
-    """The largest group of images tied by overlaps; images without any overlap form no group."""
-    ties = list(overlaps)
-    groups = tied_groups(sorted({image for both in ties for image in both}), ties)
+def _find_largest_group(overlaps: Iterable[tuple[int, int]]) -> set[int]:
+    """The largest connected group of images; images without any overlap form none."""
+    edges = list(overlaps)
+    groups = find_connected_groups(sorted({image for both in edges for image in both}), edges)
     return max(groups, key=len, default=set())
 
 
-def _gap(matches: Matches) -> tuple[int, float, float]:
-    """Number of matches, their RMS distance, and its expected value by their sigmas, mm."""
-    apart, sigma = matches.distances, matches.sigma_mm
-    return len(apart), rms(apart), rms(sigma)
+def _measure_distances(matches: Matches) -> tuple[int, float, float]:
+    """Number of matches, their RMS distance, and the RMS expected from their sigmas, mm."""
+    return len(matches.distances), rms(matches.distances), rms(matches.sigma_mm)
 
 
 def _pool_rms(parts: Sequence[tuple[int, float]]) -> float:
+    """RMS of several groups of (points, RMS), without those whose RMS is not known."""
     known = [(points, rms) for points, rms in parts if np.isfinite(rms)]
     total = sum(points for points, _ in known)
     if not total:

@@ -1,22 +1,27 @@
-"""Measure the overlaps of every two range images."""
+"""Overlaps of range images: their matches, normal equations, and the joint step of all poses."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import permutations
 from typing import TypeVar
 
+import networkx as nx
+import numpy as np
+
 from bodyscan.alignment.matching import (
-    RIM_PX,
-    SEAM_RIM_PX,
-    AlignmentPoints,
+    NARROW_MARGIN_PX,
     Matches,
+    SampledPoints,
     match_projected,
-    points_within_rims,
+    sample_points,
 )
 from bodyscan.arrays import Array, Mask
+from bodyscan.compiled import compiled
+from bodyscan.geometry.linear_gaussian import invert_scaled, solve_scaled
+from bodyscan.geometry.robust import robust_scale
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
 
@@ -24,29 +29,29 @@ Result = TypeVar("Result")
 Name = TypeVar("Name", int, str)
 
 COARSE = slice(None, None, 4)
-"""The points used in early rounds; all of them are used only in the last ones."""
+"""The points used in early rounds of alignment."""
 
 
 @dataclass(frozen=True, eq=False)
 class OverlapPoints:
-    """The points of one range image that take part.
+    """Sampled points of one range image.
 
-    inner: those of its inner part.
-    whole: the same points nearly up to its rims, for images with which it shares nothing more.
+    inner: away from its margins.
+    whole: the same points nearly up to the margins, for images that share nothing more.
     """
 
-    inner: AlignmentPoints
-    whole: AlignmentPoints
+    inner: SampledPoints
+    whole: SampledPoints
 
     @staticmethod
-    def of(image: RangeImage, spacing_mm: float) -> OverlapPoints:
-        return OverlapPoints(*points_within_rims(image, spacing_mm, RIM_PX, SEAM_RIM_PX))
+    def from_image(image: RangeImage, spacing_mm: float) -> OverlapPoints:
+        return OverlapPoints(*sample_points(image, spacing_mm, (4, NARROW_MARGIN_PX)))
 
-    def some(self, chosen: Mask | slice) -> OverlapPoints:
-        return OverlapPoints(self.inner.some(chosen), self.whole.some(chosen))
+    def select(self, chosen: Mask | slice) -> OverlapPoints:
+        return OverlapPoints(self.inner.select(chosen), self.whole.select(chosen))
 
-    def carried(self, points: Array, normals: Array) -> OverlapPoints:
-        """The same points at other places and with other normals, (N, 3) each."""
+    def with_geometry(self, points: Array, normals: Array) -> OverlapPoints:
+        """Replace points and normals, (N, 3) each."""
         inner, whole = (
             replace(part, points=points, normals=normals) for part in (self.inner, self.whole)
         )
@@ -59,43 +64,137 @@ def match_overlap(
     rig_from_source: RigidTransform,
     rig_from_target: RigidTransform,
     reach_mm: float,
-    fewest: int,
+    min_matches: int,
 ) -> Matches | None:
-    """Match the inner parts as `match_projected` does, or else everything up to the rims.
+    """Match the inner parts, or, if these have fewer than `min_matches`, everything up to the margins.
 
-    Rims are used if the inner parts share less than `fewest` spots, and get less weight; None if
-    that is too little too.
+    Matches in the margins have larger sigmas. None if those are too few as well.
     """
-    there = rig_from_source, rig_from_target, reach_mm
-    matches = match_projected(source.inner, target.inner, *there)
-    if len(matches.distances) < fewest:
-        matches = match_projected(source.whole, target.whole, *there).of_seam
-    return matches if len(matches.distances) >= fewest else None
+    poses = rig_from_source, rig_from_target, reach_mm
+    matches = match_projected(source.inner, target.inner, *poses)
+    if len(matches.distances) < min_matches:
+        matches = match_projected(source.whole, target.whole, *poses).with_margin_bias()
+    return matches if len(matches.distances) >= min_matches else None
 
 
-def each_overlap(
-    pool: ThreadPoolExecutor, count: int, of_two: Callable[[int, int], Result | None]
+def map_overlaps(
+    pool: ThreadPoolExecutor, count: int, measure: Callable[[int, int], Result | None]
 ) -> dict[tuple[int, int], Result]:
-    """Results for each of `count` images as source and each other as target, where there is one.
+    """Call `measure` for each of `count` images as source and each other as target; drop None.
 
-    Both directions are used, so that errors of one direction on curves cancel.
+    Both directions are used, so that errors of one direction on curved surfaces cancel.
     """
-    every_two = list(permutations(range(count), 2))
-    found = zip(every_two, pool.map(lambda both: of_two(*both), every_two), strict=True)
-    return {both: said for both, said in found if said is not None}
+    index_pairs = list(permutations(range(count), 2))
+    results = pool.map(lambda both: measure(*both), index_pairs)
+    return {
+        both: result
+        for both, result in zip(index_pairs, results, strict=True)
+        if result is not None
+    }
 
 
-def tied_groups(names: Iterable[Name], ties: Iterable[tuple[Name, Name]]) -> list[set[Name]]:
-    """Groups of names that ties join, directly or through others; the untied are alone.
+def find_connected_groups(
+    names: Iterable[Name], edges: Iterable[tuple[Name, Name]]
+) -> list[set[Name]]:
+    """Connected components of a graph, in the order of each component's first name."""
+    graph = nx.Graph()
+    graph.add_nodes_from(names)
+    graph.add_edges_from(edges)
+    return list(nx.connected_components(graph))
 
-    In the order of each group's first name.
+
+@dataclass(frozen=True, eq=False)
+class OverlapEquations:
+    """Normal equations of one overlap.
+
+    With d the distances of matches and J their Jacobian by the source's twist; the target's twist
+    has the opposite effect.
+
+    information: J^T W J, (6, 6).
+    gradient: J^T W d, (6,).
     """
-    group = {name: {name} for name in names}
-    for one, other in ties:
-        joined = group[one] | group[other]
-        group |= dict.fromkeys(joined, joined)
-    groups: list[set[Name]] = []
-    for own in group.values():
-        if own not in groups:
-            groups.append(own)
-    return groups
+
+    information: Array
+    gradient: Array
+
+    @staticmethod
+    def from_matches(matches: Matches, correlated: float) -> OverlapEquations:
+        """Sum over the matches, with Cauchy weights.
+
+        correlated: number of neighbouring matches that count as one.
+        """
+        information, gradient = np.zeros((6, 6)), np.zeros(6)
+        distances = matches.distances
+        surface = (matches.points, matches.normals, distances)
+        _accumulate(*surface, cauchy_weights(matches), information, gradient)
+        return OverlapEquations(information / correlated, gradient / correlated)
+
+
+def cauchy_weights(matches: Matches) -> Array:
+    """Weights (M,): 1 / (1 + (d / 2 sigma)^2) / sigma^2.
+
+    sigma^2 is the sum of a match's expected variance and the robust variance of all distances, at
+    least 0.01 mm: surfaces of two calibrations never agree better.
+    """
+    scale_mm = robust_scale(matches.distances, 0.01)
+    variance = matches.sigma_mm**2 + scale_mm * scale_mm
+    return 1.0 / (variance + 0.25 * matches.distances**2)
+
+
+def solve_motions(
+    overlaps: Mapping[tuple[int, int], OverlapEquations], motion: Array, covariance: Array
+) -> Array:
+    """Solve for the twists (P, 6) of all pairs in one Gauss-Newton step with a Gaussian prior.
+
+    overlaps: by source and target, linearized at `motion` (P, 6).
+    covariance: of the prior, whose mean is zero, (6P, 6P).
+    """
+    right = np.zeros(motion.size)
+    for (a, b), overlap in overlaps.items():
+        # Linearized distance: d + J (x_a - m_a) - J (x_b - m_b).
+        vector = overlap.information @ (motion[a] - motion[b]) - overlap.gradient
+        right[6 * a : 6 * a + 6] += vector
+        right[6 * b : 6 * b + 6] -= vector
+    return solve_scaled(_information(overlaps, covariance), right).reshape(-1, 6)
+
+
+def motion_covariance(
+    overlaps: Mapping[tuple[int, int], OverlapEquations], covariance: Array
+) -> Array:
+    """Posterior covariance (6P, 6P) of the twists that `solve_motions` finds."""
+    return invert_scaled(_information(overlaps, covariance))
+
+
+def _information(overlaps: Mapping[tuple[int, int], OverlapEquations], covariance: Array) -> Array:
+    """Information matrix (6P, 6P) of all twists: the prior's plus each overlap's."""
+    information = np.asarray(np.linalg.inv(covariance), np.float64)
+    for (a, b), overlap in overlaps.items():
+        i, j = slice(6 * a, 6 * a + 6), slice(6 * b, 6 * b + 6)
+        information[i, i] += overlap.information
+        information[j, j] += overlap.information
+        information[i, j] -= overlap.information
+        information[j, i] -= overlap.information
+    return information
+
+
+@compiled
+def _accumulate(
+    points: Array,
+    normals: Array,
+    distances: Array,
+    weights: Array,
+    information: Array,
+    gradient: Array,
+) -> None:
+    """Add M point-to-plane distances to the normal equations (6, 6), (6,)."""
+    jacobian = np.empty(6)
+    for n in range(len(distances)):
+        x, y, z = points[n, 0], points[n, 1], points[n, 2]
+        a, b, c = normals[n, 0], normals[n, 1], normals[n, 2]
+        jacobian[0], jacobian[1], jacobian[2] = y * c - z * b, z * a - x * c, x * b - y * a
+        jacobian[3], jacobian[4], jacobian[5] = a, b, c
+        for i in range(6):
+            weighted = weights[n] * jacobian[i]
+            gradient[i] += weighted * distances[n]
+            for j in range(6):
+                information[i, j] += weighted * jacobian[j]

@@ -1,7 +1,7 @@
-"""A subject's sway: how far people move between the pairs' shots, assumed, found and bounded.
+"""Prior of a subject's sway, and the displacement of the body's centre by a pair's twist.
 
-Alignment removes it (see `icp`): each pair's pose may move about the body's centre as far as this
-prior allows, in addition to what the boards left open.
+People move between the moments at which pairs capture them. Alignment (`icp`) therefore lets each
+pair move about the body's centre by a sway, in addition to what the calibration left open.
 """
 
 from __future__ import annotations
@@ -19,71 +19,83 @@ from bodyscan.geometry.uncertainty import PoseCovariance, position_sigma
 from bodyscan.settings import BODY_CENTRE_MM, AlignmentSettings
 
 BODY_CENTRE = np.array(BODY_CENTRE_MM)
-SWAY_ROOM = 1.5  # assumed standard deviations over those found
+LEVER_MM = 400.0
+"""Lever arm: at this distance from a joint or the body's centre, a unit of rotation displaces a
+point as far as a unit of translation."""
+
+
+def stance_correlation(seconds: Array) -> Array:
+    """Correlation of a standing person's posture with itself after so many seconds.
+
+    Matern's of order 5/2, so that its velocity is smooth too, with a length of 0.8 s: people sway
+    at 0.1 to 1 Hz.
+    """
+    r = np.sqrt(5.0) * np.abs(seconds) / 0.8
+    return np.asarray((1.0 + r + r**2 / 3.0) * np.exp(-r))
 
 
 @dataclass(frozen=True)
 class SwayPrior:
-    """Standard deviations of a subject's motion between pairs: a shift, and a rotation about the
-    body's centre; 0 for a rigid object. The sway found scales both, from `least` to `most`.
+    """Standard deviations of a subject's motion between pairs: a translation, and a rotation about the
+    body's centre; 0 for a rigid object. Both are scaled by a factor from `min_scale` to `max_scale`.
     """
 
     shift_mm: float
     rotation_deg: float
-    least: float
-    most: float
+    min_scale: float
+    max_scale: float
 
     @staticmethod
-    def of(settings: AlignmentSettings) -> SwayPrior:
-        return SwayPrior(
-            settings.sway_mm, settings.sway_deg, settings.least_sway, settings.most_sway
-        )
+    def from_settings(settings: AlignmentSettings) -> SwayPrior:
+        return SwayPrior(settings.sway_mm, settings.sway_deg, settings.min_sway, settings.max_sway)
 
     def scale(self, motion: Array) -> float:
-        """Size of motions (P, 6) in multiples of `shift_mm`, with some room.
+        """Estimate the prior's scale from twists (P, 6).
 
-        Too tight a prior would leave part of the sway in; too wide a one would let noise in.
+        1.5 times the RMS displacement: too tight a prior leaves part of the sway in, too wide a one
+        lets noise in.
         """
         if not self.shift_mm:
             return 1.0
-        found = rms(centre_shifts(motion)) / self.shift_mm
-        return float(np.clip(SWAY_ROOM * found, self.least, self.most))
+        ratio = rms(centre_shifts(motion)) / self.shift_mm
+        return float(np.clip(1.5 * ratio, self.min_scale, self.max_scale))
 
     def covariance(self, names: Sequence[str], boards: PoseCovariance, scale: float = 1.0) -> Array:
-        """The calibration's covariance plus `scale` times each pair's usual sway, (6P, 6P)."""
-        return boards.select(names) + np.kron(np.eye(len(names)), self.of_one(scale))
+        """The calibration's covariance plus each pair's sway, `scale` times the usual, (6P, 6P)."""
+        return boards.select(names) + np.kron(np.eye(len(names)), self.pair_covariance(scale))
 
-    def of_one(self, scale: float = 1.0) -> Array:
-        """Covariance of one pair's sway, rig frame, (6, 6)."""
+    def pair_covariance(self, scale: float = 1.0) -> Array:
+        """Covariance of the twist by which one pair's subject swayed, rig frame, (6, 6)."""
         rotation, translation = scale * np.radians(self.rotation_deg), scale * self.shift_mm
-        own = np.diag([max(rotation, 1e-7) ** 2] * 3 + [max(translation, 1e-4) ** 2] * 3)
+        centred = np.diag([max(rotation, 1e-7) ** 2] * 3 + [max(translation, 1e-4) ** 2] * 3)
         carry = adjoint(RigidTransform.from_translation(BODY_CENTRE))
-        return np.asarray(carry @ own @ carry.T)
+        return np.asarray(carry @ centred @ carry.T)
 
-    def loosen(self, boards: PoseCovariance, untied: Collection[str]) -> PoseCovariance:
-        """The calibration's covariance plus the sway of the pairs that no overlap ties."""
-        return boards.add_independent_motions(untied, self.of_one())
+    def loosen(self, boards: PoseCovariance, names: Collection[str]) -> PoseCovariance:
+        """Add the usual sway to the covariance of these pairs."""
+        return boards.add_independent_motions(names, self.pair_covariance())
 
 
 def centre_shifts(motion: Array) -> Array:
-    """How far motions (P, 6) carry the body's centre, (P, 3) mm."""
+    """Displacements (P, 3) mm of the body's centre by twists (P, 6)."""
     return motion[:, 3:] + np.cross(motion[:, :3], BODY_CENTRE)
 
 
 def centre_sigmas(boards: PoseCovariance) -> dict[str, float]:
-    """How far each pair's pose error may put the body's centre off, mm."""
+    """Standard deviation, mm, of the body's centre due to each pair's pose error."""
     return {
         name: float(np.linalg.norm(position_sigma(boards, name, BODY_CENTRE)))
         for name in boards.names
     }
 
 
-def bound_motions(
+def reject_large_motions(
     names: Sequence[str], motion: Array, covariance: Array, limit_sigmas: float
 ) -> tuple[Array, dict[str, float]]:
-    """Motions (P, 6), set to 0 for pairs that moved more than `limit_sigmas` of their own prior.
+    """Set twists (P, 6) beyond `limit_sigmas` of their prior (6P, 6P) to zero.
 
-    Sigmas are over six degrees of freedom; also returns those of the refused pairs.
+    Sigmas are Mahalanobis distances over the root of six degrees of freedom. Also returns those of
+    the rejected pairs.
     """
     kept, refused = motion.copy(), {}
     for k, name in enumerate(names):
@@ -95,13 +107,15 @@ def bound_motions(
     return kept, refused
 
 
-def better_known(
+def select_tighter(
     one: PoseCovariance, other: PoseCovariance, names: Collection[str]
 ) -> PoseCovariance:
-    """Of two covariances the one by which these pairs put the body's centre off by less; the first
-    where there are none."""
+    """Select the covariance with the smaller RMS sigma of the body's centre over these pairs.
+
+    The first if there are no names.
+    """
     if not names:
         return one
     sizes = (centre_sigmas(poses) for poses in (one, other))
-    ours, theirs = (rms(np.array([sigmas[name] for name in names])) for sigmas in sizes)
-    return other if theirs < ours else one
+    first, second = (rms(np.array([sigmas[name] for name in names])) for sigmas in sizes)
+    return other if second < first else one

@@ -81,7 +81,7 @@ def apply_mask(image: RangeImage, kept: Mask) -> RangeImage:
 def cut_to_volume(image: RangeImage, rig_from_camera: RigidTransform, volume: Volume) -> RangeImage:
     """Crop to what lies inside the scan volume; cleaning leaves nothing else."""
     box = find_crop(find_inside(image, rig_from_camera, volume)) or (slice(0, 1), slice(0, 1))
-    return image.cut(pad_crop(box, 8))  # farther than any later window reaches beyond a rim
+    return image.crop(pad_crop(box, 8))  # farther than any later window reaches beyond a rim
 
 
 def find_inside(image: RangeImage, rig_from_camera: RigidTransform, volume: Volume) -> Mask:

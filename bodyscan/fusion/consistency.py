@@ -134,7 +134,7 @@ def compare_with_surface(
         surface.corner,
         projection_table(surface.camera),
         (camera_from_rig.rotation, camera_from_rig.translation),
-        surface.bent,
+        surface.warped,
         (agreement_mm, double_mm),
         (index, at, shift, against_index, against_at),
     )

@@ -8,12 +8,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from bodyscan.alignment.following import Followed
 from bodyscan.arrays import Array, Bytes, Floats, Mask
 from bodyscan.compiled import compiled
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.mesh.body import BodyCloud
+from bodyscan.motion.estimation import EstimatedMotion
 from bodyscan.progress import map_threads, split_range
 
 
@@ -43,13 +43,15 @@ def add_pose_variance(
     return replace(cloud, sigma_mm=np.hypot(cloud.sigma_mm, sigma_mm).astype(np.float32))
 
 
-def add_motion_variance(cloud: BodyCloud, with_poses: BodyCloud, followed: Followed) -> BodyCloud:
+def add_motion_variance(
+    cloud: BodyCloud, with_poses: BodyCloud, followed: EstimatedMotion
+) -> BodyCloud:
     """Add the variance of the person's motion to a cloud's sigmas.
 
     with_poses: the cloud from `add_pose_variance`. Following leaves out motions of the body as a
         whole, which its sigmas include: the larger of both counts.
     """
-    cell = followed.cells.find_many(cloud.points, cloud.normals.astype(np.float64))
+    cell = followed.cells.find_by_groups(cloud.points, cloud.normals.astype(np.float64))
     sigma_mm = np.hypot(cloud.sigma_mm, followed.sigma_mm[cell])
     return replace(cloud, sigma_mm=np.maximum(sigma_mm, with_poses.sigma_mm).astype(np.float32))
 

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from bodyscan.alignment.part_names import NECK
 from bodyscan.arrays import Array, Bytes, Crop, Floats, Indices, Mask, crop_bounds, find_crop
 from bodyscan.compiled import compiled
 from bodyscan.fusion.brightness import MIN_GREY
@@ -23,6 +22,7 @@ from bodyscan.fusion.smoothing import estimate_pixel_size, inverse_depths, windo
 from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import DARK_CLOTH, HAIR, SKIN, UNSURE, BodyCloud
+from bodyscan.motion.body_parts import NECK
 from bodyscan.progress import map_threads
 from bodyscan.reconstruction.range_image import RangeImage
 

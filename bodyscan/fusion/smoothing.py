@@ -37,7 +37,7 @@ class SmoothSurface:
     rim: (n,) float32, rises from near 0 at the rim to 1 well inside.
     weight: (n,) float32, rim/sigma^2.
     colours: (n,) uint8.
-    bent: whether points were moved off the rays of their pixels.
+    warped: whether points were moved off the rays of their pixels.
     """
 
     pair: str
@@ -51,7 +51,7 @@ class SmoothSurface:
     rim: Floats
     weight: Floats
     colours: Bytes
-    bent: bool = False
+    warped: bool = False
 
 
 def smooth(
@@ -69,7 +69,7 @@ def smooth(
     inverse, noise = inverse_depths(image.points, image.sigma_mm, common, crop_bounds(box))
     pixel_mm = estimate_pixel_size(inverse, image.camera)
     reach = window_reach(pixel_mm, window_mm)
-    fit, fitted = fit_quadratics(inverse, noise, reach, pixel_mm, image.alike_px)
+    fit, fitted = fit_quadratics(inverse, noise, reach, pixel_mm, image.correlation_px)
     return _build_surface(image, common, rig_from_camera, box, fit, fitted, reach)
 
 
@@ -123,7 +123,7 @@ def _build_surface(
         rim,
         rim / (sigma * sigma),
         image.colours[box][there],
-        image.bent,
+        image.warped,
     )
 
 

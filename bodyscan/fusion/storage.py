@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from bodyscan.alignment.body_parts import PersonMotion
 from bodyscan.alignment.icp import Alignment
 from bodyscan.errors import FailedWork, ResultError, ScanFailed
 from bodyscan.files.atomic import write_json
@@ -31,6 +30,7 @@ from bodyscan.fusion.scan_facts import (
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.mesh.ply import read_ply_cloud, read_ply_mesh, write_ply
+from bodyscan.motion.person_motion import PersonMotion
 from bodyscan.progress import map_threads
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.registration.rig_calibration import FLOOR_AXES

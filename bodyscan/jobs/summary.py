@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from bodyscan.alignment.pair_drift import PairDrift, mean_drift
+from bodyscan.alignment.displaced_poles import PairDrift, estimate_drift
 from bodyscan.arrays import Array
 from bodyscan.files.atomic import write_json, write_text
 from bodyscan.files.hashing import file_hash
@@ -85,7 +85,7 @@ def drifted(jobs: Sequence[Job]) -> list[PairDrift]:
     for job in jobs:
         for pair, shift in _motions(job).items():
             shifts.setdefault((job.calibration, pair), []).append(shift)
-    found = [mean_drift(pair, np.array(own)) for (_, pair), own in shifts.items()]
+    found = [estimate_drift(pair, np.array(own)) for (_, pair), own in shifts.items()]
     return sorted((one for one in found if one.moved), key=lambda one: -one.shift_mm)
 
 

@@ -1,4 +1,4 @@
-"""The range image: what one pair saw of a subject, with a sigma for every point."""
+"""The range image: what one pair measured of a subject, with a standard deviation per point."""
 
 from __future__ import annotations
 
@@ -8,31 +8,31 @@ import numpy as np
 
 from bodyscan.arrays import Bytes, Crop, Floats, Mask
 from bodyscan.geometry.camera import Camera
-from bodyscan.reconstruction.two_ways import Agreement
+from bodyscan.reconstruction.crossing_stripes import Agreement
 
 
 @dataclass(frozen=True, eq=False)
 class RangeImage:
-    """What one pair saw of a subject, on the camera's pixel grid, camera frame.
+    """What one pair measured of a subject, on the camera's pixel grid, camera frame.
 
-    (height, width) is the camera's image, (h, w) the part of it that is kept: all, unless `cut`.
+    (height, width) is the camera's image, (h, w) the part of it that is kept: all, unless cropped.
 
     points: (h, w, 3) float32, mm.
-    normals: (h, w, 3) float32, unit, towards the camera; NaN at the rim of a surface.
+    normals: (h, w, 3) float32, unit, towards the camera; NaN at the margin of a surface.
     sigma_mm: (h, w) float32, standard deviation of the point along its viewing ray; NaN where
         nothing was measured, whatever the other arrays hold there.
     colours: (h, w) uint8, grey level of the lit image.
-    beyond: (h, w) bool, where the camera saw something behind the scan volume; None if everything
-        seen has a point.
-    agreement: of stripes of two directions, if such were projected.
+    beyond: (h, w) bool, where the visible surface is behind the scan volume; None if every measured
+        pixel has a point.
+    agreement: of stripes of two directions, if both were projected.
     time_ms: the moment for which the depths hold, ms since the scan began; None if not known.
     common_mm: (h, w) float32, the part of sigma_mm that neighbours share because it comes from the
         calibration: it does not shrink when they are averaged. None if there is none.
-    bent: whether points were carried to another moment, off the rays of their pixels.
+    warped: whether points were displaced to another moment, off the rays of their pixels.
     corner: row and column of the camera's image at which the kept part begins.
-    whole_depth, whole_colours: `open_depth` and `lit` from before a cut.
-    alike_px: distance along rows and columns within which pixels share noise, because their depths
-        come from the same stripe boundaries; 0 if each has its own.
+    whole_depth, whole_colours: `open_depth` and `lit` from before cropping.
+    correlation_px: distance along rows and columns within which noise is correlated, because depths
+        come from the same stripe boundaries; 0 if it is independent.
     """
 
     pair: str
@@ -45,11 +45,11 @@ class RangeImage:
     agreement: Agreement | None = None
     time_ms: float | None = None
     common_mm: Floats | None = None
-    bent: bool = False
+    warped: bool = False
     corner: tuple[int, int] = (0, 0)
     whole_depth: Floats | None = None
     whole_colours: Bytes | None = None
-    alike_px: tuple[float, float] = (0.0, 0.0)
+    correlation_px: tuple[float, float] = (0.0, 0.0)
 
     @property
     def valid(self) -> Mask:
@@ -58,7 +58,7 @@ class RangeImage:
 
     @property
     def open_depth(self) -> Floats:
-        """(height, width): depth z seen, mm; inf behind the scan volume, 0 if unknown."""
+        """(height, width): visible depth z, mm; inf behind the scan volume, 0 if unknown."""
         if self.whole_depth is not None:
             return self.whole_depth
         depth = np.where(self.valid, self.points[..., 2], np.float32(0.0))
@@ -75,7 +75,7 @@ class RangeImage:
         """(height, width): the lit image."""
         return self.colours if self.whole_colours is None else self.whole_colours
 
-    def every(self, step: int, first: int = 0) -> Crop:
+    def subsample(self, step: int, first: int = 0) -> Crop:
         """Every n-th row and column of the kept part, counted in the camera's image.
 
         These are the same pixels whatever part is kept.
@@ -83,8 +83,8 @@ class RangeImage:
         top, left = self.corner
         return slice((first - top) % step, None, step), slice((first - left) % step, None, step)
 
-    def cut(self, box: Crop) -> RangeImage:
-        """Keep points in a box of the kept part only: a third of the memory when that is a body.
+    def crop(self, box: Crop) -> RangeImage:
+        """Crop to a box of the kept part: a third of the memory when that is a body.
 
         `open_depth` and `lit` stay whole.
         """

@@ -1,4 +1,4 @@
-"""Stripe map to range image (2.3): a pixel's ray meets the light sheet of its stripe coordinate."""
+"""Triangulate a stripe map (2.3): intersect each pixel's ray with the light sheet of its stripe."""
 
 from __future__ import annotations
 
@@ -17,20 +17,17 @@ from bodyscan.geometry.light_sheets import (
     triangulate_image,
 )
 from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
+from bodyscan.reconstruction.crossing_stripes import Agreement, combine_directions
 from bodyscan.reconstruction.range_image import RangeImage
-from bodyscan.reconstruction.two_ways import Agreement, combine
 from bodyscan.stripes.stripe_map import StripeMap
 
 NORMAL_WINDOW_PX = 5
-REACH = NORMAL_WINDOW_PX // 2
-MANY, FEW_MEET = 1000, 0.01
-"""Pixels whose stripes of both directions have a sheet, and the share of their rays that must meet
-both: with a right calibration all of them do, except for wrong codes."""
-ZERO, ONE = np.float32(0.0), np.float32(1.0)  # one float64 would make it all float64
+REACH = 2
+ZERO, ONE = np.float32(0.0), np.float32(1.0)
 
 
 def reconstruct_range_image(pair: PairCalibration, stripes: StripeMap) -> RangeImage:
-    """Points, normals and sigmas on the camera's pixel grid, camera frame, mm.
+    """Triangulate points, with normals and sigmas, on the camera's pixel grid, camera frame, mm.
 
     Stripes of both directions are used if they were projected and calibrated. Raises BadInput if
     the pair has no projector, the image size differs, or the directions contradict each other as
@@ -47,49 +44,46 @@ def reconstruct_range_image(pair: PairCalibration, stripes: StripeMap) -> RangeI
             where=f"pair {pair.name}",
             remedy="scan with the camera settings of the calibration, or calibrate again",
         )
-    points, sigma_mm, common_mm = _triangulated(pair, pair.sheets, stripes.s, stripes.sigma)
-    agreement, alike_px = None, stripes.correlation_px
+    points, sigma_mm, common_mm = _triangulate(pair, pair.sheets, stripes.s, stripes.sigma)
+    agreement, correlation_px = None, stripes.correlation_px
     if pair.crossing is not None and stripes.crossing is not None:
-        across = stripes.crossing
-        *others, common_too = _triangulated(pair, pair.crossing, across.s, across.sigma)
+        crossing = stripes.crossing
+        *others, crossing_common = _triangulate(pair, pair.crossing, crossing.s, crossing.sigma)
         # Crossing stripes are decoded everywhere, not only in the scan volume.
         alone = np.full(sigma_mm.shape, stripes.beyond is None)
-        apart, counted = _apart(pair, stripes, (points, sigma_mm), (others[0], others[1]))
-        share = common_mm / sigma_mm, common_too / others[1]
-        points, sigma_mm, agreement = combine(points, sigma_mm, *others, alone=alone)
-        # Each direction's calibration has a share of its own sigma; the merged point gets the
-        # larger one.
-        common_mm = sigma_mm * np.fmax(*share)
+        offset, count = _measure_offset(pair, stripes, (points, sigma_mm), (others[0], others[1]))
+        shares = common_mm / sigma_mm, crossing_common / others[1]
+        points, sigma_mm, agreement = combine_directions(points, sigma_mm, *others, alone=alone)
+        # The merged point gets the larger share of the two calibrations.
+        common_mm = sigma_mm * np.fmax(*shares)
         if agreement is not None:
-            # Of two directions' noise, each is alike along another way: their mean hardly is.
-            alike_px = (0.0, 0.0)
-            agreement = replace(agreement, apart_stripes=apart, stripes=counted)
+            # Noise is correlated along another direction in each: in their mean it hardly is.
+            correlation_px = (0.0, 0.0)
+            agreement = replace(agreement, offset_stripes=offset, stripes=count)
         _require_fit(pair, stripes, agreement)
-    normals = grid_normals(points, np.isfinite(sigma_mm))
-    # A copy: the lit image is part of a stack, which would be kept alive with it.
-    images = (stripes.lit.copy(), stripes.beyond)
     return RangeImage(
         pair.name,
         camera,
         points,
-        normals,
+        grid_normals(points, np.isfinite(sigma_mm)),
         sigma_mm,
-        *images,
+        stripes.lit.copy(),  # part of a stack of images, which would be kept alive with it
+        stripes.beyond,
         agreement,
         common_mm=common_mm,
-        alike_px=alike_px,
+        correlation_px=correlation_px,
     )
 
 
-def _apart(
+def _measure_offset(
     pair: PairCalibration,
     stripes: StripeMap,
     one: tuple[Floats, Floats],
     other: tuple[Floats, Floats],
 ) -> tuple[float, int]:
-    """Distance of the direction with less accurate depth from the better one's points.
+    """Robust sigma, in stripes, of the less depth-sensitive direction relative to the other's points.
 
-    In its stripes, as a robust sigma; also returns the number of its stripes.
+    one, other: points and sigmas of both directions. Also returns that direction's stripe count.
     """
     assert pair.sheets is not None
     assert pair.crossing is not None
@@ -104,60 +98,65 @@ def _apart(
 
 
 def _require_fit(pair: PairCalibration, stripes: StripeMap, agreement: Agreement | None) -> None:
-    """Raise BadInput if no right calibration leaves both directions so far apart."""
+    """Raise BadInput if the directions contradict each other as no right calibration lets them."""
     assert stripes.crossing is not None
     if agreement is not None and agreement.impossible:
-        why = f"both directions are apart by {agreement.words}"
+        why = f"the directions differ by {agreement.description}"
     else:
         decoded = np.isfinite(stripes.s) & np.isfinite(stripes.crossing.s)
         measured = agreement.pixels if agreement else 0
-        if measured >= FEW_MEET * np.count_nonzero(decoded):
+        # With a right calibration, nearly all rays meet both sheets; wrong codes do not.
+        if measured >= 0.01 * np.count_nonzero(decoded):
             return
-        seen, meet = _meeting(pair, stripes, decoded)
-        if seen < MANY or meet >= FEW_MEET * seen:
+        with_sheets, met = _count_intersections(pair, stripes, decoded)
+        if with_sheets < 1000 or met >= 0.01 * with_sheets:
             return
-        why = f"{seen} pixels saw stripes of both directions, and their sheets meet at {meet}"
+        why = (
+            f"of {with_sheets} pixels with stripes of both directions, {met} meet both light sheets"
+        )
     raise BadInput(
         f"its calibration does not fit these stripes: {why}",
         where=f"pair {pair.name}",
-        remedy="are R and T the other way round (`inverse`), is the sign of `shift` or the number of "
-        "stripes another?"
+        remedy="check whether R and T are inverted (`inverse`), the sign of `shift`, and the number "
+        "of stripes"
         if pair.quality.imported
         else "calibrate again: camera or projector were moved, or `stripes` was changed",
     )
 
 
-def _meeting(pair: PairCalibration, stripes: StripeMap, decoded: Mask) -> tuple[int, int]:
-    """Number of the pixels (H, W) whose stripes both have a sheet, and of those whose ray meets both.
+def _count_intersections(
+    pair: PairCalibration, stripes: StripeMap, decoded: Mask
+) -> tuple[int, int]:
+    """Count the decoded pixels (H, W) with a sheet in both directions, and those that meet both.
 
-    An imported calibration has a sheet for every stripe. Our own has none where no board showed the
+    An imported calibration has a sheet for every stripe. Ours has none where no board showed the
     stripe; far from the boards it has one, though the depth there is only a guess.
     """
     assert pair.sheets is not None
     assert pair.crossing is not None
     assert stripes.crossing is not None
     rays = pair.camera.rays(np.argwhere(decoded)[:, ::-1].astype(float))
-    have, meet = np.isfinite(rays[:, 0]), np.ones(len(rays), bool)
-    for sheets, own in ((pair.sheets, stripes), (pair.crossing, stripes.crossing)):
-        s = own.s[decoded].astype(np.float64)
-        have &= np.isfinite(sheets.tangent_planes(s)[:, 3])
+    exist, meet = np.isfinite(rays[:, 0]), np.ones(len(rays), bool)
+    for sheets, direction in ((pair.sheets, stripes), (pair.crossing, stripes.crossing)):
+        s = direction.s[decoded].astype(np.float64)
+        exist &= np.isfinite(sheets.tangent_planes(s)[:, 3])
         meet &= np.isfinite(sheets.depth(rays, s))
-    return int(np.count_nonzero(have)), int(np.count_nonzero(have & meet))
+    return int(np.count_nonzero(exist)), int(np.count_nonzero(exist & meet))
 
 
-def _triangulated(
+def _triangulate(
     pair: PairCalibration, sheets: LightSheets, s: Floats, sigma: Floats
 ) -> tuple[Floats, Floats, Floats]:
     """`triangulate_image` with the uncertainty of the pair's rays.
 
-    An error of a ray in pixels acts as an error of s, by the stripes per pixel there, alike for its
-    neighbours.
+    An error of a ray in pixels acts as an error of s, by the stripes per pixel there, and equally on
+    neighbouring pixels.
     """
-    camera, of_rays = pair.camera, None
+    camera, ray_sigma = pair.camera, None
     if pair.rays is not None:
-        finest = stripes_per_pixel(sheets, camera, s)
-        of_rays = np.float32(finest) * pair.rays.image(camera.width, camera.height)
-    return triangulate_image(sheets, camera, s, sigma, of_rays)
+        scale = np.float32(stripes_per_pixel(sheets, camera, s))
+        ray_sigma = scale * pair.rays.image(camera.width, camera.height)
+    return triangulate_image(sheets, camera, s, sigma, ray_sigma)
 
 
 def grid_normals(points: Floats, measured: Mask | None = None) -> Floats:

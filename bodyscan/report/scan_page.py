@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from bodyscan.alignment.body_parts import PartMotion, PersonMotion
 from bodyscan.evaluation.comparison import Comparison, compare_surfaces
 from bodyscan.fusion.scan_facts import read_facts, stored_verdict
 from bodyscan.fusion.storage import StoredScan, load_scan
@@ -19,6 +18,7 @@ from bodyscan.fusion.verdict.motion import MAX_MOTION_MM, MAX_RESIDUAL_MM
 from bodyscan.fusion.verdict.overlaps import MAX_DISAGREEMENT_MM
 from bodyscan.mesh.body import compute_cover_shares, find_filled_patches
 from bodyscan.mesh.topology import compute_topology
+from bodyscan.motion.person_motion import PartMotion, PersonMotion
 from bodyscan.registration.rig_calibration import FLOOR_AXES
 from bodyscan.report import charts
 from bodyscan.report.body_model import layers, light_mesh, shape_of
@@ -237,7 +237,7 @@ def _person(person: Mapping[str, Any]) -> Section:
         when = f"{told.moment_ms / 1000.0:.2f} s after the scan began"
     what = told.summary or "moved while being scanned"
     intro = f"The person {what}. Cloud and mesh show the body as of {when}."
-    return Section("The person", [Table(columns, rows), Lines(told.beside_parts)], intro)
+    return Section("The person", [Table(columns, rows), Lines(told.breath_lines)], intro)
 
 
 def _pictures(scan: StoredScan) -> Section:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bodyscan.alignment.pair_drift import FEWEST_SCANS
+from bodyscan.alignment.displaced_poles import MIN_SCANS
 from bodyscan.captures.folder import Captures, join_captures, open_check
 from bodyscan.errors import BadInput, FailedWork
 from bodyscan.progress import Progress, silent
@@ -141,7 +141,7 @@ def describe_board_check(calibration: RigCalibration, check: BoardCheck) -> Find
 
 def describe_scan_check(check: ScanCheck) -> Findings:
     """Put the check by scans into words."""
-    step = check.search.step
+    step = check.search.found
     moved = [drift for drift in (*check.poles, *check.pairs) if drift.moved]
     count = len(check.before_mm)
     scans = "1 scan" if count == 1 else f"{count} scans"
@@ -163,7 +163,7 @@ def describe_scan_check(check: ScanCheck) -> Findings:
     else:
         known = np.isfinite(check.detectable_mm)
         less = f" by less than {check.detectable_mm:.1f} mm" if known else ""
-        more = f"{FEWEST_SCANS} scans or more" if count < FEWEST_SCANS else "more scans"
+        more = f"{MIN_SCANS} scans or more" if count < MIN_SCANS else "more scans"
         verdict = (
             f"undecided: in {scans}, a pair that moved{less} cannot be distinguished from a person's "
             f"sway; give {more}, or a shot of the board (with `kind: calibration` in its captures.yaml)"
@@ -171,8 +171,8 @@ def describe_scan_check(check: ScanCheck) -> Findings:
     lines = [verdict]
     if step is not None:
         lines.append(
-            f"{step.name} is displaced by {step.shift_mm:.1f} mm and rotated by {step.turn_deg:.2f} "
-            "degrees"
+            f"{step.name} is displaced by {step.shift_mm:.1f} mm and rotated by "
+            f"{step.rotation_deg:.2f} degrees"
         )
     for drift in moved:
         if step is None or drift.pair not in step.name:

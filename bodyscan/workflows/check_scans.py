@@ -8,9 +8,15 @@ from dataclasses import dataclass
 import networkx as nx
 import numpy as np
 
+from bodyscan.alignment.displaced_poles import (
+    MIN_DRIFT_MM,
+    DisplacementSearch,
+    PairDrift,
+    estimate_drift,
+    find_displaced_pole,
+    motions_between,
+)
 from bodyscan.alignment.icp import Alignment, align
-from bodyscan.alignment.pair_drift import LEAST_MM, PairDrift, mean_drift
-from bodyscan.alignment.pole_steps import StepSearch, find_steps, motions_between
 from bodyscan.alignment.sway_prior import BODY_CENTRE
 from bodyscan.captures.folder import Captures
 from bodyscan.fusion.cleaning import clean, require_subject
@@ -38,14 +44,14 @@ class ScanCheck:
     after_mm: tuple[float, ...]
     pairs: tuple[PairDrift, ...]
     poles: tuple[PairDrift, ...]
-    search: StepSearch
+    search: DisplacementSearch
     groups: tuple[tuple[str, ...], ...] = ()
 
     @property
     def detectable_mm(self) -> float:
         """The largest move of a pair or pole, mm, that could pass for a person's motion."""
         by_mean = max(drift.limit_mm for drift in (*self.pairs, *self.poles))
-        return min(by_mean, self.search.least_mm)
+        return min(by_mean, self.search.detectable_mm)
 
     @property
     def decided(self) -> bool:
@@ -58,13 +64,13 @@ class ScanCheck:
     @property
     def quiet(self) -> bool:
         """Whether there is nothing to explain, neither sway nor a move."""
-        still = all(drift.shift_mm < LEAST_MM for drift in self.pairs)
+        still = all(drift.shift_mm < MIN_DRIFT_MM for drift in self.pairs)
         return still and max(self.before_mm) < 0.5 and not self.groups
 
     @property
     def valid(self) -> bool:
         drifted = any(drift.moved for drift in (*self.pairs, *self.poles))
-        return not drifted and self.search.step is None
+        return not drifted and self.search.found is None
 
 
 def check_scans(
@@ -105,12 +111,12 @@ def judge_scans(
         ).reshape(-1, 3)
         for name, at in rig_from_camera.items()
     }
-    pairs = [mean_drift(name, each) for name, each in sorted(shifts.items()) if len(each)]
+    pairs = [estimate_drift(name, each) for name, each in sorted(shifts.items()) if len(each)]
     whole_poles = []
     for pole in sorted(set(poles.values())):
         of_pole = [shifts[n] for n in sorted(shifts) if poles.get(n) == pole and len(shifts[n])]
         if len(of_pole) > 1 and len({len(one) for one in of_pole}) == 1:
-            whole_poles.append(mean_drift(f"pole {pole}", np.mean(of_pole, axis=0)))
+            whole_poles.append(estimate_drift(f"pole {pole}", np.mean(of_pole, axis=0)))
     if moments_ms is None:
         moments_ms = [dict.fromkeys(found.rig_from_camera) for found in alignments]
     motions = [
@@ -122,7 +128,7 @@ def judge_scans(
         tuple(found.rms_after_mm for found in alignments),
         tuple(pairs),
         tuple(whole_poles),
-        find_steps(list(zip(motions, moments_ms, strict=True)), poles),
+        find_displaced_pole(list(zip(motions, moments_ms, strict=True)), poles),
         _separate_groups(alignments),
     )
 

@@ -87,8 +87,12 @@ def load_truth(folder: Path) -> Truth:
         return Truth(facts, None, None)
     mesh = o3d.io.read_triangle_mesh(str(surface))
     faces = np.asarray(mesh.triangles).astype(np.int64)
-    breathing = folder / "subject-mean-breath.ply"
-    mean = o3d.io.read_triangle_mesh(str(breathing)).vertices if breathing.exists() else None
+    breath_along_normals = folder / "subject-mean-breath.ply"
+    mean = (
+        o3d.io.read_triangle_mesh(str(breath_along_normals)).vertices
+        if breath_along_normals.exists()
+        else None
+    )
     at_mean_breath = None if mean is None else np.asarray(mean)
     return Truth(facts, np.asarray(mesh.vertices), faces, at_mean_breath)
 

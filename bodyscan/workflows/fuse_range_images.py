@@ -8,12 +8,8 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from bodyscan.alignment.bending import at_once
-from bodyscan.alignment.body_parts import PersonMotion
-from bodyscan.alignment.following import Followed
 from bodyscan.alignment.icp import align
-from bodyscan.alignment.sway_prior import SwayPrior, better_known
-from bodyscan.alignment.together import Together, bring_together
+from bodyscan.alignment.sway_prior import SwayPrior, select_tighter
 from bodyscan.fusion.cleaning import clean, require_subject
 from bodyscan.fusion.consistency import Contradictions
 from bodyscan.fusion.merging import MergedCloud, merge
@@ -30,6 +26,10 @@ from bodyscan.fusion.verdict.rig import find_silent_poles
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.mesh.body import BodyCloud, BodyMesh
+from bodyscan.motion.estimation import EstimatedMotion
+from bodyscan.motion.person_alignment import PersonAlignment, align_person
+from bodyscan.motion.person_motion import PersonMotion
+from bodyscan.motion.warping import warp_to_middle
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, background, silent, step
 from bodyscan.reconstruction.range_image import RangeImage
@@ -50,7 +50,7 @@ class _Subject:
     images: Sequence[RangeImage]
     rig_from_camera: dict[str, RigidTransform]
     known: PoseCovariance
-    together: Together | None = None
+    together: PersonAlignment | None = None
 
     @property
     def there(self) -> dict[str, RigidTransform]:
@@ -58,12 +58,12 @@ class _Subject:
         return {image.pair: self.rig_from_camera[image.pair] for image in self.images}
 
     @property
-    def followed(self) -> Followed | None:
-        return self.together.followed if self.together else None
+    def followed(self) -> EstimatedMotion | None:
+        return self.together.motion if self.together else None
 
     @cached_property
     def person(self) -> PersonMotion | None:
-        return PersonMotion.of(self.followed) if self.followed else None
+        return PersonMotion.from_motion(self.followed) if self.followed else None
 
 
 def fuse(
@@ -128,15 +128,15 @@ def _align(
     """Align the images and carry them to one moment."""
     images, start, boards = calibrated.images, calibrated.rig_from_camera, calibrated.known
     found = align(images, start, boards, settings)
-    together = bring_together(images, start, found, boards, calibration.rig.poles, settings)
+    together = align_person(images, start, found, boards, calibration.rig.poles, settings)
     rig_from_camera = start | together.alignment.rig_from_camera
-    images = at_once(images, rig_from_camera, together.followed)
-    moved, known, aligned = together.alignment.motion_mm, boards, together.alignment.poses
+    images = warp_to_middle(images, rig_from_camera, together.motion)
+    moved, known, aligned = together.alignment.motion_mm, boards, together.alignment.covariance
     if aligned is not None:
         # As the boards left them, if nobody moved; as the overlaps left them, whoever moved.
-        known = better_known(boards, aligned, moved)
+        known = select_tighter(boards, aligned, moved)
     unaligned = {image.pair for image in images} - moved.keys()
-    known = SwayPrior.of(settings).loosen(known, unaligned)
+    known = SwayPrior.from_settings(settings).loosen(known, unaligned)
     return _Subject(images, rig_from_camera, known, together)
 
 
@@ -159,7 +159,7 @@ def _image_evidence(
     contradictions: Contradictions,
 ) -> ImageEvidence:
     poles, tried = calibration.rig.poles, [image.pair for image in cleaned]
-    shifted = subject.together.shifted if subject.together else ()
+    shifted = subject.together.displaced if subject.together else ()
     moved = {name for one in shifted for name in one.pairs}
     unmoved = [image for image in measured.value if image.pair not in moved]
     return ImageEvidence(
@@ -198,7 +198,7 @@ def _mesh(
         known = labelling.result()
     mesh = attach_attributes(*shape, known, settings.mesh.reach_mm)
     if subject.followed:
-        mesh = subject.followed.breathing(mesh)
+        mesh = subject.followed.add_breath(mesh)
     made(mesh)
     return known, mesh
 

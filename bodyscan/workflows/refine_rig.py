@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from bodyscan.alignment.object_refinement import refine_on_object
 from bodyscan.captures.folder import Captures
 from bodyscan.errors import FailedWork
 from bodyscan.fusion.cleaning import clean, require_subject
+from bodyscan.motion.object_refinement import refine_on_object
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, silent, step
 from bodyscan.registration.rig_calibration import RigCalibration

@@ -1,21 +1,17 @@
 """Spots that two cameras see of one wavy surface, whose shape and place are known."""
 
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
-import open3d as o3d
 import pytest
 from ball import ball_points
 from ring import looking_at
 
 from bodyscan.alignment.matching import (
-    AlignmentPoints,
-    alignment_points,
+    SampledPoints,
     match_projected,
+    sample_points,
 )
-from bodyscan.alignment.open3d_registration import _matches, _Placed
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.transforms import RigidTransform
@@ -44,14 +40,14 @@ def seen(name: str, rig_from_camera: RigidTransform) -> RangeImage:
 
 
 @pytest.fixture(scope="module")
-def two() -> list[tuple[AlignmentPoints, RigidTransform]]:
+def two() -> list[tuple[SampledPoints, RigidTransform]]:
     places = [
         looking_at([1300.0 * np.cos(a), 1300.0 * np.sin(a), 950.0], CENTRE) for a in (0.2, 0.9)
     ]
-    return [(alignment_points(seen(f"p{k}", t), 5.0), t) for k, t in enumerate(places)]
+    return [(sample_points(seen(f"p{k}", t), 5.0)[0], t) for k, t in enumerate(places)]
 
 
-def test_a_patch_is_about_evenly_spread(two: list[tuple[AlignmentPoints, RigidTransform]]) -> None:
+def test_a_patch_is_about_evenly_spread(two: list[tuple[SampledPoints, RigidTransform]]) -> None:
     for part, _ in two:
         # 1050 mm away a pixel is 2.6 mm: every second one is the nearest to 5 mm.
         gaps = np.linalg.norm(np.diff(part.points, axis=0), axis=1)
@@ -60,11 +56,11 @@ def test_a_patch_is_about_evenly_spread(two: list[tuple[AlignmentPoints, RigidTr
         facing = -np.sum(part.points * part.normals, axis=1) / np.linalg.norm(part.points, axis=1)
         assert facing.min() > 0.3
         np.testing.assert_allclose(part.sigma_mm, SIGMA_MM * facing, rtol=1e-6)
-        assert 0.0 < part.rim.mean() < 0.3
+        assert 0.0 < part.in_margin.mean() < 0.3
 
 
 def test_matches_lie_on_the_surface(
-    two: list[tuple[AlignmentPoints, RigidTransform]],
+    two: list[tuple[SampledPoints, RigidTransform]],
 ) -> None:
     (a, rig_from_a), (b, rig_from_b) = two
     found = match_projected(a, b, rig_from_a, rig_from_b, 6.0)
@@ -79,7 +75,7 @@ def test_matches_lie_on_the_surface(
 
 
 def test_projected_points_are_those_that_the_camera_saw(
-    two: list[tuple[AlignmentPoints, RigidTransform]],
+    two: list[tuple[SampledPoints, RigidTransform]],
 ) -> None:
     """Each matched point lands, lens and all, on a pixel away from rims and the hole."""
     (a, rig_from_a), (b, rig_from_b) = two
@@ -90,7 +86,7 @@ def test_projected_points_are_those_that_the_camera_saw(
     grown[96:134, 146:194] = True
     assert not np.any(grown[pixels[:, 1], pixels[:, 0]])
     # And none is left out without a reason: all that face both cameras and are inside are there.
-    rig = rig_from_a.apply(a.points[~a.rim])
+    rig = rig_from_a.apply(a.points[~a.in_margin])
     local, normals = rig_from_b.inverse().apply(rig), (rig - CENTRE) / RADIUS
     facing = -np.sum(rig_from_b.inverse().rotate(normals) * local, axis=1)
     facing /= np.linalg.norm(local, axis=1)
@@ -105,7 +101,7 @@ def test_projected_points_are_those_that_the_camera_saw(
     "part", [np.s_[130:256, 0:320], np.s_[0:140, 0:320], np.s_[0:256, 130:185]]
 )
 def test_what_lies_outside_of_the_part_that_was_kept_has_no_match(
-    two: list[tuple[AlignmentPoints, RigidTransform]], part: tuple[slice, slice]
+    two: list[tuple[SampledPoints, RigidTransform]], part: tuple[slice, slice]
 ) -> None:
     (a, rig_from_a), (b, rig_from_b) = two
     image, (rows, columns) = b.image, part
@@ -129,7 +125,7 @@ def test_what_lies_outside_of_the_part_that_was_kept_has_no_match(
 
 
 def test_a_shift_is_measured_along_the_normals(
-    two: list[tuple[AlignmentPoints, RigidTransform]],
+    two: list[tuple[SampledPoints, RigidTransform]],
 ) -> None:
     (a, rig_from_a), (b, rig_from_b) = two
     shift = np.array([0.4, -0.3, 0.5])
@@ -140,7 +136,7 @@ def test_a_shift_is_measured_along_the_normals(
     np.testing.assert_allclose(found.distances, found.normals @ shift, atol=5e-3)
 
 
-def test_nothing_farther_than_the_reach(two: list[tuple[AlignmentPoints, RigidTransform]]) -> None:
+def test_nothing_farther_than_the_reach(two: list[tuple[SampledPoints, RigidTransform]]) -> None:
     (a, rig_from_a), (b, rig_from_b) = two
     inward = 8.0 * rig_from_a.rotation[:, 2]
     away = RigidTransform(rig_from_a.rotation, rig_from_a.translation + inward)
@@ -151,36 +147,9 @@ def test_nothing_farther_than_the_reach(two: list[tuple[AlignmentPoints, RigidTr
 
 
 def test_cameras_on_opposite_sides_share_nothing(
-    two: list[tuple[AlignmentPoints, RigidTransform]],
+    two: list[tuple[SampledPoints, RigidTransform]],
 ) -> None:
     (a, rig_from_a), _ = two
     opposite = looking_at(2.0 * CENTRE - rig_from_a.translation, CENTRE)
-    other = alignment_points(seen("p2", opposite), 5.0)
+    other = sample_points(seen("p2", opposite), 5.0)[0]
     assert len(match_projected(a, other, rig_from_a, opposite, 6.0).distances) == 0
-
-
-def test_of_open3ds_matches_those_stay_whose_spots_face_alike() -> None:
-    """Normals 40 and 50 degrees apart about any axis: their cosines are 0.77 and 0.64."""
-    rng = np.random.default_rng(2)
-    angle = np.radians(np.tile([40.0, 50.0], 20))
-    normals, aside = rng.normal(size=(2, 40, 3))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    aside = np.cross(normals, aside)
-    aside /= np.linalg.norm(aside, axis=1, keepdims=True)
-    turned = np.cos(angle)[:, None] * normals + np.sin(angle)[:, None] * aside
-    motion = RigidTransform.from_rotation_vector([0.3, -0.2, 0.5], [10.0, -20.0, 30.0])
-    points = rng.uniform(-100.0, 100.0, (40, 3))
-
-    def placed(at: np.ndarray, facing: np.ndarray, sigma_mm: float) -> _Placed:
-        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(at))
-        cloud.normals = o3d.utility.Vector3dVector(facing)
-        return _Placed(cloud, np.full(len(at), sigma_mm))
-
-    source = placed(motion.inverse().apply(points), motion.inverse().rotate(turned), 0.3)
-    target = placed(points + 2.0 * normals, normals, 0.4)
-    pairs = rng.permutation(np.column_stack([np.arange(40), np.arange(40)]))
-    result: Any = SimpleNamespace(correspondence_set=pairs, transformation=motion.matrix)
-    found = _matches(source, target, result)
-    np.testing.assert_allclose(found.points, points[::2], atol=1e-9)
-    np.testing.assert_allclose(found.distances, -2.0, atol=1e-9)
-    np.testing.assert_allclose(found.sigma_mm, 0.5, rtol=1e-9)

@@ -11,7 +11,12 @@ import pytest
 
 from bodyscan.alignment import overlaps
 from bodyscan.alignment.matching import Matches
-from bodyscan.alignment.overlaps import OverlapPoints, each_overlap, match_overlap, tied_groups
+from bodyscan.alignment.overlaps import (
+    OverlapPoints,
+    find_connected_groups,
+    map_overlaps,
+    match_overlap,
+)
 
 
 def test_groups_are_what_ties_join_by_way_of_any() -> None:
@@ -21,7 +26,7 @@ def test_groups_are_what_ties_join_by_way_of_any() -> None:
         ties = [(names[a], names[b]) for a, b in rng.integers(len(names), size=(count // 4, 2))]
         graph = nx.Graph(ties)
         graph.add_nodes_from(names)
-        found = tied_groups(names, ties)
+        found = find_connected_groups(names, ties)
         assert sorted(map(sorted, found)) == sorted(map(sorted, nx.connected_components(graph)))
         assert found == sorted(found, key=lambda group: min(map(names.index, group)))
 
@@ -58,5 +63,5 @@ def test_rims_are_asked_where_the_inner_parts_share_too_little(
 
 def test_every_two_images_are_asked_both_ways() -> None:
     with ThreadPoolExecutor(2) as pool:
-        found = each_overlap(pool, 3, lambda i, j: None if (i, j) == (1, 2) else 10 * i + j)
+        found = map_overlaps(pool, 3, lambda i, j: None if (i, j) == (1, 2) else 10 * i + j)
     assert found == {(0, 1): 1, (0, 2): 2, (1, 0): 10, (2, 0): 20, (2, 1): 21}

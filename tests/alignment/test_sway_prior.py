@@ -7,16 +7,16 @@ import pytest
 
 from bodyscan.alignment.sway_prior import (
     SwayPrior,
-    better_known,
-    bound_motions,
     centre_shifts,
+    reject_large_motions,
+    select_tighter,
 )
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.settings import BODY_CENTRE_MM
 
 PAIRS = ("p1", "p2")
-PRIOR = SwayPrior(shift_mm=1.0, rotation_deg=0.5, least=0.3, most=4.0)
+PRIOR = SwayPrior(shift_mm=1.0, rotation_deg=0.5, min_scale=0.3, max_scale=4.0)
 EXACT_BOARDS = PoseCovariance(PAIRS, np.zeros((12, 12)))
 
 
@@ -28,7 +28,7 @@ def shifted(*mm: float) -> np.ndarray:
 def test_what_is_found_is_believed_within_bounds() -> None:
     assert PRIOR.scale(shifted(0.0, 0.0)) == 0.3
     assert PRIOR.scale(shifted(2.0, -2.0)) == pytest.approx(1.5 * 2.0 / np.sqrt(3.0))
-    usual = SwayPrior(shift_mm=2.0, rotation_deg=0.5, least=0.3, most=4.0)
+    usual = SwayPrior(shift_mm=2.0, rotation_deg=0.5, min_scale=0.3, max_scale=4.0)
     assert usual.scale(shifted(2.0, -2.0)) == pytest.approx(0.5 * PRIOR.scale(shifted(2.0, -2.0)))
     assert PRIOR.scale(shifted(90.0, -90.0)) == 4.0
     assert SwayPrior(0.0, 0.0, 0.3, 4.0).scale(shifted(5.0, -5.0)) == 1.0
@@ -54,7 +54,7 @@ def test_pairs_are_independent_and_scale_with_what_was_found() -> None:
 
 def test_a_pair_that_wants_too_far_stays_where_it_was() -> None:
     covariance = np.eye(12)
-    kept, refused = bound_motions(PAIRS, shifted(3.0, 30.0), covariance, limit_sigmas=5.0)
+    kept, refused = reject_large_motions(PAIRS, shifted(3.0, 30.0), covariance, limit_sigmas=5.0)
     np.testing.assert_array_equal(kept, shifted(3.0, 0.0))
     assert refused == {"p2": pytest.approx(30.0 / np.sqrt(6.0))}
 
@@ -86,5 +86,5 @@ def test_of_two_covariances_the_one_that_puts_the_body_off_by_less_counts(
     loose = np.diag([0.0] * 15 + [1.0, 1.0, 1.0])
     one = PoseCovariance(("a", "b", "c"), first_mm**2 * known + 4.0 * loose)
     other = PoseCovariance(("a", "b", "c"), second_mm**2 * known + loose)
-    assert better_known(one, other, ["a", "b"]) is (one if first_mm < second_mm else other)
-    assert better_known(one, other, []) is one, "nothing ties any"
+    assert select_tighter(one, other, ["a", "b"]) is (one if first_mm < second_mm else other)
+    assert select_tighter(one, other, []) is one, "nothing ties any"

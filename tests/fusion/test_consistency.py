@@ -79,12 +79,12 @@ def test_a_surface_that_was_bent_is_asked_where_its_points_went() -> None:
     """Carried 3 mm aside, which are four pixels: as of a camera that stood so, but for its rim."""
     samples, surfaces, still = seen_beside(0.8)
     aside = np.array([3.0, 0.0, 0.0], np.float32)
-    moved = replace(surfaces[1], points=surfaces[1].points + aside, bent=True)
+    moved = replace(surfaces[1], points=surfaces[1].points + aside, warped=True)
     found = compare_with_surface(samples, moved, 1, 1.5, 6.0)
     assert len(found.index) > 0.95 * len(still.index)
     np.testing.assert_allclose(found.shift_mm, -0.8, atol=2e-3)
     apart = moved.points[found.at] - samples.points[found.index]
     assert np.abs(apart[:, :2]).max() < 0.4 + 0.4 * 0.8 + 0.75
-    asked = compare_with_surface(samples, replace(moved, bent=False), 1, 1.5, 6.0)
+    asked = compare_with_surface(samples, replace(moved, warped=False), 1, 1.5, 6.0)
     off = moved.points[asked.at] - samples.points[asked.index]
     assert np.median(off[:, 0]) > 2.0, "looked up where they were"

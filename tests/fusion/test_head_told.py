@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from bodyscan.alignment.part_names import NECK
 from bodyscan.fusion.regions import find_head
+from bodyscan.motion.body_parts import NECK
 
 
 def test_a_head_is_above_the_neck_and_near_the_middle_of_the_upper_body() -> None:

@@ -130,7 +130,7 @@ def test_what_moves_a_followed_body_as_a_whole_stays_in_its_sigmas(cloud: BodyCl
     by_boards = replace(cloud, sigma_mm=np.full_like(cloud.sigma_mm, 0.5))
 
     class Cells:
-        def find_many(self, points: Array, normals: Array) -> Indices:
+        def find_by_groups(self, points: Array, normals: Array) -> Indices:
             return np.zeros(len(points), np.int64)
 
     for motion_mm, expected in ((0.1, 0.5), (2.0, np.hypot(0.03, 2.0))):

@@ -131,7 +131,7 @@ def test_noise_that_neighbours_share_along_a_line_goes_down_less_and_sigma_says_
     off = noise * mean[:240, :320] / np.linalg.norm(RAYS, axis=-1)
     points = image.points + (RAYS * off[..., None]).astype(np.float32)
     alike = (0.0, 5.0) if along == 0 else (5.0, 0.0)
-    shared = replace(image, points=points, alike_px=alike)
+    shared = replace(image, points=points, correlation_px=alike)
     surface, own = (smooth(one, POSE, WINDOW_MM) for one in (shared, replace(image, points=points)))
     assert surface is not None
     assert own is not None

@@ -13,16 +13,16 @@ import pytest
 from made_scan import MadeScan, egg, make_scan
 from verdict_given import verdict_given
 
-from bodyscan.alignment.body_parts import PartMotion, PersonMotion
+from bodyscan.alignment.displaced_poles import DisplacedPole, DisplacementSearch
 from bodyscan.alignment.icp import Alignment, Overlap
-from bodyscan.alignment.place_evidence import SizeStep
-from bodyscan.alignment.pole_steps import PoleStep, StepSearch
+from bodyscan.alignment.pose_evidence import ScaleError
 from bodyscan.arrays import Array, Mask
 from bodyscan.fusion.consistency import Contradictions
 from bodyscan.fusion.verdict.evidence import Coverage, Seam, SeamReport
 from bodyscan.fusion.verdict.rig import find_silent_poles
 from bodyscan.mesh.body import BodyCloud, BodyMesh
-from bodyscan.reconstruction.two_ways import Agreement
+from bodyscan.motion.person_motion import PartMotion, PersonMotion
+from bodyscan.reconstruction.crossing_stripes import Agreement
 from bodyscan.registration.rig_calibration import NominalSize
 from bodyscan.rig.rig import Volume
 from bodyscan.settings import UseLimits
@@ -68,17 +68,17 @@ def person(left_mm: float) -> PersonMotion:
     return PersonMotion((PartMotion("trunk", 9.0, left_mm, 0.1),), None, None)
 
 
-def step(shift_mm: float = 3.0, turn_deg: float = 0.1, **more: Any) -> PoleStep:
-    return PoleStep("pole p1", frozenset({"p1-1", "p1-2"}), shift_mm, turn_deg, **more)
+def step(shift_mm: float = 3.0, turn_deg: float = 0.1, **more: Any) -> DisplacedPole:
+    return DisplacedPole("pole p1", frozenset({"p1-1", "p1-2"}), shift_mm, turn_deg, **more)
 
 
-PAIR_STEP = PoleStep("pair p1-1", frozenset({"p1-1"}), 5.0, 0.1)
-OTHER_STEP = PoleStep("pole p2", frozenset({"p2-1", "p2-2"}), 3.0, 0.1)
+PAIR_STEP = DisplacedPole("pair p1-1", frozenset({"p1-1"}), 5.0, 0.1)
+OTHER_STEP = DisplacedPole("pole p2", frozenset({"p2-1", "p2-2"}), 3.0, 0.1)
 MISSING = "s01/{}/lit.png: is missing\n  Copy it here."
 
 
-def displaced(rms_mm: float, sway_mm: float = 0.1) -> StepSearch:
-    return StepSearch(None, 1.0, sway_mm, rms_mm)
+def displaced(rms_mm: float, sway_mm: float = 0.1) -> DisplacementSearch:
+    return DisplacementSearch(None, 1.0, sway_mm, rms_mm)
 
 
 def boards(sigma_mm: float) -> dict[str, float]:
@@ -114,15 +114,15 @@ FINDINGS: dict[str, tuple[dict[str, Any], str, str]] = {
     "many contradictions": ({"contradictions": everywhere(0.03)}, "repeat", "contradict each other"),
     # A focal length wrong by 1 %, taken for a pole that moved, costs 16.6 mm of girth.
     "contradictions of an aligned pole": (
-        {"contradictions": everywhere(0.009), "shifted": [step()]}, "repeat", "even with the"),
-    "a pole that moved": ({"shifted": [step()]}, "usable", "pole p1 is displaced by 3.0 mm"),
-    "a pair that moved": ({"shifted": [PAIR_STEP]}, "repeat", "pair p1-1 is displaced by 5.0 mm"),
-    "two poles that moved": ({"shifted": [step(), OTHER_STEP]}, "repeat", "pole p2 is displaced"),
-    "one of all poles": ({"shifted": [step(all_moved=True)]}, "repeat", "pole p1 is displaced"),
-    "a pole that turned": ({"shifted": [step(200.0, 14.0)]}, "usable", "pole p1 is displaced by 200"),
-    "a person who turned": ({"shifted": [step(5.0, 14.0)]}, "repeat", "person turned by 14 degrees"),
-    "poles farther out": ({"size": SizeStep(0.5, 0.1)}, "usable", "farther from the body than calib"),
-    "poles farther in": ({"size": SizeStep(-3.0, 0.1)}, "repeat", "would be 19 mm too large"),
+        {"contradictions": everywhere(0.009), "displaced": [step()]}, "repeat", "even with the"),
+    "a pole that moved": ({"displaced": [step()]}, "usable", "pole p1 is displaced by 3.0 mm"),
+    "a pair that moved": ({"displaced": [PAIR_STEP]}, "repeat", "pair p1-1 is displaced by 5.0 mm"),
+    "two poles that moved": ({"displaced": [step(), OTHER_STEP]}, "repeat", "pole p2 is displaced"),
+    "one of all poles": ({"displaced": [step(all_moved=True)]}, "repeat", "pole p1 is displaced"),
+    "a pole that turned": ({"displaced": [step(200.0, 14.0)]}, "usable", "pole p1 is displaced by 200"),
+    "a person who turned": ({"displaced": [step(5.0, 14.0)]}, "repeat", "person turned by 14 degrees"),
+    "poles farther out": ({"scale_error": ScaleError(0.5, 0.1)}, "usable", "farther from the body"),
+    "poles farther in": ({"scale_error": ScaleError(-3.0, 0.1)}, "repeat", "would be 19 mm too large"),
     "nominal size": ({"nominal": NominalSize(0.98)}, "good", ""),
     "doubtful size": ({"nominal": NominalSize(1.04)}, "usable", "1.040 times as far apart"),
     "wrong size": ({"nominal": NominalSize(1.11)}, "repeat", "1.110 times as far apart"),
@@ -130,7 +130,7 @@ FINDINGS: dict[str, tuple[dict[str, Any], str, str]] = {
     "floor at 12 mm": ({"floor_mm": 12.0}, "usable", "girths are taken 12 mm too low"),
     "floor at -12 mm": ({"floor_mm": -12.0}, "usable", "girths are taken 12 mm too high"),
     "floor of a pole that moved": (
-        {"floor_mm": -12.0, "shifted": [step()]}, "repeat", "the floor is at -12 mm, not at 0"),
+        {"floor_mm": -12.0, "displaced": [step()]}, "repeat", "the floor is at -12 mm, not at 0"),
     "a silent pole": ({"silent": ["p3"]}, "usable", "pole p3 saw nobody where the others"),
     "a refused pair": (
         {"alignment": Alignment({}, {"p1": 0.1}, {"p2": 7.0}, ())}, "repeat", "pair p2 does not fit"),

@@ -18,11 +18,9 @@ from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.light_sheets import triangulate_image
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.scan_volume import (
-    LAYER_MM,
-    MARGIN_MM,
     MARGIN_STRIPES,
-    _bulges,
     _corner_rays,
+    _nonlinearity,
     stripes_in_volume,
     volume_interval,
 )
@@ -90,7 +88,7 @@ def test_all_that_lies_in_the_volume_is_wanted(
     points, *_ = triangulate_image(one.sheets, one.camera, s, np.full_like(s, 0.01))
     x, y, z = np.moveaxis(at.apply(points.astype(np.float64)), -1, 0)
     there = (np.hypot(x, y) < VOLUME.radius_mm) & (z > VOLUME.bottom_mm) & (z < VOLUME.top_mm)
-    standing = there & (z > VOLUME.bottom_mm + LAYER_MM)
+    standing = there & (z > VOLUME.bottom_mm + 25.0)
     kept, beyond = wanted.split(s, np.isfinite(s))
     assert standing.any()
     assert kept[standing].all()
@@ -168,8 +166,8 @@ def test_a_ray_is_in_the_volume_between_where_it_enters_and_leaves(
     enter, leave = volume_interval(rays, at, VOLUME, raised_mm=20.0)
     depth = rng.uniform(60.0, 3000.0, 200)
     x, y, z = at.apply(rays * depth[:, None]).T
-    within = np.hypot(x, y) < VOLUME.radius_mm + MARGIN_MM
-    within &= (z > VOLUME.bottom_mm + 20.0) & (z < VOLUME.top_mm + MARGIN_MM)
+    within = np.hypot(x, y) < VOLUME.radius_mm + 30.0
+    within &= (z > VOLUME.bottom_mm + 20.0) & (z < VOLUME.top_mm + 30.0)
     np.testing.assert_array_equal((depth > enter) & (depth < leave), within)
 
 
@@ -225,7 +223,7 @@ def test_limits_are_widened_as_much_on_the_left_as_on_the_right() -> None:
     np.testing.assert_allclose(near, near[:, ::-1], rtol=1e-9)
     finer = 1.0 + rays[..., 0] ** 2 + rays[..., 1]
     limits = 1e5 * finer * np.stack([1.0 / far, 1.0 / near, 1.0 / near])
-    for by in _bulges(rays, at, VOLUME, (near, far), limits):
+    for by in _nonlinearity(rays, at, VOLUME, (near, far), limits):
         assert np.count_nonzero(by) > 10
         # The two halves are rounded differently, and nothing else.
         np.testing.assert_allclose(by, by[:, ::-1], rtol=1e-6)
@@ -238,14 +236,14 @@ def test_limits_are_widened_as_much_on_the_left_as_on_the_right() -> None:
 def test_no_pixel_inside_a_block_loses_more_than_the_margin(
     distance_mm: float, tilt: float
 ) -> None:
-    """Where the wall meets the bottom, a limit bends by up to 80 stripes inside of a block: widened by
+    """Where the wall meets the bottom, a limit bends by up to 80 stripes inside of a block: pad_crop by
     half as much it would cut 2 to 80 of them off. Along each ray s falls as 1e5 mm over depth."""
     at = looking_at_the_middle(distance_mm, 0.0, tilt)
     block_px, per_inverse = 8, 1e5
     rays = _corner_rays(PLAIN, block_px)
     near, far = volume_interval(rays, at, VOLUME, raised_mm=0.0)
     limits = -per_inverse / np.stack([near, far, far])
-    near_by, far_by = _bulges(rays, at, VOLUME, (near, far), limits)
+    near_by, far_by = _nonlinearity(rays, at, VOLUME, (near, far), limits)
     enter, leave = volume_interval(PLAIN.pixel_rays(), at, VOLUME, raised_mm=0.0)
     inside = enter < leave
 

@@ -8,27 +8,27 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from bodyscan.alignment.body_parts import PersonMotion
+from bodyscan.alignment.displaced_poles import DisplacementSearch
 from bodyscan.alignment.icp import Alignment
-from bodyscan.alignment.pole_steps import StepSearch
-from bodyscan.alignment.together import Together
 from bodyscan.fusion.verdict import grade_scan
 from bodyscan.fusion.verdict.evidence import Coverage, ImageEvidence, RigEvidence
 from bodyscan.mesh.body import BodyCloud, BodyMesh
+from bodyscan.motion.person_alignment import PersonAlignment
+from bodyscan.motion.person_motion import PersonMotion
 from bodyscan.rig.rig import Volume
 from bodyscan.settings import UseLimits
 from bodyscan.verdict import Verdict
 
-Evidence = TypeVar("Evidence", RigEvidence, ImageEvidence, Together)
+Evidence = TypeVar("Evidence", RigEvidence, ImageEvidence, PersonAlignment)
 SOUND: dict[type, dict[str, Any]] = {
     RigEvidence: {"volume": Volume()},
     ImageEvidence: {},
-    Together: {
+    PersonAlignment: {
         "alignment": Alignment({}, {}, {}, ()),
-        "followed": None,
-        "shifted": (),
-        "size": None,
-        "search": StepSearch(None, np.inf),
+        "motion": None,
+        "displaced": (),
+        "scale_error": None,
+        "search": DisplacementSearch(None, np.inf),
     },
 }
 
@@ -42,9 +42,9 @@ def verdict_given(
     coverage: Coverage | None = None,
     **given: Any,
 ) -> Verdict:
-    """given: fields of RigEvidence, of ImageEvidence and of Together."""
+    """given: fields of RigEvidence, of ImageEvidence and of PersonAlignment."""
     rig, images = _evidence(RigEvidence, given), _evidence(ImageEvidence, given)
-    together = _evidence(Together, given)
+    together = _evidence(PersonAlignment, given)
     assert not given, f"no evidence has {', '.join(given)}"
     return grade_scan(
         cloud, rig, images, use, together=together, person=person, mesh=mesh, coverage=coverage

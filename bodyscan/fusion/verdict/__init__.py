@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from bodyscan.alignment.body_parts import PersonMotion
-from bodyscan.alignment.together import Together
 from bodyscan.fusion.verdict.coverage import check_crown, check_gaps, check_yields
 from bodyscan.fusion.verdict.evidence import (
     Check,
@@ -39,6 +37,8 @@ from bodyscan.fusion.verdict.shape import (
     check_volume,
 )
 from bodyscan.mesh.body import BodyCloud, BodyMesh
+from bodyscan.motion.person_alignment import PersonAlignment
+from bodyscan.motion.person_motion import PersonMotion
 from bodyscan.optional import optional
 from bodyscan.settings import UseLimits
 from bodyscan.verdict import Grade, Verdict
@@ -78,7 +78,7 @@ def grade_scan(
     images: ImageEvidence,
     use: UseLimits,
     *,
-    together: Together | None = None,
+    together: PersonAlignment | None = None,
     person: PersonMotion | None = None,
     mesh: BodyMesh | None = None,
     coverage: Coverage | None = None,

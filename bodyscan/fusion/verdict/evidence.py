@@ -7,14 +7,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from bodyscan.alignment.body_parts import PersonMotion
 from bodyscan.alignment.icp import Alignment
 from bodyscan.alignment.sway_prior import centre_sigmas
-from bodyscan.alignment.together import Together
 from bodyscan.arrays import Array, Mask
 from bodyscan.fusion.consistency import Contradictions
 from bodyscan.mesh.body import BodyCloud, BodyMesh
-from bodyscan.reconstruction.two_ways import Agreement
+from bodyscan.motion.person_alignment import PersonAlignment
+from bodyscan.motion.person_motion import PersonMotion
+from bodyscan.reconstruction.crossing_stripes import Agreement
 from bodyscan.registration.rig_calibration import NominalSize, RigCalibration, nominal_size
 from bodyscan.rig.rig import Volume
 from bodyscan.settings import UseLimits
@@ -134,7 +134,7 @@ class ScanEvidence:
     rig: RigEvidence
     images: ImageEvidence
     use: UseLimits
-    together: Together | None = None
+    together: PersonAlignment | None = None
     person: PersonMotion | None = None
     mesh: BodyMesh | None = None
     coverage: Coverage | None = None
@@ -146,7 +146,7 @@ class ScanEvidence:
     @property
     def poses_corrected(self) -> bool:
         """Whether alignment found displaced poles, or all poles farther out, and corrected them."""
-        return bool(self.together and (self.together.shifted or self.together.size))
+        return bool(self.together and (self.together.displaced or self.together.scale_error))
 
     @property
     def shape(self) -> BodyMesh | None:

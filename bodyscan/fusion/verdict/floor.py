@@ -31,7 +31,7 @@ def find_floor(
 
 def _floor_heights(image: RangeImage, rig_from_camera: RigidTransform, volume: Volume) -> Array:
     """Heights (N,) of points that face upwards near z = 0, of one pixel in 4 along each axis."""
-    some = image.every(4)
+    some = image.subsample(4)
     valid = image.valid[some]
     points = rig_from_camera.apply(image.points[some][valid].astype(np.float64))
     upward = image.normals[some][valid].astype(np.float64) @ rig_from_camera.rotation[2]
@@ -50,7 +50,7 @@ def check_floor(scan: ScanEvidence) -> Iterator[Finding]:
     if floor_mm is None or abs(floor_mm) <= 4.0:
         return
     yield (
-        "repeat" if scan.together and scan.together.shifted else "usable",
+        "repeat" if scan.together and scan.together.displaced else "usable",
         f"the floor is at {floor_mm:.0f} mm, not at 0: the stature is wrong by as much, and girths are "
         f"taken {abs(floor_mm):.0f} mm too {'low' if floor_mm > 0.0 else 'high'}. Possible causes: "
         "poles were lifted or lowered since the calibration; `rig_frame` is that of another floor; the "

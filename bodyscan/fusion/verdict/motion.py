@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from bodyscan.alignment.pole_steps import STILL_MM
+from bodyscan.alignment.displaced_poles import STILL_MM
 from bodyscan.fusion.verdict.evidence import GIRTH_PER_MM, Finding, ScanEvidence
 from bodyscan.settings import UseLimits
 
@@ -24,39 +24,39 @@ def check_displaced_poles(scan: ScanEvidence) -> Iterator[Finding]:
     (another lens, rows lost), which no pose corrects, cannot be determined; and if several moved,
     the overlaps alone determine the body's size.
     """
-    steps = scan.together.shifted if scan.together else ()
+    steps = scan.together.displaced if scan.together else ()
     for step in steps:
         # A bumped pole turns about its foot and carries its view of the body along, by the turn
         # times its distance, at least a metre. If the body's middle stays within a quarter of
         # that, and 5 degrees are too large for a bump, it was the body that turned.
-        lever_mm = np.radians(step.turn_deg) * 1000.0
-        if step.turn_deg > 5.0 and step.shift_mm < 0.25 * lever_mm:
+        lever_mm = np.radians(step.rotation_deg) * 1000.0
+        if step.rotation_deg > 5.0 and step.shift_mm < 0.25 * lever_mm:
             yield (
                 "repeat",
-                f"the person turned by {step.turn_deg:.0f} degrees before or after {step.name} fired: "
-                f"a pole that turned as much would have displaced the body by {lever_mm:.0f} mm, not "
-                f"by {step.shift_mm:.0f} mm",
+                f"the person turned by {step.rotation_deg:.0f} degrees before or after {step.name} "
+                f"fired: a pole that turned as much would have displaced the body by {lever_mm:.0f} "
+                f"mm, not by {step.shift_mm:.0f} mm",
             )
             continue
         yield (
             "repeat" if len(step.pairs) == 1 or len(steps) > 1 or step.all_moved else "usable",
-            f"{step.name} is displaced by {step.shift_mm:.1f} mm and {step.turn_deg:.2f} degrees from "
-            "its calibrated pose, alone and in one step, which no motion of a person explains; it was "
-            "aligned with the others. Calibrate again, unless `timing` of captures.yaml is wrong",
+            f"{step.name} is displaced by {step.shift_mm:.1f} mm and {step.rotation_deg:.2f} degrees "
+            "from its calibrated pose, alone and in one step, which no motion of a person explains; it "
+            "was aligned with the others. Calibrate again, unless `timing` of captures.yaml is wrong",
         )
 
 
 def check_size(scan: ScanEvidence) -> Iterator[Finding]:
     """A common step of all poles outwards or inwards, corrected too."""
-    size = scan.together.size if scan.together else None
+    size = scan.together.scale_error if scan.together else None
     if size is None:
         return
-    girth_mm = abs(size.out_mm) * GIRTH_PER_MM
-    where, wrong = ("farther from", "small") if size.out_mm > 0.0 else ("nearer to", "large")
+    girth_mm = abs(size.outward_mm) * GIRTH_PER_MM
+    where, wrong = ("farther from", "small") if size.outward_mm > 0.0 else ("nearer to", "large")
     yield (
         "repeat" if girth_mm > scan.use.usable_girth_mm else "usable",
-        f"all poles are {abs(size.out_mm):.1f} mm (sigma {size.sigma_mm:.1f} mm) {where} the body than "
-        f"calibrated, which no motion of a person explains. Girths would be {girth_mm:.0f} mm too "
+        f"all poles are {abs(size.outward_mm):.1f} mm (sigma {size.sigma_mm:.1f} mm) {where} the body "
+        f"than calibrated, which no motion of a person explains. Girths would be {girth_mm:.0f} mm too "
         f"{wrong}; now the overlaps alone determine the body's size. Calibrate again",
     )
 
@@ -71,13 +71,13 @@ def check_displaced_pairs(scan: ScanEvidence) -> Iterator[Finding]:
     search = scan.together.search
     boards_mm = np.array(list(scan.rig.boards_mm.values()) or [0.0])
     expected_mm = float(np.sqrt(np.mean(boards_mm**2) / 3.0))  # along one axis
-    girth_mm = float(np.sqrt(max(search.own_mm**2 - expected_mm**2, 0.0))) * GIRTH_PER_MM
+    girth_mm = float(np.sqrt(max(search.offset_mm**2 - expected_mm**2, 0.0))) * GIRTH_PER_MM
     if girth_mm <= scan.use.good_girth_mm:
         return
     sways = search.sway_mm > STILL_MM
     yield (
         "repeat" if girth_mm > scan.use.usable_girth_mm and not sways else "usable",
-        f"the pairs are displaced by {search.own_mm:.1f} mm RMS from their calibrated poses, and no "
+        f"the pairs are displaced by {search.offset_mm:.1f} mm RMS from their calibrated poses, and no "
         f"sway explains it. Possible causes: {'head or arms moved; ' if sways else ''}the rig was "
         "moved since the calibration. Take a board shot, or calibrate again",
     )

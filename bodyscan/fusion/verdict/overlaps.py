@@ -14,15 +14,15 @@ from itertools import combinations
 
 import numpy as np
 
+from bodyscan.alignment.displaced_poles import group_by_pole
 from bodyscan.alignment.matching import (
-    SEAM_RIM_PX,
-    AlignmentPoints,
+    NARROW_MARGIN_PX,
     Matches,
-    alignment_points,
+    SampledPoints,
     match_projected,
+    sample_points,
 )
-from bodyscan.alignment.overlaps import tied_groups
-from bodyscan.alignment.pole_steps import moving_alone
+from bodyscan.alignment.overlaps import find_connected_groups
 from bodyscan.arrays import Array, Indices
 from bodyscan.fusion.verdict.evidence import (
     GIRTH_PER_MM,
@@ -55,7 +55,7 @@ def find_seams(
     poles: the pole of each pair that stands on one.
     """
     with ThreadPoolExecutor(THREADS) as pool:
-        points = list(pool.map(lambda im: alignment_points(im, 3.0, SEAM_RIM_PX), images))
+        points = list(pool.map(lambda im: sample_points(im, 3.0, (NARROW_MARGIN_PX,))[0], images))
         compared = pool.map(
             lambda two: _compare_pairs(two[0], two[1], rig_from_camera), combinations(points, 2)
         )
@@ -65,13 +65,15 @@ def find_seams(
     # A pair that measured less than a hundredth of everything affects no girth.
     relevant = [name for name in names if count[name] > 0.01 * sum(count.values())]
     shared = [seam.pairs for seam in seams if set(seam.pairs) <= set(relevant)]
-    groups = sorted(tied_groups(relevant, shared), key=lambda group: (-len(group), min(group)))
+    groups = sorted(
+        find_connected_groups(relevant, shared), key=lambda group: (-len(group), min(group))
+    )
     isolated = tuple(tuple(sorted(group)) for group in groups[1:])
-    return SeamReport(seams, moving_alone(names, poles), isolated)
+    return SeamReport(seams, group_by_pole(names, poles), isolated)
 
 
 def _compare_pairs(
-    one: AlignmentPoints, other: AlignmentPoints, rig_from_camera: Mapping[str, RigidTransform]
+    one: SampledPoints, other: SampledPoints, rig_from_camera: Mapping[str, RigidTransform]
 ) -> Seam:
     here, there = rig_from_camera[one.image.pair], rig_from_camera[other.image.pair]
     both = (

@@ -73,6 +73,7 @@ def check_stripe_directions(scan: ScanEvidence) -> Iterator[Finding]:
         if agreement.moderate:
             yield (
                 "usable",
-                f"pair {name}: depths from the two stripe directions differ by {agreement.words}. Its "
-                "calibration is wrong by as much, which sigmas do not include",
+                f"pair {name}: depths from the two stripe directions differ by "
+                f"{agreement.description}. Its calibration is wrong by as much, which sigmas do "
+                "not include",
             )

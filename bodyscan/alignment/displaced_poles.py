@@ -1,0 +1,314 @@
+"""Detect poles that were displaced since the calibration, from the pairs' motions in alignment.
+
+A displaced pole and a moving subject both shift pairs relative to each other. But all pairs of a
+displaced pole are off by the same rigid motion at all times, while a person moves continuously:
+pairs that fire within a moment of each other see nearly the same posture. Both explanations are
+compared by the likelihood of Gaussian processes over time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import block_diag
+from scipy.special import fdtri
+
+from bodyscan.alignment.sway_prior import (
+    LEVER_MM,
+    SwayPrior,
+    centre_shifts,
+    stance_correlation,
+)
+from bodyscan.arrays import Array
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.uncertainty import PoseCovariance
+
+MIN_PAIRS = 4
+"""With two or three pairs, any could be the displaced one."""
+MIN_SCANS = 3
+"""What is equal in this many scans is not the sway of one person."""
+MIN_STEP_MM = 1.0
+"""Calibrations of poles disagree by less, and alignment corrects it."""
+MIN_DRIFT_MM = 0.3
+STEPS_MM = np.geomspace(0.5, 30.0, 8)  # prior standard deviations of a displacement
+SWAYS_MM = np.geomspace(0.05, 20.0, 10)
+STILL_MM = 0.4
+"""Apparent sway of a mannequin, because calibrations disagree; a standing person's is 1 to 5."""
+MIN_LOG_RATIO = 6.0
+"""Log likelihood ratio, 400 to 1, that a displaced pole must reach."""
+
+
+@dataclass(frozen=True)
+class DisplacedPole:
+    """A pole, or a single pair, that is displaced from its calibrated pose.
+
+    name: `pole p1` or `pair p1-2`.
+    shift_mm, rotation_deg: at the body's centre.
+    all_moved: whether every other pole is displaced too, so that none is a reference.
+    """
+
+    name: str
+    pairs: frozenset[str]
+    shift_mm: float
+    rotation_deg: float
+    all_moved: bool = False
+
+    @staticmethod
+    def from_motions(
+        name: str, pairs: frozenset[str], motions: Mapping[str, Array]
+    ) -> DisplacedPole:
+        """The mean twist (6,) of these pairs relative to the mean of the others."""
+        mean, reference = (
+            np.mean([twist for n, twist in motions.items() if (n in pairs) == inside], axis=0)
+            for inside in (True, False)
+        )
+        shift = float(np.linalg.norm(centre_shifts((mean - reference)[None])[0]))
+        rotation = float(np.degrees(np.linalg.norm((mean - reference)[:3])))
+        return DisplacedPole(name, pairs, shift, rotation)
+
+
+@dataclass(frozen=True)
+class DisplacementSearch:
+    """The result of a search for a displaced pole.
+
+    found: the pole or pair that is displaced in all scans, if any.
+    detectable_mm: smallest displacement that would have been detected of any pole or pair; infinite
+        if that of some cannot be told from sway.
+    sway_mm: standard deviation of the person's sway, per axis.
+    offset_mm: standard deviation of each pair's independent offset.
+    """
+
+    found: DisplacedPole | None
+    detectable_mm: float
+    sway_mm: float = 0.0
+    offset_mm: float = 0.0
+
+
+@dataclass(frozen=True)
+class PairDrift:
+    """Mean motion of a pair or pole over several scans, which no person's sway explains.
+
+    shift: (3,) mm at the body's centre, rig axes.
+    sigma_mm: standard error of its length, from the variation between scans; None for fewer than
+        three scans.
+    limit_mm: a larger shift is not chance.
+    """
+
+    pair: str
+    shift: tuple[float, float, float]
+    sigma_mm: float | None
+    limit_mm: float
+
+    @property
+    def shift_mm(self) -> float:
+        return float(np.linalg.norm(self.shift))
+
+    @property
+    def moved(self) -> bool:
+        return self.shift_mm > self.limit_mm
+
+
+def estimate_drift(name: str, shifts: Array) -> PairDrift:
+    """Estimate the drift of a pair or pole from its shifts (scans, 3) mm at the body's centre.
+
+    Hotelling's test with one variance for all axes, at 1e-4; a sigma of at least 0.05 mm.
+    """
+    scans = len(shifts)
+    x, y, z = (float(value) for value in shifts.mean(axis=0))
+    if scans < MIN_SCANS:
+        return PairDrift(name, (x, y, z), None, np.inf)
+    sigma = max(float(np.sqrt(shifts.var(axis=0, ddof=1).sum() / scans)), 0.05)
+    ratio = float(np.sqrt(fdtri(3, 3 * (scans - 1), 1.0 - 1e-4)))
+    return PairDrift(name, (x, y, z), sigma, max(ratio * sigma, MIN_DRIFT_MM))
+
+
+def group_by_pole(names: Sequence[str], poles: Mapping[str, str]) -> dict[str, frozenset[str]]:
+    """Pairs that can only be displaced together, keyed by name: `pole p1`, `pair p1-2`.
+
+    poles: the pole of each pair that is mounted on one.
+    """
+    groups = {f"pair {name}": frozenset([name]) for name in names}
+    for pole in sorted({poles[name] for name in names if name in poles}):
+        groups[f"pole {pole}"] = frozenset(name for name in names if poles.get(name) == pole)
+    return groups
+
+
+def free_pairs(boards: PoseCovariance, pairs: Collection[str]) -> PoseCovariance:
+    """Let these pairs move together by 30 mm and 5 degrees (standard deviations).
+
+    A pole displaced farther shares no surface with the others.
+    """
+    return boards.add_common_motion(pairs, SwayPrior(30.0, 5.0, 1.0, 1.0).pair_covariance())
+
+
+def motions_between(
+    before: Mapping[str, RigidTransform], after: Mapping[str, RigidTransform]
+) -> dict[str, Array]:
+    """Twist (6,) by which each pair's pose changed, rig frame."""
+    return {name: (after[name] @ before[name].inverse()).twist for name in after}
+
+
+Scan = tuple[Mapping[str, Array], Mapping[str, float | None]]
+"""Twist (6,) by which alignment moved each pair, about the rig's origin; and each pair's time, ms,
+None if not known."""
+
+
+def find_displaced_pole(
+    scans: Sequence[Scan], poles: Mapping[str, str], freed: Collection[str] = ()
+) -> DisplacementSearch:
+    """Find the pole or pair that is displaced in one scan, or in several since the calibration.
+
+    poles: as in `group_by_pole`.
+    freed: pairs already known to be displaced; another one is searched for.
+
+    A person sways differently in each scan, while a displacement is the same in all. In a single
+    scan nothing is known of pairs without a time. If every pole is displaced, the one that is
+    farthest off is returned.
+    """
+    several = len(scans) >= MIN_SCANS
+    seen = _PoseMotions.from_scans(scans, poles, freed, timed=not several)
+    if len(set(seen.names)) < MIN_PAIRS:
+        return DisplacementSearch(None, np.inf)
+    nothing = np.zeros_like(seen.sway)
+    null, covariance, sway_mm, offset_mm = _maximize_likelihood(
+        seen, SWAYS_MM, nothing, np.zeros(1)
+    )
+    candidates: list[tuple[float, DisplacedPole]] = []
+    detectable, ambiguous = MIN_STEP_MM, bool(freed)
+    for name, pairs in group_by_pole(sorted(set(seen.names)), poles).items():
+        members = np.array([pair in pairs for pair in seen.names])
+        if not pairs.isdisjoint(freed) or not set(seen.names) - pairs - set(freed):
+            continue
+        # Correlation 0.8 s apart: if a pole fires at no other pole's time, the person may have
+        # moved meanwhile.
+        if not several and seen.sway[np.ix_(members, ~members)].max() <= 0.5:
+            detectable, ambiguous = np.inf, ambiguous or len(pairs) > 1
+            continue
+        sigma = 1.0 / np.sqrt(members @ np.linalg.solve(covariance, members.astype(float)))
+        # x sigmas along one direction have a log likelihood ratio of x^2 / 2 - 3 log(1 + x^2), which
+        # is MIN_LOG_RATIO at 5.8; two more keep chance from hiding it.
+        detectable = max(detectable, 8.0 * float(sigma))
+        # A single pair may look displaced because a head or an arm moved, unless the subject hardly
+        # swayed.
+        any_sway = len(pairs) > 1 or several
+        if not any_sway and sway_mm > STILL_MM:
+            detectable = np.inf
+        sways = SWAYS_MM if any_sway else SWAYS_MM[SWAYS_MM < STILL_MM]
+        stepped = np.outer(members, members)
+        gain = _maximize_likelihood(seen, sways, stepped, STEPS_MM)[0] - null
+        motions = [{n: m[n] for n in m if n in seen.names and n not in freed} for m, _ in scans]
+        candidates.append((gain, DisplacedPole.from_motions(name, pairs, _mean_motions(motions))))
+    if not candidates:
+        return DisplacementSearch(None, np.inf)
+    gain, best = max(candidates, key=lambda one: one[0])
+    if not ambiguous:
+        # If all poles moved outwards, none moved relative to the others, and the body is too thin.
+        same_pole = _same_pole(seen.names, poles)
+        each = _maximize_likelihood(seen, SWAYS_MM, same_pole, STEPS_MM)[0] - null
+        if each > max(gain, MIN_LOG_RATIO):
+            gain = each
+            farthest = max(
+                (one for _, one in candidates), key=lambda one: (len(one.pairs), one.shift_mm)
+            )
+            best = replace(farthest, all_moved=True)
+    lever = np.radians(best.rotation_deg) * LEVER_MM
+    displaced = gain > MIN_LOG_RATIO and np.hypot(best.shift_mm, lever) > MIN_STEP_MM
+    return DisplacementSearch(best if displaced else None, detectable, sway_mm, offset_mm)
+
+
+def _mean_motions(motions: Sequence[Mapping[str, Array]]) -> dict[str, Array]:
+    """Mean twist of each pair over the scans that have it."""
+    names = dict.fromkeys(name for scan in motions for name in scan)
+    return {
+        name: np.mean([scan[name] for scan in motions if name in scan], axis=0) for name in names
+    }
+
+
+@dataclass(frozen=True, eq=False)
+class _PoseMotions:
+    """Motions of N pairs, scan after scan, and the covariances that may explain them.
+
+    motions: of the body's centre and of a point at the lever arm, (N, 6) mm.
+    sway: correlations of the person's sway, (N, N).
+    sides: 1 for pairs of one pole in one scan, (N, N).
+    nuisance: prior variances of each scan's common motion, and of freed poles, (N, N) mm^2.
+    """
+
+    names: tuple[str, ...]
+    motions: Array
+    sway: Array
+    sides: Array
+    nuisance: Array
+
+    @staticmethod
+    def from_scans(
+        scans: Sequence[Scan], poles: Mapping[str, str], freed: Collection[str], *, timed: bool
+    ) -> _PoseMotions:
+        """timed: leave out pairs without a time."""
+        names: list[str] = []
+        motions, sways, sides = [np.empty((0, 6))], [], []
+        for twist_of, moments_ms in scans:
+            used = [name for name in twist_of if not timed or moments_ms[name] is not None]
+            twists = np.array([twist_of[name] for name in used]).reshape(-1, 6)
+            motions.append(np.hstack([centre_shifts(twists), LEVER_MM * twists[:, :3]]))
+            sways.append(_stance_correlations([moments_ms[name] for name in used]))
+            sides.append(_same_pole(used, poles))
+            names += used
+        is_freed = np.array([name in freed for name in names], float)
+        nuisance = block_diag(*(np.ones_like(sway) for sway in sways))
+        nuisance += np.outer(is_freed, is_freed)
+        return _PoseMotions(
+            tuple(names),
+            np.concatenate(motions),
+            block_diag(*sways),
+            block_diag(*sides),
+            100.0**2 * nuisance,
+        )
+
+
+def _stance_correlations(moments_ms: Sequence[float | None]) -> Array:
+    """Correlations of the posture between moments; an unknown one correlates with no other."""
+    seconds = np.array([np.nan if at is None else 1e-3 * at for at in moments_ms], float)
+    lag = seconds[:, None] - seconds
+    return np.where(np.isnan(lag), np.eye(len(seconds)), stance_correlation(np.nan_to_num(lag)))
+
+
+def _same_pole(names: Sequence[str], poles: Mapping[str, str]) -> Array:
+    """(N, N): 1 for two pairs of one pole."""
+    side = [poles.get(name, name) for name in names]
+    return np.equal.outer(side, side).astype(float)
+
+
+def _maximize_likelihood(
+    seen: _PoseMotions, sways_mm: Array, stepped: Array, steps_mm: Array
+) -> tuple[float, Array, float, float]:
+    """Maximize the log likelihood of the motions over the sizes of sway, displacement and noise.
+
+    stepped: 1 for two pairs that share a displacement, (N, N).
+
+    Also returns the covariance (N, N) there, and the sizes of sway and noise, mm.
+    """
+    sway2, step2 = (sizes.ravel() for sizes in np.meshgrid(sways_mm**2, steps_mm**2))
+    # A pole's pairs see one side, which breathes by some 2 mm, and arms: the non-rigid remainder
+    # is 0.6 of the sway and at most 0.9 mm (ten sound standing people: 1.5 to 4 mm at a pole).
+    side2 = np.minimum(0.6**2 * sway2, 0.9**2)
+    covariances = (
+        sway2[:, None, None] * seen.sway
+        + side2[:, None, None] * seen.sides
+        + step2[:, None, None] * stepped
+        + seen.nuisance
+    )
+    # Noise adds to the eigenvalues, so one decomposition serves all its sizes.
+    eigenvalues, eigenvectors = np.linalg.eigh(covariances)
+    noise2 = np.geomspace(0.05, 5.0, 9) ** 2
+    variance = np.maximum(eigenvalues, 0.0)[:, None, :] + noise2[:, None]
+    squares = np.sum((eigenvectors.transpose(0, 2, 1) @ seen.motions) ** 2, axis=2)
+    chi2 = np.sum(squares[:, None, :] / variance, axis=2)
+    log_det = seen.motions.shape[1] * np.sum(np.log(variance), axis=2)
+    log_likelihood = -0.5 * chi2 - 0.5 * log_det
+    size, noise = np.unravel_index(np.argmax(log_likelihood), log_likelihood.shape)
+    covariance = covariances[size] + noise2[noise] * np.eye(len(seen.names))
+    scales = float(np.sqrt(sway2[size])), float(np.sqrt(noise2[noise]))
+    return float(log_likelihood[size, noise]), covariance, *scales

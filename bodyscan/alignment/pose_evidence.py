@@ -1,0 +1,158 @@
+"""Detect displaced poles, or a wrong scale, from what the subject's motion leaves unexplained.
+
+The pairs' motions alone (`displaced_poles`) hardly distinguish poles that all moved outwards from a
+person who moved round them in turn. But feet stay in place while a body sways, and breath lifts no
+leg: once the body's motion is estimated, little is left that only displaced poles explain.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bodyscan.alignment.displaced_poles import (
+    MIN_PAIRS,
+    MIN_STEP_MM,
+    STEPS_MM,
+    DisplacedPole,
+    group_by_pole,
+)
+from bodyscan.alignment.sway_prior import BODY_CENTRE, LEVER_MM
+from bodyscan.arrays import Array, Mask
+from bodyscan.geometry.transforms import RigidTransform
+
+MIN_LOG_RATIO = 12.0
+"""Log likelihood ratio that a displacement must reach. No model of people is exact: in ten sound
+scans of moving people it was -9 to 5.8, in thirteen for single pairs -9 to 3; for poles displaced by
+3 mm it is 70 and more, for a pair by 5 mm 530."""
+MIN_OUTWARD_MM = 0.3
+"""2 mm of a girth; for ten sound people it was 0.22 mm at most."""
+
+
+@dataclass(frozen=True)
+class ScaleError:
+    """All poles are farther from the body than calibrated, or nearer.
+
+    outward_mm: how much farther, negative for nearer; every radius of the body is too small by that.
+    sigma_mm: its standard deviation.
+    """
+
+    outward_mm: float
+    sigma_mm: float
+
+
+@dataclass(frozen=True, eq=False)
+class PoseEvidence:
+    """Normal equations of the pose errors of P pairs, marginalized over the subject's motion.
+
+    information, vector: (6P, 6P), (6P,), of twists, pair after pair, beyond the calibration's
+        uncertainty.
+    """
+
+    names: tuple[str, ...]
+    information: Array
+    vector: Array
+
+    def fit(self, basis: Array) -> _DisplacementFit:
+        """Fit displacements along `basis` (6P, k), with the prior size in mm of the best evidence."""
+        information, vector = basis.T @ self.information @ basis, basis.T @ self.vector
+        identity = np.eye(len(vector))
+        fits = []
+        for size_mm in STEPS_MM:
+            covariance = np.linalg.inv(information + identity / size_mm**2)
+            log_det = np.linalg.slogdet(identity + size_mm**2 * information)[1]
+            log_ratio = float(0.5 * vector @ covariance @ vector - 0.5 * log_det)
+            fits.append(_DisplacementFit(log_ratio, covariance @ vector, covariance))
+        return max(fits, key=lambda fit: fit.log_ratio)
+
+
+@dataclass(frozen=True, eq=False)
+class _DisplacementFit:
+    """log_ratio: log likelihood ratio against none.  steps (k,) mm, with covariance (k, k)."""
+
+    log_ratio: float
+    steps: Array
+    covariance: Array
+
+
+def detect_displacement(
+    evidence: PoseEvidence,
+    rig_from_camera: Mapping[str, RigidTransform],
+    poles: Mapping[str, str],
+    freed: Collection[str] = (),
+) -> DisplacedPole | ScaleError | None:
+    """Find the displacement that explains a scan better than any motion of the subject.
+
+    Candidates are one pole or pair; every pole by itself (`all_moved`); all poles farther out or
+    nearer.
+
+    rig_from_camera: as calibrated.
+    poles: the pole of each pair that is mounted on one.
+    freed: pairs already known to be displaced.
+    """
+    sides = [poles.get(name, name) for name in evidence.names]
+    if len(set(sides)) < 2 or not set(evidence.names) - set(freed):
+        return None
+    candidates: list[tuple[float, DisplacedPole | ScaleError]] = []
+    for name, pairs in group_by_pole(evidence.names, poles).items():
+        # Among few pairs, any single one could be displaced.
+        identifiable = len(pairs) > 1 or len(evidence.names) >= MIN_PAIRS
+        if identifiable and pairs.isdisjoint(freed):
+            fit = evidence.fit(_rigid_basis(np.isin(evidence.names, list(pairs))))
+            candidates.append((fit.log_ratio, _displaced_pole(name, pairs, fit.steps)))
+    if not freed:
+        bases = {side: _rigid_basis(np.equal(sides, side)) for side in dict.fromkeys(sides)}
+        each = evidence.fit(np.hstack(list(bases.values())))
+        relative = each.steps.reshape(-1, 6) - each.steps.reshape(-1, 6).mean(axis=0)
+        farthest = int(np.argmax(np.linalg.norm(relative, axis=1)))
+        side = list(bases)[farthest]
+        pairs = frozenset(np.array(evidence.names)[np.equal(sides, side)].tolist())
+        pole = _displaced_pole(f"pole {side}", pairs, relative[farthest])
+        candidates.append((each.log_ratio, replace(pole, all_moved=True)))
+        scale = evidence.fit(_outward_basis(evidence.names, sides, rig_from_camera).reshape(-1, 1))
+        sigma_mm = float(np.sqrt(scale.covariance[0, 0]))
+        candidates.append((scale.log_ratio, ScaleError(float(scale.steps[0]), sigma_mm)))
+    log_ratio, best = max(candidates, key=lambda one: one[0], default=(0.0, None))
+    return best if best and log_ratio > MIN_LOG_RATIO and _is_harmful(best) else None
+
+
+def _is_harmful(found: DisplacedPole | ScaleError) -> bool:
+    if isinstance(found, ScaleError):
+        return abs(found.outward_mm) > MIN_OUTWARD_MM
+    lever = LEVER_MM * np.radians(found.rotation_deg)
+    return float(np.hypot(found.shift_mm, lever)) > MIN_STEP_MM
+
+
+def _displaced_pole(name: str, pairs: frozenset[str], steps: Array) -> DisplacedPole:
+    """steps: (6,) mm, along `_rigid_basis`."""
+    shift, lever = np.linalg.norm(steps.reshape(2, 3), axis=1)
+    return DisplacedPole(name, pairs, float(shift), float(np.degrees(lever / LEVER_MM)))
+
+
+def _rigid_basis(members: Mask) -> Array:
+    """Twists (6P, 6) of the pairs (P,) that move as one.
+
+    Translations of the body's centre by 1 mm, then rotations about it that move a point at the lever
+    arm by 1 mm.
+    """
+    twists = np.zeros((6, 6))
+    twists[3:, :3] = np.eye(3)
+    twists[:3, 3:] = np.eye(3) / LEVER_MM
+    twists[3:, 3:] = -np.cross(np.eye(3) / LEVER_MM, BODY_CENTRE).T
+    return np.asarray(np.kron(members.astype(float)[:, None], twists))
+
+
+def _outward_basis(
+    names: Collection[str], sides: Sequence[str], rig_from_camera: Mapping[str, RigidTransform]
+) -> Array:
+    """(P, 6): each pair translated by 1 mm, level and away from the body, equally for one pole."""
+    outward = np.array([rig_from_camera[name].translation - BODY_CENTRE for name in names])
+    outward[:, 2] = 0.0
+    twists = np.zeros((len(outward), 6))
+    for side in dict.fromkeys(sides):
+        members = np.equal(sides, side)
+        mean = outward[members].mean(axis=0)
+        twists[members, 3:] = mean / np.linalg.norm(mean)
+    return twists

@@ -1,0 +1,1 @@
+"""Non-rigid motion of a person between the pairs' captures: estimated, removed, and reported."""

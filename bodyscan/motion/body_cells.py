@@ -1,0 +1,220 @@
+"""Cells of a few centimetres on a body's surface, and geodesic distances between them.
+
+Distances run along the surface and straight through what is solid: a hand is far from the thigh next
+to it, and the front of an arm is as near its back as the arm is thick.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components, dijkstra
+from scipy.spatial import cKDTree
+
+from bodyscan.arrays import Array, Indices
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.progress import THREADS
+
+CELL_MM = 35.0  # breath bends a surface by a hundredth of a millimetre over half of it
+NEIGHBOUR_MM = 55.0  # centres of neighbouring cells are within this
+
+
+@dataclass(frozen=True, eq=False)
+class BodyCells:
+    """C cells of a body's surface, rig frame.
+
+    centres: (C, 3) mm.
+    normals: (C, 3).
+    graph: distances of neighbouring cells, (C, C) mm.
+    landmarks: a few cells, (L,).
+    landmark_distances: geodesic distances from each landmark to all cells, (L, C) mm.
+    """
+
+    centres: Array
+    normals: Array
+    graph: sparse.csr_array
+    landmarks: Indices
+    landmark_distances: Array
+
+    @staticmethod
+    def from_points(points: Array, normals: Array) -> tuple[BodyCells, Indices]:
+        """Divide points (N, 3) with normals (N, 3) into cells.
+
+        Also returns each point's cell (N,), -1 for points in cells with fewer than five.
+        """
+        centres, mean_normals, cell = _average_in_cubes(points, normals, CELL_MM, 5)
+        graph = _build_graph(centres, mean_normals, points[::4])
+        landmarks = pick_one_per_cube(centres, 110.0)
+        distances = _geodesic_distances(graph, landmarks)
+        return BodyCells(centres, mean_normals, graph, landmarks, distances), cell
+
+    def distances(self, starts: Indices) -> Array:
+        """Geodesic distances from cells (N,) to all cells, (N, C) mm."""
+        return _geodesic_distances(self.graph, starts)
+
+    def find(self, points: Array, normals: Array) -> Indices:
+        """Nearest cell (N,) of points (N, 3) with normals (N, 3), by position and orientation."""
+        tree = cKDTree(np.hstack([self.centres, CELL_MM * self.normals]))
+        nearest = tree.query(np.hstack([points, CELL_MM * normals]), workers=THREADS)[1]
+        return np.asarray(nearest, np.int64)
+
+    def find_by_groups(self, points: Array, normals: Array) -> Indices:
+        """`find` for a million points, looked up once for each group of neighbours."""
+        centres, mean_normals, number = _average_in_cubes(points, normals, 0.4 * CELL_MM, 1)
+        return self.find(centres, mean_normals)[number]
+
+    def covariance_factor(self, length_mm: float, min_share: float) -> Array:
+        """Low-rank factor L (C, M) of the cells' squared-exponential covariance, L L^T.
+
+        The covariance is exp(-(distance / length)^2 / 2), reduced to the landmarks (Nystroem).
+        Eigenvalues below `min_share` of the largest are dropped; so are negative ones, since
+        geodesic distances are not Euclidean.
+        """
+        to_landmarks = np.exp(-0.5 * (self.landmark_distances / length_mm) ** 2)
+        among = to_landmarks[:, self.landmarks]
+        eigenvalues, eigenvectors = np.linalg.eigh(0.5 * (among + among.T))
+        kept = eigenvalues > min_share * eigenvalues[-1]
+        return np.asarray(to_landmarks.T @ (eigenvectors[:, kept] / np.sqrt(eigenvalues[kept])))
+
+    def gradients(self, values: Array) -> Array:
+        """Gradients (C, 3, M) along the surface, per mm, of values (C, M), by least squares."""
+        graph = self.graph.tocoo()
+        adjacent = graph.data < NEIGHBOUR_MM
+        i, j = graph.row[adjacent], graph.col[adjacent]
+        step = self.centres[j] - self.centres[i]
+        squares = np.zeros((len(self.centres), 3, 3))
+        np.add.at(squares, i, step[:, :, None] * step[:, None, :])
+        # Neighbours determine no slope along the normal: regularize it to zero.
+        normal = self.normals[:, :, None] * self.normals[:, None, :]
+        regularized = squares + CELL_MM**2 * (4.0 * normal + 0.01 * np.eye(3))
+        weights = np.linalg.solve(regularized[i], step[:, :, None])[..., 0]
+        size = (len(self.centres),) * 2
+        gradients = []
+        for column in weights.T:
+            forward = sparse.csr_array((column, (i, j)), shape=size)
+            gradients.append(forward @ values - np.bincount(i, column, size[0])[:, None] * values)
+        return np.stack(gradients, axis=1)
+
+
+def rigid_fields(cells: BodyCells, centre: Array, lever_mm: float) -> Array:
+    """Fields (C, 12, 6) of rotations by 1 / lever_mm about a centre and translations by 1 mm.
+
+    A field holds, for each cell, the displacement (3,) of its centre, then the displacement's
+    derivatives by x, y and z.
+    """
+    offsets = cells.centres - centre
+    fields = np.zeros((len(offsets), 4, 3, 6))
+    for k, axis in enumerate(np.eye(3)):
+        fields[:, 0, :, k] = np.cross(axis, offsets) / lever_mm
+        fields[:, 1:, :, k] = np.cross(axis, np.eye(3)) / lever_mm
+        fields[:, 0, k, 3 + k] = 1.0
+    return fields.reshape(len(offsets), 12, 6)
+
+
+def modulate_fields(fields: Array, cells: BodyCells, functions: Array) -> Array:
+    """Multiply fields (C, 12, F) by each scalar function (C, M), by the product rule: (C, 12, M F)."""
+    wide = fields.reshape(len(fields), 4, 3, 1, -1)
+    out = wide * functions[:, None, None, :, None]
+    out[:, 1:] += cells.gradients(functions)[:, :, None, :, None] * wide[:, :1]
+    return out.reshape(len(fields), 12, -1)
+
+
+def evaluate_field(field: Array, offsets: Array) -> Array:
+    """Displacements (N, 3) mm, by fields (N, 12), of points at `offsets` (N, 3) from their cells."""
+    gradients = field[:, 3:].reshape(-1, 3, 3)
+    return field[:, :3] + np.einsum("nki,nk->ni", gradients, offsets)
+
+
+def field_in_camera(field: Array, rig_from_camera: RigidTransform) -> Array:
+    """Express a field (C, 12) of the rig frame in the camera frame."""
+    rotation = rig_from_camera.rotation
+    rotated = field.reshape(-1, 4, 3) @ rotation
+    rotated[:, 1:] = np.einsum("ka,nki->nai", rotation, rotated[:, 1:])
+    return rotated.reshape(-1, 12)
+
+
+def pick_one_per_cube(centres: Array, size_mm: float) -> Indices:
+    """Indices of the point nearest to the middle of each occupied cube of that size."""
+    position = (centres - centres.min(axis=0)) / size_mm
+    cube = np.floor(position).astype(np.int64)
+    key = np.ravel_multi_index(tuple(cube.T), tuple(cube.max(axis=0) + 1))
+    order = np.lexsort((np.sum((position - cube - 0.5) ** 2, axis=1), key))
+    return np.sort(order[np.unique(key[order], return_index=True)[1]])
+
+
+def _geodesic_distances(graph: sparse.csr_array, starts: Indices) -> Array:
+    return np.asarray(dijkstra(graph, directed=False, indices=starts.astype(np.int32)))
+
+
+def _average_in_cubes(
+    points: Array, normals: Array, size_mm: float, min_points: int
+) -> tuple[Array, Array, Indices]:
+    """Mean points and normals in each cube and main direction of the normals, if enough.
+
+    Also returns each point's group, or -1.
+    """
+    axis = np.argmax(np.abs(normals), axis=1)
+    side = 2 * axis + (np.take_along_axis(normals, axis[:, None], axis=1)[:, 0] > 0)
+    cube = np.floor((points - points.min(axis=0)) / size_mm).astype(np.int64)
+    key = np.ravel_multi_index((*cube.T, side), (*(cube.max(axis=0) + 1), 6))
+    count = np.bincount(key)
+    enough = np.flatnonzero(count >= min(min_points, count.max()))
+    number = np.full(len(count), -1)
+    number[enough] = np.arange(len(enough))
+    point_sum, normal_sum = (
+        np.stack([np.bincount(key, column)[enough] for column in values.T], axis=1).astype(float)
+        for values in (points, normals)
+    )
+    length = np.maximum(np.linalg.norm(normal_sum, axis=1, keepdims=True), 1e-9)
+    return point_sum / count[enough, None], normal_sum / length, number[key]
+
+
+def _build_graph(centres: Array, normals: Array, points: Array) -> sparse.csr_array:
+    """Connect neighbours on the surface, and opposite sides of what is solid.
+
+    points: of the surface. Components that remain are bridged where they are nearest.
+    """
+    edges = cKDTree(centres).query_pairs(NEIGHBOUR_MM, output_type="ndarray")
+    # Neighbours round a finger, not across a gap.
+    edges = edges[np.sum(normals[edges[:, 0]] * normals[edges[:, 1]], axis=1) > -0.2]
+    midpoints = 0.5 * (centres[edges[:, 0]] + centres[edges[:, 1]])
+    # Half the gap between a hand and a thigh, in which nothing was measured.
+    edges = edges[cKDTree(points).query(midpoints)[0] < 15.0]
+    edges = np.concatenate([edges, _opposite_sides(centres, normals)])
+    while True:
+        graph = _weighted_graph(centres, edges)
+        label = connected_components(graph, directed=False)[1].astype(np.int64)
+        sizes = np.bincount(label)
+        if len(sizes) == 1:
+            return graph
+        smallest = label == np.argmin(sizes)
+        distance, nearest = cKDTree(centres[~smallest]).query(centres[smallest])
+        k = int(np.argmin(distance))
+        bridge = np.flatnonzero(smallest)[k], np.flatnonzero(~smallest)[np.asarray(nearest)[k]]
+        edges = np.concatenate([edges, [bridge]])
+
+
+def _weighted_graph(centres: Array, edges: Indices) -> sparse.csr_array:
+    """Symmetric graph (C, C) with the lengths of edges (N, 2), mm."""
+    edges = np.unique(np.sort(edges, axis=1), axis=0)
+    length = np.linalg.norm(centres[edges[:, 0]] - centres[edges[:, 1]], axis=1)
+    upper = sparse.coo_array((length, tuple(edges.T)), shape=(len(centres),) * 2)
+    return (upper + upper.T).tocsr()
+
+
+def _opposite_sides(centres: Array, normals: Array) -> Indices:
+    """(N, 2): cells, and for each the nearest cell straight behind it that faces the other way.
+
+    Within 300 mm, the thickest trunk; straight is a cosine of 0.85 between the line through the
+    limb and the normals at both ends.
+    """
+    x, n = (values.astype(np.float32) for values in (centres - centres.mean(axis=0), normals))
+    depth = np.sum(x * n, axis=1) - x @ n.T  # [j, i]: of j behind i
+    square = np.sum(x**2, axis=1)
+    distance = np.sqrt(np.maximum(square[:, None] + square - 2.0 * x @ x.T, np.float32(1.0)))
+    opposite = (np.minimum(depth, depth.T) > 0.85 * distance) & (distance < 300.0)
+    nearest = np.argmin(np.where(opposite, distance, np.float32(np.inf)), axis=1)
+    found = np.flatnonzero(np.any(opposite, axis=1))
+    return np.stack([found, nearest[found]], axis=1)

@@ -1,0 +1,267 @@
+"""How a person's surface moved between the pairs' moments, estimated from all overlaps jointly.
+
+Several kinds of motion compete to explain the overlaps (`motion_kinds`): the body leans above its
+ankles or moves as a whole, head and arms rotate about their joints, parts shift, the trunk breathes.
+Each is a Gaussian process over surface and time whose variance maximizes the evidence; what the
+calibration left open of the pairs' poses is estimated with them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+from scipy.linalg import cho_solve
+from scipy.linalg.lapack import dpotrf, dpotri, dtrtri, dtrtrs
+
+from bodyscan.arrays import Array, Indices
+from bodyscan.motion.body_cells import BodyCells
+from bodyscan.motion.breath import estimate_breath_covariance
+from bodyscan.motion.cell_equations import CellEquations
+from bodyscan.motion.motion_kinds import MotionKind, build_kinds
+from bodyscan.motion.temporal_modes import breath_covariances
+from bodyscan.progress import map_threads
+
+MODEL_ERROR_MM = 0.07
+"""Between the surfaces of two pairs in a cell, by no motion of the body: calibrations warp surfaces by
+0.05 mm each, which no number of matches averages out."""
+
+
+@dataclass(frozen=True, eq=False)
+class BodyMotion:
+    """Gaussian estimate of the n amplitudes of all kinds of motion.
+
+    fields: of all kinds, (C, 12, M).
+    amplitudes: of the fields along their temporal modes, (n,).
+    information, vector: normal equations of the overlaps without prior; the matrix's lower triangle,
+        (n, n), and (n,).
+    factor: lower Cholesky factor (n, n) of the posterior information in units of `units` (n,).
+    breaths: covariances of possible breaths and their priors, see `breath_covariances`.
+    """
+
+    kinds: tuple[MotionKind, ...]
+    fields: Array
+    amplitudes: Array
+    information: Array
+    vector: Array
+    factor: Array
+    units: Array
+    breaths: tuple[Array, Array]
+
+    @staticmethod
+    def at_rest(
+        cells: BodyCells, seconds: Sequence[float | None], boards: Array, sway: Array
+    ) -> BodyMotion:
+        """The state before anything has moved; arguments as in `build_kinds`."""
+        kinds = build_kinds(cells, seconds, boards, sway)
+        count = sum(kind.count for kind in kinds)
+        matrix, vector = np.zeros((count, count)), np.zeros(count)
+        fields = np.concatenate([kind.fields for kind in kinds], axis=2)
+        breaths = breath_covariances(kinds[-1].modes, seconds)
+        return BodyMotion(kinds, fields, vector, matrix, vector, matrix, np.ones(count), breaths)
+
+    @cached_property
+    def slices(self) -> tuple[slice, ...]:
+        """The amplitudes of each kind."""
+        ends = np.cumsum([0, *(kind.count for kind in self.kinds)]).tolist()
+        return tuple(slice(a, b) for a, b in pairwise(ends))
+
+    @cached_property
+    def covariance(self) -> Array:
+        """Posterior covariance of the amplitudes, (n, n)."""
+        lower = np.tril(dpotri(self.factor, lower=True)[0])
+        return (lower + np.tril(lower, -1).T) * self.units[:, None] * self.units
+
+    @property
+    def variances(self) -> Array:
+        """Posterior variances of the amplitudes, (n,), at half the cost of `covariance`."""
+        root = dtrtri(self.factor, lower=True)[0]
+        return np.asarray(np.einsum("ij,ij->j", root, root) * self.units**2, np.float64)
+
+    def kind(self, name: str) -> MotionKind:
+        return next(kind for kind in self.kinds if kind.name == name)
+
+    def amplitudes_at(self, name: str, modes: Array) -> Array:
+        """Amplitudes (M, ...) of one kind's fields where its modes have the values (J, ...)."""
+        k = self.kinds.index(self.kind(name))
+        return np.asarray(self.amplitudes[self.slices[k]].reshape(-1, len(modes)) @ modes)
+
+    def twist(self, pair: int, *, from_middle: bool = False) -> Array:
+        """Twist (6,) about the rig's origin by a pair's pose error and the whole body's motion."""
+        total = np.zeros(6)
+        for kind in self.kinds:
+            if kind.twists is not None:
+                modes = kind.modes_from_middle(pair) if from_middle else kind.modes.values[pair]
+                total += kind.twists @ self.amplitudes_at(kind.name, modes)
+        return total
+
+    def displacements(self, names: Sequence[str], *, from_middle: bool = False) -> Array:
+        """Displacement fields (P, C, 12) mm by the named kinds at each pair's moment."""
+        return self._sum_fields(
+            {k.name: k.fields for k in self.kinds if k.name in names}, from_middle
+        )
+
+    def non_rigid(self, *, from_middle: bool = False) -> Array:
+        """Displacement fields (P, C, 12) mm by all kinds, less `twist`."""
+        fields = {k.name: k.fields if k.twists is None else k.remainder for k in self.kinds}
+        return self._sum_fields({n: f for n, f in fields.items() if f is not None}, from_middle)
+
+    def _sum_fields(self, fields: Mapping[str, Array], from_middle: bool) -> Array:
+        total = np.zeros((self.fields.shape[0] * 12, len(self.kinds[0].modes.values)))
+        for name, field in fields.items():
+            modes = self.kind(name).modes
+            values = modes.values - (modes.middle if from_middle else 0.0)
+            total += field.reshape(len(total), -1) @ self.amplitudes_at(name, values.T)
+        return total.T.reshape(total.shape[1], -1, 12)
+
+    def update(self, equations: Mapping[tuple[int, int], CellEquations]) -> BodyMotion:
+        """Estimate all amplitudes, and each kind's prior variance, in one Gauss-Newton step.
+
+        equations: by pairs (a, b), linearized at the present motion.
+        """
+        current = self.displacements([kind.name for kind in self.kinds])
+
+        def project(overlap: tuple[tuple[int, int], CellEquations]) -> tuple[Array, Array]:
+            (a, b), cells = overlap
+            return self._project(cells.with_model_error(MODEL_ERROR_MM), current[a] - current[b])
+
+        projected = map_threads(project, equations.items(), stage="aligning")
+        matrices, vectors = (np.array(values) for values in zip(*projected, strict=True))
+        first, second = np.array(list(equations)).T
+        ends = np.cumsum([0, *(kind.fields.shape[2] for kind in self.kinds)])
+        differences = [k.modes.values[first] - k.modes.values[second] for k in self.kinds]
+        count = len(self.amplitudes)
+        information, total = np.zeros((count, count), order="F"), np.zeros(count)
+        for g, kind in enumerate(self.kinds):
+            columns, rows = slice(ends[g], ends[g + 1]), self.slices[g]
+            total[rows] = (vectors[:, columns].T @ differences[g]).ravel()
+            for h, other in enumerate(self.kinds[: g + 1]):
+                block = matrices[:, columns, ends[h] : ends[h + 1]]
+                information[rows, self.slices[h]] = _sum_products(
+                    block, differences[g], differences[h]
+                ).reshape(kind.count, other.count)
+        motion = replace(self, information=information, vector=total)
+        motion = motion._solve()._estimate_breath()._solve()
+        for _ in range(3):  # variances that the overlaps do not require shrink step by step
+            motion = motion._update_prior_variances()._solve()
+        return motion
+
+    def covariance_with_min_parts(self) -> Array:
+        """Covariance (n, n) if parts moved at least by a fifteenth of the breath.
+
+        The evidence sizes the motion of all parts at once, and legs that stood still say nothing
+        about a hip: 0.1 mm in those who stand, 0.25 in the restless.
+        """
+        breath = self.kind("breath").mode_covariance
+        assert breath is not None
+        min_size = 1.0 / 15.0 * float(np.sqrt(np.linalg.eigvalsh(breath)[-1]))
+        kinds = (
+            replace(kind, size=max(kind.size, min_size)) if kind.name == "parts" else kind
+            for kind in self.kinds
+        )
+        return replace(self, kinds=tuple(kinds))._solve().covariance
+
+    def pose_equations(self) -> tuple[Array, Array]:
+        """Normal equations (6P, 6P), (6P,) of pose errors beyond the calibration's uncertainty.
+
+        Twists (6,), pair after pair, marginalized over everything else (Schur complement).
+        """
+        pose = self.slices[0]
+        # Poses come first: their columns of the lower triangle are complete but for their own block.
+        columns = self.information[:, pose].copy()
+        columns[pose] = np.tril(columns[pose]) + np.tril(columns[pose], -1).T
+        information = columns[pose] - columns.T @ self.covariance @ columns
+        vector = self.vector[pose] - columns.T @ self.amplitudes
+        by_pair = np.arange(len(vector)).reshape(6, -1).T.ravel()
+        return information[np.ix_(by_pair, by_pair)], vector[by_pair]
+
+    def error_factor(self, name: str, modes: Array, normals: Array) -> Array:
+        """Factor L (C, n) of the covariance L L^T of one kind's displacement along normals (C, 3).
+
+        modes: values (J,) of its temporal modes.
+        """
+        kind = self.kind(name)
+        block = self.slices[self.kinds.index(kind)]
+        rows = _along_normals(kind, np.arange(len(normals)), normals, modes)
+        eigenvalues, eigenvectors = np.linalg.eigh(self.covariance[block, block])
+        return np.asarray(rows @ (eigenvectors * np.sqrt(np.maximum(eigenvalues, 0.0))))
+
+    def observation_matrix(self, pair: int, cells: Indices, normals: Array) -> Array:
+        """Jacobian (c, n) of displacements along normals (c, 3) from the middle to a pair's moment."""
+        return np.hstack(
+            [_along_normals(k, cells, normals, k.modes_from_middle(pair)) for k in self.kinds]
+        )
+
+    def _project(self, equations: CellEquations, offset: Array) -> tuple[Array, Array]:
+        """Project an overlap's normal equations onto the fields: (M, M), (M,).
+
+        offset: displacement (C, 12) of its pairs at present, at which they were linearized.
+        """
+        fields = self.fields[equations.cells]
+        basis = fields.reshape(-1, fields.shape[2])
+        vector = np.einsum("cij,cj->ci", equations.information, offset[equations.cells])
+        vector -= equations.gradient
+        matrix = basis.T @ (equations.information @ fields).reshape(basis.shape)
+        return matrix, basis.T @ vector.ravel()
+
+    def _solve(self) -> BodyMotion:
+        """Solve the normal equations with the prior, in place by LAPACK."""
+        matrix = self.information.copy(order="F")
+        for kind, block in zip(self.kinds, self.slices, strict=True):
+            matrix[block, block] += kind.prior_information
+        units = 1.0 / np.sqrt(np.diag(matrix))
+        matrix *= units[:, None]
+        matrix *= units
+        factor, failed = dpotrf(matrix, lower=True, overwrite_a=True)
+        if failed:
+            raise np.linalg.LinAlgError("the overlaps do not determine the motion")
+        amplitudes = units * cho_solve((factor, True), units * self.vector, check_finite=False)
+        return replace(self, amplitudes=amplitudes, factor=factor, units=units)
+
+    def _estimate_breath(self) -> BodyMotion:
+        """Set the breath's prior covariance from the evidence, marginalized over all other motion.
+
+        Motions of limbs could explain most of a breath too, but none of them moves the whole trunk
+        periodically.
+        """
+        breath = self.kind("breath")
+        block = self.slices[self.kinds.index(breath)]
+        unit = np.zeros((len(self.units), block.stop - block.start), order="F")
+        unit[block] = np.diag(self.units[block])
+        root = dtrtrs(self.factor, unit, lower=True, overwrite_b=True)[0]
+        posterior = np.linalg.inv(np.asarray(root.T @ root, np.float64))
+        covariance = estimate_breath_covariance(
+            posterior - breath.prior_information,
+            posterior @ self.amplitudes[block],
+            *self.breaths,
+        )
+        kinds = (replace(k, mode_covariance=covariance) if k is breath else k for k in self.kinds)
+        return replace(self, kinds=tuple(kinds))
+
+    def _update_prior_variances(self) -> BodyMotion:
+        """Update each kind's prior variance by type-II maximum likelihood (MacKay 1992)."""
+        kinds, variances = [], self.variances
+        for kind, block in zip(self.kinds, self.slices, strict=True):
+            if kind.precision is None and kind.mode_covariance is None:
+                determined = kind.count - np.sum(variances[block]) / kind.size**2
+                size = np.sqrt(np.sum(self.amplitudes[block] ** 2) / max(determined, 1e-6))
+                kind = replace(kind, size=max(float(size), 1e-3))
+            kinds.append(kind)
+        return replace(self, kinds=tuple(kinds))
+
+
+def _sum_products(block: Array, first: Array, second: Array) -> Array:
+    """(M, J, N, K): sums over overlaps of (O, M, N) times (O, J) and (O, K)."""
+    flat = block.reshape(len(block), -1)
+    modes = (first[:, :, None] * second[:, None, :]).reshape(len(block), -1)
+    shape = (*block.shape[1:], first.shape[1], second.shape[1])
+    return np.asarray((flat.T @ modes).reshape(shape).transpose(0, 2, 1, 3))
+
+
+def _along_normals(kind: MotionKind, cells: Indices, normals: Array, modes: Array) -> Array:
+    """Jacobian (c, M J) of a kind's displacement of cells along normals (c, 3)."""
+    along = np.einsum("cim,ci->cm", kind.fields[cells, :3], normals)
+    return (along[:, :, None] * modes).reshape(len(cells), -1)

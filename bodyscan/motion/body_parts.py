@@ -1,0 +1,88 @@
+"""Parts of a person: which part each cell belongs to, and how head and arms move."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bodyscan.arrays import Array, Indices
+from bodyscan.motion.body_cells import BodyCells, modulate_fields, rigid_fields
+
+PARTS = ("trunk", "head", "left arm", "right arm", "left leg", "right leg")
+LEGS = PARTS[-2:]
+LIMBS = ("head", "left arm", "right arm")
+SHIFTS = tuple(f"{limb} shift" for limb in LIMBS)
+# Shares of the stature (Drillis and Contini 1966, rounded).
+NECK, CROTCH = 0.86, 0.47
+FOOT, ANKLE, SHIN = 0.03, 0.05, 0.15
+
+
+def name_parts(cells: BodyCells) -> Indices:
+    """Assign each cell (C,) an index in PARTS, whichever way the person faces."""
+    stature = float(cells.centres[:, 2].max())
+    height = cells.centres[:, 2] / stature
+    offsets = cells.centres[:, :2] - np.median(cells.centres[:, :2], axis=0)
+    sideways = offsets @ leftward(cells) / stature
+    part = np.where(height > NECK, PARTS.index("head"), PARTS.index("trunk"))
+    part[height < CROTCH] = PARTS.index("right leg")
+    part[(height < CROTCH) & (sideways > 0.0)] = PARTS.index("left leg")
+    navel = int(np.argmin(np.abs(height - 0.6) + np.abs(sideways)))
+    from_navel = cells.distances(np.array([navel]))[0] / stature
+    hands = (height > 0.29) & (height < NECK)  # above the knees
+    for name, outward in (("left arm", sideways), ("right arm", -sideways)):
+        tip = int(np.argmax(np.where(hands, outward, -np.inf)))
+        if from_navel[tip] > 0.35:  # through the body; a fingertip is farther from the navel
+            from_tip = cells.distances(np.array([tip]))[0] / stature
+            part[from_tip < 0.38] = PARTS.index(name)  # up to the shoulder
+    return part
+
+
+def ankles(cells: BodyCells) -> Array:
+    """Midpoint of the ankles, (3,) mm; below the middle of the body if no shin was measured."""
+    stature = float(cells.centres[:, 2].max())
+    shins = cells.centres[:, 2] < SHIN * stature
+    low = cells.centres[shins] if shins.any() else cells.centres
+    return np.append(low[:, :2].mean(axis=0), ANKLE * stature)
+
+
+def weight_above_feet(cells: BodyCells) -> Array:
+    """Weight (C,) of each cell: 0 in the feet, 1 above the ankles."""
+    height = cells.centres[:, 2] / cells.centres[:, 2].max()
+    return np.clip((height - FOOT) / (ANKLE - FOOT), 0.0, 1.0)
+
+
+def leftward(cells: BodyCells) -> Array:
+    """Unit vector (2,) to the subject's left, from the direction of the toes, or else the rig's x."""
+    height = cells.centres[:, 2] / cells.centres[:, 2].max()
+    feet, shins = height < FOOT, (height > ANKLE) & (height < SHIN)
+    forward = np.array([1.0, 0.0])
+    if feet.any() and shins.any():
+        toes = cells.centres[feet, :2].mean(axis=0) - cells.centres[shins, :2].mean(axis=0)
+        if np.linalg.norm(toes) > 0.01 * cells.centres[:, 2].max():
+            forward = toes / np.linalg.norm(toes)
+    return np.array([-forward[1], forward[0]])
+
+
+def limb_weights(cells: BodyCells) -> dict[str, Array]:
+    """Share (C,) with which each cell follows each of LIMBS: 1 on it, 0 on the trunk.
+
+    It fades over 60 mm, the width of a neck's or shoulder's border.
+    """
+    part = name_parts(cells)
+    kernel = np.exp(-0.5 * (cells.landmark_distances / 60.0) ** 2)
+    total = np.maximum(kernel.sum(axis=0), 1e-12)
+    members = {limb: part[cells.landmarks] == PARTS.index(limb) for limb in LIMBS}
+    return {limb: np.minimum((marks @ kernel) / total, 1.0) for limb, marks in members.items()}
+
+
+def limb_fields(cells: BodyCells, lever_mm: float) -> dict[str, Array]:
+    """Displacement fields (C, 12, 3) of each limb's rotation about its joint, and of its shift.
+
+    The joint is the middle of the limb's border; limbs that were not measured have zero fields.
+    """
+    fields = {}
+    for (limb, weight), shift in zip(limb_weights(cells).items(), SHIFTS, strict=True):
+        border = weight * (1.0 - weight)
+        joint = border @ cells.centres / max(border.sum(), 1e-12)
+        field = modulate_fields(rigid_fields(cells, joint, lever_mm), cells, weight[:, None])
+        fields[limb], fields[shift] = field[..., :3], field[..., 3:]
+    return fields

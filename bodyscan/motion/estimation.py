@@ -1,0 +1,330 @@
+"""Estimate a person's motion between the pairs' captures, and the pairs' poses with it.
+
+Alignment moves each pair by one rigid motion. A person who breathes or moves an arm needs more: each
+pair's surface is displaced, cell by cell of the body, to where it was in the middle of the scan.
+This is done only if the overlaps require it; a mannequin stays as aligned.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TypeVar
+
+import numpy as np
+
+from bodyscan.alignment.icp import Alignment
+from bodyscan.alignment.matching import Matches, SampledPoints
+from bodyscan.alignment.overlaps import COARSE, OverlapPoints, map_overlaps, match_overlap
+from bodyscan.alignment.pose_evidence import PoseEvidence
+from bodyscan.alignment.sway_prior import SwayPrior, centre_shifts
+from bodyscan.arrays import Array, Indices, Mask
+from bodyscan.geometry.robust import rms, rms_length
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.uncertainty import PoseCovariance
+from bodyscan.mesh.body import BodyMesh, BreathAt
+from bodyscan.motion.body_cells import BodyCells, evaluate_field
+from bodyscan.motion.body_motion import BodyMotion
+from bodyscan.motion.body_parts import LIMBS, SHIFTS
+from bodyscan.motion.cell_equations import CellEquations
+from bodyscan.motion.motion_uncertainty import girth_sigmas, shape_sigmas
+from bodyscan.progress import THREADS
+from bodyscan.reconstruction.range_image import RangeImage
+from bodyscan.settings import AlignmentSettings
+
+Result = TypeVar("Result")
+
+RIGID = ("lean", "sway")
+NON_RIGID = (*LIMBS, *SHIFTS, "parts", "breath")
+ROUNDS = 3  # the last with all points
+
+
+@dataclass(frozen=True, eq=False)
+class BreathOffset:
+    """Displacement from the middle of the scan to mean breath.
+
+    field: (C, 12), see `rigid_fields`.
+    sigma_mm: standard deviation (C,) along the normals, as it affects a girth there.
+    """
+
+    field: Array
+    sigma_mm: Array
+
+    def along_normals(self, cells: BodyCells, points: Array, normals: Array) -> tuple[Array, Array]:
+        """Displacement and sigma, (N,) mm each, along the normals of points (N, 3)."""
+        cell = cells.find_by_groups(points, normals)
+        displacement = evaluate_field(self.field[cell], points - cells.centres[cell])
+        return np.sum(displacement * normals, axis=1), self.sigma_mm[cell]
+
+
+@dataclass(frozen=True, eq=False)
+class EstimatedMotion:
+    """A person's motion, in cells of the body.
+
+    warps: by pair, displacement fields (C, 12) from where the pair's pose puts the surface to where
+        it was in the middle of the scan.
+    displacements: by pair, of the whole motion between its moment and the middle, (P, C, 3) mm.
+    observed: which pairs measured which cells, (P, C).
+    sigma_mm: standard deviation of a cell's surface along its normal, from the uncertainty of the
+        motion and of the pairs' poses, (C,).
+    moment_ms: the middle of the scan; None (the mean of all) if no pair's moment is known.
+    breath: None without moments.
+    """
+
+    cells: BodyCells
+    warps: dict[str, Array]
+    displacements: Array
+    observed: Mask
+    sigma_mm: Array
+    moment_ms: float | None
+    breath: BreathOffset | None = None
+
+    def add_breath(self, surface: BodyMesh) -> BodyMesh:
+        """Attach each vertex's displacement to mean breath, where it is known."""
+        if self.breath is None:
+            return surface
+        offset, sigma = self.breath.along_normals(
+            self.cells, surface.vertices, surface.normals.astype(np.float64)
+        )
+        breath = BreathAt(offset.astype(np.float32), sigma.astype(np.float32))
+        return replace(surface, breath=breath)
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """The sampled points of one pair, its initial pose, and the cell of each point."""
+
+    initial: RigidTransform
+    sampled: OverlapPoints
+    cell: Indices
+
+    @staticmethod
+    def from_image(pose: RigidTransform, image: RangeImage, spacing_mm: float) -> _View:
+        sampled = OverlapPoints.from_image(image, spacing_mm)
+        return _View(pose, sampled, np.zeros(len(sampled.inner.points), np.int64))
+
+    @property
+    def points(self) -> SampledPoints:
+        return self.sampled.inner
+
+    def with_cells(self, cell: Indices) -> _View:
+        """Set each point's cell; drop points that are in none."""
+        return replace(self, cell=cell).select(cell >= 0)
+
+    def select(self, chosen: Mask | slice) -> _View:
+        return _View(self.initial, self.sampled.select(chosen), self.cell[chosen].copy())
+
+
+def estimate_motion(
+    images: Sequence[RangeImage],
+    rig_from_camera: Mapping[str, RigidTransform],
+    aligned: Alignment,
+    prior: PoseCovariance,
+    settings: AlignmentSettings,
+    *,
+    workers: int = THREADS,
+) -> tuple[Alignment, EstimatedMotion | None, PoseEvidence | None]:
+    """Estimate the motion of a person, and the poses of the pairs, from all overlaps.
+
+    images, rig_from_camera, prior, settings: as given to `align`.
+    aligned: its result.
+
+    Returns the alignment with sway as a function of time; the non-rigid motion, None (and the
+    alignment unchanged) for a person who stood still or if too little overlaps; and the evidence on
+    pose errors, None if a pair's moment is unknown, since sway would then explain any of them.
+    """
+    if not aligned.overlaps or not settings.sway_mm or aligned.refused:
+        return aligned, None, None
+    names = [image.pair for image in images]
+    seconds = [None if image.time_ms is None else 1e-3 * image.time_ms for image in images]
+    with ThreadPoolExecutor(workers) as pool:
+        views = list(
+            pool.map(
+                lambda image: _View.from_image(
+                    rig_from_camera[image.pair], image, settings.spacing_mm
+                ),
+                images,
+            )
+        )
+        views, cells = _divide_into_cells(views, [aligned.rig_from_camera[name] for name in names])
+        observed = np.array(
+            [np.bincount(view.cell, minlength=len(cells.centres)) > 0 for view in views]
+        )
+        sway = np.repeat([np.radians(settings.sway_deg), settings.sway_mm], 3)
+        boards = SwayPrior(0.0, 0.0, 0.0, 0.0).covariance(names, prior)
+        at_rest = BodyMotion.at_rest(cells, seconds, boards, sway)
+        solution = _solve(pool, views, (at_rest, cells), observed, settings)
+        if solution is None:
+            return aligned, None, None
+        motion = solution.motion
+        evidence = None
+        if None not in seconds:
+            evidence = PoseEvidence(tuple(names), *motion.pose_equations())
+        if solution.negligible:
+            return aligned, None, evidence
+        coarse = [view.select(COARSE) for view in views]
+        distances = _map_matches(
+            lambda matches, cell: rms(matches.distances),
+            pool,
+            coarse,
+            (motion, cells),
+            solution.reach_mm,
+            settings,
+        )
+    moved = _update_alignment(aligned, names, views, motion, distances)
+    # If non-rigid motion does not bring overlaps closer, they are apart because of the pairs' own
+    # calibrations, which warp with position and not with time.
+    no_closer = moved.rms_after_mm > 0.95 * aligned.rms_after_mm
+    if no_closer and _is_rigid_negligible(motion, observed, settings):
+        return aligned, None, evidence
+    known = [image.time_ms for image in images if image.time_ms is not None]
+    estimated = EstimatedMotion(
+        cells,
+        dict(zip(names, motion.non_rigid(from_middle=True), strict=True)),
+        motion.displacements((*RIGID, *NON_RIGID), from_middle=True)[..., :3],
+        observed,
+        shape_sigmas(motion, cells, observed),
+        0.5 * (min(known) + max(known)) if known else None,
+        _offset_to_mean_breath(motion, cells) if known else None,
+    )
+    return moved, estimated, evidence
+
+
+def _divide_into_cells(
+    views: Sequence[_View], rig_from_camera: Sequence[RigidTransform]
+) -> tuple[list[_View], BodyCells]:
+    """Divide the aligned points of all views into cells; returns views with each point's cell."""
+    both = [(pose, view.points) for pose, view in zip(rig_from_camera, views, strict=True)]
+    cells, cell = BodyCells.from_points(
+        np.concatenate([pose.apply(cloud.points) for pose, cloud in both]),
+        np.concatenate([pose.rotate(cloud.normals) for pose, cloud in both]),
+    )
+    ends = np.cumsum([len(cloud.points) for _, cloud in both])[:-1]
+    by_view = np.split(cell, ends)
+    return [view.with_cells(part) for view, part in zip(views, by_view, strict=True)], cells
+
+
+@dataclass(frozen=True, eq=False)
+class _Solution:
+    """The motion, the next search radius, and whether the motion is negligible."""
+
+    motion: BodyMotion
+    reach_mm: float
+    negligible: bool = False
+
+
+def _solve(
+    pool: ThreadPoolExecutor,
+    views: Sequence[_View],
+    person: tuple[BodyMotion, BodyCells],
+    observed: Mask,
+    settings: AlignmentSettings,
+) -> _Solution | None:
+    """Match and update the motion in turn; None if nothing overlaps. person: initial state."""
+    motion, cells = person
+    linearize = partial(
+        CellEquations.from_matches, centres=cells.centres, correlated=settings.correlated
+    )
+    coarse, reach = [view.select(COARSE) for view in views], settings.reach_mm
+    for remaining in range(ROUNDS, 0, -1):
+        points = coarse if remaining > 1 else views
+        equations = _map_matches(linearize, pool, points, (motion, cells), reach, settings)
+        if not equations:
+            return None
+        motion = motion.update(_combine_directions(equations))
+        reach = max(reach / 2.0, settings.min_reach_mm)
+        if remaining == ROUNDS - 1:
+            # Calibrations warp surfaces by half of 0.1 mm; so little motion does no harm.
+            still = _rms_displacement(motion, NON_RIGID, observed) < 0.1
+            if still and _is_rigid_negligible(motion, observed, settings):
+                return _Solution(motion, reach, negligible=True)
+    return _Solution(motion, reach)
+
+
+def _offset_to_mean_breath(motion: BodyMotion, cells: BodyCells) -> BreathOffset:
+    """At mean breath the temporal modes, which have zero mean, are zero."""
+    middle = motion.kind("breath").modes.middle
+    field = motion.kind("breath").fields @ motion.amplitudes_at("breath", middle)
+    errors = motion.error_factor("breath", middle, cells.normals)
+    return BreathOffset(field, girth_sigmas(errors, cells.centres[:, 2]))
+
+
+def _map_matches(
+    measure: Callable[[Matches, Indices], Result],
+    pool: ThreadPoolExecutor,
+    views: Sequence[_View],
+    person: tuple[BodyMotion, BodyCells],
+    reach_mm: float,
+    settings: AlignmentSettings,
+) -> dict[tuple[int, int], Result]:
+    """Call `measure` with the matches of each two pairs, after the present motion, and their cells."""
+    motion, cells = person
+    poses = [view.initial.retract(motion.twist(k)) for k, view in enumerate(views)]
+    warps = motion.non_rigid()
+
+    def measure_two(i: int, j: int) -> Result | None:
+        """Displace the source to where it was at the target's moment, and match."""
+        view = views[i]
+        points, warp = poses[i].apply(view.points.points), warps[i] - warps[j]
+        points += evaluate_field(warp[view.cell], points - cells.centres[view.cell])
+        source = view.sampled.with_geometry(points, poses[i].rotate(view.points.normals))
+        matches = match_overlap(
+            source,
+            views[j].sampled,
+            RigidTransform.identity(),
+            poses[j],
+            reach_mm,
+            settings.min_matches,
+        )
+        return None if matches is None else measure(matches, view.cell[matches.source])
+
+    return map_overlaps(pool, len(views), measure_two)
+
+
+def _combine_directions(
+    equations: Mapping[tuple[int, int], CellEquations],
+) -> dict[tuple[int, int], CellEquations]:
+    """Add both directions of each overlap: errors of one direction on curved surfaces cancel."""
+    gathered: dict[tuple[int, int], list[CellEquations]] = {}
+    for (i, j), one in equations.items():
+        gathered.setdefault((min(i, j), max(i, j)), []).append(one if i < j else one.swap())
+    return {both: CellEquations.sum(parts) for both, parts in gathered.items()}
+
+
+def _is_rigid_negligible(motion: BodyMotion, observed: Mask, settings: AlignmentSettings) -> bool:
+    """Whether the whole body moved by less than the smallest sway that is assumed."""
+    return _rms_displacement(motion, RIGID, observed) < settings.min_sway * settings.sway_mm
+
+
+def _rms_displacement(motion: BodyMotion, names: Sequence[str], observed: Mask) -> float:
+    """RMS displacement by those kinds, mm."""
+    return rms_length(motion.displacements(names, from_middle=True)[observed][:, :3])
+
+
+def _update_alignment(
+    aligned: Alignment,
+    names: Sequence[str],
+    views: Sequence[_View],
+    motion: BodyMotion,
+    distances: Mapping[tuple[int, int], float],
+) -> Alignment:
+    """Replace poses, displacements of the body's centre, and RMS distances of the overlaps."""
+    twists = np.array([motion.twist(k, from_middle=True) for k in range(len(views))])
+    shift = np.linalg.norm(centre_shifts(twists), axis=1)
+    poses = [view.initial.retract(twist) for view, twist in zip(views, twists, strict=True)]
+    rms_mm = {(names[i], names[j]): distance for (i, j), distance in distances.items()}
+    return replace(
+        aligned,
+        rig_from_camera=dict(zip(names, poses, strict=True)),
+        motion_mm={
+            name: mm
+            for name, mm in zip(names, shift.tolist(), strict=True)
+            if name in aligned.motion_mm
+        },
+        overlaps=tuple(
+            replace(o, rms_after_mm=rms_mm.get((o.source, o.target), o.rms_after_mm))
+            for o in aligned.overlaps
+        ),
+    )

@@ -1,0 +1,106 @@
+"""Kinds of motion that a body may do: displacement fields, their temporal modes and priors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bodyscan.alignment.sway_prior import BODY_CENTRE, LEVER_MM, stance_correlation
+from bodyscan.arrays import Array
+from bodyscan.geometry.linear_gaussian import invert_scaled
+from bodyscan.geometry.transforms import RigidTransform, adjoint
+from bodyscan.motion.body_cells import BodyCells, modulate_fields, rigid_fields
+from bodyscan.motion.body_parts import ankles, limb_fields, weight_above_feet
+from bodyscan.motion.breath import breath_fields
+from bodyscan.motion.temporal_modes import TemporalModes, breath_correlation
+
+PART_MM = 250.0
+"""Correlation length of free motion of parts: a forearm, half a thigh, a shoulder."""
+
+
+@dataclass(frozen=True, eq=False)
+class MotionKind:
+    """One kind of motion: M displacement fields, each with amplitudes along J temporal modes.
+
+    fields: (C, 12, M) mm, see `rigid_fields`.
+    size: prior standard deviation of the amplitudes.
+    precision: prior information (M J, M J) of the amplitudes, instead of `size`.
+    mode_covariance: prior covariance (J, J) of each field's amplitudes, instead of `size`.
+    twists: (6, M) about the rig's origin, if the body moves as a whole.
+    remainder: fields less twists, (C, 12, M), if the feet stay.
+    """
+
+    name: str
+    fields: Array
+    modes: TemporalModes
+    size: float = 1.0
+    precision: Array | None = None
+    mode_covariance: Array | None = None
+    twists: Array | None = None
+    remainder: Array | None = None
+
+    @property
+    def count(self) -> int:
+        """Number of amplitudes, M J."""
+        return self.fields.shape[2] * self.modes.count
+
+    @property
+    def prior_information(self) -> Array:
+        """(M J, M J)."""
+        if self.precision is not None:
+            return self.precision
+        if self.mode_covariance is not None:
+            return np.kron(np.eye(self.fields.shape[2]), np.linalg.inv(self.mode_covariance))
+        return np.eye(self.count) / self.size**2
+
+    def modes_from_middle(self, pair: int) -> Array:
+        """Change (J,) of the modes from the middle of the scan to a pair's moment."""
+        return self.modes.values[pair] - self.modes.middle
+
+
+def build_kinds(
+    cells: BodyCells, seconds: Sequence[float | None], boards: Array, sway: Array
+) -> tuple[MotionKind, ...]:
+    """All kinds of motion, beginning with the pairs' pose errors.
+
+    seconds: each pair's moment, None if not known.
+    boards: covariance (6P, 6P) of the pairs' poses.
+    sway: standard deviations (6,) of a usual rotation (radians) and translation (mm) about the
+        body's centre.
+    """
+    stance = TemporalModes.from_correlation(stance_correlation, seconds)
+    breathing = TemporalModes.from_correlation(breath_correlation, seconds)
+    pairs = len(seconds)
+    by_freedom = np.arange(6 * pairs).reshape(pairs, 6).T.ravel()
+    pose = _whole_body("pose", cells, np.eye(6), TemporalModes.constant_per_pair(pairs))
+    any_twist = adjoint(RigidTransform.from_translation(BODY_CENTRE)) * sway
+    translations = rigid_fields(cells, np.zeros(3), LEVER_MM)[:, :, 3:]
+    parts = modulate_fields(translations, cells, cells.covariance_factor(PART_MM, 0.02))
+    identity = np.eye(breathing.count)
+    return (
+        replace(pose, precision=invert_scaled(boards)[np.ix_(by_freedom, by_freedom)]),
+        _lean(cells, stance),
+        _whole_body("sway", cells, any_twist, stance),
+        *(MotionKind(name, field, stance) for name, field in limb_fields(cells, LEVER_MM).items()),
+        MotionKind("parts", parts, stance),
+        MotionKind("breath", breath_fields(cells), breathing, mode_covariance=identity),
+    )
+
+
+def _whole_body(name: str, cells: BodyCells, twists: Array, modes: TemporalModes) -> MotionKind:
+    """A rigid motion of the whole body; twists: (6, M)."""
+    fields = rigid_fields(cells, np.zeros(3), 1.0) @ twists
+    return MotionKind(name, fields, modes, 2.0, twists=twists)
+
+
+def _lean(cells: BodyCells, modes: TemporalModes) -> MotionKind:
+    """A lean about the ankles, as of an inverted pendulum (Winter 1995), and a turn; the feet stay.
+
+    A unit of amplitude moves the middle of the body, 1 m above the ankles, by 1 mm.
+    """
+    about_ankles = adjoint(RigidTransform.from_translation(ankles(cells)))[:, :3] / 1000.0
+    whole = _whole_body("lean", cells, about_ankles, modes)
+    fields = modulate_fields(whole.fields, cells, weight_above_feet(cells)[:, None])
+    return replace(whole, fields=fields, remainder=fields - whole.fields)

@@ -1,0 +1,103 @@
+"""Temporal modes of a person's motion: how it correlates between the pairs' moments."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from bodyscan.alignment.sway_prior import stance_correlation
+from bodyscan.arrays import Array
+
+MIN_SHARE = 1e-3  # of the largest eigenvalue; less is not worth an unknown
+BREATHS_S = np.geomspace(2.5, 5.8, 12)
+"""Duration of a breath at rest: 10 to 24 a minute."""
+PHASES = np.arange(8) * np.pi / 8.0
+"""Half a turn later each phase recurs with the opposite sign."""
+
+
+def breath_correlation(seconds: Array) -> Array:
+    """Correlation of a breath with itself after so many seconds, averaged over its duration.
+
+    A twentieth of its variance does not recur.
+    """
+    phase = 2.0 * np.pi * np.asarray(seconds)[..., None] / BREATHS_S
+    return np.asarray(0.95 * np.cos(phase).mean(axis=-1) + 0.05 * stance_correlation(seconds))
+
+
+@dataclass(frozen=True, eq=False)
+class TemporalModes:
+    """Karhunen-Loeve basis of J modes of a stationary Gaussian process, of unit variance each.
+
+    values: at the pairs' moments, (P, J).
+    middle: at the middle of the scan, to which everything is carried, (J,).
+    """
+
+    values: Array
+    middle: Array
+
+    @property
+    def count(self) -> int:
+        return len(self.middle)
+
+    @staticmethod
+    def from_correlation(
+        correlation: Callable[[Array], Array], seconds: Sequence[float | None]
+    ) -> TemporalModes:
+        """Modes of a correlation over time; seconds: each pair's moment, None if not known.
+
+        Pairs without a moment have one mode each, independent of all others. If no moment is known,
+        everything is carried to the mean.
+        """
+        timed = [k for k, second in enumerate(seconds) if second is not None]
+        untimed = [k for k, second in enumerate(seconds) if second is None]
+        at = np.array([second for second in seconds if second is not None])
+        independent = np.zeros((len(seconds), len(untimed)))
+        independent[untimed, np.arange(len(untimed))] = 1.0
+        middle = np.zeros(len(untimed))
+        if not timed:
+            return TemporalModes(independent, middle)
+        knots = np.append(at, 0.5 * (at.min() + at.max()))
+        covariance = correlation(knots[:, None] - knots)
+        eigenvalues, eigenvectors = np.linalg.eigh(covariance)
+        kept = eigenvalues > MIN_SHARE * eigenvalues[-1]
+        modes = covariance @ (eigenvectors[:, kept] / np.sqrt(eigenvalues[kept]))
+        rows = np.zeros((len(seconds), int(kept.sum())))
+        rows[timed] = modes[:-1]
+        return TemporalModes(np.hstack([rows, independent]), np.concatenate([modes[-1], middle]))
+
+    @staticmethod
+    def constant_per_pair(count: int) -> TemporalModes:
+        """Modes of what differs from pair to pair and does not change with time."""
+        return TemporalModes(np.eye(count), np.zeros(count))
+
+
+def breath_covariances(
+    modes: TemporalModes, seconds: Sequence[float | None]
+) -> tuple[Array, Array]:
+    """Covariances (K, J, J) of the modes' amplitudes for K breaths, and their priors (K,).
+
+    The breaths have every duration and phase. If a moment is not known there is only one, with
+    independent moments.
+    """
+    at = np.array([second for second in seconds if second is not None])
+    if len(at) < len(seconds):
+        return np.eye(modes.count)[None], np.ones(1)
+    knots = np.append(at, 0.5 * (at.min() + at.max()))
+    amplitudes_from_values = np.linalg.pinv(np.vstack([modes.values, modes.middle]))
+    phase = (2.0 * np.pi * knots / BREATHS_S[:, None, None] + PHASES[:, None]).reshape(
+        -1, len(knots)
+    )
+    # Belly and chest differ in phase by 10 to 30 degrees at rest (Konno and Mead 1967): tan 0.35.
+    waves = amplitudes_from_values @ np.stack([np.cos(phase), 0.35 * np.sin(phase)], axis=2)
+    sines = 2.0 * waves @ np.swapaxes(waves, 1, 2)
+    # A twentieth of a breath is not a sine. The small diagonal keeps the sum positive definite.
+    irregular = amplitudes_from_values @ stance_correlation(
+        knots[:, None] - knots
+    ) @ amplitudes_from_values.T + MIN_SHARE * np.eye(modes.count)
+    # 16 breaths a minute, give or take a fifth: adults at rest breathe 12 to 20 times. Half a breath
+    # alone looks much like a third of a deeper and slower one.
+    prior = np.exp(-0.5 * (np.log(BREATHS_S / 3.75) / 0.2) ** 2)
+    priors = np.repeat(prior / (prior.sum() * len(PHASES)), len(PHASES))
+    return sines + 0.05**2 * irregular, priors

@@ -1,0 +1,106 @@
+"""Distances through a body of two slabs side by side, whose gap is narrower than they are thick."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from normal_field import normal_field
+
+from bodyscan.arrays import Array
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.motion.body_cells import (
+    BodyCells,
+    evaluate_field,
+    field_in_camera,
+    modulate_fields,
+    rigid_fields,
+)
+
+
+def sides(low: Array, high: Array) -> tuple[Array, Array]:
+    """Points every 5 mm on the four upright sides and the top of a box, and outward normals."""
+    points, normals = [], []
+    for axis, end in ((0, 0), (0, 1), (1, 0), (1, 1), (2, 1)):
+        others = [k for k in range(3) if k != axis]
+        grid = np.meshgrid(*(np.arange(low[k] + 2.5, high[k], 5.0) for k in others))
+        face = np.empty((grid[0].size, 3))
+        face[:, others] = np.stack([g.ravel() for g in grid], axis=1)
+        face[:, axis] = (low, high)[end][axis]
+        points.append(face)
+        normals.append(np.tile((2.0 * end - 1.0) * np.eye(3)[axis], (len(face), 1)))
+    return np.concatenate(points), np.concatenate(normals)
+
+
+@pytest.fixture(scope="module")
+def slabs() -> BodyCells:
+    """An arm 80 mm thick, 40 mm beside a trunk of 200, joined by a shoulder above both."""
+    parts = [
+        sides(np.array([0.0, -100.0, 0.0]), np.array([120.0, 100.0, 600.0])),
+        sides(np.array([0.0, 140.0, 0.0]), np.array([120.0, 220.0, 600.0])),
+        sides(np.array([0.0, -100.0, 605.0]), np.array([120.0, 220.0, 700.0])),
+    ]
+    points = np.concatenate([part[0] for part in parts])
+    return BodyCells.from_points(points, np.concatenate([part[1] for part in parts]))[0]
+
+
+def cell_at(cells: BodyCells, *place: float) -> int:
+    return int(np.argmin(np.linalg.norm(cells.centres - place, axis=1)))
+
+
+def test_it_is_far_across_a_gap_and_near_through_a_limb(slabs: BodyCells) -> None:
+    inner, outer = cell_at(slabs, 60.0, 140.0, 100.0), cell_at(slabs, 60.0, 220.0, 100.0)
+    beside = cell_at(slabs, 60.0, 100.0, 100.0)
+    away = slabs.distances(np.array([inner]))[0]
+    assert away[outer] < 130.0  # 80 straight through
+    assert away[beside] > 800.0  # up to the shoulder and down again; 40 across
+
+
+def test_what_is_near_moves_alike(slabs: BodyCells) -> None:
+    alike = slabs.covariance_factor(150.0, 1e-4)
+    inner, beside = cell_at(slabs, 60.0, 140.0, 100.0), cell_at(slabs, 60.0, 100.0, 100.0)
+    above = cell_at(slabs, 60.0, 140.0, 200.0)
+    products = alike @ alike[inner]
+    assert products[inner] == pytest.approx(1.0, abs=0.1)
+    assert products[above] == pytest.approx(np.exp(-0.5 * (100.0 / 150.0) ** 2), abs=0.15)
+    assert abs(products[beside]) < 0.05
+
+
+def test_slopes_are_those_of_a_function_along_the_surface(slabs: BodyCells) -> None:
+    slopes = slabs.gradients(slabs.centres @ np.array([[0.0], [0.02], [0.03]]))[..., 0]
+    side = np.abs(slabs.normals[:, 0]) > 0.99
+    inside = side & (np.abs(slabs.centres[:, 2] - 300.0) < 200.0)
+    np.testing.assert_allclose(slopes[inside, 1:].mean(axis=0), [0.02, 0.03], rtol=0.05)
+    assert np.abs(slopes[inside, 0]).max() < 0.004
+
+
+def test_a_turn_carries_points_as_a_turn_does(slabs: BodyCells) -> None:
+    centre = np.array([10.0, 20.0, 300.0])
+    field = rigid_fields(slabs, centre, 400.0) @ np.array([0.4, -0.3, 0.2, 1.0, 2.0, 3.0])
+    points = slabs.centres + np.random.default_rng(1).uniform(-15.0, 15.0, slabs.centres.shape)
+    expected = np.cross([0.001, -0.00075, 0.0005], points - centre) + [1.0, 2.0, 3.0]
+    np.testing.assert_allclose(evaluate_field(field, points - slabs.centres), expected, atol=1e-9)
+    # And in a camera's frame.
+    place = RigidTransform.from_rotation_vector([0.3, -0.5, 0.9], [100.0, 200.0, 900.0])
+    back = place.inverse()
+    off = back.apply(points) - back.apply(slabs.centres)
+    np.testing.assert_allclose(
+        place.rotate(evaluate_field(field_in_camera(field, place), off)), expected, atol=1e-9
+    )
+
+
+def test_a_field_times_a_function_changes_as_both_do(slabs: BodyCells) -> None:
+    rising = slabs.centres[:, 2:] * 0.01
+    found = modulate_fields(normal_field(slabs), slabs, rising)[..., 0]
+    np.testing.assert_allclose(found[:, :3], rising * slabs.normals)
+    side = (np.abs(slabs.normals[:, 0]) > 0.99) & (np.abs(slabs.centres[:, 2] - 300.0) < 200.0)
+    by_z = found.reshape(-1, 4, 3)[side, 3]
+    np.testing.assert_allclose(
+        by_z.mean(axis=0), 0.01 * slabs.normals[side].mean(axis=0), atol=1e-3
+    )
+
+
+def test_every_point_is_found_in_its_cell(slabs: BodyCells) -> None:
+    near = slabs.centres + 2.0 * slabs.normals
+    np.testing.assert_array_equal(slabs.find(near, slabs.normals), np.arange(len(near)))
+    many = slabs.find_by_groups(near, slabs.normals)
+    assert np.linalg.norm(slabs.centres[many] - near, axis=1).max() < 40.0

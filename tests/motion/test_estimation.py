@@ -1,0 +1,234 @@
+"""A person who sways, breathes and moves the arms while twelve pairs take turns, put together again."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from living_body import (
+    STANDING,
+    STILL,
+    LivingScan,
+    Motion,
+    boards,
+    cast_living,
+    errors_mm,
+    images_of,
+)
+from ray_cast_scan import load_rig
+from scipy.spatial import cKDTree
+
+from bodyscan.alignment.icp import Alignment, align
+from bodyscan.arrays import Array
+from bodyscan.motion.body_parts import PARTS, name_parts
+from bodyscan.motion.breath import breath_along_normals
+from bodyscan.motion.estimation import (
+    EstimatedMotion,
+    estimate_motion,
+)
+from bodyscan.motion.person_motion import PartMotion, PersonMotion
+from bodyscan.motion.warping import warp_to_middle
+from bodyscan.settings import AlignmentSettings
+
+SCALE = 0.25  # pixels of 4 mm
+
+
+def together(
+    scan: LivingScan, *, timed: bool = True
+) -> tuple[Alignment, Alignment, EstimatedMotion | None]:
+    images, settings = images_of(scan, timed=timed), AlignmentSettings()
+    aligned = align(images, scan.rig_from_camera, boards(scan), settings)
+    return aligned, *estimate_motion(images, scan.rig_from_camera, aligned, boards(scan), settings)[
+        :2
+    ]
+
+
+def surface(scan: LivingScan, alignment: Alignment, followed: EstimatedMotion | None) -> Array:
+    """Noiseless points of all pairs as they were put together, where pixels are not edge-on."""
+    images = warp_to_middle(scan.exact, alignment.rig_from_camera, followed)
+    found = []
+    for image in images:
+        points, normals = image.points[image.valid], image.normals[image.valid]
+        facing = -np.sum(points * normals, axis=1) > 0.3 * np.linalg.norm(points, axis=1)
+        placed = alignment.rig_from_camera[image.pair].apply(points[facing].astype(float))
+        found.append(placed[::4])
+    return np.concatenate(found)
+
+
+def rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+@pytest.fixture(scope="module")
+def found(standing: LivingScan) -> tuple[Alignment, Alignment, EstimatedMotion | None]:
+    return together(standing)
+
+
+def test_one_body_comes_of_many_moments(
+    standing: LivingScan, found: tuple[Alignment, Alignment, EstimatedMotion | None]
+) -> None:
+    aligned, alignment, followed = found
+    assert followed is not None
+    truth = standing.body.at(standing.middle_s)
+    rigid = errors_mm(truth, surface(standing, aligned, None))
+    carried = errors_mm(truth, surface(standing, alignment, followed))
+    # 0.19 mm of 1.23; with pixels of 4 mm, fingers are a few pixels wide.
+    assert rms(carried) < 0.3
+    assert rms(carried) < 0.25 * rms(rigid)
+    assert np.median(np.abs(carried)) < 0.1
+    assert alignment.rms_after_mm < 0.6 * aligned.rms_after_mm
+
+
+def test_sigmas_say_what_is_left(
+    standing: LivingScan, found: tuple[Alignment, Alignment, EstimatedMotion | None]
+) -> None:
+    _, alignment, followed = found
+    assert followed is not None
+    errors = errors_mm(standing.body.at(standing.middle_s), surface(standing, alignment, followed))
+    # As much as they err, within what a single person's motion may be off by. Of both the
+    # squares' mean: arms err, and are known, several times worse than legs. (0.66 here; of five people,
+    # on three and four poles, 0.9.)
+    assert 0.6 < rms(errors) / rms(followed.sigma_mm) < 1.4
+
+
+def test_the_operator_hears_what_each_part_did(
+    standing: LivingScan, found: tuple[Alignment, Alignment, EstimatedMotion | None]
+) -> None:
+    _, _, followed = found
+    assert followed is not None
+    person = PersonMotion.from_motion(followed)
+    assert [part.name for part in person.parts] == list(PARTS)
+    assert person.moment_ms == pytest.approx(1e3 * standing.middle_s)
+    moved = {part.name: part.moved_mm for part in person.parts}
+    truth, still = standing.body, standing.body.at(standing.middle_s).vertices
+    most = np.max(
+        [np.linalg.norm(truth.at(s).vertices - still, axis=1) for s in standing.seconds.values()],
+        axis=0,
+    )
+    arm = truth.arms[0] > 0.9
+    # Along the arm nothing shows how far it moved.
+    assert 0.5 < moved["left arm"] / np.percentile(most[arm], 95) < 1.3
+    assert "left arm: moved by" in person.lines[2]
+
+
+def test_a_pair_has_seen_what_faces_it_and_not_what_faces_away(
+    standing: LivingScan, found: tuple[Alignment, Alignment, EstimatedMotion | None]
+) -> None:
+    _, _, followed = found
+    assert followed is not None
+    cells = followed.cells
+    for pair, seen in zip(followed.warps, followed.observed, strict=True):
+        away = cells.centres - standing.rig_from_camera[pair].translation
+        facing = -np.sum(away * cells.normals, axis=1) / np.linalg.norm(away, axis=1)
+        # A cell's points face as it does, but a cell of a hand may have points of its other side.
+        assert 0.1 < seen.mean() < 0.3
+        assert seen[facing < -0.2].mean() < 0.01
+
+
+def test_who_needs_a_part_better_is_told_so() -> None:
+    parts = PartMotion("trunk", 3.0, 0.1, 0.2), PartMotion("left arm", 8.6, 0.4, 0.5)
+    person = PersonMotion(parts, None, None)
+    assert person.summary == (
+        "moved 9 mm while being scanned; corrected to 0.29 mm; repeat if you need the left arm "
+        "(0.4 mm)"
+    )
+    assert "repeat" not in replace(person, parts=parts[:1]).summary
+
+
+def test_parts_are_named_whichever_way_a_person_faces(
+    standing: LivingScan, found: tuple[Alignment, Alignment, EstimatedMotion | None]
+) -> None:
+    _, _, followed = found
+    assert followed is not None
+    cells = followed.cells
+    turned = replace(
+        cells,
+        centres=cells.centres * [-1.0, -1.0, 1.0],
+        normals=cells.normals * [-1.0, -1.0, 1.0],
+    )
+    for one in (cells, turned):
+        part, way = name_parts(one), np.sign(one.centres @ [0.0, 1.0, 0.0])
+        left = part == PARTS.index("left arm")
+        assert abs(np.mean(way[left]) - (1.0 if one is cells else -1.0)) < 0.01
+        head = part == PARTS.index("head")
+        assert one.centres[head, 2].min() > one.centres[part == 0, 2].mean()
+
+
+def test_without_a_trunk_there_is_no_breath(
+    found: tuple[Alignment, Alignment, EstimatedMotion | None],
+) -> None:
+    """Legs alone were seen: they are named, and that is all."""
+    _, _, followed = found
+    assert followed is not None
+    cells = followed.cells
+    high = cells.centres * [1.0, 1.0, 0.0] + [0.0, 0.0, 100.0]
+    high[0, 2] = 1000.0
+    person = PersonMotion.from_motion(replace(followed, cells=replace(cells, centres=high)))
+    assert "trunk" not in {part.name for part in person.parts}
+    assert person.breathed_mm is None
+    assert person.fuller_mm is None
+    assert "cannot be separated" in person.lines[-1]
+
+
+def test_the_way_to_mean_breath_is_told(
+    standing: LivingScan, found: tuple[Alignment, Alignment, EstimatedMotion | None]
+) -> None:
+    """Half of it and more, and the sigma says what is left."""
+    _, _, followed = found
+    assert followed is not None
+    assert followed.breath is not None
+    cells, body = followed.cells, standing.body
+    now = body.at(standing.middle_s).vertices
+    mean = replace(body, motion=replace(STANDING, breath_mm=0.0)).at(standing.middle_s).vertices
+    near = cKDTree(now).query(cells.centres)[1]
+    front = breath_along_normals(cells) > 0.5
+    true = float(np.mean(np.sum((now - mean)[near] * cells.normals, axis=1)[front]))
+    person = PersonMotion.from_motion(followed)
+    assert person.fuller_mm is not None
+    assert person.fuller_sigma_mm is not None
+    assert abs(true) > 0.3  # or the seed says nothing
+    assert abs(person.fuller_mm - true) < 0.7 * abs(true)
+    # Of fourteen people this one is the farthest off; all are by 1.16 of it, RMS.
+    assert abs(person.fuller_mm - true) < 3.5 * person.fuller_sigma_mm
+    assert "mean breath" in person.lines[-1]
+    along, sigma = followed.breath.along_normals(cells, cells.centres, cells.normals)
+    np.testing.assert_allclose(along[front].mean(), -person.fuller_mm, rtol=0.02)
+    assert sigma[front].mean() < 1.5
+
+
+def middle(scan: LivingScan) -> LivingScan:
+    """Of half of the pairs: each has its own unknowns, and the work grows with their cube."""
+    return replace(
+        scan,
+        images=[image for image in scan.images if image.pair[-1] in "23"],
+        exact=[image for image in scan.exact if image.pair[-1] in "23"],
+        rig_from_camera={n: at for n, at in scan.rig_from_camera.items() if n[-1] in "23"},
+    )
+
+
+def test_without_times_every_pair_has_a_free_stance(standing: LivingScan) -> None:
+    aligned, alignment, followed = together(middle(standing), timed=False)
+    assert followed is not None
+    assert followed.moment_ms is None
+    # Its moment is the mean of all, which nobody knows: how well overlaps agree is what there is.
+    assert alignment.rms_after_mm < 0.6 * aligned.rms_after_mm
+
+
+def test_a_mannequin_is_not_bent() -> None:
+    scan = cast_living(load_rig(), STILL, seed=1, scale=0.5 * SCALE)
+    aligned, alignment, followed = together(scan)
+    assert followed is None
+    assert alignment is aligned
+    images = images_of(scan)
+    assert warp_to_middle(images, aligned.rig_from_camera, None) == images
+
+
+def test_who_only_sways_is_carried_along_time() -> None:
+    """The back, which on three poles no other pole sees, is put where a smooth sway had it."""
+    sway = Motion(sway_mm_s=10.0, breath_mm=0.0, arms_deg=0.0, head_deg=0.0)
+    scan = cast_living(load_rig(), sway, seed=1, scale=SCALE)
+    aligned, alignment, followed = together(scan)
+    truth = scan.body.at(scan.middle_s)
+    rigid = errors_mm(truth, surface(scan, aligned, None))
+    assert rms(errors_mm(truth, surface(scan, alignment, followed))) < 0.3 * rms(rigid)
