@@ -11,10 +11,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
-from bodyscan.arrays import Array, Floats, Indices, Mask, find_crop
+from bodyscan.arrays import Array, Floats, Greys, Indices, Mask, find_crop
 from bodyscan.compiled import compiled
 from bodyscan.stripes.scan_lines import ScanLines
 
@@ -46,11 +45,8 @@ class Brightness:
         usable: (L, P) pixels on a lit surface.
         """
         if images.lit.dtype == np.uint8:
-            contrast = cv2.max(cv2.subtract(images.lit, images.dark), 1)
             logarithms = np.log(np.maximum(np.arange(256), 1)).astype(np.float32)
-            logarithm = np.asarray(cv2.LUT(contrast, logarithms), np.float32)
-            noise2 = cv2.LUT(images.lit, variance) + cv2.LUT(images.dark, variance)
-            noise2 /= np.square(contrast.astype(np.float32))
+            logarithm, noise2 = _measure(images.lit, images.dark, variance, logarithms)
         else:
             contrast = np.maximum(images.lit - images.dark, 0.02).astype(np.float32)
             at_lit, at_dark = (variance[g.astype(np.uint8)] for g in (images.lit, images.dark))
@@ -115,64 +111,117 @@ def correct_across_lines(
 
 def fit_gradient(image: Floats, usable: Mask) -> tuple[Floats, Floats]:
     """Fit a plane to the usable pixels in 7 x 7 windows: its gradient along and across the lines
-    (L, P), 1/px; 0 at pixels that are not usable or have fewer than 12 of them around."""
+    (L, P), 1/px; 0 at pixels that are not usable or have fewer than 12 of them around.
+
+    Loops over lines take a quarter of the time of OpenCV's separable filters.
+    """
     along, across = np.zeros((2, *image.shape), np.float32)
     box = find_crop(usable)
-    if box is None:
-        return along, across
-    inside = usable[box].astype(np.float32)
-    values = image[box] * inside
-    x = np.arange(-3.0, 4.0, dtype=np.float32)
-    one, square = np.ones(7, np.float32), x * x
-
-    def window_sums(array: Floats, columns: Floats, rows: Floats) -> Floats:
-        summed = cv2.sepFilter2D(array, cv2.CV_32F, columns, rows, borderType=cv2.BORDER_CONSTANT)
-        return np.asarray(summed, np.float32)
-
-    _solve_gradients(
-        usable[box],
-        window_sums(inside, one, one),
-        (window_sums(inside, x, one), window_sums(inside, one, x)),
-        (
-            window_sums(inside, square, one),
-            window_sums(inside, x, x),
-            window_sums(inside, one, square),
-        ),
-        (window_sums(values, one, one), window_sums(values, x, one), window_sums(values, one, x)),
-        along[box],
-        across[box],
-    )
+    if box is not None:
+        _fit_gradient(image[box], usable[box], along[box], across[box])
     return along, across
 
 
 @compiled
-def _solve_gradients(
-    usable: Mask,
-    count: Floats,
-    first: tuple[Floats, Floats],
-    second: tuple[Floats, Floats, Floats],
-    moments: tuple[Floats, Floats, Floats],
-    along: Floats,
-    across: Floats,
-) -> None:
-    """Solve the normal equations of each window (L, P) where they are well determined.
+def _fit_gradient(image: Floats, usable: Mask, along: Floats, across: Floats) -> None:
+    """Write the gradient (L, P) line by line.
 
-    first, second: sums of x, y and of x^2, xy, y^2 over the window.
-    moments: sums of v, x v, y v.
+    inside, values: for the last 7 lines, which pixels are usable (1 or 0) and their values there,
+        with zeros on both sides.
+    columns: see `_sum_columns`, of both.
     """
-    for line in range(count.shape[0]):
-        for k in range(count.shape[1]):
-            n = count[line, k]
-            if not usable[line, k] or n < 11.5:
-                continue
-            x, y, v = first[0][line, k] / n, first[1][line, k] / n, moments[0][line, k] / n
-            xx, yy = second[0][line, k] / n - x * x, second[2][line, k] / n - y * y
-            xy = second[1][line, k] / n - x * y
-            xv, yv = moments[1][line, k] / n - x * v, moments[2][line, k] / n - y * v
-            determinant = xx * yy - xy * xy
-            if determinant > 0.5:  # px^4: pixels on two lines give about 1
-                along[line, k] = (yy * xv - xy * yv) / determinant
-                across[line, k] = (xx * yv - xy * xv) / determinant
+    lines, width = image.shape
+    inside = np.zeros((7, width + 6), np.float32)
+    values = np.zeros_like(inside)
+    columns = np.empty((2, 3, width + 6), np.float32)
+    for last in range(lines + 3):
+        newest, line = last % 7, last - 3
+        if last < lines:
+            _mask_line(image[last], usable[last], inside[newest, 3:-3], values[newest, 3:-3])
+        else:
+            inside[newest], values[newest] = 0.0, 0.0
+        if line >= 0:
+            _sum_columns(inside, line, columns[0])
+            _sum_columns(values, line, columns[1])
+            _solve_windows(columns, usable[line], along[line], across[line])
+
+
+@compiled
+def _mask_line(image: Floats, usable: Mask, inside: Floats, values: Floats) -> None:
+    for x in range(image.size):
+        inside[x] = usable[x]
+        values[x] = image[x] * inside[x]
+
+
+@compiled
+def _sum_columns(rows: Floats, middle: int, sums: Floats) -> None:
+    """Write sums (3, P) of v, y v and y^2 v over columns of 7 lines, y counted from the middle
+    line; line k is in row k mod 7."""
+    above3, above2, above = rows[(middle - 3) % 7], rows[(middle - 2) % 7], rows[(middle - 1) % 7]
+    here, below = rows[middle % 7], rows[(middle + 1) % 7]
+    below2, below3 = rows[(middle + 2) % 7], rows[(middle + 3) % 7]
+    for u in range(here.size):
+        one, two, three = below[u] + above[u], below2[u] + above2[u], below3[u] + above3[u]
+        sums[0, u] = here[u] + one + two + three
+        sums[2, u] = one + np.float32(4) * two + np.float32(9) * three
+        one, two, three = below[u] - above[u], below2[u] - above2[u], below3[u] - above3[u]
+        sums[1, u] = one + np.float32(2) * two + np.float32(3) * three
+
+
+@compiled
+def _solve_windows(columns: Floats, usable: Mask, along: Floats, across: Floats) -> None:
+    """Write the gradient of a line (P,) from the sums over its columns, (2, 3, P + 6).
+
+    Intermediate results have arrays of their own: only then does the compiler know that they do not
+    overlap, and computes eight pixels at once. An area of 0.5 px^4 is half of that of pixels on two
+    lines.
+    """
+    ones, ones_y, values = columns[0, 0], columns[0, 1], columns[1, 0]
+    n, sum_x, sum_xx = _sum_row(ones), _sum_row_x(ones), _sum_row_x2(ones)
+    sum_y, sum_xy, sum_yy = _sum_row(ones_y), _sum_row_x(ones_y), _sum_row(columns[0, 2])
+    sum_v, sum_xv, sum_yv = _sum_row(values), _sum_row_x(values), _sum_row(columns[1, 1])
+    by_x, by_y, area = np.empty_like(n), np.empty_like(n), np.empty_like(n)
+    for u in range(usable.size):
+        share = np.float32(1) / n[u]
+        x, y, v = sum_x[u] * share, sum_y[u] * share, sum_v[u] * share
+        xx, yy = sum_xx[u] * share - x * x, sum_yy[u] * share - y * y
+        xy = sum_xy[u] * share - x * y
+        xv, yv = sum_xv[u] * share - x * v, sum_yv[u] * share - y * v
+        area[u] = xx * yy - xy * xy
+        by_x[u], by_y[u] = (yy * xv - xy * yv) / area[u], (xx * yv - xy * xv) / area[u]
+    for u in range(usable.size):
+        known = usable[u] & (n[u] >= np.float32(11.5)) & (area[u] > np.float32(0.5))
+        along[u], across[u] = (by_x[u], by_y[u]) if known else (np.float32(0), np.float32(0))
+
+
+@compiled
+def _sum_row(row: Floats) -> Floats:
+    """Sums (P,) of v over 7 pixels of a row (P + 6,)."""
+    total = np.empty(row.size - 6, np.float32)
+    for u in range(total.size):
+        near, far = row[u + 2] + row[u + 4], row[u] + row[u + 6]
+        total[u] = row[u + 3] + near + row[u + 1] + row[u + 5] + far
+    return total
+
+
+@compiled
+def _sum_row_x(row: Floats) -> Floats:
+    """The same sums of x v, with x counted from the window's middle."""
+    total = np.empty(row.size - 6, np.float32)
+    for u in range(total.size):
+        near, far = row[u + 4] - row[u + 2], row[u + 6] - row[u]
+        total[u] = near + np.float32(2) * (row[u + 5] - row[u + 1]) + np.float32(3) * far
+    return total
+
+
+@compiled
+def _sum_row_x2(row: Floats) -> Floats:
+    """The same sums of x^2 v."""
+    total = np.empty(row.size - 6, np.float32)
+    for u in range(total.size):
+        near, far = row[u + 4] + row[u + 2], row[u + 6] + row[u]
+        total[u] = near + np.float32(4) * (row[u + 5] + row[u + 1]) + np.float32(9) * far
+    return total
 
 
 @compiled
@@ -180,6 +229,22 @@ def _shrink(gradient: float, variance: float) -> float:
     """A gradient, shrunk towards zero if it is no more than some 2.5 sigmas."""
     square = gradient * gradient
     return gradient * square / (square + 2.5**2 * variance + 1e-12)
+
+
+@compiled
+def _measure(
+    lit: Greys, dark: Greys, variance: Floats, logarithms: Floats
+) -> tuple[Floats, Floats]:
+    """The logarithm of lit minus dark (L, P), and its variance."""
+    logarithm, noise2 = np.empty(lit.shape, np.float32), np.empty(lit.shape, np.float32)
+    for line in range(lit.shape[0]):
+        for x in range(lit.shape[1]):
+            light, black = lit[line, x], dark[line, x]
+            contrast = max(np.int32(light) - np.int32(black), np.int32(1))
+            logarithm[line, x] = logarithms[contrast]
+            square = np.float32(contrast * contrast)
+            noise2[line, x] = (variance[light] + variance[black]) / square
+    return logarithm, noise2
 
 
 @compiled

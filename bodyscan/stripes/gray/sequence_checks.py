@@ -219,7 +219,7 @@ def _share_in_step(
     shares = {}
     for k in range(bits):
         changes = np.flatnonzero(bit == k)
-        changes = changes[:: 1 + len(changes) // 2000]
+        changes = changes[:: 1 + len(changes) // 1000]
         here, masks = (line[changes], x[changes]), np.zeros(len(changes), np.uint16)
         if code.single and images.inverses is not None:
             clear, masks = _find_clear_changes(images, words, *here, k, variance)
@@ -257,8 +257,10 @@ def _find_clear_changes(
         return np.asarray(np.square(step) >= CLEAR_SIGMAS**2 * noise)
 
     left, right = np.maximum(x - 4, 0), np.minimum(x + 5, last)
-    contrast = cv2.subtract(images.lit, images.dark)
-    sides = [contrast[line, each].astype(np.float32) for each in (left, right)]
+    sides = [
+        np.maximum(images.lit[line, k].astype(np.float32) - images.dark[line, k], 0.0)
+        for k in (left, right)
+    ]
     clear = np.maximum(*sides) <= 2.0 * np.minimum(*sides)
     masks = np.zeros(len(line), np.uint16)
     for k in range(bits):
