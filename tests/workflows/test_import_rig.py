@@ -255,7 +255,7 @@ def test_what_is_wrong_is_named(
 
 
 @pytest.mark.parametrize(("millimetres", "units"), [(1.0, "m"), (1000.0, "mm")])
-def test_another_unit_is_asked_about(tmp_path: Path, millimetres: float, units: str) -> None:
+def test_an_implausible_baseline_names_the_unit(tmp_path: Path, millimetres: float, units: str) -> None:
     """211 mm for metres and the other way round."""
     write_storage(tmp_path / "foreign.yaml", millimetres=millimetres)
     content = described("a")
@@ -265,7 +265,7 @@ def test_another_unit_is_asked_about(tmp_path: Path, millimetres: float, units: 
         CalibrationFileError, match=r"puts the projector (2.11e\+05|0.211) mm"
     ) as found:
         import_rig(load_rig(rig_file), tmp_path)
-    assert f"lengths are in {units}" in found.value.remedy
+    assert f"its lengths are not in {units}" in found.value.what
 
 
 def test_a_mirrored_or_endless_pose_is_named(folder: Path) -> None:
