@@ -91,8 +91,8 @@ def _table_1(found: Reproduction) -> str:
         "## Table 1: camera parameters\n\n"
         + _table(heading, rows)
         + "\n\n`corners`: the chapter's way, Zhang's method on the corners, its sigma "
-        "that of their noise alone. `joint`: ours, corners and stripes in one solve, its sigma with what "
-        "is open of the board's warp and print. `off by`: estimated "
+        "that of their noise alone. `joint`: ours, corners and stripes in one solve, its sigma with "
+        "what is open of the board's warp and print. `off by`: estimated "
         "less true, in sigmas. "
         f"Corners' residual {zhang.rms_px:.4f} px RMS. Ours: {found.calibrated.model}; "
         f"solved by: {found.calibrated.refinement}."

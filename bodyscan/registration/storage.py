@@ -49,6 +49,9 @@ DERIVED = (REPORT_NAME, MAP_NAME)
 ACCEPT = "if the change is meant, say `bodyscan accept-changed` of its folder"
 CHANGED = f"restore the file from a copy, or calibrate again; {ACCEPT}"
 
+UNUSED_QUALITY: dict[str, Any] = {"flatness_mm": None, "ways": []}
+"""Keys of a pair's quality that files of 0.2 and before fill; they are written empty, not read."""
+
 
 def refuse_existing(folder: Path, overwrite: bool) -> None:
     """Raise CalibrationFileError if `folder` holds a calibration that may not be replaced."""
@@ -240,7 +243,7 @@ def _pair_content(calibration: RigCalibration, name: str) -> dict[str, Any]:
         "camera": camera_to_fields(pair.camera),
         "rig_from_camera": calibration.rig_from_camera[name].matrix,
         "light": None if pair.sheets is None else _light_content(pair.sheets),
-        "quality": asdict(pair.quality),
+        "quality": asdict(pair.quality) | UNUSED_QUALITY,
     } | crossing
 
 
@@ -305,8 +308,7 @@ def _under(prefix: str, arrays: dict[str, Any]) -> dict[str, Any]:
 
 def _quality(content: dict[str, Any]) -> PairQuality:
     """Read the quality, requiring exactly the types of its fields."""
-    # Written by 0.2 and before: figures of a choice that is not made any more.
-    content = {key: part for key, part in content.items() if key not in ("flatness_mm", "ways")}
+    content = {key: part for key, part in content.items() if key not in UNUSED_QUALITY}
     odd = content.keys() - {part.name for part in fields(PairQuality)}
     if odd:
         raise ValueError(f"quality has no {', '.join(sorted(odd))}")

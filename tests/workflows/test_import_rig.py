@@ -255,7 +255,9 @@ def test_what_is_wrong_is_named(
 
 
 @pytest.mark.parametrize(("millimetres", "units"), [(1.0, "m"), (1000.0, "mm")])
-def test_an_implausible_baseline_names_the_unit(tmp_path: Path, millimetres: float, units: str) -> None:
+def test_an_implausible_baseline_names_the_unit(
+    tmp_path: Path, millimetres: float, units: str
+) -> None:
     """211 mm for metres and the other way round."""
     write_storage(tmp_path / "foreign.yaml", millimetres=millimetres)
     content = described("a")
