@@ -15,8 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.people import of_arms
-from bodyscan.evaluation.comparison import fit_to_surface
-from bodyscan.evaluation.surface import signed_distances
+from bodyscan.evaluation.surface import fit_to_surface, signed_distances
 from bodyscan.fusion.storage import load_scan
 from bodyscan.geometry.robust import rms
 from bodyscan.simulation.living import load_moving_body

@@ -25,7 +25,7 @@ from bodyscan.captures.captures_file import load_captures_file
 from bodyscan.captures.grey_png import png_damage
 from bodyscan.captures.image_header import NotAnImage, read_header
 from bodyscan.errors import BodyscanError
-from bodyscan.evaluation.acceptance_file import load_acceptance
+from bodyscan.evaluation.acceptance import load_acceptance
 from bodyscan.files.corners_vnl import read_corners
 from bodyscan.fusion.storage import load_scan
 from bodyscan.geometry.camera import Camera

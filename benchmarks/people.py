@@ -13,8 +13,7 @@ from scipy.spatial import cKDTree
 from benchmarks.cast_people import SCALE, STANCE_DEG, STANCE_MM, cast_person
 from bodyscan.arrays import Array, Mask
 from bodyscan.evaluation.body import WHOLE, true_girths
-from bodyscan.evaluation.comparison import fit_to_surface
-from bodyscan.evaluation.surface import normalized_errors, signed_distances
+from bodyscan.evaluation.surface import fit_to_surface, normalized_errors, signed_distances
 from bodyscan.geometry.robust import rms
 from bodyscan.measurement.measurements import Measurements, measure
 from bodyscan.outcome import Outcome

@@ -12,7 +12,7 @@ from scipy.spatial.distance import pdist
 
 from bodyscan.arrays import Array
 from bodyscan.boards.board_layout import corner_points
-from bodyscan.evaluation.spheres import centre_distances
+from bodyscan.evaluation.primitives import compare_centre_distances
 from bodyscan.geometry.camera import camera_from_fields
 from bodyscan.geometry.robust import rms
 from bodyscan.laboratory import apparatus
@@ -92,7 +92,9 @@ def _unit(boards: int, real_light: bool, seed: int) -> UnitErrors:
     )
     true = camera_from_fields(describe_camera(apparatus.CAMERA)).parameters
     off = (ours.camera.parameters - true) / np.sqrt(np.diag(covariance))
-    print_ppm = centre_distances(setup.board.corners, corner_points(apparatus.BOARD)).scale_ppm
+    print_ppm = compare_centre_distances(
+        setup.board.corners, corner_points(apparatus.BOARD)
+    ).scale_ppm
     accuracy, best = (measure_artefacts(one, captures) for one in (ours, true_approach(setup)))
     return UnitErrors(point_sigma(ours, captures), off, accuracy, best, print_ppm)
 

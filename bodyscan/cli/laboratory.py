@@ -159,7 +159,7 @@ def accept(
     overwrite: Overwrite = False,
 ) -> None:
     """Measure spheres and a plate of known size at several places, and judge the figures."""
-    from bodyscan.evaluation.acceptance_file import limit_from, load_acceptance
+    from bodyscan.evaluation.acceptance import limit_from, load_acceptance
     from bodyscan.laboratory.simulated_acceptance import simulate_readings
     from bodyscan.registration.storage import load_calibration
     from bodyscan.report.acceptance_page import NO_STANDARD, screen_table

@@ -20,8 +20,6 @@ from bodyscan.mesh.body import BodyMesh
 STEP_MM = 20.0
 TORSO = (0.46, 0.86)  # of the stature: crotch to shoulders
 WHOLE = 0.97  # of a girth measured, and not hair: what is filled is a declared guess
-STEEPEST_COSINE = 0.17  # a surface seen at more than 80 degrees does not count as seen
-SPOTS = 60_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,11 +27,11 @@ class SwayResidual:
     """What is left of calibration error and sway.
 
     rig_from_still: where the model has the true body.
-    apart_mm: RMS of what is left, over pairs and the body, along all axes.
+    rms_mm: RMS of what is left, over pairs and the body, along all axes.
     """
 
     rig_from_still: RigidTransform
-    apart_mm: float
+    rms_mm: float
 
 
 def sway_residual(
@@ -46,15 +44,15 @@ def sway_residual(
     vertices: the true body.
     """
     body = vertices[:: max(1, len(vertices) // 500)]
-    placed = []
-    for name, placing in found.items():
+    moved = []
+    for name, pose in found.items():
         true = true_pairs[name]
         camera = RigidTransform.from_matrix(true["rig_from_camera"])
         swayed = RigidTransform.from_matrix(true["swayed_from_still"])
-        placed.append((placing @ camera.inverse() @ swayed).apply(body))
-    mean = np.mean(placed, axis=0)
-    apart = float(np.sqrt(np.mean(np.sum((np.array(placed) - mean) ** 2, axis=-1))))
-    return SwayResidual(fit_rigid_transform(body, mean), apart)
+        moved.append((pose @ camera.inverse() @ swayed).apply(body))
+    mean = np.mean(moved, axis=0)
+    rms_mm = float(np.sqrt(np.mean(np.sum((np.array(moved) - mean) ** 2, axis=-1))))
+    return SwayResidual(fit_rigid_transform(body, mean), rms_mm)
 
 
 @dataclass(frozen=True)
@@ -127,17 +125,17 @@ def _as_measured(vertices: Array, faces: Indices) -> BodyMesh:
     )
 
 
-def coverage_of_seen(
+def measure_visible_coverage(
     points: Array, vertices: Array, faces: Indices, true_pairs: Mapping[str, Any]
 ) -> tuple[float, float]:
-    """Share of the truth that some camera and its projector see, and the share of that covered.
+    """Measure the share of the truth that a camera and its projector see, and what covers of it.
 
     points: in the truth's frame; they cover what is within 1 mm along the normal.
     """
-    spots, normals = sample_surface(vertices, faces, SPOTS, seed=0)
+    spots, normals = sample_surface(vertices, faces, 60_000, seed=0)
     scene = o3d.t.geometry.RaycastingScene()
     scene.add_triangles(vertices.astype(np.float32), faces.astype(np.uint32))
-    seen = np.zeros(len(spots), bool)
+    visible = np.zeros(len(spots), bool)
     for pair in true_pairs.values():
         still_from_camera = RigidTransform.from_matrix(
             pair["swayed_from_still"]
@@ -147,20 +145,22 @@ def coverage_of_seen(
         ahead = in_camera[:, 2] > 100.0
         u, v = camera.project(np.where(ahead[:, None], in_camera, 1.0)).T
         inside = ahead & (u > 0) & (u < camera.width - 1) & (v > 0) & (v < camera.height - 1)
-        index = np.flatnonzero(inside & ~seen)
+        index = np.flatnonzero(inside & ~visible)
         for eye in (np.zeros(3), np.array(pair["projector"]["centre"])):
             index = index[
                 _in_sight(scene, spots[index], normals[index], still_from_camera.apply(eye))
             ]
-        seen[index] = True
-    return float(seen.mean()), float(covered_spots(points, spots[seen], normals[seen]).mean())
+        visible[index] = True
+    return float(visible.mean()), float(
+        covered_spots(points, spots[visible], normals[visible]).mean()
+    )
 
 
 def _in_sight(scene: Any, spots: Array, normals: Array, eye: Array) -> Mask:
     """Which spots face the eye with nothing in between, (N,)."""
-    way = eye - spots
-    distance = np.linalg.norm(way, axis=1)
-    facing = np.sum(way * normals, axis=1) > STEEPEST_COSINE * distance
+    ray = eye - spots
+    distance = np.linalg.norm(ray, axis=1)
+    facing = np.sum(ray * normals, axis=1) > 0.17 * distance  # 80 degrees
     start = spots + 0.2 * normals  # clear of the surface itself
     rays = np.concatenate([start, eye - start], axis=1).astype(np.float32)
     hidden = scene.test_occlusions(o3d.core.Tensor(rays), tnear=0.0, tfar=1.0).numpy()

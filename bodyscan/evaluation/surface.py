@@ -1,8 +1,9 @@
-"""How far points lie from a known surface."""
+"""Distances of points from a known surface, and comparison of a scan with another surface."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,11 +12,14 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bodyscan.arrays import Array, Indices, Mask
+from bodyscan.errors import BadInput
+from bodyscan.fusion.scan_facts import FILE_NAME
+from bodyscan.fusion.storage import load_scan
 from bodyscan.geometry.robust import rms
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.mesh.body import BodyMesh
 from bodyscan.mesh.nearest_surface import build_centred_scene
 from bodyscan.mesh.topology import directed_edges
-
-ON_EDGE = 1e-5  # of a barycentric coordinate, in float32
 
 
 @dataclass(frozen=True)
@@ -54,7 +58,7 @@ def _pseudo_normals(vertices: Array, faces: Indices, face: Indices, barycentric:
     cross = np.cross(sides[:, 0], sides[:, 1])
     unit = cross / np.maximum(np.linalg.norm(cross, axis=-1, keepdims=True), 1e-300)
     normals = unit[face]
-    low = barycentric < ON_EDGE
+    low = barycentric < 1e-5  # in float32
     on_side = low[:, [2, 0, 1]]  # side k lies opposite corner k + 2
     spot, side = np.nonzero(on_side & (low.sum(axis=1, keepdims=True) == 1))
     normals[spot] += unit[_neighbours(faces)[face[spot], side]]
@@ -69,9 +73,9 @@ def _neighbours(faces: Indices) -> Indices:
     edges, count = directed_edges(faces), int(faces.max()) + 1
     keys, opposite = edges[:, 0] * count + edges[:, 1], edges[:, 1] * count + edges[:, 0]
     order = np.argsort(keys)
-    place = order[np.minimum(np.searchsorted(keys[order], opposite), len(keys) - 1)]
-    own = np.tile(np.arange(len(faces)), 3)
-    return np.where(keys[place] == opposite, place % len(faces), own).reshape(3, -1).T
+    match = order[np.minimum(np.searchsorted(keys[order], opposite), len(keys) - 1)]
+    face = np.tile(np.arange(len(faces)), 3)
+    return np.where(keys[match] == opposite, match % len(faces), face).reshape(3, -1).T
 
 
 def _corner_normals(count: int, faces: Indices, sides: Array, unit: Array) -> Array:
@@ -98,8 +102,8 @@ def deviation(signed_mm: Array) -> Deviation:
 
 
 def normalized_errors(signed_mm: Array, sigma_mm: NDArray[np.floating[Any]]) -> tuple[float, float]:
-    """Robust sigma of errors over their sigmas (1 if honest), and the share beyond three sigmas
-    (0.003 if Gaussian)."""
+    """Robust sigma of errors over their sigmas (1 if these are right), and the share beyond
+    three (0.003 if Gaussian)."""
     over = np.abs(signed_mm / sigma_mm)
     return float(np.median(over) / 0.6745), float(np.mean(over > 3.0))
 
@@ -133,3 +137,123 @@ def sample_surface(
     root, t = np.sqrt(rng.random((count, 1))), rng.random((count, 1))
     points = (1 - root) * a[chosen] + root * (1 - t) * b[chosen] + root * t * c[chosen]
     return points, cross[chosen] / area[chosen, None]
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Signed distances of a scan from another surface.
+
+    name: of the other.
+    is_scan: whether the other is a scan rather than a known surface.
+    vertices: numbers of the mesh's measured vertices, (N,).
+    signed_mm: their distances, positive outside the other surface, (N,).
+    figures: statistics of the distances.
+    fitted: whether the scan was first fitted to the other, by `other_from_scan`.
+    """
+
+    name: str
+    is_scan: bool
+    vertices: Indices
+    signed_mm: Array
+    figures: Deviation
+    fitted: bool
+    other_from_scan: RigidTransform
+
+
+def compare_surfaces(mesh: BodyMesh, other: Path) -> list[Comparison]:
+    """Compare the mesh's measured part with `other`, a scan's folder or a PLY in mm, rig frame.
+
+    First as they stand, then with the scan fitted to the other as a whole. Raises ResultError or
+    BadInput if `other` cannot be read, or cannot be the same subject.
+    """
+    vertices, faces = _surface(other)
+    share = np.ptp(mesh.vertices, axis=0).max() / max(float(np.ptp(vertices, axis=0).max()), 1e-9)
+    if not 0.2 < share < 5.0:  # another subject, or not both in mm
+        raise BadInput(
+            f"is {1.0 / share:.3g} times as large as the scan",
+            where=str(other),
+            remedy="give a surface of the same subject, in millimetres",
+        )
+    measured = np.unique(mesh.faces[~mesh.filled])
+    points = mesh.vertices[measured]
+    fit = fit_to_surface(points, vertices, faces)
+    return [
+        Comparison(_name(other), _is_scan(other), measured, signed, deviation(signed), fitted, pose)
+        for pose, fitted in ((RigidTransform.identity(), False), (fit, True))
+        for signed in (signed_distances(pose.apply(points), vertices, faces),)
+    ]
+
+
+def fit_to_surface(points: Array, vertices: Array, faces: Indices) -> RigidTransform:
+    """Fit points (N, 3) to a mesh by a rigid motion, `other_from_scan`.
+
+    Point to plane (Chen and Medioni 1992) with Tukey's weights, in Open3D; then onto the faces.
+    """
+    middle = vertices.mean(axis=0)
+    target = o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(vertices - middle),
+        o3d.utility.Vector3iVector(faces.astype(np.int32)),
+    )
+    target.compute_vertex_normals()
+    known = o3d.geometry.PointCloud(target.vertices)
+    known.normals = target.vertex_normals
+    some = points[:: max(1, len(points) // 30_000)] - middle
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(some))
+    icp = o3d.pipelines.registration
+    motion = np.eye(4)
+    for reach in (40.0, 10.0, 3.0):  # mm
+        loss = icp.TransformationEstimationPointToPlane(icp.TukeyLoss(0.5 * reach))
+        motion = icp.registration_icp(cloud, known, reach, motion, loss).transformation
+    rough = RigidTransform.from_matrix(motion)
+    found = _refine_on_faces(rough, some, vertices - middle, faces)
+    return (
+        RigidTransform.from_translation(middle) @ found @ RigidTransform.from_translation(-middle)
+    )
+
+
+def _refine_on_faces(
+    start: RigidTransform, points: Array, vertices: Array, faces: Indices
+) -> RigidTransform:
+    """`other_from_scan` that starts as `start`, improved by the nearest points of the faces.
+
+    A corner's tangent plane lies outside a round surface. Of points all around the errors cancel;
+    those of one pair would be drawn a few hundredths of a millimetre towards it.
+    """
+    scene, centre = build_centred_scene(vertices, faces)
+    found = RigidTransform.from_translation(-centre) @ start
+    for _ in range(3):  # the first nearly does it
+        moved = found.apply(points)
+        nearest = scene.compute_closest_points(o3d.core.Tensor(moved.astype(np.float32)))
+        normals = nearest["primitive_normals"].numpy().astype(np.float64)
+        residual = np.sum((moved - nearest["points"].numpy()) * normals, axis=1)
+        weight = np.maximum(1.0 - (residual / (0.5 * 3.0)) ** 2, 0.0)  # the root of Tukey's
+        jacobian = np.hstack([np.cross(moved, normals), normals]) * weight[:, None]
+        found = found.retract(np.linalg.lstsq(jacobian, -weight * residual, rcond=None)[0])
+    return RigidTransform.from_translation(centre) @ found
+
+
+def _is_scan(path: Path) -> bool:
+    return path.is_dir() or path.name == FILE_NAME
+
+
+def _name(path: Path) -> str:
+    """`truth/subject.ply`, but `scan` for a scan's folder."""
+    whole = path.resolve()
+    if path.name == FILE_NAME:
+        return whole.parent.name
+    return whole.name if path.is_dir() else f"{whole.parent.name}/{whole.name}"
+
+
+def _surface(path: Path) -> tuple[Array, Indices]:
+    """Vertices (V, 3) mm and faces (F, 3)."""
+    if _is_scan(path):
+        mesh = load_scan(path if path.is_dir() else path.parent).mesh
+        return mesh.vertices, mesh.faces
+    read = o3d.io.read_triangle_mesh(str(path)) if path.is_file() else o3d.geometry.TriangleMesh()
+    if not read.has_triangles():
+        raise BadInput(
+            "no surface can be read here",
+            where=str(path),
+            remedy="give a scan's folder, or a PLY with faces, in mm",
+        )
+    return np.asarray(read.vertices), np.asarray(read.triangles).astype(np.int64)

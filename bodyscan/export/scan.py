@@ -17,7 +17,7 @@ from bodyscan.export.formats import BODY_FORMATS
 from bodyscan.files.model import did_you_mean
 from bodyscan.fusion.storage import StoredScan
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.measurement.body_frame import rig_from_body
+from bodyscan.measurement.measurements import rig_from_body
 from bodyscan.mesh.body import BodyMesh
 from bodyscan.mesh.decimation import decimate
 from bodyscan.settings import ExportSettings

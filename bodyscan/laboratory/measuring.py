@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyscan.arrays import Array, Mask
-from bodyscan.evaluation.planes import Flatness, flatness
-from bodyscan.evaluation.spheres import (
+from bodyscan.evaluation.primitives import (
     CentreDistances,
+    Flatness,
     SphereAccuracy,
-    centre_distances,
+    compare_centre_distances,
+    measure_flatness,
     measure_sphere,
 )
 from bodyscan.geometry.camera import camera_from_fields
@@ -91,9 +92,9 @@ def measure_artefacts(
         approach.name,
         tuple(found),
         tuple(covered),
-        centre_distances(centres, apparatus.CENTRES),
-        flatness(_drop_unknown(points_of(approach, plate_s, captures.on_plate))),
-        flatness(
+        compare_centre_distances(centres, apparatus.CENTRES),
+        measure_flatness(_drop_unknown(points_of(approach, plate_s, captures.on_plate))),
+        measure_flatness(
             _drop_unknown(points_of(approach, captures.plate.truth.s, captures.on_plate))
         ).rms_mm,
     )

@@ -9,8 +9,7 @@ import numpy as np
 
 from bodyscan.arrays import Array
 from bodyscan.captures.folder import open_scan
-from bodyscan.evaluation.acceptance_file import AcceptanceFile
-from bodyscan.evaluation.acceptance_readings import Readings
+from bodyscan.evaluation.acceptance import AcceptanceFile, Readings
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.progress import Progress, silent
 from bodyscan.registration.rig_calibration import RigCalibration

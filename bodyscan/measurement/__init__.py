@@ -1,5 +1,1 @@
-"""Measure a body mesh, as far as shows that it is fit for use: stature, girths, volume, area.
-
-measurements (all of them), body_frame (which way the body faces), outline (unmeasured parts of a
-slice), head (where it ends under the hair).
-"""
+"""Measure a body mesh: stature, girths, volume, area, the top of the head under hair."""

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from rich.table import Table as ScreenTable
 
-from bodyscan.evaluation.acceptance_readings import ALL, Figure, Readings, grade_acceptance
+from bodyscan.evaluation.acceptance import ALL, Figure, Readings, grade_acceptance
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.report.page import Column, Lines, Number, Numbers, Page, Section, Table, format_value
 

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from bodyscan.arrays import Bytes, Mask
 from bodyscan.errors import ScanFailed
-from bodyscan.evaluation.comparison import Comparison
+from bodyscan.evaluation.surface import Comparison
 from bodyscan.mesh.body import REGION_NAMES, BodyCloud, BodyMesh, compute_cover_shares
 from bodyscan.mesh.decimation import decimate
 from bodyscan.progress import THREADS

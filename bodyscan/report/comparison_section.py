@@ -6,7 +6,7 @@ from dataclasses import astuple
 
 import numpy as np
 
-from bodyscan.evaluation.comparison import Comparison
+from bodyscan.evaluation.surface import Comparison
 from bodyscan.mesh.body import BodyMesh
 from bodyscan.report import charts
 from bodyscan.report.canvas import PICTURE_PX, round_up

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from bodyscan.evaluation.comparison import Comparison, compare_surfaces
+from bodyscan.evaluation.surface import Comparison, compare_surfaces
 from bodyscan.fusion.scan_facts import read_facts, stored_verdict
 from bodyscan.fusion.storage import StoredScan, load_scan
 from bodyscan.fusion.verdict.coverage import MAX_FILLED

@@ -14,9 +14,9 @@ from bodyscan.arrays import Array
 from bodyscan.captures.folder import Captures, open_scan
 from bodyscan.errors import BadInput, BodyscanError
 from bodyscan.evaluation import artefacts
-from bodyscan.evaluation.acceptance_file import AcceptanceFile
-from bodyscan.evaluation.acceptance_readings import (
+from bodyscan.evaluation.acceptance import (
     ALL,
+    AcceptanceFile,
     Figure,
     PlateRow,
     Readings,

@@ -14,9 +14,19 @@ import open3d as o3d
 
 from bodyscan.arrays import Array, Floats, Indices
 from bodyscan.errors import BadInput
-from bodyscan.evaluation.body import GirthErrors, coverage_of_seen, girth_errors, sway_residual
-from bodyscan.evaluation.comparison import fit_to_surface
-from bodyscan.evaluation.surface import Deviation, deviation, normalized_errors, signed_distances
+from bodyscan.evaluation.body import (
+    GirthErrors,
+    girth_errors,
+    measure_visible_coverage,
+    sway_residual,
+)
+from bodyscan.evaluation.surface import (
+    Deviation,
+    deviation,
+    fit_to_surface,
+    normalized_errors,
+    signed_distances,
+)
 from bodyscan.export.scan import transform_mesh
 from bodyscan.files.atomic import write_bytes
 from bodyscan.fusion.storage import StoredScan, load_scan
@@ -190,9 +200,9 @@ def _scan_lines(
             girths = girth_errors(body, truth.at_mean_breath, truth.faces, mean_breath=True)
             lines.append(f"  ... against mean breath {_girth_figures(girths)}")
     with part("coverage"):
-        lines.append(_coverage_line(*coverage_of_seen(points, *surface, pairs)))
+        lines.append(_coverage_line(*measure_visible_coverage(points, *surface, pairs)))
     lines.append(
-        f"  pairs to each other     {sway.apart_mm:.3f} mm RMS over the body, along and across"
+        f"  pairs to each other     {sway.rms_mm:.3f} mm RMS over the body, along and across"
     )
     with part("cloud-deviation.png"):
         drawn = draw_deviation(stored.cloud.points, stored.cloud.normals, cloud)

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from bodyscan.evaluation.acceptance_readings import (
+from bodyscan.evaluation.acceptance import (
     ALL,
     Figure,
     PlateRow,

@@ -7,7 +7,7 @@ import pytest
 
 from bodyscan.errors import FailedWork
 from bodyscan.evaluation.artefacts import locate_spheres, read_plate, read_sphere, spacing_errors
-from bodyscan.evaluation.spheres import Sphere
+from bodyscan.evaluation.primitives import Sphere
 
 CENTRE, RADIUS = np.array([30.0, -20.0, 900.0]), 50.0
 

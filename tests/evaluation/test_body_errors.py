@@ -10,7 +10,7 @@ import open3d as o3d
 import pytest
 from made_bodies import mesh_of
 
-from bodyscan.evaluation.body import coverage_of_seen, girth_errors, sway_residual
+from bodyscan.evaluation.body import girth_errors, measure_visible_coverage, sway_residual
 from bodyscan.geometry.camera import Camera, camera_to_fields
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.transforms import RigidTransform
@@ -82,16 +82,18 @@ def test_sway_left_in_is_told_and_a_common_motion_is_not() -> None:
     true = pairs([RigidTransform.identity(), RigidTransform.identity()])
     cameras = {name: RigidTransform.from_matrix(p["rig_from_camera"]) for name, p in true.items()}
     together = sway_residual({name: common @ t for name, t in cameras.items()}, true, vertices)
-    assert together.apart_mm < 1e-9
+    assert together.rms_mm < 1e-9
     np.testing.assert_allclose(together.rig_from_still.matrix, common.matrix, atol=1e-6)
     apart = sway_residual({"p0": cameras["p0"], "p1": aside @ cameras["p1"]}, true, vertices)
-    assert apart.apart_mm == pytest.approx(0.3)
+    assert apart.rms_mm == pytest.approx(0.3)
 
 
 @pytest.mark.slow
 def test_only_what_camera_and_projector_see_counts() -> None:
     vertices, faces = column(150.0)
-    seen, covered = coverage_of_seen(vertices, vertices, faces, pairs([RigidTransform.identity()]))
+    seen, covered = measure_visible_coverage(
+        vertices, vertices, faces, pairs([RigidTransform.identity()])
+    )
     # Less than the half that faces the camera; of 0.85 m x 1.1 m at 1.35 m.
     assert 0.15 < seen < 0.45
     assert covered < 0.2  # the column's own vertices lie 10 mm and more apart
@@ -99,9 +101,9 @@ def test_only_what_camera_and_projector_see_counts() -> None:
     angle, height = rng.uniform(-np.pi, np.pi, 1_000_000), rng.uniform(0.0, 1700.0, 1_000_000)
     dense = np.stack([150.0 * np.cos(angle), 150.0 * np.sin(angle), height], axis=-1)
     true = pairs([RigidTransform.identity()])
-    assert coverage_of_seen(dense, vertices, faces, true)[1] > 0.98
+    assert measure_visible_coverage(dense, vertices, faces, true)[1] > 0.98
     off = dense + [1.5, 0.0, 0.0]
-    assert coverage_of_seen(off, vertices, faces, true)[1] < 0.6
+    assert measure_visible_coverage(off, vertices, faces, true)[1] < 0.6
 
 
 def test_no_camera_sees_beyond_the_middles_of_its_last_pixels() -> None:
@@ -116,6 +118,6 @@ def test_no_camera_sees_beyond_the_middles_of_its_last_pixels() -> None:
         "camera": camera_to_fields(coarse),
         "projector": {"centre": [0.0, 0.0, 0.0]},
     }
-    seen, _ = coverage_of_seen(wall, wall, faces, {"p": facts})
+    seen, _ = measure_visible_coverage(wall, wall, faces, {"p": facts})
     # Spots are drawn at random: a standard deviation of 0.3 % of some 20,000.
     assert seen == pytest.approx(800.0 * 600.0 / 2000.0**2, rel=0.05)

@@ -7,13 +7,13 @@ from hypothesis import strategies as st
 
 from bodyscan.arrays import Array
 from bodyscan.errors import FailedWork
-from bodyscan.evaluation.sphere_search import find_spheres
-from bodyscan.evaluation.spheres import (
+from bodyscan.evaluation.primitives import (
     Sphere,
     _fit_algebraically,
-    centre_distances,
+    compare_centre_distances,
+    find_spheres,
     fit_sphere,
-    mean_square,
+    mean_square_distance,
     measure_sphere,
 )
 from bodyscan.reconstruction.triangulation import grid_normals
@@ -50,7 +50,7 @@ def test_an_exact_cap_gives_its_sphere(x: float, z: float, radius: float, seed: 
     assert free.radius == pytest.approx(radius, abs=1e-5)
     assert np.allclose(held.centre, centre, atol=1e-6)
     assert held.radius == radius
-    assert mean_square(points, free) < 1e-9
+    assert mean_square_distance(points, free) < 1e-9
 
 
 def test_eq_19_is_the_noise_squared() -> None:
@@ -127,7 +127,7 @@ def test_missing_spheres_are_missed() -> None:
 
 def test_scale_and_distances() -> None:
     turned = CENTRES[:, [2, 0, 1]] * (1.0 + 200e-6) + 7.0
-    found = centre_distances(turned, CENTRES)
+    found = compare_centre_distances(turned, CENTRES)
     assert found.scale_ppm == pytest.approx(200.0, abs=1e-6)
     # Distances of 60 to 124 mm, 200 ppm of them.
     assert 0.012 < found.rms_mm < 0.025

@@ -13,9 +13,14 @@ from made_bodies import cylinder, mesh_of
 from surface_coverage import coverage
 
 from bodyscan.errors import BadInput
-from bodyscan.evaluation import comparison
-from bodyscan.evaluation.comparison import _surface, fit_to_surface
-from bodyscan.evaluation.surface import deviation, sample_surface, signed_distances
+from bodyscan.evaluation import surface
+from bodyscan.evaluation.surface import (
+    _surface,
+    deviation,
+    fit_to_surface,
+    sample_surface,
+    signed_distances,
+)
 from bodyscan.geometry.transforms import RigidTransform
 
 BOX = o3d.geometry.TriangleMesh.create_box(100.0, 200.0, 300.0)
@@ -125,10 +130,8 @@ def test_only_what_was_measured_is_compared(
     vertices, faces = cylinder(50.0, 0.0, 400.0)
     filled = vertices[faces, 2].max(axis=1) > 200.0
     moved = vertices + np.where(vertices[:, 2:] > 200.0, [10.0, 0.0, 0.0], 0.0)
-    monkeypatch.setattr(comparison, "_surface", lambda other: (vertices, faces))
-    standing, laid = comparison.compare_surfaces(
-        mesh_of(moved, faces, filled), tmp_path / "other.ply"
-    )
+    monkeypatch.setattr(surface, "_surface", lambda other: (vertices, faces))
+    standing, laid = surface.compare_surfaces(mesh_of(moved, faces, filled), tmp_path / "other.ply")
     for one in (standing, laid):
         np.testing.assert_array_equal(one.vertices, np.unique(faces[~filled]))
         assert np.abs(one.signed_mm).max() < 0.01
@@ -180,13 +183,13 @@ def test_what_is_a_fifth_or_five_times_as_large_is_not_the_same_subject(
     """Wherever it stands: a body of 400 mm beside a box as high as that, five metres off."""
     body = mesh_of(*cylinder(50.0, 0.0, 400.0))
     box = (VERTICES - LOW) / 300.0 * size_mm + [5000.0, 0.0, 0.0]
-    monkeypatch.setattr(comparison, "_surface", lambda other: (box, FACES))
-    monkeypatch.setattr(comparison, "fit_to_surface", lambda *of: RigidTransform.identity())
+    monkeypatch.setattr(surface, "_surface", lambda other: (box, FACES))
+    monkeypatch.setattr(surface, "fit_to_surface", lambda *of: RigidTransform.identity())
     if said:
         with pytest.raises(BadInput, match=f"{said} as large as the scan"):
-            comparison.compare_surfaces(body, tmp_path / "other.ply")
+            surface.compare_surfaces(body, tmp_path / "other.ply")
         return
-    standing, laid = comparison.compare_surfaces(body, tmp_path / "other.ply")
+    standing, laid = surface.compare_surfaces(body, tmp_path / "other.ply")
     assert (standing.fitted, laid.fitted) == (False, True)
     assert (standing.is_scan, standing.name) == (False, f"{tmp_path.name}/other.ply")
     assert standing.signed_mm.min() > 4900.0

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bodyscan.boards.detection import find_boards
-from bodyscan.evaluation.sphere_search import find_spheres
+from bodyscan.evaluation.primitives import find_spheres
 from bodyscan.geometry.light_planes import baseline_angle_tilt
 from bodyscan.laboratory import apparatus
 from bodyscan.laboratory.calibrating import Calibrations, calibrate_all, sigma_trial

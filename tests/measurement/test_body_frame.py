@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.measurement.body_frame import rig_from_body
+from bodyscan.measurement.measurements import rig_from_body
 
 
 def standing() -> np.ndarray:

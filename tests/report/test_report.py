@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 
 from bodyscan.cli.main import app
 from bodyscan.errors import BadInput, ResultError
-from bodyscan.evaluation.comparison import compare_surfaces
+from bodyscan.evaluation.surface import compare_surfaces
 from bodyscan.files.atomic import write_json
 from bodyscan.fusion.storage import Origin
 from bodyscan.jobs.forgetting import find_subject

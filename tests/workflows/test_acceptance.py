@@ -15,24 +15,24 @@ from typer.testing import CliRunner
 from bodyscan.arrays import Array
 from bodyscan.cli.main import app
 from bodyscan.errors import BadInput, FailedWork
-from bodyscan.evaluation.acceptance_file import AcceptanceError, load_acceptance
-from bodyscan.evaluation.acceptance_readings import (
+from bodyscan.evaluation.acceptance import (
     ALL,
+    AcceptanceError,
     PlateRow,
     Readings,
     SpacingRow,
     SphereRow,
     figures,
+    load_acceptance,
 )
 from bodyscan.evaluation.artefacts import (
-    RIM_MM,
     locate_spheres,
     read_plate,
     read_sphere,
     require_spheres,
     spacing_errors,
 )
-from bodyscan.evaluation.spheres import Sphere
+from bodyscan.evaluation.primitives import Sphere
 from bodyscan.laboratory.simulated_acceptance import plates_at, spheres_at
 from bodyscan.rig.rig import Volume
 from bodyscan.workflows import accept_rig
@@ -60,7 +60,7 @@ def test_a_former_test_is_replaced_only_where_that_is_asked(tmp_path: Path) -> N
     accept_rig.refuse_existing_test(tmp_path, overwrite=False)
     (tmp_path / accept_rig.FILE_NAME).write_text("{}")
     accept_rig.refuse_existing_test(tmp_path, overwrite=True)
-    with pytest.raises(BadInput, match="an acceptance test lies here already"):
+    with pytest.raises(BadInput, match="holds an acceptance test already"):
         accept_rig.refuse_existing_test(tmp_path, overwrite=False)
 
 
@@ -127,7 +127,7 @@ def test_a_missing_sphere_is_said() -> None:
     ("squeeze", "apart", "said"),
     [
         (0.8, 1.0, "sphere 1 of radius 60 mm was not found: .* lies in a shell of"),
-        (1.0, 0.7, "two of what is most like them are 150 mm too close"),
+        (1.0, 0.7, "distance of two candidates is 150 mm too small"),
     ],
 )
 def test_what_is_no_sphere_or_stands_elsewhere_is_not_read(
@@ -155,7 +155,7 @@ def plate(wave_mm: float = 0.0) -> tuple[Array, Array]:
     rng = np.random.default_rng(3)
     u, v = rng.uniform(-200.0, 200.0, 40_000), rng.uniform(-150.0, 150.0, 40_000)
     off = wave_mm * np.cos(u / 15.0)  # even: no plane tilts to meet it
-    at_rim = np.minimum(200.0 - np.abs(u), 150.0 - np.abs(v)) < RIM_MM - 4.0
+    at_rim = np.minimum(200.0 - np.abs(u), 150.0 - np.abs(v)) < 12.0 - 4.0
     off[at_rim] += 3.0
     along, up = np.array([0.8, 0.6, 0.0]), np.array([0.0, 0.28, 0.96])
     up = up - (up @ along) * along
@@ -178,7 +178,7 @@ def test_no_plate_is_said() -> None:
         read_plate(*(part[:100] for part in plate()))
     with pytest.raises(FailedWork, match="no plate"):
         read_plate(*ball(AT, 30.0, 200_000))
-    with pytest.raises(FailedWork, match=r"what is most like one is [12].* mm RMS off a plane"):
+    with pytest.raises(FailedWork, match=r"the flattest surface is [12].* mm RMS off a plane"):
         read_plate(*plate(wave_mm=3.0))
 
 

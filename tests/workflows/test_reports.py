@@ -11,7 +11,7 @@ import pytest
 from small_workspace import Workspace, run
 from typer.testing import Result
 
-from bodyscan.evaluation.acceptance_file import load_acceptance
+from bodyscan.evaluation.acceptance import load_acceptance
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.laboratory.simulated_acceptance import spheres_at
 from bodyscan.registration.storage import load_calibration, save_calibration
@@ -107,7 +107,7 @@ def test_a_person_is_taken_for_no_artefact_and_no_test_is_replaced_unasked(
     assert not found["spheres"]
     assert not found["plates"]
     assert "was not found" in found["problems"][0]
-    assert "does the folder show the plate?" in found["problems"][1]
+    assert "check that the folder shows the plate" in found["problems"][1]
     (tmp_path / "acceptance.json").write_text("{}", "utf-8")
     again, kept = accept(person, calibration, tmp_path)
     assert getattr(again.exception, "exit_code", None) == 2
