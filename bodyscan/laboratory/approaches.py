@@ -205,27 +205,6 @@ class Approach:
     sheets: LightSheets
 
 
-def fit_pinhole_approach(target: Target, shots: Sequence[StripedShot], readings: Array) -> Approach:
-    """Approach (i) of the chapter: a 3 x 4 and a 2 x 4 matrix from a slide stage, without a lens,
-    and with the index used as a place on the projector's slide."""
-    return _fit("(i)", calibrate_by_matrix(target, shots, readings), target, pinhole_planes)
-
-
-def fit_mended_pinhole(target: Target, stage: LocatedBoards) -> Approach:
-    """Approach (i) with what it lacks: Tsai's camera with its lens, and a re-mapped index."""
-    return _fit("(i) mended", stage, target, remapped_planes)
-
-
-def fit_planes_approach(
-    name: str, target: Target, stage: LocatedBoards, shots: Sequence[StripedShot]
-) -> Approach:
-    """Approach (ii): Tsai's camera from the slide stage, planes from the reference plane.
-
-    This follows the chapter's text, although its heading says `calibrated by slide stage`.
-    """
-    return _fit(name, locate_boards(target, shots, stage.camera), target, free_planes)
-
-
 Model = Callable[[BoundaryPoints, int, Axis], LightPlanes]
 
 
@@ -262,10 +241,11 @@ image is estimated too, instead of being assumed to be the camera's x axis."""
 
 def fit_rivals(target: Target, where: LocatedBoards) -> list[Approach]:
     """Each model fitted to the same boundaries."""
-    return [_fit(name, where, target, model) for name, model in PROJECTORS.items()]
+    return [fit_approach(name, where, target, model) for name, model in PROJECTORS.items()]
 
 
-def _fit(name: str, where: LocatedBoards, target: Target, model: Model) -> Approach:
+def fit_approach(name: str, where: LocatedBoards, target: Target, model: Model) -> Approach:
+    """Fit one model of the projector to boundaries at known points."""
     projector = target.projector
     sheets = model(where.points, projector.stripes, projector.direction)
     return Approach(name, where.camera, sheets)

@@ -24,13 +24,16 @@ from bodyscan.laboratory import apparatus
 from bodyscan.laboratory.approaches import (
     Approach,
     LocatedBoards,
+    calibrate_by_matrix,
     calibrate_by_reference_plane,
     calibrate_by_slide_stage,
-    fit_mended_pinhole,
-    fit_pinhole_approach,
-    fit_planes_approach,
+    fit_approach,
     fit_rivals,
+    free_planes,
+    locate_boards,
     locate_boundaries,
+    pinhole_planes,
+    remapped_planes,
 )
 from bodyscan.laboratory.chapter_captures import TARGET, ChapterCaptures
 from bodyscan.simulation.files import describe_camera
@@ -68,11 +71,19 @@ def calibrate_all(captures: ChapterCaptures) -> Calibrations:
     projector = TARGET.projector
     planes = fit_light_planes(reference_boards.points, projector.stripes, projector.direction)
     ours, covariance, model, refinement = calibrate_ours(captures, reference, reference_boards)
+    by_matrix = calibrate_by_matrix(TARGET, captures.stage, captures.readings)
+    second, with_skew = (
+        locate_boards(TARGET, captures.boards, boards.camera) for boards in (stage, skewed)
+    )
     approaches = (
-        fit_pinhole_approach(TARGET, captures.stage, captures.readings),
-        fit_mended_pinhole(TARGET, stage),
-        fit_planes_approach("(ii)", TARGET, stage, captures.boards),
-        fit_planes_approach("(ii) with skew", TARGET, skewed, captures.boards),
+        # 3 x 4 and 2 x 4 matrices from the stage, no lens, the index taken as linear.
+        fit_approach("(i)", by_matrix, TARGET, pinhole_planes),
+        # Tsai's camera with its lens, and a re-mapped index.
+        fit_approach("(i) mended", stage, TARGET, remapped_planes),
+        # Tsai's camera from the stage, planes from the reference plane: the chapter's text, not its
+        # heading `calibrated by slide stage`.
+        fit_approach("(ii)", second, TARGET, free_planes),
+        fit_approach("(ii) with skew", with_skew, TARGET, free_planes),
         Approach("(iii)", reference_boards.camera, planes.planes),
         ours,
     )

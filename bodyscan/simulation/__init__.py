@@ -1,7 +1,7 @@
 """A rig, a body, lenses, light and noise: images with known truth.
 
 It shares no mathematics with what calibrates and reconstructs, so that an error made there shows.
-simulate makes a data set, artefact a scan of spheres or a plate. settings, presets; layout, plan,
+simulate makes a data set. settings, presets; layout, plan,
 board, body, living, scene (what there is); render, rays, lens, projector, patterns, lamps, sensor
 (its images); files.
 """

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import lru_cache
 
 import cv2
@@ -63,7 +63,6 @@ def render_pair(
     sequence: bool = True,
     moving: Moving | None = None,
     flicker: Mapping[str, Brightness] | None = None,
-    empty: EmptyRoom | None = None,
 ) -> dict[str, Floats]:
     """Images without sensor noise, (height, width) float32 grey levels, by frame name.
 
@@ -74,8 +73,6 @@ def render_pair(
         image of a stripe-index rig, which its instrument keeps to itself, is named "".
     moving: pixels near it are cast anew for every frame; its shadows on what is still do not move.
     flicker: of frames that differ in brightness (its gain is left to `sensor.expose`).
-    empty: the room formed by the scene's last surfaces, rendered in the same view and light
-        without anything in it: only what differs is cast; the images are the same.
 
     `sensor.expose` turns the result into 8-bit images.
     """
@@ -85,8 +82,7 @@ def render_pair(
     dark = frames.dark if code.uses_dark else None if code.is_projected else ""
     unlit = () if dark is None or not sequence else (dark,)
     source = _Source(projector, lamps, projection)
-    every = _rays(scene, view, source) if empty is None else empty.recast_changes(scene)
-    images = _render_still(every, view, source, lit, unlit, moving.surfaces if moving else 0)
+    images = _render_still(scene, view, source, lit, unlit, moving.surfaces if moving else 0)
     if moving is not None:
         _rerender_moving(images, view, source, lit, moving)
     for name in lit:
@@ -138,22 +134,22 @@ class _LightImages:
 
 
 def _render_still(
-    every: Iterator[tuple[Band, _LitRays]],
+    scene: Scene,
     view: View,
     source: _Source,
     lit: Mapping[str, LightTable],
     unlit: tuple[str, ...],
     moving_surfaces: int,
 ) -> _LightImages:
-    """Render every frame of a still scene from its bands; its first surfaces will move."""
+    """Render every frame of a still scene, whose first surfaces will move."""
     shape = (view.camera.height, view.camera.width)
     laser = {name: np.zeros(shape, np.float32) for name in (*lit, *unlit)}
     ambient, depth = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
     near, skin = np.zeros(shape, bool), np.zeros(shape, np.float32)
     glossy = lit if source.lamps.skin.gloss > 0 else {}
     gloss = {name: np.zeros(shape, np.float32) for name in glossy}
-    for band, rays in every:
-        slices = band.slices
+    for band in view.bands:
+        rays, slices = _LitRays.cast(scene, band, source), band.slices
         for name, table in lit.items():
             laser[name][slices] = rays.light(table)
         ambient[slices], depth[slices] = rays.ambient, rays.depth
@@ -227,69 +223,6 @@ class _LitRays:
     def gloss_light(self, table: LightTable) -> Floats:
         """The part (R, C) of one frame that glossy skin mirrors."""
         return mean_light(self.gloss, self.index, table.values.ravel())
-
-    def with_columns(self, columns: slice, part: _LitRays) -> _LitRays:
-        """These rays, with others in some columns."""
-        whole = {field.name: getattr(self, field.name).copy() for field in fields(self)}
-        for name, values in whole.items():
-            values[:, columns] = getattr(part, name)
-        return _LitRays(**whole)
-
-
-def _rays(scene: Scene, view: View, source: _Source) -> Iterator[tuple[Band, _LitRays]]:
-    return ((band, _LitRays.cast(scene, band, source)) for band in view.bands)
-
-
-@dataclass(frozen=True, eq=False)
-class EmptyRoom:
-    """What a view sees of a room in which nothing stands: most of it is the same in every shot.
-
-    rays: of each band, surfaces numbered beyond those of any scene.
-    corners, towards: of each band, (R + 1, C + 1, 3), where the rays between its pixels end, and
-        the direction from there to their light, NaN where none arrives.
-    steps: of each band, the largest distance between two rays along x and y at z = 1.
-    """
-
-    source: _Source
-    view: View
-    rays: tuple[_LitRays, ...]
-    corners: tuple[Floats, ...]
-    towards: tuple[Floats, ...]
-    steps: tuple[float, ...]
-
-    @staticmethod
-    def render(
-        room: Scene, view: View, projector: Projector, lamps: Lamps, projection: Projection
-    ) -> EmptyRoom:
-        source = _Source(projector, lamps, projection)
-        rays = [
-            replace(lit_rays, surface=np.full_like(lit_rays.surface, np.inf))
-            for _, lit_rays in _rays(room, view, source)
-        ]
-        corners = [
-            room.cast(band.corners.reshape(-1, 3)).points.reshape(band.corners.shape)
-            for band in view.bands
-        ]
-        towards = [projector.source(projector.stripe(ends)) - ends for ends in corners]
-        steps = [
-            max(float(np.abs(np.diff(band.corners, axis=k)).max()) for k in (0, 1))
-            for band in view.bands
-        ]
-        return EmptyRoom(source, view, tuple(rays), tuple(corners), tuple(towards), tuple(steps))
-
-    def recast_changes(self, scene: Scene) -> Iterator[tuple[Band, _LitRays]]:
-        """Yield each band's rays, cast anew in columns where something shows or casts a shadow."""
-        known = (self.view.bands, self.rays, self.corners, self.towards, self.steps)
-        for band, rays, ends, towards, step in zip(*known, strict=True):
-            changed = scene.may_change(band.corners, ends, towards, step)
-            columns = np.flatnonzero(changed.any(axis=0))
-            if not columns.size:
-                yield band, rays
-                continue
-            part = band.crop_columns(
-                max(int(columns[0]) - 1, 0), min(int(columns[-1]), band.columns.stop - 1)
-            )
-            yield band, rays.with_columns(part.columns, _LitRays.cast(scene, part, self.source))
 
 
 def _dilate(near: Mask, depth: Floats, reach_mm: float, camera: TrueCamera) -> Mask:

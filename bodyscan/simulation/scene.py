@@ -83,7 +83,6 @@ class Scene:
         self._shadowable = np.array([not surface.open_to_light for surface in surfaces] + [False])
         standing = [surface for surface in surfaces if not surface.encloses]
         self._ball = _bounding_ball(standing)
-        self._slopes = _bounding_slopes(standing)
         # Open3D holds Python's lock while it casts: threads of Python would take turns.
         self._rays = o3d.t.geometry.RaycastingScene(nthreads=2)
         self._finish = [_Finish.from_surface(surface) for surface in self.surfaces]
@@ -126,21 +125,6 @@ class Scene:
                 on = surface == number
                 albedo[on] = finish.printed.albedo(np.stack([across[on], down[on]], axis=1))
 
-    def may_change(self, directions: Floats, ends: Floats, towards: Floats, step: float) -> Mask:
-        """Where what stands here may show, or cast its shadow, in an empty room, (R, C).
-
-        directions: (R, C, 3) neighbouring rays from the origin, z = 1.
-        ends, towards: (R, C, 3) where they end in the empty room, and the direction from there to
-            the light's source, NaN without light.
-        step: largest distance between two of the rays, so that nothing between two is missed.
-        """
-        (left, top), (right, bottom) = self._slopes
-        x, y = directions[..., 0], directions[..., 1]
-        shows = (x > left - step) & (x < right + step) & (y > top - step) & (y < bottom + step)
-        middle, radius = self._ball
-        aside = _distance_squared(ends.reshape(-1, 3), towards.reshape(-1, 3), middle)
-        return shows | (aside.reshape(shows.shape) < (radius + step * ends[..., 2]) ** 2)
-
     def is_shadowed(self, points: Floats, towards: Floats, surface: NDArray[np.uint32]) -> Mask:
         """Whether something is between points (N, 3) on surfaces and the source of their light.
 
@@ -170,15 +154,6 @@ def _bounding_ball(surfaces: Iterable[Surface]) -> tuple[Array, float]:
         return np.zeros(3), 0.0
     low, high = np.min(corners, axis=(0, 1)), np.max(corners, axis=(0, 1))
     return (low + high) / 2.0, float(np.linalg.norm(high - low)) / 2.0
-
-
-def _bounding_slopes(surfaces: Iterable[Surface]) -> tuple[Array, Array]:
-    """The least and the greatest x / z and y / z of what stands there, (2,) each."""
-    vertices = np.concatenate([np.zeros((0, 3)), *(one.vertices for one in surfaces)])
-    if np.any(vertices[:, 2] <= 1.0):  # beside the camera: it may show anywhere
-        return np.full(2, -np.inf), np.full(2, np.inf)
-    slopes = vertices[:, :2] / vertices[:, 2:]
-    return slopes.min(axis=0, initial=np.inf), slopes.max(axis=0, initial=-np.inf)
 
 
 def _distance_squared(points: Floats, directions: Floats, middle: Array) -> Floats:

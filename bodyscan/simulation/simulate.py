@@ -30,7 +30,7 @@ from bodyscan.simulation.patterns import (
 )
 from bodyscan.simulation.plan import default_shots, plan_boards
 from bodyscan.simulation.rays import View
-from bodyscan.simulation.render import EmptyRoom, Moving, render_pair
+from bodyscan.simulation.render import Moving, render_pair
 from bodyscan.simulation.scene import Scene, Surface
 from bodyscan.simulation.sensor import (
     Brightness,
@@ -225,10 +225,9 @@ def _render_all(rig: Rig, truth: Truth, out: Path, workers: int, progress: Progr
         rays = np.random.default_rng([truth.seed, Stream.RAYS, number])
         view = View.from_camera(pair.camera, truth.settings.optics, rays)
         fixed = sensor_of(pair.camera, truth.settings, truth.seed, number)
-        empty = see_empty(pair, view, room, truth.settings)
         for task in tasks[pair.name]:
             noise = np.random.default_rng([truth.seed, Stream.NOISE, number, task.number])
-            render_task(rig, pair, view, room, task, truth.settings, out, noise, fixed, empty)
+            render_task(rig, pair, view, room, task, truth.settings, out, noise, fixed)
             count_task()
 
     map_threads(work, enumerate(truth.pairs.values()), stage="simulate", workers=workers)
@@ -267,12 +266,10 @@ def render_task(
     out: Path,
     rng: np.random.Generator,
     fixed: FixedPattern | None = None,
-    empty: EmptyRoom | None = None,
 ) -> None:
     """Cast, expose and write one pair's images of one shot.
 
     fixed: of the camera's sensor.
-    empty: the room as `see_empty` saw it, for pairs that take more than one shot.
     """
     scene, moving = _scenes(pair, room, task)
     light = settings.lighting
@@ -291,7 +288,6 @@ def render_task(
         sequence=task.sequence,
         moving=moving,
         flicker=flicker,
-        empty=empty,
     )
     length = exposure(images[rig.frames.lit or "lit"], task.bright_grey, light)
     exposed = {
@@ -330,14 +326,6 @@ def _scenes(pair: TruePair, room: Sequence[Surface], task: Task) -> tuple[Scene,
     return scene, Moving(
         len(task.surfaces), scene_at, _reach(living, list(task.frames_ms.values()))
     )
-
-
-def see_empty(
-    pair: TruePair, view: View, room: Sequence[Surface], settings: SimulationSettings
-) -> EmptyRoom:
-    """The room as a pair sees it before anything stands there."""
-    scene, lamps = Scene(_around(pair, room)), _lamps(pair, settings)
-    return EmptyRoom.render(scene, view, pair.projector, lamps, settings.projection)
 
 
 def _around(pair: TruePair, room: Sequence[Surface]) -> list[Surface]:

@@ -17,7 +17,7 @@ from bodyscan.simulation.lens import TrueCamera
 from bodyscan.simulation.patterns import code_bits
 from bodyscan.simulation.projector import MirrorProjector, PinholeProjector
 from bodyscan.simulation.rays import View
-from bodyscan.simulation.render import EmptyRoom, pixel_truth, render_pair
+from bodyscan.simulation.render import pixel_truth, render_pair
 from bodyscan.simulation.scene import Scene, Surface, grid_surface
 from bodyscan.simulation.sensor import blur, blurs_of, digitise, expose
 from bodyscan.simulation.settings import Noise, Optics, Projection
@@ -236,28 +236,6 @@ def test_lit_alone_is_the_lit_frame_of_the_sequence() -> None:
     alone = render(surfaces, sequence=False)
     assert list(alone) == ["lit"]
     assert (alone["lit"] == render(surfaces)["lit"]).all()
-
-
-def test_a_room_once_seen_empty_changes_no_image() -> None:
-    """Only between the columns of the ball and of its shadow are rays cast anew."""
-    room = wall(1500.0, encloses=True)
-    scene = Scene([ball([120.0, 30.0, 900.0], 60.0), room])
-    soft = Projection(blur_stripes=0.3, defocus_stripes=1.0)
-    rays, light = view(), projector(projection=soft)
-
-    def images(empty: EmptyRoom | None) -> dict[str, Floats]:
-        rng = np.random.default_rng(0)
-        return render_pair(scene, rays, light, LAMPS, soft, rng, empty=empty)
-
-    empty = EmptyRoom.render(Scene([room]), rays, light, LAMPS, soft)
-    anew, known = images(None), images(empty)
-    assert all(np.array_equal(anew[name], known[name]) for name in anew)
-    bare = render_pair(Scene([room]), rays, light, LAMPS, soft, np.random.default_rng(0))
-    changed = np.flatnonzero((bare["lit"] != anew["lit"]).any(axis=0))
-    ((_, cast),) = empty.recast_changes(scene)
-    recast = np.flatnonzero((cast.surface < np.inf).any(axis=0))
-    assert 0 < changed[0] - recast[0] < 20
-    assert changed[-1] <= recast[-1] < 159
 
 
 def test_a_sensor_adds_noise_as_large_as_it_says_and_rounds() -> None:

@@ -13,9 +13,13 @@ from typer.testing import Result
 
 from bodyscan.evaluation.acceptance import load_acceptance
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.laboratory.simulated_acceptance import spheres_at
+from bodyscan.laboratory.simulated_acceptance import (
+    capture_artefact,
+    open_workspace,
+    sphere_surfaces,
+    spheres_at,
+)
 from bodyscan.registration.storage import load_calibration, save_calibration
-from bodyscan.simulation.artefact import capture_artefact, open_workspace, sphere_surfaces
 
 
 def report(workspace: Workspace, *arguments: object) -> str:
