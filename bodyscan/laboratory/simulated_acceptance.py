@@ -26,7 +26,14 @@ from bodyscan.simulation.presets import settings_of
 from bodyscan.simulation.rays import View
 from bodyscan.simulation.scene import Surface, grid_surface
 from bodyscan.simulation.settings import SimulationSettings
-from bodyscan.simulation.simulate import Stream, Task, render_task, sensor_of, true_pairs
+from bodyscan.simulation.simulate import (
+    Stream,
+    Task,
+    random_stream,
+    render_task,
+    sensor_of,
+    true_pairs,
+)
 from bodyscan.workflows.accept_rig import read_plates, read_spheres
 
 
@@ -108,13 +115,13 @@ def capture_artefact(
     names = [f"s{k + 1:02d}" for k in range(shots)]
 
     def work(pair: TruePair) -> None:
-        rays = np.random.default_rng([simulated.seed, Stream.ARTEFACT_RAYS, order[pair.name]])
+        rays = random_stream(simulated.seed, Stream.ARTEFACT_RAYS, order[pair.name])
         view = View.from_camera(pair.camera, settings.optics, rays)
         fixed = sensor_of(pair.camera, settings, simulated.seed, order[pair.name])
         for k, name in enumerate(names):
-            seed = [simulated.seed, Stream.ARTEFACT_NOISE, order[pair.name], number, k]
+            purpose = Stream.ARTEFACT_NOISE, order[pair.name], number, k
             task = Task(k, name, out.name, tuple(surfaces), rig_from_artefact, 225.0, True)
-            noise = np.random.default_rng(seed)
+            noise = random_stream(simulated.seed, *purpose)
             render_task(rig, pair, view, room, task, settings, out.parent, noise, fixed)
 
     map_threads(work, taking, stage=f"simulating {out.name}", progress=progress)

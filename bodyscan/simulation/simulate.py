@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from pathlib import Path
@@ -131,129 +131,98 @@ def simulate(
     write_json(out / "truth" / "truth.json", describe(truth))
 
 
+def random_stream(seed: int, *purpose: int) -> np.random.Generator:
+    """Random numbers for one purpose (`Stream`, and numbers below it) of a data set."""
+    return np.random.default_rng([seed, *purpose])
+
+
 def _decide(
     rig: Rig, subject: Path | None, settings: SimulationSettings, seed: int, shots: int | None
 ) -> Truth:
-    """Everything that is true of the data set, drawn before any image is made."""
-
-    def stream(*purpose: int) -> np.random.Generator:
-        return np.random.default_rng([seed, *purpose])
-
+    """Draw everything that is true of the data set before any image is made."""
     pairs = true_pairs(rig, settings, seed)
     boards = {
-        board.name: make_board(board, settings.board, stream(Stream.BOARDS, number))
+        board.name: make_board(board, settings.board, random_stream(seed, Stream.BOARDS, number))
         for number, board in enumerate(rig.boards)
     }
     shots = default_shots(len(pairs)) if shots is None else shots
-    plan = plan_boards(rig, pairs, shots, stream(Stream.PLAN)) if shots else []
+    plan = plan_boards(rig, pairs, shots, random_stream(seed, Stream.PLAN)) if shots else []
+    truth = Truth(rig.name, seed, settings, pairs, boards, tuple(plan), None, None, {})
     if subject is None:
-        return Truth(rig.name, seed, settings, pairs, boards, tuple(plan), None, None, {})
-    person = body.load_subject(subject, settings.person, stream(Stream.SKIN), settings.skin)
+        return truth
+    person = body.load_subject(
+        subject, settings.person, random_stream(seed, Stream.SKIN), settings.skin
+    )
     height = float(person.vertices[:, 2].max())
-    sways = body.draw_sways(settings.person, height, len(pairs), stream(Stream.SWAY))
+    sways = body.draw_sways(settings.person, height, len(pairs), random_stream(seed, Stream.SWAY))
     by_pair = dict(zip(pairs, sways, strict=True))
     motion = None
     if moves(settings.person):
-        living = animate(person, settings.person, stream(Stream.LIFE))
+        living = animate(person, settings.person, random_stream(seed, Stream.LIFE))
         times = files.times_of_person(rig, PERSON_SHOT, settings.pace)
         every = [ms for by_frame in times.values() for ms in by_frame.values()]
         motion = Motion(living, times, (min(every) + max(every)) / 2.0, by_pair)
         person = living.surface(motion.moment_ms)
         by_pair = {name: motion.trunk(name) for name in by_pair}
     pseudonym = f"sim-{subject.stem.replace('_', '-')}"
-    return Truth(
-        rig.name, seed, settings, pairs, boards, tuple(plan), pseudonym, person, by_pair, motion
-    )
+    return replace(truth, subject=pseudonym, person=person, sways=by_pair, motion=motion)
 
 
 def true_pairs(rig: Rig, settings: SimulationSettings, seed: int) -> dict[str, TruePair]:
-    """The pairs of a data set with these settings and seed, wherever they are needed."""
-    return build_pairs(
-        rig, settings, lambda number: np.random.default_rng([seed, Stream.PAIRS, number])
-    )
+    """Build the pairs of a data set with these settings and seed."""
+    return build_pairs(rig, settings, lambda number: random_stream(seed, Stream.PAIRS, number))
 
 
 def _tasks(truth: Truth, pair: str) -> list[Task]:
-    """What one pair captures: its board shots, then the person."""
-    light = truth.settings.lighting
+    """List what one pair captures: its board shots, then the person."""
+    light, motion = truth.settings.lighting, truth.motion
     tasks = [
-        Task(
-            number=number,
-            shot=shot.name,
-            folder=CALIBRATION,
-            surfaces=truth.boards[shot.board].surfaces,
-            rig_from_surfaces=shot.rig_from_board,
-            bright_grey=light.board_grey,
-            sequence=pair in shot.stripes,
-        )
+        Task(number, shot.name, CALIBRATION, truth.boards[shot.board].surfaces,
+             shot.rig_from_board, light.board_grey, pair in shot.stripes)
         for number, shot in enumerate(truth.plan)
         if pair in (*shot.stripes, *shot.lit)
-    ]
-    if truth.person is not None:
-        task = Task(
-            number=len(truth.plan),
-            shot=PERSON_SHOT,
-            folder=PERSON,
-            surfaces=(truth.person,),
-            rig_from_surfaces=truth.sways[pair],
-            bright_grey=light.person_grey,
-            sequence=truth.pairs[pair].has_stripes,
-        )
-        tasks.append(_at_their_times(task, truth.motion, pair) if truth.motion else task)
-    return tasks
-
-
-def _at_their_times(task: Task, motion: Motion, pair: str) -> Task:
-    """The task with the person as that pair finds them, frame by frame."""
-    return replace(
-        task,
-        surfaces=(motion.body.surface(motion.middle_ms(pair)),),
-        rig_from_surfaces=motion.stances[pair],
-        body=motion.body,
-        frames_ms=motion.times[pair],
-    )
+    ]  # fmt: skip
+    if truth.person is None:
+        return tasks
+    surface = truth.person if motion is None else motion.body.surface(motion.middle_ms(pair))
+    pose = truth.sways[pair] if motion is None else motion.stances[pair]
+    person = Task(
+        len(truth.plan), PERSON_SHOT, PERSON, (surface,), pose, light.person_grey,
+        truth.pairs[pair].has_stripes,
+    )  # fmt: skip
+    if motion is not None:
+        person = replace(person, body=motion.body, frames_ms=motion.times[pair])
+    return [*tasks, person]
 
 
 def _render_all(rig: Rig, truth: Truth, out: Path, workers: int, progress: Progress) -> None:
     """Render every image of every pair; each thread has one pair at a time."""
     tasks = {name: _tasks(truth, name) for name in truth.pairs}
-    count_task = _counter("simulate", sum(map(len, tasks.values())), progress)
-    room = build_room(truth.pairs.values(), truth.settings.room)
+    room, settings = build_room(truth.pairs.values(), truth.settings.room), truth.settings
+    lock, done, total = Lock(), 0, sum(map(len, tasks.values()))
+    progress("simulate", 0, total)
 
-    def work(numbered: tuple[int, TruePair]) -> None:
+    def render(numbered: tuple[int, TruePair]) -> None:
+        nonlocal done
         number, pair = numbered
-        rays = np.random.default_rng([truth.seed, Stream.RAYS, number])
-        view = View.from_camera(pair.camera, truth.settings.optics, rays)
-        fixed = sensor_of(pair.camera, truth.settings, truth.seed, number)
+        rays = random_stream(truth.seed, Stream.RAYS, number)
+        view = View.from_camera(pair.camera, settings.optics, rays)
+        fixed = sensor_of(pair.camera, settings, truth.seed, number)
         for task in tasks[pair.name]:
-            noise = np.random.default_rng([truth.seed, Stream.NOISE, number, task.number])
-            render_task(rig, pair, view, room, task, truth.settings, out, noise, fixed)
-            count_task()
+            noise = random_stream(truth.seed, Stream.NOISE, number, task.number)
+            render_task(rig, pair, view, room, task, settings, out, noise, fixed)
+            with lock:
+                done += 1
+                progress("simulate", done, total)
 
-    map_threads(work, enumerate(truth.pairs.values()), stage="simulate", workers=workers)
+    map_threads(render, enumerate(truth.pairs.values()), stage="simulate", workers=workers)
 
 
 def sensor_of(
     camera: TrueCamera, settings: SimulationSettings, seed: int, number: int
 ) -> FixedPattern | None:
-    """Fixed pattern of the camera with that number, wherever it is needed."""
-    return fixed_pattern(
-        camera, settings.noise, np.random.default_rng([seed, Stream.PIXELS, number])
-    )
-
-
-def _counter(stage: str, total: int, progress: Progress) -> Callable[[], None]:
-    """A function that counts its calls, from any thread, and reports progress."""
-    lock, done = Lock(), 0
-    progress(stage, 0, total)
-
-    def count_task() -> None:
-        nonlocal done
-        with lock:
-            done += 1
-            progress(stage, done, total)
-
-    return count_task
+    """Draw the fixed pattern of the camera with that number."""
+    return fixed_pattern(camera, settings.noise, random_stream(seed, Stream.PIXELS, number))
 
 
 def render_task(
@@ -267,49 +236,39 @@ def render_task(
     rng: np.random.Generator,
     fixed: FixedPattern | None = None,
 ) -> None:
-    """Cast, expose and write one pair's images of one shot.
-
-    fixed: of the camera's sensor.
-    """
+    """Cast, expose and write one pair's images of one shot; `fixed` is of its camera's sensor."""
     scene, moving = _scenes(pair, room, task)
-    light = settings.lighting
-    code = rig.pair(pair.name).projector
+    code, lighting = rig.pair(pair.name).projector, settings.lighting
     taken = settings.pace.order or rig.frames.sequence_names(code)
     flicker = draw_flicker(taken, settings, rng.spawn(1)[0])
+    direction = np.array(lighting.window_from) / np.linalg.norm(lighting.window_from)
+    window = pair.rig_from_camera.inverse().rotate(direction)
+    lamps = Lamps(
+        lighting.laser_grey, lighting.ambient_grey, 0.85 * pair.reach_mm, pair.reach_mm,
+        lighting.window_grey, tuple(window.tolist()), settings.skin,
+    )  # fmt: skip
     images = render_pair(
-        scene,
-        view,
-        pair.projector,
-        _lamps(pair, settings),
-        settings.projection,
-        rng,
-        frames=rig.frames,
-        code=code,
-        sequence=task.sequence,
-        moving=moving,
-        flicker=flicker,
-    )
-    length = exposure(images[rig.frames.lit or "lit"], task.bright_grey, light)
+        scene, view, pair.projector, lamps, settings.projection, rng, frames=rig.frames, code=code,
+        sequence=task.sequence, moving=moving, flicker=flicker,
+    )  # fmt: skip
+    length = exposure(images[rig.frames.lit or "lit"], task.bright_grey, lighting)
+    gains = {name: np.float32(flicker.get(name, Brightness()).gain) for name in images}
     exposed = {
-        name: expose(
-            image * length * np.float32(flicker.get(name, Brightness()).gain),
-            settings.noise,
-            rng,
-            fixed,
-        )
+        name: expose(image * length * gains[name], settings.noise, rng, fixed)
         for name, image in images.items()
     }
     if code and not code.is_projected and task.sequence:
         exposed = instrument_images(exposed, code, rig.frames)
-    for frame, image in exposed.items():
+    for frame, grey in exposed.items():
         name = fill(rig.files, shot=task.shot, pair=pair.name, frame=frame)
-        files.write_image(out / task.folder / name, image)
+        files.write_image(out / task.folder / name, grey)
 
 
 def _scenes(pair: TruePair, room: Sequence[Surface], task: Task) -> tuple[Scene, Moving | None]:
-    """What stands there, in the camera's frame, and how it moves from frame to frame if it does."""
-    camera_from_surfaces = pair.rig_from_camera.inverse() @ task.rig_from_surfaces
-    around, living = _around(pair, room), task.body
+    """Build the scene in the camera's frame, and how it moves from frame to frame if it does."""
+    camera_from_rig = pair.rig_from_camera.inverse()
+    camera_from_surfaces = camera_from_rig @ task.rig_from_surfaces
+    around, living = [surface.transform(camera_from_rig) for surface in room], task.body
 
     def scene_with(surfaces: Sequence[Surface]) -> Scene:
         return Scene([*(surface.transform(camera_from_surfaces) for surface in surfaces), *around])
@@ -319,37 +278,12 @@ def _scenes(pair: TruePair, room: Sequence[Surface], task: Task) -> tuple[Scene,
         return scene, None
 
     def scene_at(frame: str) -> Scene:
-        # What an instrument takes for itself has no times: it is quick.
+        # Images that an instrument keeps to itself have no times: it is quick.
         taken = task.frames_ms.get(frame)
         return scene if taken is None else scene_with((living.surface(taken),))
 
-    return scene, Moving(
-        len(task.surfaces), scene_at, _reach(living, list(task.frames_ms.values()))
-    )
-
-
-def _around(pair: TruePair, room: Sequence[Surface]) -> list[Surface]:
-    """The room in the camera's frame."""
-    return [surface.transform(pair.rig_from_camera.inverse()) for surface in room]
-
-
-def _lamps(pair: TruePair, settings: SimulationSettings) -> Lamps:
-    light, reach = settings.lighting, pair.reach_mm
-    direction = np.array(light.window_from) / np.linalg.norm(light.window_from)
-    window = pair.rig_from_camera.inverse().rotate(direction)
-    return Lamps(
-        light.laser_grey,
-        light.ambient_grey,
-        0.85 * reach,
-        reach,
-        light.window_grey,
-        tuple(window.tolist()),
-        settings.skin,
-    )
-
-
-def _reach(body: LivingBody, moments_ms: Sequence[float]) -> float:
-    """Largest distance, mm, that anything moves meanwhile from its place at the middle of the time.
-    Motion is smooth: a few moments suffice, with a margin."""
-    first, last = min(moments_ms), max(moments_ms)
-    return 1.3 * body.max_displacement((first + last) / 2.0, np.linspace(first, last, 5))
+    # Motion is smooth: its largest displacement at a few moments suffices, with a margin.
+    first, last = min(task.frames_ms.values()), max(task.frames_ms.values())
+    moments = np.linspace(first, last, 5)
+    reach_mm = 1.3 * living.max_displacement((first + last) / 2.0, moments)
+    return scene, Moving(len(task.surfaces), scene_at, reach_mm)

@@ -5,9 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bodyscan.boards.detection import find_boards
-from bodyscan.evaluation.primitives import find_spheres
-from bodyscan.geometry.light_planes import baseline_angle_tilt
+from bodyscan.evaluation.sphere_search import find_spheres
 from bodyscan.laboratory import apparatus
 from bodyscan.laboratory.calibrating import Calibrations, calibrate_all, sigma_trial
 from bodyscan.laboratory.chapter_captures import ChapterCaptures, take_captures
@@ -18,7 +16,6 @@ from bodyscan.laboratory.measuring import (
     point_sigma,
     points_of,
     true_approach,
-    whole_stripes,
 )
 from bodyscan.laboratory.reproduce import draw
 from bodyscan.laboratory.text import Reproduction, figure_names, reproduction_text
@@ -47,16 +44,6 @@ def measured(
         }
         for whole in (True, False)
     }
-
-
-def test_baselines_reduce_angles_grow_tilts_stay() -> None:
-    # Fig. 6, in words.
-    baseline, angle, tilt = baseline_angle_tilt(
-        apparatus.true_planes(apparatus.chapter_setup(apparatus.ideal_settings(1))), "vertical"
-    )
-    assert (np.diff(baseline) < 0).all()
-    assert (np.diff(angle) > 0).all()
-    assert np.degrees(np.ptp(tilt)) < 0.5 < np.degrees(np.ptp(angle))
 
 
 def test_boards_and_stage_are_wholly_in_the_picture(captures: ChapterCaptures) -> None:
@@ -194,11 +181,6 @@ def test_points_are_as_far_off_as_they_say(
     assert found.median_mm < 3.0 * 0.076
 
 
-def test_whole_stripes_are_middles() -> None:
-    assert whole_stripes(np.array([0.0, 3.2, 3.99])) == pytest.approx([0.5, 3.5, 3.5])
-    assert np.isnan(whole_stripes(np.array([np.nan]))[0])
-
-
 def test_the_report_says_all_of_it(
     tmp_path: Path,
     captures: ChapterCaptures,
@@ -233,7 +215,3 @@ def test_the_report_says_all_of_it(
         assert f"({name})" in text
         assert (tmp_path / name).stat().st_size > 10_000
     assert not list(tmp_path.glob("*.tmp*"))
-
-
-def test_no_board_is_seen_among_the_spheres(captures: ChapterCaptures) -> None:
-    assert find_boards(captures.spheres.lit, [apparatus.BOARD], pair="p", shot="s") == []

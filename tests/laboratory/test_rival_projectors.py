@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from mirror_points import MIRROR, STRIPES, TRUE_PLANES, mirror_points, systematic_mm
+from mirror_points import STRIPES, mirror_points, systematic_mm
 
 from bodyscan.arrays import Array
 from bodyscan.geometry.light_planes import LightPlanes, baseline_angle_tilt
@@ -131,12 +131,3 @@ def test_a_rotating_mirror_fits_planes_best() -> None:
     assert error["2 x 4 matrix, index re-mapped"] < 0.3 * error["2 x 4 matrix"]
     assert error["variable baseline, tilted"] < error["invariable baseline, tilted"]
     assert error["variable baseline, tilted"] < 0.5 * error["variable baseline"]
-
-
-def test_true_planes_hold_the_light() -> None:
-    points = mirror_points(every_px=16)
-    planes = TRUE_PLANES[points.index]
-    off = np.sum(points.points * planes[:, :3], axis=1) + planes[:, 3]
-    # 1e-7 of a stripe, 0.6 mm wide, and the table of the simulator's lens (1e-9 of 1061 px).
-    assert np.max(np.abs(off)) < 1e-5
-    assert MIRROR.offset_mm > 4.0

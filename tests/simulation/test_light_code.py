@@ -21,12 +21,6 @@ def test_every_stripe_has_its_code_and_neighbours_differ_in_one_bit(
     assert (np.diff(code.astype(int), axis=1) != 0).sum(axis=0).tolist() == [1] * (stripes - 1)
 
 
-def test_most_significant_bit_first() -> None:
-    """Of 8 stripes: 0 1 3 2 6 7 5 4."""
-    values = code_bits(8).T @ [4, 2, 1]
-    assert values.tolist() == [0, 1, 3, 2, 6, 7, 5, 4]
-
-
 def test_light_is_on_in_lit_stripes_and_nowhere_beyond_the_sweep() -> None:
     lit = np.array([True, False, True])
     table = light_table(lit, NO_BLUR)
@@ -51,11 +45,3 @@ def test_jitter_moves_boundaries() -> None:
     on = np.flatnonzero(table > 0.5) / FINE - PAD
     assert on[0] == pytest.approx(1.1, abs=1 / FINE)
     assert on[-1] == pytest.approx(2.8, abs=2 / FINE)
-
-
-def test_each_blur_has_its_row() -> None:
-    table = light_table(np.ones(2, bool), np.array([0.1, 0.5]))
-    s = np.array([-0.3, -0.3])
-    near, far = table.at(table_index(s, 2, np.array([0, 1])))
-    assert near < 0.01  # three standard deviations out
-    assert far == pytest.approx(0.274, abs=0.01)  # 0.6 standard deviations out

@@ -119,19 +119,6 @@ def test_arms_turn_about_shoulders_and_the_head_about_the_neck() -> None:
     assert [joint.weights[hands[0]] for joint in body.limbs] == [1.0, 0.0, 0.0]
 
 
-def test_it_is_smooth_in_time(living: LivingBody) -> None:
-    path = np.array([living.vertices(ms) for ms in (0.0, 8.0, 16.0, 24.0)])
-    bent = np.abs(np.diff(path, 2, axis=0)).max()
-    # 1.2 Hz at most: a wave of 5 mm bends by 5 (2 pi 1.2 0.008)^2 = 0.02 mm.
-    assert bent < 0.03
-    assert np.linalg.norm(np.diff(path, axis=0), axis=-1).max() < 1.0
-
-
-def test_the_same_seed_is_the_same_motion(living: LivingBody) -> None:
-    assert np.array_equal(load_moving_body(STANDING).vertices(123.0), living.vertices(123.0))
-    assert not np.array_equal(load_moving_body(STANDING, 1).vertices(123.0), living.vertices(123.0))
-
-
 def test_only_a_mannequin_stands_still() -> None:
     still = {name: moves(Person(**person)) for name, person in SUBJECTS.items()}
     assert still == {"mannequin": False, "standing": True, "restless": True, "child": True}

@@ -16,7 +16,7 @@ import yaml
 from bodyscan.captures.folder import open_scan
 from bodyscan.errors import BadInput
 from bodyscan.rig.rig_file import load_rig
-from bodyscan.simulation import SimulationSettings, settings_for, simulate
+from bodyscan.simulation import SimulationSettings, simulate
 from bodyscan.simulation.body import draw_sways, load_subject
 from bodyscan.simulation.settings import Person
 
@@ -187,13 +187,6 @@ def test_sway_is_a_smooth_walk_bounded_at_the_head() -> None:
 def test_a_subject_that_is_no_mesh_is_refused(tmp_path: Path) -> None:
     with pytest.raises(BadInput, match="no triangle mesh"):
         load_subject(tmp_path / "none.ply", Person(), np.random.default_rng(0))
-
-
-def test_settings_for_a_kind_of_projector() -> None:
-    assert settings_for("mirror").projection.kind == "mirror"
-    assert settings_for("pinhole").projection.kind == "pinhole"
-    with pytest.raises(BadInput, match="laser"):
-        settings_for("laser")
 
 
 def test_a_camera_without_projector_takes_lit_images_by_a_lamp(tmp_path: Path) -> None:

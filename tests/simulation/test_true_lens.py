@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
-from bodyscan.simulation.lens import TrueCamera, sample_directions, sample_offsets
+from bodyscan.simulation.lens import TrueCamera, sample_directions
 
 SKEWED = TrueCamera(1061.71, 1064.09, -0.56, 350.08, 286.5, -0.14, -0.09, 640, 480)
 
@@ -53,13 +53,6 @@ def test_a_lens_that_folds_the_image_is_refused() -> None:
     folding = TrueCamera(300.0, 300.0, 0.0, 320.0, 240.0, -0.6, 0.0, 640, 480)
     with pytest.raises(ValueError, match="folds"):
         folding.directions(folding.grid())
-
-
-@pytest.mark.parametrize("count", [1, 2, 3, 4])
-def test_samples_share_no_row_and_no_column(count: int) -> None:
-    offsets = sample_offsets(count)
-    for axis in offsets.T:
-        assert sorted(axis) == pytest.approx((np.arange(count**2) + 0.5) / count**2)
 
 
 def test_samples_stay_inside_their_pixel_and_average_to_its_middle() -> None:
