@@ -20,10 +20,10 @@ from bodyscan.boards.view import BoardView
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.rig.board import Board
 from bodyscan.rig.rig import Rig
-from bodyscan.simulation.board import board_print
+from bodyscan.simulation.board import make_print
 from bodyscan.simulation.layout import TruePair, build_pairs
 from bodyscan.simulation.lens import sample_directions
-from bodyscan.simulation.plan import BoardShot, default_shots, plan_boards
+from bodyscan.simulation.plan import BoardShot, count_default_shots, plan_boards
 from bodyscan.simulation.sensor import expose, exposure
 from bodyscan.simulation.settings import SimulationSettings
 
@@ -56,7 +56,7 @@ def see_boards(
         same corners.
     """
     pairs = build_pairs(rig, SETTINGS, lambda k: np.random.default_rng([seed, 1, k]))
-    count = shots or default_shots(len(pairs))
+    count = shots or count_default_shots(len(pairs))
     plan = plan_boards(rig, pairs, count, np.random.default_rng([seed, 3]))
     if stored is not None and stored.exists():
         return SeenRig(rig, pairs, tuple(plan), load_views(stored))
@@ -193,5 +193,5 @@ def _texture(board: Board, face: int) -> Floats:
         for length in size
     )
     grid = np.stack(np.meshgrid(x, y), axis=-1).astype(np.float32)
-    flat = board_print(board, face, SETTINGS.board).albedo(grid.reshape(-1, 2))
+    flat = make_print(board, face, SETTINGS.board).albedo(grid.reshape(-1, 2))
     return flat.reshape(grid.shape[:2])

@@ -21,15 +21,15 @@ from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_file import load_rig
 from bodyscan.simulation.body import load_subject
-from bodyscan.simulation.files import describe_camera, scale_rig, times_of_person
-from bodyscan.simulation.lamps import Lamps, laser_light
+from bodyscan.simulation.files import compute_person_times, describe_camera, scale_rig
+from bodyscan.simulation.lamps import Lamps, compute_laser_light
 from bodyscan.simulation.layout import TruePair
 from bodyscan.simulation.living import LivingBody, animate
 from bodyscan.simulation.presets import settings_for
 from bodyscan.simulation.projector import MirrorProjector
 from bodyscan.simulation.scene import Hits, Scene
 from bodyscan.simulation.settings import Pace
-from bodyscan.simulation.simulate import CALIBRATION, PERSON_SHOT, true_pairs
+from bodyscan.simulation.simulate import CALIBRATION, PERSON_SHOT, draw_true_pairs
 
 PROJECT = Path(__file__).parents[1]
 SCALE = 0.45
@@ -89,13 +89,13 @@ def cast_person(
     rig = scale_rig(full, SCALE, CALIBRATION)
     settings = settings_for("mirror", preset="workshop", subject=preset)
     person = replace(settings.person, size=size * settings.person.size, subdivisions=1)
-    pairs = true_pairs(rig, settings, seed)
+    pairs = draw_true_pairs(rig, settings, seed)
     still = load_subject(PROJECT / "data" / "subjects" / f"{subject}.ply", person, rng)
     body = animate(still, person, rng)
     turn = np.array([0.0, 0.0, np.radians(STANCE_DEG) * rng.standard_normal()])
     shift = STANCE_MM * rng.standard_normal(3) * [1.0, 1.0, 0.0]
     stance = RigidTransform.from_rotation_vector(turn, shift)
-    frames = times_of_person(full, PERSON_SHOT, Pace(start=start)).items()
+    frames = compute_person_times(full, PERSON_SHOT, Pace(start=start)).items()
     moments = {name: 0.5 * (min(ms.values()) + max(ms.values())) for name, ms in frames}
     middle = 0.5 * (min(moments.values()) + max(moments.values()))
     calibration = _calibrated(rig, pairs, seed)
@@ -150,7 +150,7 @@ def _seen(pair: TruePair, rays: Array, scan: CastScan, ms: float) -> tuple[Array
     surface = replace(surface, normals=scan.stance.rotate(np.asarray(surface.normals)))
     scene = Scene([surface.transform(pair.rig_from_camera.inverse())])
     hits: Hits = scene.cast(rays.astype(np.float32))
-    lit = laser_light(scene, hits, pair.projector, Lamps(1.0, 0.0, 1.0, 1.0)).weight > 0.0
+    lit = compute_laser_light(scene, hits, pair.projector, Lamps(1.0, 0.0, 1.0, 1.0)).weight > 0.0
     normals = hits.normals.astype(np.float64)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     return np.where(lit, hits.depth, np.nan).astype(np.float64), normals

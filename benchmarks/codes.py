@@ -14,9 +14,9 @@ from bodyscan.simulation.board import make_board
 from bodyscan.simulation.files import scale_rig
 from bodyscan.simulation.lamps import Lamps
 from bodyscan.simulation.layout import TruePair, build_pairs
-from bodyscan.simulation.patterns import instrument_images
+from bodyscan.simulation.patterns import simulate_instrument
 from bodyscan.simulation.rays import View
-from bodyscan.simulation.render import PixelTruth, pixel_truth, render_pair
+from bodyscan.simulation.render import PixelTruth, compute_pixel_truth, render_pair
 from bodyscan.simulation.scene import Scene, grid_surface
 from bodyscan.simulation.sensor import expose, exposure
 from bodyscan.simulation.settings import SimulationSettings
@@ -62,7 +62,7 @@ def report() -> str:
     )
     rows = []
     for group, scene, chosen, names in groups:
-        truth = pixel_truth(scene, pair.camera, pair.projector)
+        truth = compute_pixel_truth(scene, pair.camera, pair.projector)
         rows.append(f"| **{group}** | | | | | | | |")
         for name in names:
             same = {"stripes": projector.stripes, "direction": projector.direction}
@@ -123,7 +123,7 @@ def _row(
     length = exposure(images["lit"], light.board_grey, light)
     seen = {name: expose(image * length, settings.noise, rng) for name, image in images.items()}
     if not spec.is_projected:
-        seen = instrument_images(seen, spec, frames)
+        seen = simulate_instrument(seen, spec, frames)
     coded = np.stack([seen[name] for name in frames.code_names(spec)])
     found = decode_stripes(spec, seen["lit"], seen.get(frames.dark or ""), coded)
     lit = np.isfinite(truth.s)

@@ -22,9 +22,9 @@ from bodyscan.laboratory.chapter_captures import TARGET, take_captures
 from bodyscan.laboratory.measuring import (
     ApproachAccuracy,
     PointSigma,
+    compare_point_sigmas,
+    make_true_approach,
     measure_artefacts,
-    point_sigma,
-    true_approach,
 )
 from bodyscan.progress import THREADS
 from bodyscan.simulation.files import describe_camera
@@ -92,11 +92,9 @@ def _unit(boards: int, real_light: bool, seed: int) -> UnitErrors:
     )
     true = camera_from_fields(describe_camera(apparatus.CAMERA)).parameters
     off = (ours.camera.parameters - true) / np.sqrt(np.diag(covariance))
-    print_ppm = compare_centre_distances(
-        setup.board.corners, corner_points(apparatus.BOARD)
-    ).scale_ppm
-    accuracy, best = (measure_artefacts(one, captures) for one in (ours, true_approach(setup)))
-    return UnitErrors(point_sigma(ours, captures), off, accuracy, best, print_ppm)
+    print_ppm = centre_distances(setup.board.corners, corner_points(apparatus.BOARD)).scale_ppm
+    accuracy, best = (measure_artefacts(one, captures) for one in (ours, make_true_approach(setup)))
+    return UnitErrors(compare_point_sigmas(ours, captures), off, accuracy, best, print_ppm)
 
 
 def _unit_row(boards: int, light: str, seeds: Sequence[UnitErrors]) -> str:

@@ -102,7 +102,7 @@ class ChapterSetup:
 
 
 def ideal_settings(samples: int = 5) -> SimulationSettings:
-    """A flat, exact board and the simulator's own noise.
+    """Make settings of a flat, exact board and the simulator's own noise.
 
     samples: rays per pixel along each axis. With 3 their positions alone move a boundary by 0.015
         px, as much as the noise does; with 5 by 0.005 px.
@@ -111,7 +111,7 @@ def ideal_settings(samples: int = 5) -> SimulationSettings:
 
 
 def real_settings(samples: int = 5) -> SimulationSettings:
-    """Realistic light and a realistic board: see the numbers."""
+    """Make settings of realistic light and a realistic board."""
     return SimulationSettings(
         optics=Optics(samples=samples, defocus_px=2.0),
         projection=Projection(
@@ -123,7 +123,7 @@ def real_settings(samples: int = 5) -> SimulationSettings:
 
 
 def chapter_setup(settings: SimulationSettings, seed: int = 0) -> ChapterSetup:
-    """The set-up; its projector is the same whatever the seed."""
+    """Build the set-up; its projector is the same whatever the seed."""
     x, _, z = PROJECTOR_AT
     turn = [0.0, float(np.arctan2(-x, DISTANCE_MM - z)), 0.0]
     projector = build_mirror(
@@ -144,24 +144,23 @@ def chapter_setup(settings: SimulationSettings, seed: int = 0) -> ChapterSetup:
 
 
 def true_planes(setup: ChapterSetup) -> Array:
-    """Planes (S + 1, 4) of the boundaries, before any smile; (a, b, c) unit, d >= 0."""
+    """Compute planes (S + 1, 4) of the boundaries before any smile; (a, b, c) unit, d >= 0."""
     return towards_camera(setup.projector.plane(np.arange(setup.projector.stripes + 1.0)))
 
 
 def board_poses(count: int = BOARDS) -> list[RigidTransform]:
-    """camera_from_board of the three poses, or of `count` poses."""
+    """List camera_from_board of the three poses, or of `count` poses."""
     middles, turns = (*BOARD_MIDDLES, *MORE_MIDDLES), (*BOARD_TURNS, *MORE_TURNS)
     return [pose_about(m, t) for m, t in zip(middles[:count], turns[:count], strict=True)]
 
 
 def stage_readings(count: int = len(STAGE_MM)) -> Array:
-    """Nominal stops of the slide stage, mm; fewer stops span the same range."""
+    """Space the slide stage's nominal stops, mm, evenly over its range."""
     return np.linspace(STAGE_MM[0], STAGE_MM[-1], count)
 
 
 def stage_poses(readings: Array, seed: int) -> list[RigidTransform]:
-    """camera_from_board at each stop: the stage slides along its board's own normal, and stops
-    nearly where it should."""
+    """List camera_from_board at each stop, along the board's normal, with the stage's errors."""
     rng = np.random.default_rng([seed, STAGE])
     stage = pose_about(STAGE_MIDDLE, STAGE_TURN)
     stops = readings + STAGE_ERROR_MM * rng.standard_normal(len(readings))
@@ -172,7 +171,7 @@ def stage_poses(readings: Array, seed: int) -> list[RigidTransform]:
 def pose_about(
     position: Sequence[float], turn: Sequence[float], middle: Array | None = None
 ) -> RigidTransform:
-    """camera_from_board with the board's middle at a position and rotated about it."""
+    """Compute camera_from_board that puts the board's middle at a position, rotated about it."""
     if middle is None:
         middle = BOARD.square_mm / 2.0 * np.array([BOARD.columns, BOARD.rows, 0.0])
     rotation = RigidTransform.from_rotation_vector(turn, np.zeros(3)).rotation

@@ -68,7 +68,7 @@ class LocatedBoards:
 def calibrate_by_reference_plane(
     target: Target, shots: Sequence[StripedShot]
 ) -> tuple[CameraCalibration, LocatedBoards]:
-    """The chapter's method (section 3): Zhang's camera, which also gives the boards' poses."""
+    """Calibrate by Zhang's method (section 3), which also gives the boards' poses."""
     height, width = shots[0].stripes.s.shape
     views = [planar_view(shot.view, target.board) for shot in shots]
     found = calibrate_camera(views, width, height)
@@ -78,7 +78,7 @@ def calibrate_by_reference_plane(
 def calibrate_by_slide_stage(
     target: Target, shots: Sequence[StripedShot], readings: Array, *, skewed: bool = False
 ) -> tuple[TsaiCamera, LocatedBoards]:
-    """Tsai's camera, with a skew if wanted, from a board that slid along its normal.
+    """Calibrate Tsai's camera, with a skew if wanted, from a board slid along its normal.
 
     readings: (shots,) mm, of the stage.
     """
@@ -96,7 +96,7 @@ def calibrate_by_slide_stage(
 def calibrate_by_matrix(
     target: Target, shots: Sequence[StripedShot], readings: Array
 ) -> LocatedBoards:
-    """A 3 x 4 camera from the same stage, without a lens (Bolles et al. 1981).
+    """Calibrate a 3 x 4 camera without a lens from the stage (Bolles et al. 1981).
 
     The stripes' positions are read off each board by its own homography, which has no lens either.
     """
@@ -130,8 +130,7 @@ def locate_boundaries(
     *,
     bin_px: int = 1,
 ) -> LocatedBoards:
-    """Carry boundaries onto boards of known pose (Eq. 18),
-    one by one or as means of short pieces."""
+    """Project stripe boundaries onto boards of known pose (Eq. 18), singly or binned."""
     parts = [
         on_board(
             camera,
@@ -150,8 +149,7 @@ def locate_boundaries(
 def stage_points(
     board: Board, shots: Sequence[StripedShot], readings: Array
 ) -> tuple[Array, Array]:
-    """All corners in the stage's frame (N, 3) mm, which is the
-    board's at reading 0; and pixels (N, 2)."""
+    """Stack all corners (N, 3) mm, frame of the board at reading 0, and their pixels (N, 2)."""
     views = [planar_view(shot.view, board) for shot in shots]
     points = [
         view.points + [0.0, 0.0, reading] for view, reading in zip(views, readings, strict=True)
@@ -171,7 +169,7 @@ def _locate_by_homography(
     camera_from_board: RigidTransform,
     number: int,
 ) -> BoundaryPoints:
-    """A board's boundaries, located on it only by the corners around them."""
+    """Locate a board's boundaries on it by the homography of its corners alone."""
     near = boundaries_near(shot.stripes, box_around(shot.view))
     onto_board = np.linalg.inv(homography(view.points[:, :2], view.pixels))
 
@@ -209,19 +207,19 @@ Model = Callable[[BoundaryPoints, int, Axis], LightPlanes]
 
 
 def free_planes(points: BoundaryPoints, stripes: int, direction: Axis) -> LightPlanes:
-    """One free plane per stripe (Eq. 6)."""
+    """Fit one free plane per stripe (Eq. 6)."""
     return fit_light_planes(points, stripes, direction).planes
 
 
 def pinhole_planes(points: BoundaryPoints, stripes: int, direction: Axis) -> LightPlanes:
-    """Planes of the 2 x 4 matrix of Bolles et al. 1981."""
+    """Fit the 2 x 4 matrix of Bolles et al. 1981."""
     few = subsample(points, 20_000)
     fitted = fit_pinhole(few.points, few.index.astype(float))
     return fitted.planes(stripes, direction)
 
 
 def remapped_planes(points: BoundaryPoints, stripes: int, direction: Axis) -> LightPlanes:
-    """Planes of the 2 x 4 matrix with a re-mapped index."""
+    """Fit the 2 x 4 matrix with a re-mapped index."""
     few = subsample(points, 20_000)
     return fit_remapped_pinhole(few.points, few.index.astype(float), stripes, direction)
 
@@ -240,7 +238,7 @@ image is estimated too, instead of being assumed to be the camera's x axis."""
 
 
 def fit_rivals(target: Target, where: LocatedBoards) -> list[Approach]:
-    """Each model fitted to the same boundaries."""
+    """Fit each model of the projector to the same boundaries."""
     return [fit_approach(name, where, target, model) for name, model in PROJECTORS.items()]
 
 

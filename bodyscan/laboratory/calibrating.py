@@ -149,7 +149,7 @@ class SigmaTrial:
         return int(np.count_nonzero(np.abs(self.errors) > 3.0))
 
 
-def sigma_trial(seeds: int, seed: int = 0) -> SigmaTrial:
+def run_sigma_trial(seeds: int, seed: int = 0) -> SigmaTrial:
     """Calibrate Table 1's camera from three poses, `seeds` times with corner noise of 0.012 px."""
     corners = corner_points(TARGET.board)
     poses = apparatus.board_poses()

@@ -19,7 +19,7 @@ from bodyscan.laboratory.approaches import StripedShot, Target
 from bodyscan.progress import Progress, silent
 from bodyscan.rig.frame_names import FrameNames
 from bodyscan.simulation.lamps import Lamps
-from bodyscan.simulation.render import PixelTruth, pixel_truth, render_pair
+from bodyscan.simulation.render import PixelTruth, compute_pixel_truth, render_pair
 from bodyscan.simulation.scene import Scene, Surface, grid_surface
 from bodyscan.simulation.sensor import expose
 from bodyscan.stripes.decoding import decode_stripes
@@ -35,12 +35,12 @@ class Exposure:
 
 
 def board_scene(setup: ChapterSetup, camera_from_board: RigidTransform) -> list[Surface]:
-    """The board, and a wall behind it."""
+    """Build the board, and a wall behind it."""
     return [*(surface.transform(camera_from_board) for surface in setup.board.surfaces), _wall()]
 
 
 def sphere_scene() -> list[Surface]:
-    """Five white spheres on the ground, and a wall behind."""
+    """Build five white spheres on the ground, and a wall behind."""
     mesh = o3d.geometry.TriangleMesh.create_sphere(apparatus.RADIUS_MM, resolution=400)
     arms = np.asarray(mesh.vertices)
     ball = Surface(arms, np.asarray(mesh.triangles), 0.8, normals=arms / apparatus.RADIUS_MM)
@@ -49,7 +49,7 @@ def sphere_scene() -> list[Surface]:
 
 
 def plate_scene() -> list[Surface]:
-    """A flat white plate, somewhat smaller than the board: no calibration reaches farther."""
+    """Build a flat white plate, smaller than the board: no calibration reaches farther."""
     pose = apparatus.pose_about(apparatus.PLATE_MIDDLE, apparatus.PLATE_TURN, middle=np.zeros(3))
     width, height = apparatus.PLATE_MM
     across, down = np.array([width, 0.0, 0.0]), np.array([0.0, height, 0.0])
@@ -84,7 +84,7 @@ def _read(frames: dict[str, Bytes]) -> Exposure:
 
 
 def _ground() -> Surface:
-    """The plane on which all five spheres lie."""
+    """Build the plane on which all five spheres lie."""
     across, down = np.array([1.0, 0.0, 0.0]), apparatus.CENTRES[3] - apparatus.CENTRES[0]
     down = (down - (down @ across) * across) / np.linalg.norm(down[1:])
     below = apparatus.CENTRES[1] + apparatus.RADIUS_MM * np.cross(across, down)
@@ -176,11 +176,12 @@ def _board_shot(setup: ChapterSetup, pose: RigidTransform, shot: str, number: in
 
 def _expose(setup: ChapterSetup, surfaces: Sequence[Surface], number: int) -> SceneCapture:
     first, second = expose_scene(setup, surfaces, number, times=2)
-    truth = pixel_truth(Scene(surfaces), apparatus.CAMERA, setup.projector)
+    truth = compute_pixel_truth(Scene(surfaces), apparatus.CAMERA, setup.projector)
     return SceneCapture(first.lit, first.stripes, second.stripes, truth)
 
 
 def _label_spheres(setup: ChapterSetup, truth: PixelTruth) -> Indices:
+    """Label pixels (H, W) by the sphere they see and the projector lights, -1 elsewhere."""
     camera = setup.view.camera
     points = camera.directions(camera.grid()) * truth.depth[..., None]
     distances = np.abs(
@@ -193,6 +194,7 @@ def _label_spheres(setup: ChapterSetup, truth: PixelTruth) -> Indices:
 
 
 def _mask_plate(truth: PixelTruth) -> Mask:
+    """Mask pixels (H, W) on the lit plate, clear of its rim."""
     near = (np.nan_to_num(truth.depth, nan=np.inf) < 600.0) & np.isfinite(truth.s)
     window = np.ones((9, 9), np.uint8)
     return cv2.erode(near.astype(np.uint8), window, borderValue=0) > 0

@@ -35,8 +35,7 @@ class PlaneCurve:
 def draw_projector(
     curves: Sequence[PlaneCurve], true: PlaneCurve, residuals_mm: Array, direction: Axis, path: Path
 ) -> Path:
-    """Fig. 6: baselines, projection angles and tilts against the stripe's number for each model and
-    the truth; and the distribution of the boundary points' distances from their planes."""
+    """Draw Fig. 6: baseline, projection angle and tilt of each stripe; residuals of the planes."""
     figure, axes = plt.subplots(2, 2, figsize=(10.0, 7.5), constrained_layout=True)
     baseline, angle, tilt, residual_axis = axes.ravel()
     for axis, part, label in (
@@ -71,8 +70,7 @@ class RangeData:
 
 
 def draw_range_data(data: Sequence[RangeData], path: Path) -> Path:
-    """Fig. 7: the five spheres as measured by each approach, and their distance from the truth
-    along the viewing ray after a rigid motion brings the whole image onto the truth."""
+    """Draw Fig. 7: the spheres as measured, and their distance along the ray from the truth."""
     figure, axes = plt.subplots(
         2, len(data), figsize=(4.2 * len(data), 6.6), constrained_layout=True, squeeze=False
     )
@@ -97,7 +95,7 @@ def _baseline_angle_tilt(curve: PlaneCurve, direction: Axis) -> tuple[Array, Arr
 
 
 def _distribution(axis: Axes, residuals_mm: Array) -> None:
-    """Distribution of the residuals, and a normal curve with their robust sigma."""
+    """Plot the distribution of residuals, and a normal curve with their robust sigma."""
     sigma_mm = robust_scale(residuals_mm)
     edges = np.linspace(-8.0 * sigma_mm, 8.0 * sigma_mm, 161)
     density, _ = np.histogram(residuals_mm, edges)

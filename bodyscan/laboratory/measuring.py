@@ -55,9 +55,8 @@ class ApproachAccuracy:
         return float(np.mean([sphere.e_given for sphere in self.spheres]))
 
 
-def points_of(approach: Approach, s: Stripes, where: Mask | None = None) -> Array:
-    """Points (N, 3) mm, camera frame, of the pixels where `where` (H, W) is true (all by default),
-    row by row, from each pixel's stripe coordinate s (H, W); NaN where nothing is measured."""
+def triangulate_pixels(approach: Approach, s: Stripes, where: Mask | None = None) -> Array:
+    """Triangulate pixels where `where` (H, W) holds: (N, 3) mm, camera frame, NaN if unmeasured."""
     rows, columns = np.nonzero(np.ones(s.shape, bool) if where is None else where)
     rays = approach.camera.rays(np.column_stack([columns, rows]).astype(float))
     wanted = s[rows, columns].astype(float)
@@ -68,8 +67,8 @@ def points_of(approach: Approach, s: Stripes, where: Mask | None = None) -> Arra
     return points
 
 
-def whole_stripes(s: Stripes) -> Stripes:
-    """One whole stripe per pixel, as from the chapter's instrument: the middle of the stripe."""
+def round_to_stripes(s: Stripes) -> Stripes:
+    """Round s to the middle of its stripe, as the chapter's instrument gives it."""
     return np.floor(s) + 0.5
 
 
@@ -78,9 +77,9 @@ def measure_artefacts(
 ) -> ApproachAccuracy:
     """Measure spheres and plate. whole: use only the stripe number of each pixel, no fraction."""
     maps = [captures.spheres.stripes.s, captures.plate.stripes.s]
-    spheres_s, plate_s = (whole_stripes(s) if whole else s for s in maps)
+    spheres_s, plate_s = (round_to_stripes(s) if whole else s for s in maps)
     on_spheres = captures.owner >= 0
-    points, owner = points_of(approach, spheres_s, on_spheres), captures.owner[on_spheres]
+    points, owner = triangulate_pixels(approach, spheres_s, on_spheres), captures.owner[on_spheres]
     found, covered = [], []
     for number in range(len(apparatus.CENTRES)):
         pixels = owner == number
@@ -92,10 +91,10 @@ def measure_artefacts(
         approach.name,
         tuple(found),
         tuple(covered),
-        compare_centre_distances(centres, apparatus.CENTRES),
-        measure_flatness(_drop_unknown(points_of(approach, plate_s, captures.on_plate))),
-        measure_flatness(
-            _drop_unknown(points_of(approach, captures.plate.truth.s, captures.on_plate))
+        centre_distances(centres, apparatus.CENTRES),
+        flatness(_drop_unknown(triangulate_pixels(approach, plate_s, captures.on_plate))),
+        flatness(
+            _drop_unknown(triangulate_pixels(approach, captures.plate.truth.s, captures.on_plate))
         ).rms_mm,
     )
 
@@ -119,7 +118,7 @@ class TrueSheets:
         return "true"
 
     def depth(self, rays: Array, s: Array) -> Array:
-        """Depths by the secant method, started at the planes that there would be without smile."""
+        """Compute depths by the secant method, started at the planes without smile."""
         planes = self.setup.projector.plane(s)
         first = -planes[..., 3] / np.sum(planes[..., :3] * rays, axis=-1)
         light = self.setup.projector.stripe
@@ -141,12 +140,12 @@ class TrueSheets:
         return np.zeros(rays.shape[:-1])
 
     def tangent_planes(self, s: Array) -> Array:
-        """Planes that touch in the middle of the fan, where there is no smile."""
+        """Compute planes that touch in the middle of the fan, where there is no smile."""
         return towards_camera(self.setup.projector.plane(s))
 
 
-def true_approach(setup: ChapterSetup) -> Approach:
-    """The simulator's pixels camera and light, which no calibration can better."""
+def make_true_approach(setup: ChapterSetup) -> Approach:
+    """Make an approach of the simulator's own camera and light."""
     return Approach(
         "true calibration", camera_from_fields(describe_camera(apparatus.CAMERA)), TrueSheets(setup)
     )
@@ -165,13 +164,17 @@ class NoiseBound:
     best_share: tuple[float, ...]
 
 
-def noise_bound(captures: ChapterCaptures) -> NoiseBound:
-    truth = true_approach(captures.setup)
+def estimate_noise_bound(captures: ChapterCaptures) -> NoiseBound:
+    """Estimate what sensor noise alone contributes to E, from two exposures of the same light."""
+    truth = make_true_approach(captures.setup)
     capture = captures.spheres
     everything, best = [], []
     for number, centre in enumerate(apparatus.CENTRES):
         pixels = captures.owner == number
-        both = (points_of(truth, stripes.s, pixels) for stripes in (capture.stripes, capture.again))
+        both = (
+            triangulate_pixels(truth, stripes.s, pixels)
+            for stripes in (capture.stripes, capture.again)
+        )
         distance = [np.linalg.norm(points - centre, axis=1) for points in both]
         half = 0.5 * (distance[0] - distance[1]) ** 2
         sigma = capture.stripes.sigma[pixels]
@@ -201,9 +204,8 @@ class PointSigma:
     median_mm: float
 
 
-def point_sigma(approach: Approach, captures: ChapterCaptures) -> PointSigma:
-    """Compare sigmas, from decoding noise and the sheets'
-    covariance, with the true depth errors."""
+def compare_point_sigmas(approach: Approach, captures: ChapterCaptures) -> PointSigma:
+    """Compare depth errors with their sigmas from decoding noise and the sheets' covariance."""
     parts = (
         _depth_errors(approach, captures.spheres, captures.owner >= 0),
         _depth_errors(approach, captures.plate, captures.on_plate),
@@ -220,7 +222,7 @@ def point_sigma(approach: Approach, captures: ChapterCaptures) -> PointSigma:
 
 
 def _depth_errors(approach: Approach, capture: SceneCapture, where: Mask) -> tuple[Array, Array]:
-    """Error of depth and its sigma, mm, of the measured pixels among `where` (H, W)."""
+    """Compute errors of depth and their sigmas, mm, of measured pixels in `where` (H, W)."""
     rows, columns = np.nonzero(where & np.isfinite(capture.stripes.s))
     rays = approach.camera.rays(np.column_stack([columns, rows]).astype(float))
     measured = intersect_rays(approach.sheets, rays, capture.stripes.s[rows, columns].astype(float))

@@ -12,15 +12,15 @@ from bodyscan.files.atomic import write_text
 from bodyscan.geometry.transforms import fit_rigid_transform
 from bodyscan.laboratory import apparatus
 from bodyscan.laboratory.approaches import Approach
-from bodyscan.laboratory.calibrating import Calibrations, calibrate_all, sigma_trial
+from bodyscan.laboratory.calibrating import Calibrations, calibrate_all, run_sigma_trial
 from bodyscan.laboratory.chapter_captures import ChapterCaptures, take_captures
 from bodyscan.laboratory.measuring import (
     ApproachAccuracy,
+    compare_point_sigmas,
+    estimate_noise_bound,
+    make_true_approach,
     measure_artefacts,
-    noise_bound,
-    point_sigma,
-    points_of,
-    true_approach,
+    triangulate_pixels,
 )
 from bodyscan.laboratory.text import (
     Reproduction,
@@ -74,7 +74,8 @@ def _measure_all(
     real_light: bool,
     progress: Progress,
 ) -> Reproduction:
-    compared = [*calibrated.approaches, true_approach(captures.setup)]
+    """Measure the artefacts by every approach, whole-stripe and sub-pixel."""
+    compared = [*calibrated.approaches, make_true_approach(captures.setup)]
     groups: list[tuple[Sequence[Approach], bool]] = [
         (compared, True),
         (compared, False),
@@ -95,15 +96,15 @@ def _measure_all(
         real_light=real_light,
         boards=len(captures.boards),
         calibrated=calibrated,
-        trial=sigma_trial(5 if quick else 250, seed),
+        trial=run_sigma_trial(5 if quick else 250, seed),
         whole=results[0],
         fine=results[1],
         by_stage=results[2],
         by_reference=results[3],
-        noise=noise_bound(captures),
+        noise=estimate_noise_bound(captures),
         # Of the approaches whose sheets know their covariance.
         sigmas=tuple(
-            point_sigma(one, captures) for one in compared if one.name in ("(iii)", "ours")
+            compare_point_sigmas(one, captures) for one in compared if one.name in ("(iii)", "ours")
         ),
     )
 
@@ -135,10 +136,11 @@ def draw(
 
 
 def _range_data(approach: Approach, captures: ChapterCaptures) -> RangeData:
+    """Triangulate the spheres by an approach and align them with the truth, for Fig. 7."""
     from bodyscan.laboratory.figures import RangeData
 
     s = captures.spheres.stripes.s
-    points = points_of(approach, s).reshape(*s.shape, 3)
+    points = triangulate_pixels(approach, s).reshape(*s.shape, 3)
     true = (
         apparatus.CAMERA.directions(apparatus.CAMERA.grid())
         * captures.spheres.truth.depth[..., None]

@@ -45,7 +45,7 @@ class TsaiCamera:
     skew: float = 0.0
 
     def camera(self, width: int, height: int) -> Camera:
-        """The chapter's camera whose radial lens undoes kappa best over the image."""
+        """Fit the chapter's camera whose radial lens undoes kappa best over the image."""
         corners = np.array([[0.0, 0.0], [width, 0.0], [0.0, height], [width, height]])
         scale = np.array([self.focal * self.aspect, self.focal])
         real = np.linspace(0.0, 1.0, 201)[1:] * np.linalg.norm(
@@ -107,7 +107,7 @@ def calibrate_tsai(
 
 
 def _solve_alignment(points: Array, image: Array) -> tuple[Array, Array]:
-    """Unknowns (8,) s r1, s tx, r2, ty with |r2| = 1, s the aspect, and residuals (N,), px mm."""
+    """Solve radial alignment for (8,) s r1, s tx, r2, ty, |r2| = 1; residuals (N,) px mm."""
     u, v = image[:, :1], image[:, 1:]
     whole = np.column_stack([points, np.ones(len(points))])
     rows = np.concatenate([v * whole, -u * whole], axis=1)
@@ -119,7 +119,7 @@ def _solve_alignment(points: Array, image: Array) -> tuple[Array, Array]:
 
 
 def _align(points: Array, image: Array) -> tuple[Array, Array, float]:
-    """Rotation (3, 3), lateral translation (2,), aspect."""
+    """Compute rotation (3, 3), lateral translation (2,) and aspect from radial alignment."""
     solved, _ = _solve_alignment(points, image)
     aspect = float(np.linalg.norm(solved[:3]))
     first, second = solved[:4] / aspect, solved[4:]
@@ -135,7 +135,7 @@ def _align(points: Array, image: Array) -> tuple[Array, Array, float]:
 def _focal_and_depth(
     points: Array, image: Array, rotation: Array, across: Array
 ) -> tuple[float, float]:
-    """Focal length (px) and depth (mm) without distortion, by linear least squares."""
+    """Solve focal length (px) and depth (mm) without distortion by linear least squares."""
     height = points @ rotation[1] + across[1]
     forward = points @ rotation[2]
     rows = np.stack([height, -image[:, 1]], axis=1)
@@ -144,7 +144,7 @@ def _focal_and_depth(
 
 
 def _residuals(values: Array, points: Array, pixels: Array) -> Array:
-    """Residuals (2 N,) px, in the ideal image."""
+    """Compute residuals (2 N,) px in the ideal image."""
     focal, aspect, centre, kappa = values[6], values[7], values[8:10], values[10]
     in_camera = RigidTransform.from_rotation_vector(values[:3], values[3:6]).apply(points)
     scale = np.array([focal * aspect, focal])
@@ -156,8 +156,7 @@ def _residuals(values: Array, points: Array, pixels: Array) -> Array:
 
 
 def projection_matrix(points: Array, pixels: Array) -> Array:
-    """Matrix (3, 4) with pixels ~ P X, from points (N, 3) mm not all in one plane and pixels (N,
-    2).
+    """Estimate the matrix (3, 4) with pixels (N, 2) ~ P X from points (N, 3) mm not in one plane.
 
     Direct linear transformation (Abdel-Aziz and Karara 1971) with Hartley's scaling.
     """
@@ -180,7 +179,7 @@ def projection_matrix(points: Array, pixels: Array) -> Array:
 def split_projection_matrix(
     matrix: Array, width: int, height: int
 ) -> tuple[Camera, RigidTransform]:
-    """The matrix as a camera without a lens, and its pose: camera, camera_from_points."""
+    """Split the matrix into a camera without a lens and camera_from_points."""
     inner, rotation = rq(matrix[:, :3])
     sign = np.diag(np.sign(np.diag(inner)))
     inner, rotation = inner @ sign, sign @ rotation
@@ -204,7 +203,7 @@ def split_projection_matrix(
 
 
 def _scaling(points: Array) -> Array:
-    """Matrix (D + 1, D + 1) that scales points to mean 0 and a mean distance of sqrt(D)."""
+    """Compute the matrix (D + 1, D + 1) that scales points to mean 0, mean distance sqrt(D)."""
     size = points.shape[1]
     mean = points.mean(axis=0)
     scale = np.sqrt(size) / float(np.mean(np.linalg.norm(points - mean, axis=1)))

@@ -22,7 +22,7 @@ from bodyscan.geometry.robust import cauchy_weights, robust_scale
 def fit_invariable_baseline(
     data: BoundaryPoints, stripes: int, direction: Axis, *, fit_tilt: bool = True
 ) -> LightPlanes:
-    """One baseline for all, an angle for each stripe; least squares over all stripes at once.
+    """Fit one baseline for all stripes and an angle for each, by joint least squares.
 
     fit_tilt: estimate the baseline's direction in the image too; otherwise it is the camera's x
         axis (y for horizontal stripes).
@@ -35,8 +35,7 @@ def fit_invariable_baseline(
 def fit_variable_baseline(
     data: BoundaryPoints, stripes: int, direction: Axis, *, fit_tilt: bool = True
 ) -> LightPlanes:
-    """A baseline and an angle for each stripe, and one tilt for all; see
-    `fit_invariable_baseline`."""
+    """Fit a baseline and an angle for each stripe, and one tilt for all."""
     return _fit(data, stripes, direction, variable=True, fit_tilt=fit_tilt)
 
 
@@ -67,7 +66,7 @@ def _fit(
 
 
 def _axes(vectors: Array, direction: Axis) -> tuple[Array, Array, Array]:
-    """Coordinates across the stripes, along them, and forward."""
+    """Split vectors into coordinates across the stripes, along them, and forward."""
     x, y, z = vectors.T
     return (y, x, z) if direction == "horizontal" else (x, y, z)
 
@@ -96,7 +95,7 @@ def _solve(
 
 
 def _planes(slope: Array, baseline: Array, tilt: float, direction: Axis) -> LightPlanes:
-    """Planes of the projection angles' tangents `slope` (S + 1,), NaN where there is no plane."""
+    """Build planes from the tangents `slope` (S + 1,) of projection angles, NaN for none."""
     across, along = np.ones_like(slope), np.full_like(slope, -tilt)
     first, second = (along, across) if direction == "horizontal" else (across, along)
     planes = np.stack([first, second, -slope, baseline], axis=1)
@@ -105,7 +104,7 @@ def _planes(slope: Array, baseline: Array, tilt: float, direction: Axis) -> Ligh
 
 
 def fit_remapped_pinhole(points: Array, s: Array, stripes: int, direction: Axis) -> LightPlanes:
-    """Planes of the best 2 x 4 matrix and re-mapping of s (N,) at points (N, 3), camera frame.
+    """Fit a 2 x 4 matrix and a re-mapping of s (N,) to points (N, 3), camera frame.
 
     Robust (Cauchy), started from the matrix alone.
     """
@@ -135,5 +134,5 @@ def fit_remapped_pinhole(points: Array, s: Array, stripes: int, direction: Axis)
 
 
 def _powers(u: Array) -> Array:
-    """Powers 3 to 5 (N, 3) of the index u in [-1, 1]; the matrix has those from 0 to 2."""
+    """Compute powers 3 to 5 (N, 3) of the index u in [-1, 1]; the matrix has those from 0 to 2."""
     return np.stack([u**power for power in (3, 4, 5)], axis=-1)

@@ -22,17 +22,17 @@ from bodyscan.rig.rig import Rig, Volume
 from bodyscan.rig.rig_file import load_rig
 from bodyscan.simulation import files
 from bodyscan.simulation.layout import TruePair, build_room
-from bodyscan.simulation.presets import settings_of
+from bodyscan.simulation.presets import settings_from_dict
 from bodyscan.simulation.rays import View
 from bodyscan.simulation.scene import Surface, grid_surface
 from bodyscan.simulation.settings import SimulationSettings
 from bodyscan.simulation.simulate import (
     Stream,
     Task,
+    draw_sensor,
+    draw_true_pairs,
     random_stream,
     render_task,
-    sensor_of,
-    true_pairs,
 )
 from bodyscan.workflows.accept_rig import read_plates, read_spheres
 
@@ -48,12 +48,11 @@ class SimulatedRig:
 
 
 def open_workspace(workspace: Path) -> SimulatedRig:
-    """The rig that `bodyscan simulate` built there. Raises BadInput if it is not of this
-    version."""
+    """Rebuild the rig that `bodyscan simulate` built there; BadInput if another version made it."""
     remedy = "give a folder that this version of `bodyscan simulate` wrote"
     try:
         truth = json.loads((workspace / "truth" / "truth.json").read_text("utf-8"))
-        settings, seed = settings_of(truth["settings"]), int(truth["seed"])
+        settings, seed = settings_from_dict(truth["settings"]), int(truth["seed"])
         stored_poses = {name: pair["rig_from_camera"] for name, pair in truth["pairs"].items()}
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise BadInput(
@@ -62,7 +61,7 @@ def open_workspace(workspace: Path) -> SimulatedRig:
             remedy=remedy,
         ) from error
     rig = load_rig(workspace / "rig.yaml")
-    pairs = true_pairs(rig, settings, seed)
+    pairs = draw_true_pairs(rig, settings, seed)
     for name, pair in pairs.items():
         if not np.allclose(pair.rig_from_camera.matrix, stored_poses.get(name, np.nan), atol=1e-6):
             raise BadInput(
@@ -74,7 +73,7 @@ def open_workspace(workspace: Path) -> SimulatedRig:
 
 
 def sphere_surfaces(centres: Array, radius_mm: float) -> tuple[Surface, ...]:
-    """White balls at centres (N, 3)."""
+    """Build white balls at centres (N, 3)."""
     # Facets of a 60 mm sphere are then less than 0.002 mm inside it.
     mesh = o3d.geometry.TriangleMesh.create_sphere(radius_mm, resolution=200)
     arms, triangles = np.asarray(mesh.vertices), np.asarray(mesh.triangles)
@@ -84,7 +83,7 @@ def sphere_surfaces(centres: Array, radius_mm: float) -> tuple[Surface, ...]:
 
 
 def plate_surface(width_mm: float, height_mm: float) -> tuple[Surface, ...]:
-    """A white plate in the plane x = 0, centred on the origin, visible from either side."""
+    """Build a white plate in the plane x = 0, centred on the origin, visible from either side."""
     across, up = np.array([0.0, width_mm, 0.0]), np.array([0.0, 0.0, height_mm])
     return (grid_surface(-0.5 * (across + up), across, up, albedo=0.7),)
 
@@ -99,7 +98,7 @@ def capture_artefact(
     number: int = 0,
     progress: Progress = silent,
 ) -> Path:
-    """Write a scan folder `out` of the artefact at one place, taken `shots` times.
+    """Write a scan folder `out` of the artefact in one pose, taken `shots` times.
 
     number: of the place; every place and shot has its own noise. Pairs that do not see the artefact
         take no part.
@@ -117,7 +116,7 @@ def capture_artefact(
     def work(pair: TruePair) -> None:
         rays = random_stream(simulated.seed, Stream.ARTEFACT_RAYS, order[pair.name])
         view = View.from_camera(pair.camera, settings.optics, rays)
-        fixed = sensor_of(pair.camera, settings, simulated.seed, order[pair.name])
+        fixed = draw_sensor(pair.camera, settings, simulated.seed, order[pair.name])
         for k, name in enumerate(names):
             purpose = Stream.ARTEFACT_NOISE, order[pair.name], number, k
             task = Task(k, name, out.name, tuple(surfaces), rig_from_artefact, 225.0, True)

@@ -42,7 +42,7 @@ class Reproduction:
 
 
 def reproduction_text(found: Reproduction) -> str:
-    """The whole report as one text."""
+    """Format the whole report as Markdown."""
     parts = [
         _heading(found),
         _table_1(found),
@@ -188,13 +188,13 @@ def _point_sigmas(found: Reproduction) -> str:
 
 
 def figure_names(real_light: bool) -> tuple[str, str]:
-    """File names of Fig. 6 and Fig. 7, which are written beside the text."""
+    """Name the files of Fig. 6 and Fig. 7, which lie beside the text."""
     light = "-real-light" if real_light else ""
     return f"fig6-projector{light}.png", f"fig7-range-data{light}.png"
 
 
 def text_name(real_light: bool) -> str:
-    """File name of the text."""
+    """Name the file of the text."""
     return "reproduction-real-light.md" if real_light else "reproduction.md"
 
 
@@ -283,12 +283,13 @@ def _remarks(found: Reproduction) -> str:
 
 
 def _times(all_: Sequence[ApproachAccuracy], one: ApproachAccuracy) -> float:
+    """Divide an approach's mean E by that of (iii)."""
     third = next(m for m in all_ if m.name == "(iii)")
     return one.mean_e / third.mean_e
 
 
 def _table(heading: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table whose columns are padded so that its source is readable too."""
+    """Format a Markdown table whose columns are padded so that its source is readable too."""
     cells = [list(heading), *(list(row) for row in rows)]
     widths = [max(len(row[k]) for row in cells) for k in range(len(heading))]
 

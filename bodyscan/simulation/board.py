@@ -30,7 +30,7 @@ class BoardPrint:
     cells: Floats
 
     def albedo(self, positions: Floats) -> Floats:
-        """Albedo (N,) at positions (N, 2) mm on the print, from the first square's outer corner."""
+        """Look up albedo (N,) at positions (N, 2) mm, from the first square's outer corner."""
         rows, columns, modules, _ = self.cells.shape
         column, i = self._cell(positions[:, 0], columns, modules)
         row, j = self._cell(positions[:, 1], rows, modules)
@@ -39,7 +39,7 @@ class BoardPrint:
     def _cell(
         self, position: Floats, squares: int, modules: int
     ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """The number of the square along one side, and of the module inside it."""
+        """Compute the number of the square along one side, and of the module inside it."""
         number = np.floor(position / np.float32(self.square_mm))
         inside = position - number * np.float32(self.square_mm)
         start = (self.square_mm - self.inner_mm) / 2.0
@@ -50,8 +50,8 @@ class BoardPrint:
         )
 
 
-def board_print(board: Board, face: int, making: BoardMaking) -> BoardPrint:
-    """The print of face 0 (front) or 1 (back); the back's markers follow the front's."""
+def make_print(board: Board, face: int, making: BoardMaking) -> BoardPrint:
+    """Draw the print of face 0 (front) or 1 (back); the back's markers follow the front's."""
     if board.kind == "aprilgrid":
         raise BadInput("boards of kind aprilgrid are not simulated", where=f"board {board.name}")
     dark = _dark_squares(board)
@@ -73,7 +73,7 @@ def _dark_squares(board: Board) -> Mask:
 
 
 def _markers(board: Board, face: int, count: int) -> Mask:
-    """Dark modules (count, m, m) of the markers on one face, including their border."""
+    """Look up dark modules (count, m, m) of the markers on one face, borders included."""
     if not hasattr(cv2.aruco, board.dictionary):
         raise BadInput(f"OpenCV has no marker dictionary {board.dictionary}", where=board.name)
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
@@ -103,7 +103,7 @@ class MadeBoard:
 
 
 def make_board(board: Board, making: BoardMaking, rng: np.random.Generator) -> MadeBoard:
-    """The board of the rig file, with errors of manufacture."""
+    """Make the board of the rig file with errors of manufacture."""
     width, height = board.size_mm
     surfaces, corners = [], []
     sheet = _draw_sheet(making, rng)
@@ -112,7 +112,7 @@ def make_board(board: Board, making: BoardMaking, rng: np.random.Generator) -> M
         positions = _mesh_positions(board, flat=sheet.flat and making.print_error_mm == 0)
         vertices = _on_sheet(positions.reshape(-1, 2), board, face, error, sheet)
         triangles = grid_triangles(positions.shape[1] - 1, positions.shape[0] - 1)
-        printed = board_print(board, face, making)
+        printed = make_print(board, face, making)
         surfaces.append(
             Surface(
                 vertices,
@@ -130,7 +130,7 @@ def make_board(board: Board, making: BoardMaking, rng: np.random.Generator) -> M
 
 
 def _mesh_positions(board: Board, flat: bool) -> Array:
-    """Mesh vertices on the print, (rows, columns, 2) mm, margin included; 4 cells a square."""
+    """Space mesh vertices on the print, (rows, columns, 2) mm, margin included; 4 cells a square."""
 
     def line(squares: int) -> Array:
         size = squares * board.square_mm
@@ -158,7 +158,7 @@ class _Sheet:
         return not any((self.bowl, self.across, self.down, self.twist))
 
     def height(self, across: Array, down: Array) -> Array:
-        """Height towards the front, at positions from -1/2 to 1/2 along each side."""
+        """Compute the height towards the front, at positions from -1/2 to 1/2 along each side."""
         bowl = self.bowl * (1.0 - 2.0 * (across**2 + down**2))
         if not any((self.across, self.down, self.twist)):
             return bowl
@@ -166,6 +166,7 @@ class _Sheet:
 
 
 def _draw_sheet(making: BoardMaking, rng: np.random.Generator) -> _Sheet:
+    """Draw the shape of the sheet, its range of height log-uniform in `warp_mm`."""
     low, high = making.warp_mm
     if high <= 0:
         return _Sheet(making.bow_mm)
@@ -190,7 +191,7 @@ def _on_sheet(positions: Array, board: Board, face: int, error: Array, sheet: _S
 
 
 def _print_error(board: Board, making: BoardMaking, rng: np.random.Generator) -> Array:
-    """Printing error (2, rows + 1, columns + 1), mm, of each corner of a square."""
+    """Draw the printing error (2, rows + 1, columns + 1), mm, of each corner of a square."""
     shape = (2, board.rows + 1, board.columns + 1)
     if making.print_error_mm == 0:
         return np.zeros(shape)
@@ -206,7 +207,7 @@ def _print_error(board: Board, making: BoardMaking, rng: np.random.Generator) ->
 
 
 def _sides(board: Board, width: float, height: float, making: BoardMaking) -> list[Surface]:
-    """The sheet's edges, and its blank back if only one face is printed."""
+    """Build the sheet's edges, and its blank back if only one face is printed."""
     m, depth = board.margin_mm, np.array([0.0, 0.0, board.thickness_mm])
     x, y = np.array([width + 2 * m, 0.0, 0.0]), np.array([0.0, height + 2 * m, 0.0])
     start = np.array([-m, -m, 0.0])

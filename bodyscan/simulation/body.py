@@ -19,7 +19,7 @@ from bodyscan.simulation.settings import Person, Skin
 def load_subject(
     path: Path, person: Person, rng: np.random.Generator, covered_by: Skin | None = None
 ) -> Surface:
-    """A subject's PLY (metres, z up, facing -y) as a smooth surface in the rig frame, mm.
+    """Load a subject's PLY (metres, z up, facing -y) as a smooth surface, rig frame, mm.
 
     The mesh is subdivided by Loop's rule, turned to face +x and centred over the rig's origin. The
     surface returned is itself the truth.
@@ -48,7 +48,7 @@ def load_subject(
 
 
 def skin(vertices: Array, person: Person, rng: np.random.Generator) -> Array:
-    """Albedo (N,) at vertices (N, 3): a sum of waves 60 to 400 mm long."""
+    """Draw the albedo (N,) of vertices (N, 3): a sum of waves 60 to 400 mm long."""
     waves = sum_waves(vertices, 60.0, 400.0, rng)
     return person.skin * (1.0 + person.skin_variation * waves / 4.0)
 
@@ -56,8 +56,7 @@ def skin(vertices: Array, person: Person, rng: np.random.Generator) -> Array:
 def draw_sways(
     person: Person, height_mm: float, count: int, rng: np.random.Generator
 ) -> list[RigidTransform]:
-    """`swayed_from_still` at `count` successive moments: a smooth walk that starts from standing
-    still.
+    """Draw `swayed_from_still` at `count` successive moments: a smooth walk from standing still.
 
     At each moment a lean about the feet and a shift in the same direction, together at most sway_mm
     at the head, and a slight rotation. Seven tenths come from leaning, because a standing person
@@ -93,7 +92,7 @@ def save_truth(surface: Surface, path: Path) -> None:
 
 
 def dress(bare: Surface, skin: Skin, rng: np.random.Generator) -> Surface:
-    """The surface covered as `skin` says. Hair is rough: its surface is the truth as well."""
+    """Cover a surface as `skin` says. Hair is rough: its surface is the truth as well."""
     vertices, albedo = bare.vertices.copy(), np.array(bare.albedo, float)
     if skin.mottling > 0:
         albedo *= 1.0 + skin.mottling * _mottle(vertices, rng)
@@ -116,7 +115,7 @@ def dress(bare: Surface, skin: Skin, rng: np.random.Generator) -> Surface:
 def sum_waves(
     vertices: Array, shortest_mm: float, longest_mm: float, rng: np.random.Generator
 ) -> Array:
-    """(N,) at vertices (N, 3): eight waves in random directions, standard deviation 2."""
+    """Sum eight waves in random directions at vertices (N, 3): (N,), standard deviation 2."""
     waves = np.zeros(len(vertices))
     for length in np.geomspace(shortest_mm, longest_mm, 8):
         direction = rng.standard_normal(3)
@@ -126,7 +125,7 @@ def sum_waves(
 
 
 def _mottle(vertices: Array, rng: np.random.Generator) -> Array:
-    """(N,) waves 8 to 40 mm long, standard deviation 1."""
+    """Sum waves 8 to 40 mm long at vertices: (N,), standard deviation 1."""
     return sum_waves(vertices, 8.0, 40.0, rng) / 2.0
 
 

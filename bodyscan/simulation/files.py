@@ -64,8 +64,7 @@ def write_captures(
     subject: str | None = None,
     pace: Pace | None = None,
 ) -> None:
-    """Write captures.yaml: each shot's name, the pairs that took stripes, those that took only the
-    lit image, and the timing if a pace is given."""
+    """Write captures.yaml: shots, each with pairs that took stripes and pairs that took lit only."""
     entries = tuple(
         ShotEntry(name=name, stripes=tuple(stripes) or None, lit=tuple(lit) or None)
         for name, stripes, lit in shots
@@ -76,20 +75,20 @@ def write_captures(
         subject=subject,
         simulated=True,
         shots=entries,
-        timing=None if pace is None else timing_of(pace),
+        timing=None if pace is None else timing_from_pace(pace),
     )
     write_captures_file(folder, captures)
 
 
-def timing_of(pace: Pace) -> Timing:
-    """The timing for captures.yaml."""
+def timing_from_pace(pace: Pace) -> Timing:
+    """Make the timing for captures.yaml."""
     return Timing(frame_ms=pace.frame_ms, order=pace.order or None, start=pace.start)
 
 
-def times_of_person(rig: Rig, shot: str, pace: Pace) -> dict[str, dict[str, float]]:
-    """Times by pair, then by frame, ms since the first pair began."""
+def compute_person_times(rig: Rig, shot: str, pace: Pace) -> dict[str, dict[str, float]]:
+    """Compute times by pair, then by frame, ms since the first pair began."""
     taken = {(shot, pair.name): rig.frames.sequence_names(pair.projector) for pair in rig.pairs}
-    times = compute_frame_times(timing_of(pace), rig, taken, Path())
+    times = compute_frame_times(timing_from_pace(pace), rig, taken, Path())
     return {pair: dict(times[shot, pair]) for shot, pair in taken}
 
 
@@ -146,11 +145,11 @@ class Motion:
     stances: Mapping[str, RigidTransform]
 
     def middle_ms(self, pair: str) -> float:
-        """Middle of the time in which a pair takes its frames."""
+        """Compute the middle of the time in which a pair takes its frames."""
         return (min(self.times[pair].values()) + max(self.times[pair].values())) / 2.0
 
     def trunk(self, pair: str) -> RigidTransform:
-        """`swayed_from_still` of the trunk at the middle of a pair's frames."""
+        """Compute `swayed_from_still` of the trunk at the middle of a pair's frames."""
         return self.stances[pair] @ self.body.trunk_motion(self.middle_ms(pair), self.moment_ms)
 
 
@@ -176,7 +175,7 @@ class Truth:
 
 
 def describe(truth: Truth) -> dict[str, Any]:
-    """The truth as JSON values, without the subject's surface."""
+    """Describe the truth as JSON values, without the subject's surface."""
     making, motion = truth.settings.board, truth.motion
     perfect = not any((making.bow_mm, making.warp_mm[1], making.print_error_mm))
     return {
@@ -212,7 +211,7 @@ def _pair(pair: TruePair, sway: RigidTransform | None) -> dict[str, Any]:
 
 
 def describe_camera(camera: TrueCamera) -> dict[str, Any]:
-    """A camera as in calibration files: the kind of lens is left out if it is the chapter's."""
+    """Describe a camera as in calibration files, without a lens kind if it is the chapter's."""
     values, more = asdict(camera), ("p1", "p2", "k3")
     if any(values[name] for name in more):
         return {"lens": "brown"} | values

@@ -38,8 +38,8 @@ class Lamps:
     skin: Skin = field(default_factory=Skin)
 
 
-def room_light(hits: Hits, lamps: Lamps) -> Floats:
-    """Grey level (N,) of a white surface at each hit, due to the room's own light."""
+def compute_room_light(hits: Hits, lamps: Lamps) -> Floats:
+    """Compute the grey level (N,) of a white surface at each hit under the room's own light."""
     light = np.full(len(hits.depth), lamps.ambient_grey, np.float32)
     if lamps.window_grey <= 0:
         return light
@@ -67,7 +67,7 @@ class LaserLight:
     gloss: Floats | None
 
 
-def laser_light(scene: Scene, hits: Hits, projector: Projector, lamps: Lamps) -> LaserLight:
+def compute_laser_light(scene: Scene, hits: Hits, projector: Projector, lamps: Lamps) -> LaserLight:
     """Light the hits by cosine, 1/r^2 and shadow, on the side that the camera sees."""
     s = projector.stripe(hits.points)
     reached = np.isfinite(hits.depth) & (s > -PAD) & (s < projector.stripes + PAD)
@@ -97,13 +97,12 @@ Reals = NDArray[Any]
 
 
 def shape_mm(skin: Skin) -> float:
-    """Burley's d, from the mean free path at the surface and its albedo (Christensen and Burley
-    2015, Approximate Reflectance Profiles, Eq. 5)."""
+    """Compute Burley's d from mean free path and albedo (Christensen and Burley 2015, Eq. 5)."""
     return skin.spread_mm / (1.9 - skin.albedo + 3.5 * (skin.albedo - 0.8) ** 2)
 
 
 def spread_light(light: Floats, share: Floats, depth: Floats, alpha: float, skin: Skin) -> Floats:
-    """Light (H, W) as it leaves: what enters skin comes out around there, and only from skin.
+    """Diffuse light (H, W) below the skin: what enters comes out nearby, and only from skin.
 
     share: (H, W) of each pixel that is skin.
     depth: (H, W) mm.
@@ -128,7 +127,7 @@ def spread_light(light: Floats, share: Floats, depth: Floats, alpha: float, skin
 
 @lru_cache(maxsize=64)
 def _profile_kernel(shape_px: float) -> Floats:
-    """Burley's profile (exp(-r / d) + exp(-r / 3 d)) / (8 pi d r), (k, k), normalised to sum 1."""
+    """Sample Burley's profile (exp(-r / d) + exp(-r / 3 d)) / (8 pi d r) on (k, k), sum 1."""
     half = max(1, int(np.ceil(18.0 * shape_px)))  # 1/500 of the light lies beyond
     size, fine_steps = 2 * half + 1, 9  # the profile is steep in the middle
     fine = (np.arange(size * fine_steps) + 0.5) / fine_steps - size / 2.0
@@ -140,8 +139,7 @@ def _profile_kernel(shape_px: float) -> Floats:
 
 
 def highlight(points: Reals, towards: Reals, normals: Reals, skin: Skin) -> Floats:
-    """Brightness (N,) of the gloss at points, camera at the origin, relative to a white matt
-    surface that faces the light (Blinn 1977)."""
+    """Compute gloss (N,) for a camera at the origin, relative to a white matt surface (Blinn 1977)."""
     view = -points / np.linalg.norm(points, axis=1, keepdims=True)
     light = towards / np.linalg.norm(towards, axis=1, keepdims=True)
     half = view + light

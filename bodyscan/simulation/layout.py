@@ -39,7 +39,7 @@ class TruePair:
 def build_pairs(
     rig: Rig, settings: SimulationSettings, stream: Callable[[int], np.random.Generator]
 ) -> dict[str, TruePair]:
-    """Every pair's true parameters, each drawn from its own `stream(number)`.
+    """Draw every pair's true parameters, each from its own `stream(number)`.
 
     A pair that fixes the rig frame stands exactly where it should. Raises BadInput for a pair
     without a nominal pose.
@@ -103,7 +103,7 @@ def draw_camera(width: int, height: int, optics: Optics, rng: np.random.Generato
 
 
 def rig_from_nominal(nominal_pose: NominalPose) -> RigidTransform:
-    """Pose of a device that looks along its z axis, y down, upright in the rig."""
+    """Compute the pose of a device that looks along its z axis, y down, upright in the rig."""
     position, target = _endpoints(nominal_pose)
     forward = target - position
     forward = forward / np.linalg.norm(forward)
@@ -119,7 +119,7 @@ def _endpoints(nominal_pose: NominalPose) -> tuple[Array, Array]:
 
 
 def _default_projector(nominal: RigidTransform, reach: float, horizontal: bool) -> NominalPose:
-    """Pose of a projector that has none in the rig file: above the camera, or to its right."""
+    """Choose a projector's pose if the rig file has none: above the camera, or to its right."""
     axis = -nominal.rotation[:, 1] if horizontal else nominal.rotation[:, 0]
     position = nominal.translation + 0.22 * reach * axis
     target = nominal.translation + reach * nominal.rotation[:, 2]
@@ -153,7 +153,7 @@ def build_mirror(
     projection: Projection,
     rng: np.random.Generator,
 ) -> MirrorProjector:
-    """A laser and mirror in the projector's position, sweeping over all points.
+    """Build a laser and mirror in the projector's position, sweeping over all points.
 
     The laser's apex lies at a right angle to the outgoing direction; stripes run along the mirror's
     axis.
@@ -195,7 +195,7 @@ def build_pinhole(
     projection: Projection,
     rng: np.random.Generator,
 ) -> PinholeProjector:
-    """A projector with a lens in the projector's position; its sheets bend with k1 and k2."""
+    """Build a projector with a lens in the projector's position; k1 and k2 bow its sheets."""
     x, y, z = camera_from_projector.rotation.T
     rows = np.stack([x, y, z] if horizontal else [-y, x, z])
     k1 = projection.k1 * (1.0 + 0.2 * rng.standard_normal())
@@ -210,8 +210,7 @@ def build_pinhole(
 
 
 def _sweep(points: Array, values: Array, horizontal: bool, margin: float) -> tuple[float, float]:
-    """Compute a sweep's first and last value over values (N,) at points (N, 3), in the order down
-    the image or to its right."""
+    """Bound values (N,) at points (N, 3): first and last, down the image or to its right."""
     low, high = float(values.min()), float(values.max())
     low, high = low - margin * (high - low), high + margin * (high - low)
     image = points[:, 1 if horizontal else 0] / points[:, 2]
@@ -219,7 +218,7 @@ def _sweep(points: Array, values: Array, horizontal: bool, margin: float) -> tup
 
 
 def build_room(pairs: Iterable[TruePair], room: Room) -> tuple[Surface, ...]:
-    """Floor at z = 0 and four walls, in the rig frame."""
+    """Build the floor at z = 0 and four walls, rig frame."""
     positions = np.stack([pair.rig_from_camera.translation for pair in pairs])
     half = max(room.wall_mm, 2.0 * float(np.linalg.norm(positions[:, :2], axis=1).max()))
     x, y = np.array([2.0 * half, 0.0, 0.0]), np.array([0.0, 2.0 * half, 0.0])

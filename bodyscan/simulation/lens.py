@@ -35,7 +35,7 @@ class TrueCamera:
     k3: float = 0.0
 
     def image(self, points: Array) -> Array:
-        """Image points (..., 3) in front of the camera: (..., 2) px.
+        """Project points (..., 3) in front of the camera to px (..., 2).
 
         Eq. 3 and 4 as they stand: the ideal point is pushed away from [u0, v0].
         """
@@ -52,7 +52,7 @@ class TrueCamera:
         return np.stack([u + (u - self.u0) * push, v + (v - self.v0) * push], axis=-1)
 
     def directions(self, pixels: Array) -> Array:
-        """Ray directions (..., 3), camera frame, z = 1, of px (..., 2).
+        """Compute ray directions (..., 3), camera frame, z = 1, of px (..., 2).
 
         The lens is inverted by a dense table of real radius against ideal radius (accurate to about
         1e-9 of the focal length).
@@ -78,14 +78,14 @@ class TrueCamera:
         return bool(self.p1 or self.p2 or self.k3)
 
     def _undistort(self, real: Array) -> Array:
-        """The ideal points that the lens maps to `real` (..., 2)."""
+        """Find the ideal points that the lens maps to `real` (..., 2)."""
         ideal = real.reshape(-1, 2).copy()
         if not undistort_points(ideal, np.array([self.k1, self.k2, self.k3, self.p1, self.p2])):
             raise ValueError("the lens folds the image over: no ray belongs to its corners")
         return ideal.reshape(real.shape)
 
     def grid(self, rows: slice | None = None) -> Array:
-        """Pixel centres of some rows (all by default), (rows, width, 2)."""
+        """List pixel centres of some rows (all by default), (rows, width, 2)."""
         v = np.arange(self.height, dtype=float)[rows or slice(None)]
         u, v = np.meshgrid(np.arange(self.width, dtype=float), v)
         return np.stack([u, v], axis=-1)
@@ -94,7 +94,7 @@ class TrueCamera:
 def distort(
     x: Any, y: Any, k1: float, k2: float, k3: float, p1: float, p2: float
 ) -> tuple[Any, Any]:
-    """Normalised coordinates, numbers or arrays, after the lens (Brown 1966)."""
+    """Distort normalised coordinates, numbers or arrays (Brown 1966)."""
     square = x * x + y * y
     scale = 1.0 + square * (k1 + square * (k2 + square * k3))
     aside = 2.0 * p1 * x * y + p2 * (square + 2.0 * (x * x))
@@ -136,7 +136,7 @@ def undistort_points(points: Array, lens: Array) -> bool:
 
 
 def sample_offsets(count: int) -> Array:
-    """count^2 positions inside a pixel, (count^2, 2) in [0, 1): no two share a column or a row.
+    """Space count^2 positions in a pixel, (count^2, 2) in [0, 1): none share a column or a row.
 
     A square grid would resolve an edge along a row of pixels in only `count` steps.
     """
@@ -147,8 +147,7 @@ def sample_offsets(count: int) -> Array:
 
 
 def sample_directions(camera: TrueCamera, count: int, shift: Array, rows: slice) -> Floats:
-    """Rays of some rows, (rows * width * count^2, 3) float32; each pixel shifts its samples by
-    `shift` (rows, width, 2), in [0, 1)."""
+    """Compute rays of rows, (rows * width * count^2, 3); `shift` (rows, width, 2) moves the samples."""
     inside = np.mod(sample_offsets(count) + shift[:, :, None], 1.0) - 0.5
     pixels = camera.grid(rows)[:, :, None, :] + inside
     return camera.directions(pixels.reshape(-1, 2)).astype(np.float32)

@@ -40,8 +40,7 @@ class RandomSignal:
 def draw_signal(
     rms: float, components: int, rng: np.random.Generator, *, speed: bool
 ) -> RandomSignal:
-    """Draw a function whose components together, or with `speed` their changes per second, are
-    `rms`.
+    """Draw a signal whose components together, or with `speed` their rates, have an RMS of `rms`.
 
     Sizes fall with frequency, so that slow motion dominates.
     """
@@ -67,12 +66,12 @@ class Joint:
     turn: RandomSignal
 
     def rotate(self, vertices: Array, ms: float) -> Array:
-        """Vertices (N, 3) after its rotation."""
+        """Rotate vertices (N, 3) by their weights."""
         moved = self.motion(ms).apply(vertices)
         return vertices + self.weights[:, None] * (moved - vertices)
 
     def motion(self, ms: float) -> RigidTransform:
-        """The motion of what fully rotates with it."""
+        """Compute the motion of what fully rotates with it."""
         turn = RigidTransform.from_rotation_vector(self.turn.at(ms), np.zeros(3)).rotation
         return RigidTransform(turn, self.pivot - turn @ self.pivot)
 
@@ -115,8 +114,7 @@ class LivingBody:
         return np.maximum(left, right)
 
     def vertices(self, ms: float, *, breathing: bool = True) -> Array:
-        """Vertices (N, 3) mm, rig frame, at a time since the scan
-        began; without breathing, at mean breath."""
+        """Compute vertices (N, 3) mm, rig frame, at a time since the scan began, or at mean breath."""
         moved = self.rest.vertices
         for limb in self.limbs:
             moved = limb.rotate(moved, ms)
@@ -125,18 +123,17 @@ class LivingBody:
         return self.ankles.rotate(moved, ms)
 
     def surface(self, ms: float, *, breathing: bool = True) -> Surface:
-        """The skin at that time. Normals are those at rest:
-        nothing rotates more than a degree or so."""
+        """Build the skin at a time, with normals at rest: nothing rotates more than a degree or so."""
         return replace(self.rest, vertices=self.vertices(ms, breathing=breathing))
 
     def max_displacement(self, from_ms: float, moments_ms: Iterable[float]) -> float:
-        """Largest distance, mm, of any vertex at some moments from where it is at another."""
+        """Compute the largest displacement, mm, of any vertex between a time and some moments."""
         start = self.vertices(from_ms)
         away = [np.linalg.norm(self.vertices(ms) - start, axis=1).max() for ms in moments_ms]
         return float(max(away))
 
     def trunk_motion(self, ms: float, since_ms: float) -> RigidTransform:
-        """The trunk's motion between two moments, rig frame."""
+        """Compute the trunk's motion between two moments, rig frame."""
         return self.ankles.motion(ms) @ self.ankles.motion(since_ms).inverse()
 
 
@@ -177,22 +174,20 @@ def animate(still: Surface, person: Person, rng: np.random.Generator) -> LivingB
 
 
 def _smoothstep(values: Array, low: float, high: float) -> Array:
-    """0 below, 1 above, smooth between."""
+    """Interpolate smoothly from 0 below `low` to 1 above `high`."""
     t = np.clip((values - low) / (high - low), 0.0, 1.0)
     return t * t * (3.0 - 2.0 * t)
 
 
 def _arm_weights(still: Surface, side: float, height: float) -> Array:
-    """Weights (N,), 1 on the arm that reaches max_displacement to
-    positive y (side 1) or negative y (-1)."""
+    """Weigh vertices (N,): 1 on the arm towards positive y (side 1) or negative y (-1)."""
     fingertip = int(np.argmax(side * still.vertices[:, 1]))
     along = dijkstra(_edges(still), indices=[fingertip], limit=0.6 * height)[0]
     return 1.0 - _smoothstep(along / height, 0.36, 0.46)
 
 
 def _edges(surface: Surface) -> csr_matrix:
-    """Lengths (N, N) of the edges between vertices, mm; on a closed surface each is present in both
-    directions, from the triangle on either side."""
+    """Build the graph (N, N) of edge lengths between vertices, mm, both directions."""
     ends = surface.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     lengths = np.linalg.norm(np.diff(surface.vertices[ends], axis=1)[:, 0], axis=1)
     count = len(surface.vertices)
@@ -200,13 +195,12 @@ def _edges(surface: Surface) -> csr_matrix:
 
 
 def _border(vertices: Array, weights: Array) -> Array:
-    """The middle (3,) of where a limb ends: its joint."""
+    """Average the vertices (3,) where a limb ends: its joint."""
     return vertices[(weights > 0.3) & (weights < 0.7)].mean(axis=0)
 
 
 def _breath_modes(vertices: Array, trunk: Array, height: float) -> Array:
-    """Motion (N, 3, 2) with chest and belly, per mm by which the max_displacement vertex of each stands
-    out: the front forward, the sides outward, the back not at all."""
+    """Compute motion (N, 3, 2) per mm of chest and belly: front forward, sides out, back not."""
     heights = np.array([0.72, 0.60]) * height
     sigma = 0.065 * height
     rises = np.exp(-0.5 * ((vertices[:, 2:] - heights) / sigma) ** 2)
@@ -222,7 +216,7 @@ def _breath_modes(vertices: Array, trunk: Array, height: float) -> Array:
 
 
 def describe_motion(body: LivingBody, moment_ms: float) -> dict[str, Any]:
-    """For truth.json: which moment the truth's surface shows, and the parameters of the motion."""
+    """Describe for truth.json the moment of the truth's surface and the motion's parameters."""
 
     def signal_fields(one: RandomSignal) -> dict[str, Any]:
         return {"hz": one.hz, "sizes": one.sizes, "phases": one.phases}
@@ -251,8 +245,7 @@ def save_body(body: LivingBody, path: Path) -> None:
 
 
 def load_body(motion: dict[str, Any], path: Path) -> LivingBody:
-    """The body of a simulated workspace from `motion` in its truth.json and truth/body.npz: where
-    each vertex of truth/subject.ply was at any time."""
+    """Load a simulated body from `motion` in truth.json and truth/body.npz, for any time."""
     with np.load(path) as stored:
         kept = {name: stored[name] for name in stored.files}
     joints = [
@@ -271,8 +264,7 @@ def _signal_from_fields(fields: dict[str, Any]) -> RandomSignal:
 
 
 def load_moving_body(truth: Path) -> LivingBody | None:
-    """The body in a workspace's folder `truth`; None if the subject did not move, or is
-    unreadable."""
+    """Load the body of a workspace's folder `truth`; None if it did not move or is unreadable."""
     try:
         motion = json.loads((truth / "truth.json").read_text("utf-8"))["motion"]
         return load_body(motion, truth / "body.npz")

@@ -31,19 +31,19 @@ FINE = 128
 """Entries of a table of light per stripe."""
 
 
-def bit_count(stripes: int) -> int:
-    """Number of patterns needed to tell the stripes apart."""
+def count_bits(stripes: int) -> int:
+    """Count the patterns needed to distinguish the stripes."""
     return int(np.ceil(np.log2(stripes)))
 
 
-def code_bits(stripes: int, first: int = 0) -> Mask:
-    """Whether stripe i is lit in pattern k, (bits, stripes), 0 the most significant.
+def gray_code_bits(stripes: int, first: int = 0) -> Mask:
+    """Compute whether pattern k of a Gray code lights stripe i, (bits, stripes), 0 highest.
 
     first: the number of stripe 0.
     """
     index = np.arange(first, first + stripes)
     code = index ^ (index >> 1)
-    positions = np.arange(bit_count(first + stripes))[::-1]
+    positions = np.arange(count_bits(first + stripes))[::-1]
     return (code >> positions[:, None] & 1).astype(bool)
 
 
@@ -64,21 +64,20 @@ class LightTable:
 def table_index(
     s: NDArray[np.floating], stripes: int, blur: NDArray[np.integer] | None = None
 ) -> NDArray[np.int32]:
-    """Table entry of a stripe coordinate (NaN: outside the sweep), in the row of its blur if
-    several."""
+    """Look up table entries of s (NaN: outside the sweep), in the row of its blur if several."""
     entries = (stripes + 2 * PAD) * FINE
     position = np.nan_to_num((s + PAD) * FINE, nan=0.0, posinf=0.0, neginf=0.0)
     index = np.clip(position, 0, entries - 1).astype(np.int32)
     return index if blur is None else (index + blur * entries).astype(np.int32)
 
 
-def light_table(
+def make_light_table(
     lit: NDArray[Any],
     blurs: Array,
     jitter: Array | None = None,
     parts: int = 1,
 ) -> LightTable:
-    """Light of one frame: the lit stripes, blurred by Gaussians.
+    """Tabulate one frame's light against s: the lit stripes, blurred by Gaussians.
 
     lit: (S,), or (S * parts,) if light changes inside stripes.
     blurs: (B,) standard deviations in stripes.
@@ -98,8 +97,7 @@ def light_table(
 
 
 def _blur_light(values: Floats, blurs: tuple[float, ...]) -> Floats:
-    """Values (N,) blurred by each blur, (B, N); block-wise Fourier transforms are ten times
-    quicker."""
+    """Blur values (N,) by each blur, (B, N); block-wise Fourier transforms are ten times quicker."""
     if max(blurs) <= 0:
         return np.repeat(values[None], len(blurs), axis=0)
     padded = np.pad(values, PAD * FINE, mode="edge")
@@ -108,7 +106,7 @@ def _blur_light(values: Floats, blurs: tuple[float, ...]) -> Floats:
 
 @lru_cache(maxsize=8)
 def _kernels(blurs: tuple[float, ...]) -> Floats:
-    """Gaussians (B, k) with these standard deviations in stripes, cut at four of them or at PAD."""
+    """Sample Gaussians (B, k) of these sigmas in stripes, cut at four of them or at PAD."""
     position = np.arange(-PAD * FINE, PAD * FINE + 1) / FINE
     reached = np.minimum(4.0 * np.array(blurs), PAD)[:, None]
     sigma = np.maximum(blurs, 1e-3 / FINE)[:, None]
@@ -119,7 +117,7 @@ def _kernels(blurs: tuple[float, ...]) -> Floats:
 
 
 def refuse_unknown_code(code: StripeCode, pair: str) -> None:
-    """Raises BadInput for a code that has no formulas here."""
+    """Raise BadInput for a code that has no formulas here."""
     if type(code) not in (Gray, Binary, LightSection, PhaseShift, StripeIndex):
         raise BadInput(
             f"its code {code.code} is none that the simulator knows how to project",
@@ -130,7 +128,7 @@ def refuse_unknown_code(code: StripeCode, pair: str) -> None:
 
 
 def refuse_unknown_frames(rig: Rig) -> None:
-    """Raises BadInput for kinds of images that are not rendered here."""
+    """Raise BadInput for kinds of images that are not rendered here."""
     crossed = next((p.name for p in rig.pairs if p.projector and p.projector.crossing), None)
     wrong = {
         "it projects stripes one way only": crossed is not None,
@@ -147,8 +145,8 @@ def refuse_unknown_frames(rig: Rig) -> None:
             )
 
 
-def projected_patterns(code: StripeCode, frames: FrameNames) -> dict[str, Array]:
-    """Light (stripes * k,), 0 to 1, at evenly spaced positions of the sweep, by name of the image.
+def make_patterns(code: StripeCode, frames: FrameNames) -> dict[str, Array]:
+    """Compute light (stripes * k,), 0 to 1, evenly over the sweep, by name of the image.
 
     For a stripe-index rig, what its instrument projects: Gray code (see `instrument`).
     """
@@ -162,20 +160,19 @@ def projected_patterns(code: StripeCode, frames: FrameNames) -> dict[str, Array]
         if not code.needs_gray:
             return phases
         halves = np.floor(2.0 * position / code.waves[0].period).astype(int)
-        bits = code_bits(int(halves[-1]) + 1)[:, halves].astype(float)
+        bits = gray_code_bits(int(halves[-1]) + 1)[:, halves].astype(float)
         return _bit_images(frames, bits, code.inverses) | phases
     if isinstance(code, Binary):
         last = code.first_code + code.stripes
-        shifts = np.arange(bit_count(last))[::-1]
+        shifts = np.arange(count_bits(last))[::-1]
         bits = (np.arange(code.first_code, last) >> shifts[:, None] & 1).astype(float)
         return _bit_images(frames, bits, code.inverses)
     inverses, first = (code.inverses, code.first_code) if isinstance(code, Gray) else (True, 0)
-    return _bit_images(frames, code_bits(code.stripes, first).astype(float), inverses)
+    return _bit_images(frames, gray_code_bits(code.stripes, first).astype(float), inverses)
 
 
 def _wave_images(wave: Wave, position: Array) -> Array:
-    """Images (steps, N): at each step the wave is shifted by
-    a part of its period, forward or back."""
+    """Compute images (steps, N), the wave shifted by a part of its period at each step."""
     step = wave.period / wave.steps * (1.0 if wave.shift == "forward" else -1.0)
     crest = wave.origin - wave.start * wave.period / (2.0 * np.pi)
     return np.stack(
@@ -195,23 +192,25 @@ def _name_images(frames: FrameNames, kind: ImageKind, images: Array) -> dict[str
     return dict(zip(frames.kind_names(kind, len(images)), images, strict=True))
 
 
-def instrument_images(
+def simulate_instrument(
     images: dict[str, Bytes], code: StripeCode, frames: FrameNames
 ) -> dict[str, Bytes]:
-    """The lit image and the stripe-index image, from what its camera saw of its Gray code.
+    """Compute the lit and the stripe-index image from camera images of its Gray code.
 
     images: by the names of `patterns.projected_patterns`, with lit and a dark one named "".
     """
     lit_name = frames.lit or "lit"
     lit, dark = images[lit_name], images[""]
     coded = [name for name in images if name not in (lit_name, "")]
-    bits = bit_count(code.stripes)
+    bits = count_bits(code.stripes)
     words = sum(
         (images[pattern] > images[inverse]).astype(int) << (bits - 1 - bit)
         for bit, (pattern, inverse) in enumerate(zip(coded[:bits], coded[bits:], strict=True))
     )
     number = np.zeros(2**bits, np.uint8)
-    number[(1 << np.arange(bits)[::-1]) @ code_bits(code.stripes)] = np.arange(code.stripes) + 1
+    number[(1 << np.arange(bits)[::-1]) @ gray_code_bits(code.stripes)] = (
+        np.arange(code.stripes) + 1
+    )
     index = number[words]
     index[lit.astype(int) - dark < 12] = 0  # grey levels: too dark for a stripe
     index[lit == 255] = 255  # saturated

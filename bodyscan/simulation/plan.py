@@ -59,15 +59,15 @@ class Merits:
     needed: Array
 
 
-def default_shots(pairs: int) -> int:
-    """40 for twelve pairs; 8 for one."""
+def count_default_shots(pairs: int) -> int:
+    """Count 40 board shots for twelve pairs, at least 8."""
     return max(8, round(40 * pairs / 12))
 
 
 def plan_boards(
     rig: Rig, pairs: Mapping[str, TruePair], shots: int, rng: np.random.Generator
 ) -> list[BoardShot]:
-    """The floor shot if the rig file names one, then `shots` poses.
+    """Plan the floor shot if the rig file names one, then `shots` poses.
 
     Poses are drawn in front of pairs chosen in turn; of many, those are taken that add most: image
     area not yet covered near and far, new tilts, links between pairs that share no board yet.
@@ -85,7 +85,7 @@ def plan_boards(
 
 
 def look(pair: TruePair, poses: Sequence[RigidTransform], board: Board) -> Sight:
-    """What a pair sees of the board in each pose (rig_from_board)."""
+    """Compute what a pair sees of the board in each pose (rig_from_board)."""
     points = _board_grid(board)
     turns = np.stack([pose.rotation for pose in poses])
     shifts = np.stack([pose.translation for pose in poses])
@@ -131,7 +131,7 @@ def _board_grid(board: Board) -> Array:
 
 
 def _mask_visible(board: Board, sight: Sight, stripes: bool) -> Mask:
-    """Poses (N,) in which a pair takes stripes (or at least the lit image).
+    """Mask poses (N,) in which a pair takes stripes (or at least the lit image).
 
     A plain board is found only if it is seen whole; a board's back only if it is printed.
     """
@@ -176,7 +176,7 @@ def _floor_shot(rig: Rig, pairs: Mapping[str, TruePair]) -> BoardShot:
 def _candidates(
     board: Board, pairs: Sequence[TruePair], rng: np.random.Generator
 ) -> list[RigidTransform]:
-    """Poses near the middle of what pairs look at, facing them or turned between two poles."""
+    """Draw poses near the middle of what pairs look at, facing them or turned between two poles."""
     poses: list[RigidTransform] = []
     count = -(-3000 // len(pairs))
     for pair in pairs:
@@ -192,7 +192,7 @@ def _candidates(
 
 
 def _lift_above_floor(rig_from_board: RigidTransform, board: Board) -> RigidTransform:
-    """The pose, raised if necessary so that the board just clears the floor."""
+    """Raise a pose if necessary so that the board just clears the floor."""
     margin = np.array([[-1.0, -1.0, 0.0], [1.0, 1.0, 0.0]]) * board.margin_mm
     low, high = margin + [[0.0, 0.0, 0.0], [1.0, 1.0, 0.0]] * _board_extent(board)
     x, y = np.meshgrid([low[0], high[0]], [low[1], high[1]])
@@ -203,14 +203,14 @@ def _lift_above_floor(rig_from_board: RigidTransform, board: Board) -> RigidTran
 
 
 def _board_extent(board: Board) -> Array:
-    """Width and height of the checkered area, and 0, (3,) mm."""
+    """Compute width and height of the checkered area, and 0, (3,) mm."""
     return np.array([board.columns, board.rows, 0.0]) * board.square_mm
 
 
 def _draw_pose(
     board: Board, middle: Array, turn_away: bool, rng: np.random.Generator
 ) -> RigidTransform:
-    """A pose of a board with its middle there, its facing and its rotation drawn at random.
+    """Draw a pose of a board with its middle there, facing and rotation at random.
 
     turn_away: two poses in five face away from the camera, towards other poles.
     """

@@ -110,7 +110,7 @@ def settings_for(
     sway_mm: float = 0.0,
     changes: Iterable[str] = (),
 ) -> SimulationSettings:
-    """Settings from one kind of projector, a preset of devices, a person, and single changes.
+    """Compose settings of a kind of projector, a preset of devices, a person, and single changes.
 
     projector: `mirror` or `pinhole`.
     preset: `ideal` or `workshop`.
@@ -144,11 +144,11 @@ def settings_for(
         for part, changed in _WORKSHOP.items():
             values[part] |= changed
         values["projection"] |= _WORKSHOP_LIGHT[projector]
-    return with_changes(settings_of(values), changes)
+    return with_changes(settings_from_dict(values), changes)
 
 
 def with_changes(settings: SimulationSettings, changes: Iterable[str]) -> SimulationSettings:
-    """Settings with single numbers changed, such as `person.breath_mm=5`.
+    """Change single numbers of settings, such as `person.breath_mm=5`.
 
     Raises BadInput for an unknown setting, or a value that it cannot have.
     """
@@ -168,12 +168,11 @@ def with_changes(settings: SimulationSettings, changes: Iterable[str]) -> Simula
                     remedy=f"there are {', '.join(known)}",
                 )
         values[part][name] = _value(value.strip())
-    return settings_of(values)
+    return settings_from_dict(values)
 
 
-def settings_of(values: Mapping[str, Any]) -> SimulationSettings:
-    """Read back settings from what `dataclasses.asdict` made of them; missing parts get their
-    defaults.
+def settings_from_dict(values: Mapping[str, Any]) -> SimulationSettings:
+    """Read settings from `dataclasses.asdict` values; missing parts get their defaults.
 
     Raises BadInput for a value that a setting cannot have.
     """

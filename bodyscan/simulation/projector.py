@@ -58,7 +58,7 @@ class MirrorProjector:
     smile_stripes: float = 0.0
 
     def angle(self, points: Reals) -> Reals:
-        """Mirror angle at which the sheet passes through points (..., 3), radians.
+        """Compute the mirror angle at which the sheet passes through points (..., 3), radians.
 
         The mirrored point P' = P - 2 (n.q - e) n, q = P - centre, lies on the laser's own sheet:
         m.(P' - laser) = 0. With n.q and n.m in cos and sin of theta this reads
@@ -88,7 +88,7 @@ class MirrorProjector:
         return np.where(np.abs(fan_tangent) <= 1.0, s, np.nan).astype(points.dtype)
 
     def fan_tangent(self, points: Reals, theta: Reals) -> Reals:
-        """Tangent of the angle, inside the fan, between a point's ray and the middle ray.
+        """Compute the tangent of the angle between a point's ray and the fan's middle ray.
 
         It is computed after the point is mirrored back to the laser's side: (P' - laser) against
         `aim` and the sheet's other direction. Infinite behind the projector.
@@ -120,8 +120,7 @@ class MirrorProjector:
         return np.stack(parts, axis=-1)
 
     def plane(self, s: Reals) -> Reals:
-        """Planes (..., 4) of Eq. 6 at stripe coordinates s,
-        without smile: a, b, c (unit normal), d."""
+        """Compute planes (..., 4) of Eq. 6 at s, without smile: a, b, c (unit normal), d."""
         theta = self.first_angle + np.asarray(s, float) * (self.sweep_angle / self.stripes)
         zero, side = self._normals
         normal = np.cos(theta)[..., None] * zero + np.sin(theta)[..., None] * side
@@ -157,7 +156,7 @@ class PinholeProjector:
     smile_stripes: float = 0.0
 
     def slide(self, points: Reals) -> tuple[Reals, Reals]:
-        """Slide coordinates (along, across) of points; NaN behind the projector."""
+        """Compute slide coordinates (along, across) of points; NaN behind the projector."""
         x, y, z = (_project(points, row, self.centre) for row in self.rotation)
         front = np.where(z > 0, z, np.nan).astype(points.dtype)
         x, y = x / front, y / front
@@ -176,12 +175,12 @@ class PinholeProjector:
 
 
 def _project(points: Reals, vector: Array, origin: Array) -> Reals:
-    """Distance of points (..., 3) from the origin along a vector."""
+    """Compute the distance of points (..., 3) from the origin along a vector."""
     x, y, z = (points[..., i] * float(vector[i]) for i in range(3))
     return x + y + z - float(vector @ origin)
 
 
 def _wrap_angle(angle: Reals) -> Reals:
-    """Angles brought to (-pi, pi]."""
+    """Wrap angles to (-pi, pi]."""
     turn = angle.dtype.type(2.0 * np.pi)
     return angle - turn * np.round(angle / turn)

@@ -13,7 +13,7 @@ import numpy as np
 
 from bodyscan.arrays import Array, Floats, Mask
 from bodyscan.compiled import compiled
-from bodyscan.simulation.lamps import Lamps, laser_light, room_light
+from bodyscan.simulation.lamps import Lamps, compute_laser_light, compute_room_light
 from bodyscan.simulation.lens import TrueCamera, sample_directions, sample_offsets
 from bodyscan.simulation.projector import Projector
 from bodyscan.simulation.scene import Hits, Scene
@@ -116,7 +116,7 @@ class RayEnds:
     down: Floats
 
 
-def ends_of_rays(scene: Scene, band: Band, projector: Projector, lamps: Lamps) -> RayEnds:
+def trace_band(scene: Scene, band: Band, projector: Projector, lamps: Lamps) -> RayEnds:
     """Cast the band's rays, or interpolate them, and light their ends."""
     rows, columns, samples, _ = band.rays.shape
     hits = scene.cast(band.corners.reshape(-1, 3))
@@ -135,16 +135,16 @@ def ends_of_rays(scene: Scene, band: Band, projector: Projector, lamps: Lamps) -
 
 
 def _light_fields(scene: Scene, hits: Hits, projector: Projector, lamps: Lamps) -> Floats:
-    """Fields (F, N) in the order of `RayEnds`."""
+    """Compute fields (F, N) in the order of `RayEnds`."""
     white = replace(hits, albedo=np.ones_like(hits.albedo))
-    light = laser_light(scene, white, projector, lamps)
+    light = compute_laser_light(scene, white, projector, lamps)
     gloss = np.zeros_like(light.weight) if light.gloss is None else light.gloss
     return np.stack(
         [
             light.weight,
             gloss,
             light.s,
-            room_light(hits, lamps),
+            compute_room_light(hits, lamps),
             hits.albedo,
             hits.skin,
             hits.depth,
@@ -155,7 +155,7 @@ def _light_fields(scene: Scene, hits: Hits, projector: Projector, lamps: Lamps) 
 
 
 def _mask_smooth(hits: Hits, corners: RayEnds) -> Mask:
-    """Pixels (R, C) whose corners lie on one smooth piece of a surface, all lit or none."""
+    """Mask pixels (R, C) whose corners lie on one smooth piece of a surface, all lit or none."""
     shape = corners.depth.shape
     points, facets = hits.points.reshape(*shape, 3), hits.facets.reshape(*shape, 3)
     facets = facets / np.maximum(np.linalg.norm(facets, axis=-1, keepdims=True), 1e-12)
@@ -203,8 +203,7 @@ def interpolate(
 def mean_light(
     weight: Floats, index: np.ndarray[tuple[int, ...], np.dtype[np.int32]], table: Floats
 ) -> Floats:
-    """Mean (R, C) over samples of weight (R, C, K) times the
-    light at entries (R, C, K) of a table."""
+    """Average weight (R, C, K) times light at entries (R, C, K) of a table over the samples."""
     rows, columns, samples = weight.shape
     mean = np.empty((rows, columns), np.float32)
     for r in range(rows):
@@ -218,7 +217,7 @@ def mean_light(
 
 @compiled
 def min_over_samples(samples: Floats) -> Floats:
-    """The min_over_samples (R, C) of samples (R, C, K)."""
+    """Take the minimum (R, C) over samples (R, C, K)."""
     rows, columns, count = samples.shape
     result = np.empty((rows, columns), np.float32)
     for r in range(rows):

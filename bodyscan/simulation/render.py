@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from bodyscan.arrays import Array, Floats, Mask
 from bodyscan.rig.frame_names import FrameNames
-from bodyscan.simulation.lamps import Lamps, laser_light, spread_light
+from bodyscan.simulation.lamps import Lamps, compute_laser_light, spread_light
 from bodyscan.simulation.lens import TrueCamera
-from bodyscan.simulation.patterns import LightTable, light_table, projected_patterns, table_index
+from bodyscan.simulation.patterns import LightTable, make_light_table, make_patterns, table_index
 from bodyscan.simulation.projector import Projector
-from bodyscan.simulation.rays import Band, View, ends_of_rays, mean_light, min_over_samples
+from bodyscan.simulation.rays import Band, View, mean_light, min_over_samples, trace_band
 from bodyscan.simulation.scene import Scene
-from bodyscan.simulation.sensor import Brightness, add_speckle, blur, blurs_of, defocus, shade
+from bodyscan.simulation.sensor import Brightness, add_speckle, blur, defocus, list_blurs, shade
 from bodyscan.simulation.settings import Projection
 from bodyscan.stripes.codes.gray import Gray
 from bodyscan.stripes.stripe_code import StripeCode
@@ -64,7 +64,7 @@ def render_pair(
     moving: Moving | None = None,
     flicker: Mapping[str, Brightness] | None = None,
 ) -> dict[str, Floats]:
-    """Images without sensor noise, (height, width) float32 grey levels, by frame name.
+    """Render images without sensor noise, (height, width) float32 grey levels, by frame name.
 
     scene: in the camera's frame.
     rng: for the laser's jitter and speckle.
@@ -94,7 +94,7 @@ def render_pair(
             images.laser[name] *= np.float32(now.laser)
             images.ambient[name] = images.ambient[name] * np.float32(now.room)
     shading = shade(view.camera, view.optics)
-    blurs = blurs_of(view.optics, defocus(images.depth, lamps.focus_mm))
+    blurs = list_blurs(view.optics, defocus(images.depth, lamps.focus_mm))
     return {
         name: blur(
             (add_speckle(light, projection.speckle, rng) + images.ambient[name]) * shading,
@@ -204,7 +204,7 @@ class _LitRays:
 
     @staticmethod
     def cast(scene: Scene, band: Band, source: _Source) -> _LitRays:
-        ends = ends_of_rays(scene, band, source.projector, source.lamps)
+        ends = trace_band(scene, band, source.projector, source.lamps)
         blurs = _blur_rows(ends.depth, source.projection, source.lamps)
         return _LitRays(
             weight=ends.white * ends.albedo,
@@ -217,11 +217,11 @@ class _LitRays:
         )
 
     def light(self, table: LightTable) -> Floats:
-        """Grey level (R, C) of one frame."""
+        """Compute the grey level (R, C) of one frame."""
         return mean_light(self.weight, self.index, table.values.ravel())
 
     def gloss_light(self, table: LightTable) -> Floats:
-        """The part (R, C) of one frame that glossy skin mirrors."""
+        """Compute the part (R, C) of one frame that glossy skin mirrors."""
         return mean_light(self.gloss, self.index, table.values.ravel())
 
 
@@ -235,12 +235,12 @@ def _dilate(near: Mask, depth: Floats, reach_mm: float, camera: TrueCamera) -> M
     return grown.astype(bool)
 
 
-def pixel_truth(scene: Scene, camera: TrueCamera, projector: Projector) -> PixelTruth:
-    """Depth and stripe coordinate at the pixels' centres."""
+def compute_pixel_truth(scene: Scene, camera: TrueCamera, projector: Projector) -> PixelTruth:
+    """Compute depth and stripe coordinate at the pixels' centres."""
     directions = camera.directions(camera.grid()).reshape(-1, 3)
     hits = scene.cast(directions.astype(np.float32))
     depth = np.where(np.isfinite(hits.depth), hits.depth, np.nan).astype(float)
-    weight = laser_light(scene, hits, projector, Lamps(1.0, 0.0, 1.0, 1.0)).weight
+    weight = compute_laser_light(scene, hits, projector, Lamps(1.0, 0.0, 1.0, 1.0)).weight
     s = projector.stripe(directions * depth[:, None])
     lit = (weight > 0) & (s >= 0) & (s <= projector.stripes)
     shape = (camera.height, camera.width)
@@ -254,7 +254,7 @@ def _tables(
     frames: FrameNames,
     sequence: bool,
 ) -> dict[str, LightTable]:
-    """A table of light for each frame that the laser lights."""
+    """Tabulate the light of each frame that the laser lights."""
     if projection.jitter_stripes <= 0:
         steady = _steady_tables(code, frames, projection)
         return dict(steady if sequence else steady[:1])
@@ -263,7 +263,7 @@ def _tables(
     strays = projection.jitter_stripes * rng.standard_normal((len(lights), code.stripes + 1))
     blurs = _blurs(projection)
     return {
-        name: light_table(light, blurs, stray, len(light) // code.stripes)
+        name: make_light_table(light, blurs, stray, len(light) // code.stripes)
         for (name, light), stray in zip(lights, strays, strict=True)
     }
 
@@ -272,24 +272,24 @@ def _tables(
 def _steady_tables(
     code: StripeCode, frames: FrameNames, projection: Projection
 ) -> tuple[tuple[str, LightTable], ...]:
-    """Tables of lit and the code's images, without jitter."""
+    """Tabulate lit and the code's images without jitter."""
     blurs = _blurs(projection)
     return tuple(
-        (name, light_table(light, blurs, parts=len(light) // code.stripes))
+        (name, make_light_table(light, blurs, parts=len(light) // code.stripes))
         for name, light in _lights(code, frames, projection.gamma)
     )
 
 
 def _lights(code: StripeCode, frames: FrameNames, gamma: float) -> list[tuple[str, Array]]:
-    """Name, and light along the sweep, of lit and the code's images."""
-    coded = projected_patterns(code, frames)
+    """List name and light along the sweep of lit and the code's images."""
+    coded = make_patterns(code, frames)
     if gamma != 1.0:
         coded = {name: light**gamma for name, light in coded.items()}
     return [(frames.lit or "lit", np.ones(code.stripes)), *coded.items()]
 
 
 def _blurs(projection: Projection) -> Array:
-    """Standard deviations in stripes, from the best focus to the worst, in 12 steps."""
+    """List sigmas in stripes from the best focus to the worst, in 12 steps."""
     if projection.defocus_stripes <= 0:
         return np.array([projection.blur_stripes])
     steps = np.linspace(0.0, projection.defocus_stripes, 12)

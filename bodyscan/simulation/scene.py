@@ -126,7 +126,7 @@ class Scene:
                 albedo[on] = finish.printed.albedo(np.stack([across[on], down[on]], axis=1))
 
     def is_shadowed(self, points: Floats, towards: Floats, surface: NDArray[np.uint32]) -> Mask:
-        """Whether something is between points (N, 3) on surfaces and the source of their light.
+        """Test whether something is between points (N, 3) on surfaces and the source of their light.
 
         towards: (N, 3) from each point to the source.
         """
@@ -148,7 +148,7 @@ class Scene:
 
 
 def _bounding_ball(surfaces: Iterable[Surface]) -> tuple[Array, float]:
-    """A ball (middle, radius) around everything that can cast a shadow."""
+    """Bound everything that can cast a shadow by a ball (middle, radius)."""
     corners = [[one.vertices.min(axis=0), one.vertices.max(axis=0)] for one in surfaces]
     if not corners:
         return np.zeros(3), 0.0
@@ -164,7 +164,7 @@ def _distance_squared(points: Floats, directions: Floats, middle: Array) -> Floa
 
 
 def dot(a: Floats, b: Floats) -> Floats:
-    """Dot products (N,) of rows (N, 3); several times faster than einsum on such short rows."""
+    """Compute dot products (N,) of rows (N, 3), faster than einsum on such short rows."""
     return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]
 
 
@@ -213,7 +213,7 @@ class _Finish:
 
 
 def _interpolate(corners: Floats, triangles: NDArray[np.integer], uv: Floats) -> Floats:
-    """Values (N, k) at barycentric coordinates uv (N, 2) of the triangles that were hit."""
+    """Interpolate (N, k) at barycentric coordinates uv (N, 2) of the triangles hit."""
     picked = corners.take(triangles, axis=0)
     return picked[:, 0] + uv[:, :1] * picked[:, 1] + uv[:, 1:] * picked[:, 2]
 
@@ -221,7 +221,7 @@ def _interpolate(corners: Floats, triangles: NDArray[np.integer], uv: Floats) ->
 def grid_surface(
     corner: Array, across: Array, down: Array, steps: tuple[int, int] = (1, 1), **more: Any
 ) -> Surface:
-    """A flat patch from a corner and its two sides (3,), cut in steps; print_xy are (0..1, 0..1)."""
+    """Build a flat patch from a corner and two sides (3,), cut in steps; print_xy from 0 to 1."""
     columns, rows = steps
     x, y = np.meshgrid(np.linspace(0, 1, columns + 1), np.linspace(0, 1, rows + 1))
     print_xy = np.stack([x.ravel(), y.ravel()], axis=1)
@@ -230,7 +230,7 @@ def grid_surface(
 
 
 def grid_triangles(columns: int, rows: int) -> Indices:
-    """Two triangles for each cell of a grid of (rows + 1) x (columns + 1) vertices."""
+    """List two triangles for each cell of a grid of (rows + 1) x (columns + 1) vertices."""
     first = (np.arange(rows)[:, None] * (columns + 1) + np.arange(columns)).ravel()
     below = first + columns + 1
     upper = np.stack([first, first + 1, below], axis=1)

@@ -27,8 +27,7 @@ class Brightness:
 def draw_flicker(
     frames: Iterable[str], settings: SimulationSettings, rng: np.random.Generator
 ) -> Mapping[str, Brightness]:
-    """Brightness by frame; the frames are in the order in which they are taken, at the person's
-    pace.
+    """Draw the brightness of each frame, taken in this order at the person's pace.
 
     A lamp pulses; a frame sees its mean over the exposure, which is as long as the frame. None if
     nothing flickers.
@@ -49,7 +48,7 @@ def draw_flicker(
 
 
 def exposure(lit: Floats, grey: float, lighting: Lighting) -> float:
-    """The exposure at which the brightest thousandth of a lit image begins at `grey`."""
+    """Choose the exposure at which the brightest thousandth of a lit image begins at `grey`."""
     bright = max(float(np.percentile(lit, 99.9)), 1e-3)
     return float(np.clip(grey / bright, lighting.shortest, lighting.longest))
 
@@ -65,7 +64,7 @@ class FixedPattern:
 def fixed_pattern(
     camera: TrueCamera, noise: Noise, rng: np.random.Generator
 ) -> FixedPattern | None:
-    """Fixed pattern of a camera's sensor; None if its pixels are all alike."""
+    """Draw a sensor's fixed pattern; None if its pixels are all alike."""
     if noise.pixel_gain <= 0 and noise.pixel_grey <= 0:
         return None
     gain, grey = rng.standard_normal((2, camera.height, camera.width), dtype=np.float32)
@@ -78,8 +77,7 @@ def fixed_pattern(
 def expose(
     image: Floats, noise: Noise, rng: np.random.Generator, fixed: FixedPattern | None = None
 ) -> Bytes:
-    """The sensor's image of a noiseless one: shot and read
-    noise, its pixels' own errors, 8 bits."""
+    """Expose an image to 8 bits: fixed pattern, shot and read noise."""
     if fixed is not None:
         image = image * fixed.gain + fixed.grey
     electrons = noise.electrons_per_grey * noise.photons
@@ -110,8 +108,7 @@ def digitise(
 
 
 def add_speckle(image: Floats, size: float, rng: np.random.Generator) -> Floats:
-    """Add laser speckle of relative standard deviation `size` and mean 1: a gamma distribution, as
-    for speckle averaged over a pixel (Goodman, Speckle Phenomena, 2007)."""
+    """Multiply by laser speckle of mean 1 and sigma `size`: gamma-distributed (Goodman 2007)."""
     if size <= 0:
         return image
     return image * (
@@ -121,7 +118,7 @@ def add_speckle(image: Floats, size: float, rng: np.random.Generator) -> Floats:
 
 @lru_cache(maxsize=4)
 def shade(camera: TrueCamera, optics: Optics) -> Floats | float:
-    """Vignetting: the share of light that arrives, (height, width)."""
+    """Compute vignetting: the share of light that arrives, (height, width)."""
     if optics.vignetting <= 0:
         return 1.0
     cosine = 1.0 / np.linalg.norm(camera.directions(camera.grid()), axis=-1)
@@ -129,14 +126,12 @@ def shade(camera: TrueCamera, optics: Optics) -> Floats | float:
 
 
 def defocus(depth: Floats, focus_mm: float) -> Floats:
-    """How far depths (mm, > 0) are out of focus: |focus / depth - 1|, proportional to the circle of
-    confusion; 0 at focus_mm, 1 at half of it, and never more."""
+    """Compute |focus / depth - 1| of depths (mm, > 0), at most 1, which is half the distance."""
     return np.minimum(np.abs(np.float32(focus_mm) / depth - 1.0), 1.0)
 
 
-def blurs_of(optics: Optics, out_of_focus: Floats) -> list[tuple[float, Floats | None]]:
-    """The lens's Gaussian blurs, px, and the share (H, W) of each in a pixel, None for all of it:
-    the blur is wider where the scene is out of focus (0..1)."""
+def list_blurs(optics: Optics, out_of_focus: Floats) -> list[tuple[float, Floats | None]]:
+    """List Gaussian blurs, px, wider out of focus, and each one's share (H, W) (None: all)."""
     if optics.defocus_px <= 0:
         return [(optics.blur_px, None)]
     steps = 5
@@ -151,7 +146,7 @@ def blurs_of(optics: Optics, out_of_focus: Floats) -> list[tuple[float, Floats |
 
 
 def blur(image: Floats, blurs: Sequence[tuple[float, Floats | None]]) -> Floats:
-    """An image (H, W) as the lens blurs it."""
+    """Blur an image (H, W) as the lens does."""
     result = np.zeros_like(image)
     for wide, share in blurs:
         if share is None:

@@ -24,11 +24,11 @@ from bodyscan.simulation.layout import TruePair, build_pairs, build_room
 from bodyscan.simulation.lens import TrueCamera
 from bodyscan.simulation.living import LivingBody, animate, moves, save_body
 from bodyscan.simulation.patterns import (
-    instrument_images,
     refuse_unknown_code,
     refuse_unknown_frames,
+    simulate_instrument,
 )
-from bodyscan.simulation.plan import default_shots, plan_boards
+from bodyscan.simulation.plan import count_default_shots, plan_boards
 from bodyscan.simulation.rays import View
 from bodyscan.simulation.render import Moving, render_pair
 from bodyscan.simulation.scene import Scene, Surface
@@ -132,7 +132,7 @@ def simulate(
 
 
 def random_stream(seed: int, *purpose: int) -> np.random.Generator:
-    """Random numbers for one purpose (`Stream`, and numbers below it) of a data set."""
+    """Start random numbers of one purpose (`Stream`, and numbers below it) of a data set."""
     return np.random.default_rng([seed, *purpose])
 
 
@@ -140,12 +140,12 @@ def _decide(
     rig: Rig, subject: Path | None, settings: SimulationSettings, seed: int, shots: int | None
 ) -> Truth:
     """Draw everything that is true of the data set before any image is made."""
-    pairs = true_pairs(rig, settings, seed)
+    pairs = draw_true_pairs(rig, settings, seed)
     boards = {
         board.name: make_board(board, settings.board, random_stream(seed, Stream.BOARDS, number))
         for number, board in enumerate(rig.boards)
     }
-    shots = default_shots(len(pairs)) if shots is None else shots
+    shots = count_default_shots(len(pairs)) if shots is None else shots
     plan = plan_boards(rig, pairs, shots, random_stream(seed, Stream.PLAN)) if shots else []
     truth = Truth(rig.name, seed, settings, pairs, boards, tuple(plan), None, None, {})
     if subject is None:
@@ -159,7 +159,7 @@ def _decide(
     motion = None
     if moves(settings.person):
         living = animate(person, settings.person, random_stream(seed, Stream.LIFE))
-        times = files.times_of_person(rig, PERSON_SHOT, settings.pace)
+        times = files.compute_person_times(rig, PERSON_SHOT, settings.pace)
         every = [ms for by_frame in times.values() for ms in by_frame.values()]
         motion = Motion(living, times, (min(every) + max(every)) / 2.0, by_pair)
         person = living.surface(motion.moment_ms)
@@ -168,7 +168,7 @@ def _decide(
     return replace(truth, subject=pseudonym, person=person, sways=by_pair, motion=motion)
 
 
-def true_pairs(rig: Rig, settings: SimulationSettings, seed: int) -> dict[str, TruePair]:
+def draw_true_pairs(rig: Rig, settings: SimulationSettings, seed: int) -> dict[str, TruePair]:
     """Build the pairs of a data set with these settings and seed."""
     return build_pairs(rig, settings, lambda number: random_stream(seed, Stream.PAIRS, number))
 
@@ -207,7 +207,7 @@ def _render_all(rig: Rig, truth: Truth, out: Path, workers: int, progress: Progr
         number, pair = numbered
         rays = random_stream(truth.seed, Stream.RAYS, number)
         view = View.from_camera(pair.camera, settings.optics, rays)
-        fixed = sensor_of(pair.camera, settings, truth.seed, number)
+        fixed = draw_sensor(pair.camera, settings, truth.seed, number)
         for task in tasks[pair.name]:
             noise = random_stream(truth.seed, Stream.NOISE, number, task.number)
             render_task(rig, pair, view, room, task, settings, out, noise, fixed)
@@ -218,7 +218,7 @@ def _render_all(rig: Rig, truth: Truth, out: Path, workers: int, progress: Progr
     map_threads(render, enumerate(truth.pairs.values()), stage="simulate", workers=workers)
 
 
-def sensor_of(
+def draw_sensor(
     camera: TrueCamera, settings: SimulationSettings, seed: int, number: int
 ) -> FixedPattern | None:
     """Draw the fixed pattern of the camera with that number."""
@@ -258,7 +258,7 @@ def render_task(
         for name, image in images.items()
     }
     if code and not code.is_projected and task.sequence:
-        exposed = instrument_images(exposed, code, rig.frames)
+        exposed = simulate_instrument(exposed, code, rig.frames)
     for frame, grey in exposed.items():
         name = fill(rig.files, shot=task.shot, pair=pair.name, frame=frame)
         files.write_image(out / task.folder / name, grey)

@@ -7,15 +7,15 @@ import pytest
 
 from bodyscan.evaluation.sphere_search import find_spheres
 from bodyscan.laboratory import apparatus
-from bodyscan.laboratory.calibrating import Calibrations, calibrate_all, sigma_trial
+from bodyscan.laboratory.calibrating import Calibrations, calibrate_all, run_sigma_trial
 from bodyscan.laboratory.chapter_captures import ChapterCaptures, take_captures
 from bodyscan.laboratory.measuring import (
     ApproachAccuracy,
+    compare_point_sigmas,
+    estimate_noise_bound,
+    make_true_approach,
     measure_artefacts,
-    noise_bound,
-    point_sigma,
-    points_of,
-    true_approach,
+    triangulate_pixels,
 )
 from bodyscan.laboratory.reproduce import draw
 from bodyscan.laboratory.text import Reproduction, figure_names, reproduction_text
@@ -37,7 +37,7 @@ def calibrated(captures: ChapterCaptures) -> Calibrations:
 def measured(
     captures: ChapterCaptures, calibrated: Calibrations
 ) -> dict[bool, dict[str, ApproachAccuracy]]:
-    approaches = [*calibrated.approaches, true_approach(captures.setup)]
+    approaches = [*calibrated.approaches, make_true_approach(captures.setup)]
     return {
         whole: {
             m.name: m for m in (measure_artefacts(a, captures, whole=whole) for a in approaches)
@@ -63,10 +63,10 @@ def test_corners_are_the_simulated_boards(captures: ChapterCaptures) -> None:
 
 
 def test_true_stripes_and_true_calibration_leave_nothing(captures: ChapterCaptures) -> None:
-    truth = true_approach(captures.setup)
+    truth = make_true_approach(captures.setup)
     for number, centre in enumerate(apparatus.CENTRES):
         own = captures.owner == number
-        points = points_of(truth, captures.spheres.truth.s, own)
+        points = triangulate_pixels(truth, captures.spheres.truth.s, own)
         # 0.0005 mm of facets, and float32 in the ray caster.
         assert np.abs(np.linalg.norm(points - centre, axis=1) - 25.0).max() < 0.003
     assert measure_artefacts(truth, captures).plate_systematic_mm < 1e-3
@@ -75,7 +75,7 @@ def test_true_stripes_and_true_calibration_leave_nothing(captures: ChapterCaptur
 def test_a_smile_belongs_to_the_truth() -> None:
     """Under real light as well nothing is left of points that the true light says."""
     setup = apparatus.chapter_setup(apparatus.real_settings(1))
-    truth = true_approach(setup)
+    truth = make_true_approach(setup)
     u, v = np.meshgrid(np.arange(200.0, 500.0, 30.0), np.arange(150.0, 400.0, 30.0))
     rays = truth.camera.rays(np.column_stack([u.ravel(), v.ravel()]))
     true = rays * 400.0
@@ -140,7 +140,7 @@ def test_table_1_is_recovered(calibrated: Calibrations) -> None:
 
 
 def test_sigmas_are_honest_over_many_seeds() -> None:
-    trial = sigma_trial(50)
+    trial = run_sigma_trial(50)
     # RMS of 50 normal draws is 1 +- 0.1.
     assert np.all(np.abs(trial.rms - 1.0) < 0.3), trial.rms
     # 350 draws: 0.95 beyond three sigmas expected, 5 or more once in three hundred times.
@@ -151,7 +151,7 @@ def test_the_spheres_are_found_without_knowing_where_they_are(
     captures: ChapterCaptures, calibrated: Calibrations
 ) -> None:
     s = captures.spheres.stripes.s
-    points = points_of(calibrated.ours, s).reshape(*s.shape, 3).astype(np.float32)
+    points = triangulate_pixels(calibrated.ours, s).reshape(*s.shape, 3).astype(np.float32)
     found = find_spheres(points.astype(float), grid_normals(points).astype(float), 25.0, 5)
     places = np.stack([sphere.centre for sphere in found])
     assert np.allclose(places, apparatus.CENTRES, atol=0.8)
@@ -160,7 +160,7 @@ def test_the_spheres_are_found_without_knowing_where_they_are(
 def test_noise_is_less_than_everything(
     captures: ChapterCaptures, measured: dict[bool, dict[str, ApproachAccuracy]]
 ) -> None:
-    noise = noise_bound(captures)
+    noise = estimate_noise_bound(captures)
     assert max(noise.best_share) < 0.001
     for alone, sphere in zip(
         noise.everything, measured[False]["true calibration"].spheres, strict=True
@@ -171,7 +171,7 @@ def test_noise_is_less_than_everything(
 def test_points_are_as_far_off_as_they_say(
     captures: ChapterCaptures, calibrated: Calibrations
 ) -> None:
-    found = point_sigma(calibrated.ours, captures)
+    found = compare_point_sigmas(calibrated.ours, captures)
     # Nearly all of a sigma is common to all points: one calibration is one draw of a normal variable,
     # of which nothing but "not beyond three" can be asked; many are drawn in test_refinement_choice.
     assert found.spheres < 3.0
@@ -193,13 +193,13 @@ def test_the_report_says_all_of_it(
         real_light=False,
         boards=3,
         calibrated=calibrated,
-        trial=sigma_trial(3),
+        trial=run_sigma_trial(3),
         whole=whole,
         fine=fine,
         by_stage=fine[:1],
         by_reference=fine[-1:],
-        noise=noise_bound(captures),
-        sigmas=(point_sigma(calibrated.ours, captures),),
+        noise=estimate_noise_bound(captures),
+        sigmas=(compare_point_sigmas(calibrated.ours, captures),),
     )
     text = reproduction_text(found)
     for wanted in ("Table 1", "Table 2", "mean square", "contradicts", "scale ppm", "noise alone"):

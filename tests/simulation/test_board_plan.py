@@ -11,7 +11,7 @@ from bodyscan.errors import BadInput
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_file import load_rig
 from bodyscan.simulation.layout import TruePair, build_pairs
-from bodyscan.simulation.plan import BoardShot, default_shots, plan_boards
+from bodyscan.simulation.plan import BoardShot, count_default_shots, plan_boards
 from bodyscan.simulation.settings import SimulationSettings
 
 RIGS = Path(__file__).parents[2] / "rigs"
@@ -20,7 +20,7 @@ RIGS = Path(__file__).parents[2] / "rigs"
 def planned(name: str) -> tuple[Rig, dict[str, TruePair], list[BoardShot]]:
     rig = load_rig(RIGS / name)
     pairs = build_pairs(rig, SimulationSettings(), lambda n: np.random.default_rng([0, n]))
-    shots = default_shots(len(pairs))
+    shots = count_default_shots(len(pairs))
     return rig, pairs, plan_boards(rig, pairs, shots, np.random.default_rng(1))
 
 

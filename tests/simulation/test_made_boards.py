@@ -10,7 +10,7 @@ import pytest
 
 from bodyscan.errors import BadInput
 from bodyscan.rig.board import Board
-from bodyscan.simulation.board import board_print, make_board
+from bodyscan.simulation.board import make_board, make_print
 from bodyscan.simulation.settings import BoardMaking
 
 CHARUCO = Board(
@@ -39,7 +39,7 @@ def test_charuco_is_as_opencv_draws_it(legacy: bool, face: int) -> None:
     image = drawn(board, face)
     v, u = np.indices(image.shape)
     places = np.stack([(u.ravel() + 0.5) / 4, (v.ravel() + 0.5) / 4], axis=1).astype(np.float32)
-    dark = board_print(board, face, MAKING).albedo(places).reshape(image.shape) < 0.4
+    dark = make_print(board, face, MAKING).albedo(places).reshape(image.shape) < 0.4
     # OpenCV rounds the markers' modules (7.5 mm) to whole px: only edges may differ
     differs = cv2.erode((dark != image).astype(np.uint8), np.ones((3, 3), np.uint8))
     assert differs.sum() == 0
@@ -47,7 +47,7 @@ def test_charuco_is_as_opencv_draws_it(legacy: bool, face: int) -> None:
 
 
 def test_margin_is_blank_and_the_first_square_dark() -> None:
-    printed = board_print(PLAIN, 0, MAKING)
+    printed = make_print(PLAIN, 0, MAKING)
     places = np.array([[-3, 10], [3, 3], [23, 3], [23, 23], [103, 3], [97, 3]], np.float32)
     dark = printed.albedo(places) < 0.4
     assert dark.tolist() == [False, True, False, True, False, True]

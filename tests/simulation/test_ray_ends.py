@@ -8,8 +8,8 @@ import pytest
 from small_view import LAMPS, SHARP, projector, view, wall
 
 from bodyscan.rig.board import Board
-from bodyscan.simulation.board import board_print
-from bodyscan.simulation.rays import ends_of_rays, interpolate
+from bodyscan.simulation.board import make_print
+from bodyscan.simulation.rays import interpolate, trace_band
 from bodyscan.simulation.scene import Scene, Surface, grid_surface
 from bodyscan.simulation.settings import BoardMaking
 
@@ -31,7 +31,7 @@ def furnished() -> Scene:
     sheet = Surface(
         slanting.vertices,
         slanting.triangles,
-        printed=board_print(board, 0, BoardMaking()),
+        printed=make_print(board, 0, BoardMaking()),
         print_xy=places,
     )
     return Scene([wall(1500.0), ball, sheet])
@@ -39,7 +39,7 @@ def furnished() -> Scene:
 
 def test_a_curved_surface_is_cast_ray_by_ray() -> None:
     scene, band = furnished(), view(SHARP).bands[0]
-    ends = ends_of_rays(scene, band, projector(), LAMPS)
+    ends = trace_band(scene, band, projector(), LAMPS)
     straight = scene.cast(band.rays.reshape(-1, 3)).depth.reshape(ends.depth.shape)
     assert ends.depth == pytest.approx(straight, abs=0.01)
 

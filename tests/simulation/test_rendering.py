@@ -14,12 +14,12 @@ from small_view import CAMERA, CRISP, LAMPS, SHARP, STRIPES, projector, view, wa
 from bodyscan.arrays import Floats
 from bodyscan.simulation.layout import build_mirror, build_pinhole
 from bodyscan.simulation.lens import TrueCamera
-from bodyscan.simulation.patterns import code_bits
+from bodyscan.simulation.patterns import gray_code_bits
 from bodyscan.simulation.projector import MirrorProjector, PinholeProjector
 from bodyscan.simulation.rays import View
-from bodyscan.simulation.render import pixel_truth, render_pair
+from bodyscan.simulation.render import compute_pixel_truth, render_pair
 from bodyscan.simulation.scene import Scene, Surface, grid_surface
-from bodyscan.simulation.sensor import blur, blurs_of, expose
+from bodyscan.simulation.sensor import blur, expose, list_blurs
 from bodyscan.simulation.settings import Noise, Optics, Projection
 
 BITS = 5
@@ -59,7 +59,7 @@ def read(images: dict[str, np.ndarray]) -> np.ndarray:
     bits = [images[f"bit{k:02d}"] > images[f"bit{k:02d}-inverse"] for k in range(BITS)]
     table = np.full(2**BITS, -1)
     places = 2 ** np.arange(BITS)
-    table[places @ code_bits(STRIPES)] = np.arange(STRIPES)
+    table[places @ gray_code_bits(STRIPES)] = np.arange(STRIPES)
     return table[np.tensordot(places, np.stack(bits), axes=1)]
 
 
@@ -68,7 +68,7 @@ def test_frames_read_as_the_true_stripe(build: Callable[..., MirrorProjector]) -
     surfaces = [wall(1500.0, albedo=0.7), ball([40.0, -30.0, 1000.0], 200.0)]
     light = projector(build)
     images = render(surfaces, light=light)
-    truth = pixel_truth(Scene(surfaces), CAMERA, light)
+    truth = compute_pixel_truth(Scene(surfaces), CAMERA, light)
     inside = np.mod(truth.s, 1.0)
     slope = np.abs(np.gradient(truth.s)).max(axis=0)
     # a pixel wholly inside a stripe: its middle lies more than half a pixel's s from a boundary
@@ -78,7 +78,9 @@ def test_frames_read_as_the_true_stripe(build: Callable[..., MirrorProjector]) -
 
 
 def test_depth_is_that_of_the_surfaces() -> None:
-    truth = pixel_truth(Scene([wall(1500.0), ball([0.0, 0.0, 1000.0], 200.0)]), CAMERA, projector())
+    truth = compute_pixel_truth(
+        Scene([wall(1500.0), ball([0.0, 0.0, 1000.0], 200.0)]), CAMERA, projector()
+    )
     rays = CAMERA.directions(CAMERA.grid())
     b, c = rays @ np.array([0, 0, 1000.0]), 1000.0**2 - 200.0**2
     root = b**2 - np.sum(rays**2, axis=-1) * c
@@ -95,7 +97,7 @@ def test_depth_is_that_of_the_surfaces() -> None:
 def test_brightness_is_albedo_cosine_and_inverse_square() -> None:
     light = projector()
     images = render([wall(1200.0, albedo=0.5)], light=light)
-    truth = pixel_truth(Scene([wall(1200.0)]), CAMERA, light)
+    truth = compute_pixel_truth(Scene([wall(1200.0)]), CAMERA, light)
     points = CAMERA.directions(CAMERA.grid()) * 1200.0
     towards = light.source(truth.s) - points
     distance = np.linalg.norm(towards, axis=-1)
@@ -120,7 +122,7 @@ def test_shadow_falls_away_from_the_mirrored_apex() -> None:
     light = projector()
     surfaces = [wall(1500.0), ball(list(middle), radius)]
     images = render(surfaces, light=light)
-    truth = pixel_truth(Scene(surfaces), CAMERA, light)
+    truth = compute_pixel_truth(Scene(surfaces), CAMERA, light)
     points = CAMERA.directions(CAMERA.grid()) * 1500.0
     source = light.source(light.stripe(points))
     way = source - points
@@ -143,7 +145,7 @@ def test_a_surface_turned_away_from_the_light_stays_dark() -> None:
         np.array([-200.0, -100.0, 900.0]), np.array([400.0, 0, 0]), np.array([0, 25.0, 300.0])
     )
     light = projector()
-    truth = pixel_truth(Scene([ledge, wall(3000.0)]), CAMERA, light)
+    truth = compute_pixel_truth(Scene([ledge, wall(3000.0)]), CAMERA, light)
     seen = truth.depth < 1300
     assert seen.sum() > 200
     assert np.isnan(truth.s[seen]).all()
@@ -205,7 +207,7 @@ def test_camera_out_of_focus_blurs_what_is_near() -> None:
     off = np.zeros_like(image)
     off[:, :40] = 1.0
     optics = Optics(blur_px=0.6, defocus_px=2.0)
-    result = blur(image, blurs_of(optics, off))[20]
+    result = blur(image, list_blurs(optics, off))[20]
     u = np.arange(80)
     near, far = result[:40] / result[:40].sum(), result[40:] / result[40:].sum()
     # the pixel itself is not part of the blur here: the line is one sample wide
