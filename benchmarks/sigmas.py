@@ -92,7 +92,9 @@ def _unit(boards: int, real_light: bool, seed: int) -> UnitErrors:
     )
     true = camera_from_fields(describe_camera(apparatus.CAMERA)).parameters
     off = (ours.camera.parameters - true) / np.sqrt(np.diag(covariance))
-    print_ppm = centre_distances(setup.board.corners, corner_points(apparatus.BOARD)).scale_ppm
+    print_ppm = compare_centre_distances(
+        setup.board.corners, corner_points(apparatus.BOARD)
+    ).scale_ppm
     accuracy, best = (measure_artefacts(one, captures) for one in (ours, make_true_approach(setup)))
     return UnitErrors(compare_point_sigmas(ours, captures), off, accuracy, best, print_ppm)
 

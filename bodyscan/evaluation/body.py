@@ -35,18 +35,18 @@ class SwayResidual:
 
 
 def sway_residual(
-    found: Mapping[str, RigidTransform], draw_true_pairs: Mapping[str, Any], vertices: Array
+    found: Mapping[str, RigidTransform], true_pairs: Mapping[str, Any], vertices: Array
 ) -> SwayResidual:
     """Compare poses with the truth.
 
     found: rig_from_camera as the scan used it.
-    draw_true_pairs: `pairs` of truth.json.
+    true_pairs: `pairs` of truth.json.
     vertices: the true body.
     """
     body = vertices[:: max(1, len(vertices) // 500)]
-    placed = []
-    for name, placing in found.items():
-        true = draw_true_pairs[name]
+    moved = []
+    for name, pose in found.items():
+        true = true_pairs[name]
         camera = RigidTransform.from_matrix(true["rig_from_camera"])
         swayed = RigidTransform.from_matrix(true["swayed_from_still"])
         moved.append((pose @ camera.inverse() @ swayed).apply(body))
@@ -125,8 +125,8 @@ def _as_measured(vertices: Array, faces: Indices) -> BodyMesh:
     )
 
 
-def coverage_of_seen(
-    points: Array, vertices: Array, faces: Indices, draw_true_pairs: Mapping[str, Any]
+def measure_visible_coverage(
+    points: Array, vertices: Array, faces: Indices, true_pairs: Mapping[str, Any]
 ) -> tuple[float, float]:
     """Measure the share of the truth that a camera and its projector see, and what covers of it.
 
@@ -135,8 +135,8 @@ def coverage_of_seen(
     spots, normals = sample_surface(vertices, faces, 60_000, seed=0)
     scene = o3d.t.geometry.RaycastingScene()
     scene.add_triangles(vertices.astype(np.float32), faces.astype(np.uint32))
-    seen = np.zeros(len(spots), bool)
-    for pair in draw_true_pairs.values():
+    visible = np.zeros(len(spots), bool)
+    for pair in true_pairs.values():
         still_from_camera = RigidTransform.from_matrix(
             pair["swayed_from_still"]
         ).inverse() @ RigidTransform.from_matrix(pair["rig_from_camera"])

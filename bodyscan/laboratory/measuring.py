@@ -91,9 +91,9 @@ def measure_artefacts(
         approach.name,
         tuple(found),
         tuple(covered),
-        centre_distances(centres, apparatus.CENTRES),
-        flatness(_drop_unknown(triangulate_pixels(approach, plate_s, captures.on_plate))),
-        flatness(
+        compare_centre_distances(centres, apparatus.CENTRES),
+        measure_flatness(_drop_unknown(triangulate_pixels(approach, plate_s, captures.on_plate))),
+        measure_flatness(
             _drop_unknown(triangulate_pixels(approach, captures.plate.truth.s, captures.on_plate))
         ).rms_mm,
     )

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bodyscan.evaluation.sphere_search import find_spheres
+from bodyscan.evaluation.primitives import find_spheres
 from bodyscan.laboratory import apparatus
 from bodyscan.laboratory.calibrating import Calibrations, calibrate_all, run_sigma_trial
 from bodyscan.laboratory.chapter_captures import ChapterCaptures, take_captures
