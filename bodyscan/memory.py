@@ -1,4 +1,4 @@
-"""How a process of ours treats memory: freed blocks are kept, garbage is sought seldom."""
+"""Memory of a process: keep freed blocks, and collect cyclic garbage seldom."""
 
 from __future__ import annotations
 
@@ -6,15 +6,10 @@ import ctypes
 import gc
 import sys
 
-TRIM_THRESHOLD, MMAP_MAX, ARENA_MAX = -1, -4, -8  # from glibc's malloc.h
-NEVER = 2**31 - 1
-SELDOM = 50_000
-"""Objects, net, made between two searches for cycles; Python's 700 cost a cold scan 0.06 s."""
-
 
 def collect_seldom() -> None:
     """Search for cyclic garbage less often: what is large are arrays, freed by counting alone."""
-    gc.set_threshold(SELDOM)
+    gc.set_threshold(50_000)  # Python's 700 cost a cold scan 0.06 s
 
 
 def keep_freed_memory() -> None:
@@ -27,6 +22,7 @@ def keep_freed_memory() -> None:
         return
     set_option = getattr(ctypes.CDLL(None), "mallopt", None)
     if set_option is not None:
-        set_option(TRIM_THRESHOLD, NEVER)
-        set_option(MMAP_MAX, 0)
-        set_option(ARENA_MAX, 1)  # otherwise each thread keeps memory of its own
+        trim_threshold, mmap_max, arena_max = -1, -4, -8  # from glibc's malloc.h
+        set_option(trim_threshold, 2**31 - 1)
+        set_option(mmap_max, 0)
+        set_option(arena_max, 1)  # otherwise each thread keeps memory of its own

@@ -93,7 +93,7 @@ def test_work_that_the_system_kills_is_told() -> None:
     process = start("os.kill(os.getpid(), 9)")
     _, errors = process.communicate(timeout=30)
     assert process.returncode == 137
-    assert errors == "error: the work was ended by SIGKILL (out of memory?)\n"
+    assert errors == "error: the work was ended by SIGKILL (possibly out of memory)\n"
 
 
 def test_ctrl_c_is_heard_while_modules_are_imported() -> None:

@@ -79,7 +79,7 @@ def patterns(
     orders = write_patterns(rig, out, width, height)
     output.notes(find_uneven_stripes(rig, width, height))
     for order in orders:
-        output.made("patterns, in the order of", order)
+        output.add_files("patterns, in the order of", order)
 
 
 def calibrate_rig(
@@ -93,7 +93,7 @@ def calibrate_rig(
 
     out = _calibration_folder(rig_file, out, overwrite)
     with output.stages() as progress:
-        _say_calibration(output, *calibrate_folder(rig_file, out, progress))
+        _report_calibration(output, *calibrate_folder(rig_file, out, progress))
 
 
 def import_(
@@ -113,24 +113,24 @@ def import_(
     from bodyscan.workflows.import_rig import import_folder
 
     out = _calibration_folder(rig_file, out, overwrite)
-    _say_calibration(output, *import_folder(rig_file, out, sigma_px))
+    _report_calibration(output, *import_folder(rig_file, out, sigma_px))
 
 
 def _calibration_folder(rig_file: Path, out: Path | None, overwrite: bool) -> Path:
     folder = out or rig_file.parent / "calibration"
-    _require_place(folder, overwrite)
+    _require_writable(folder, overwrite)
     return folder
 
 
-def _require_place(folder: Path, overwrite: bool) -> None:
-    """That a calibration can be written there: now, not after minutes of work."""
+def _require_writable(folder: Path, overwrite: bool) -> None:
+    """Raise BadInput if no calibration can be written there: now, not after minutes of work."""
     from bodyscan.registration.storage import refuse_existing
 
     require_writable(folder)
     refuse_existing(folder, overwrite)
 
 
-def _say_calibration(output: Output, found: RigCalibration, saved: Path) -> None:
+def _report_calibration(output: Output, found: RigCalibration, saved: Path) -> None:
     from bodyscan.cli import tables
 
     output.notes(found.notes)
@@ -139,7 +139,7 @@ def _say_calibration(output: Output, found: RigCalibration, saved: Path) -> None
         output.show(tables.calibration_table(found))
         output.figures(**tables.calibration_figures(found))
     output.say(*found.advice)
-    output.made("calibration", saved)
+    output.add_files("calibration", saved)
 
 
 def check_calibration(
@@ -161,7 +161,7 @@ def check_calibration(
     from bodyscan.workflows.check_rig import check_rig
 
     if repair is not None:
-        _require_place(repair, overwrite)
+        _require_writable(repair, overwrite)
     rig = load_calibration(calibration)
     with output.stages() as progress:
         found = check_rig(rig, folders, progress, follow_links=follow_links)
@@ -170,7 +170,7 @@ def check_calibration(
     if repair is not None:
         repaired = found.repair(rig)
         archive_previous(repair)
-        output.made("repaired", save_calibration(repaired, repair))
+        output.add_files("repaired", save_calibration(repaired, repair))
     output.exit_code = 0 if found.valid else 1
 
 
@@ -180,9 +180,9 @@ def accept_changed(output: Output, calibration: CalibrationArgument) -> None:
 
     accepted = accept_calibration(calibration)
     if accepted is None:
-        output.say("nothing was changed since it was stored: there is nothing to accept")
+        output.say("the calibration was not edited: there is nothing to accept")
     else:
-        output.made("calibration", accepted)
+        output.add_files("calibration", accepted)
 
 
 def refine_rig(
@@ -199,7 +199,7 @@ def refine_rig(
     from bodyscan.registration.storage import archive_previous, load_calibration, save_calibration
     from bodyscan.workflows.refine_rig import refine_rig as refine
 
-    _require_place(out, overwrite)
+    _require_writable(out, overwrite)
     rig = load_calibration(calibration)
     with output.stages() as progress:
         found = refine(rig, open_scan(rig.rig, folder), folder.name, progress)
@@ -207,7 +207,7 @@ def refine_rig(
     saved = save_calibration(found.value, out)
     output.failures(found.failures, "left out")
     output.say(*found.notes)
-    output.made("calibration", saved)
+    output.add_files("calibration", saved)
 
 
 def sigma_map(
@@ -217,10 +217,10 @@ def sigma_map(
         Path | None, typer.Option(help="Default: `sigma-map.png` beside the calibration.")
     ] = None,
 ) -> None:
-    """Draw how well the poses of the pairs determine each place of the scan volume."""
+    """Map the sigma that the poses of the pairs cause in the scan volume."""
     from bodyscan.report.sigma_map import write_sigma_map
 
-    output.made("picture", write_sigma_map(calibration, out))
+    output.add_files("picture", write_sigma_map(calibration, out))
 
 
 def export_rig(
@@ -241,5 +241,5 @@ def export_rig(
     require_writable(out)
     written = write(load_calibration(calibration), out, formats.split(","))
     for path in written.value:
-        output.made("rig", path)
-    output.told(written)
+        output.add_files("rig", path)
+    output.report(written)

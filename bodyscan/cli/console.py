@@ -1,4 +1,4 @@
-"""What a command tells of its work: to a person as text, to another program as one JSON document.
+"""Report a command's work: to a person as text, to another program as one JSON document.
 
 Text and documents go to standard output, errors and progress to standard error.  A command is a
 function whose first parameter is its `Output`; `add_command` gives it the options that all share.
@@ -39,14 +39,11 @@ if TYPE_CHECKING:
 # Tables keep their lines whole when the output goes into a file.
 CONSOLE = Console(width=None if sys.stdout.isatty() or "COLUMNS" in os.environ else 120)
 ERRORS = Console(stderr=True)
-MOST_NOTES = 20  # are shown without --verbose, the first line of each
-WIDEST = 10_000  # columns: no table is as wide
-STYLES = {"good": "green", "usable": "yellow", "bad": "red"}
 
 
 @dataclass
 class Output:
-    """Collects what was made and what has to be said of it; shows it as it comes, or as JSON.
+    """Collects files, findings and figures; shows them as they come, or as JSON.
 
     exit_code: 1 where the work came to its end but its result must not be used as it is.
     """
@@ -56,7 +53,7 @@ class Output:
     quiet: bool = False
     verbose: bool = False
     exit_code: int = 0
-    _made: dict[str, list[str]] = field(default_factory=dict)
+    _files: dict[str, list[str]] = field(default_factory=dict)
     _figures: dict[str, Any] = field(default_factory=dict)
     _lines: list[str] = field(default_factory=list)
     _notes: list[str] = field(default_factory=list)
@@ -71,19 +68,19 @@ class Output:
         """Whether nothing is shown to a person."""
         return self.json or self.quiet
 
-    def made(self, what: str, *paths: Path) -> None:
-        """Files or folders that were written."""
-        self._made.setdefault(what, []).extend(str(path) for path in paths)
+    def add_files(self, what: str, *paths: Path) -> None:
+        """Report files or folders that were written."""
+        self._files.setdefault(what, []).extend(str(path) for path in paths)
         self._print(f"{what}: {', '.join(map(str, paths))}")
 
     def say(self, *lines: str, wrong: bool = False) -> None:
-        """Findings in words; `wrong`: --quiet shows them too, for they are why the command fails."""
+        """Report findings; `wrong`: --quiet shows them too, because they are why the command fails."""
         self._lines += lines
         for line in lines:
             self._print(line, wrong=wrong)
 
     def show(self, *tables: RenderableType) -> None:
-        """Tables, which --json leaves to `figures`."""
+        """Show tables, which --json leaves to `figures`."""
         if not self.silent:
             CONSOLE.print(*map(_fitting, tables), sep="\n")
 
@@ -92,41 +89,45 @@ class Output:
         self._figures |= values
 
     def notes(self, notes: Iterable[str], what: str = "note") -> None:
-        """What a person should know; without --verbose the first line of the first few."""
+        """Report notes; without --verbose the first line of the first 20."""
         every = list(notes)
         self._notes += every
-        for note in every if self.verbose else every[:MOST_NOTES]:
+        for note in every if self.verbose else every[:20]:
             shown = note if self.verbose else note.partition("\n")[0]
             self._print(f"{what}: {shown}", style="yellow")
-        if len(every) > MOST_NOTES and not self.verbose:
-            self._print(f"and {len(every) - MOST_NOTES} more: see --verbose", style="yellow")
+        if len(every) > 20 and not self.verbose:
+            self._print(f"and {len(every) - 20} more: see --verbose", style="yellow")
 
     def failures(self, failures: Mapping[str, str], what: str = "failed") -> None:
-        """Pairs that were lost, with the reason."""
+        """Report pairs that were lost, with the reason."""
         self._failures |= failures
         parts = {name: reason.partition("\n") for name, reason in failures.items()}
-        for name, (said, _, _) in parts.items():
-            self._print(f"{what}: {name}: {said}", style="red")
+        for name, (reason, _, _) in parts.items():
+            self._print(f"{what}: {name}: {reason}", style="red")
         for remedy in dict.fromkeys(remedy for _, _, remedy in parts.values() if remedy):
             self._print(remedy, style="red")  # once, however many it would help
 
     def optional(self, what: str) -> AbstractContextManager[None]:
-        """For what the command's result stands without: a block that fails is a note."""
+        """Turn a failure of the block, whose work is not essential, into a note."""
         return optional(what, lambda line: self.notes([line]))
 
-    def told(self, outcome: Outcome[Any], what: str = "left out") -> None:
-        """Notes and failures of a step."""
+    def report(self, outcome: Outcome[Any], what: str = "left out") -> None:
+        """Report notes and failures of a step."""
         self.notes(outcome.notes)
         self.failures(outcome.failures, what)
 
     def verdict(self, verdict: Verdict) -> None:
         """A grade and its reasons."""
         self._verdict = verdict
-        self._print(str(verdict), style=STYLES[verdict.mark], wrong=verdict.mark == "bad")
+        self._print(
+            str(verdict),
+            style={"good": "green", "usable": "yellow", "bad": "red"}[verdict.mark],
+            wrong=verdict.mark == "bad",
+        )
 
     @contextmanager
     def stages(self) -> Iterator[StageClock]:
-        """A bar for the stages of the work, whose times --verbose shows."""
+        """Draw a bar for each stage of the work; --verbose shows their times."""
         from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
         from rich.progress import Progress as Bar
 
@@ -148,7 +149,7 @@ class Output:
         return {
             "command": self.command,
             "exit_code": error.exit_code if error else self.exit_code,
-            "made": self._made,
+            "made": self._files,
             "figures": _finite(self._figures),
             "lines": self._lines,
             "notes": self._notes,
@@ -226,15 +227,15 @@ class StageClock:
 
 
 def complain(text: str) -> None:
-    """An error, in red where NO_COLOR does not forbid it (which rich obeys)."""
+    """Print an error, in red unless NO_COLOR forbids it."""
     ERRORS.print(text, style="red", highlight=False, markup=False, soft_wrap=True)
 
 
 def _fitting(table: RenderableType) -> RenderableType:
-    """A table that is wider than the screen as a list of its rows: nobody reads folded numbers."""
+    """Turn a table that is wider than the screen into a list of rows: folded numbers are unreadable."""
     if not isinstance(table, Table):
         return table
-    whole = CONSOLE.options.update(max_width=WIDEST)
+    whole = CONSOLE.options.update(max_width=10_000)  # no table is as wide
     if Measurement.get(CONSOLE, whole, table).maximum <= CONSOLE.width:
         return table
     headings = [str(column.header) for column in table.columns]
@@ -248,7 +249,7 @@ def _fitting(table: RenderableType) -> RenderableType:
 
 
 def _finite(value: Any) -> Any:
-    """The same with None for what is no number: JSON has no NaN."""
+    """Replace NaN and infinity by None: JSON has neither."""
     if isinstance(value, Mapping):
         return {key: _finite(one) for key, one in value.items()}
     if isinstance(value, list | tuple):
@@ -259,11 +260,12 @@ def _finite(value: Any) -> Any:
 def add_command(app: typer.Typer, panel: str, function: Callable[..., None]) -> None:
     """Add `function` to the commands under its own name, with --json, --quiet and --verbose.
 
-    Its first parameter is the Output that it tells what it makes; the others are its options.
+    Its first parameter is the Output to which it reports; the others are its options.
     """
     name = function.__name__.rstrip("_").replace("_", "-")
-    _, *own = inspect.signature(function, eval_str=True).parameters.values()
-    parameters = [*(one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in own), *SHARED]
+    _, *options = inspect.signature(function, eval_str=True).parameters.values()
+    keywords = (one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in options)
+    parameters = [*keywords, *SHARED]
 
     @wraps(function)
     def run(*, json: bool, quiet: bool, verbose: bool, **given: Any) -> None:

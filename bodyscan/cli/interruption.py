@@ -1,8 +1,8 @@
-"""Ctrl-C ends a command at once, whatever it is in the middle of.
+"""End a command at once on Ctrl-C, whatever it is doing.
 
-Python hears of a signal between two of its own instructions, and libraries that mesh or solve stay
-away for many seconds, all threads of Python with them. So the work runs in a process of its own, and
-the one that the shell waits for only waits: it asks the other to end, and soon makes it.
+Python handles a signal between two of its own instructions, and libraries that mesh or solve block it
+for many seconds. So the work runs in a child process, and the parent, for which the shell waits,
+tells the child to end, and kills it after a second.
 """
 
 from __future__ import annotations
@@ -17,22 +17,16 @@ from types import FrameType
 from typing import NoReturn
 
 STOPPED = 130  # as shells have it: 128 + SIGINT
-GRACE_S = 1.0  # for taking away what is half written
-LOOK_S = 0.02
+STOP_SIGNAL = signal.SIGUSR1
+"""Stops the child: COLMAP, where it is imported, answers a SIGTERM with a stack trace."""
 
 
-ASKED = signal.SIGUSR1
-"""By which the child is asked: COLMAP, where it is imported, answers a SIGTERM with a stack trace."""
-ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-SHOW_CURSOR = "\x1b[?25h"
-
-
-class _Asked(Exception):
-    """Someone wants the command to end, by a signal of that number."""
+class _StopRequest(Exception):
+    """The command is to end, because of a signal of that number."""
 
 
 def run_interruptibly(work: Callable[[], int]) -> int:
-    """The exit code of `work`, run in a child; of a signal 128 and its number, and a line that says so.
+    """Run `work` in a child and return its exit code; after a signal, 128 and its number.
 
     It returns in the parent alone; the child ends with the code.
     """
@@ -40,27 +34,31 @@ def run_interruptibly(work: Callable[[], int]) -> int:
         return work()
     sys.stdout.flush()
     sys.stderr.flush()
-    heard = [number for number in ENDING if signal.getsignal(number) != signal.SIG_IGN]
+    heard = [
+        number
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+        if signal.getsignal(number) != signal.SIG_IGN
+    ]
     for number in heard:
-        signal.signal(number, _ask)
+        signal.signal(number, _raise_request)
     parent = os.getpid()
     child = os.fork()
     if child == 0:
         _work(work, parent)
     try:
         return _code(os.waitpid(child, 0)[1])
-    except _Asked as asked:
+    except _StopRequest as request:
         for number in heard:
             signal.signal(number, signal.SIG_IGN)
         _stop(child)
-        return 128 + int(asked.args[0])
+        return 128 + int(request.args[0])
 
 
 def _work(work: Callable[[], int], parent: int) -> NoReturn:
-    """In the child: a Ctrl-C of the terminal reaches both, so only the parent's word counts."""
+    """Run in the child: a Ctrl-C of the terminal reaches both, so only the parent's signal counts."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    for number in (ASKED, signal.SIGTERM):
+    for number in (STOP_SIGNAL, signal.SIGTERM):
         signal.signal(number, _interrupt)
     _end_with(parent)
     try:
@@ -72,8 +70,7 @@ def _work(work: Callable[[], int], parent: int) -> NoReturn:
     with suppress(OSError):  # nobody reads it any more
         sys.stdout.flush()
         sys.stderr.flush()
-    # Without waiting for threads, of which nobody wants anything any more, and for Python to give back
-    # memory and modules one by one: half a second after a scan.
+    # Without waiting for threads, or for Python to free memory piece by piece: 0.5 s after a scan.
     os._exit(code)
 
 
@@ -81,31 +78,31 @@ def _code(status: int) -> int:
     code = os.waitstatus_to_exitcode(status)
     if code < 0:
         name = signal.Signals(-code).name
-        print(f"error: the work was ended by {name} (out of memory?)", file=sys.stderr)
+        print(f"error: the work was ended by {name} (possibly out of memory)", file=sys.stderr)
         return 128 - code
     return code
 
 
 def _stop(child: int) -> None:
-    """Asks the child to end, and ends it if it does not."""
-    os.kill(child, ASKED)
-    until = time.monotonic() + GRACE_S
+    """Tell the child to end, and kill it if it does not."""
+    os.kill(child, STOP_SIGNAL)
+    until = time.monotonic() + 1.0  # to remove what is half written
     while os.waitpid(child, os.WNOHANG)[0] == 0:
         if time.monotonic() > until:
             os.kill(child, signal.SIGKILL)
             os.waitpid(child, 0)
             _say_stopped()
             return
-        time.sleep(LOOK_S)
+        time.sleep(0.02)
 
 
 def _say_stopped() -> None:
-    cursor = SHOW_CURSOR if sys.stderr.isatty() else ""  # progress bars hide it
+    cursor = "\x1b[?25h" if sys.stderr.isatty() else ""  # progress bars hide it
     print(f"{cursor}stopped", file=sys.stderr, flush=True)
 
 
-def _ask(number: int, frame: FrameType | None) -> None:
-    raise _Asked(number)
+def _raise_request(number: int, frame: FrameType | None) -> None:
+    raise _StopRequest(number)
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:

@@ -73,9 +73,9 @@ def simulate(
     require_writable(out)
     if not overwrite and ((out / "captures").exists() or (out / "rig.yaml").exists()):
         raise BadInput(
-            "this folder holds captures already, which would be written over",
+            "this folder holds captures already, which would be overwritten",
             where=str(out),
-            remedy="give another --out, or say --overwrite",
+            remedy="give another --out, or --overwrite to replace them",
         )
     from bodyscan.simulation import settings_for
     from bodyscan.simulation import simulate as run
@@ -98,8 +98,8 @@ def simulate(
             board_shots=board_shots,
             progress=progress,
         )
-    output.made("captures", out / "captures")
-    output.made("rig file", out / "rig.yaml")
+    output.add_files("captures", out / "captures")
+    output.add_files("rig file", out / "rig.yaml")
 
 
 def evaluate(
@@ -169,7 +169,9 @@ def accept(
     captured = [*(spheres or ()), *(plate or ())]
     if bool(captured) == (simulate is not None):
         raise BadInput(
-            "both captures and --simulate" if captured else "there is nothing to measure",
+            "captures and --simulate exclude each other"
+            if captured
+            else "there is nothing to measure",
             remedy="give --spheres and --plate folders, or --simulate WORKSPACE",
         )
     if calibration is None and simulate is None:
@@ -192,9 +194,9 @@ def accept(
     output.notes([NO_STANDARD, *found.notes])
     output.notes(readings.problems, "problem")
     output.verdict(found.verdict)
-    output.made("figures", found.file)
+    output.add_files("figures", found.file)
     if found.page is not None:
-        output.made("report", found.page)
+        output.add_files("report", found.page)
     output.exit_code = 1 if found.verdict.grade == "not accepted" else 0
 
 
@@ -226,6 +228,6 @@ def reproduce(
             out, seed=seed, quick=quick, real_light=real_light, boards=boards, progress=progress
         )
     output.say(*text.splitlines())
-    output.made(
+    output.add_files(
         "written", *(out / name for name in (text_name(real_light), *figure_names(real_light)))
     )

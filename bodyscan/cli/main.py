@@ -33,10 +33,10 @@ for _group in (builder, operator, laboratory):
 
 def main() -> None:
     """Entry point: errors are printed without a traceback, 2 for bad input, 1 for failed work."""
-    # Work is shared out by stages, in threads of their own; BLAS threads inside them only get in
-    # each other's way (measured: 15 s instead of 1 s for twelve cameras on two cores).
+    # Stages run threads of their own; BLAS threads inside them get in each other's way (measured:
+    # 15 s instead of 1 s for twelve cameras on two cores).
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    # What OpenCV warns of, we say in our own words, with the place in the rig file.
+    # Our own errors say what OpenCV warns of, with the line of the rig file.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
     keep_freed_memory()
     collect_seldom()

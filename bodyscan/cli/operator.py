@@ -94,10 +94,10 @@ def scan(
     with output.optional("table"):
         output.show(tables.scan_table(found))
         output.figures(**tables.scan_figures(found))
-    output.made("result", saved)
+    output.add_files("result", saved)
     output.notes(found.notes)
     output.notes(pictures.notes)
-    output.made("pictures", *pictures.value)
+    output.add_files("pictures", *pictures.value)
     output.verdict(found.verdict)
     output.exit_code = 1 if found.verdict.grade == "repeat" else 0
     if e57:
@@ -111,7 +111,7 @@ def scan(
             subject=facts["subject"],
             calibration_id=facts["calibration_id"],
         )
-        output.made("raw clouds", out / "raw.e57")
+        output.add_files("raw clouds", out / "raw.e57")
 
 
 def report(
@@ -132,7 +132,7 @@ def report(
 
     path, verdict = write_report(result, out, compare)
     output.verdict(verdict)
-    output.made("report", path)
+    output.add_files("report", path)
 
 
 def measure(
@@ -166,7 +166,7 @@ def measure(
     write_json(path, content)
     output.show(*tables(measured))
     output.figures(**content)
-    output.made("measurements", path)
+    output.add_files("measurements", path)
 
 
 def export(
@@ -199,7 +199,7 @@ def export(
             refuse_repeat(result, stored.facts)
         written = export_scan(stored, folder, formats.split(","), deface=deface, frame=frame)
     for path in written:
-        output.made("export", path)
+        output.add_files("export", path)
 
 
 def batch(
@@ -236,7 +236,7 @@ def batch(
 
     With --json each event is printed as a line of JSON when it happens; the last one is the summary.
     """
-    from bodyscan.jobs.discovery import find_jobs
+    from bodyscan.jobs.job import find_jobs
     from bodyscan.jobs.object_storage import Store, find_stored_jobs, is_url
     from bodyscan.jobs.pipeline import load_pipeline
     from bodyscan.jobs.stages import KINDS, stages_until
@@ -257,8 +257,8 @@ def batch(
     fuses = settings.kind == "fuse"
     if explain or not (is_url(scans) and is_url(out)) or (fuses and not is_url(calibration or "")):
         raise BadInput(
-            "of scans, output and calibration either all lie in object storage or none; "
-            "--explain is for folders",
+            "scans, output and calibration are either all in object storage or none; "
+            "--explain works on folders only",
             where=f"{scans}, {out}, {calibration}",
             remedy="give a URL to each of --scans, --out and --calibration",
         )
@@ -278,8 +278,8 @@ def _explain(output: Output, jobs: Sequence[Job], stages: Sequence[Stage]) -> No
         for job, steps in zip(jobs, pool.map(lambda job: plan(job, stages), jobs), strict=True):
             for step in steps:
                 run = "will run" if step.certain else "may run"
-                said = f"{run}: {step.why}" if step.why else "up to date"
-                output.say(printable(f"{job.name}: {step.stage}: {said}"))
+                action = f"{run}: {step.why}" if step.why else "up to date"
+                output.say(printable(f"{job.name}: {step.stage}: {action}"))
 
 
 def _run(
@@ -291,15 +291,15 @@ def _run(
     store: Store | None = None,
 ) -> None:
     """The exit code is 1 if a job was set aside, or a scan has to be repeated."""
-    from bodyscan.jobs import allocation, display, object_storage
-    from bodyscan.jobs.batch import finish, run_batch, run_locally
+    from bodyscan.jobs import batch as batches
+    from bodyscan.jobs import display, object_storage
     from bodyscan.jobs.cluster import run_on_cluster
     from bodyscan.jobs.supervision import supervise_job
 
     output.tell_events()
     resources = jobs[0].pipeline.resources
-    shares = allocation.allocate(
-        resources, len(jobs), workers, allocation.cores(), allocation.free_memory_mb()
+    shares = batches.allocate(
+        resources, len(jobs), workers, batches.cores(), batches.free_memory_mb()
     )
     work = partial(object_storage.work_on_stored, store=store) if store else supervise_job
     with _listening(output, display.screen) as listen:
@@ -307,11 +307,11 @@ def _run(
             run = run_on_cluster(cluster, resources.threads, listen=listen, work=work)
         else:
             listen({"event": "shares", **asdict(shares)})
-            run = run_locally(shares, listen=listen, work=work)
-        outcomes = run_batch(jobs, out, run, listen)
+            run = batches.run_locally(shares, listen=listen, work=work)
+        outcomes = batches.run_batch(jobs, out, run, listen)
         if store:
             object_storage.fetch_figures(jobs, store)
-        summary = finish(jobs, outcomes, out)
+        summary = batches.finish(jobs, outcomes, out)
         if store:
             summary |= {"table": object_storage.put_summary(out, store)}
         listen(summary)
@@ -322,7 +322,7 @@ def _run(
 def _listening(
     output: Output, usual: Callable[[], AbstractContextManager[Listen]]
 ) -> Iterator[Listen]:
-    """What shows how jobs go; the process ends at once when it is interrupted."""
+    """Show how jobs go; the process ends at once when it is interrupted."""
     from bodyscan.jobs import display
 
     show = display.json_lines if output.json else display.silence if output.quiet else usual
@@ -425,21 +425,21 @@ def forget(
     found = forgetting.find_subject(subject, workspace)
     if not dry_run:
         if not yes and (found.files or found.rows):
-            _ask(f"{len(found.files)} files of {subject}", workspace)
+            _confirm_removal(f"{len(found.files)} files of {subject}", workspace)
         found = forgetting.forget_subject(subject, workspace)
     verb = "would remove" if dry_run else "removed"
     output.say(*(f"{verb} {printable(str(path))}" for path in found.files))
-    output.notes((printable(str(path)) for path in found.unreadable), "cannot tell whose")
+    output.notes((printable(str(path)) for path in found.unreadable), "owner unknown")
     output.figures(files=len(found.files), removed=not dry_run)
     output.say(f"{verb} {len(found.files)} files of {subject}")
 
 
-def _ask(what: str, workspace: Path) -> None:
-    """Go on only if a person says yes; a pipe's answer may be meant for something else."""
+def _confirm_removal(what: str, workspace: Path) -> None:
+    """Ask on the terminal, and abort unless the answer is yes; a pipe's input may not be an answer."""
     if sys.stdin is None or not sys.stdin.isatty():  # None: closed
         raise BadInput(
-            f"nobody can be asked whether to remove {what} for good: there is no terminal",
+            f"removing {what} for good needs a confirmation, and there is no terminal",
             where=str(workspace),
-            remedy="add --yes to remove them, or --dry-run to see which they are",
+            remedy="add --yes to remove them, or --dry-run to list them",
         )
     typer.confirm(f"remove {what} for good?", abort=True, err=True)

@@ -41,8 +41,8 @@ def calibration_table(calibration: RigCalibration) -> Table:
         table.add_column(heading, justify="left" if heading == "pair" else "right")
     for name, pair in calibration.pairs.items():
         quality = pair.quality
-        place = calibration.rig_from_camera[name].translation
-        sigma = position_sigma(calibration.covariance, name, place)
+        position = calibration.rig_from_camera[name].translation
+        sigma = position_sigma(calibration.covariance, name, position)
         table.add_row(
             name,
             "-" if quality.corners_rms_px is None else f"{quality.corners_rms_px:.3f}",
@@ -53,7 +53,7 @@ def calibration_table(calibration: RigCalibration) -> Table:
             f"{quality.stripes_calibrated} of {quality.stripes_projected}"
             if pair.sheets is not None
             else "-",
-            " ".join(f"{value:.1f}" for value in place),
+            " ".join(f"{value:.1f}" for value in position),
             "not known" if quality.unjudged else " ".join(f"{value:.3f}" for value in sigma),
         )
     for name in calibration.failed:
@@ -95,8 +95,8 @@ def scan_table(scan: Scan) -> Table:
     table.add_row("of its surface filled", f"{100.0 * surface.filled_share:.1f} %")
     covered = compute_cover_shares(cloud.regions)
     if covered:
-        told = ", ".join(f"{name} {100.0 * share:.1f} %" for name, share in covered.items())
-        table.add_row("of the points no skin", told)
+        shares = ", ".join(f"{name} {100.0 * share:.1f} %" for name, share in covered.items())
+        table.add_row("points not on skin", shares)
     if scan.alignment is not None:
         before, after = scan.alignment.rms_before_mm, scan.alignment.rms_after_mm
         table.add_row("overlaps before, after alignment", f"{before:.3f}, {after:.3f} mm RMS")

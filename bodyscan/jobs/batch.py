@@ -1,16 +1,17 @@
-"""Many jobs: a lock on the output folder, jobs side by side, events, and the final state."""
+"""Many jobs: how many at once, a lock on the output folder, events, and the final state."""
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import asdict
+from contextlib import suppress
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from bodyscan.errors import BadInput, BodyscanError, FailedWork
 from bodyscan.files.atomic import lock_file, restrict_to_owner
-from bodyscan.jobs.allocation import Allocation
 from bodyscan.jobs.job import BATCH_LOCK, STAGE, Job, write_job
 from bodyscan.jobs.supervision import (
     COMMAND,
@@ -20,6 +21,7 @@ from bodyscan.jobs.supervision import (
     ignore_events,
     supervise_job,
 )
+from bodyscan.settings import Resources
 
 Run = Callable[[Sequence[Job]], Iterator[JobResult]]
 """Starts jobs and yields each result as soon as the job ends."""
@@ -53,13 +55,13 @@ def run_batch(
                 except (BodyscanError, OSError) as error:
                     outcomes[job.name] = JobResult(job.name, "set aside", reason=str(error))
             for outcome in outcomes.values():
-                _tell(outcome, listen)
+                _report(outcome, listen)
             since = time.monotonic()
             waiting = {job.name for job in ready if not (job.folder / job.until / STAGE).exists()}
             for outcome in run(ready):
                 outcomes[outcome.job] = outcome
                 waiting.discard(outcome.job)
-                _tell(outcome, listen)
+                _report(outcome, listen)
                 left = seconds_left(list(outcomes.values()), waiting, time.monotonic() - since)
                 ended = {"ended": len(outcomes), "jobs": len(jobs), "seconds_left": left}
                 listen({"event": "progress", **ended})
@@ -109,7 +111,7 @@ def sweep(out: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def _tell(outcome: JobResult, listen: Listen) -> None:
+def _report(outcome: JobResult, listen: Listen) -> None:
     listen({"event": "job", **asdict(outcome)})
 
 
@@ -119,9 +121,9 @@ def finish(jobs: Sequence[Job], outcomes: Sequence[JobResult], out: Path) -> dic
     Raises FailedWork if they cannot be written.
     """
     from bodyscan.jobs.summary import (
-        drifted,
-        odd_stature,
-        to_repeat,
+        find_drift,
+        find_odd_stature,
+        scans_to_repeat,
         write_out_manifest,
         write_summary,
     )
@@ -134,7 +136,7 @@ def finish(jobs: Sequence[Job], outcomes: Sequence[JobResult], out: Path) -> dic
         raise FailedWork(
             f"the summary cannot be written: {error.strerror}",
             where=str(out),
-            remedy="make room, then start the same batch again: what is done stays done",
+            remedy="make room, then start the same batch again: jobs that are done stay done",
         ) from error
     aside = [outcome.job for outcome in outcomes if outcome.state != "done"]
     done = [job for job in jobs if job.name not in aside]
@@ -144,8 +146,56 @@ def finish(jobs: Sequence[Job], outcomes: Sequence[JobResult], out: Path) -> dic
         "done": len(jobs) - len(aside),
         "ran": sum(bool(outcome.stages) for outcome in outcomes),
         "set_aside": aside,
-        "repeat": to_repeat(done),
-        "drifted": {one.pair: round(one.shift_mm, 2) for one in drifted(done)},
-        "odd_stature_mm": odd_stature(done),
+        "repeat": scans_to_repeat(done),
+        "drifted": {one.pair: round(one.shift_mm, 2) for one in find_drift(done)},
+        "odd_stature_mm": find_odd_stature(done),
         "table": str(table),
     }
+
+
+@dataclass(frozen=True)
+class Allocation:
+    """workers: jobs at the same time. threads: per job. why: what limits them, in words."""
+
+    workers: int
+    threads: int
+    why: str
+
+
+def allocate(
+    resources: Resources, jobs: int, workers: int | None, cores: int, memory_mb: float
+) -> Allocation:
+    """Choose as many jobs at once as cores and memory allow, but no more than there are.
+
+    workers: a number requested by the user; more workers get fewer threads each, but never more
+        memory than there is.
+    """
+    by_memory = max(1, int(memory_mb // resources.memory_mb))
+    wanted = workers or max(1, cores // resources.threads)
+    count = max(1, min(wanted, by_memory, jobs))
+    threads = max(1, min(resources.threads, cores // count))
+    why = f"{cores} cores, {memory_mb / 1000.0:.1f} GB free"
+    if count == by_memory < min(wanted, jobs):
+        why += f"; memory limits them, a job takes {resources.memory_mb / 1000.0:g} GB"
+    return Allocation(count, threads, why)
+
+
+def cores() -> int:
+    """Number of cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def free_memory_mb() -> float:
+    """Memory that is free on the machine, or left to this container, in MB (1e6 bytes)."""
+    free = [float("inf")]
+    with suppress(OSError, ValueError):
+        for line in Path("/proc/meminfo").read_text("ascii").splitlines():
+            if line.startswith("MemAvailable:"):
+                free.append(int(line.split()[1]) * 1024 / 1e6)
+    with suppress(OSError, ValueError):
+        group = Path("/sys/fs/cgroup")
+        limit = int((group / "memory.max").read_text("ascii"))
+        free.append((limit - int((group / "memory.current").read_text("ascii"))) / 1e6)
+    return min(free) if len(free) > 1 else 4000.0

@@ -16,8 +16,6 @@ from bodyscan.jobs.batch import Run, Work
 from bodyscan.jobs.job import Job
 from bodyscan.jobs.supervision import JobProcess, JobResult, Listen, ignore_events
 
-_TIMEOUT_S = 20
-
 
 def run_on_cluster(
     address: str,
@@ -44,8 +42,8 @@ def run_on_cluster(
 
     def run(jobs: Sequence[Job]) -> Iterator[JobResult]:
         try:
-            client = Client(address, timeout=_TIMEOUT_S, set_as_default=False)
-            client.wait_for_workers(1, timeout=_TIMEOUT_S)
+            client = Client(address, timeout=20, set_as_default=False)
+            client.wait_for_workers(1, timeout=20)
         except (OSError, ValueError) as error:
             raise FailedWork(
                 f"no dask scheduler with a worker answers ({error})",

@@ -17,13 +17,10 @@ from rich.text import Text
 from bodyscan.jobs.supervision import Listen
 from bodyscan.verdict import LEFT_OUT, MARKS
 
-_STYLES = {"good": "green", "usable": "yellow", "bad": "red"}
-
 
 @contextmanager
 def json_lines() -> Iterator[Listen]:
-    """Print every event as a line of JSON on standard
-    output, with the time (seconds since 1970)."""
+    """Print every event as a line of JSON on standard output, with the time (seconds since 1970)."""
     lock = threading.Lock()
 
     def listen(event: dict[str, Any]) -> None:
@@ -56,7 +53,7 @@ def screen() -> Iterator[Listen]:
 
 @contextmanager
 def lines() -> Iterator[Listen]:
-    """Print a line per scan as soon as its points tell how good it is, one for its verdict, and one
+    """Print a line per scan as soon as its points are judged, one for its verdict, and one
     when its job has ended."""
     console = Console()
 
@@ -90,17 +87,17 @@ class _Screen:
 
     def _shares(self, event: dict[str, Any]) -> None:
         jobs = "job" if event["workers"] == 1 else "jobs"
-        said = f"{event['workers']} {jobs} at a time, {event['threads']} threads each"
-        self._bars.console.print(Text(f"{said} ({event['why']})", style="dim"), soft_wrap=True)
+        text = f"{event['workers']} {jobs} at a time, {event['threads']} threads each"
+        self._bars.console.print(Text(f"{text} ({event['why']})", style="dim"), soft_wrap=True)
 
     def _summary(self, event: dict[str, Any]) -> None:
         aside = len(event["set_aside"])
-        said = f"{event['done']} of {event['jobs']} jobs done ({event['ran']} of them now)"
-        said += f", {aside} set aside" if aside else ""
-        said += f"\nto be scanned again: {', '.join(event['repeat'])}" if event["repeat"] else ""
-        said += _drift_text(event["drifted"])
-        said += _stature_text(event["odd_stature_mm"])
-        self._bars.console.print(Text(f"{said}\ntable: {event['table']}"), soft_wrap=True)
+        text = f"{event['done']} of {event['jobs']} jobs done ({event['ran']} of them now)"
+        text += f", {aside} set aside" if aside else ""
+        text += f"\nto be scanned again: {', '.join(event['repeat'])}" if event["repeat"] else ""
+        text += _drift_text(event["drifted"])
+        text += _stature_text(event["odd_stature_mm"])
+        self._bars.console.print(Text(f"{text}\ntable: {event['table']}"), soft_wrap=True)
 
     def _progress(self, event: dict[str, Any]) -> None:
         if self._all is not None:
@@ -140,11 +137,14 @@ class _Screen:
 def _verdict_text(event: dict[str, Any]) -> Text:
     """A scan's verdict with its worst reason, and every other pair that was lost."""
     grade = event["grade"] if event["final"] else f"{event['grade']} so far"
-    said = ": ".join([event["job"], grade, *event["reasons"][:1]])
+    text = ": ".join([event["job"], grade, *event["reasons"][:1]])
     others = [reason for reason in event["reasons"][1:] if reason.startswith(LEFT_OUT)]
     lost = ", ".join(reason.removeprefix(LEFT_OUT).partition(": ")[0] for reason in others)
-    said += f"\n  also left out: {lost}" if lost else ""
-    return Text(said, style=_STYLES[MARKS.get(event["grade"], "bad")])
+    text += f"\n  also left out: {lost}" if lost else ""
+    return Text(
+        text,
+        style={"good": "green", "usable": "yellow"}.get(MARKS.get(event["grade"], "bad"), "red"),
+    )
 
 
 def _kept_text(event: dict[str, Any]) -> Text:
@@ -173,8 +173,9 @@ def _stature_text(median_mm: float | None) -> str:
     if median_mm is None:
         return ""
     return (
-        f"\nthe median person of these scans is {median_mm:.0f} mm tall, as no nation's grown-ups are: "
-        "unless they are children, is square_mm right in the rig file, is the floor where z = 0 is?"
+        f"\nthe median stature of these scans is {median_mm:.0f} mm, which no nation's adults have. "
+        "Possible causes: they are children; square_mm is wrong in the rig file; the floor is not at "
+        "z = 0"
     )
 
 
@@ -183,8 +184,8 @@ def _drift_text(drifted: dict[str, float]) -> str:
     if not drifted:
         return ""
     name, mm = next(iter(drifted.items()))
-    more = f", {len(drifted) - 1} more likewise" if len(drifted) > 1 else ""
+    more = f", and {len(drifted) - 1} more" if len(drifted) > 1 else ""
     return (
-        f"\nevery scan moves pair {name} by {mm:.1f} mm the same way{more}: no sway does; the rig or "
-        "its cameras changed since the calibration, calibrate again"
+        f"\npair {name}{more}: alignment moves it by {mm:.1f} mm in the same direction in every scan, "
+        "which sway does not explain: the rig has changed since the calibration, calibrate again"
     )

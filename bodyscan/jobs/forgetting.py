@@ -48,7 +48,7 @@ class SubjectFiles:
 
 
 def find_subject(subject: str, workspace: Path) -> SubjectFiles:
-    """What `forget_subject` would remove. Raises BadInput if the workspace is not a folder."""
+    """Find what `forget_subject` would remove. Raises BadInput if the workspace is not a folder."""
     if not workspace.is_dir():
         raise BadInput("there is no such folder", where=str(workspace), remedy="check --workspace")
     files: list[Path] = []
@@ -56,8 +56,8 @@ def find_subject(subject: str, workspace: Path) -> SubjectFiles:
     tables: list[Path] = []
     unreadable: list[Path] = []
     for folder, names, owner in _walk(workspace, None, unreadable):
-        own = set(names) if owner == subject else _exports(folder, names, subject)
-        files += (folder / name for name in own)
+        found = set(names) if owner == subject else _exports(folder, names, subject)
+        files += (folder / name for name in found)
         if owner == subject and folder != workspace:
             folders.append(folder)
         if BATCH_LOCK in names and owner is None:
@@ -127,13 +127,13 @@ def _subject(path: Path) -> str | None:
 
 def _exports(folder: Path, names: list[str], subject: str) -> set[str]:
     """The subject's exports in a folder of no one or another subject, with their JSON files."""
-    own: set[str] = set()
+    found: set[str] = set()
     for name in names:
         if name.endswith(".json") and name.removesuffix(".json") in names:
             with suppress(OSError, ValueError):
                 if _subject(folder / name) == subject:
-                    own |= {name, name.removesuffix(".json")}
-    return own
+                    found |= {name, name.removesuffix(".json")}
+    return found
 
 
 def _rank(name: str) -> int:

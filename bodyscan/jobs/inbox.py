@@ -22,17 +22,9 @@ from bodyscan.files.hashing import list_files
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.templates import ANYTHING, fill
 
-DONE = "done"
-SHOT = "s01"
 SETTLED_S = 0.5
 """An image without an end mark is whole when it has not grown for this long: camera drivers write a
 file in one go, in hundredths of a second."""
-
-_ENDS = {".png": b"IEND\xaeB`\x82", ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
-"""The last bytes of a complete file."""
-
-
-_LOSSLESS = (".png", ".tif", ".tiff", ".bmp", ".pgm")
 
 
 @dataclass(frozen=True)
@@ -45,7 +37,7 @@ class Arrival:
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _File:
     size: int
     changed_ns: int
     since_s: float
@@ -53,22 +45,23 @@ class _Seen:
 
 
 def put_image(
-    inbox: Path, rig: Rig, scan: str, pair: str, frame: str, image: Bytes, *, shot: str = SHOT
+    inbox: Path, rig: Rig, scan: str, pair: str, frame: str, image: Bytes, *, shot: str = "s01"
 ) -> Path:
     """Write an image from memory to where `watch` expects that frame; returns its path.
 
-    image: (height, width) uint8 or uint16. The file appears complete or not at all. Raises BadInput
-        for
-    a pair, or a template of `files`, that yields no image name.
+    image: (height, width) uint8 or uint16. The file appears complete or not at all.
+
+    Raises BadInput for a pair, or a template of `files`, that yields no image name.
     """
-    if pair not in {own.name for own in rig.pairs}:
+    if pair not in {one.name for one in rig.pairs}:
         raise BadInput(f"rig {rig.name} has no pair {pair}", where=f"scan {scan}, frame {frame}")
     name = fill(rig.files, shot=shot, pair=pair, frame=frame)
-    if ANYTHING in name or Path(name).suffix.lower() not in _LOSSLESS:
+    lossless = (".png", ".tif", ".tiff", ".bmp", ".pgm")
+    if ANYTHING in name or Path(name).suffix.lower() not in lossless:
         raise BadInput(
             f"`files` is {rig.files}, by which no image can be written",
             where=f"rig {rig.name}",
-            remedy=f"calibrate with a template that has no * and ends in one of {_LOSSLESS}",
+            remedy=f"calibrate with a template that has no * and ends in one of {lossless}",
         )
     path = Path(inbox) / scan / name
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -82,11 +75,11 @@ class IncomingScan:
 
     def __init__(self, folder: Path, rig: Rig) -> None:
         self.folder, self.rig = folder, rig
-        self._files: dict[Path, _Seen] = {}
+        self._files: dict[Path, _File] = {}
         self._changed_s: float | None = None
 
     def look(self, now_s: float, quiet_s: float) -> Arrival:
-        """What is there now.
+        """Look at what is there now.
 
         now_s: of a monotonic clock.
         quiet_s: a scan to which nothing was added for this long is taken as it is.
@@ -99,25 +92,25 @@ class IncomingScan:
             sequences = ()  # nothing yet, or an error that the scan itself will report
         striped = [sequence for sequence in sequences if sequence.has_stripes]
         whole = {sequence.pair for sequence in striped if self._is_whole(sequence, now_s)}
-        all_there = bool(whole) and self._expected(striped) <= whole
+        all_there = bool(whole) and self._expected_pairs(striped) <= whole
         complete = all_there or self._is_marked() or now_s - self._changed_s >= quiet_s
         return Arrival(tuple(sorted(whole)), complete)
 
-    def _expected(self, striped: list[ImageSequence]) -> set[str]:
+    def _expected_pairs(self, striped: list[ImageSequence]) -> set[str]:
         """Pairs to expect: those in captures.yaml, or all that have a projector."""
         if (self.folder / CAPTURES).exists():
             return {sequence.pair for sequence in striped}
         return {pair.name for pair in self.rig.pairs if pair.projector is not None}
 
     def _is_marked(self) -> bool:
-        return (self.folder / DONE).exists()
+        return (self.folder / "done").exists()
 
     def _is_whole(self, sequence: ImageSequence, now_s: float) -> bool:
         if sequence.missing:
             return False
-        seen = [self._files[path] for path in sequence.paths if path in self._files]
-        settled = [own.whole or now_s - own.since_s >= SETTLED_S for own in seen]
-        return len(seen) == len(sequence.paths) and all(settled)
+        there = [self._files[path] for path in sequence.paths if path in self._files]
+        whole = [one.whole or now_s - one.since_s >= SETTLED_S for one in there]
+        return len(there) == len(sequence.paths) and all(whole)
 
     def _look_for_changes(self, now_s: float) -> bool:
         """Check every file in the folder; returns whether one came, went or changed."""
@@ -128,17 +121,17 @@ class IncomingScan:
             except OSError:
                 continue
             stamp = (found.st_size, found.st_mtime_ns)
-            seen = before.get(path)
-            if seen is None or stamp != (seen.size, seen.changed_ns):
-                seen = _Seen(*stamp, now_s, _ends_as_it_should(path, found.st_size))
-            self._files[path] = seen
+            known = before.get(path)
+            if known is None or stamp != (known.size, known.changed_ns):
+                known = _File(*stamp, now_s, _has_end_mark(path, found.st_size))
+            self._files[path] = known
         return before != self._files
 
 
-def _ends_as_it_should(path: Path, size: int) -> bool:
-    """Whether the file's last bytes show that it is complete;
-    False for formats without an end mark."""
-    end = _ENDS.get(path.suffix.lower())
+def _has_end_mark(path: Path, size: int) -> bool:
+    """Whether the last bytes show that the file is complete; False for formats without an end mark."""
+    ends = {".png": b"IEND\xaeB`\x82", ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
+    end = ends.get(path.suffix.lower())
     if end is None or size < len(end) or not path.is_file():
         return False
     try:

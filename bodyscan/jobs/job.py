@@ -1,4 +1,4 @@
-"""One job: a folder that holds what to do (job.json), its state, its log and its results."""
+"""A job: its folder with job.json, state, log and results; and the jobs of a folder of scans."""
 
 from __future__ import annotations
 
@@ -10,19 +10,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from bodyscan.captures.captures_file import FILE_NAME as CAPTURES
 from bodyscan.errors import BadInput, ResultError
 from bodyscan.files.atomic import write_json
 from bodyscan.files.hashing import list_relative_files
+from bodyscan.files.yaml_file import YamlError, read_yaml
 from bodyscan.jobs.pipeline import Pipeline
 
-SCHEMA, VERSION = "bodyscan-job", 1
 JOB, STATE, LOG, LOCK, MANIFEST = "job.json", "state.json", "log.txt", "lock", "manifest.json"
 KEPT = "kept-"  # begins the name of a folder with what people added to a result that is gone
 STAGE = "stage.json"  # in every stage's folder: what it was made from, and its hashes
 SUMMARY, BATCH_LOCK = "summary.csv", "batch.lock"
-
-_PLAIN = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")
-_TAKEN = {MANIFEST, SUMMARY, BATCH_LOCK}
 
 
 @dataclass(frozen=True)
@@ -46,11 +44,13 @@ class Job:
 
 
 def job_name(folder_name: str) -> str:
-    """A job's name from that of its scan's folder: unchanged, or its plain letters and a hash.
+    """Derive a job's name from that of its scan's folder: unchanged, or its plain letters and a hash.
 
     A name with quotes, line breaks or other alphabets thus is safe in every file system and table.
     """
-    if _PLAIN.fullmatch(folder_name) and folder_name not in _TAKEN:
+    reserved = (MANIFEST, SUMMARY, BATCH_LOCK)
+    plain_name = re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}", folder_name)
+    if plain_name and folder_name not in reserved:
         return folder_name
     plain = re.sub(r"[^A-Za-z0-9]+", "-", folder_name).strip("-")[:40] or "scan"
     return f"{plain}-{hashlib.sha256(os.fsencode(folder_name)).hexdigest()[:8]}"
@@ -71,8 +71,8 @@ def write_job(job: Job) -> None:
     write_json(
         job.folder / JOB,
         {
-            "schema": SCHEMA,
-            "version": VERSION,
+            "schema": "bodyscan-job",
+            "version": 1,
             "name": job.name,
             "source": os.path.relpath(job.source, job.folder),
             "calibration": job.calibration and os.path.relpath(job.calibration, job.folder),
@@ -91,8 +91,8 @@ def read_job(folder: Path) -> Job:
         return Job(
             content["name"],
             folder,
-            _there(folder, content["source"]),
-            _there(folder, calibration) if calibration else None,
+            _resolve(folder, content["source"]),
+            _resolve(folder, calibration) if calibration else None,
             Pipeline.model_validate_json(json.dumps(content["pipeline"])),
             content["until"],
             content["subject"],
@@ -106,7 +106,7 @@ def read_job(folder: Path) -> Job:
 
 
 def read_record(path: Path) -> dict[str, Any]:
-    """The JSON object in a file; empty if it is missing or unreadable."""
+    """Read the JSON object in a file; empty if it is missing or unreadable."""
     try:
         content = json.loads(path.read_text("utf-8"))
     except (OSError, ValueError):
@@ -115,19 +115,106 @@ def read_record(path: Path) -> dict[str, Any]:
 
 
 def results_in(folder: Path) -> dict[str, Path]:
-    """What a stage wrote, as far as it is there, by relative path: people may have added files."""
+    """The files that a stage wrote, as far as they exist, by relative path; not what people added."""
     named = read_record(folder / STAGE).get("outputs")
     if not isinstance(named, dict):
         return {}
     return {name: path for name, path in list_relative_files(folder).items() if name in named}
 
 
-def _there(folder: Path, relative: str) -> Path:
+def _resolve(folder: Path, relative: str) -> Path:
     return Path(os.path.normpath(folder.absolute() / relative))
 
 
 def printable(text: str) -> str:
-    """Text that cannot disturb a terminal or a table: control characters are spelt out."""
+    """Escape control characters, which would disturb a terminal or a table."""
     return "".join(
         letter if letter.isprintable() or letter == "\n" else ascii(letter)[1:-1] for letter in text
+    )
+
+
+CALIBRATION = "calibration.json"
+RESULTS = (CALIBRATION, "scan.json")
+"""Files that mark a folder as written by bodyscan rather than by cameras."""
+RIG_FILE = "rig.yaml"
+
+
+def find_jobs(
+    pipeline: Pipeline, scans: Path, out: Path, calibration: Path | None, until: str
+) -> list[Job]:
+    """Make one job for every scan (or rig) in `scans`, sorted by name.
+
+    calibration: None for the nearest `calibration` folder: in `scans`, beside it or above it.
+
+    Raises BadInput if there is no scan, or no calibration for scans.
+    """
+    if not scans.is_dir():
+        raise BadInput("there is no such folder", where=str(scans), remedy="check --scans")
+    if pipeline.kind == "fuse":
+        sources, what = _scans(scans, out), "scan folder"
+        calibration = calibration or nearest_calibration(scans)
+    else:
+        sources, what, calibration = _rigs(scans, out), f"folder with a {RIG_FILE}", None
+    if not sources:
+        raise BadInput(f"holds no {what}", where=str(scans), remedy="check --scans")
+    return [job_of(path, pipeline, out, calibration, until) for path in sources]
+
+
+def job_of(path: Path, pipeline: Pipeline, out: Path, calibration: Path | None, until: str) -> Job:
+    """Make the job of one scan's (or rig's) folder."""
+    name, subject = job_name(path.name), _captures_content(path).get("subject")
+    subject = subject if isinstance(subject, str) else None
+    return Job(name, out.absolute() / name, path, calibration, pipeline, until, subject)
+
+
+def _scans(scans: Path, out: Path) -> list[Path]:
+    """Every folder except hidden ones, results, and captures that say they are not a scan.
+
+    A folder that cannot be read as a scan is a job too: its failure must be reported.
+    """
+    if (scans / CAPTURES).exists():
+        return [scans.absolute()]
+    return [
+        path
+        for path in _folders(scans, out)
+        if not any((path / name).exists() for name in RESULTS)
+        and _captures_content(path).get("kind") != "calibration"
+    ]
+
+
+def _rigs(folder: Path, out: Path) -> list[Path]:
+    if (folder / RIG_FILE).exists():
+        return [folder.absolute()]
+    return [path for path in _folders(folder, out) if (path / RIG_FILE).exists()]
+
+
+def _folders(folder: Path, out: Path) -> list[Path]:
+    results = os.path.realpath(out)
+    return [
+        path
+        for path in sorted(folder.absolute().iterdir())
+        if path.is_dir() and not path.name.startswith(".") and os.path.realpath(path) != results
+    ]
+
+
+def _captures_content(folder: Path) -> dict[str, Any]:
+    """The folder's captures.yaml, unchecked; empty if it cannot be read."""
+    try:
+        data = read_yaml(folder / CAPTURES).data
+    except (YamlError, OSError, RecursionError):
+        return {}
+    return data if isinstance(data, dict) else {}
+
+
+def nearest_calibration(scans: Path) -> Path:
+    """The `calibration` folder in the folder of the scans, beside it or above it. Raises
+    BadInput."""
+    absolute = scans.absolute()
+    for above in (absolute, *list(absolute.parents)[:2]):
+        if (above / "calibration" / CALIBRATION).exists():
+            return above / "calibration"
+    raise BadInput(
+        f"no calibration/{CALIBRATION} lies in this folder, beside it or above it",
+        where=str(scans),
+        remedy="name what `bodyscan calibrate-rig` wrote with --calibration",
     )

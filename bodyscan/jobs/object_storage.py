@@ -17,12 +17,9 @@ from typing import Any
 from bodyscan.captures.captures_file import FILE_NAME as CAPTURES
 from bodyscan.errors import BadInput
 from bodyscan.files.hashing import list_files
-from bodyscan.jobs.discovery import find_jobs
-from bodyscan.jobs.job import KEPT, LOCK, MANIFEST, STAGE, SUMMARY, Job, write_job
+from bodyscan.jobs.job import KEPT, LOCK, MANIFEST, STAGE, SUMMARY, Job, find_jobs, write_job
 from bodyscan.jobs.pipeline import Pipeline
 from bodyscan.jobs.supervision import JobProcess, JobResult, Listen, ignore_events, supervise_job
-
-_FIGURES = ("scan/scan.json", "calibration/calibration.json", MANIFEST)
 
 
 def is_url(place: str) -> bool:
@@ -64,8 +61,7 @@ def find_stored_jobs(store: Store, pipeline: Pipeline, until: str, work: Path) -
 def work_on_stored(
     job: Job, process: JobProcess, listen: Listen = ignore_events, *, store: Store
 ) -> JobResult:
-    """Fetch a job, bring it up to date, and put back what is
-    new. Returns failures, never raises them."""
+    """Fetch a job, bring it up to date, and put back what is new; return failures, never raise them."""
     try:
         with tempfile.TemporaryDirectory(prefix="bodyscan-") as folder:
             work = Path(folder)
@@ -93,7 +89,7 @@ def fetch_figures(jobs: Sequence[Job], store: Store) -> None:
     """Fetch what the summary needs of every job into the outline."""
     for job in jobs:
         files = _Files(store.job(job.name))
-        for name in _FIGURES:
+        for name in ("scan/scan.json", "calibration/calibration.json", MANIFEST):
             files.fetch_one(name, job.folder / name)
 
 

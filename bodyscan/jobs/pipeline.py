@@ -22,8 +22,6 @@ from bodyscan.settings import (
     UseLimits,
 )
 
-_REMEDY = "Correct the pipeline file; docs/formats.md explains every key."
-
 
 class PipelineError(BadInput):
     """The pipeline file, or a --set, is wrong."""
@@ -55,9 +53,9 @@ class Pipeline(Model):
     rig_export: RigExportSettings = RigExportSettings()
 
     def problems(self) -> Iterator[Problem]:
-        own = SECTIONS[self.kind]
+        allowed = SECTIONS[self.kind]
         every = {name for names in SECTIONS.values() for name in names}
-        for name in sorted((every - set(own)) & self.model_fields_set):
+        for name in sorted((every - set(allowed)) & self.model_fields_set):
             yield (name,), f"is for another kind of pipeline than {self.kind}"
         yield from _unknown_formats("export", self.export.formats, BODY_FORMATS.names())
         yield from _unknown_formats("rig_export", self.rig_export.formats, RIG_FORMATS.names())
@@ -90,5 +88,6 @@ def load_pipeline(path: Path, changes: Sequence[str] = ()) -> Pipeline:
 
     Raises PipelineError, which lists every problem, those of the file by line and column.
     """
-    pipeline = load_model(Path(path), Pipeline, PipelineError, remedy=_REMEDY)
+    remedy = "Correct the pipeline file; docs/formats.md explains every key."
+    pipeline = load_model(Path(path), Pipeline, PipelineError, remedy=remedy)
     return apply_settings(pipeline, changes, PipelineError) if changes else pipeline

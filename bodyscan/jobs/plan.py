@@ -1,5 +1,4 @@
-"""What has to be done again, and why: results are compared
-with what they would be made from now."""
+"""Which stages have to run again, and why: results are compared with what they would be made from."""
 
 from __future__ import annotations
 
@@ -13,9 +12,6 @@ from bodyscan.files.hashing import file_hashes
 from bodyscan.jobs.job import STAGE, STATE, Job, read_record, results_in
 from bodyscan.jobs.stages import Stage
 
-SCHEMA, VERSION = "bodyscan-stage", 1
-_MOST_NAMED = 3
-
 
 @dataclass(frozen=True)
 class Origin:
@@ -27,18 +23,17 @@ class Origin:
     inputs: dict[str, str]
 
     def record(self, outputs: Mapping[str, str]) -> dict[str, Any]:
-        """Content of stage.json: no time and no place, so that
-        the same work gives the same bytes."""
-        heading = {"schema": SCHEMA, "version": VERSION}
+        """Content of stage.json: without time or folder, so that the same work gives the same bytes."""
+        heading = {"schema": "bodyscan-stage", "version": 1}
         return heading | asdict(self) | {"outputs": dict(outputs)}
 
 
 @dataclass(frozen=True)
 class Step:
-    """What is to be expected of a stage.
+    """Whether a stage will run.
 
     why: it has to run; "" if its results are up to date.
-    certain: False if it depends on what a stage before it will give.
+    certain: False if it depends on the result of a stage before it.
     """
 
     stage: str
@@ -53,7 +48,7 @@ def origin_of(job: Job, stage: Stage) -> Origin:
 
 
 def plan(job: Job, stages: Sequence[Stage]) -> list[Step]:
-    """What a batch would do now, stage by stage."""
+    """Predict what a batch would do now, stage by stage."""
     steps: list[Step] = []
     for stage in stages:
         try:
@@ -91,24 +86,24 @@ def reason_to_run(job: Job, now: Origin) -> str:
         return "what its last result was made from cannot be read"
     if version != now.stage_version:
         return f"version {now.stage_version} of the stage, it was {version}"
-    if said := _changes(_flat(settings), _flat(now.settings)):
-        return f"settings changed: {said}"
-    if said := _difference(inputs, now.inputs):
-        return f"inputs changed: {said}"
-    if said := _difference(outputs, file_hashes(results_in(folder))):
-        return f"its result was changed: {said}"
+    if changes := _changes(_flat(settings), _flat(now.settings)):
+        return f"settings changed: {changes}"
+    if changes := _difference(inputs, now.inputs):
+        return f"inputs changed: {changes}"
+    if changes := _difference(outputs, file_hashes(results_in(folder))):
+        return f"its result was changed: {changes}"
     return ""
 
 
 def _difference(was: Mapping[str, str], now: Mapping[str, str]) -> str:
-    """Which files changed, came or went, the first few by name."""
-    said = [
+    """List which files changed, came or went, the first three by name."""
+    changes = [
         *(f"{name} has other content" for name in was if name in now and was[name] != now[name]),
         *(f"{name} is new" for name in now if name not in was),
         *(f"{name} is gone" for name in was if name not in now),
     ]
-    more = [f"and {len(said) - _MOST_NAMED} more"] if len(said) > _MOST_NAMED else []
-    return ", ".join([*said[:_MOST_NAMED], *more])
+    more = [f"and {len(changes) - 3} more"] if len(changes) > 3 else []
+    return ", ".join([*changes[:3], *more])
 
 
 def _changes(was: Mapping[str, Any], now: Mapping[str, Any]) -> str:

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 
 from bodyscan.captures.folder import Captures, open_captures, open_scan
 from bodyscan.errors import BadInput, CalibrationFileError, CaptureError
-from bodyscan.jobs.discovery import CALIBRATION, RIG_FILE
-from bodyscan.jobs.job import Job, results_in
+from bodyscan.jobs.job import CALIBRATION, RIG_FILE, Job, results_in
 from bodyscan.progress import Progress, step
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_file import load_rig

@@ -19,14 +19,6 @@ from bodyscan.jobs.job import MANIFEST, SUMMARY, Job, read_record
 from bodyscan.jobs.supervision import JobResult
 from bodyscan.settings import BODY_CENTRE_MM
 
-NEIGHBOURS = 2  # scans before and after, which separate drift from the sway of one person
-USUAL_STATURES_MM = (1450.0, 1890.0)
-"""Means for the men and women of whole nations are 1490 to 1830 (NCD-RisC, 2016), and a day's may
-be 3 % off besides. Around 1700 mm this reveals a size 15 % too small, or 11 % too large; nominal
-poses, if the rig file has some, reveal 3 %."""
-FEWEST_PEOPLE = 8
-"""Their median is known to 31 mm: one person's stature differs from the mean by 70 mm."""
-
 COLUMNS = {
     "fuse": (
         "verdict",
@@ -46,8 +38,6 @@ COLUMNS = {
     ),
     "calibrate": ("pairs", "pairs_failed", "corners_rms_px", "sheets_rms_mm"),
 }
-_FIRST = ("job", "subject", "when", "state", "attempts", "seconds", "stages")
-
 Motions = dict[str, Array]
 
 
@@ -57,8 +47,9 @@ def write_summary(jobs: Sequence[Job], outcomes: Sequence[JobResult], out: Path)
     rows = [_row(job, outcome) for job, outcome in zip(jobs, outcomes, strict=True)]
     if kind == "fuse":
         _add_drift(jobs, rows)
+    first = ("job", "subject", "when", "state", "attempts", "seconds", "stages")
     text = io.StringIO()
-    table = csv.DictWriter(text, (*_FIRST, *COLUMNS[kind], "reason"), extrasaction="ignore")
+    table = csv.DictWriter(text, (*first, *COLUMNS[kind], "reason"), extrasaction="ignore")
     table.writeheader()
     table.writerows(rows)
     write_text(out / SUMMARY, text.getvalue().encode("utf-8", "backslashreplace").decode())
@@ -72,37 +63,41 @@ def write_out_manifest(out: Path) -> None:
     write_json(out / MANIFEST, {"schema": "bodyscan-batch", "version": 1, "jobs": jobs})
 
 
-def to_repeat(jobs: Sequence[Job]) -> list[str]:
-    """Names of the jobs whose scan was fused but has the verdict `repeat`."""
+def scans_to_repeat(jobs: Sequence[Job]) -> list[str]:
+    """List the jobs whose scan was fused but has the verdict `repeat`, by name."""
     verdicts = {job.name: _facts(job).get("verdict") for job in jobs}
     return [name for name, verdict in verdicts.items() if verdict and verdict["grade"] == "repeat"]
 
 
-def drifted(jobs: Sequence[Job]) -> list[PairDrift]:
-    """Pairs that all scans of a calibration move the same way,
-    farthest first: sway does not do that."""
+def find_drift(jobs: Sequence[Job]) -> list[PairDrift]:
+    """Find pairs that alignment moves the same way in all scans of a calibration, farthest first;
+    sway differs from scan to scan."""
     shifts: dict[tuple[Path | None, str], list[Array]] = {}
     for job in jobs:
         for pair, shift in _motions(job).items():
             shifts.setdefault((job.calibration, pair), []).append(shift)
-    found = [estimate_drift(pair, np.array(own)) for (_, pair), own in shifts.items()]
+    found = [estimate_drift(pair, np.array(each)) for (_, pair), each in shifts.items()]
     return sorted((one for one in found if one.moved), key=lambda one: -one.shift_mm)
 
 
-def odd_stature(jobs: Sequence[Job]) -> float | None:
-    """Stature of the median person, mm, if no nation's adults are so tall or short: children, or a
-    wrong size. None if it is usual, or there are too few people."""
+def find_odd_stature(jobs: Sequence[Job]) -> float | None:
+    """Return the median stature, mm, if it is outside the range of any nation's adults: children, or a
+    wrong size. None if it is within, or for fewer than eight people, whose median is known to 31 mm.
+
+    Means for the men and women of whole nations are 1490 to 1830 (NCD-RisC, 2016), and a day's may
+    differ by 3 %. Around 1700 mm this reveals a size 15 % too small, or 11 % too large; nominal poses,
+    if the rig file has some, reveal 3 %.
+    """
     statures: dict[str, list[float]] = {}
     for job in jobs:
         facts = _facts(job)
         graded = (facts.get("verdict") or {}).get("grade")
         if facts.get("stature_mm") and graded != "repeat":
             statures.setdefault(job.subject or job.name, []).append(facts["stature_mm"])
-    if len(statures) < FEWEST_PEOPLE:
+    if len(statures) < 8:
         return None
-    median = float(np.median([np.median(own) for own in statures.values()]))
-    low, high = USUAL_STATURES_MM
-    return None if low <= median <= high else median
+    median = float(np.median([np.median(each) for each in statures.values()]))
+    return None if 1450.0 <= median <= 1890.0 else median
 
 
 def _row(job: Job, outcome: JobResult) -> dict[str, Any]:
@@ -163,7 +158,8 @@ def _add_drift(jobs: Sequence[Job], rows: Sequence[dict[str, Any]]) -> None:
     """Fill in drift_mm and drift_pair of scans that have neighbours on the day.
 
     A person's sway differs from scan to scan; what a pair's motion has in common over a scan and
-    its neighbours in time is the rig's: the median of each coordinate, the largest over the pairs.
+    two neighbours in time on either side is the rig's: the median of each coordinate, the largest
+    over the pairs.
     """
     measured = [
         (str(row.get("when") or ""), number, motions)
@@ -171,13 +167,13 @@ def _add_drift(jobs: Sequence[Job], rows: Sequence[dict[str, Any]]) -> None:
         if row["state"] == "done" and (motions := _motions(job))
     ]
     measured.sort(key=lambda one: one[:2])
-    for place, (_, number, own) in enumerate(measured):
-        around = measured[max(0, place - NEIGHBOURS) : place + NEIGHBOURS + 1]
+    for k, (_, number, motions) in enumerate(measured):
+        around = measured[max(0, k - 2) : k + 3]
         if len(around) < 3:
             continue
         drift = {
             pair: float(np.linalg.norm(np.median([m[pair] for *_, m in around if pair in m], 0)))
-            for pair in own
+            for pair in motions
         }
         pair = max(drift, key=lambda name: drift[name])
         rows[number].update(drift_mm=_round(drift[pair]), drift_pair=pair)
@@ -189,8 +185,7 @@ def _facts(job: Job) -> dict[str, Any]:
 
 
 def _motions(job: Job) -> Motions:
-    """Motion (3,) mm of every pair at the body's centre, from
-    the calibration's pose to this scan's."""
+    """Motion (3,) mm of every pair at the body's centre, from its calibrated to its aligned pose."""
     alignment = _facts(job).get("alignment")
     if not alignment or job.calibration is None:
         return {}

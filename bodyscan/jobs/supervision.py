@@ -1,4 +1,4 @@
-"""Starts a job's process, listens to it, tries once more, and then sets the job aside."""
+"""Start a job's process, listen to it, try once more, and then set the job aside."""
 
 from __future__ import annotations
 
@@ -22,13 +22,11 @@ Listen = Callable[[dict[str, Any]], None]
 
 ATTEMPTS = 2
 COMMAND = ("-m", "bodyscan.jobs")
-_LAST_LINES = 4000
 
 
 @dataclass(frozen=True)
 class JobResult:
-    """How a job ended. state: done or set aside. stages: those
-    that ran. reason: for setting it aside."""
+    """How a job ended. state: done, or set aside for `reason`. stages: those that ran."""
 
     job: str
     state: str
@@ -55,8 +53,7 @@ def ignore_events(event: dict[str, Any]) -> None:
 
 
 def supervise_job(job: Job, process: JobProcess, listen: Listen = ignore_events) -> JobResult:
-    """Run a job's process in its folder, twice if necessary.
-    Returns failures, never raises them."""
+    """Run a job's process in its folder, twice if necessary; return failures, never raise them."""
     path, since = job.folder, time.monotonic()
     stages: tuple[str, ...] = ()
     reason = ""
@@ -101,7 +98,7 @@ def _attempt(job: Job, how: JobProcess, listen: Listen) -> tuple[str, tuple[str,
         stuck = threading.Timer(60.0 * minutes, process.kill)
         stuck.start()
         try:
-            said, ran = _listen_to(process, folder.name, listen)
+            reason, ran = _listen_to(process, folder.name, listen)
             status = process.wait()
         finally:
             in_time = stuck.is_alive()
@@ -110,11 +107,11 @@ def _attempt(job: Job, how: JobProcess, listen: Listen) -> tuple[str, tuple[str,
                 process.stdin.close()
     if status == 0:
         return "", ran
-    if said:
-        return said, ran
+    if reason:
+        return reason, ran
     if not in_time:
-        return f"was stuck: it took longer than {minutes:g} minutes", ran
-    return how_it_died(status, folder / LOG), ran
+        return f"was stopped: it took longer than {minutes:g} minutes", ran
+    return describe_death(status, folder / LOG), ran
 
 
 def _listen_to(
@@ -127,38 +124,35 @@ def _listen_to(
     with process.stdout as stream:
         for line in stream:
             try:
-                told = json.loads(line)
+                message = json.loads(line)
             except ValueError:
                 continue
-            if "failed" in told:
-                reason = printable(told["failed"])
-            if "why" in told:
-                ran.append(told["stage"])
-            if "grade" in told:
-                listen({"event": "verdict", "job": job, **told})
-            if "stage" in told:
-                listen({"event": "stage", "job": job, **told})
+            if "failed" in message:
+                reason = printable(message["failed"])
+            if "why" in message:
+                ran.append(message["stage"])
+            if "grade" in message:
+                listen({"event": "verdict", "job": job, **message})
+            if "stage" in message:
+                listen({"event": "stage", "job": job, **message})
     return reason, tuple(ran)
 
 
-def how_it_died(status: int, log: Path) -> str:
-    """Why a process died without saying so: its exit status, and the last line of its log."""
+def describe_death(status: int, log: Path) -> str:
+    """Describe how a process died without giving a reason: exit status, last line of its log."""
     how = f"its process ended with {status}"
     if status < 0:
         with suppress(ValueError):
             how = f"its process was ended by {signal.Signals(-status).name}"
         if -status == signal.SIGKILL:
-            how += " (was memory short?)"
+            how += " (possibly out of memory)"
     with suppress(OSError), log.open("rb") as stream:
-        stream.seek(max(0, stream.seek(0, os.SEEK_END) - _LAST_LINES))
+        stream.seek(max(0, stream.seek(0, os.SEEK_END) - 4000))
         lines = stream.read().decode("utf-8", "replace").split("\n")
         last = next((line for line in reversed(lines) if line.strip()), "")
-        if last and not last.startswith(_HEADING):
-            how += f"; its last words: {printable(last)}"
+        if last and not last.startswith("-- "):
+            how += f"; the last line of its log: {printable(last)}"
     return how
-
-
-_HEADING = "-- "
 
 
 def open_log(path: Path) -> Any:
@@ -166,13 +160,12 @@ def open_log(path: Path) -> Any:
     handle = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW, 0o600)
     stream = os.fdopen(handle, "ab", buffering=0)
     with suppress(OSError):
-        stream.write(f"{_HEADING}{time.strftime('%Y-%m-%dT%H:%M:%S%z')}\n".encode())
+        stream.write(f"-- {time.strftime('%Y-%m-%dT%H:%M:%S%z')}\n".encode())
     return stream
 
 
 def environment(threads: int) -> dict[str, str]:
-    """Environment with the libraries' threads; BLAS gets one, since stages use the rest
-    themselves."""
+    """Set the libraries' threads; BLAS gets one, since stages use the rest themselves."""
     return os.environ | {
         "OMP_NUM_THREADS": str(threads),
         "OPENCV_FOR_THREADS_NUM": str(threads),

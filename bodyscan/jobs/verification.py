@@ -1,4 +1,4 @@
-"""Every byte checked against the manifests: images, calibration, cloud, mesh, exports."""
+"""Check every byte against the manifests: images, calibration, cloud, mesh, exports."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def verify(folder: Path, kinds: Kinds = KINDS) -> Verification:
         files += 1
         if fault:
             faults.append(f"{path}: {fault}")
-    return Verification(files, tuple(faults), tuple(_added(folder)))
+    return Verification(files, tuple(faults), tuple(_find_added(folder)))
 
 
 def _all(folder: Path, kinds: Kinds) -> Iterator[tuple[Path, str]]:
@@ -47,7 +47,7 @@ def _all(folder: Path, kinds: Kinds) -> Iterator[tuple[Path, str]]:
         yield from _job(folder, kinds)
         return
     for name, digest in sorted(jobs.items()):
-        yield _held(folder / name / MANIFEST, digest)
+        yield _compare_hash(folder / name / MANIFEST, digest)
         if (folder / name / MANIFEST).exists():
             yield from _job(folder / name, kinds)
     for path in sorted(folder.glob(f"*/{MANIFEST}")):
@@ -59,22 +59,22 @@ def _job(folder: Path, kinds: Kinds) -> Iterator[tuple[Path, str]]:
     path = folder / MANIFEST
     content = read_record(path)
     try:
-        own = content.pop("own_sha256")
+        stored = content.pop("own_sha256")
         inputs, outputs = dict(content["inputs"]), dict(content["outputs"])
     except (KeyError, TypeError, ValueError):
         yield path, "is not a manifest"
         return
-    yield path, "" if content_hash(content) == own else "was changed"
+    yield path, "" if content_hash(content) == stored else "was changed"
     for name, digest in outputs.items():
-        yield _held(folder / name, digest)
+        yield _compare_hash(folder / name, digest)
     yield from _inputs(folder, inputs, kinds)
 
 
-def _added(folder: Path) -> Iterator[Path]:
+def _find_added(folder: Path) -> Iterator[Path]:
     """Files that people put among a batch's results, or a job's."""
     for record in sorted((*folder.glob(f"*/{STAGE}"), *folder.glob(f"*/*/{STAGE}"))):
-        own = {record, *results_in(record.parent).values()}
-        yield from (path for path in list_files(record.parent) if path not in own)
+        known = {record, *results_in(record.parent).values()}
+        yield from (path for path in list_files(record.parent) if path not in known)
 
 
 def _inputs(folder: Path, inputs: Mapping[str, str], kinds: Kinds) -> Iterator[tuple[Path, str]]:
@@ -83,15 +83,16 @@ def _inputs(folder: Path, inputs: Mapping[str, str], kinds: Kinds) -> Iterator[t
         job = read_job(folder)
         there = kinds[job.pipeline.kind][0].inputs(job)
     except BodyscanError as error:
-        yield folder, f"its inputs cannot be looked at: {error}"
+        yield folder, f"its inputs cannot be read: {error}"
         return
     for name, digest in inputs.items():
-        yield _held(there.get(name) or job.source / name.removeprefix("captures/"), digest)
+        yield _compare_hash(there.get(name) or job.source / name.removeprefix("captures/"), digest)
     for name in there.keys() - inputs.keys():
         yield there[name], "is new: the job did not read it"
 
 
-def _held(path: Path, digest: str) -> tuple[Path, str]:
+def _compare_hash(path: Path, digest: str) -> tuple[Path, str]:
+    """The file, and how it differs from its hash; "" if it does not."""
     try:
         return path, "" if file_hash(path) == digest else "was changed"
     except FileNotFoundError:

@@ -20,14 +20,15 @@ from typing import Any
 from bodyscan.errors import BadInput, BodyscanError, FailedWork
 from bodyscan.files.atomic import lock_file, restrict_to_owner
 from bodyscan.jobs.batch import finish, sweep
-from bodyscan.jobs.discovery import RESULTS, job_of
 from bodyscan.jobs.inbox import IncomingScan
 from bodyscan.jobs.job import (
     BATCH_LOCK,
     LOG,
+    RESULTS,
     STATE,
     Job,
     job_name,
+    job_of,
     printable,
     read_record,
     write_job,
@@ -39,15 +40,11 @@ from bodyscan.jobs.supervision import (
     COMMAND,
     JobResult,
     Listen,
+    describe_death,
     environment,
-    how_it_died,
     ignore_events,
     note_state,
 )
-
-POLL_S = 0.1
-"""Greatest delay until an image is found after it was written: a twentieth of the time to a
-verdict."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +86,7 @@ def watch(
                     for folder in watching.folders():
                         scan = watching.scans.setdefault(folder, IncomingScan(folder, rig))
                         watching.look_at(scan)
-                    watching.hear()
+                    watching.handle_messages()
                     if once and not watching.scans:
                         return watching.summary()
             finally:
@@ -113,15 +110,19 @@ class _Watching:
     is_ready: bool = False
 
     def __post_init__(self) -> None:
-        own = self.watched
-        self.process = ResidentProcess(own.calibration, own.pipeline.resources.threads, own.command)
+        watched = self.watched
+        self.process = ResidentProcess(
+            watched.calibration, watched.pipeline.resources.threads, watched.command
+        )
 
     def folders(self) -> list[Path]:
         """Folders of scans that are not done: what an earlier watch or batch did stays done."""
-        own = self.watched
+        watched = self.watched
         found = []
-        for path in sorted(own.inbox.absolute().iterdir()):
-            hidden = path.name.startswith(".") or not path.is_dir() or path == own.out.absolute()
+        for path in sorted(watched.inbox.absolute().iterdir()):
+            hidden = (
+                path.name.startswith(".") or not path.is_dir() or path == watched.out.absolute()
+            )
             if hidden or path in self.ended or any((path / name).exists() for name in RESULTS):
                 continue
             if path not in self.scans and (outcome := self._earlier(path)):
@@ -141,28 +142,28 @@ class _Watching:
         new = sorted(set(arrival.whole) - known)
         if new:
             known.update(new)
-            self.process.ask(folder=str(path), pairs=new)
+            self.process.send(folder=str(path), pairs=new)
         if arrival.complete:
             self._hand_over(path, attempt=1)
 
-    def hear(self) -> None:
+    def handle_messages(self) -> None:
         """Handle messages from the process; waits for them briefly."""
-        for told in self.process.told(POLL_S):
-            if "unusable" in told:
-                raise BadInput(told["unusable"])
-            self.is_ready |= "ready" in told
+        for message in self.process.receive(0.1):
+            if "unusable" in message:
+                raise BadInput(message["unusable"])
+            self.is_ready |= "ready" in message
             path = next(iter(self.running), None)
             if path is None:
                 continue
             job, attempt = self.running[path]
-            if "grade" in told:
-                self.listen({"event": "verdict", "job": job.name, **told})
-            if "why" in told:
-                self.stages.setdefault(path, []).append(told["stage"])
-            if "stage" in told:
-                self.listen({"event": "stage", "job": job.name, **told})
-            if "ended" in told:
-                self._end(path, attempt, printable(told["failed"]))
+            if "grade" in message:
+                self.listen({"event": "verdict", "job": job.name, **message})
+            if "why" in message:
+                self.stages.setdefault(path, []).append(message["stage"])
+            if "stage" in message:
+                self.listen({"event": "stage", "job": job.name, **message})
+            if "ended" in message:
+                self._end(path, attempt, printable(message["failed"]))
         status, limit_s = (
             self.process.status(),
             60.0 * self.watched.pipeline.resources.limit_minutes,
@@ -170,17 +171,17 @@ class _Watching:
         if status is None and self.running and time.monotonic() - self.started_s > limit_s:
             self.process.kill()
         elif status is not None:
-            self._begin_again(status)
+            self._restart(status)
 
-    def _begin_again(self, status: int) -> None:
+    def _restart(self, status: int) -> None:
         """Restart the process after it died, either of the running job, which is tried once more,
         or of an image; scans present are then decoded only by their jobs, which count how often
         they fail."""
         if not self.is_ready:
             raise FailedWork(
-                f"the process that fuses scans does not start: it ended with {status}",
+                f"the process that fuses scans does not start: exit status {status}",
                 where=str(self.watched.calibration),
-                remedy="try `bodyscan scan` on one of the scans: it says more",
+                remedy="run `bodyscan scan` on one of the scans for a full message",
             )
         self.is_ready = False
         for path in self.scans:
@@ -191,7 +192,7 @@ class _Watching:
         for number, (path, (job, attempt)) in enumerate(waiting):
             if number == 0:
                 self.running[path] = (job, attempt)
-                self._end(path, attempt, how_it_died(status, job.folder / LOG))
+                self._end(path, attempt, describe_death(status, job.folder / LOG))
             else:
                 self._hand_over(path, attempt)
 
@@ -208,7 +209,7 @@ class _Watching:
         self.running[path] = (job, attempt)
         note_state(job.folder, {"state": "running", "attempts": attempt, "reason": ""})
         self.listen({"event": "job", "job": job.name, "state": "running", "attempt": attempt})
-        self.process.ask(folder=str(job.folder))
+        self.process.send(folder=str(job.folder))
 
     def _end(self, path: Path, attempt: int, reason: str) -> None:
         job, _ = self.running.pop(path)
@@ -235,9 +236,9 @@ class _Watching:
         return finish(jobs, list(self.ended.values()), self.watched.out)
 
     def _job(self, path: Path) -> Job:
-        own = self.watched
+        watched = self.watched
         last = KINDS["fuse"][-1].name
-        return job_of(path, own.pipeline, own.out, own.calibration.absolute(), last)
+        return job_of(path, watched.pipeline, watched.out, watched.calibration.absolute(), last)
 
     def _earlier(self, path: Path) -> JobResult | None:
         """How the scan's job ended before this watch began, unless its folder has changed since."""
@@ -260,11 +261,11 @@ class ResidentProcess:
         self._line = [sys.executable, *command, "--resident", str(calibration)]
         self._threads = threads
         self._process: subprocess.Popen[str] | None = None
-        self._said: SimpleQueue[dict[str, Any]] = SimpleQueue()
+        self._messages: SimpleQueue[dict[str, Any]] = SimpleQueue()
 
     def start(self) -> None:
         self.stop()
-        self._said = SimpleQueue()
+        self._messages = SimpleQueue()
         self._process = subprocess.Popen(
             self._line,
             stdin=subprocess.PIPE,
@@ -273,9 +274,11 @@ class ResidentProcess:
             env=environment(self._threads),
             start_new_session=True,
         )
-        threading.Thread(target=self._read, args=(self._process, self._said), daemon=True).start()
+        threading.Thread(
+            target=self._read, args=(self._process, self._messages), daemon=True
+        ).start()
 
-    def ask(self, **request: Any) -> None:
+    def send(self, **request: Any) -> None:
         """Send a request; if the process has died, `status` notices."""
         assert self._process is not None
         assert self._process.stdin is not None
@@ -285,19 +288,19 @@ class ResidentProcess:
         except OSError:
             pass
 
-    def told(self, wait_s: float) -> list[dict[str, Any]]:
+    def receive(self, wait_s: float) -> list[dict[str, Any]]:
         """Messages since the last call; waits this long for the first one."""
         found = []
         try:
-            found.append(self._said.get(timeout=wait_s))
+            found.append(self._messages.get(timeout=wait_s))
             while True:
-                found.append(self._said.get_nowait())
+                found.append(self._messages.get_nowait())
         except Empty:
             return found
 
     def status(self) -> int | None:
         """Exit status; None while it runs, or while messages are left."""
-        if self._process is None or not self._said.empty():
+        if self._process is None or not self._messages.empty():
             return None
         return self._process.poll()
 
@@ -313,10 +316,10 @@ class ResidentProcess:
             self._process = None
 
     @staticmethod
-    def _read(process: subprocess.Popen[str], said: SimpleQueue[dict[str, Any]]) -> None:
+    def _read(process: subprocess.Popen[str], messages: SimpleQueue[dict[str, Any]]) -> None:
         assert process.stdout is not None
         for line in process.stdout:
             try:
-                said.put(json.loads(line))
+                messages.put(json.loads(line))
             except ValueError:
                 continue

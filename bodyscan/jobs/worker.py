@@ -39,7 +39,6 @@ from bodyscan.verdict import Verdict
 
 Tell = Callable[..., None]
 
-SCHEMA, VERSION = "bodyscan-manifest", 1
 _BEING_MADE, _TAKEN_AWAY = ".making-", ".old-"
 
 
@@ -83,7 +82,7 @@ def become_worker() -> Tell:
     logging.basicConfig(format="%(message)s")  # on standard error, which is the job's log
     logging.getLogger("bodyscan").setLevel(logging.DEBUG)
     tell = _take_over_output()
-    _be_the_first_to_go()
+    _prefer_killing_this()
     return tell
 
 
@@ -132,18 +131,18 @@ def _perform(job: Job, stage: Stage, before: Origin, tell: Tell) -> None:
     _put_in_place(made, job.folder / stage.name, tell)
 
 
-def _put_in_place(made: Path, place: Path, tell: Tell) -> None:
+def _put_in_place(made: Path, folder: Path, tell: Tell) -> None:
     """Rename; a folder cannot replace another in one step, so the old one is moved aside first."""
-    old = _take_away(place)
-    made.rename(place)
-    flush(place.parent)
+    old = _move_aside(folder)
+    made.rename(folder)
+    flush(folder.parent)
     _remove_results(old, tell)
 
 
-def _take_away(place: Path) -> Path:
-    old = place.with_name(f"{_TAKEN_AWAY}{place.name}-{secrets.token_hex(4)}")
+def _move_aside(folder: Path) -> Path:
+    old = folder.with_name(f"{_TAKEN_AWAY}{folder.name}-{secrets.token_hex(4)}")
     with suppress(FileNotFoundError):
-        place.rename(old)
+        folder.rename(old)
     return old
 
 
@@ -175,7 +174,7 @@ def _drop_if_stale(job: Job, stage: Stage, tell: Tell) -> None:
     folder = job.folder / stage.name
     with suppress(BodyscanError, OSError):
         if folder.exists() and reason_to_run(job, origin_of(job, stage)):
-            _remove_results(_take_away(folder), tell)
+            _remove_results(_move_aside(folder), tell)
 
 
 def _write_manifest(job: Job, stages: Sequence[Stage]) -> None:
@@ -194,8 +193,8 @@ def _write_manifest(job: Job, stages: Sequence[Stage]) -> None:
             outputs[f"{stage.name}/{STAGE}"] = file_hash(path)
     inputs = {name: value for name, value in inputs.items() if name not in outputs}
     content: dict[str, Any] = {
-        "schema": SCHEMA,
-        "version": VERSION,
+        "schema": "bodyscan-manifest",
+        "version": 1,
         "inputs": inputs,
         "outputs": outputs,
     }
@@ -251,7 +250,7 @@ def _end_with_parent() -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
-def _be_the_first_to_go() -> None:
-    """If memory runs out, Linux should kill a job, which is tried again, and not the batch."""
+def _prefer_killing_this() -> None:
+    """Make Linux kill this process first if memory runs out: a job is tried again, a batch is not."""
     with suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text("900")

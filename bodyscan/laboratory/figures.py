@@ -13,7 +13,7 @@ from bodyscan.arrays import Array
 from bodyscan.files.atomic import atomic_replacement
 from bodyscan.geometry.light_planes import Axis, baseline_angle_tilt
 from bodyscan.geometry.robust import robust_scale
-from bodyscan.report.canvas import round_up
+from bodyscan.report.charts import round_up
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt

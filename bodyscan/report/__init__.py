@@ -2,7 +2,6 @@
 
 page holds what a report is made of, and result_page finds what a folder holds. scan_page (with
 comparison_section), calibration_page (with calibration_verdict and calibration_charts) and
-acceptance_page make their reports. Pictures are drawn by pictures and sigma_map on a canvas, charts
-as SVG; rotatable models are packed by model, from body_model and rig_model. measurements: a table
-on screen.
+acceptance_page make their reports. pictures shades bodies; charts and sigma_map use Matplotlib;
+body_model and rig_model are models to rotate, packed by model. measurements: a table on screen.
 """

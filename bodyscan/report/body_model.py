@@ -12,12 +12,9 @@ from bodyscan.evaluation.surface import Comparison
 from bodyscan.mesh.body import REGION_NAMES, BodyCloud, BodyMesh, compute_cover_shares
 from bodyscan.mesh.decimation import decimate
 from bodyscan.progress import THREADS
-from bodyscan.report.canvas import blue_white_red, turbo
 from bodyscan.report.model import Layer, Shape, css, ramp_legend
-from bodyscan.report.pictures import FILLED_TINT
+from bodyscan.report.pictures import FILLED_TINT, blue_white_red, turbo
 
-FACES = (50_000, 44_000, 38_000)
-"""Tried in turn: a mesh reduced to one number of faces may fold, but not to another."""
 UNKNOWN = (150, 150, 150)
 SKIN = (214, 210, 205)
 REGIONS = (UNKNOWN, SKIN, (120, 70, 30), (40, 70, 130))
@@ -33,9 +30,9 @@ PAIRS = (
 """For one pair, two, ... and six or more."""
 
 
-def light_mesh(mesh: BodyMesh) -> BodyMesh | None:
-    """The mesh with about 50,000 faces; None if it does not stay closed for any number tried."""
-    for faces in FACES:
+def simplify_mesh(mesh: BodyMesh) -> BodyMesh | None:
+    """Reduce the mesh to about 50,000 faces; None if it does not stay closed for any number tried."""
+    for faces in (50_000, 44_000, 38_000):  # it may fold with one number, but not with another
         try:
             return decimate(mesh, faces=faces)
         except ScanFailed:
@@ -50,8 +47,8 @@ def layers(
     comparison: Comparison | None,
     limit_mm: float,
 ) -> list[Layer]:
-    """Layers by photo, plain, number of pairs, sigma, filled; by region if some of it is covered,
-    and by deviation if compared."""
+    """Colour the mesh by photo, plain, number of pairs, sigma, filled; by region if some of it is
+    covered, and by deviation if compared."""
     made_up = np.zeros(len(small.vertices), bool)
     made_up[small.faces[small.filled]] = True
     top = _round_up(float(np.nanpercentile(cloud.sigma_mm, 98)))
@@ -77,15 +74,16 @@ def layers(
         }),
     ]  # fmt: skip
     if compute_cover_shares(small.regions) and small.regions is not None:
-        own = np.array(REGIONS, np.uint8)
+        region_colours = np.array(REGIONS, np.uint8)
         swatches = [(css(colour), name) for colour, name in zip(REGIONS, REGION_NAMES, strict=True)]
-        found.append(Layer("regions", own[small.regions], {"swatches": swatches}))
+        found.append(Layer("regions", region_colours[small.regions], {"swatches": swatches}))
     if comparison is not None:
         found.append(_deviation(small, mesh, comparison, made_up, limit_mm))
     return found
 
 
 def shape_of(mesh: BodyMesh) -> Shape:
+    """The mesh as the viewer takes it."""
     return Shape(mesh.vertices, mesh.faces, mesh.normals)
 
 
@@ -96,8 +94,8 @@ def _deviation(
     made_up: Mask,
     limit_mm: float,
 ) -> Layer:
-    """Deviation of the full mesh's nearest vertex: the light
-    mesh itself is off by some tenths of a mm."""
+    """Colour by the deviation of the full mesh's nearest vertex: reduction moves the surface by some
+    tenths of a mm."""
     tree = cKDTree(mesh.vertices[comparison.vertices])
     signed = comparison.signed_mm[np.asarray(tree.query(small.vertices, workers=THREADS)[1])]
     table = blue_white_red()[:, ::-1]

@@ -15,15 +15,8 @@ from bodyscan.arrays import Array
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.light_planes import baseline_angle_tilt
 from bodyscan.registration.rig_calibration import ObservedCorners, RigCalibration
-from bodyscan.report.canvas import round_down
-from bodyscan.report.charts import BLUE, GREY, INK, RED, grid_of, style, svg
+from bodyscan.report.charts import BLUE, GREY, INK, RED, grid_of, round_down, style, svg
 
-COLUMNS = 4
-CELLS = (10, 8)
-"""Cells into which the image is divided for residuals, across and down."""
-FEWEST = 3
-ARROW = 0.08
-"""Length of the longest arrow as a share of the image's width."""
 POLES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#999999")
 """Okabe and Ito's colours, which the colour-blind can tell apart too."""
 DASHES = ("-", "--", "-.", ":")
@@ -32,7 +25,7 @@ DASHES = ("-", "--", "-.", ":")
 def coverage_chart(calibration: RigCalibration) -> bytes:
     """For each camera: its image, and where each view of a board lay in it."""
     with style():
-        figure, axes = grid_of(len(calibration.seen), COLUMNS, (2.6, 2.3))
+        figure, axes = grid_of(len(calibration.seen), 4, (2.6, 2.3))
         for axis, (name, seen) in zip(axes, calibration.seen.items(), strict=True):
             views = [seen.pixels[seen.target == k] for k in np.unique(seen.target)]
             hulls = [cv2.convexHull(view).reshape(-1, 2) for view in views]
@@ -56,9 +49,10 @@ def residual_chart(calibration: RigCalibration) -> tuple[bytes, float]:
     lengths = _finite([np.linalg.norm(mean, axis=-1) for _, mean, _ in maps.values()])
     top = float(np.percentile(rms_known, 98))
     widest = max(calibration.pairs[name].camera.width for name in maps)
-    times = round_down(ARROW * widest / max(float(np.percentile(lengths, 98)), 1e-6), 1)
+    # The longest arrow is 8 % of the image's width.
+    times = round_down(0.08 * widest / max(float(np.percentile(lengths, 98)), 1e-6), 1)
     with style():
-        figure, axes = grid_of(len(maps), COLUMNS, (2.6, 2.3))
+        figure, axes = grid_of(len(maps), 4, (2.6, 2.3))
         for axis, (name, (rms, mean, middles)) in zip(axes, maps.items(), strict=True):
             camera = calibration.pairs[name].camera
             extent = (-0.5, camera.width - 0.5, camera.height - 0.5, -0.5)
@@ -116,13 +110,13 @@ def held_out_chart(calibration: RigCalibration) -> bytes:
         figure, axis = plt.subplots(figsize=(9.6, 3.4), constrained_layout=True)
         for k, (model, colour) in enumerate(zip(models, colours, strict=True)):
             shift = 0.6 * ((k + 0.5) / len(models) - 0.5)
-            own = [
-                (place + shift, one.mean_mm, one.chosen)
-                for place, every in enumerate(tried.values())
+            trials = [
+                (column + shift, one.mean_mm, one.chosen)
+                for column, every in enumerate(tried.values())
                 for one in every
                 if one.model == model
             ]
-            x, y, chosen = (np.array(part) for part in zip(*own, strict=True))
+            x, y, chosen = (np.array(part) for part in zip(*trials, strict=True))
             axis.plot(x, y, "o", color=colour, markerfacecolor="none", markersize=5.0, label=model)
             axis.plot(x[chosen], y[chosen], "o", color=colour, markersize=6.5)
         axis.set_xticks(range(len(tried)), list(tried))
@@ -139,25 +133,25 @@ def view_graph_chart(calibration: RigCalibration) -> bytes:
     """Pairs around a circle, with lines between those that saw a board at the same moment: more
     boards, thicker lines."""
     names = list(calibration.seen)
-    together = shared_boards(calibration)
+    shared = shared_boards(calibration)
     turn = 2.0 * np.pi * np.arange(len(names)) / max(len(names), 1)
-    places = np.stack([np.sin(turn), np.cos(turn)], axis=1)
+    positions = np.stack([np.sin(turn), np.cos(turn)], axis=1)
     colour, _ = line_styles(calibration)
-    top = max(float(np.max(together, initial=0.0)), 1.0)
+    top = max(float(np.max(shared, initial=0.0)), 1.0)
     with style():
         figure, axis = plt.subplots(figsize=(5.6, 5.2), constrained_layout=True)
         for i, j in combinations(range(len(names)), 2):
-            if together[i, j]:
-                share = together[i, j] / top
+            if shared[i, j]:
+                share = shared[i, j] / top
                 axis.plot(
-                    *places[[i, j]].T,
+                    *positions[[i, j]].T,
                     color=INK,
                     linewidth=0.4 + 4.0 * share,
                     alpha=0.18 + 0.4 * share,
                 )
-        for place, name in zip(places, names, strict=True):
-            axis.plot(*place, "o", color=colour[name], markersize=13.0)
-            axis.annotate(name, 1.17 * place, ha="center", va="center")
+        for position, name in zip(positions, names, strict=True):
+            axis.plot(*position, "o", color=colour[name], markersize=13.0)
+            axis.annotate(name, 1.17 * position, ha="center", va="center")
         axis.set(xlim=(-1.35, 1.35), ylim=(-1.3, 1.3), aspect="equal")
         axis.axis("off")
     return svg(figure)
@@ -186,14 +180,16 @@ def line_styles(calibration: RigCalibration) -> tuple[dict[str, str], dict[str, 
 
 
 def _residual_map(seen: ObservedCorners, camera: Camera) -> tuple[Array, Array, Array]:
-    """RMS (rows, columns) and mean (rows, columns, 2) of residuals, px, and the cells' middles; NaN
-    for fewer than three corners."""
-    columns, rows = CELLS
+    """RMS (rows, columns) and mean (rows, columns, 2) of residuals, px, in 8 rows of 10 cells, and the
+    cells' middles; NaN for fewer than three corners."""
+    columns, rows = 10, 8
     size = np.array([camera.width, camera.height])
-    cell = np.clip(((seen.pixels + 0.5) / size * CELLS).astype(int), 0, np.array(CELLS) - 1)
+    cell = np.clip(
+        ((seen.pixels + 0.5) / size * [columns, rows]).astype(int), 0, [columns - 1, rows - 1]
+    )
     number = cell[:, 1] * columns + cell[:, 0]
     count = np.bincount(number, minlength=columns * rows).astype(float)
-    enough = np.where(count >= FEWEST, count, np.nan)
+    enough = np.where(count >= 3, count, np.nan)
     residuals = seen.residuals_px.astype(float)
     square = np.bincount(number, np.sum(residuals**2, axis=1), columns * rows) / enough
     mean = [np.bincount(number, residuals[:, k], columns * rows) / enough for k in (0, 1)]

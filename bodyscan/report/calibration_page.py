@@ -17,7 +17,6 @@ from bodyscan.report import calibration_charts as draw
 from bodyscan.report import calibration_verdict as limits
 from bodyscan.report import charts
 from bodyscan.report.calibration_verdict import PairFigures, figures_of, grade_calibration
-from bodyscan.report.canvas import PICTURE_PX
 from bodyscan.report.page import (
     Block,
     Column,
@@ -33,14 +32,6 @@ from bodyscan.report.page import (
 from bodyscan.report.rig_model import rig_model
 from bodyscan.report.sigma_map import draw_sigma_map, why_no_sigma
 
-NOT_STORED = (
-    "This calibration was made before corners were kept with it: calibrate again to see where the "
-    "boards lay in each picture and how far their corners are off."
-)
-NO_IMAGES = (
-    "This calibration was imported: no image of a board was looked at. `bodyscan check-calibration` "
-    "tells from a few whether it is right."
-)
 PAIR_COLUMNS = (
     Column("pair"),
     Column(
@@ -53,7 +44,7 @@ PAIR_COLUMNS = (
     Column(
         "covered",
         "% of picture",
-        "by the boards' corners together; beyond, the lens is a guess.",
+        "by the boards' corners together; beyond, the lens is extrapolated.",
         limits.COVERED_PERCENT,
         True,
         0,
@@ -84,7 +75,7 @@ PAIR_COLUMNS = (
     Column(
         "sigma",
         "mm",
-        "of the camera's place in the rig frame, all axes together, from the covariance of the "
+        "of the camera's position in the rig frame, all axes together, from the covariance of the "
         "joint solve.",
         limits.SIGMA_MM,
     ),
@@ -129,8 +120,8 @@ def _rig(calibration: RigCalibration) -> Section:
     if calibration.is_import:
         source = "the import says (that of 1 px where it says nothing)"
     ellipsoids = (
-        f"Ellipsoids: one sigma of each camera's place in the rig frame as {source}, drawn "
-        f"{times:,.0f} times too large. "
+        f"Ellipsoids: one sigma of each camera's position in the rig frame as {source}, enlarged "
+        f"{times:,.0f} times. "
         if len(calibration.pairs) > 1
         else ""
     )
@@ -140,7 +131,7 @@ def _rig(calibration: RigCalibration) -> Section:
             Viewer(
                 "Cameras in the rig frame",
                 f"Pyramids: cameras and what they see. {ellipsoids}"
-                "Grey: boards as they were held, and the scan volume. Red, green and blue: the rig's "
+                "Grey: boards, and the scan volume. Red, green and blue: the rig's "
                 "axes x, y and z.",
                 model,
             )
@@ -200,17 +191,21 @@ def _better(gain: float) -> str:
 
 def _advice(calibration: RigCalibration) -> Section:
     why = (
-        "another program tied the pairs"
-        if calibration.is_import
-        else "a single pair has nothing to be tied to"
+        "another program calibrated the rig" if calibration.is_import else "there is a single pair"
     )
     lines = calibration.advice or (f"No advice: {why}.",)
-    return Section("How well the pairs are tied, and what would help", [Lines(lines)])
+    return Section("How well the pairs are connected, and what would help", [Lines(lines)])
 
 
 def _boards(calibration: RigCalibration) -> Section:
     if not calibration.seen:
-        why = NO_IMAGES if calibration.is_import else NOT_STORED
+        why = (
+            "This calibration was imported: no image of a board was read. `bodyscan check-calibration` "
+            "tests it with a few."
+            if calibration.is_import
+            else "This calibration was stored without its corners: calibrate again to see where the "
+            "boards lay in each picture, and their residuals."
+        )
         return Section("Boards in the pictures", [Lines((why,))])
     residuals, times = draw.residual_chart(calibration)
     return Section(
@@ -225,8 +220,8 @@ def _boards(calibration: RigCalibration) -> Section:
             Picture(
                 "Residuals of corners",
                 "Colour: RMS over each part of the picture, px. Arrows: their mean, "
-                f"{times:,.0f} times too long; arrows that all point one way in a part of the picture "
-                "mean that the lens model does not fit there. Empty: fewer than three corners.",
+                f"enlarged {times:,.0f} times; arrows that all point the same way in a part of the "
+                "picture mean that the lens model does not fit there. Empty: fewer than three corners.",
                 residuals,
             ),
         ],
@@ -272,10 +267,10 @@ def _light_models(calibration: RigCalibration) -> list[Block]:
 def _view_graph(calibration: RigCalibration) -> Section:
     if len(calibration.seen) < 2:
         return Section("Who shares boards with whom", [Lines(("There is nothing to share.",))])
-    together = draw.shared_boards(calibration)
+    shared = draw.shared_boards(calibration)
     return Section(
         "Who shares boards with whom",
-        intro="Two pairs are tied together by boards that both saw at the same moment.",
+        intro="Two pairs are connected by boards that both saw at the same moment.",
         blocks=[
             Picture(
                 "View graph",
@@ -287,7 +282,7 @@ def _view_graph(calibration: RigCalibration) -> Section:
                 "Number of boards seen by both at the same moment. Empty: none.",
                 charts.matrix(
                     list(calibration.seen),
-                    np.where(together > 0, together, np.nan),
+                    np.where(shared > 0, shared, np.nan),
                     "boards",
                     ".0f",
                 ),
@@ -303,11 +298,11 @@ def _sigma(calibration: RigCalibration) -> Section:
         return Section(title, [Lines((f"There is no map: {why[0]}; {why[1]}.",))])
     picture = Picture(
         "Sigma over the scan volume",
-        "How far the poses of the pairs alone may put a point wrong (one sigma, all axes together, "
+        "Error of a point from the poses of the pairs alone (one sigma, all axes together, "
         "mm), in two upright planes through the rig's axis. Stripe noise and the subject's sway are "
         "not in it. Light grey: nothing is measured there (no camera sees it, or a single one "
         "without a projector).",
-        draw_sigma_map(calibration, height_px=PICTURE_PX),
+        draw_sigma_map(calibration, height_px=charts.PICTURE_PX),
     )
     return Section(title, [picture])
 

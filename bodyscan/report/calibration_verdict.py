@@ -21,8 +21,6 @@ COVERED_PERCENT = 40.0
 POSES, STRIPE_SHOTS = 6, 4
 STRIPES_PERCENT = 50.0
 SIGMA_MM = 0.5
-FAR_BEYOND = 2.0
-"""Exceeding a limit by this factor calls for a new calibration, by less for care."""
 
 
 @dataclass(frozen=True)
@@ -41,16 +39,16 @@ class PairFigures:
     sigma_mm: float | None
 
     def beyond(self) -> Iterator[tuple[float, str]]:
-        """Each limit that is exceeded: by what factor, and in words."""
+        """Yield each limit that is exceeded: by what factor, and in words."""
         checks = (
-            ("corners are off by", self.corners_rms_px, CORNERS_RMS_PX, "px RMS", False),
+            ("corner residuals are", self.corners_rms_px, CORNERS_RMS_PX, "px RMS", False),
             ("was calibrated from", self.poses, POSES, "board poses", True),
             ("boards covered", self.covered_percent, COVERED_PERCENT, "% of its picture", True),
-            ("light sheets are off by", self.sheets_rms_mm, SHEETS_RMS_MM, "mm RMS", False),
-            ("is off on held-out boards by", self.held_out_mm, HELD_OUT_MM, "mm", False),
+            ("light sheets have residuals of", self.sheets_rms_mm, SHEETS_RMS_MM, "mm RMS", False),
+            ("held-out boards are missed by", self.held_out_mm, HELD_OUT_MM, "mm", False),
             ("stripes were decoded on", self.stripe_shots, STRIPE_SHOTS, "boards", True),
             ("has planes for", self.stripes_percent, STRIPES_PERCENT, "% of its stripes", True),
-            ("its place is known to", self.sigma_mm, SIGMA_MM, "mm", False),
+            ("its position has a sigma of", self.sigma_mm, SIGMA_MM, "mm", False),
         )
         for words, value, limit, unit, at_least in checks:
             if value is None or (value >= limit if at_least else value <= limit):
@@ -61,7 +59,7 @@ class PairFigures:
 
 
 def figures_of(calibration: RigCalibration) -> list[PairFigures]:
-    """Figures of every calibrated pair, in the order of the rig."""
+    """Collect the figures of every calibrated pair, in the order of the rig."""
     return [
         _figures(calibration, pair.name)
         for pair in calibration.rig.pairs
@@ -70,14 +68,14 @@ def figures_of(calibration: RigCalibration) -> list[PairFigures]:
 
 
 def grade_calibration(calibration: RigCalibration) -> Verdict:
-    """Grade a calibration by how far its pairs are beyond their limits."""
+    """Grade a calibration by how far its pairs are beyond their limits: recalibrate from twice on."""
     findings = [
         (np.inf, f"recalibrate: pair {name} failed: {reason}")
         for name, reason in calibration.failed.items()
     ]
     for pair in figures_of(calibration):
         for times, words in pair.beyond():
-            far = times > FAR_BEYOND
+            far = times > 2.0
             findings.append((times, f"{'recalibrate: ' if far else ''}pair {pair.name}: {words}"))
     size = nominal_size(calibration.rig, calibration.rig_from_camera)
     if size and size.mark != "good":  # one in use is reported; a new one is not made
@@ -85,12 +83,12 @@ def grade_calibration(calibration: RigCalibration) -> Verdict:
     findings.sort(key=lambda finding: -finding[0])
     worst = findings[0][0] if findings else 0.0
     unjudged = [
-        f"pair {name}: imported from {pair.quality.imported}, how exact it is is not known: show it a "
-        "board (check-calibration), or say what it is good to (import --sigma-px)"
+        f"pair {name}: imported from {pair.quality.imported}, its accuracy is not known: check it with "
+        "a board (check-calibration), or state it (import --sigma-px)"
         for name, pair in calibration.pairs.items()
         if pair.quality.unjudged
     ]
-    grade: Grade = "recalibrate" if worst > FAR_BEYOND else "usable" if findings else "good"
+    grade: Grade = "recalibrate" if worst > 2.0 else "usable" if findings else "good"
     if unjudged and grade != "recalibrate":
         grade = "not judged"
     return Verdict(grade, (*(words for _, words in findings), *unjudged))
@@ -99,9 +97,9 @@ def grade_calibration(calibration: RigCalibration) -> Verdict:
 def _figures(calibration: RigCalibration, name: str) -> PairFigures:
     pair = calibration.pairs[name]
     quality, camera, seen = pair.quality, pair.camera, calibration.seen.get(name)
-    place = calibration.rig_from_camera[name].translation
+    position = calibration.rig_from_camera[name].translation
     striped, ours = pair.sheets is not None, not quality.imported
-    sigma = position_sigma(calibration.covariance, name, place)
+    sigma = position_sigma(calibration.covariance, name, position)
     share = None
     if seen is not None:
         views = [seen.pixels[seen.target == k].astype(float) for k in np.unique(seen.target)]

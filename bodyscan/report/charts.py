@@ -1,4 +1,4 @@
-"""Small charts as SVG, all in one style. Matplotlib is imported only here and in `figures`."""
+"""Small charts by Matplotlib, all in one style: SVG, or PNG for maps."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 INK, GREY, BLUE, RED = "#1d2430", "#8a93a0", "#0072b2", "#d55e00"
+PICTURE_PX = 760  # height of a picture in a page
 STYLE: Any = {
     "svg.hashsalt": "bodyscan",
     "font.size": 9.0,
@@ -33,6 +34,7 @@ STYLE: Any = {
 
 @contextmanager
 def style() -> Iterator[None]:
+    """Draw in the style of the reports within the block."""
     with matplotlib.rc_context(STYLE):
         yield
 
@@ -42,6 +44,15 @@ def svg(figure: Figure) -> bytes:
     stream = io.BytesIO()
     with style():
         figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})
+    plt.close(figure)
+    return stream.getvalue()
+
+
+def png(figure: Figure, height_px: int) -> bytes:
+    """A figure as PNG of this height."""
+    stream = io.BytesIO()
+    with style():
+        figure.savefig(stream, format="png", dpi=height_px / figure.get_figheight())
     plt.close(figure)
     return stream.getvalue()
 
@@ -126,3 +137,15 @@ def grid_of(count: int, columns: int, cell: tuple[float, float]) -> tuple[Figure
     for axis in flat[count:]:
         axis.set_visible(False)
     return figure, flat[:count]
+
+
+def round_down(value: float, digits: int) -> float:
+    """Round a positive number down to so many digits."""
+    power = 10.0 ** (np.floor(np.log10(value)) - digits + 1)
+    return float(np.floor(value / power) * power)
+
+
+def round_up(value: float) -> float:
+    """Round a positive number up to 1, 2 or 5 times a power of ten."""
+    power = 10.0 ** np.floor(np.log10(value))
+    return float(next(step * power for step in (1.0, 2.0, 5.0, 10.0) if step * power >= value))

@@ -9,7 +9,6 @@ import numpy as np
 from bodyscan.evaluation.surface import Comparison
 from bodyscan.mesh.body import BodyMesh
 from bodyscan.report import charts
-from bodyscan.report.canvas import PICTURE_PX, round_up
 from bodyscan.report.page import Column, Picture, Section, Table
 from bodyscan.report.pictures import draw_deviation
 
@@ -17,7 +16,7 @@ from bodyscan.report.pictures import draw_deviation
 def comparison_section(
     mesh: BodyMesh, found: list[Comparison], shown: Comparison, limit: float
 ) -> Section:
-    """The comparisons' figures, and a map of the one `shown`; limit: of the map's scale, mm."""
+    """Tabulate the comparisons, and map the one `shown`; limit: of the map's scale, mm."""
     columns = (
         Column("the scan"),
         Column("bias", "mm", "mean signed distance, outside is positive."),
@@ -26,27 +25,28 @@ def comparison_section(
         Column("95 %", "mm", "of the absolute distances are less."),
         Column("worst", "mm", "the largest of the absolute distances.", digits=2),
     )
-    rows = tuple((_standing(one), *astuple(one.figures)[1:]) for one in found)
+    rows = tuple((_frame_words(one), *astuple(one.figures)[1:]) for one in found)
     points = mesh.vertices[shown.vertices]
-    laid = found[-1].other_from_scan
-    moved = float(np.linalg.norm(laid.apply(points.mean(axis=0)) - points.mean(axis=0)))
+    fit = found[-1].other_from_scan
+    moved = float(np.linalg.norm(fit.apply(points.mean(axis=0)) - points.mean(axis=0)))
     return Section(
         f"Compared with {shown.name}",
         intro=f"Distances of the {len(points):,} measured vertices of this scan's mesh from the "
         f"surface of {shown.name}; what was filled is left out. To fit it, the scan was moved "
-        f"by {moved:.2f} mm and turned by {np.degrees(laid.angle):.3f} degrees as a whole.",
+        f"by {moved:.2f} mm and turned by {np.degrees(fit.angle):.3f} degrees as a whole.",
         blocks=[
             Table(columns, rows),
             Picture(
                 "Deviation map",
-                f"Front, left side, back; the scan {_standing(shown)}. Red: outside of {shown.name}, "
-                "blue: inside. Beyond the ends of the scale the colour is that of the end.",
+                f"Front, left side, back; the scan {_frame_words(shown)}. Red: outside of "
+                f"{shown.name}, blue: inside. Values beyond the scale "
+                "have the colour of its end.",
                 draw_deviation(
                     points,
                     mesh.normals[shown.vertices],
                     shown.signed_mm,
                     limit_mm=limit,
-                    height_px=PICTURE_PX,
+                    height_px=charts.PICTURE_PX,
                     caption="deviation, mm",
                 ),
             ),
@@ -59,10 +59,10 @@ def comparison_section(
     )
 
 
-def _standing(one: Comparison) -> str:
-    return "fitted to the other as a whole" if one.fitted else "as it stands in its rig frame"
+def _frame_words(one: Comparison) -> str:
+    return "fitted rigidly to the other" if one.fitted else "in its rig frame"
 
 
 def map_limit(one: Comparison) -> float:
-    """The end of the map's scale, mm: a round number that most deviations stay below."""
-    return round_up(max(one.figures.p95_mm, 1e-3))
+    """Choose the end of the map's scale, mm: a round number above 95 % of the deviations."""
+    return charts.round_up(max(one.figures.p95_mm, 1e-3))

@@ -13,17 +13,12 @@ from bodyscan.measurement.outline import Range
 from bodyscan.mesh.body import DARK_CLOTH, HAIR, REGION_NAMES, SKIN
 from bodyscan.version import __version__
 
-MOSTLY = 0.5
-LITTLE = 0.95
-TAPE_MM = 4.0
-"""Difference between two measurers with a tape (ISO 20685-1)."""
-
 
 def tables(measured: Measurements) -> Iterator[Table]:
     """The whole body, then one row for each part of each slice, from the top down."""
     body = Table("", "", title="body", show_header=False)
     body.columns[1].justify = "right"
-    guess = "" if measured.stature_measured >= MOSTLY else " (guessed: the crown was not measured)"
+    guess = "" if measured.stature_measured >= 0.5 else " (guessed: the crown was not measured)"
     of = {REGION_NAMES[HAIR]: " (top of the hair)", REGION_NAMES[DARK_CLOTH]: " (of a cap or hood)"}
     which = of.get(measured.crown or "", guess)
     body.add_row("stature in pose", f"{measured.stature_mm:.1f} mm{which}")
@@ -33,7 +28,7 @@ def tables(measured: Measurements) -> Iterator[Table]:
     body.add_row("volume", f"{measured.volume_l:.2f} l")
     body.add_row("area", f"{measured.area_m2:.3f} m2")
     body.add_row("of it measured", f"{100.0 * measured.measured:.1f} %")
-    over = _covered(measured.regions)
+    over = _name_covered(measured.regions)
     if over:
         body.add_row("of it covered", over)
     yield body
@@ -56,30 +51,33 @@ def tables(measured: Measurements) -> Iterator[Table]:
             slices.add_row(
                 f"{level.height_mm:.0f}",
                 girth.part,
-                _told(girth.tape_mm, girth.tape_range_mm),
-                _told(girth.girth_mm, girth.girth_range_mm),
+                _format_girth(girth.tape_mm, girth.tape_range_mm),
+                _format_girth(girth.girth_mm, girth.girth_range_mm),
                 f"{girth.width_mm:.1f}",
                 f"{girth.depth_mm:.1f}",
                 f"{100.0 * girth.measured:.0f} %",
-                _covered(girth.regions),
-                style="" if girth.measured_skin >= LITTLE else "yellow",
+                _name_covered(girth.regions),
+                style="" if girth.measured_skin >= 0.95 else "yellow",
             )
     yield slices
 
 
-def _covered(regions: Mapping[str, float] | None) -> str:
-    """What a girth crosses that is not skin, if that is more than a little."""
+def _name_covered(regions: Mapping[str, float] | None) -> str:
+    """Name what a girth crosses that is not skin, from 5 % on."""
     parts = (
         (name, (regions or {}).get(name, 0.0))
         for name in (REGION_NAMES[HAIR], REGION_NAMES[DARK_CLOTH])
     )
-    return ", ".join(f"{name} {100.0 * part:.0f} %" for name, part in parts if part > 1.0 - LITTLE)
+    return ", ".join(f"{name} {100.0 * part:.0f} %" for name, part in parts if part > 0.05)
 
 
-def _told(value: float, between: Range) -> str:
-    """A range if unmeasured parts leave more open than a tape does, else the value."""
+def _format_girth(value: float, between: Range) -> str:
+    """Give the range if unmeasured parts leave more open than a tape does, else the value.
+
+    Two measurers with a tape differ by 4 mm (ISO 20685-1).
+    """
     low, high = between
-    return f"{low:.0f} to {high:.0f}" if high - low > TAPE_MM else f"{value:.1f}"
+    return f"{low:.0f} to {high:.0f}" if high - low > 4.0 else f"{value:.1f}"
 
 
 def measurements_document(measured: Measurements, facts: Mapping[str, Any]) -> dict[str, Any]:

@@ -50,11 +50,6 @@ class Standpoint:
     elevation_deg: float = 6.0
 
 
-MOST_VERTICES = 65_536
-"""The most that a 16-bit index can address."""
-STEPS = 65_535
-
-
 def pack(
     shape: Shape | None,
     layers: Sequence[Layer] = (),
@@ -68,13 +63,15 @@ def pack(
     A coordinate is `low + step * integer`, in steps of 1/65,535 of the longest side. Raises
     ValueError for a mesh of more than 65,536 vertices.
     """
-    if shape is not None and len(shape.vertices) > MOST_VERTICES:
-        raise ValueError(f"{len(shape.vertices)} vertices; a viewer's mesh has {MOST_VERTICES}")
-    places = [shape.vertices] if shape is not None else []
-    places += [strokes.ends.reshape(-1, 3)] if strokes is not None else []
-    everything = np.concatenate(places)
+    if shape is not None and len(shape.vertices) > 65_536:
+        raise ValueError(
+            f"{len(shape.vertices)} vertices; the viewer's 16-bit indices address 65,536"
+        )
+    coordinates = [shape.vertices] if shape is not None else []
+    coordinates += [strokes.ends.reshape(-1, 3)] if strokes is not None else []
+    everything = np.concatenate(coordinates)
     low, high = everything.min(axis=0), everything.max(axis=0)
-    step = float((high - low).max()) / STEPS or 1.0
+    step = float((high - low).max()) / 65_535 or 1.0
 
     def whole(points: Array) -> str:
         return encode(np.rint((points - low) / step).astype("<u2"))

@@ -144,8 +144,7 @@ class Section:
 
 
 def sections_of(parts: Mapping[str, Callable[[], Section]]) -> list[Section]:
-    """Every section of a report, by its title; one that
-    cannot be made is replaced by its reason."""
+    """Make the sections of a report, by title; one that cannot be made is replaced by its reason."""
     made: list[Section] = []
     for title, make in parts.items():
         notes: list[str] = []
@@ -174,15 +173,10 @@ class Page:
     subject: str | None = None
 
 
-LEVELS = 3
-"""How many folders above a result are searched: a batch's
-results are deeper than a single scan's."""
-
-
 def is_synthetic(folder: Path) -> bool:
     """Whether the simulator's truth lies beside a result or above it."""
-    above = (folder.resolve(), *folder.resolve().parents[:LEVELS])
-    return any((place / "truth" / "truth.json").is_file() for place in above)
+    above = (folder.resolve(), *folder.resolve().parents[:3])  # a batch's results are deepest
+    return any((parent / "truth" / "truth.json").is_file() for parent in above)
 
 
 def render(page: Page) -> str:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -20,19 +21,9 @@ from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.mesh.depth_buffer import nearest_faces, nearest_points
 from bodyscan.optional import optional
 from bodyscan.outcome import Outcome
-from bodyscan.report.canvas import (
-    BACKGROUND,
-    Scale,
-    blue_white_red,
-    colour_bar,
-    png,
-    turbo,
-    write_label,
-)
 
 FILLED_TINT = (60, 160, 255)  # blue, green, red: orange
-WRONG_SIDE = (200, 40, 200)
-SLICE_POINTS = 20_000  # of a body's cloud, 40 mm of the trunk: far thicker than a gap
+BACKGROUND, INK = (250, 250, 250), (40, 40, 40)
 Pictures = Outcome[dict[str, bytes]]
 """PNG files by name; those that could not be drawn are noted."""
 AZIMUTHS_DEG = {"front": 0.0, "side": 90.0, "back": 180.0}
@@ -40,8 +31,8 @@ AZIMUTHS_DEG = {"front": 0.0, "side": 90.0, "back": 180.0}
 
 
 def cloud_pictures(cloud: BodyCloud) -> Pictures:
-    """The cloud by photo, sigma and number of pairs."""
-    return _drawn(
+    """Draw the cloud by photo, sigma and number of pairs."""
+    return _draw_each(
         {
             "cloud.png": partial(draw_cloud, cloud, colour="photo"),
             "sigma.png": partial(draw_cloud, cloud, colour="sigma"),
@@ -51,13 +42,12 @@ def cloud_pictures(cloud: BodyCloud) -> Pictures:
 
 
 def mesh_pictures(mesh: BodyMesh) -> Pictures:
-    """The mesh with its filled faces marked."""
-    return _drawn({"mesh.png": partial(draw_mesh, mesh)})
+    """Draw the mesh with its filled faces marked."""
+    return _draw_each({"mesh.png": partial(draw_mesh, mesh)})
 
 
 def write_pictures(pictures: Iterable[Pictures], folder: Path) -> Outcome[list[Path]]:
-    """Write a scan's pictures beside its result. A picture
-    that cannot be drawn or written is noted."""
+    """Write a scan's pictures beside its result. One that cannot be drawn or written is noted."""
     written: list[Path] = []
     notes: list[str] = []
     for some in pictures:
@@ -69,7 +59,8 @@ def write_pictures(pictures: Iterable[Pictures], folder: Path) -> Outcome[list[P
     return Outcome(written, tuple(notes))
 
 
-def _drawn(pictures: Mapping[str, Callable[[], bytes]]) -> Pictures:
+def _draw_each(pictures: Mapping[str, Callable[[], bytes]]) -> Pictures:
+    """Draw pictures by name; those that fail are noted."""
     drawn: dict[str, bytes] = {}
     notes: list[str] = []
     for name, draw in pictures.items():
@@ -146,8 +137,7 @@ def _draw_points(
 
 @dataclass(frozen=True)
 class _Frame:
-    """The frame of a view's picture: which part of the
-    picture plane it shows, and at what scale."""
+    """Which part of the picture plane a view shows, and at what scale."""
 
     axes: Array
     left: float
@@ -156,14 +146,14 @@ class _Frame:
     width: int
     height: int
 
-    def places(self, points: Array) -> Floats:
+    def project(self, points: Array) -> Floats:
         """Column, row and depth (mm, from the middle) (N, 3) of points (N, 3)."""
         right, up, towards = self.axes
-        places = np.empty((len(points), 3), np.float32)
-        places[:, 0] = (points @ right - self.left) / self.step_mm - 0.5
-        places[:, 1] = (self.top - points @ up) / self.step_mm - 0.5
-        places[:, 2] = -(points @ towards)
-        return places
+        projected = np.empty((len(points), 3), np.float32)
+        projected[:, 0] = (points @ right - self.left) / self.step_mm - 0.5
+        projected[:, 1] = (self.top - points @ up) / self.step_mm - 0.5
+        projected[:, 2] = -(points @ towards)
+        return projected
 
 
 def _frames(points: Array, views: Sequence[str], height_px: int) -> list[_Frame]:
@@ -197,14 +187,14 @@ def _write_name(panel: Bytes, view: str) -> Bytes:
 
 def _draw_faces(mesh: BodyMesh, base: Bytes, frame: _Frame) -> Bytes:
     """Draw faces in their colours (F, 3), shaded by how they face the viewer."""
-    number = nearest_faces(frame.places(mesh.vertices), mesh.faces, frame.height, frame.width)
+    number = nearest_faces(frame.project(mesh.vertices), mesh.faces, frame.height, frame.width)
     hit = number >= 0
     face = number[hit]
     first, second, third = np.moveaxis(mesh.vertices[mesh.faces[face]], 1, 0)
     normals = np.cross(second - first, third - first)
     length = np.maximum(np.linalg.norm(normals, axis=1), 1e-12)
     facing = normals @ frame.axes[2] / length
-    colours = np.where((facing < 0)[:, None], WRONG_SIDE, base[face])
+    colours = np.where((facing < 0)[:, None], (200, 40, 200), base[face])
     canvas = np.full((*number.shape, 3), BACKGROUND, np.uint8)
     canvas[hit] = colours * (0.25 + 0.75 * np.abs(facing))[:, None]
     return canvas
@@ -213,23 +203,91 @@ def _draw_faces(mesh: BodyMesh, base: Bytes, frame: _Frame) -> Bytes:
 def _splat_view(
     points: Array, normals: NDArray[np.floating], colours: Bytes, frame: _Frame, dot_mm: float
 ) -> Bytes:
+    """Draw points that face the viewer as squares of dot_mm."""
     front = np.flatnonzero(normals @ frame.axes[2].astype(normals.dtype) > 0)
     size = max(1, int(np.ceil(dot_mm / frame.step_mm)))
-    places = frame.places(points.take(front, axis=0))
-    number = nearest_points(places, size, frame.height, frame.width)
+    projected = frame.project(points.take(front, axis=0))
+    number = nearest_points(projected, size, frame.height, frame.width)
     canvas = np.full((*number.shape, 3), BACKGROUND, np.uint8)
     canvas[number >= 0] = colours[front[number[number >= 0]]]
     return canvas
 
 
 def _dot_size(points: Array) -> float:
-    """Size to draw a point, mm, so that a surface shows no holes: four times the usual gap."""
+    """Size to draw a point, mm, so that a surface shows no holes: four times the median gap."""
     if len(points) < 2:
         return 0.0
     height = points[:, 2]
     level = np.abs(height - np.median(height))
-    # A slice says as much as the whole cloud, and its tree is built at once.
-    count = min(SLICE_POINTS, len(points))
+    # A slice is enough, and its tree is built at once: of a body 40 mm of the trunk.
+    count = min(20_000, len(points))
     slice_ = points[np.argpartition(level, count - 1)[:count]]
     gaps = np.asarray(cKDTree(slice_).query(slice_[:: max(1, count // 2000)], k=2)[0])[:, 1]
     return 4.0 * float(np.median(gaps))
+
+
+@dataclass(frozen=True)
+class Scale:
+    """A colour for every number between two ends, with a caption for its bar."""
+
+    low: float
+    high: float
+    caption: str
+    table: Bytes  # (256, 3) blue, green, red
+
+    def colours(self, values: NDArray[np.floating]) -> Bytes:
+        """Colours (N, 3) of values (N,); clipped to the ends, grey for NaN."""
+        share = (np.nan_to_num(values) - self.low) / (self.high - self.low)
+        colours = self.table[np.clip(np.rint(255 * share), 0, 255).astype(np.uint8)]
+        return np.where(np.isfinite(values)[:, None], colours, 128).astype(np.uint8)
+
+
+def colour_bar(scale: Scale, height_px: int) -> Bytes:
+    """Draw a colour bar with round numbers beside it, and its caption."""
+    panel = np.full((height_px, 130, 3), BACKGROUND, np.uint8)
+    top, bottom = height_px // 6, height_px - height_px // 6
+    ramp = scale.table[np.linspace(255, 0, bottom - top).astype(np.uint8)]
+    panel[top:bottom, 20:50] = ramp[:, None]
+    for value in round_ticks(scale.low, scale.high):
+        share = (value - scale.low) / (scale.high - scale.low)
+        row = round(bottom - share * (bottom - top))
+        panel[row, 50:54] = INK
+        write_label(panel, f"{value:g}", (58, row + 5))
+    write_label(panel, scale.caption, (8, top - 20))
+    return panel
+
+
+def round_ticks(low: float, high: float) -> list[float]:
+    """Choose three to six round numbers from low to high; whole ones if the range is large enough."""
+    rough = (high - low) / 5.0
+    unit = 10.0 ** np.floor(np.log10(rough))
+    step = next(unit * times for times in (1.0, 2.0, 5.0, 10.0) if unit * times >= rough * 0.999)
+    first, last = np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9)
+    return [float(np.round(k * step, 10)) + 0.0 for k in np.arange(first, last + 1)]
+
+
+def write_label(panel: Bytes, text: str, corner: tuple[int, int]) -> None:
+    """Write text with its lower left corner at (column, row)."""
+    cv2.putText(panel, text, corner, cv2.FONT_HERSHEY_SIMPLEX, 0.45, INK, 1, cv2.LINE_AA)
+
+
+def turbo() -> Bytes:
+    """Return the turbo colour map: (256, 3) blue, green, red."""
+    ramp = np.arange(256, dtype=np.uint8)[:, None]
+    return np.asarray(cv2.applyColorMap(ramp, cv2.COLORMAP_TURBO)).reshape(256, 3)
+
+
+def blue_white_red() -> Bytes:
+    """Return a diverging colour map: (256, 3) blue, green, red."""
+    share = np.linspace(-1.0, 1.0, 256)[:, None]
+    blue, white, red = np.array([[180, 60, 20], [245, 245, 245], [30, 20, 180]], float)
+    ends = np.where(share < 0, blue, red)
+    return np.rint(white + np.abs(share) ** 0.8 * (ends - white)).astype(np.uint8)
+
+
+def png(panels: Iterable[Bytes]) -> bytes:
+    """Encode panels of equal height, side by side, as PNG."""
+    ok, data = cv2.imencode(".png", np.concatenate(list(panels), axis=1))
+    if not ok:
+        raise ValueError("no PNG could be made")
+    return data.tobytes()

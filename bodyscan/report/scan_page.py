@@ -21,8 +21,7 @@ from bodyscan.mesh.topology import compute_topology
 from bodyscan.motion.person_motion import PartMotion, PersonMotion
 from bodyscan.registration.rig_calibration import FLOOR_AXES
 from bodyscan.report import charts
-from bodyscan.report.body_model import layers, light_mesh, shape_of
-from bodyscan.report.canvas import PICTURE_PX
+from bodyscan.report.body_model import layers, shape_of, simplify_mesh
 from bodyscan.report.comparison_section import comparison_section, map_limit
 from bodyscan.report.model import pack
 from bodyscan.report.page import (
@@ -41,12 +40,6 @@ from bodyscan.report.page import (
 from bodyscan.report.pictures import draw_cloud, draw_mesh
 from bodyscan.verdict import Verdict
 
-MOST_HOLES = 8
-SMALL_HOLE_MM2 = 100.0
-NO_VERDICT = (
-    "this scan was made by a version of bodyscan that gave no verdict: scan again to have one"
-)
-
 
 def scan_page(folder: Path, other: Path | None = None) -> Page:
     """The report of the scan in `folder`, compared with `other` if given.
@@ -62,7 +55,8 @@ def scan_page(folder: Path, other: Path | None = None) -> Page:
         sections = _sections(scan, found)
     return Page(
         f"Scan of {subject}" if subject else f"Scan {folder.resolve().name}",
-        stored_verdict(facts) or Verdict("usable", (NO_VERDICT,)),
+        stored_verdict(facts)
+        or Verdict("usable", ("this scan was made by a version of bodyscan that gave no verdict",)),
         is_synthetic(folder) or facts.get("simulated", False),
         (
             ("taken", _in_words(facts.get("when"))),
@@ -77,7 +71,7 @@ def scan_page(folder: Path, other: Path | None = None) -> Page:
 
 
 def _in_words(when: str | None) -> str:
-    """A date as people write it; text that is no date is returned unchanged."""
+    """Format a date as people write it; text that is no date is returned unchanged."""
     if not when:
         return "not known"
     try:
@@ -110,9 +104,9 @@ def _sections(scan: StoredScan, found: list[Comparison]) -> list[Section]:
 
 
 def _viewer(scan: StoredScan, shown: Comparison | None, limit: float) -> Viewer | Lines:
-    small = light_mesh(scan.mesh)
+    small = simplify_mesh(scan.mesh)
     if small is None:
-        return Lines(("The mesh folds when it is made small, so there is no model to turn here.",))
+        return Lines(("The mesh cannot be reduced without folds: there is no model to rotate.",))
     return Viewer(
         "Body model",
         f"The mesh reduced to {len(small.faces):,} faces, a few tenths of a millimetre from the full "
@@ -172,7 +166,7 @@ def _numbers(scan: StoredScan) -> Numbers:
 def _alignment_numbers(facts: Mapping[str, Any]) -> list[Number]:
     alignment = facts.get("alignment")
     if alignment is None:
-        return [Number("overlaps", "not aligned", "", "pairs stand where the boards put them")]
+        return [Number("overlaps", "not aligned", "", "pairs are at their calibrated poses")]
     motions = sorted(alignment["motion_mm"].items(), key=lambda item: -item[1])
     return [
         Number(
@@ -193,7 +187,7 @@ def _alignment_numbers(facts: Mapping[str, Any]) -> list[Number]:
                 "sway",
                 motion,
                 "mm",
-                "how far the subject moved between pairs at most, as the alignment found it: pair "
+                "the largest motion of the subject between pairs, by alignment: pair "
                 f"{farthest}, at the body's middle",
                 MAX_MOTION_MM,
                 digits=2,
@@ -212,20 +206,18 @@ def _person(person: Mapping[str, Any]) -> Section:
         Column(
             "known to",
             "mm",
-            "standard deviation of what is left of that, along the surface's normals.",
+            "standard deviation of what remains of that, along the surface's normals.",
             MAX_RESIDUAL_MM,
             digits=2,
         ),
-        Column(
-            "seen once", "%", "by a single pair: no other could tell how it had moved.", digits=0
-        ),
+        Column("seen once", "%", "by a single pair: no other could measure its motion.", digits=0),
     )
     rows = tuple(
         (part["name"], part["moved_mm"], part["left_mm"], 100.0 * part["seen_once"])
         for part in person["parts"]
     )
     keys = ("name", "moved_mm", "left_mm", "seen_once")
-    told = PersonMotion(
+    motion = PersonMotion(
         tuple(PartMotion(*(part[key] for key in keys)) for part in person["parts"]),
         person["breathed_mm"],
         person.get("moment_ms"),
@@ -233,11 +225,11 @@ def _person(person: Mapping[str, Any]) -> Section:
         person.get("fuller_sigma_mm"),
     )
     when = "the mean of all pairs"
-    if told.moment_ms is not None:
-        when = f"{told.moment_ms / 1000.0:.2f} s after the scan began"
-    what = told.summary or "moved while being scanned"
+    if motion.moment_ms is not None:
+        when = f"{motion.moment_ms / 1000.0:.2f} s after the scan began"
+    what = motion.summary or "moved while being scanned"
     intro = f"The person {what}. Cloud and mesh show the body as of {when}."
-    return Section("The person", [Table(columns, rows), Lines(told.breath_lines)], intro)
+    return Section("The person", [Table(columns, rows), Lines(motion.breath_lines)], intro)
 
 
 def _pictures(scan: StoredScan) -> Section:
@@ -249,22 +241,22 @@ def _pictures(scan: StoredScan) -> Section:
             Picture(
                 "Measured points, as photographed",
                 views + "White: nothing was measured there.",
-                draw_cloud(cloud, height_px=PICTURE_PX),
+                draw_cloud(cloud, height_px=charts.PICTURE_PX),
             ),
             Picture(
                 "Mesh",
                 views + "Orange: filled to close the mesh.",
-                draw_mesh(mesh, height_px=PICTURE_PX),
+                draw_mesh(mesh, height_px=charts.PICTURE_PX),
             ),
             Picture(
                 "Sigma of the points",
                 views + "Standard deviation of each point along its normal, mm.",
-                draw_cloud(cloud, colour="sigma", height_px=PICTURE_PX),
+                draw_cloud(cloud, colour="sigma", height_px=charts.PICTURE_PX),
             ),
             Picture(
                 "Pairs",
                 views + "How many pairs measured each place.",
-                draw_cloud(cloud, colour="pairs_seen", height_px=PICTURE_PX),
+                draw_cloud(cloud, colour="pairs_seen", height_px=charts.PICTURE_PX),
             ),
         ],
     )
@@ -284,7 +276,7 @@ def _pairs(facts: Mapping[str, Any]) -> Section:
             "moved",
             "mm",
             "by the alignment, at the body's middle: sway of the subject and error of the pair's "
-            "placing together.",
+            "pose together.",
             MAX_MOTION_MM,
             digits=3,
         ),
@@ -297,7 +289,7 @@ def _pairs(facts: Mapping[str, Any]) -> Section:
     )
     lost = [f"{name} gave nothing: {reason}" for name, reason in facts["failed"].items()]
     lost += [
-        f"{name} was left where the boards put it: alignment would have moved it by {sigmas:.1f} sigmas"
+        f"{name} was left at its calibrated pose: alignment would have moved it by {sigmas:.1f} sigmas"
         for name, sigmas in alignment["refused"].items()
     ]
     blocks: list[Any] = [Table(columns, rows)]
@@ -311,11 +303,11 @@ def _pairs(facts: Mapping[str, Any]) -> Section:
 
 
 def _pair_residual(overlaps: list[dict[str, Any]], name: str) -> float | None:
-    own = [o for o in overlaps if o["source"] == name and o["rms_after_mm"] is not None]
-    points = sum(o["points"] for o in own)
+    known = [o for o in overlaps if o["source"] == name and o["rms_after_mm"] is not None]
+    points = sum(o["points"] for o in known)
     if not points:
         return None
-    return float(np.sqrt(sum(o["points"] * o["rms_after_mm"] ** 2 for o in own) / points))
+    return float(np.sqrt(sum(o["points"] * o["rms_after_mm"] ** 2 for o in known) / points))
 
 
 def _overlap_picture(overlaps: list[dict[str, Any]]) -> Picture:
@@ -341,10 +333,10 @@ def _sway_picture(motion: Mapping[str, float]) -> Picture:
 
 
 def _holes(scan: StoredScan) -> Section:
-    found = [hole for hole in find_filled_patches(scan.mesh) if hole.area_mm2 >= SMALL_HOLE_MM2]
+    found = [hole for hole in find_filled_patches(scan.mesh) if hole.area_mm2 >= 100.0]
     rows = tuple(
         (str(k), hole.area_mm2 / 100.0, hole.centre[2], hole.centre[0], hole.centre[1], hole.facing)
-        for k, hole in enumerate(found[:MOST_HOLES], start=1)
+        for k, hole in enumerate(found[:8], start=1)
     )
     columns = (
         Column("hole"),
@@ -356,7 +348,7 @@ def _holes(scan: StoredScan) -> Section:
     )
     intro = (
         f"Patches of at least 1 cm² that nothing measured and that were filled: {len(found)}"
-        + (f", of which the {MOST_HOLES} largest are listed" if len(found) > MOST_HOLES else "")
+        + (", of which the 8 largest are listed" if len(found) > 8 else "")
         + ". Height and place are of the patch's middle."
     )
     return Section("Holes", [Table(columns, rows)] if rows else [], intro)

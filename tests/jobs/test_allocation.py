@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from bodyscan.jobs.allocation import allocate, cores, free_memory_mb
+from bodyscan.jobs.batch import allocate, cores, free_memory_mb
 from bodyscan.settings import Resources
 
 NEEDS = Resources(threads=2, memory_mb=4000)

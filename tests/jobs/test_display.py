@@ -39,8 +39,8 @@ def test_people_are_told_what_happened(capsys: pytest.CaptureFixture[str]) -> No
     assert "1 of 2 jobs done (0 of them now), 1 set aside" in said
     assert "to be scanned again: b" in said
     assert "out/summary.csv" in said
-    assert "the median person of these scans is 1410 mm tall" in said
-    assert "every scan moves pair p1-4 by 1.3 mm the same way, 1 more likewise" in said
+    assert "the median stature of these scans is 1410 mm" in said
+    assert "pair p1-4, and 1 more: alignment moves it by 1.3 mm in the same direction" in said
 
 
 def test_programs_are_told_in_json(capsys: pytest.CaptureFixture[str]) -> None:

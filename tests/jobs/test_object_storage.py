@@ -17,8 +17,7 @@ from typer.testing import CliRunner
 
 from bodyscan.cli.main import app
 from bodyscan.errors import BadInput
-from bodyscan.jobs.allocation import Allocation
-from bodyscan.jobs.batch import finish, run_batch, run_locally
+from bodyscan.jobs.batch import Allocation, finish, run_batch, run_locally
 from bodyscan.jobs.object_storage import (
     Store,
     fetch_figures,

@@ -15,7 +15,7 @@ from cheap_batch import jobs_of
 from bodyscan.arrays import Array
 from bodyscan.jobs.batch import seconds_left
 from bodyscan.jobs.job import Job
-from bodyscan.jobs.summary import drifted, odd_stature, to_repeat, write_summary
+from bodyscan.jobs.summary import find_drift, find_odd_stature, scans_to_repeat, write_summary
 from bodyscan.jobs.supervision import JobResult
 from bodyscan.settings import BODY_CENTRE_MM
 
@@ -81,7 +81,7 @@ def test_drift_is_what_neighbours_in_time_have_in_common(day: tuple[list[Job], P
     assert float(table[0]["coverage_percent"]) == 92.5
     assert table[0]["pairs_measured"] == "1"
     assert table[3]["verdict_reasons"] == "moved, a lot"
-    assert to_repeat(jobs) == ["s3"]
+    assert scans_to_repeat(jobs) == ["s3"]
 
 
 def test_a_pair_that_all_scans_move_alike_is_told_from_one_that_sways(
@@ -89,8 +89,8 @@ def test_a_pair_that_all_scans_move_alike_is_told_from_one_that_sways(
 ) -> None:
     """b by 3 mm on the mean of five scans; a sways by 0.5 mm along each axis."""
     jobs, _ = day
-    assert [one.pair for one in drifted(jobs[4:])] == ["b"]
-    assert drifted(jobs[:2]) == []
+    assert [one.pair for one in find_drift(jobs[4:])] == ["b"]
+    assert find_drift(jobs[:2]) == []
 
 
 def test_two_scans_tell_no_drift_from_sway(day: tuple[list[Job], Path]) -> None:
@@ -112,7 +112,7 @@ def test_a_day_of_people_too_tall_or_too_short_for_any_nation(
         facts = json.loads(path.read_text())
         tall = 3000.0 if number == 3 else 1700.0 + 20.0 * (number - 4.5)
         path.write_text(json.dumps(facts | {"stature_mm": size * tall}))
-    found = odd_stature(jobs[:people])
+    found = find_odd_stature(jobs[:people])
     assert (found is not None) == odd
     if found:
         assert found == pytest.approx(1700.0 * size, rel=0.01)
@@ -123,8 +123,8 @@ def test_one_person_scanned_all_day_is_no_nation(day: tuple[list[Job], Path]) ->
     for job in jobs:
         path = job.folder / "scan" / "scan.json"
         path.write_text(json.dumps(json.loads(path.read_text()) | {"stature_mm": 1400.0}))
-    assert odd_stature(jobs) is not None
-    assert odd_stature([replace(job, subject="anna") for job in jobs]) is None
+    assert find_odd_stature(jobs) is not None
+    assert find_odd_stature([replace(job, subject="anna") for job in jobs]) is None
 
 
 def test_the_time_left_counts_only_what_has_to_be_done() -> None:

@@ -11,8 +11,7 @@ import pytest
 
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.mesh.topology import vertex_normals
-from bodyscan.report.canvas import round_ticks
-from bodyscan.report.pictures import draw_cloud, draw_deviation, draw_mesh
+from bodyscan.report.pictures import draw_cloud, draw_deviation, draw_mesh, round_ticks
 
 RADIUS = 100.0
 CENTRE = np.array([5.0, 7.0, 900.0])

@@ -14,8 +14,7 @@ import cheap_job
 
 from bodyscan.errors import BodyscanError
 from bodyscan.files.hashing import file_hash, list_files
-from bodyscan.jobs.discovery import find_jobs
-from bodyscan.jobs.job import Job
+from bodyscan.jobs.job import Job, find_jobs
 from bodyscan.jobs.pipeline import load_pipeline
 
 

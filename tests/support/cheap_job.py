@@ -74,10 +74,9 @@ def kinds(scan_version: int = 1) -> dict[str, tuple[Stage, ...]]:
 
 def batch(scans: Path, out: Path, workers: int) -> int:
     # As in the package, a job's own process does not load what hands jobs out.
-    from bodyscan.jobs.allocation import Allocation
-    from bodyscan.jobs.batch import finish, run_batch, run_locally
-    from bodyscan.jobs.discovery import find_jobs
+    from bodyscan.jobs.batch import Allocation, finish, run_batch, run_locally
     from bodyscan.jobs.display import json_lines
+    from bodyscan.jobs.job import find_jobs
     from bodyscan.jobs.pipeline import load_pipeline
 
     pipeline = load_pipeline(PIPELINE)

@@ -149,7 +149,7 @@ def test_pairs_are_decoded_one_after_another_and_notes_are_in_the_order_of_shots
     ]
     rig: Any = SimpleNamespace(pair=pairs.__getitem__, pairs=[])
     captures: Any = SimpleNamespace(
-        sequences=sequences, of_pair=lambda pair: [s for s in sequences if s.pair == pair]
+        sequences=sequences, pair_sequences=lambda pair: [s for s in sequences if s.pair == pair]
     )
 
     def decoded(sequence: ImageSequence, *_: object, **__: object) -> Any:

@@ -205,7 +205,7 @@ def test_the_rig_frame_is_as_the_rig_file_says(folder: Path) -> None:
     assert import_rig(load_rig(folder / "rig.yaml"), folder).axes.startswith("origin on the floor")
     board = {"name": "b", "columns": 9, "rows": 6, "square_mm": 10}
     content = described("a", rig_frame={"shot": "floor"}, boards=[board])
-    with pytest.raises(BadInput, match="a board is to fix the rig frame"):
+    with pytest.raises(BadInput, match="the rig frame is to be fixed by a board"):
         import_rig(load_rig(write_rig_file(folder, content)), folder)
 
 
@@ -280,7 +280,7 @@ def test_a_mirrored_or_endless_pose_is_named(folder: Path) -> None:
     content["pairs"][0]["known"]["projector"]["file"] = "mixed.yaml"
     own = (folder / "mirrored.yaml").read_text().partition("---\n")[2]
     (folder / "mixed.yaml").write_text(text.replace("R_light_a:", "unused:") + own)
-    with pytest.raises(CalibrationFileError, match=r"mixed.yaml:\d+: R_light_a: is mirrored"):
+    with pytest.raises(CalibrationFileError, match=r"mixed.yaml:\d+: R_light_a: is a reflection"):
         import_rig(load_rig(write_rig_file(folder, content)), folder)
     number = re.compile(r"(T_light_a:.*?data: \[ )[^,]*", re.DOTALL)
     (folder / "mixed.yaml").write_text(number.sub(r"\1.Inf", text))
@@ -369,19 +369,19 @@ def test_the_command_makes_a_calibration_folder(folder: Path) -> None:
     rig_file = write_rig_file(folder, described("a"))
     done = CliRunner().invoke(app, ["import", str(rig_file), "--out", str(folder / "out")])
     assert done.exit_code == 0, done.output
-    assert "how exact it is is not known" in done.output.replace("\n", " ")
+    assert "its accuracy is not known" in done.output.replace("\n", " ")
     assert load_calibration(folder / "out").pairs["a"].quality.imported == "foreign.yaml (opencv)"
     report = CliRunner().invoke(app, ["report", str(folder / "out")])
     assert report.exit_code == 0, report.output
     assert "not judged" in report.output
     text = (folder / "out" / "report.html").read_text("utf-8")
     assert "left out" not in text
-    assert "This calibration was imported: no image of a board was looked at" in text
+    assert "This calibration was imported: no image of a board was read" in text
     assert "calibrate again" not in text
-    assert "There is no map: nobody said how exact the imported calibration of a is" in text
+    assert "There is no map: the accuracy of the imported calibration of a is not known" in text
     assert "Rig frame: that of the imported files, wherever it lies." in text
     drawn = CliRunner().invoke(app, ["sigma-map", str(folder / "out")])
-    assert "nobody said how exact" in str(drawn.exception)
+    assert "is not known" in str(drawn.exception)
     export = ["export-rig", str(folder / "out"), "--out", str(folder / "rig"), "--format", "kalibr"]
     assert "Kalibr has no lens like 'brown'" in str(CliRunner().invoke(app, export).exception)
     export[-1] = "mrcal,aniposelib"
