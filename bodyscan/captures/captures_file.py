@@ -124,7 +124,11 @@ def load_captures_file(folder: Path, rig: Rig) -> CapturesFile:
     """
     path = folder / FILE_NAME
     return load_model(
-        path, CapturesFile, CaptureError, remedy=_REMEDY, also=lambda file: _misfits(file, rig)
+        path,
+        CapturesFile,
+        CaptureError,
+        remedy=_REMEDY,
+        also=lambda file: _find_unknown_names(file, rig),
     )
 
 
@@ -134,7 +138,7 @@ def write_captures_file(folder: Path, captures: CapturesFile) -> None:
     write_text(folder / FILE_NAME, dump_yaml(data))
 
 
-def _misfits(captures: CapturesFile, rig: Rig) -> Iterator[Problem]:
+def _find_unknown_names(captures: CapturesFile, rig: Rig) -> Iterator[Problem]:
     """Find names that the rig does not have."""
     pairs = {pair.name: pair for pair in rig.pairs}
     for index, shot in enumerate(captures.shots or ()):
@@ -176,7 +180,7 @@ def find_timing_problems(timing: Timing, rig: Rig) -> Iterator[Problem]:
 
 
 def compute_frame_times(timing: Timing, rig: Rig, sequences: Sequences, folder: Path) -> FrameTimes:
-    """Times of all frames. Raises CaptureError, with the line, for a wrong file of times."""
+    """Compute the times of all frames. Raises CaptureError, by line, for a wrong file of times."""
     if timing.times is not None:
         return _read_times(folder / timing.times, rig, sequences)
     times: dict[tuple[str, str], dict[str, float]] = {}
@@ -193,7 +197,7 @@ def compute_frame_times(timing: Timing, rig: Rig, sequences: Sequences, folder: 
 
 
 def _compute_starts(timing: Timing, rig: Rig, counts: Mapping[str, int]) -> dict[str, float]:
-    """When each pair began, ms, given how many frames each took."""
+    """Compute when each pair began, ms, from the number of frames that each took."""
     if isinstance(timing.start, dict):
         return dict(timing.start)
     starts: dict[str, float] = {}
@@ -207,6 +211,7 @@ def _compute_starts(timing: Timing, rig: Rig, counts: Mapping[str, int]) -> dict
 
 
 def _read_times(path: Path, rig: Rig, sequences: Sequences) -> FrameTimes:
+    """Read and check a file of times."""
     try:
         content = read_regular(path, MAX_BYTES)
         lines = content.decode("utf-8-sig").splitlines()
@@ -269,7 +274,7 @@ def _find_row_fault(
     sequences: Sequences,
     found: Mapping[tuple[str, str], Mapping[str, float]],
 ) -> str | None:
-    """What is wrong with one row, or None."""
+    """Return what is wrong with one row, or None."""
     if len(words) != 4:
         return f"has {len(words)} columns, not 4"
     shot, pair, frame, ms = words

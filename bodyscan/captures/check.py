@@ -101,7 +101,7 @@ def check(
 
     sequences = [sequence for part in captures for sequence in part.sequences]
     known = {path for part in captures for path in part.corners}
-    found = zip(sequences, _map(partial(_bad_images, rig, known), sequences), strict=True)
+    found = zip(sequences, _map(partial(_find_bad_images, rig, known), sequences), strict=True)
     bad_of = dict(found)
     good = [s for s in (calibration.sequences if calibration else ()) if not bad_of[s]]
     counts = tuple(_count_shots(pair, good) for pair in rig.pairs)
@@ -112,9 +112,11 @@ def check(
         empty = [shot for shot in part.shots if shot not in taken]
         errors += [f"{part.folders[0]}: shot {shot}: no image" for shot in empty]
     if calibration:
-        errors += _frame_errors(calibration, good)
+        errors += _find_frame_errors(calibration, good)
         errors += _find_separate_groups(rig, good)
-        errors += () if rig.is_known else filter(None, map(_too_few_shots, rig.pairs, counts))
+        errors += (
+            () if rig.is_known else filter(None, map(_explain_too_few_shots, rig.pairs, counts))
+        )
     return CheckReport(
         rig_path=Path(rig_path),
         rig=rig,
@@ -124,7 +126,7 @@ def check(
         pairs=counts,
         bad_images=tuple(bad),
         errors=tuple(errors),
-        warnings=tuple(_warnings(Path(rig_path), rig, captures, calibration, counts)),
+        warnings=tuple(_find_warnings(Path(rig_path), rig, captures, calibration, counts)),
     )
 
 
@@ -149,7 +151,7 @@ def format_report(report: CheckReport) -> list[str]:
 
 
 def _map(work: Callable[[Any], Result], items: Iterable[Any]) -> list[Result]:
-    """Results of several threads, which wait for a disk or a server, not for a processor."""
+    """Map in threads, which wait for a disk or a server, not for a processor."""
     with ThreadPoolExecutor(8) as pool:
         return list(pool.map(work, items))
 
@@ -163,8 +165,8 @@ def _attempt(errors: list[str], work: Callable[..., Captures], *args: object) ->
         return None
 
 
-def _bad_images(rig: Rig, known: set[Path], sequence: ImageSequence) -> tuple[BadImage, ...]:
-    """The unusable images of a sequence; none is needed if its corners are `known`."""
+def _find_bad_images(rig: Rig, known: set[Path], sequence: ImageSequence) -> tuple[BadImage, ...]:
+    """Find the unusable images of a sequence; none is needed if its corners are `known`."""
     camera, missing = rig.pair(sequence.pair).camera, set(sequence.missing)
     bad = []
     for path in sequence.paths:
@@ -187,10 +189,11 @@ def _count_shots(pair: Pair, good: list[ImageSequence]) -> PairCount:
 
 
 def _count_poses(pair: Pair, count: PairCount) -> int:
+    """Count the board poses that calibrate a pair."""
     return count.stripe_shots + (0 if pair.projector else count.lit_shots)
 
 
-def _too_few_shots(pair: Pair, count: PairCount) -> str | None:
+def _explain_too_few_shots(pair: Pair, count: PairCount) -> str | None:
     """The error if a pair has too few shots. It needs three board poses with stripes, a camera
     alone three lit ones (Zhang 2000)."""
     have = _count_poses(pair, count)
@@ -203,18 +206,19 @@ def _too_few_shots(pair: Pair, count: PairCount) -> str | None:
     )
 
 
-def _warnings(
+def _find_warnings(
     rig_path: Path,
     rig: Rig,
     captures: list[Captures],
     calibration: Captures | None,
     counts: tuple[PairCount, ...],
 ) -> Iterator[str]:
+    """Find what should be checked, though calibration can start."""
     sequences = [sequence for part in captures for sequence in part.sequences]
     if not (rig.calibration or rig.is_known):
         yield f"{rig_path}: names no calibration captures"
     yield from find_unusual_lengths(rig)
-    if calibration and rig.is_known and any(map(_too_few_shots, rig.pairs, counts)):
+    if calibration and rig.is_known and any(map(_explain_too_few_shots, rig.pairs, counts)):
         yield "all pairs are `known`: `bodyscan import` takes them as they are"
     if any(s.missing and set(s.missing) == set(s.inverses) for s in sequences):
         yield NO_INVERSES
@@ -247,7 +251,7 @@ def _warn_of_jpeg(sequences: list[ImageSequence]) -> Iterator[str]:
 
 
 def _read_rounding_error(path: Path) -> float:
-    """In grey levels; 0 if the file cannot be read, which is reported elsewhere."""
+    """Read a JPEG's error in grey levels; 0 if it cannot be read, which is reported elsewhere."""
     try:
         return read_header(path).rounding_error
     except (NotAnImage, BadInput, OSError):
@@ -285,7 +289,8 @@ def _find_separate_groups(rig: Rig, good: list[ImageSequence]) -> list[str]:
     ]
 
 
-def _frame_errors(calibration: Captures, good: list[ImageSequence]) -> list[str]:
+def _find_frame_errors(calibration: Captures, good: list[ImageSequence]) -> list[str]:
+    """The error if the shot that fixes the rig frame is missing or unusable."""
     frame = calibration.rig.rig_frame
     if missing := frame.missing_shot(calibration.shots):
         return [missing]
@@ -295,7 +300,7 @@ def _frame_errors(calibration: Captures, good: list[ImageSequence]) -> list[str]
 
 
 def _format_bad_images(bad: tuple[BadImage, ...]) -> list[str]:
-    """One line per pair, shot and fault, with the first file of each; one per pair and fault if
+    """Format one line per pair, shot and fault, with the first file of each; one per pair and fault if
     more than three shots have it."""
     shots_of: dict[tuple[str, str], set[str]] = {}
     for image in bad:
@@ -331,7 +336,7 @@ def describe_unlisted_images(captures: Captures) -> str | None:
 
 
 def _find_unlisted_images(captures: Captures) -> list[Path]:
-    """Images next to those of the captures' shots that belong to no pair and frame of the rig file.
+    """Find images next to those of the shots that belong to no pair and frame of the rig file.
 
     Shots that are not wanted are ignored, unless nothing is left of one that is: it may have been
     renamed.

@@ -132,19 +132,19 @@ class Captures:
         return {(sequence.pair, sequence.shot): sequence for sequence in self.sequences}
 
     def sequence(self, pair: str, shot: str) -> ImageSequence | None:
-        """What that pair took in that shot, or None."""
+        """Return the sequence of a pair in a shot, or None."""
         return self._by_pair_and_shot.get((pair, shot))
 
     def pair_sequences(self, pair: str) -> tuple[ImageSequence, ...]:
-        """That pair's sequences in the order of the shots."""
+        """Return a pair's sequences in the order of the shots."""
         return tuple(sequence for sequence in self.sequences if sequence.pair == pair)
 
     def shot_sequences(self, shot: str) -> tuple[ImageSequence, ...]:
-        """That shot's sequences in the order of the rig's pairs."""
+        """Return a shot's sequences in the order of the rig's pairs."""
         return tuple(sequence for sequence in self.sequences if sequence.shot == shot)
 
     def frame_ms(self, shot: str, pair: str) -> dict[str, float] | None:
-        """When the pair took each frame of that shot, by the frame's name, in the order taken.
+        """Return when a pair took each frame of a shot, by the frame's name, in the order taken.
 
         In ms from the moment the first pair began to the middle of the exposure; None if unknown.
         """
@@ -152,16 +152,16 @@ class Captures:
         return None if times is None else dict(times)
 
     def relative(self, text: str) -> str:
-        """A message with its paths relative to `base`, fit to be stored."""
+        """Make the paths in a message relative to `base`, so that it can be stored."""
         return make_paths_relative(text, self.base, self.folders)
 
     def missing(self) -> tuple[Path, ...]:
-        """Every image that should exist and does not."""
+        """List every image that should exist and does not."""
         return tuple(path for sequence in self.sequences for path in sequence.missing)
 
 
 def open_captures(rig: Rig, rig_path: Path) -> Captures:
-    """The calibration captures that a rig file names, its folders joined.
+    """Open the calibration captures that a rig file names, and join its folders.
 
     Raises CaptureError if it names none, and as `open_folder` and `join_captures` do.
     """
@@ -178,7 +178,7 @@ def open_captures(rig: Rig, rig_path: Path) -> Captures:
 
 
 def open_folder(rig: Rig, rig_path: Path, entry: CaptureFolder) -> Captures:
-    """The captures in one folder of the rig file's `calibration` list. Raises as `open_scan`."""
+    """Open one folder of the rig file's `calibration` list. Raises as `open_scan`."""
     folder, template = capture_path(rig_path, entry), entry.files or rig.files
     if entry.corners is None:
         return _open(rig, folder, "calibration", template, entry.shots)
@@ -191,14 +191,14 @@ def open_folder(rig: Rig, rig_path: Path, entry: CaptureFolder) -> Captures:
 
 
 def capture_path(rig_path: Path, entry: CaptureFolder) -> Path:
-    """Path of a folder in the rig file, with .. resolved if that leads to the same folder."""
+    """Return the path of a folder, with .. resolved if that leads to the same folder."""
     path = Path(rig_path).parent / entry.folder
     short = os.path.normpath(path)  # differs if a symbolic link comes before ..
     return Path(short) if os.path.realpath(short) == os.path.realpath(path) else path
 
 
 def open_scan(rig: Rig, folder: Path) -> Captures:
-    """The captures of one scan.
+    """Open the captures of one scan.
 
     Raises CaptureError if the folder does not exist, if its captures.yaml is wrong or says that
     this is no scan, if it holds no image of this rig, or if a symbolic link leads out of it and the
@@ -208,7 +208,7 @@ def open_scan(rig: Rig, folder: Path) -> Captures:
 
 
 def open_check(rig: Rig, folder: Path) -> tuple[Kind, Captures]:
-    """Captures of either kind, for a check. Raises as `open_scan`.
+    """Open captures of either kind, for a check. Raises as `open_scan`.
 
     The kind is that of the folder's captures.yaml; without one, a scan unless it holds several
     shots.
@@ -262,6 +262,11 @@ def _open(
     wanted: tuple[str, ...] | None,
     named: tuple[str, ...] = (),
 ) -> Captures:
+    """Open a folder's captures of one kind.
+
+    wanted: shots, instead of those that captures.yaml lists or that are found.
+    named: files that count as present, since their corners are known.
+    """
     listing = Listing(folder, follow_links=rig.follow_links, named=named)
     file = load_captures_file(folder, rig) if listing.has(FILE_NAME) else None
     if file is not None and file.kind != kind:
@@ -281,21 +286,21 @@ def _open(
         )
     shots = [entries.get(name, ShotEntry(name=name)) for name in names]
     sequences = tuple(
-        sequence for shot in shots for sequence in _sequences(rig, listing, template, shot)
+        sequence for shot in shots for sequence in _collect_sequences(rig, listing, template, shot)
     )
     if not sequences:
-        above = _folder_above(rig, folder, template)
+        above = _find_folder_above(rig, folder, template)
         if above is not None:
             raise CaptureError(
                 f"is one shot of rig {rig.name}, by the template {template}",
                 where=str(folder),
                 remedy=f"Give the folder above it, {above}, or take {{shot}}/ out of `files`.",
             )
-        example = fill(first, shot="SHOT", pair=rig.pairs[0].name, frame=_some_frame(rig))
+        example = fill(first, shot="SHOT", pair=rig.pairs[0].name, frame=_choose_frame(rig))
         raise CaptureError(
             f"holds no image of rig {rig.name} by the template {template}",
             where=str(folder),
-            remedy=f"An image should be named such as {example}{_some_image(folder)}; correct "
+            remedy=f"An image should be named such as {example}{_find_some_image(folder)}; correct "
             "`files` in the rig file (capitals and small letters count).",
         )
     captures = Captures(rig, (folder,), names, sequences, base=folder)
@@ -315,7 +320,7 @@ def _open(
 def _read_times(
     captures: Captures, listing: Listing, timing: Timing | None
 ) -> tuple[FrameTimes, tuple[Path, ...]]:
-    """When frames were taken, and the file that says so if it is a separate one."""
+    """Read when frames were taken; also the path of a separate file of times."""
     if timing is None:
         return {}, ()
     if timing.times is not None and not listing.has(timing.times):
@@ -335,17 +340,17 @@ def _read_times(
     return compute_frame_times(timing, captures.rig, taken, listing.root), times_file
 
 
-def _folder_above(rig: Rig, folder: Path, template: str) -> Path | None:
-    """The parent folder, if the template fits there and this folder is one of its shots."""
+def _find_folder_above(rig: Rig, folder: Path, template: str) -> Path | None:
+    """Return the parent folder if, by the template, this folder is one of its shots."""
     here = Path(os.path.abspath(folder))
     if not (template.startswith("{shot}/") and re.fullmatch(SHOT, here.name)):
         return None
     listing, shot = Listing(here.parent, follow_links=rig.follow_links), ShotEntry(name=here.name)
-    return here.parent if any(_sequences(rig, listing, template, shot)) else None
+    return here.parent if any(_collect_sequences(rig, listing, template, shot)) else None
 
 
-def _some_image(folder: Path) -> str:
-    """The name of some image in the folder, to compare with what was expected."""
+def _find_some_image(folder: Path) -> str:
+    """Find an image in the folder, to show its name beside the expected one."""
     for root, _, names in os.walk(folder):
         for name in sorted(names):
             if Path(name).suffix.lower() in IMAGE_SUFFIXES:
@@ -353,14 +358,14 @@ def _some_image(folder: Path) -> str:
     return ""
 
 
-def _some_frame(rig: Rig) -> str:
-    """The name of an image that every pair should have."""
+def _choose_frame(rig: Rig) -> str:
+    """Return the name of an image that every pair should have."""
     code = rig.pairs[0].projector
     return rig.frames.board_image or (rig.frames.code_names(code)[0] if code else "")
 
 
 def _discover_shots(rig: Rig, listing: Listing, template: str) -> tuple[str, ...]:
-    """Shots found in the names of files: those with a lit image or a code's first image."""
+    """Find shots by the names of files: those with a lit image or a code's first image."""
     if not has_field(template, "shot"):
         name = listing.root.resolve().name
         if re.fullmatch(SHOT, name) and len(name) <= MAX_SHOT_LENGTH:
@@ -383,7 +388,7 @@ def _discover_shots(rig: Rig, listing: Listing, template: str) -> tuple[str, ...
 def _find_shots(
     listing: Listing, parts: tuple[re.Pattern[str], ...], folder: str, shot: str | None
 ) -> set[str]:
-    """Names of shots for which a path below `folder` matches the patterns, part by part."""
+    """Find names of shots for which a path below `folder` matches the patterns, part by part."""
     found: set[str] = set()
     for name in listing.names(folder):
         match = parts[0].fullmatch(name)
@@ -400,19 +405,20 @@ def _find_shots(
 
 
 def _natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
-    """Sort key that puts b2 before b10."""
+    """Return a sort key that puts b2 before b10."""
     pieces = re.findall(r"\d+|\D+", name)
     return tuple((0, int(p), p) if p.isdecimal() else (1, 0, p) for p in pieces)
 
 
-def _sequences(
+def _collect_sequences(
     rig: Rig, listing: Listing, template: str, shot: ShotEntry
 ) -> Iterator[ImageSequence]:
+    """Collect what each pair took in a shot, by captures.yaml or, without a list, by the files."""
     look = shot.stripes is None and shot.lit is None
     templates = [with_exposure(template, name) for name in rig.exposures]
     template = templates[0] if templates else template
     for pair in rig.pairs:
-        whole = _sequence(rig, listing, template, shot.name, pair)
+        whole = _collect_sequence(rig, listing, template, shot.name, pair)
         if whole.coded and templates:
             whole = _add_exposures(whole, rig, listing, templates)
         alone = _board_image_alone(rig, listing, template, shot.name, pair)
@@ -441,8 +447,10 @@ def _sequences(
             yield alone
 
 
-def _sequence(rig: Rig, listing: Listing, template: str, shot: str, pair: Pair) -> ImageSequence:
-    """The whole sequence; empty for a camera without a projector."""
+def _collect_sequence(
+    rig: Rig, listing: Listing, template: str, shot: str, pair: Pair
+) -> ImageSequence:
+    """Collect the whole sequence; empty for a camera without a projector."""
     frames = rig.frames
     code = pair.projector if has_field(template, "frame") else None
     if code is None:
@@ -464,10 +472,13 @@ def _sequence(rig: Rig, listing: Listing, template: str, shot: str, pair: Pair) 
 def _add_exposures(
     whole: ImageSequence, rig: Rig, listing: Listing, templates: list[str]
 ) -> ImageSequence:
-    """The sequence with its longer exposures added."""
+    """Add the longer exposures to a sequence."""
     first, *others = zip(rig.exposures, templates, strict=True)
     longer = tuple(
-        replace(_sequence(rig, listing, template, whole.shot, rig.pair(whole.pair)), exposure=name)
+        replace(
+            _collect_sequence(rig, listing, template, whole.shot, rig.pair(whole.pair)),
+            exposure=name,
+        )
         for name, template in others
     )
     missing = whole.missing + tuple(path for each in longer for path in each.missing)
@@ -477,7 +488,7 @@ def _add_exposures(
 def _board_image_alone(
     rig: Rig, listing: Listing, template: str, shot: str, pair: Pair
 ) -> ImageSequence | None:
-    """The board image alone; None if none is taken."""
+    """Collect the board image alone; None if none is taken."""
     frames, files = rig.frames, _Files(listing, template, shot, pair.name)
     path = files.path(frames.board_image if has_field(template, "frame") else "")
     if path is None:
@@ -493,7 +504,7 @@ class _Files:
         self.missing: list[Path] = []
 
     def path(self, frame: str | None) -> Path | None:
-        """Path of a frame; None for no frame."""
+        """Return the path of a frame, None for no frame, and note whether it is missing."""
         if frame is None:
             return None
         wanted = fill(self.template, shot=self.shot, pair=self.pair, frame=frame)

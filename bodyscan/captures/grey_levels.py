@@ -53,19 +53,20 @@ def find_full_scale(images: Sequence[Raw], bits: int | None) -> float:
 
 
 def convert_to_greys(image: Raw, scale: float) -> Greys:
-    """Grey levels 0 to 255 of an image whose white is `scale`: float32, of 8-bit files unchanged."""
+    """Scale to grey levels 0 to 255, float32, so that `scale` is white; keep 8-bit images."""
     if image.dtype == np.uint8:
         return image.astype(np.uint8, copy=False)
     return np.minimum(image * np.float32(255.0 / scale), np.float32(255.0))
 
 
 def _sample(image: Raw) -> NDArray[np.uint16]:
-    """About a million of an image's numbers: 8 bits in 16 show within the first thousand."""
+    """Sample about a million numbers: 8 bits in 16 show within the first thousand."""
     values = image.ravel()
     return values[:: max(1, values.size >> 20)].astype(np.uint16, copy=False)
 
 
 def _refuse_eight_bits(values: Sequence[NDArray[np.uint16]], largest: int, used: int) -> None:
+    """Raise ImageError if 16-bit numbers hold only 8 bits."""
     found = ""
     if largest < 256:
         found = f"none of their numbers is above {largest}"
@@ -147,7 +148,7 @@ def _fit_exposures(
 
 
 def _fit_line(x: Array, y: Array) -> tuple[float, float]:
-    """Offset and slope of y against x, without residuals beyond 4 sigma."""
+    """Fit offset and slope of y against x, without residuals beyond 4 sigma."""
     inliers = np.ones(len(x), bool)
     slope, offset = 1.0, 0.0
     for _ in range(4):

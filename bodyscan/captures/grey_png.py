@@ -21,7 +21,7 @@ SUB, UP, AVERAGE, PAETH = 1, 2, 3, 4  # filters of rows; 0 is none
 
 
 def png_damage(data: bytes) -> str | None:
-    """What is wrong with the chunks of a whole PNG file (ends early, wrong checksum), or None.
+    """Check a whole PNG file: return what is wrong (ends early, wrong checksum), or None.
 
     libpng decodes such a file as far as it can and leaves the rest of the image as it is.
     """
@@ -33,7 +33,7 @@ def png_damage(data: bytes) -> str | None:
 
 
 def _png_chunks(data: bytes) -> Iterator[tuple[bytes, memoryview, int]]:
-    """Kind, content and checksum of every chunk of a PNG file, as far as they are complete."""
+    """Yield kind, content and checksum of every complete chunk of a PNG file."""
     position, kind = 8, b""
     while kind != b"IEND" and position + 12 <= len(data):
         length, kind = struct.unpack_from(">I4s", data, position)
@@ -46,7 +46,7 @@ def _png_chunks(data: bytes) -> Iterator[tuple[bytes, memoryview, int]]:
 
 
 def _update_crc(content: memoryview, crc: int, step: int = 5120) -> int:
-    """CRC-32 of a chunk, continued from `crc`.
+    """Continue the CRC-32 `crc` with the content of a chunk.
 
     Chunks are a few kilobytes, whose sum takes a microsecond. From 5120 bytes on ISA-L releases the
     interpreter's lock for it, and getting it back from another thread takes many times as long.

@@ -78,6 +78,7 @@ def read_header(path: Path) -> ImageHeader:
 
 
 def _read_png_header(start: bytes) -> tuple[int, int, int]:
+    """Read width, height and bits from the first 33 bytes of a PNG file."""
     if len(start) < 33:
         raise NotAnImage("is cut short")
     length, kind, width, height, bits = struct.unpack_from(">I4sIIB", start, 8)
@@ -130,7 +131,7 @@ def _ends_with(stream: BinaryIO, start: int, mark: bytes) -> bool:
 
 
 def find_header_fault(path: Path, width: int, height: int) -> str | None:
-    """Why the file cannot be an image of that size with at most 16 bits per sample, or None."""
+    """Return why a file cannot be an image of that size with 8 to 16 bits a sample, or None."""
     try:
         header = read_header(path)
     except FileNotFoundError:
@@ -150,7 +151,7 @@ def find_header_fault(path: Path, width: int, height: int) -> str | None:
 
 
 def describe_missing(path: Path) -> str:
-    """Why a file was not found: it is missing, or `*` in its name matches several."""
+    """Return why a file was not found: it is missing, or `*` in its name matches several."""
     pattern = path.name.replace("[", "[[]").replace("?", "[?]")  # only `*` is special
     matches = sorted(found.name for found in path.parent.glob(pattern))
     if ANYTHING in path.name and len(matches) > 1:
@@ -162,7 +163,7 @@ def describe_missing(path: Path) -> str:
 
 
 def image_error(what: str, path: Path, pair: str, shot: str, *, remedy: str = "") -> ImageError:
-    """An ImageError that names file, pair and shot, and what to do."""
+    """Make an ImageError that names file, pair and shot, and what to do."""
     taken = ", ".join(f"{kind} {name}" for kind, name in (("pair", pair), ("shot", shot)) if name)
     where = f"{path} ({taken})" if taken else str(path)
     return ImageError(what, where=where, remedy=remedy or _choose_remedy(what))
@@ -171,7 +172,7 @@ def image_error(what: str, path: Path, pair: str, shot: str, *, remedy: str = ""
 def missing_error(
     missing: Sequence[Path], inverses: Sequence[Path], pair: str, shot: str
 ) -> ImageError:
-    """An ImageError for missing images, which names the first of them.
+    """Make an ImageError for missing images, which names the first of them.
 
     inverses: those of the sequence, missing or not.
     """

@@ -43,21 +43,21 @@ class StripeImages:
 def read_image(
     path: Path, camera: CameraSpec, *, pair: str = "", shot: str = "", lit: bool = False
 ) -> Bytes:
-    """One image as whole grey levels, (height, width) uint8.
+    """Read one image as whole grey levels, (height, width) uint8.
 
     lit: the image should show something, and is refused if it is black.
 
     Raises ImageError as `_read_raw` and `find_full_scale`.
     """
     raw = _read_raw(path, camera, pair, shot)
-    image = whole_grey(convert_to_greys(raw, _scale([raw], camera, path, pair, shot)))
+    image = whole_grey(convert_to_greys(raw, _find_scale([raw], camera, path, pair, shot)))
     if lit:
         _refuse_black(image, path, pair, shot)
     return image
 
 
 def read_board_image(sequence: ImageSequence, pair: Pair) -> Bytes:
-    """The image in which boards are looked for, (H, W) uint8.
+    """Read the image in which boards are detected, (H, W) uint8.
 
     This is the board image, the lit one, or if neither was taken one made from the code's images.
     Of several exposures it is the shortest. Raises ImageError as `read_image`.
@@ -76,7 +76,7 @@ def read_board_image(sequence: ImageSequence, pair: Pair) -> Bytes:
 def read_sequence(
     sequence: ImageSequence, camera: CameraSpec, *, crop: Crop = WHOLE, workers: int = THREADS
 ) -> StripeImages:
-    """All images of a stripe sequence, cut to `crop`; several exposures are merged.
+    """Read all images of a stripe sequence, cut to `crop`; several exposures are merged.
 
     Raises ImageError as `read_image`, if exposures are out of order, and if the sequence is a board
     image alone.
@@ -102,7 +102,7 @@ def read_sequence(
 
 
 def _read_stack(sequence: ImageSequence, camera: CameraSpec, crop: Crop, workers: int) -> Greys:
-    """Grey levels (F, H, W) of one exposure: lit and dark, if they exist, then the code's images."""
+    """Read grey levels (F, H, W) of one exposure: lit, dark if they exist, then the code's."""
     taken = [path for path in (sequence.lit, sequence.dark) if path is not None]
     paths = (*taken, *sequence.coded)
     missing = [path for path in paths if path in sequence.missing]
@@ -128,12 +128,12 @@ def _read_stack(sequence: ImageSequence, camera: CameraSpec, crop: Crop, workers
 
     with ThreadPoolExecutor(workers) as pool:
         list(pool.map(read_into, range(1, len(paths))))
-    scale = _scale(list(stack), camera, paths[0], sequence.pair, sequence.shot)
+    scale = _find_scale(list(stack), camera, paths[0], sequence.pair, sequence.shot)
     return convert_to_greys(np.ascontiguousarray(stack[(slice(None), *late)]), scale)
 
 
-def _scale(images: list[Raw], camera: CameraSpec, path: Path, pair: str, shot: str) -> float:
-    """See `find_full_scale`; its errors name the file."""
+def _find_scale(images: list[Raw], camera: CameraSpec, path: Path, pair: str, shot: str) -> float:
+    """Call `find_full_scale` so that its errors name the file."""
     try:
         return find_full_scale(images, camera.bits)
     except ImageError as error:
@@ -141,8 +141,9 @@ def _scale(images: list[Raw], camera: CameraSpec, path: Path, pair: str, shot: s
 
 
 def _read_raw(path: Path, camera: CameraSpec, pair: str, shot: str, rows: int | None = None) -> Raw:
-    """The numbers in an image file, (height, width) uint8 or uint16; of a colour image those of the
-    camera's channel, where grey is luma.
+    """Read the numbers in an image file, (height, width) uint8 or uint16.
+
+    Of a colour image those of the camera's channel are read, where grey is luma.
 
     rows: only so many rows, from the first, need be read.
 
@@ -179,7 +180,7 @@ def _read_raw(path: Path, camera: CameraSpec, pair: str, shot: str, rows: int | 
 
 
 def _decode(data: bytes, channel: str) -> Raw | None:
-    """(H, W) if the image or the channel is grey, else (H, W, 3); None if it cannot be decoded."""
+    """Decode to (H, W) if image or channel is grey, else (H, W, 3); None if it is not decodable."""
     colour = cv2.IMREAD_GRAYSCALE if channel == "grey" else cv2.IMREAD_ANYCOLOR
     flags = colour | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)

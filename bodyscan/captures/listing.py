@@ -36,7 +36,7 @@ class Listing:
         self._entries: dict[str, dict[str, bool]] = {}
 
     def has(self, relative: str) -> bool:
-        """Whether a file or folder with that relative path (parts joined by /) exists."""
+        """Test whether a file or folder with that relative path (parts joined by /) exists."""
         parent, _, name = relative.rpartition("/")
         is_link = self._read(parent).get(name)
         if is_link is None:
@@ -49,7 +49,7 @@ class Listing:
         return path.exists()
 
     def find(self, relative: str) -> str:
-        """The path itself; if it contains `*`, the file that matches if there is just one."""
+        """Replace a path that contains `*` by the file that matches if there is just one."""
         if ANYTHING not in relative:
             return relative
         matches = [""]
@@ -65,11 +65,11 @@ class Listing:
         return existing[0] if len(existing) == 1 else relative
 
     def names(self, relative: str) -> tuple[str, ...]:
-        """Names in a folder, () if it does not exist. "" is the root."""
+        """List the names in a folder, () if it does not exist. "" is the root."""
         return tuple(self._read(relative))
 
     def _read(self, relative: str) -> dict[str, bool]:
-        """Names in a folder, and whether each is a symbolic link."""
+        """List the names in a folder, and whether each is a symbolic link."""
         if relative not in self._entries:
             exists = relative == "" or self.has(relative)
             found = self._scan(self.root / relative) if exists else {}
@@ -91,6 +91,7 @@ class Listing:
             raise CaptureError(what, where=str(folder), remedy="Check its permissions.") from None
 
     def _refuse_if_outside(self, path: Path) -> None:
+        """Raise CaptureError if a symbolic link leads out of the capture folder."""
         real = os.path.realpath(path)
         if not Path(real).is_relative_to(self._real_root):
             raise CaptureError(

@@ -66,7 +66,7 @@ def write_patterns(rig: Rig, out: Path, width: int, height: int) -> tuple[Path, 
 
 
 def _folder_names(kinds: tuple[StripeCode, ...]) -> dict[StripeCode, str]:
-    """Names such as gray-640-horizontal, numbered if they would be equal."""
+    """Make names such as gray-640-horizontal, numbered if they would be equal."""
     names: dict[StripeCode, str] = {}
     for kind in kinds:
         directions = "-".join(f"{one.stripes}-{one.direction}" for one in kind.directions)
@@ -100,7 +100,7 @@ def _write_kind(
 def _ordered_images(
     frames: FrameNames, kind: StripeCode, coded: Bytes
 ) -> Iterator[tuple[str, Bytes]]:
-    """Name and image (H, W) in the best order to show: lit and dark if they are taken, then the
+    """Yield name and image (H, W) in the best order to show: lit and dark if they are taken, then the
     code's."""
     blank = np.zeros(coded.shape[1:], np.uint8)
     if frames.lit is not None:

@@ -65,7 +65,7 @@ def _find_format(path: Path, body: BodyCloud | BodyMesh) -> BodyFormat:
 def describe_body(
     name: str, format_: BodyFormat, body: BodyCloud | BodyMesh, origin: Provenance
 ) -> dict[str, Any]:
-    """Content of the JSON beside an exported file of that name."""
+    """Describe a body in an exported file of that name: the content of the JSON beside it."""
     in_body = origin.rig_from_body
     info: dict[str, Any] = dict(origin.found) | {
         "file": name,
@@ -97,6 +97,6 @@ def describe_body(
 
 
 def _median(sigma_mm: np.ndarray[Any, Any]) -> float | None:
-    """Median of what was measured; None if nothing was."""
+    """Compute the median of what was measured; None if nothing was."""
     known = sigma_mm[np.isfinite(sigma_mm)]
     return float(np.median(known)) if known.size else None

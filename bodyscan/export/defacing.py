@@ -65,7 +65,7 @@ def find_neck(vertices: Array, faces: Indices) -> Neck:
 
 
 def _girth(slicer: MeshSlicer, height: float, axis: Array) -> float:
-    """Hull perimeter, mm, of a slice's points near `axis` (x, y); infinite if there are too few."""
+    """Compute a slice's hull perimeter, mm, near `axis` (x, y); infinite for too few points."""
     loops = slicer.slice(height)
     points = np.concatenate([np.empty((0, 2)), *(loop.segments[:, 0] for loop in loops)])
     points = points[np.linalg.norm(points - axis, axis=1) < REACH_MM]
@@ -73,7 +73,7 @@ def _girth(slicer: MeshSlicer, height: float, axis: Array) -> float:
 
 
 def _find_crown(vertices: Array) -> tuple[Array, float]:
-    """The head's axis (x, y) and height: the top of what is above the trunk's middle."""
+    """Find the head's axis (x, y) and height: the top of what is above the trunk's middle."""
     low, high = vertices[:, 2].min(), vertices[:, 2].max()
     trunk = vertices[np.abs(vertices[:, 2] - (low + 0.55 * (high - low))) < 0.1 * (high - low)]
     middle = np.median(trunk[:, :2], axis=0)
@@ -116,7 +116,7 @@ def deface(mesh: BodyMesh, neck: Neck) -> BodyMesh:
 def _attach_attributes(
     mesh: BodyMesh, head: Mask, used: Indices, vertices: Array, faces: Indices
 ) -> BodyMesh:
-    """The mesh with what is kept unchanged, and what is added grey, filled and without sigma."""
+    """Make the mesh: what is kept unchanged, what is added grey, filled and without sigma."""
     added = len(vertices) - len(used)
     filled = mesh.filled[~head]
     return BodyMesh(
@@ -131,7 +131,7 @@ def _attach_attributes(
 
 
 def _head_faces(mesh: BodyMesh, neck: Neck) -> Mask:
-    """Which faces (F,) reach above the neck, in components that come near the head's axis.
+    """Find faces (F,) that reach above the neck, in components that come near the head's axis.
 
     Hands held up beside the head are other components, and stay.
     """
@@ -159,7 +159,7 @@ def _simplify_rim(faces: Indices, head: Mask) -> Mask:
 
 
 def _free_edges(faces: Indices) -> Indices:
-    """Directed edges (E, 2) without a twin."""
+    """Find directed edges (E, 2) without a twin."""
     edges = directed_edges(faces)
     count = int(faces.max(initial=-1)) + 1
     twins = np.isin(edges[:, 0] * count + edges[:, 1], edges[:, 1] * count + edges[:, 0])
@@ -181,7 +181,7 @@ def _trace_loops(edges: Indices) -> list[Indices]:
 
 
 def _dome(rim: Array, crown_mm: float, rings: int = 40) -> Array:
-    """Rings over a rim (N, 3), from its shape to an ellipsoid's, and the top: (rings N + 1, 3)."""
+    """Build rings from a rim (N, 3) to an ellipsoid, and the top: (rings N + 1, 3)."""
     # Shares of the height from neck to crown: half the head's length and breadth, where it is
     # widest, and where the neck's shape ends.
     half_length, half_breadth, widest, neck_end = 0.36, 0.28, 0.52, 0.45
@@ -206,14 +206,14 @@ def _dome(rim: Array, crown_mm: float, rings: int = 40) -> Array:
 
 
 def _smooth(line: Array, harmonics: int = 4) -> Array:
-    """A closed line (N, 3) reduced to its first few harmonics."""
+    """Reduce a closed line (N, 3) to its first few harmonics."""
     waves = np.fft.rfft(line, axis=0)
     waves[harmonics + 1 :] = 0.0
     return np.fft.irfft(waves, len(line), axis=0)
 
 
 def _stitch(rim: Indices, start: int, count: int) -> Indices:
-    """Faces from a rim (in the kept faces' direction) over rings of vertices `start`... to a top."""
+    """Make faces from a rim, in the kept faces' direction, over rings from `start` on to a top."""
     size = len(rim)
     rings = [rim, *(start + np.arange(count - 1)).reshape(-1, size)]
     faces = []

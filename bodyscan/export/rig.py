@@ -35,7 +35,7 @@ def export_rig(
 
 
 def collect_cameras(calibration: RigCalibration) -> RigCameras:
-    """Camera and `rig_from_camera` of every pair of a calibration."""
+    """Collect camera and `rig_from_camera` of every pair of a calibration."""
     return {
         name: (pair.camera, calibration.rig_from_camera[name])
         for name, pair in calibration.pairs.items()

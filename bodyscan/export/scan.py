@@ -80,7 +80,7 @@ def export_scan(
 
 
 def scan_facts(facts: Mapping[str, Any]) -> dict[str, Any]:
-    """What an export repeats from scan.json: verdict, pairs left out, the subject's sway (mm)."""
+    """Select what an export repeats from scan.json: verdict, pairs left out, sway (mm)."""
     alignment = facts.get("alignment")
     return {
         "when": facts.get("when"),

@@ -23,7 +23,7 @@ _REMEDY = "A corners.vnl has a line `# filename x y level` and below it a line f
 
 
 def read_corners(path: Path) -> dict[str, Corners]:
-    """Corners by image name, as in the file; () for an image without a board.
+    """Read corners by image name, as in the file; () for an image without a board.
 
     Raises CaptureError, with the line, if the file is not such a table.
     """
@@ -74,7 +74,7 @@ def write_corners(path: Path, corners: Iterable[tuple[str, Corners]]) -> None:
 
 
 def _columns(names: list[str], where: str) -> list[int]:
-    """Positions of filename, x, y, level in a row; -1 for a level that the table does not have."""
+    """Find the positions of filename, x, y, level in a row; -1 if there is no level."""
     columns = ("filename", "x", "y", "level")
     if any(name not in names for name in columns[:3]):
         raise CaptureError(f"has the columns {' '.join(names)}", where=where, remedy=_REMEDY)
@@ -84,7 +84,7 @@ def _columns(names: list[str], where: str) -> list[int]:
 def _corner(
     words: list[str], order: list[int], where: str
 ) -> tuple[str, tuple[float, float] | None]:
-    """An image's name and its next corner; None for an image without a board."""
+    """Parse an image's name and its next corner; None for an image without a board."""
     name, x, y, level = (words[k] if 0 <= k < len(words) else None for k in order)
     if name is None or x is None or y is None:
         raise CaptureError(f"has {len(words)} columns, too few", where=where, remedy=_REMEDY)

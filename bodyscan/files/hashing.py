@@ -14,7 +14,7 @@ from bodyscan.progress import map_threads
 
 
 def file_hash(path: Path) -> str:
-    """SHA-256 of a file, in hexadecimal.
+    """Compute the SHA-256 of a file, in hexadecimal.
 
     Raises BadInput if it is not a regular file (reading a pipe might never end), OSError if it
     cannot be read.
@@ -27,7 +27,7 @@ def file_hash(path: Path) -> str:
 
 
 def file_hashes(files: Mapping[str, Path]) -> dict[str, str]:
-    """SHA-256 of each file by name, sorted by name."""
+    """Compute the SHA-256 of each file by name, sorted by name."""
     names = sorted(files)
     hashes = map_threads(lambda name: file_hash(files[name]), names, stage="hashing")
     return dict(zip(names, hashes, strict=True))
@@ -42,11 +42,11 @@ def list_files(folder: Path) -> Iterator[Path]:
 
 
 def list_relative_files(folder: Path) -> dict[str, Path]:
-    """Every file below `folder` by its path relative to it."""
+    """List every file below `folder` by its path relative to it."""
     return {path.relative_to(folder).as_posix(): path for path in list_files(folder)}
 
 
 def content_hash(content: Any) -> str:
-    """SHA-256 of plain data, by its JSON with sorted keys."""
+    """Compute the SHA-256 of plain data, by its JSON with sorted keys."""
     text = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode("ascii")).hexdigest()

@@ -13,7 +13,7 @@ from bodyscan.errors import BadInput, BodyscanError, FailedWork
 
 
 def translate_os_error(error: OSError) -> BodyscanError:
-    """BadInput if another file or folder would do, FailedWork if the machine has to change."""
+    """Convert to BadInput if another file or folder would do, else to FailedWork."""
     where = "" if error.filename is None else os.fsdecode(error.filename)
     what = error.strerror or str(error)
     if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
@@ -52,8 +52,7 @@ def require_writable(folder: Path) -> None:
 
 
 def make_paths_relative(text: str, base: Path, below: Iterable[Path] = ()) -> str:
-    """`text` with every path that begins with `base`, or with a folder of `below`, made relative to
-    `base`.
+    """Make every path in `text` that begins with `base`, or a folder of `below`, relative to `base`.
 
     For stored messages: folders are named after people, and the same work in another folder must
     give the same bytes.

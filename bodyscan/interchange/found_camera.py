@@ -32,7 +32,7 @@ class FoundCamera:
     where: str
 
     def camera(self, width: int, height: int) -> Camera:
-        """The camera with an image of that size, px.
+        """Make the camera with an image of that size, px.
 
         Raises CalibrationFileError if the file gives another size, if its axis is outside such an
         image, or if its lens folds within it.
@@ -61,7 +61,7 @@ class FoundCamera:
         return self.projector(width, height)
 
     def projector(self, width: int, height: int) -> Camera:
-        """The projector with an image of that size, px; its axis may be outside it, as many shine
+        """Make the projector with an image of that size, px; its axis may be outside it, as many shine
         upwards.
 
         Raises CalibrationFileError if the lens folds within it.
@@ -86,7 +86,7 @@ class FoundCamera:
 
 
 def find_camera(cameras: Mapping[str, FoundCamera], name: str, where: str) -> FoundCamera:
-    """The camera of that name. Raises CalibrationFileError, which lists them, if there is none."""
+    """Find a camera by name. Raises CalibrationFileError, which lists all, if there is none."""
     if name not in cameras:
         raise CalibrationFileError(
             f"has no camera {name!r}{did_you_mean(name, cameras)}",

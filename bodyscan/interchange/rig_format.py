@@ -46,13 +46,15 @@ class RigFormat:
 
 
 def projector_name(pair: str) -> str:
-    """The name of a pair's projector among the cameras."""
+    """Return the name of a pair's projector among the cameras."""
     return f"{pair}-projector"
 
 
 def opencv_coefficients(name: str, camera: Camera) -> Array:
-    """OpenCV's coefficients (5,) or more of a pair's camera. Raises BadInput, which names the pair,
-    for a lens that OpenCV does not have."""
+    """Return OpenCV's coefficients (5,) or more of a pair's camera.
+
+    Raises BadInput, which names the pair, for a lens that OpenCV does not have.
+    """
     try:
         return camera.lens.opencv()
     except BadInput as error:

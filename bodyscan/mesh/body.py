@@ -42,7 +42,7 @@ class BodyCloud:
         return None if self.regions is None else compute_region_shares(self.regions)
 
     def subsample(self, step: int) -> BodyCloud:
-        """Every step-th point."""
+        """Keep every step-th point."""
         parts: dict[str, Any] = {part.name: getattr(self, part.name) for part in fields(self)}
         return replace(self, **{k: v[::step] for k, v in parts.items() if v is not None})
 
@@ -98,19 +98,19 @@ class BodyMesh:
         return float(area[self.filled].sum() / area.sum()) if area.any() else 0.0
 
     def at_mean_breath(self, sigmas: float = 0.0) -> BodyMesh:
-        """The body at mean breath; sigmas: everywhere so many standard deviations larger."""
+        """Move vertices to mean breath, plus so many standard deviations outwards."""
         if self.breath is None:
             return self
         step = (self.breath.mm + sigmas * self.breath.sigma_mm).astype(np.float64)
         return replace(self, vertices=self.vertices + step[:, None] * self.normals, breath=None)
 
     def measured_part(self) -> BodyMesh:
-        """The open surface without the filled faces."""
+        """Remove the filled faces, which leaves an open surface."""
         vertices, faces, used = drop_unused_vertices(self.vertices, self.faces[~self.filled])
         return self.part(vertices, faces, used, np.zeros(len(faces), bool))
 
     def part(self, vertices: Array, faces: Indices, used: Indices, filled: Mask) -> BodyMesh:
-        """The mesh with only the vertices `used` (U,), and faces (F, 3) of these."""
+        """Make a mesh with the attributes of vertices `used` (U,), new positions and faces."""
         return BodyMesh(
             vertices,
             faces,
@@ -123,13 +123,13 @@ class BodyMesh:
 
 
 def compute_region_shares(regions: Bytes, sizes: Array | None = None) -> dict[str, float]:
-    """Share of each region, by name, in regions (N,), weighted by sizes (N,)."""
+    """Compute the share of each region, by name, in regions (N,), weighted by sizes (N,)."""
     counts = np.bincount(regions, sizes, len(REGION_NAMES))
     return dict(zip(REGION_NAMES, (counts / max(counts.sum(), 1e-12)).tolist(), strict=True))
 
 
 def compute_cover_shares(regions: Bytes | None) -> dict[str, float]:
-    """Shares, by name, of the regions that are not or may not be skin; empty if unknown.
+    """Compute the shares, by name, of regions that are not or may not be skin; empty if unknown.
 
     Half a percent or less, a few moles and rims, is left out.
     """
@@ -138,15 +138,15 @@ def compute_cover_shares(regions: Bytes | None) -> dict[str, float]:
 
 
 def select_regions(regions: Bytes | None, indices: Indices) -> Bytes | None:
-    """Regions (M,) at indices (M,) into regions (N,), unsure where an index is -1; None if regions
-    are unknown."""
+    """Select regions (M,) by indices (M,) into regions (N,): unsure where an index is -1, None if
+    regions are unknown."""
     if regions is None:
         return None
     return np.where(indices >= 0, regions[indices], np.uint8(UNSURE))
 
 
 def compute_face_regions(regions: Bytes, faces: Indices) -> Bytes:
-    """Region (F,) of at least two corners of faces (F, 3), else unsure; regions: of vertices (V,)."""
+    """Compute the region (F,) of at least two corners of faces (F, 3), else unsure."""
     a, b, c = regions[faces].T
     return np.where((a == b) | (a == c), a, np.where(b == c, b, np.uint8(UNSURE)))
 
@@ -190,5 +190,5 @@ def find_filled_patches(mesh: BodyMesh) -> list[FilledPatch]:
 
 
 def _sum_by_patch(patch: NDArray[np.int32], values: Array) -> Array:
-    """Sums (P, 3) of values (N, 3) by patch (N,)."""
+    """Sum values (N, 3) by patch (N,) to (P, 3)."""
     return np.stack([np.bincount(patch, column) for column in values.T], axis=1)

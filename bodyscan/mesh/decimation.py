@@ -20,7 +20,7 @@ from bodyscan.progress import THREADS
 
 
 def decimate(mesh: BodyMesh, *, faces: int = 50_000, within_mm: float = 0.19) -> BodyMesh:
-    """A closed mesh of about `faces` faces, no farther than `within_mm` from the full one.
+    """Reduce to a closed mesh of about `faces` faces, at most `within_mm` from the full one.
 
     Quadric decimation (Garland and Heckbert 1997), which has no such limit, then refinement where
     it deviates too far (some hundred faces at 50,000). Vertices take colour, sigma and region from
@@ -115,7 +115,7 @@ def refine_to_tolerance(
 def _find_strays(
     vertices: Array, faces: Indices, active: Mask, full: NearestSurface, limit_mm: float
 ) -> Mask:
-    """Which `active` faces (F,) have their centre or an edge's midpoint too far from the full mesh."""
+    """Find `active` faces (F,) whose centre or edges' midpoints are too far from the full mesh."""
     corners = vertices[faces[active]]
     tested = [corners.mean(axis=1), *(0.5 * (corners[:, k] + corners[:, k - 1]) for k in range(3))]
     stray = active.copy()
@@ -124,7 +124,7 @@ def _find_strays(
 
 
 def _select_edges(vertices: Array, faces: Indices, stray: Mask) -> tuple[Indices, Indices]:
-    """Half-edges (N,) to split, and their twins: the longest of stray faces, at most one a face."""
+    """Select half-edges (N,) to split, and their twins: the longest of stray faces, one a face."""
     corners = vertices[faces]
     length = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=-1)
     twin = find_twins(faces, len(vertices)).ravel()
@@ -142,8 +142,8 @@ def _select_edges(vertices: Array, faces: Indices, stray: Mask) -> tuple[Indices
 
 
 def _split_edges(faces: Indices, edges: Indices, across: Indices, vertex_count: int) -> Indices:
-    """Faces (F + 2 N, 3) with half-edges (N,) and their twins split at new vertices, numbered from
-    `vertex_count` on."""
+    """Split half-edges (N,) and their twins at new vertices, numbered from `vertex_count` on, to
+    faces (F + 2 N, 3)."""
     both = np.concatenate([edges, across])
     middle = vertex_count + np.tile(np.arange(len(edges)), 2)
     face, corner = both // 3, both % 3
@@ -156,7 +156,7 @@ def _split_edges(faces: Indices, edges: Indices, across: Indices, vertex_count: 
 def _find_farthest(
     distance: Array, face: Indices, face_count: int, limit_mm: float
 ) -> tuple[Indices, Indices]:
-    """Of points too far from their nearest face: the farthest one (N,) of each such face (N,)."""
+    """Find, of points too far from their nearest face, the farthest (N,) of each face (N,)."""
     far = np.flatnonzero(distance > limit_mm)
     far = far[np.argsort(distance[far], kind="stable")]
     last = np.full(face_count, -1)
@@ -166,8 +166,8 @@ def _find_farthest(
 
 
 def _split_faces(faces: Indices, split: Indices, vertex_count: int) -> Indices:
-    """Faces (F + 2 N, 3) with N of them split in three around new vertices, numbered from
-    `vertex_count` on."""
+    """Split N faces in three around new vertices, numbered from `vertex_count` on, to faces
+    (F + 2 N, 3)."""
     a, b, c = faces[split].T
     middle = vertex_count + np.arange(len(split))
     faces = faces.copy()

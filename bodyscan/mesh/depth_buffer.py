@@ -16,7 +16,7 @@ Numbers = NDArray[np.int32]
 
 @compiled
 def nearest_faces(pixels: Floats, faces: Indices, height: int, width: int) -> Numbers:
-    """Index (height, width) of the nearest face at each pixel, -1 where there is none.
+    """Find the index (height, width) of the nearest face at each pixel, -1 where there is none.
 
     pixels: (V, 3) column, row, depth of vertices; NaN for those behind the camera.
     faces: (F, 3), flat; a face covers the pixels whose centres it contains.
@@ -46,7 +46,7 @@ def nearest_faces(pixels: Floats, faces: Indices, height: int, width: int) -> Nu
 
 @compiled
 def nearest_points(pixels: Floats, size: int, height: int, width: int) -> Numbers:
-    """Index (height, width) of the nearest point at each pixel, -1 where there is none.
+    """Find the index (height, width) of the nearest point at each pixel, -1 where there is none.
 
     pixels: (N, 3) column, row, depth.
     size: side of the square of pixels that a point covers around its own.

@@ -11,7 +11,7 @@ from bodyscan.arrays import Array, Indices
 def build_centred_scene(
     vertices: Array, faces: Indices
 ) -> tuple[o3d.t.geometry.RaycastingScene, Array]:
-    """A scene of vertices (V, 3) less their mean, as it computes in float32; and that mean (3,)."""
+    """Build a scene of vertices (V, 3) less their mean, as it is float32; also return the mean (3,)."""
     centre = vertices.mean(axis=0)
     scene = o3d.t.geometry.RaycastingScene()
     scene.add_triangles(
@@ -28,7 +28,7 @@ class NearestSurface:
         self.scene, self.centre = build_centred_scene(vertices, faces)
 
     def nearest(self, points: Array) -> tuple[Array, Array, Indices]:
-        """The nearest positions (N, 3) to points (N, 3), their distances (N,) and faces (N,)."""
+        """Find the nearest positions (N, 3) to points (N, 3), their distances (N,) and faces (N,)."""
         if not len(points):
             return points, np.empty(0), np.empty(0, np.int64)
         centred = (points - self.centre).astype(np.float32)

@@ -36,7 +36,7 @@ class Element:
 
 
 def _vertex(*extra: tuple[str, str, str]) -> Element:
-    """Position, normal, colour, sigma, and `extra` fields: (name, numpy type, PLY type)."""
+    """Describe a vertex: position, normal, colour, sigma, `extra` (name, numpy type, PLY type)."""
     fields = [(axis, "<f8", "double") for axis in ("x", "y", "z")]
     fields += [(axis, "<f4", "float") for axis in ("nx", "ny", "nz")]
     fields += [(colour, "u1", "uchar") for colour in ("red", "green", "blue")]
@@ -56,7 +56,7 @@ def _cloud(*, regions: bool) -> tuple[Element, ...]:
 
 
 def _mesh(*, breath: bool, regions: bool) -> tuple[Element, ...]:
-    """Elements of a mesh: with the displacement to mean breath, with regions."""
+    """Describe vertices and faces, with or without displacements to mean breath and regions."""
     breath_fields = [("breath_mm", "<f4", "float"), ("breath_sigma_mm", "<f4", "float")]
     vertex = _vertex(*(breath_fields if breath else []), *([_REGION] if regions else []))
     fields = [("count", "u1"), ("corners", "<i4", 3), ("filled", "u1")]
@@ -140,7 +140,7 @@ def _vertex_records(element: Element, body: BodyCloud | BodyMesh, positions: Arr
 
 
 def _vertex_arrays(records: Records) -> tuple[Array, Floats, Floats, Bytes]:
-    """Positions, normals, sigmas and colours."""
+    """Extract positions, normals, sigmas and colours."""
 
     def columns(*names: str) -> NDArray[Any]:
         return np.stack([records[name] for name in names], axis=-1)
@@ -158,7 +158,7 @@ def _header(elements: Sequence[Element], counts: Sequence[int]) -> bytes:
 
 
 def _read(path: Path, known: Sequence[Sequence[Element]], what: str) -> list[Records]:
-    """Records of each element of a file that `write_ply` wrote with one of the known layouts."""
+    """Read the records of each element of a file that `write_ply` wrote with a known layout."""
     try:
         data = read_regular(path)
     except OSError as error:
@@ -182,5 +182,5 @@ def _read(path: Path, known: Sequence[Sequence[Element]], what: str) -> list[Rec
 
 
 def _strip_comments(header: bytes) -> list[bytes]:
-    """A header's lines without its comments."""
+    """Split a header into lines without its comments."""
     return [line for line in header.splitlines() if not line.startswith(b"comment")]

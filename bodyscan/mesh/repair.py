@@ -22,7 +22,7 @@ from bodyscan.mesh.topology import (
 
 
 def close_mesh(vertices: Array, faces: Indices) -> tuple[Array, Indices]:
-    """Vertices (V, 3) and faces (F, 3) of a closed manifold surface made from a nearly closed one.
+    """Make a nearly closed surface of vertices (V, 3) and faces (F, 3) a closed manifold.
 
     Faces at edges shared by more than two are removed, surfaces that touch in a vertex are
     separated, holes are closed with fans of triangles. An octree's surface has a few such places; a
@@ -57,7 +57,7 @@ def _fill_holes(vertices: Array, faces: Indices, rim: Indices) -> tuple[Array, I
 def extract_largest_piece(
     vertices: Array, faces: Indices, points: Array | None = None
 ) -> tuple[Array, Indices]:
-    """Vertices and faces of the connected component with the most faces, closed and outward.
+    """Extract the connected component with the most faces, closed and outward.
 
     points: (N, 3); choose the component nearest to most of these instead: what closes the surface
         behind a wall may have more faces than what was scanned before it.

@@ -36,7 +36,7 @@ class MeshSlicer:
         return np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
 
     def slice(self, height_mm: float) -> tuple[Loop, ...]:
-        """The loops of the slice z = height_mm, largest area first; () if it misses the mesh.
+        """Cut at z = height_mm into loops, largest area first; () if the plane misses the mesh.
 
         A vertex exactly in the plane counts as above it, so that loops always close.
         """
@@ -67,7 +67,7 @@ def slice_mesh(
     filled: Mask | None = None,
     regions: Bytes | None = None,
 ) -> tuple[Loop, ...]:
-    """The loops of one slice of a mesh; see `MeshSlicer`."""
+    """Cut a mesh once into loops; see `MeshSlicer`."""
     return MeshSlicer(vertices, faces, filled, regions).slice(height_mm)
 
 
@@ -141,7 +141,7 @@ class Run:
 
 
 def hull_perimeter(points: Array) -> float:
-    """Perimeter of the convex hull of points (N, 2)."""
+    """Compute the perimeter of the convex hull of points (N, 2)."""
     try:
         return float(ConvexHull(points).area)
     except QhullError:  # a speck, or points on one line
@@ -187,7 +187,7 @@ def join_runs(loop: Loop, runs: Sequence[Run]) -> Loop:
 
 
 def _make_run(ends: Indices, segments: Indices, measured: Mask) -> Run:
-    """A run of these segments (N,). A whole loop begins and ends anywhere."""
+    """Make a run of these segments (N,). A whole loop begins and ends anywhere."""
     first = segments[~np.isin(ends[segments, 0], ends[segments, 1])]
     last = segments[~np.isin(ends[segments, 1], ends[segments, 0])]
     if not (first.size and last.size):
@@ -196,14 +196,14 @@ def _make_run(ends: Indices, segments: Indices, measured: Mask) -> Run:
 
 
 def _label_runs(ends: Indices, measured: Mask, count: int) -> Indices:
-    """Number (N,), from 0, of the run of each segment, with ends (N, 2) at `count` nodes."""
+    """Label each segment, with ends (N, 2) at `count` nodes, with the number (N,) of its run."""
     split = ends + count * ~measured[:, None]  # measured and unmeasured segments share no nodes
     labels = connect(split, 2 * count)[1]
     return np.unique(labels[split[:, 0]], return_inverse=True)[1]
 
 
 def _cut(vertices: Array, faces: Indices, height_mm: float) -> tuple[Array, Indices]:
-    """Segments (N, 2, 2) and ids (N, 2) of the edges on which they end, of faces that are crossed."""
+    """Cut the crossed faces to segments (N, 2, 2), with ids (N, 2) of the edges on which they end."""
     above = (vertices[:, 2] >= height_mm)[faces]
     # The corner that is alone on its side of the plane, and the other two after it.
     alone_above = above.sum(axis=1) == 1
@@ -219,7 +219,7 @@ def _cut(vertices: Array, faces: Indices, height_mm: float) -> tuple[Array, Indi
 
 
 def _intersect(vertices: Array, a: Indices, b: Indices, height_mm: float) -> Array:
-    """Points (N, 2) where edges from a to b cross the height, identical from either face."""
+    """Intersect edges from a to b with the height: points (N, 2), identical from either face."""
     low, high = vertices[np.minimum(a, b)], vertices[np.maximum(a, b)]
     share = (height_mm - low[:, 2]) / (high[:, 2] - low[:, 2])
     return low[:, :2] + share[:, None] * (high[:, :2] - low[:, :2])

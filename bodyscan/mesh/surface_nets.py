@@ -44,7 +44,7 @@ class Bricks:
 
     @staticmethod
     def from_mask(wanted: Mask, origin: Array, cell_mm: float) -> Bricks:
-        """The wanted bricks (a, b, c) of a grid."""
+        """Make a grid of the wanted bricks (a, b, c)."""
         indices = np.argwhere(wanted).astype(np.int32)
         table = np.full(wanted.shape, -1, np.int32)
         table[wanted] = np.arange(len(indices))
@@ -57,20 +57,20 @@ class Bricks:
 
 
 def split_into_bricks(dense: Floats) -> Floats:
-    """Values (a b c, SIDE, SIDE, SIDE) in bricks of a dense grid (SIDE a, SIDE b, SIDE c)."""
+    """Split a dense grid (SIDE a, SIDE b, SIDE c) into bricks (a b c, SIDE, SIDE, SIDE)."""
     a, b, c = (size // SIDE for size in dense.shape)
     split = dense.reshape(a, SIDE, b, SIDE, c, SIDE).transpose(0, 2, 4, 1, 3, 5)
     return np.ascontiguousarray(split).reshape(-1, SIDE, SIDE, SIDE)
 
 
 def join_bricks(values: Floats, shape: tuple[int, ...]) -> Floats:
-    """The inverse of `split_into_bricks`: dense values of all a x b x c bricks, shape (a, b, c)."""
+    """Invert `split_into_bricks`: dense values of all a x b x c bricks, shape (a, b, c)."""
     split = values.reshape(*shape, SIDE, SIDE, SIDE).transpose(0, 3, 1, 4, 2, 5)
     return np.ascontiguousarray(split).reshape([SIDE * size for size in shape])
 
 
 def extract_surface(bricks: Bricks, values: Floats) -> tuple[Array, Indices]:
-    """Vertices (V, 3) mm and outward faces (F, 3) of the zero set of values, negative inside.
+    """Extract vertices (V, 3) mm and outward faces (F, 3) of the zero set of values, negative inside.
 
     values: (B, SIDE, SIDE, SIDE) at the nodes. The surface is closed and manifold wherever all
         surrounding nodes are in bricks.
@@ -87,8 +87,8 @@ def extract_surface(bricks: Bricks, values: Floats) -> tuple[Array, Indices]:
 
 @cache
 def tabulate_sheets() -> tuple[NDArray[np.int8], NDArray[np.int8]]:
-    """For each of the 256 sets of a cell's corners inside: the sheet (256, 12) that crosses each
-    edge, -1 for none, and the number of sheets (256,).
+    """Tabulate, for each of the 256 sets of a cell's corners inside, the sheet (256, 12) that crosses
+    each edge, -1 for none, and the number of sheets (256,).
 
     Corner x + 2 y + 4 z; edge 4 a + p + 2 q runs along axis a, at p and q on the two axes after it.
     """
@@ -112,7 +112,7 @@ def tabulate_sheets() -> tuple[NDArray[np.int8], NDArray[np.int8]]:
 
 
 def _links(case: int, axis: int, side: int) -> list[tuple[int, int]]:
-    """Pairs of edges that the surface joins across one face of a cell."""
+    """Find pairs of edges that the surface joins across one face of a cell."""
     b, c = (axis + 1) % 3, (axis + 2) % 3
     around = [(0, 0), (1, 0), (1, 1), (0, 1)]
     inside = [case >> ((side << axis) + (p << b) + (q << c)) & 1 for p, q in around]
@@ -174,7 +174,7 @@ def _resolve_ambiguous_faces(table: Numbers, indices: Numbers, values: Floats) -
 def _number_vertices(
     table: Numbers, indices: Numbers, values: Floats, counts: NDArray[np.int8]
 ) -> tuple[NDArray[np.uint8], Numbers, int]:
-    """Case and number of the first vertex of each cell, and the number of vertices."""
+    """Compute case and first vertex of each cell, and the number of vertices."""
     cases, first = np.zeros(values.shape, np.uint8), np.zeros(values.shape, np.int32)
     block = np.empty((SIDE + 1, SIDE + 1, SIDE + 1), np.float32)
     total = 0
@@ -204,7 +204,7 @@ def _compute_vertices(
     sheets: NDArray[np.int8],
     total: int,
 ) -> Array:
-    """Vertices (total, 3), in cells from the grid's first node."""
+    """Compute vertices (total, 3), in cells from the grid's first node: means of edge crossings."""
     sums, crossings = np.zeros((total, 3)), np.zeros(total)
     block = np.empty((SIDE + 1, SIDE + 1, SIDE + 1), np.float32)
     low, high = np.empty(3, np.int64), np.empty(3, np.int64)
@@ -246,7 +246,7 @@ def _make_faces(
     sheets: NDArray[np.int8],
     vertices: Array,
 ) -> Indices:
-    """Faces (F, 3): two for each edge that crosses zero, split along the shorter diagonal."""
+    """Make faces (F, 3), two for each edge that crosses zero, split along the shorter diagonal."""
     faces, count = np.empty((6 * len(vertices) + 64, 3), np.int64), 0
     corners, cell = np.empty(4, np.int64), np.empty(3, np.int64)
     for brick in range(len(indices)):
@@ -294,7 +294,7 @@ def _vertex(
     sheets: NDArray[np.int8],
     edge: int,
 ) -> int:
-    """The vertex of the sheet that crosses an edge of a cell, -1 if there is none."""
+    """Find the vertex of the sheet that crosses an edge of a cell, -1 if there is none."""
     a, b, c = index[0] + cell[0] // SIDE, index[1] + cell[1] // SIDE, index[2] + cell[2] // SIDE
     if a < 0 or b < 0 or c < 0 or table[a, b, c] < 0:
         return -1

@@ -21,7 +21,7 @@ UNSOUND = -2  # several faces run along the edge the same way, or it has no leng
 
 
 def find_twins(faces: Indices, vertex_count: int) -> Indices:
-    """The opposite half-edge (F, 3) of each half-edge of faces (F, 3), or RIM or UNSOUND."""
+    """Find the opposite half-edge (F, 3) of each half-edge of faces (F, 3), or RIM or UNSOUND."""
     return _twins(np.ascontiguousarray(faces, np.int64).ravel(), vertex_count).reshape(-1, 3)
 
 
@@ -37,7 +37,7 @@ def label_corner_fans(twin: Indices) -> tuple[Indices, int]:
 
 @compiled
 def _twins(corners: Indices, vertex_count: int) -> Indices:
-    """Twins (3 F,) from the faces' corners (3 F,), by the half-edges that leave each vertex."""
+    """Find twins (3 F,) from the faces' corners (3 F,), by the half-edges that leave each vertex."""
     size = len(corners)
     start = np.zeros(vertex_count + 1, np.int64)
     for vertex in corners:
@@ -66,7 +66,7 @@ def _twins(corners: Indices, vertex_count: int) -> Indices:
 
 @compiled
 def _fans(twin: Indices) -> tuple[Indices, int]:
-    """Fans (3 F,) of the corners, numbered as found, by turning about each vertex."""
+    """Number the fans (3 F,) of the corners, by turning about each vertex."""
     labels = np.full(len(twin), -1, np.int64)
     count = 0
     for first in range(len(twin)):
@@ -106,7 +106,7 @@ class Topology:
 
 
 def compute_topology(vertices: Array, faces: Indices) -> Topology:
-    """Topology of a mesh with vertices (V, 3) and faces (F, 3); unused vertices do not count."""
+    """Compute the topology of vertices (V, 3) and faces (F, 3); unused vertices do not count."""
     used, count = used_vertices(faces, len(vertices)), len(vertices)
     closed, manifold = check_manifold(faces, count)
     edge_count = 3 * len(faces) // 2
@@ -123,19 +123,19 @@ def compute_topology(vertices: Array, faces: Indices) -> Topology:
 
 
 def check_manifold(faces: Indices, vertex_count: int) -> tuple[bool, bool]:
-    """The `closed` and `manifold` of `Topology` for faces (F, 3), without the rest."""
+    """Compute the `closed` and `manifold` of `Topology` for faces (F, 3), without the rest."""
     twin = find_twins(faces, vertex_count)
     closed = bool(faces.size) and bool((twin >= 0).all())
     return closed, closed and label_corner_fans(twin)[1] == used_vertices(faces, vertex_count).size
 
 
 def directed_edges(faces: Indices) -> Indices:
-    """Edges (3 F, 2): edge k of face f, at k * F + f, runs from its corner k to the next."""
+    """List edges (3 F, 2): edge k of face f, at k * F + f, runs from its corner k to the next."""
     return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
 
 
 def connect(edges: Indices, count: int) -> tuple[int, NDArray[np.int32]]:
-    """Number of connected components of a graph, and the component (count,) of each node.
+    """Find the number of connected components of a graph, and the component (count,) of each node.
 
     edges: (N, 2), pairs of nodes 0 to count - 1.
     """
@@ -153,18 +153,18 @@ def label_components(faces: Indices, vertex_count: int) -> NDArray[np.int32]:
 
 
 def signed_volume(vertices: Array, faces: Indices) -> float:
-    """Volume inside a closed mesh, mm^3; negative if its faces are oriented inwards."""
+    """Compute the volume inside a closed mesh, mm^3; negative if its faces are oriented inwards."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     return float(np.einsum("fc,fc->", a, np.cross(b, c)) / 6.0)
 
 
 def face_areas(vertices: Array, faces: Indices) -> Array:
-    """Areas (F,) mm^2."""
+    """Compute the areas (F,) mm^2 of faces (F, 3)."""
     return 0.5 * np.linalg.norm(face_normals(vertices, faces), axis=1)
 
 
 def face_normals(vertices: Array, faces: Indices) -> Array:
-    """Normals (F, 3) of faces (F, 3), twice as long as their areas."""
+    """Compute the normals (F, 3) of faces (F, 3), twice as long as their areas."""
     normals = np.empty((len(faces), 3))
     _cross(np.ascontiguousarray(vertices, float), np.ascontiguousarray(faces, np.int64), normals)
     return normals
@@ -181,7 +181,7 @@ def _cross(vertices: Array, faces: Indices, normals: Array) -> None:
 
 
 def vertex_normals(vertices: Array, faces: Indices) -> Floats:
-    """Unit normals (V, 3), the area-weighted mean of the faces around each vertex."""
+    """Compute unit normals (V, 3), the area-weighted mean of the faces around each vertex."""
     cross = face_normals(vertices, faces)
     corners, count = faces.ravel(), len(vertices)
     total = np.stack([np.bincount(corners, np.repeat(n, 3), count) for n in cross.T], axis=-1)
@@ -190,7 +190,7 @@ def vertex_normals(vertices: Array, faces: Indices) -> Floats:
 
 
 def drop_unused_vertices(vertices: Array, faces: Indices) -> tuple[Array, Indices, Indices]:
-    """Vertices (U, 3) that faces use, the faces renumbered, and the old indices (U,) of those."""
+    """Drop vertices that no face uses: vertices (U, 3), faces renumbered, old indices (U,)."""
     used = used_vertices(faces, len(vertices))
     number = np.full(len(vertices), -1, np.int64)
     number[used] = np.arange(used.size)
@@ -198,7 +198,7 @@ def drop_unused_vertices(vertices: Array, faces: Indices) -> tuple[Array, Indice
 
 
 def used_vertices(faces: Indices, count: int) -> Indices:
-    """Indices of the vertices (of `count`) that faces use, ascending."""
+    """Find the indices of the vertices (of `count`) that faces use, ascending."""
     used = np.zeros(count, bool)
     used[faces] = True
     return np.flatnonzero(used)
@@ -248,7 +248,7 @@ def find_handles(vertices: Array, faces: Indices, *, min_height_mm: float = 80.0
 
 
 def prune_branches(links: Indices) -> Indices:
-    """The 2-core of a graph: its links (N, 2) without those to nodes that have no other link."""
+    """Reduce links (N, 2) to the graph's 2-core, without those to nodes that have no other link."""
     links = np.unique(np.sort(links, axis=1), axis=0)
     while True:
         inside = (np.bincount(links.ravel())[links] > 1).all(axis=1)

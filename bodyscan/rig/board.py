@@ -135,6 +135,6 @@ def _problems(board: Board) -> Iterator[Problem]:
 
 
 def dictionary_family(dictionary: str) -> str:
-    """The family of a dictionary, which shares its first markers: DICT_4X4 of DICT_4X4_50."""
+    """Return a dictionary's family, which shares its first markers: DICT_4X4 of DICT_4X4_50."""
     head, _, count = dictionary.rpartition("_")
     return head if count.isdigit() else dictionary

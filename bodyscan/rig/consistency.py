@@ -38,14 +38,15 @@ def rig_problems(parts: RigParts) -> Iterator[Problem]:
             yield (key, index, "name"), f"is given to two {key}: every name once (got {name!r})"
     if parts.folders and not parts.boards:
         yield ("boards",), "is missing: calibration captures show a board"
-    yield from _marker_overlaps(parts.boards)
-    yield from _wrong_frames(parts)
-    yield from _template_problems(parts)
-    yield from _unknown_references(parts)
-    yield from _wrong_references(parts)
+    yield from _find_marker_overlaps(parts.boards)
+    yield from _find_wrong_frames(parts)
+    yield from _find_template_problems(parts)
+    yield from _find_unknown_references(parts)
+    yield from _find_wrong_references(parts)
 
 
-def _marker_overlaps(boards: Sequence[Board | None]) -> Iterator[Problem]:
+def _find_marker_overlaps(boards: Sequence[Board | None]) -> Iterator[Problem]:
+    """Find boards that share markers."""
     taken: list[tuple[Board, range]] = []
     for index, board in enumerate(boards):
         if board is None or board.kind == "checkerboard":
@@ -66,15 +67,16 @@ def _marker_overlaps(boards: Sequence[Board | None]) -> Iterator[Problem]:
         taken.append((board, ids))
 
 
-def _wrong_frames(parts: RigParts) -> Iterator[Problem]:
+def _find_wrong_frames(parts: RigParts) -> Iterator[Problem]:
+    """Find names of images that the pairs' codes do not fit, or that are missing."""
     pairs = [pair for pair in parts.pairs if pair]
     codes = [(pair.name, pair.projector) for pair in pairs if pair.projector]
     frames = parts.frames
     if frames is None:
         return
-    yield from _wrong_counts(frames, ("frames",), codes)
+    yield from _find_wrong_counts(frames, ("frames",), codes)
     across = [(name, code.crossing) for name, code in codes if code.crossing]
-    yield from _wrong_counts(frames.crossing, ("frames", "crossing"), across)
+    yield from _find_wrong_counts(frames.crossing, ("frames", "crossing"), across)
     if frames.crossing.model_extra and not across and len(pairs) == len(parts.pairs):
         yield ("frames", "crossing"), "is for a projector with `crossing`: no pair has one"
     directions = [(name, one) for name, code in codes for one in code.directions]
@@ -96,7 +98,7 @@ def _wrong_frames(parts: RigParts) -> Iterator[Problem]:
             yield ("frames", "lit"), wrong
 
 
-def _wrong_counts(
+def _find_wrong_counts(
     names: ImageNames, where: tuple[str, ...], codes: Sequence[tuple[str, StripeCode]]
 ) -> Iterator[Problem]:
     """Find lists of names that are longer or shorter than a pair's code requires."""
@@ -117,7 +119,8 @@ def _wrong_counts(
                 break
 
 
-def _template_problems(parts: RigParts) -> Iterator[Problem]:
+def _find_template_problems(parts: RigParts) -> Iterator[Problem]:
+    """Find file-name templates, exposures and folders that do not fit."""
     many = len(parts.pairs) > 1
     stripes = any(pair and pair.projector for pair in parts.pairs)
     if len(parts.exposures) == 1:
@@ -139,7 +142,8 @@ def _template_problems(parts: RigParts) -> Iterator[Problem]:
         yield ("calibration", index, "folder"), f"is listed twice (got {path!r})"
 
 
-def _unknown_references(parts: RigParts) -> Iterator[Problem]:
+def _find_unknown_references(parts: RigParts) -> Iterator[Problem]:
+    """Find names in `rig_frame` that the file does not have."""
     frame = parts.rig_frame
     if frame is None:
         return
@@ -152,7 +156,8 @@ def _unknown_references(parts: RigParts) -> Iterator[Problem]:
         yield ("rig_frame", "board"), "is missing: say which of the boards fixes the rig frame"
 
 
-def _wrong_references(parts: RigParts) -> Iterator[Problem]:
+def _find_wrong_references(parts: RigParts) -> Iterator[Problem]:
+    """Find references to boards that cannot give a length."""
     names = tuple(reference.name if reference else None for reference in parts.references)
     for index, name in find_duplicates(names):
         yield ("references", index, "name"), f"is given to two references (got {name!r})"

@@ -41,7 +41,8 @@ class CaptureFolder(Model):
             yield ("shots", index), f"is a shot named twice ({name})"
 
 
-def _name_faults(kind: ImageKind, names: Names) -> Iterator[Problem]:
+def _find_name_faults(kind: ImageKind, names: Names) -> Iterator[Problem]:
+    """Find what is wrong with the names of one kind of image."""
     if isinstance(names, str):
         numbering = frame_name_faults(names, kind.number) if kind.number else ()
         for fault in [*numbering, *filter(None, [path_fault(names)])]:
@@ -81,15 +82,15 @@ class ImageNames(Model):
         return names
 
     def templates(self, kind: ImageKind) -> Names:
-        """The template or list of names for one kind of image."""
+        """Return the template or list of names for one kind of image."""
         return (self.model_extra or {}).get(kind.name, self.default(kind))
 
     def default(self, kind: ImageKind) -> str:
-        """The template of a kind of image that the rig file does not name."""
+        """Return the template of a kind of image that the rig file does not name."""
         return kind.template
 
     def kind_names(self, kind: ImageKind, count: int) -> tuple[str, ...]:
-        """Names of `count` images of one kind, in the code's order."""
+        """Return the names of `count` images of one kind, in the code's order."""
         names = self.templates(kind)
         if not isinstance(names, str):
             return names
@@ -98,13 +99,13 @@ class ImageNames(Model):
         return tuple(names.format(**{kind.number: number}) for number in range(count))
 
     def direction_names(self, code: StripeCode) -> tuple[str, ...]:
-        """Names of a code's images in the order of its `image_counts`, without crossing stripes."""
+        """Return the names of a code's images, without crossing stripes, by its `image_counts`."""
         counts = code.image_counts.items()
         return tuple(name for kind, count in counts for name in self.kind_names(kind, count))
 
     def problems(self) -> Iterator[Problem]:
         for kind in image_kinds():
-            yield from _name_faults(kind, self.templates(kind))
+            yield from _find_name_faults(kind, self.templates(kind))
 
 
 class CrossingNames(ImageNames):
@@ -130,18 +131,17 @@ class FrameNames(ImageNames):
 
     @property
     def board_image(self) -> str | None:
-        """Name of the image in which boards are looked for; None if it is made from the code's
-        images."""
+        """Name of the image in which boards are detected; None if it is made from the code's."""
         return self.board or self.lit
 
     def code_names(self, code: StripeCode) -> tuple[str, ...]:
-        """Names of a code's images, without lit and dark, in the order of its `image_counts`, then
-        those of the crossing stripes."""
+        """Return the names of a code's images in the order of its `image_counts`, then those of the
+        crossing stripes; without lit and dark."""
         by_direction = zip((self, self.crossing), code.directions, strict=False)
         return tuple(name for names, one in by_direction for name in names.direction_names(one))
 
     def shown_names(self, code: StripeCode) -> tuple[str, ...]:
-        """Names as `code_names`, in the best order to show them (`StripeCode.show_order`)."""
+        """Return `code_names` in the best order to show them (`StripeCode.show_order`)."""
         by_direction = zip((self, self.crossing), code.directions, strict=False)
         return tuple(
             names.direction_names(one)[k] for names, one in by_direction for k in one.show_order
@@ -163,7 +163,7 @@ class FrameNames(ImageNames):
         )
 
     def sequence_names(self, code: StripeCode | None) -> tuple[str, ...]:
-        """Names of all images of a sequence in the default order in which they are taken; for a
+        """Return the names of all images of a sequence in the default order of taking them; for a
         camera without a projector, the board image alone."""
         if code is None:
             return tuple(filter(None, [self.board_image]))

@@ -57,11 +57,11 @@ class Rig(Model):
     volume: Volume = Volume()
 
     def pair(self, name: str) -> Pair:
-        """The pair of that name; KeyError if there is none."""
+        """Return the pair of that name. Raises KeyError if there is none."""
         return {pair.name: pair for pair in self.pairs}[name]
 
     def board(self, name: str) -> Board:
-        """The board of that name; KeyError if there is none."""
+        """Return the board of that name. Raises KeyError if there is none."""
         return {board.name: board for board in self.boards}[name]
 
     @property
@@ -78,14 +78,14 @@ class Rig(Model):
 
     @property
     def frame_pair(self) -> Pair | None:
-        """The pair that fixes the rig frame, or None where a board in a shot does."""
+        """The pair that fixes the rig frame, or None if a board in a shot does."""
         if self.rig_frame.shot is not None:
             return None
         return self.pair(self.rig_frame.pair) if self.rig_frame.pair else self.pairs[0]
 
     @property
     def frame_board(self) -> Board | None:
-        """The board that fixes the rig frame, or None where a pair does."""
+        """The board that fixes the rig frame, or None if a pair does."""
         if self.rig_frame.shot is None:
             return None
         return self.board(self.rig_frame.board) if self.rig_frame.board else self.boards[0]

@@ -23,7 +23,9 @@ _REMEDY = "Correct the rig file; docs/formats.md explains every key."
 
 def load_rig(path: Path) -> Rig:
     """Read and check a rig file. Raises RigFileError, which lists every problem by line."""
-    return load_model(Path(path), Rig, RigFileError, remedy=_REMEDY, salvage=_problems_of_parts)
+    return load_model(
+        Path(path), Rig, RigFileError, remedy=_REMEDY, salvage=_find_problems_of_parts
+    )
 
 
 def write_rig(path: Path, rig: Rig) -> None:
@@ -32,8 +34,8 @@ def write_rig(path: Path, rig: Rig) -> None:
     write_text(path, dump_yaml({"version": rig.version, **data}))
 
 
-def _problems_of_parts(data: Any) -> Iterator[Problem]:
-    """Find what does not fit together in a file that is not a valid rig, as far as can be told."""
+def _find_problems_of_parts(data: Any) -> Iterator[Problem]:
+    """Find what does not fit together in a file that is not a valid rig, as far as it is valid."""
     if not isinstance(data, dict):
         return iter(())
     boards, pairs, folders = (_items(data, key) for key in ("boards", "pairs", "calibration"))

@@ -46,7 +46,7 @@ class RigFrame(Model):
             yield ("y_axis",), "must be perpendicular to x_axis"
 
     def missing_shot(self, shots: Collection[str]) -> str | None:
-        """The error, in words, if the shot that fixes the frame is none of `shots`."""
+        """Return an error message if the shot that fixes the frame is none of `shots`, else None."""
         if self.shot is None or self.shot in shots:
             return None
         hint = did_you_mean(self.shot, shots)

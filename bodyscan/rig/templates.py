@@ -21,33 +21,32 @@ def fill(template: str, *, shot: str, pair: str, frame: str) -> str:
 
 
 def with_exposure(template: str, exposure: str) -> str:
-    """The template for images of one exposure."""
+    """Fill in the exposure."""
     return template.replace("{exposure}", exposure)
 
 
 def has_field(template: str, field: str) -> bool:
-    return field in _fields(template)
+    return field in _parse_fields(template)
 
 
 def names_pattern(name: str) -> re.Pattern[str]:
-    """A pattern for the names that one part of a path, with ANYTHING in it, stands for."""
+    """Compile a pattern for the names that one part of a path, with ANYTHING in it, matches."""
     return re.compile(_anything(re.escape(name)))
 
 
 @lru_cache(maxsize=4096)
 def shot_pattern(template: str, pair: str, frame: str) -> tuple[re.Pattern[str], ...]:
-    """One pattern per part of a path; together they find the shot (group `shot`) in a file's
-    path."""
+    """Compile one pattern per part of a path; together they find the shot (group `shot`) in it."""
     marked = re.escape(fill(template, shot="\0", pair=pair, frame=frame)).split("/")
-    return tuple(_shot_group(part) for part in marked)
+    return tuple(_compile_part(part) for part in marked)
 
 
 def template_faults(
     template: str, *, many_pairs: bool, needs_frame: bool, exposures: bool = False
 ) -> Iterator[str]:
-    """Find what is wrong with a file-name template, in words that follow its key."""
+    """Find what is wrong with a file-name template, as messages that follow its key."""
     try:
-        fields = _fields(template)
+        fields = _parse_fields(template)
     except ValueError as error:
         yield f"is not a file-name template: {error}"
         return
@@ -91,7 +90,7 @@ def frame_name_faults(name: str, number: str) -> Iterator[str]:
 
 
 def path_fault(path: str) -> str | None:
-    """Why a relative path might lead out of its starting folder, or None."""
+    """Return why a relative path might lead out of its starting folder, or None."""
     if "\\" in path or "\0" in path or re.match(r"[A-Za-z]:", path):
         return "must use / between folders, and neither \\ nor a drive letter"
     if path.startswith("/"):
@@ -102,7 +101,8 @@ def path_fault(path: str) -> str | None:
     return "has an empty part between two /" if "" in parts else None
 
 
-def _fields(template: str) -> set[str]:
+def _parse_fields(template: str) -> set[str]:
+    """Parse the fields of a template. Raises ValueError for unknown ones."""
     known, fields = ("shot", "pair", "frame", "exposure"), set()
     for _, field, spec, conversion in Formatter().parse(template):
         if field is None:
@@ -114,7 +114,8 @@ def _fields(template: str) -> set[str]:
     return fields
 
 
-def _shot_group(part: str) -> re.Pattern[str]:
+def _compile_part(part: str) -> re.Pattern[str]:
+    """Compile one part of a path, in which NUL marks the shot."""
     first, *others = _anything(part).split(re.escape("\0"))
     if not others:
         return re.compile(first)

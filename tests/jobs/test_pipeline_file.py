@@ -58,7 +58,7 @@ def test_changes_are_applied() -> None:
             "formats[1]: must be 'glb', 'obj', 'ply' or 'stl' (did you mean 'obj'",
         ),
         ("nonsense", "is not a change"),
-        ("fusion.points.x=1", "has nothing inside"),
+        ("fusion.points.x=1", "is a value, not a mapping"),
         ("rig_export.formats=colmap", "is for another kind"),
     ],
 )

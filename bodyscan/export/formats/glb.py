@@ -44,12 +44,12 @@ def write_glb(path: Path, body: BodyCloud | BodyMesh) -> None:
 
 
 def _y_up(vectors: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Vectors (N, 3) of the rig frame (x front, y left, z up) in glTF's (x left, y up, z front)."""
+    """Rotate vectors (N, 3) from the rig frame (x front, y left, z up) to glTF's (left, up, front)."""
     return vectors[:, [1, 2, 0]]
 
 
 def _linear(colours: Bytes) -> NDArray[np.uint16]:
-    """Linear shorts (N, 4) with alpha, as glTF's vertex colours are, of sRGB bytes (N, 3)."""
+    """Convert sRGB bytes (N, 3) to linear shorts (N, 4) with alpha, glTF's vertex colours."""
     encoded = np.arange(256) / 255.0
     linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
     table = np.rint(65535.0 * linear).astype(np.uint16)
@@ -59,7 +59,7 @@ def _linear(colours: Bytes) -> NDArray[np.uint16]:
 def _document(
     attributes: dict[str, NDArray[Any]], indices: Indices | None
 ) -> tuple[dict[str, Any], list[bytes]]:
-    """The JSON part and the chunks of the binary part (each a multiple of four bytes)."""
+    """Build the JSON part and the chunks of the binary part (each a multiple of four bytes)."""
     accessors: list[dict[str, Any]] = []
     views: list[dict[str, Any]] = []
     chunks: list[bytes] = []

@@ -69,7 +69,7 @@ def join_columns(columns: Sequence[Bytes | str]) -> bytes:
 
 
 def _digits(values: Indices, min_digits: int) -> Bytes:
-    """Digits (N, width), with zero bytes for leading zeros beyond the last `min_digits`."""
+    """Split into digits (N, width), zero bytes for leading zeros beyond the last `min_digits`."""
     width = max(min_digits, len(str(int(values.max(initial=0)))))
     digits = np.empty((len(values), width), np.uint8)
     rest = values

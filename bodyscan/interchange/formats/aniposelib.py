@@ -32,7 +32,7 @@ def write_aniposelib(cameras: RigCameras, path: Path) -> Path:
 
 
 def read_aniposelib(path: Path) -> dict[str, FoundCamera]:
-    """Cameras by their names, and by those of their tables."""
+    """Read cameras by their names, and by those of their tables."""
     file = ForeignFile.read(path)
     tables = {key: table for key, table in read_toml(file).items() if key != "metadata"}
     found: dict[str, FoundCamera] = {}

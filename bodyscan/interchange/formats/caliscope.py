@@ -33,7 +33,7 @@ def write_caliscope(cameras: RigCameras, path: Path) -> Path:
 
 
 def read_caliscope(path: Path) -> dict[str, FoundCamera]:
-    """Cameras by their numbers, and by the pair's name if bodyscan wrote the file."""
+    """Read cameras by their numbers, and by the pair's name if bodyscan wrote the file."""
     file = ForeignFile.read(path)
     tables = read_toml(file).get("cameras")
     if not isinstance(tables, dict) or not tables:

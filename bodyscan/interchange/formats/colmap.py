@@ -63,8 +63,8 @@ def write_colmap(cameras: RigCameras, folder: Path) -> Path:
 
 
 def read_colmap(folder: Path) -> dict[str, FoundCamera]:
-    """Every image by its name; and every camera with several images by the folder that holds them,
-    or by its number, with its pose in its rig, or none.
+    """Read every image by its name, and every camera with several images by their folder or its
+    number, with its pose in its rig if there is one.
 
     The skew comes from `bodyscan.json` if there is one.
     """
@@ -81,12 +81,12 @@ def read_colmap(folder: Path) -> dict[str, FoundCamera]:
             where=str(folder),
             remedy="give the folder that holds cameras, images and points3D, .bin or .txt",
         ) from error
-    gammas = _gammas(folder)
+    gammas = _read_gammas(folder)
     found: dict[str, FoundCamera] = {}
     for number, camera in sorted(model.cameras.items()):
         taken = [image for image in images if image.camera_id == number]
         names = {str(number), *_common_folder([names_of[image.image_id] for image in taken])}
-        rig_pose = _pose_in_rig(model, number)
+        rig_pose = _find_pose_in_rig(model, number)
         for name in names - {image.name for image in taken}:
             found[name] = _read_camera(folder, camera, 0.0, rig_pose)
         for image in taken:
@@ -102,7 +102,8 @@ def read_colmap(folder: Path) -> dict[str, FoundCamera]:
     return found
 
 
-def _gammas(folder: Path) -> dict[str, float]:
+def _read_gammas(folder: Path) -> dict[str, float]:
+    """Read the skew of each pair from the file beside the model, if there is one."""
     file = folder / SKEW_FILE
     if not file.is_file():
         return {}
@@ -123,14 +124,15 @@ def _common_folder(names: list[str]) -> set[str]:
 
 
 def _image_pose(image: Any) -> RigidTransform | None:
-    """The pose of an image; None if it has none, or its camera has none in its rig."""
+    """Return the pose of an image; None if it has none, or its camera has none in its rig."""
     try:
         return _transform(image.cam_from_world()) if image.has_pose else None
     except RuntimeError:
         return None
 
 
-def _pose_in_rig(model: Any, number: int) -> RigidTransform | None:
+def _find_pose_in_rig(model: Any, number: int) -> RigidTransform | None:
+    """Return a camera's pose in a rig of several sensors, None if there is none."""
     sensor = pycolmap.sensor_t(pycolmap.SensorType.CAMERA, number)
     for rig in model.rigs.values():
         if rig.num_sensors() > 1 and rig.has_sensor(sensor):

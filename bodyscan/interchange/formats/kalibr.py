@@ -61,7 +61,7 @@ def write_kalibr(cameras: RigCameras, path: Path) -> Path:
 
 
 def read_kalibr(path: Path) -> dict[str, FoundCamera]:
-    """Cameras by cam0, cam1, ..., and by the pair's name if bodyscan wrote the file."""
+    """Read cameras by cam0, cam1, ..., and by the pair's name if bodyscan wrote the file."""
     file = ForeignFile.read(path)
     try:
         data = read_yaml(path).data
@@ -82,18 +82,18 @@ def read_kalibr(path: Path) -> dict[str, FoundCamera]:
             break
         entry = cameras[key]
         if number > 0:
-            pose = _next_pose(file, key, entry, pose)
-        one = _camera(file, key, entry, pose)
+            pose = _compute_next_pose(file, key, entry, pose)
+        one = _read_camera(file, key, entry, pose)
         found[key] = one
         if isinstance(entry.get("name"), str):
             found[entry["name"]] = one
     return found
 
 
-def _next_pose(
+def _compute_next_pose(
     file: ForeignFile, key: str, entry: dict[str, Any], before: RigidTransform | None
 ) -> RigidTransform | None:
-    """The next camera's pose; a broken chain leaves the cameras after the gap without one."""
+    """Compute the next camera's pose; after a gap in the chain there is none."""
     if "T_cn_cnm1" not in entry or before is None:
         return None
     matrix = file.numbers(entry["T_cn_cnm1"], "T_cn_cnm1", (16,), after=key).reshape(4, 4)
@@ -101,7 +101,7 @@ def _next_pose(
     return step @ before
 
 
-def _camera(
+def _read_camera(
     file: ForeignFile, key: str, entry: dict[str, Any], pose: RigidTransform | None
 ) -> FoundCamera:
     words = ("camera_model", "intrinsics", "distortion_model", "resolution")

@@ -36,7 +36,7 @@ def write_mrcal(cameras: RigCameras, folder: Path) -> Path:
 
 
 def read_mrcal(path: Path) -> dict[str, FoundCamera]:
-    """Cameras of one file, or of all such files in a folder, by the files' names without suffix."""
+    """Read the cameras of one file, or of all in a folder, by the files' names without suffix."""
     files = sorted(path.glob(f"*{SUFFIX}")) if path.is_dir() else [path]
     if not files:
         raise CalibrationFileError(
@@ -76,7 +76,7 @@ def _format_model(name: str, camera: Any, rig_from_camera: Any) -> str:
 
 def _read_model(path: Path) -> FoundCamera:
     file = ForeignFile.read(path)
-    content = _literal(file)
+    content = _parse_literal(file)
     model = str(content.get("lensmodel", content.get("distortion_model", "")))
     kind = re.sub(r"^(LENSMODEL|DISTORTION)_", "", model)
     kind = "PINHOLE" if kind == "NONE" else kind
@@ -103,7 +103,8 @@ def _read_model(path: Path) -> FoundCamera:
     )
 
 
-def _literal(file: ForeignFile) -> dict[Any, Any]:
+def _parse_literal(file: ForeignFile) -> dict[Any, Any]:
+    """Parse the Python literal that a cameramodel is."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", SyntaxWarning)

@@ -81,7 +81,7 @@ def _write_camera(store: Any, name: str, camera: Camera, pose: RigidTransform) -
 
 
 def read_opencv(path: Path) -> dict[str, FoundCamera]:
-    """The cameras of a file that `write_opencv` wrote, and their projectors by `projector_name`."""
+    """Read a file that `write_opencv` wrote: cameras, and projectors by `projector_name`."""
     file = ForeignFile.read(path)
     store = _open_storage(file)
     pairs = store.getNode("pairs")
@@ -94,10 +94,10 @@ def read_opencv(path: Path) -> dict[str, FoundCamera]:
     found = {}
     for k in range(int(pairs.size())):
         entry, name = pairs.at(k), f"pairs/{k}"
-        label = _below(file, entry, "name", name).string()
+        label = _find_below(file, entry, "name", name).string()
         camera = found[label] = _read_camera(file, entry, name, label)
         if "projector" in entry.keys():  # noqa: SIM118 (it is no dict)
-            light = _below(file, entry, "projector", name)
+            light = _find_below(file, entry, "projector", name)
             inner = _read_camera(file, light, f"{name}/projector", label)
             assert inner.camera_from_world is not None
             assert camera.camera_from_world is not None
@@ -108,7 +108,7 @@ def read_opencv(path: Path) -> dict[str, FoundCamera]:
 
 def _read_camera(file: ForeignFile, entry: Any, name: str, label: str) -> FoundCamera:
     def numbers(key: str) -> Any:
-        return _values(file, _below(file, entry, key, name), f"{name}/{key}")
+        return _read_values(file, _find_below(file, entry, key, name), f"{name}/{key}")
 
     size = [numbers("image_width"), numbers("image_height")]
     return FoundCamera(
@@ -121,13 +121,13 @@ def _read_camera(file: ForeignFile, entry: Any, name: str, label: str) -> FoundC
 
 
 def read_nodes(path: Path, nodes: Nodes) -> FoundCamera:
-    """The camera whose numbers are in these nodes: matrix; distortion, size (or width and height),
+    """Read the camera whose numbers are in these nodes: matrix; distortion, size (or width and height),
     rotation and translation if given."""
     file = ForeignFile.read(path)
     store = _open_storage(file)
 
     def values(what: str) -> Any:
-        return _values(file, _node(file, store, nodes[what]), nodes[what])
+        return _read_values(file, _find_node(file, store, nodes[what]), nodes[what])
 
     size = file.size(values("size"), nodes["size"]) if "size" in nodes else None
     if "width" in nodes:
@@ -145,7 +145,7 @@ def read_nodes(path: Path, nodes: Nodes) -> FoundCamera:
 
 
 def _open_storage(file: ForeignFile) -> Any:
-    """The open storage; its nodes live only as long as it does."""
+    """Open the storage; its nodes live only as long as it does."""
     text = file.text.lstrip()
     if not text.startswith(("%YAML", "<?xml", "{")):
         text = "%YAML:1.0\n---\n" + text  # OpenCV needs it, ROS leaves it out
@@ -159,15 +159,17 @@ def _open_storage(file: ForeignFile) -> Any:
     raise file.error("is neither YAML, XML nor JSON as OpenCV's FileStorage reads them")
 
 
-def _node(file: ForeignFile, store: Any, name: str) -> Any:
+def _find_node(file: ForeignFile, store: Any, name: str) -> Any:
+    """Find a node by its name, with those around it first: `stereo/K1`."""
     node, passed = store.root(), ""
     for part in name.split("/"):
-        node = _below(file, node, part, passed)
+        node = _find_below(file, node, part, passed)
         passed = f"{passed}/{part}" if passed else part
     return node
 
 
-def _below(file: ForeignFile, node: Any, name: str, passed: str) -> Any:
+def _find_below(file: ForeignFile, node: Any, name: str, passed: str) -> Any:
+    """Find a node below another. Raises CalibrationFileError, which lists those there are."""
     keys = list(node.keys()) if node.isMap() else []
     if name not in keys:
         parent = f"below {passed}" if passed else "in it"
@@ -179,12 +181,12 @@ def _below(file: ForeignFile, node: Any, name: str, passed: str) -> Any:
     return node.getNode(name)
 
 
-def _values(file: ForeignFile, node: Any, name: str) -> Any:
-    """A number, or a list of what is in the node; for a matrix its numbers row by row."""
+def _read_values(file: ForeignFile, node: Any, name: str) -> Any:
+    """Read a number, or a list of what is in the node; of a matrix its numbers row by row."""
     if node.isMap() and "data" in node.keys():  # noqa: SIM118 (it is no dict)
-        return _values(file, node.getNode("data"), name)
+        return _read_values(file, node.getNode("data"), name)
     if node.isSeq():
-        return [_values(file, node.at(k), name) for k in range(int(node.size()))]
+        return [_read_values(file, node.at(k), name) for k in range(int(node.size()))]
     if node.isInt() or node.isReal():
         return float(node.real())
     raise file.error("holds what is not a number", name.split("/")[-1])
