@@ -64,12 +64,12 @@ def _candidate_positions(image: Bytes, board: Board, thorough: bool) -> Iterator
             first = count_dictionary_markers(board)
             tags = detect_markers(picture, board, border_bits=border_bits, first=first)
             corners = (tags.corners + 0.5) / scale - 0.5
-            position = place_tags(board, Markers(tags.ids, corners), border_bits)
+            position = locate_grid(board, Markers(tags.ids, corners), border_bits)
             if position is not None:
                 yield position
 
 
-def place_tags(board: Board, tags: Markers, border_bits: int = 2) -> GridPosition | None:
+def locate_grid(board: Board, tags: Markers, border_bits: int = 2) -> GridPosition | None:
     """Locate the grid by its tags; None if too few agree.
 
     All tags may be rotated by quarter turns, and count from the lowest row (Kalibr) or the highest.

@@ -105,7 +105,7 @@ def locate_charuco(
 ) -> DetectedCorners | None:
     """Find the board's corners next to the detected markers.
 
-    position: from `place_markers`; None if it is None, or most markers disagree with it.
+    position: from `locate_face`; None if it is None, or most markers disagree with it.
     """
     if position is None or not position.valid:
         return None
@@ -132,24 +132,22 @@ def _has_more_rows(position: FacePosition, markers: Markers) -> bool:
     if not np.any((markers.ids >= end) & (markers.ids < end + board.columns)):
         return False
     try:
-        more = place_markers(longer, markers)
+        more = locate_face(longer, markers)
     except BadInput:  # the dictionary has no more
         return False
     return more is not None and more.agreeing > position.agreeing
 
 
-def place_markers(board: Board, markers: Markers) -> FacePosition | None:
+def locate_face(board: Board, markers: Markers) -> FacePosition | None:
     """Locate the face of the board, and the layout, on which most markers agree; None if none."""
     layouts = [board]
     if board.rows % 2 == 0:  # OpenCV before 4.6 printed these differently
         layouts.append(board.model_copy(update={"legacy_layout": not board.legacy_layout}))
-    found = [
-        _place_face(layout, face, markers) for layout in layouts for face in range(board.faces)
-    ]
+    found = [_fit_face(layout, face, markers) for layout in layouts for face in range(board.faces)]
     return max((face for face in found if face), key=lambda face: face.agreeing, default=None)
 
 
-def _place_face(board: Board, face: int, markers: Markers) -> FacePosition | None:
+def _fit_face(board: Board, face: int, markers: Markers) -> FacePosition | None:
     face_ids, printed = board_layout.marker_corners(board, face)
     _, detected, of_face = np.intersect1d(markers.ids, face_ids, return_indices=True)
     if len(detected) < 2:

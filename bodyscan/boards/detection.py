@@ -14,7 +14,7 @@ from bodyscan.boards.charuco import (
     count_dictionary_markers,
     detect_markers,
     locate_charuco,
-    place_markers,
+    locate_face,
 )
 from bodyscan.boards.checkerboard import find_checkerboard
 from bodyscan.boards.corners import DetectedCorners
@@ -102,11 +102,11 @@ def _find_charuco(
 
     if appearance == AS_PRINTED:  # true of nearly all
         markers = detect(quick=True)
-        position = place_markers(board, markers)
+        position = locate_face(board, markers)
         if position is not None and position.valid and position.complete(picture.shape):
             return locate_charuco(picture, board, markers, position)
     markers = detect(quick=False)
-    return locate_charuco(picture, board, markers, place_markers(board, markers))
+    return locate_charuco(picture, board, markers, locate_face(board, markers))
 
 
 def _determines_plane(found: DetectedCorners) -> bool:

@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 
 from bodyscan.arrays import Bytes
-from bodyscan.boards.aprilgrid import BORDER_BITS, place_tags
+from bodyscan.boards.aprilgrid import BORDER_BITS, locate_grid
 from bodyscan.boards.board_layout import marker_corners
-from bodyscan.boards.charuco import Markers, detect_markers, place_markers
+from bodyscan.boards.charuco import Markers, detect_markers, locate_face
 from bodyscan.boards.checkerboard import MIN_SQUARES, find_checkerboard
 from bodyscan.boards.detection import OTHER_APPEARANCES
 from bodyscan.boards.view import AS_PRINTED, Appearance
@@ -80,11 +80,11 @@ def _detect(image: Bytes, board: Board, appearance: Appearance) -> Markers:
 def _count_agreeing(board: Board, markers: Markers) -> int:
     """Count the markers that lie as on this board; 0 if too few to be this board."""
     if board.kind == "aprilgrid":
-        tags = place_tags(board, markers)
+        tags = locate_grid(board, markers)
         return tags.agreeing if tags else 0
     if board.first_marker + board.marker_count > MARKERS_IN.get(board.dictionary, 0):
         return 0
-    position = place_markers(board, markers)
+    position = locate_face(board, markers)
     return position.agreeing if position and position.valid else 0
 
 

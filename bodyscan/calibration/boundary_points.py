@@ -64,11 +64,11 @@ def rays_on_board(
     # One iteration errs by how much the board rises over a few tenths of a millimetre.
     for _ in range(2):
         heights = height(board_from_camera.apply(points)[..., :2])
-        points = flat + lifts(rays, camera_from_board, heights)
+        points = flat + lift_along_rays(rays, camera_from_board, heights)
     return points
 
 
-def lifts(rays: Array, camera_from_board: RigidTransform, height: Array) -> Array:
+def lift_along_rays(rays: Array, camera_from_board: RigidTransform, height: Array) -> Array:
     """Displacement of points along their rays (..., 3) for a board `height` mm above its plane."""
     return np.asarray(rays * (height / (rays @ camera_from_board.rotation[:, 2]))[..., None])
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.calibration.board_views import BoardFace, PlanarView, corner_keys, match_corners
-from bodyscan.calibration.boundary_points import BoundaryPoints, lifts, rays_on_board
+from bodyscan.calibration.boundary_points import BoundaryPoints, lift_along_rays, rays_on_board
 from bodyscan.calibration.camera import camera_prior
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.least_squares import EXACT, Block, Noise, Solution, minimize
@@ -374,7 +374,9 @@ def _stripe_jacobian(state: _State[Sheets], k: int, board: StripedBoard, rays: A
 
     def residuals(rays: Array, pose: RigidTransform) -> Array:
         camera_from_face = pose @ board.board_from_face
-        points = rays_on_board(rays, camera_from_face) + lifts(rays, camera_from_face, height)
+        points = rays_on_board(rays, camera_from_face) + lift_along_rays(
+            rays, camera_from_face, height
+        )
         return _whitened_offsets(state.sheets, at, board, points)
 
     def by_parameter(column: int, step: float) -> Array:

@@ -13,7 +13,7 @@ from board_rendering import render, true_corners, view_of
 from bodyscan.arrays import Array, Bytes
 from bodyscan.boards import detection
 from bodyscan.boards.board_layout import corner_points
-from bodyscan.boards.charuco import Markers, detect_markers, place_markers
+from bodyscan.boards.charuco import Markers, detect_markers, locate_face
 from bodyscan.boards.detection import find_boards
 from bodyscan.boards.unfound import describe_unfound
 from bodyscan.boards.view import BoardView
@@ -97,7 +97,7 @@ def test_markers_that_a_picture_cuts_off_are_not_missing(picture: Bytes) -> None
     """Half of a board seen whole needs no second search."""
     half = np.ascontiguousarray(picture[:, : int(true_corners(MARKED, PLACE)[:, 0].mean())])
     markers = detect_markers(half, MARKED, quick=True)
-    position = place_markers(MARKED, markers)
+    position = locate_face(MARKED, markers)
     assert position is not None
     assert 5 < len(markers.ids) < 25
     assert position.complete(half.shape)

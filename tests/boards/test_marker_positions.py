@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from bodyscan.arrays import Array, Mask
-from bodyscan.boards.aprilgrid import place_tags
+from bodyscan.boards.aprilgrid import locate_grid
 from bodyscan.boards.board_layout import marker_corners
-from bodyscan.boards.charuco import FacePosition, Markers, fit_markers, place_markers
+from bodyscan.boards.charuco import FacePosition, Markers, fit_markers, locate_face
 from bodyscan.rig.board import Board
 
 BOARD = Board(name="b", kind="charuco", columns=9, rows=8, square_mm=50, marker_mm=40)
@@ -59,18 +59,18 @@ def test_a_board_is_located_by_some_of_its_markers() -> None:
     ids, points = marker_corners(BOARD)
     pixels = image_of(points[..., :2], 1.0)
     some = np.arange(3, 36, 4)
-    position = place_markers(BOARD, Markers(np.asarray(ids)[some], pixels[some]))
+    position = locate_face(BOARD, Markers(np.asarray(ids)[some], pixels[some]))
     assert position is not None
     assert (position.agreeing, position.detected, position.face, position.valid) == (9, 9, 0, True)
     corner = np.array([[200.0, 150.0]])
     np.testing.assert_allclose(position.board_map.apply(corner), image_of(corner, 1.0), atol=0.01)
     one = Markers(np.asarray(ids)[:1], pixels[:1])
-    assert place_markers(BOARD, one) is None
+    assert locate_face(BOARD, one) is None
 
 
 def test_six_of_ten_markers_have_to_agree() -> None:
     ids, points = marker_corners(BOARD)
-    position = place_markers(BOARD, Markers(np.asarray(ids), image_of(points[..., :2], 1.0)))
+    position = locate_face(BOARD, Markers(np.asarray(ids), image_of(points[..., :2], 1.0)))
     assert position is not None
 
     def of_ten(agreeing: int) -> FacePosition:
@@ -97,7 +97,7 @@ def tags(turn: int = 0, *, from_top: bool = False, wrong: int = 0, count: int = 
 def test_a_grid_is_placed_however_its_tags_are_turned_and_counted(
     turn: int, from_top: bool
 ) -> None:
-    position = place_tags(TAGS, tags(turn, from_top=from_top))
+    position = locate_grid(TAGS, tags(turn, from_top=from_top))
     assert position is not None
     assert position.agreeing == 30
     corner = np.array([[200.0, 150.0]])
@@ -105,14 +105,14 @@ def test_a_grid_is_placed_however_its_tags_are_turned_and_counted(
 
 
 def test_three_tags_and_six_of_ten_have_to_agree() -> None:
-    assert place_tags(TAGS, tags(count=2)) is None
-    position = place_tags(TAGS, tags(count=3))
+    assert locate_grid(TAGS, tags(count=2)) is None
+    position = locate_grid(TAGS, tags(count=3))
     assert position is not None
     assert position.agreeing == 3
-    position = place_tags(TAGS, tags(wrong=11))
+    position = locate_grid(TAGS, tags(wrong=11))
     assert position is not None
     assert position.agreeing == 19
-    assert place_tags(TAGS, tags(wrong=13)) is None
+    assert locate_grid(TAGS, tags(wrong=13)) is None
 
 
 @pytest.mark.parametrize(("first_px", "whole"), [(0.3, True), (-0.3, False)])
@@ -125,7 +125,7 @@ def test_a_marker_at_the_pictures_first_pixels_lies_wholly_within_it(
     pixels = 20.0 + points[..., :2]
     pixels[..., axis] += first_px - pixels[..., axis].min()
     others = pixels[..., axis].min(axis=1) > 1.0  # all but the first column, or row
-    position = place_markers(BOARD, Markers(np.asarray(ids)[others], pixels[others]))
+    position = locate_face(BOARD, Markers(np.asarray(ids)[others], pixels[others]))
     assert position is not None
     assert 0 < position.agreeing == others.sum() < len(pixels)
     assert position.complete((500, 500)) != whole
