@@ -55,8 +55,8 @@ def test_what_the_person_did_is_said_part_by_part(html: str) -> None:
     assert "The person moved 5 mm while being scanned; corrected to 0.17 mm." in body
     assert "as of 1.04 s after the scan began" in body
     assert "left arm" in body
-    assert "breathed by 2.2 mm, carried to one moment" in body
-    assert "stood 1.3 mm behind their place at mean breath, known to 0.4" in body
+    assert "breath of 2.2 mm, corrected to one moment" in body
+    assert "were 1.3 +- 0.4 mm behind their position at mean breath" in body
 
 
 def test_a_report_elsewhere_is_found_when_its_subject_is_forgotten(
