@@ -12,7 +12,7 @@ import numpy as np
 
 from bodyscan.geometry.uncertainty import point_covariance, position_sigma
 from bodyscan.registration.more_shots import (
-    MOST_SHOTS,
+    MAX_SHOTS,
     BoardCandidate,
     RigInformation,
     SigmaReduction,
@@ -89,57 +89,57 @@ class Advice:
     @property
     def lines(self) -> list[str]:
         """The advice, for the builder of the rig."""
-        said = [
-            f"{_shots(link.shots)} in common is all that ties {link.first} to {link.second}, and with "
-            "them the parts of the rig on either side"
+        lines = [
+            f"{link.first} and {link.second}, with {_shots(link.shots)} in common, are the only link "
+            "between two parts of the rig"
             for link in self.bridges
         ]
         if self.crucial:
             names = ", ".join(f"{shot} ({board})" for shot, board in self.crucial)
-            said.append(f"without any one of these shots the rig would fall apart: {names}")
-        said += [
-            f"weak link: {link.second} is known to {link.sigma_mm:.3f} mm from {link.first} "
-            f"({_shots(link.shots)} in common), and no other link ties their sides better"
+            lines.append(f"without any one of these shots the rig is disconnected: {names}")
+        lines += [
+            f"weak link: sigma of {link.second} relative to {link.first} is {link.sigma_mm:.3f} mm "
+            f"({_shots(link.shots)} in common), and no other link between their parts is better"
             for link in self.weak
         ]
-        said.append(
-            f"{self.worst} is known least in the rig frame: sigma {self.worst_sigma_mm:.3f} mm"
+        lines.append(
+            f"{self.worst} has the largest sigma in the rig frame: {self.worst_sigma_mm:.3f} mm"
         )
-        return said + ([_sentence(self.more)] if self.more else [])
+        return lines + ([_sentence(self.more)] if self.more else [])
 
 
-def advise(rig: Rig, placed: RigSolution) -> Advice:
+def advise(rig: Rig, solution: RigSolution) -> Advice:
     """Links, weak spots and the most useful further shots of a solved rig."""
-    links = find_links(placed)
-    graph = view_graph(placed.views, sorted(placed.rig_from_camera))
+    links = find_links(solution)
+    graph = view_graph(solution.views, sorted(solution.rig_from_camera))
     bridging = {frozenset(edge) for edge in nx.bridges(graph)}
     chain = minimum_spanning_links(links)
-    usual = float(np.median([link.sigma_mm for link in chain])) if chain else 0.0
+    median = float(np.median([link.sigma_mm for link in chain])) if chain else 0.0
     sigmas = {
-        name: float(np.linalg.norm(position_sigma(placed.covariance, name, t.translation)))
-        for name, t in placed.rig_from_camera.items()
+        name: float(np.linalg.norm(position_sigma(solution.covariance, name, t.translation)))
+        for name, t in solution.rig_from_camera.items()
     }
     worst = max(sorted(sigmas), key=lambda name: sigmas[name])
     return Advice(
         links,
         chain,
         tuple(link for link in links if {link.first, link.second} in bridging),
-        tuple(link for link in chain if link.sigma_mm > WEAK_TIMES * usual),
-        find_articulation_shots(placed),
+        tuple(link for link in chain if link.sigma_mm > WEAK_TIMES * median),
+        find_articulation_shots(solution),
         worst,
         sigmas[worst],
-        more_shots(rig, placed, worst),
+        more_shots(rig, solution, worst),
     )
 
 
-def find_links(placed: RigSolution) -> tuple[Link, ...]:
+def find_links(solution: RigSolution) -> tuple[Link, ...]:
     """Every two pairs that share a shot, least known first."""
     found = []
-    graph = view_graph(placed.views, sorted(placed.rig_from_camera))
+    graph = view_graph(solution.views, sorted(solution.rig_from_camera))
     for first, second, targets in graph.edges(data="targets"):
-        motion = placed.covariance.relative(first, second)
-        spread = point_covariance(motion, placed.rig_from_camera[second].translation)
-        found.append(Link(first, second, len(targets), float(np.sqrt(np.trace(spread)))))
+        motion = solution.covariance.relative(first, second)
+        covariance = point_covariance(motion, solution.rig_from_camera[second].translation)
+        found.append(Link(first, second, len(targets), float(np.sqrt(np.trace(covariance)))))
     return tuple(sorted(found, key=lambda link: (-link.sigma_mm, link.first, link.second)))
 
 
@@ -154,49 +154,52 @@ def minimum_spanning_links(links: Sequence[Link]) -> tuple[Link, ...]:
     return tuple(sorted((data["link"] for _, _, data in tree), key=lambda link: -link.sigma_mm))
 
 
-def find_articulation_shots(placed: RigSolution) -> tuple[Target, ...]:
+def find_articulation_shots(solution: RigSolution) -> tuple[Target, ...]:
     """Shots without which some pairs would share no view with the others."""
     graph = nx.Graph()
-    graph.add_nodes_from(("pair", name) for name in placed.rig_from_camera)
-    graph.add_edges_from((("pair", view.pair), ("shot", view.target)) for view in placed.views)
+    graph.add_nodes_from(("pair", name) for name in solution.rig_from_camera)
+    graph.add_edges_from((("pair", view.pair), ("shot", view.target)) for view in solution.views)
     return tuple(sorted(what for kind, what in nx.articulation_points(graph) if kind == "shot"))
 
 
-def more_shots(rig: Rig, placed: RigSolution, pair: str) -> ShotSuggestion | None:
-    """The place for a board at which the fewest further shots halve the sigma of `pair`'s position.
+def more_shots(rig: Rig, solution: RigSolution, pair: str) -> ShotSuggestion | None:
+    """Find the board candidate at which the fewest further shots halve the sigma of `pair`'s position.
 
-    None if no place in the scan volume is seen by two pairs, or no shot would add information.
+    None if no candidate in the scan volume is seen by two pairs, or no shot would add information.
     """
-    usual, _ = Counter(view.board for view in placed.views).most_common(1)[0]
-    places = propose_board_poses(
-        rig.board(usual), rig.volume, placed.cameras, placed.rig_from_camera
+    board, _ = Counter(view.board for view in solution.views).most_common(1)[0]
+    candidates = propose_board_poses(
+        rig.board(board), rig.volume, solution.cameras, solution.rig_from_camera
     )
-    if not places:
+    if not candidates:
         return None
     equations = normal_equations(
-        placed.views,
-        placed.cameras,
-        placed.rig_from_camera,
-        placed.rig_from_board,
+        solution.views,
+        solution.cameras,
+        solution.rig_from_camera,
+        solution.rig_from_board,
         fixed_pair=rig.frame_pair.name if rig.frame_pair else None,
         fixed_target=frame_target(rig),
         cameras_free=True,
     )
-    knowledge = RigInformation(equations, placed.cameras, placed.rig_from_camera)
-    tried = [(place, knowledge.after(knowledge.information(place), pair)) for place in places]
-    place, best = min(tried, key=lambda item: _preference(item[1]))
+    knowledge = RigInformation(equations, solution.cameras, solution.rig_from_camera)
+    tried = [
+        (candidate, knowledge.after(knowledge.information(candidate), pair))
+        for candidate in candidates
+    ]
+    candidate, best = min(tried, key=lambda item: _preference(item[1]))
     if best.after_mm2[-1] > 0.98 * best.before_mm2:
         return None
-    shots = best.shots_to_halve or MOST_SHOTS
+    shots = best.shots_to_halve or MAX_SHOTS
     # The sigma as boards have shown it; the gain as if corners erred independently.
-    here = placed.rig_from_camera[pair].translation
-    before = float(np.linalg.norm(position_sigma(placed.covariance, pair, here)))
+    here = solution.rig_from_camera[pair].translation
+    before = float(np.linalg.norm(position_sigma(solution.covariance, pair, here)))
     gained = float(np.sqrt(best.after_mm2[shots - 1] / best.before_mm2))
     return ShotSuggestion(
         pair,
         shots,
-        _between(knowledge, place, pair, shots),
-        place,
+        _best_two_views(knowledge, candidate, pair, shots),
+        candidate,
         before,
         gained * before,
         best.shots_to_halve is not None,
@@ -206,24 +209,24 @@ def more_shots(rig: Rig, placed: RigSolution, pair: str) -> ShotSuggestion | Non
 def _preference(sharpening: SigmaReduction) -> tuple[int, float]:
     """Sort key: fewest shots to halve; if equal or out of reach, the largest gain."""
     shots = sharpening.shots_to_halve
-    return shots or MOST_SHOTS + 1, float(sharpening.after_mm2[(shots or MOST_SHOTS) - 1])
+    return shots or MAX_SHOTS + 1, float(sharpening.after_mm2[(shots or MAX_SHOTS) - 1])
 
 
-def _between(
-    knowledge: RigInformation, place: BoardCandidate, pair: str, shots: int
+def _best_two_views(
+    knowledge: RigInformation, candidate: BoardCandidate, pair: str, shots: int
 ) -> tuple[str, str]:
     """The two pairs whose views of that board alone would add most."""
 
-    def left(two: tuple[str, str]) -> float:
-        information = knowledge.information(place.restrict_to(two))
+    def remaining_variance(two: tuple[str, str]) -> float:
+        information = knowledge.information(candidate.restrict_to(two))
         return float(knowledge.after(information, pair, shots).after_mm2[-1])
 
-    return min(combinations(place.visible_to, 2), key=left)
+    return min(combinations(candidate.visible_to, 2), key=remaining_variance)
 
 
 def _facing(degrees: float) -> str:
     """A direction in words; x is the way the subject faces, y the subject's left."""
-    ways = (
+    directions = (
         "front",
         "front left",
         "left",
@@ -233,7 +236,7 @@ def _facing(degrees: float) -> str:
         "right",
         "front right",
     )
-    return f"the subject's {ways[round(degrees / 45.0) % 8]}"
+    return f"the subject's {directions[round(degrees / 45.0) % 8]}"
 
 
 def _shots(count: int) -> str:
@@ -243,13 +246,13 @@ def _shots(count: int) -> str:
 def _sentence(more: ShotSuggestion) -> str:
     if more.after_mm > WORTH * more.before_mm:
         return (
-            f"further shots of this board would not help {more.pair} much: {more.shots} more bring its "
-            f"sigma from {more.before_mm:.3f} to {more.after_mm:.3f} mm"
+            f"further shots of this board would improve {more.pair} little: {more.shots} more reduce "
+            f"its sigma from {more.before_mm:.3f} to {more.after_mm:.3f} mm"
         )
     a, b = more.between
-    place = more.place
-    x, y, z = place.centre_mm
-    others = [name for name in place.visible_to if name not in more.between]
+    candidate = more.place
+    x, y, z = candidate.centre_mm
+    others = [name for name in candidate.visible_to if name not in more.between]
     also = f" (also by {', '.join(others)})" if others else ""
     effect = (
         f"would halve the sigma of {more.pair}"
@@ -258,8 +261,8 @@ def _sentence(more: ShotSuggestion) -> str:
     )
     return (
         f"{more.shots} more {'shot' if more.shots == 1 else 'shots'} seen by both {a} and {b}{also}, "
-        f"board at {place.height} height "
-        f"(middle at {x:.0f}, {y:.0f}, {z:.0f} mm, facing {_facing(place.facing_deg)}, tilted in turn "
-        f"in all directions), {effect}: {more.before_mm:.3f} to "
+        f"board at {candidate.height} height "
+        f"(middle at {x:.0f}, {y:.0f}, {z:.0f} mm, facing {_facing(candidate.facing_deg)}, tilted in "
+        f"turn in all directions), {effect}: {more.before_mm:.3f} to "
         f"{more.after_mm:.3f} mm"
     )

@@ -27,13 +27,13 @@ def describe_board(board: Board) -> str:
 
 def boards_not_found(rig: Rig, views: Sequence[BoardView], images: int) -> list[str]:
     """One line for each board that no image shows as the rig file describes it."""
-    seen = {view.board for view in views}
+    found = {view.board for view in views}
     return [
         f"{describe_board(board)} was found in none of {images} images: check it against the board "
         "itself: kind, columns and rows (they count squares, not corners)"
         + (", dictionary, and square_mm against marker_mm" if board.marker_mm else "")
         for board in rig.boards
-        if board.name not in seen and images
+        if board.name not in found and images
     ]
 
 
@@ -41,16 +41,16 @@ def describe_findings(rig: Rig, views: Sequence[BoardView], images: int) -> str:
     """How much of each board was seen and what to check, for when no camera could be calibrated."""
     lines = boards_not_found(rig, views, images)
     for board in rig.boards:
-        own = [
+        shares = [
             len(view.pixels) / corners_per_face(board) for view in views if view.board == board.name
         ]
-        if own:
+        if shares:
             lines.append(
-                f"{describe_board(board)} was found in {len(own)} of {images} images, with "
-                f"{100 * float(np.median(own)):.0f} % of its corners in the usual one"
+                f"{describe_board(board)} was found in {len(shares)} of {images} images, with "
+                f"{100 * float(np.median(shares)):.0f} % of its corners in the median view"
                 + (
                     ": its columns, rows or square_mm in the rig file may not be those of the board"
-                    if np.median(own) < SELDOM
+                    if np.median(shares) < SELDOM
                     else ""
                 )
             )
@@ -72,9 +72,9 @@ def drop_inconsistently_mirrored(views: Sequence[BoardView]) -> tuple[list[Board
     odd: list[BoardView] = []
     for group in groups.values():
         mirrored = [view for view in group if view.appearance.mirrored]
-        usual = [view for view in group if not view.appearance.mirrored]
-        if mirrored and usual:
-            odd += mirrored if len(mirrored) <= len(usual) else usual
+        unmirrored = [view for view in group if not view.appearance.mirrored]
+        if mirrored and unmirrored:
+            odd += mirrored if len(mirrored) <= len(unmirrored) else unmirrored
     notes = [
         f"{view.pair}: board {view.board} is {'' if view.appearance.mirrored else 'not '}mirrored in "
         f"shot {view.shot}, unlike in most images of this camera: a flipped picture, or one with a "
@@ -129,30 +129,32 @@ def _notes_of_board(board: Board, views: Sequence[BoardView]) -> Iterator[str]:
             f"more than {board.rows} rows of squares"
         )
     if board.kind != "checkerboard":
-        yield from _lines_never_seen(board, views)
+        yield from _find_unobserved_lines(board, views)
 
 
-def _lines_never_seen(board: Board, views: Sequence[BoardView]) -> Iterator[str]:
+def _find_unobserved_lines(board: Board, views: Sequence[BoardView]) -> Iterator[str]:
     """Lines on a last row or column of the described board that no view shows."""
     columns, rows = corner_grid(board)
     for face in range(board.faces):
-        seen = np.zeros((rows, columns), np.int64)
+        counts_by_corner = np.zeros((rows, columns), np.int64)
         for view in views:
-            own = view.corner_ids[view.corner_ids // corners_per_face(board) == face]
-            np.add.at(seen.reshape(-1), own % corners_per_face(board), 1)
+            ids = view.corner_ids[view.corner_ids // corners_per_face(board) == face]
+            np.add.at(counts_by_corner.reshape(-1), ids % corners_per_face(board), 1)
         for name, described, counts in (
-            ("row", board.rows, seen.sum(axis=1)),
-            ("column", board.columns, seen.sum(axis=0)),
+            ("row", board.rows, counts_by_corner.sum(axis=1)),
+            ("column", board.columns, counts_by_corner.sum(axis=0)),
         ):
             used = np.flatnonzero(counts)
             if not len(used):
                 continue
             missing = len(counts) - 1 - used[-1]
-            beside = seen[used[-1]] if name == "row" else seen[:, used[-1]]
-            if missing and np.median(beside) >= LEAST_VIEWS:
+            neighbour = (
+                counts_by_corner[used[-1]] if name == "row" else counts_by_corner[:, used[-1]]
+            )
+            if missing and np.median(neighbour) >= LEAST_VIEWS:
                 lines = "line" if missing == 1 else f"{missing} lines"
                 yield (
                     f"board {board.name}: the last {lines} of corners along its {name}s was never "
-                    f"found, though the one beside it was in {int(np.median(beside))} views: it seems "
-                    f"to have fewer than {described} {name}s"
+                    f"found, the one beside it in {int(np.median(neighbour))} views. Possible cause: "
+                    f"fewer than {described} {name}s"
                 )

@@ -131,7 +131,7 @@ def estimate_board_shapes(
         return plain
     held_out = _hold_out(views, solution, root, refine_cameras)
     shaped = _estimate(views, solution, root, refine_cameras)
-    sizes = "; ".join(_said(name, shape) for name, shape in sorted(shaped.shapes.items()))
+    sizes = "; ".join(_describe(name, shape) for name, shape in sorted(shaped.shapes.items()))
     better_by = gain(held_out)
     figures = (
         f"boards held out fit to {_median(held_out.rich):.3f} px with it, "
@@ -158,7 +158,7 @@ def apply_shape(view: LocatedView, shapes: Mapping[str, BoardShape]) -> LocatedV
     return replace(view, points=shapes[view.board].apply(view.points))
 
 
-def _said(name: str, shape: BoardShape) -> str:
+def _describe(name: str, shape: BoardShape) -> str:
     across, down = shape.stretch
     return (
         f"board {name} is not as described: corners {shape.rms_mm:.3f} mm RMS off, "
@@ -174,11 +174,12 @@ def _estimate(
     refine_cameras: bool,
     start: Mapping[str, BoardShape] | None = None,
     *,
-    alike: bool = False,
+    equal_noise: bool = False,
 ) -> ShapedSolution:
     """Alternate between shapes and everything else until both settle.
 
-    start: shapes that the solution has; None for boards as described. alike: see `refine_solution`.
+    start: shapes that the solution has; None for boards as described.
+    equal_noise: see `refine_solution`.
     """
     shapes = _flat(views)
     if start:
@@ -189,17 +190,17 @@ def _estimate(
     shaped = [apply_shape(view, shapes) for view in views]
     numbers = [shapes[view.board].numbers(view.points) for view in views]
     for _ in range(ROUNDS):
-        steps = _corner_steps(shaped, numbers, shapes, solution, alike)
+        steps = _corner_steps(shaped, numbers, shapes, solution, equal_noise)
         shapes = {
             name: _without_motion(replace(shape, offsets=shape.offsets + HASTE * steps[name]))
             for name, shape in shapes.items()
         }
         shaped = [
-            replace(view, points=view.points + shapes[view.board].offsets[own])
-            for view, own in zip(views, numbers, strict=True)
+            replace(view, points=view.points + shapes[view.board].offsets[corners])
+            for view, corners in zip(views, numbers, strict=True)
         ]
         solution = refine_solution(
-            shaped, solution, root=root, refine_cameras=refine_cameras, alike=alike
+            shaped, solution, root=root, refine_cameras=refine_cameras, equal_noise=equal_noise
         )
         moved = (np.sqrt(np.mean(steps[name] ** 2)) / s.diagonal for name, s in shapes.items())
         if max(moved) < SETTLED:
@@ -210,8 +211,8 @@ def _estimate(
 def _flat(views: Sequence[LocatedView]) -> dict[str, BoardShape]:
     """Flat shapes of all corners that any view shows, by board."""
     boards = sorted({view.board for view in views})
-    seen = (np.concatenate([v.points for v in views if v.board == name]) for name in boards)
-    nominal = (np.unique(corner_keys(points), axis=0) for points in seen)
+    observed = (np.concatenate([v.points for v in views if v.board == name]) for name in boards)
+    nominal = (np.unique(corner_keys(points), axis=0) for points in observed)
     return {n: BoardShape(p, np.zeros_like(p)) for n, p in zip(boards, nominal, strict=True)}
 
 
@@ -230,15 +231,17 @@ def _corner_steps(
     numbers: Sequence[Indices],
     shapes: Mapping[str, BoardShape],
     solution: JointSolution,
-    alike: bool,
+    equal_noise: bool,
 ) -> dict[str, Array]:
     """Gauss-Newton steps (N, 3) mm of single corners, with a prior at the nominal board."""
-    information, pull, variance = _corner_equations(shaped, numbers, shapes, solution, alike)
+    information, gradient, variance = _corner_equations(
+        shaped, numbers, shapes, solution, equal_noise
+    )
     steps = {}
     for name, shape in shapes.items():
-        held = variance / (PRIOR * shape.diagonal) ** 2
-        matrix = information[name] + held * np.eye(3)
-        right = pull[name] + held * shape.offsets
+        prior = variance / (PRIOR * shape.diagonal) ** 2
+        matrix = information[name] + prior * np.eye(3)
+        right = gradient[name] + prior * shape.offsets
         steps[name] = -solve_scaled(matrix, right)
     return steps
 
@@ -247,12 +250,12 @@ def _gain_per_unknown(views: Sequence[LocatedView], solution: JointSolution) -> 
     """Mean reduction of the squared residuals per coordinate of freed corners, in variances."""
     shapes = _flat(views)
     numbers = [shapes[view.board].numbers(view.points) for view in views]
-    information, pull, variance = _corner_equations(views, numbers, shapes, solution, True)
+    information, gradient, variance = _corner_equations(views, numbers, shapes, solution, True)
     gain, unknowns = 0.0, 0
     for name in shapes:
         inverse = np.linalg.pinv(information[name], rcond=1e-6, hermitian=True)
-        gain += float(np.einsum("ni,nij,nj->", pull[name], inverse, pull[name]))
-        unknowns += 3 * len(pull[name])
+        gain += float(np.einsum("ni,nij,nj->", gradient[name], inverse, gradient[name]))
+        unknowns += 3 * len(gradient[name])
     return gain / (variance * unknowns)
 
 
@@ -261,7 +264,7 @@ def _corner_equations(
     numbers: Sequence[Indices],
     shapes: Mapping[str, BoardShape],
     solution: JointSolution,
-    alike: bool,
+    equal_noise: bool,
 ) -> tuple[dict[str, Array], dict[str, Array], float]:
     """J^T W J (N, 3, 3) and J^T W r (N, 3) of each board's corners, and the variance in px2.
 
@@ -272,25 +275,25 @@ def _corner_equations(
     first = dict(zip(shapes, [0, *ends[:-1].tolist()], strict=True))
     corners, parts = [], []
     for pair in sorted({view.pair for view in shaped}):
-        own = [k for k, view in enumerate(shaped) if view.pair == pair]
-        corners += [first[shaped[k].board] + numbers[k] for k in own]
-        parts.append(_by_corner([shaped[k] for k in own], solution))
+        of_pair = [k for k, view in enumerate(shaped) if view.pair == pair]
+        corners += [first[shaped[k].board] + numbers[k] for k in of_pair]
+        parts.append(_by_corner([shaped[k] for k in of_pair], solution))
     number = np.concatenate(corners)
-    every = [residuals for _, own in parts for residuals in own]
-    sigmas = np.ones(len(every)) if alike else view_sigmas([one.ravel() for one in every])
+    every = [residuals for _, of_pair in parts for residuals in of_pair]
+    sigmas = np.ones(len(every)) if equal_noise else view_sigmas([one.ravel() for one in every])
     counts = [len(residuals) for residuals in every]
     sigma = np.repeat(sigmas, counts)
-    jacobian = np.concatenate([by_place for by_place, _ in parts]) / sigma[:, None, None]
+    jacobian = np.concatenate([by_corner for by_corner, _ in parts]) / sigma[:, None, None]
     residuals = np.concatenate(every) / sigma[:, None]
     weights = CORNERS.weights(residuals.ravel() / CORNERS.estimate_scale(residuals.ravel()))
     variance = float(np.sum(weights * residuals.ravel() ** 2) / np.sum(weights))
     weighted = np.swapaxes(jacobian * weights.reshape(-1, 2, 1), 1, 2)
-    information, pull = np.zeros((ends[-1], 3, 3)), np.zeros((ends[-1], 3))
+    information, gradient = np.zeros((ends[-1], 3, 3)), np.zeros((ends[-1], 3))
     np.add.at(information, number, weighted @ jacobian)
-    np.add.at(pull, number, (weighted @ residuals[..., None])[..., 0])
+    np.add.at(gradient, number, (weighted @ residuals[..., None])[..., 0])
     return (
         dict(zip(shapes, np.split(information, ends[:-1]), strict=True)),
-        dict(zip(shapes, np.split(pull, ends[:-1]), strict=True)),
+        dict(zip(shapes, np.split(gradient, ends[:-1]), strict=True)),
         variance,
     )
 
@@ -303,12 +306,16 @@ def _by_corner(views: Sequence[LocatedView], solution: JointSolution) -> tuple[A
     """
     pair = views[0].pair
     camera, camera_from_root = solution.cameras[pair], solution.root_from_camera[pair].inverse()
-    placed = [camera_from_root @ solution.root_from_board[view.target] for view in views]
-    points = np.concatenate([p.apply(view.points) for p, view in zip(placed, views, strict=True)])
-    turns = np.repeat([p.rotation for p in placed], [len(view.points) for view in views], axis=0)
+    camera_from_board = [camera_from_root @ solution.root_from_board[view.target] for view in views]
+    points = np.concatenate(
+        [p.apply(view.points) for p, view in zip(camera_from_board, views, strict=True)]
+    )
+    rotations = np.repeat(
+        [p.rotation for p in camera_from_board], [len(view.points) for view in views], axis=0
+    )
     pixels = np.concatenate([view.pixels for view in views])
     cuts = np.cumsum([len(view.points) for view in views])[:-1]
-    return camera.jacobians(points)[1] @ turns, np.split(camera.project(points) - pixels, cuts)
+    return camera.jacobians(points)[1] @ rotations, np.split(camera.project(points) - pixels, cuts)
 
 
 def _hold_out(
@@ -317,23 +324,31 @@ def _hold_out(
     """Residuals of held-out boards, flat and in the shape found from the rest, both posed by the
     rest's cameras."""
     targets = sorted({view.target for view in views})
-    flat_ones, bent_ones, part = [], [], []
+    flat_residuals, shaped_residuals, part = [], [], []
     for half in range(2):
-        held = set(targets[half::2])
-        others = [view for view in views if view.target not in held]
-        kept = {t: p for t, p in solution.root_from_board.items() if t not in held}
+        left_out = set(targets[half::2])
+        others = [view for view in views if view.target not in left_out]
+        kept = {t: p for t, p in solution.root_from_board.items() if t not in left_out}
         start = replace(solution, root_from_board=kept)
         # While it is open whether boards are as described, what they err by for that is no noise.
-        flat = refine_solution(others, start, root=root, refine_cameras=refine_cameras, alike=True)
-        bent = _estimate(others, flat, root, refine_cameras, alike=True)
-        for target in sorted(held):
-            own = [view for view in views if view.target == target]
-            true = [apply_shape(view, bent.shapes) for view in own]
-            placing = solution.root_from_board[target]
-            flat_ones.append(np.concatenate(fit_board(own, flat, placing).residuals))
-            bent_ones.append(np.concatenate(fit_board(true, bent.solution, placing).residuals))
-            part.append(np.full(len(flat_ones[-1]), targets.index(target)))
-    every = ResidualPair(np.concatenate(flat_ones), np.concatenate(bent_ones), np.concatenate(part))
+        flat = refine_solution(
+            others, start, root=root, refine_cameras=refine_cameras, equal_noise=True
+        )
+        shaped = _estimate(others, flat, root, refine_cameras, equal_noise=True)
+        for target in sorted(left_out):
+            of_board = [view for view in views if view.target == target]
+            true = [apply_shape(view, shaped.shapes) for view in of_board]
+            root_from_board = solution.root_from_board[target]
+            flat_residuals.append(
+                np.concatenate(fit_board(of_board, flat, root_from_board).residuals)
+            )
+            shaped_residuals.append(
+                np.concatenate(fit_board(true, shaped.solution, root_from_board).residuals)
+            )
+            part.append(np.full(len(flat_residuals[-1]), targets.index(target)))
+    every = ResidualPair(
+        np.concatenate(flat_residuals), np.concatenate(shaped_residuals), np.concatenate(part)
+    )
     return _without_extremes(every)
 
 

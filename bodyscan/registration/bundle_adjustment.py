@@ -33,11 +33,11 @@ def refine_solution(
     *,
     root: str,
     refine_cameras: bool,
-    alike: bool = False,
+    equal_noise: bool = False,
 ) -> JointSolution:
     """Least squares from a solution of `solve_jointly`, in the root camera's frame.
 
-    alike: whether all views are taken to be as noisy as each other.
+    equal_noise: whether all views are taken to be as noisy as each other.
     """
     unknowns = _Unknowns(solution, root, refine_cameras)
     of_pair = [
@@ -45,7 +45,7 @@ def refine_solution(
     ]
     return minimize(
         solution,
-        lambda state: _blocks(of_pair, state, unknowns, alike),
+        lambda state: _blocks(of_pair, state, unknowns, equal_noise),
         unknowns.retract,
         unknowns=unknowns.count,
         steps=MOST_STEPS,
@@ -72,7 +72,7 @@ class _Unknowns:
         return np.arange(self.count - size, self.count)
 
     def retract(self, solution: JointSolution, step: Array) -> JointSolution:
-        placed = {
+        root_from_camera = {
             name: pose.retract(step[self.of_pair[name]]) if len(self.of_pair[name]) else pose
             for name, pose in solution.root_from_camera.items()
         }
@@ -83,31 +83,32 @@ class _Unknowns:
         cameras = dict(solution.cameras)
         if self.refine_cameras:
             cameras |= {
-                name: cameras[name].retract(step[own]) for name, own in self.of_camera.items()
+                name: cameras[name].retract(step[columns])
+                for name, columns in self.of_camera.items()
             }
-        return JointSolution(placed, boards, cameras)
+        return JointSolution(root_from_camera, boards, cameras)
 
 
 def _blocks(
     of_pair: Sequence[Sequence[LocatedView]],
     solution: JointSolution,
     unknowns: _Unknowns,
-    alike: bool,
+    equal_noise: bool,
 ) -> Iterator[Block]:
     """The corners of each pair's views, then the priors on the cameras."""
-    placings = solution.cameras, solution.root_from_camera, solution.root_from_board
-    seen = [
-        reprojection_errors(views, *placings, cameras_free=unknowns.refine_cameras)
+    poses = solution.cameras, solution.root_from_camera, solution.root_from_board
+    errors = [
+        reprojection_errors(views, *poses, cameras_free=unknowns.refine_cameras)
         for views in of_pair
     ]
     runs = [np.array([2 * len(view.points) for view in views]) for views in of_pair]
-    apart = [
-        np.split(residuals, np.cumsum(own)[:-1])
-        for (residuals, _), own in zip(seen, runs, strict=True)
+    by_view = [
+        np.split(residuals, np.cumsum(lengths)[:-1])
+        for (residuals, _), lengths in zip(errors, runs, strict=True)
     ]
-    every = [one for views in apart for one in views]
-    sigmas = iter(np.ones(len(every)) if alike else view_sigmas(every))
-    for views, (residuals, linearize), own in zip(of_pair, seen, runs, strict=True):
+    every = [one for views in by_view for one in views]
+    sigmas = iter(np.ones(len(every)) if equal_noise else view_sigmas(every))
+    for views, (residuals, linearize), lengths in zip(of_pair, errors, runs, strict=True):
         pair = views[0].pair
         of_motion, of_camera = unknowns.of_pair[pair], unknowns.of_camera[pair]
         columns = [
@@ -115,23 +116,23 @@ def _blocks(
         ]
         if not len(of_motion):
             linearize = _without_motion(linearize)
-        sigma = np.repeat([next(sigmas) for _ in views], own)
-        yield Block(residuals, linearize, np.array(columns), CORNERS, sigma, runs=own)
+        sigma = np.repeat([next(sigmas) for _ in views], lengths)
+        yield Block(residuals, linearize, np.array(columns), CORNERS, sigma, runs=lengths)
     if unknowns.refine_cameras:
-        for name, own in unknowns.of_camera.items():
-            yield from camera_priors(solution.cameras[name], own)
+        for name, parameters in unknowns.of_camera.items():
+            yield from camera_priors(solution.cameras[name], parameters)
 
 
-def camera_priors(camera: Camera, own: Indices) -> Iterator[Block]:
-    """Priors on a camera whose parameters have the columns `own`.
+def camera_priors(camera: Camera, columns: Indices) -> Iterator[Block]:
+    """Yield the priors on a camera whose parameters have those columns.
 
-    Its own prior, or one on its matrix around the current values, which does not pull but keeps
+    Its prior, or one on its matrix around the current values, which has no gradient but keeps
     what no view shows from running away; and the lens as in `lens_prior`.
     """
     if camera.prior is None:
         known = np.diag(1.0 / camera.prior_sigmas[: len(MATRIX)])
-        yield Block(np.zeros(len(MATRIX)), lambda: known, own[: len(MATRIX)], EXACT)
-    yield camera_prior(camera, own)
+        yield Block(np.zeros(len(MATRIX)), lambda: known, columns[: len(MATRIX)], EXACT)
+    yield camera_prior(camera, columns)
 
 
 def _without_motion(linearize: Callable[[], Array]) -> Callable[[], Array]:

@@ -118,15 +118,16 @@ def find_drift(
     lonely = tuple(sorted({pose.pair for pose in poses} - set(pairs)))
     groups = _groups(pairs, poles)
     state = _State.start(shared, pairs, rig_from_camera, prior)
-    fit = before = state.solved([])
+    fit = before = state.solve([])
     moved: list[Group] = []
     while True:
         candidates = [
             group
             for group in groups
-            if group not in moved and not set(group[1]) & {p for _, own in moved for p in own}
+            if group not in moved
+            and not set(group[1]) & {p for _, group_pairs in moved for p in group_pairs}
         ]
-        tried = [(state.solved([*moved, group]), group) for group in candidates]
+        tried = [(state.solve([*moved, group]), group) for group in candidates]
         if not tried:
             break
         best, group = min(tried, key=lambda one: one[0].cost)
@@ -153,9 +154,9 @@ def _groups(pairs: Sequence[str], poles: Mapping[str, str]) -> list[Group]:
     """Every pair, and every pole with several pairs."""
     groups: list[Group] = [(f"pair {name}", (name,)) for name in pairs]
     for pole in sorted({poles[name] for name in pairs if name in poles}):
-        own = tuple(name for name in pairs if poles.get(name) == pole)
-        if 1 < len(own) < len(pairs):
-            groups.append((f"pole {pole}", own))
+        members = tuple(name for name in pairs if poles.get(name) == pole)
+        if 1 < len(members) < len(pairs):
+            groups.append((f"pole {pole}", members))
     return groups
 
 
@@ -170,18 +171,18 @@ class _Fit:
 
 
 @dataclass(frozen=True, eq=False)
-class _Placings:
+class _Unknowns:
     """Unknowns: small twists (P, 6) of the pairs, motions of the groups, poses of the boards."""
 
     small: Array
     motions: list[RigidTransform]
     boards: dict[Target, RigidTransform]
 
-    def retract(self, step: Array) -> _Placings:
+    def retract(self, step: Array) -> _Unknowns:
         twists, count = step.reshape(-1, 6), len(self.small)
         of_groups, of_boards = np.split(twists[count:], [len(self.motions)])
         boards = zip(self.boards.items(), of_boards, strict=True)
-        return _Placings(
+        return _Unknowns(
             self.small + twists[:count],
             [motion.retract(twist) for motion, twist in zip(self.motions, of_groups, strict=True)],
             {target: board.retract(twist) for (target, board), twist in boards},
@@ -210,17 +211,17 @@ class _State:
             np.tile([1e-6**2] * 3 + [1e-3**2] * 3, len(pairs))
         )
         boards = {
-            target: _agreed([p for p in poses if p.target == target], rig_from_camera)
+            target: _majority_pose([p for p in poses if p.target == target], rig_from_camera)
             for target in sorted({pose.target for pose in poses})
         }
         return _State(tuple(poses), pairs, rig_from_camera, _whitener(covariance), boards)
 
-    def solved(self, groups: Sequence[Group]) -> _Fit:
+    def solve(self, groups: Sequence[Group]) -> _Fit:
         """Solve for pair motions within the calibration's covariance, free motions of the groups,
         and boards; all as twists in the rig frame."""
         first_group = 6 * len(self.pairs)
         first_board = first_group + 6 * len(groups)
-        start = _Placings(
+        start = _Unknowns(
             np.zeros((len(self.pairs), 6)),
             [RigidTransform.identity()] * len(groups),
             self.start_boards,
@@ -228,32 +229,40 @@ class _State:
         solution = minimize(
             start,
             lambda placings: self._blocks(groups, placings),
-            _Placings.retract,
+            _Unknowns.retract,
             unknowns=first_board + 6 * len(start.boards),
             steps=MOST_STEPS,
             tolerance=SETTLED,
             damping=1e-9,
         )
-        own, found = slice(first_group, first_board), solution.state
+        columns, found = slice(first_group, first_board), solution.state
         return _Fit(
-            solution.report.cost_after, found.motions, solution.covariance[own, own], found.boards
+            solution.report.cost_after,
+            found.motions,
+            solution.covariance[columns, columns],
+            found.boards,
         )
 
-    def _blocks(self, groups: Sequence[Group], placings: _Placings) -> Iterator[Block]:
+    def _blocks(self, groups: Sequence[Group], state: _Unknowns) -> Iterator[Block]:
         """The prior on the pairs, then for each view the offset of its board."""
-        pairs, targets = list(self.pairs), list(placings.boards)
-        of_group = {name: g for g, (_, own) in enumerate(groups) for name in own}
-        held = placings.small.ravel()
-        yield Block(self.prior_root @ held, lambda: self.prior_root, slice(0, held.size), EXACT)
+        pairs, targets = list(self.pairs), list(state.boards)
+        of_group = {name: g for g, (_, members) in enumerate(groups) for name in members}
+        small_twists = state.small.ravel()
+        yield Block(
+            self.prior_root @ small_twists,
+            lambda: self.prior_root,
+            slice(0, small_twists.size),
+            EXACT,
+        )
         for pose in self.poses:
             pair, group = pairs.index(pose.pair), of_group.get(pose.pair)
-            camera = self.rig_from_camera[pose.pair].retract(placings.small[pair])
+            camera = self.rig_from_camera[pose.pair].retract(state.small[pair])
             board = len(pairs) + len(groups) + targets.index(pose.target)
             touched = [pair, board]
             if group is not None:
-                camera = placings.motions[group] @ camera
+                camera = state.motions[group] @ camera
                 touched.append(len(pairs) + group)
-            residuals, root = _gap(pose, camera, placings.boards[pose.target])
+            residuals, root = _gap(pose, camera, state.boards[pose.target])
             signs = np.array([1.0, -1.0, 1.0])[: len(touched)]
             columns = (6 * np.array(touched)[:, None] + np.arange(6)).ravel()
             yield Block(residuals, partial(_side_by_side, signs, root), columns, EXACT)
@@ -264,14 +273,14 @@ class _State:
         rows = slice(6 * number, 6 * number + 6)
         covariance = fit.covariance[rows, rows]
         middle = np.mean([self.rig_from_camera[pair].translation for pair in pairs], axis=0)
-        spread = point_covariance(covariance, middle)
+        covariance_mm2 = point_covariance(covariance, middle)
         return Move(
             name,
             pairs,
             motion,
             covariance,
             float(np.linalg.norm(motion.apply(middle) - middle)),
-            float(np.sqrt(np.trace(spread))),
+            float(np.sqrt(np.trace(covariance_mm2))),
             float(np.degrees(motion.angle)),
         )
 
@@ -301,14 +310,16 @@ def _whitener(covariance: Array) -> Array:
     return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)), np.float64)
 
 
-def _agreed(
+def _majority_pose(
     poses: Sequence[ObservedPose], rig_from_camera: Mapping[str, RigidTransform]
 ) -> RigidTransform:
     """A board's pose by majority: the view from which the others differ least."""
 
-    def off(board: RigidTransform) -> float:
+    def median_distance(board: RigidTransform) -> float:
         """Median squared distance of all views from a pose, in sigmas squared."""
         gaps = (_gap(pose, rig_from_camera[pose.pair], board) for pose in poses)
         return float(np.median([sigmas @ sigmas for sigmas, _ in gaps]))
 
-    return min((rig_from_camera[pose.pair] @ pose.camera_from_board for pose in poses), key=off)
+    return min(
+        (rig_from_camera[pose.pair] @ pose.camera_from_board for pose in poses), key=median_distance
+    )

@@ -23,7 +23,7 @@ from bodyscan.rig.rig_frame import RigFrame
 REACH_MM = 1300.0
 """Distance ahead of a camera at which its pose matters: about where the subject stands."""
 ATTEMPTS = 200
-FEWEST_BOARDS = 3
+MIN_BOARDS = 3
 """Fewest boards per camera in a half: fewer do not determine its lens and focal length."""
 TIMES_WHOLE = 5.0
 """Limit on the expected difference of two halves, in sigmas of the whole. They should differ by
@@ -37,7 +37,7 @@ class HalvesComparison:
     """Differences between two solutions of the rig, second minus first, common motion removed.
 
     names: the pairs compared.
-    apart: pairs not compared, which saw too few boards in a half or could not be solved from it.
+    excluded: pairs not compared, which saw too few boards in a half or could not be solved from it.
     halves: the shots of each.
     shifts_mm: of the camera centres, (P, 3), rig frame.
     sigmas_mm: expected sigmas of the shifts, (P, 3).
@@ -45,7 +45,7 @@ class HalvesComparison:
     """
 
     names: tuple[str, ...]
-    apart: tuple[str, ...]
+    excluded: tuple[str, ...]
     halves: tuple[tuple[str, ...], tuple[str, ...]]
     shifts_mm: Array
     sigmas_mm: Array
@@ -55,7 +55,9 @@ class HalvesComparison:
     def summary(self) -> str:
         """The comparison in one line."""
         shift, sigma = rms_length(self.shifts_mm), rms_length(self.sigmas_mm)
-        without = f" (without {', '.join(self.apart)}, not known from a half)" if self.apart else ""
+        without = (
+            f" (without {', '.join(self.excluded)}, not known from a half)" if self.excluded else ""
+        )
         return (
             f"solved from either half of the shots, cameras{without} differ by {shift:.3f} mm RMS "
             f"({sigma:.3f} expected); all differences are {self.over_expected:.2f} times what is "
@@ -63,46 +65,48 @@ class HalvesComparison:
         )
 
 
-def compare_halves(rig: Rig, placed: RigSolution, *, seed: int = 0) -> HalvesComparison:
+def compare_halves(rig: Rig, solution: RigSolution, *, seed: int = 0) -> HalvesComparison:
     """Solve the rig from either half of its shots and compare, pair by pair.
 
-    Each half's frame is fixed by one pair and carried to where `placed` has that pair; the
+    Each half's frame is fixed by one pair and carried to where `solution` has that pair; the
     remaining common motion is the frame's own and is removed. Raises FailedWork if there are fewer
     than two pairs, if no halves tie two of them together with enough boards for their cameras, or
     if halves determine the rig so much worse than all shots that nothing follows; RigDisconnected
     as `solve_rig`.
     """
-    everyone = tuple(sorted(placed.rig_from_camera))
+    everyone = tuple(sorted(solution.rig_from_camera))
     if len(everyone) < 2:
         raise FailedWork("one pair alone has no pose to compare", where=f"rig {rig.name}")
-    tied, *halves = split_shots(placed.views, everyone, seed=seed)
-    holder = rig.frame_pair.name if rig.frame_pair and rig.frame_pair.name in tied else tied[0]
-    first, second = (_placed_by(rig, placed, tied, shots, holder) for shots in halves)
-    names = tuple(name for name in tied if name in first[0] and name in second[0])
+    connected, *halves = split_shots(solution.views, everyone, seed=seed)
+    holder = (
+        rig.frame_pair.name if rig.frame_pair and rig.frame_pair.name in connected else connected[0]
+    )
+    first, second = (_solve_half(rig, solution, connected, shots, holder) for shots in halves)
+    names = tuple(name for name in connected if name in first[0] and name in second[0])
     if len(names) < 2:
-        raise _not_halved(len({view.shot for view in placed.views}))
+        raise _cannot_halve(len({view.shot for view in solution.views}))
     # (6P,): twists about the rig's origin that carry each first pose to the second.
     differences = np.concatenate(
         [(second[0][name] @ first[0][name].inverse()).twist for name in names]
     )
-    centres = np.array([placed.rig_from_camera[name].translation for name in names])
-    ahead = np.array([placed.rig_from_camera[name].rotation[:, 2] for name in names])
-    keep = _without_common_motion(centres, ahead)
+    centres = np.array([solution.rig_from_camera[name].translation for name in names])
+    ahead = np.array([solution.rig_from_camera[name].rotation[:, 2] for name in names])
+    keep = _common_motion_projector(centres, ahead)
     differences = keep @ differences
     covariance = keep @ (first[1].select(names) + second[1].select(names)) @ keep.T
-    known = keep @ placed.covariance.select(names) @ keep.T
+    prior = keep @ solution.covariance.select(names) @ keep.T
     shifts = np.einsum("pij,pj->pi", twist_jacobian(centres), differences.reshape(-1, 6))
     sigmas = _centre_sigmas(covariance, centres)
-    expected, whole = rms_length(sigmas), rms_length(_centre_sigmas(known, centres))
+    expected, whole = rms_length(sigmas), rms_length(_centre_sigmas(prior, centres))
     if expected > TIMES_WHOLE * whole:
         raise FailedWork(
             f"halves of the shots should differ by {expected:.2g} mm where all shots know the rig to "
             f"{whole:.2g} mm: too few boards, or too much alike, in a half",
             remedy="capture more shots that all pairs see, differently tilted",
         )
-    apart = tuple(name for name in everyone if name not in names)
-    over = _over_expected(differences, covariance)
-    return HalvesComparison(names, apart, (halves[0], halves[1]), shifts, sigmas, over)
+    excluded = tuple(name for name in everyone if name not in names)
+    ratio = _normalized_rms(differences, covariance)
+    return HalvesComparison(names, excluded, (halves[0], halves[1]), shifts, sigmas, ratio)
 
 
 def split_shots(
@@ -110,7 +114,7 @@ def split_shots(
 ) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
     """Split the shots at random into two halves that both tie as many pairs together as possible.
 
-    Returns the pairs tied together in both, with enough boards for each, and the shots of the two
+    Returns the pairs connected together in both, with enough boards for each, and the shots of the two
     halves: the best of many draws. Raises FailedWork if no draw ties two pairs.
     """
     shots = sorted({view.shot for view in views})
@@ -119,32 +123,36 @@ def split_shots(
     for _ in range(ATTEMPTS):
         order = [shots[k] for k in rng.permutation(len(shots))]
         halves = set(order[: len(order) // 2]), set(order[len(order) // 2 :])
-        tied = _tied([[v for v in views if v.shot in half] for half in halves], names)
-        if len(tied) > len(best[0]):
-            best = tied, tuple(sorted(halves[0])), tuple(sorted(halves[1]))
-        if len(tied) == len(names):
+        connected = _largest_connected(
+            [[v for v in views if v.shot in half] for half in halves], names
+        )
+        if len(connected) > len(best[0]):
+            best = connected, tuple(sorted(halves[0])), tuple(sorted(halves[1]))
+        if len(connected) == len(names):
             break
     if len(best[0]) < 2:
-        raise _not_halved(len(shots))
+        raise _cannot_halve(len(shots))
     return best
 
 
-def _not_halved(shots: int) -> FailedWork:
+def _cannot_halve(shots: int) -> FailedWork:
     return FailedWork(
         f"{shots} shots cannot be halved so that both halves tie pairs together and show each "
-        f"{FEWEST_BOARDS} boards",
+        f"{MIN_BOARDS} boards",
         remedy="capture more shots that pairs of different poles see at the same moment",
     )
 
 
-def _tied(halves: Sequence[Sequence[LocatedView]], names: Sequence[str]) -> tuple[str, ...]:
+def _largest_connected(
+    halves: Sequence[Sequence[LocatedView]], names: Sequence[str]
+) -> tuple[str, ...]:
     """The largest group of pairs that every half ties together, with enough boards for each."""
     group = set(names)
     while True:
         left = set(group)
         for half in halves:
             boards = Counter(view.pair for view in half)
-            left = {name for name in left if boards[name] >= FEWEST_BOARDS}
+            left = {name for name in left if boards[name] >= MIN_BOARDS}
             graph = view_graph([view for view in half if view.pair in left], sorted(left))
             left = max(nx.connected_components(graph), key=len, default=set())
         if left == group:
@@ -152,51 +160,51 @@ def _tied(halves: Sequence[Sequence[LocatedView]], names: Sequence[str]) -> tupl
         group = left
 
 
-def _placed_by(
-    rig: Rig, placed: RigSolution, names: Sequence[str], shots: Sequence[str], holder: str
+def _solve_half(
+    rig: Rig, solution: RigSolution, names: Sequence[str], shots: Sequence[str], holder: str
 ) -> tuple[dict[str, RigidTransform], PoseCovariance]:
     """`rig_from_camera` of these pairs from these shots alone, and its covariance.
 
-    In the frame of `placed`, without pairs that disagree with the others there. Raises FailedWork
+    In the frame of `solution`, without pairs that disagree with the others there. Raises FailedWork
     if the holder does.
     """
-    held = rig.model_copy(update={"rig_frame": RigFrame(pair=holder)})
-    views = [view for view in placed.views if view.shot in shots and view.pair in names]
-    cameras = {name: placed.cameras[name] for name in names}
+    rig_with_fixed_pair = rig.model_copy(update={"rig_frame": RigFrame(pair=holder)})
+    views = [view for view in solution.views if view.shot in shots and view.pair in names]
+    cameras = {name: solution.cameras[name] for name in names}
     try:
-        half = solve_rig(held, views, cameras, choose=False).value
+        half = solve_rig(rig_with_fixed_pair, views, cameras, choose=False).value
     except BadInput as error:
         raise FailedWork(f"{holder} does not fit the others in a half of the shots") from error
-    to_rig = placed.rig_from_camera[holder] @ half.rig_from_camera[holder].inverse()
+    to_rig = solution.rig_from_camera[holder] @ half.rig_from_camera[holder].inverse()
     carry = np.kron(np.eye(len(half.covariance.names)), adjoint(to_rig))
-    placings = {name: to_rig @ t for name, t in half.rig_from_camera.items()}
+    rig_from_camera = {name: to_rig @ t for name, t in half.rig_from_camera.items()}
     # The variance_inflation over independent corners is better determined by all boards.
-    unseen = max(placed.variance_inflation / half.variance_inflation, 1.0)
-    matrix = unseen * carry @ half.covariance.matrix @ carry.T
-    return placings, PoseCovariance(half.covariance.names, matrix)
+    more_inflation = max(solution.variance_inflation / half.variance_inflation, 1.0)
+    matrix = more_inflation * carry @ half.covariance.matrix @ carry.T
+    return rig_from_camera, PoseCovariance(half.covariance.names, matrix)
 
 
 def _centre_sigmas(covariance: Array, centres: Array) -> Array:
     """Sigmas (P, 3) mm of camera centres (P, 3), from the covariance (6P, 6P) of their motions."""
-    count, shown = len(centres), twist_jacobian(centres)
-    own = covariance.reshape(count, 6, count, 6)[range(count), :, range(count)]
-    variance = np.einsum("pii->pi", shown @ own @ shown.transpose(0, 2, 1))
+    count, jacobian = len(centres), twist_jacobian(centres)
+    blocks = covariance.reshape(count, 6, count, 6)[range(count), :, range(count)]
+    variance = np.einsum("pii->pi", jacobian @ blocks @ jacobian.transpose(0, 2, 1))
     return np.sqrt(np.maximum(variance, 0.0))
 
 
-def _without_common_motion(centres: Array, ahead: Array) -> Array:
+def _common_motion_projector(centres: Array, ahead: Array) -> Array:
     """(6P, 6P): removes from the pairs' motions the part common to all.
 
     Least squares over each camera's centre and the place it looks at.
     """
     points = np.concatenate([centres, centres + REACH_MM * ahead])
-    own = twist_jacobian(points).reshape(2, len(centres), 3, 6)
-    weights = np.einsum("kpij,kpil->pjl", own, own)  # (P, 6, 6)
+    jacobians = twist_jacobian(points).reshape(2, len(centres), 3, 6)
+    weights = np.einsum("kpij,kpil->pjl", jacobians, jacobians)  # (P, 6, 6)
     common = np.linalg.solve(weights.sum(axis=0), np.concatenate(list(weights), axis=1))
     return np.eye(6 * len(centres)) - np.tile(common, (len(centres), 1))
 
 
-def _over_expected(differences: Array, covariance: Array) -> float:
+def _normalized_rms(differences: Array, covariance: Array) -> float:
     """RMS of the differences in their standard deviations, with correlations."""
     scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))

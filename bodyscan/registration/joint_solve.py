@@ -58,25 +58,25 @@ def solve_jointly(
     points = _add_points(model, views)
     if not points:  # a single view of a known camera; `bundle_adjustment` needs no start
         return start
-    seen = _seen_by_colmap(views, cameras)
+    pixels = _colmap_pixels_by_view(views, cameras)
     for number, target in enumerate(targets, start=1):
         group = [view for view in views if view.target == target]
-        _add_frame(model, number, group, ids, seen, points, start.root_from_board[target])
+        _add_frame(model, number, group, ids, pixels, points, start.root_from_board[target])
     # Ceres is not told of cameras' priors, so hold those cameras here; `bundle_adjustment` uses the
     # priors.
     known = [ids[name] for name in names if cameras[name].prior is not None]
     _adjust(model, refine_cameras, loss_px, known)
     rig = model.rig(1)
-    placed = {root: RigidTransform.identity()}
+    root_from_camera = {root: RigidTransform.identity()}
     for name in names[1:]:
         sensor_from_rig = rig.sensor_from_rig(_sensor(ids[name]))
-        placed[name] = RigidTransform.from_matrix(sensor_from_rig.matrix()).inverse()
+        root_from_camera[name] = RigidTransform.from_matrix(sensor_from_rig.matrix()).inverse()
     boards = {
         target: RigidTransform.from_matrix(model.frame(number).rig_from_world.matrix())
         for number, target in enumerate(targets, start=1)
     }
-    solved = {name: _refined(cameras[name], model.camera(ids[name])) for name in names}
-    return JointSolution(placed, boards, solved)
+    solved = {name: _camera_from_colmap(cameras[name], model.camera(ids[name])) for name in names}
+    return JointSolution(root_from_camera, boards, solved)
 
 
 def colmap_camera(camera: Camera, camera_id: int) -> pycolmap.Camera:
@@ -108,20 +108,20 @@ def colmap_pixels(camera: Camera, pixels: Array) -> Array:
     return square + COLMAP_PIXEL_CENTRE
 
 
-def _seen_by_colmap(
+def _colmap_pixels_by_view(
     views: Sequence[LocatedView], cameras: Mapping[str, Camera]
 ) -> dict[ViewKey, Array]:
     """`colmap_pixels` of each view, computed camera by camera."""
-    seen: dict[ViewKey, Array] = {}
+    by_view: dict[ViewKey, Array] = {}
     for pair in sorted({view.pair for view in views}):
-        own = [view for view in views if view.pair == pair]
-        pixels = colmap_pixels(cameras[pair], np.concatenate([view.pixels for view in own]))
-        cuts = np.cumsum([len(view.pixels) for view in own])[:-1]
-        seen |= zip((view.key for view in own), np.split(pixels, cuts), strict=True)
-    return seen
+        of_pair = [view for view in views if view.pair == pair]
+        pixels = colmap_pixels(cameras[pair], np.concatenate([view.pixels for view in of_pair]))
+        cuts = np.cumsum([len(view.pixels) for view in of_pair])[:-1]
+        by_view |= zip((view.key for view in of_pair), np.split(pixels, cuts), strict=True)
+    return by_view
 
 
-def _refined(camera: Camera, solved: pycolmap.Camera) -> Camera:
+def _camera_from_colmap(camera: Camera, solved: pycolmap.Camera) -> Camera:
     focal, u0, v0, *coefficients = (float(value) for value in solved.params)
     lens = camera.lens.with_coefficients(np.array(coefficients)) if coefficients else camera.lens
     aspect, shear = camera.beta / camera.alpha, camera.gamma / camera.beta
@@ -157,16 +157,16 @@ def _colmap_rig(names: Sequence[str], root_from_camera: dict[str, RigidTransform
 def _add_points(
     model: pycolmap.Reconstruction, views: Sequence[LocatedView]
 ) -> dict[tuple[str, tuple[float, ...]], int]:
-    """Add one constant point for each corner of each board, keyed by board and rounded place.
+    """Add one constant point for each corner of each board, keyed by board and rounded position.
 
     COLMAP refuses a point observed in a single view: such corners are left out.
     """
-    seen = Counter(key for view in views for key in _point_keys(view))
-    keys = sorted(key for key, count in seen.items() if count > 1)
+    counts = Counter(key for view in views for key in _point_keys(view))
+    keys = sorted(key for key, count in counts.items() if count > 1)
     numbers = {key: number for number, key in enumerate(keys, start=1)}
-    for (_, place), number in numbers.items():
+    for (_, position), number in numbers.items():
         point = pycolmap.Point3D()
-        point.xyz = np.array(place)
+        point.xyz = np.array(position)
         model.add_point3D_with_id(number, point)
     return numbers
 
@@ -181,7 +181,7 @@ def _add_frame(
     number: int,
     group: Sequence[LocatedView],
     ids: dict[str, int],
-    seen: Mapping[ViewKey, Array],
+    colmap_pixels_of_view: Mapping[ViewKey, Array],
     points: dict[tuple[str, tuple[float, ...]], int],
     root_from_board: RigidTransform,
 ) -> None:
@@ -193,7 +193,7 @@ def _add_frame(
     frame.rig_from_world = _rigid3d(root_from_board)
     model.add_frame(frame)
     for image_id, view in enumerate(group, start=first_image):
-        pixels = seen[view.key]
+        pixels = colmap_pixels_of_view[view.key]
         image = pycolmap.Image(
             name=f"{view.shot}/{view.board}/{view.pair}",
             keypoints=pixels,

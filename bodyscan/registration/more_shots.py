@@ -28,11 +28,11 @@ from bodyscan.rig.rig import Volume
 HEIGHTS_MM = {"knee": 500.0, "waist": 1000.0, "chest": 1350.0}
 # Shots at one place differ a little, as hand-held boards do: about x, y and the board's normal.
 TILTS_DEG = ((20.0, 0.0, 0.0), (-20.0, 0.0, 15.0), (0.0, 20.0, -15.0))
-LEAST_FACING = 0.4  # cosine between the board's normal and the line of sight
-FEWEST_CORNERS = 12
+MIN_FACING = 0.4  # cosine between the board's normal and the line of sight
+MIN_CORNERS = 12
 EDGE_PX = 5.0
-MOST_SHOTS = 60
-APART = 0.35  # of the volume's radius: boards are also tried this far off the middle
+MAX_SHOTS = 60
+OFFSETS = 0.35  # of the volume's radius: boards are also tried this far off the middle
 STEP_DEG = 15.0
 
 
@@ -56,8 +56,8 @@ class BoardCandidate:
     @property
     def visible_to(self) -> tuple[str, ...]:
         """Pairs that see every tilt."""
-        seen = [{view.pair for view in tilt} for tilt in self.views]
-        return tuple(sorted(set.intersection(*seen)))
+        pairs = [{view.pair for view in tilt} for tilt in self.views]
+        return tuple(sorted(set.intersection(*pairs)))
 
     def restrict_to(self, pairs: Sequence[str]) -> BoardCandidate:
         views = tuple(tuple(v for v in tilt if v.pair in pairs) for tilt in self.views)
@@ -82,22 +82,22 @@ def propose_board_poses(
             continue
         for azimuth in candidate_azimuths(rig_from_camera.values(), board.faces == 2):
             ahead = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-            for share in (-APART, 0.0, APART):
+            for share in (-OFFSETS, 0.0, OFFSETS):
                 centre = np.array([0.0, 0.0, z]) + share * volume.radius_mm * ahead
-                poses = tuple(_tilted(board, centre, ahead))
+                poses = tuple(_tilted_poses(board, centre, ahead))
                 views = tuple(
                     tuple(_views(board, pose, cameras, rig_from_camera)) for pose in poses
                 )
-                place = BoardCandidate(height, centre, float(np.degrees(azimuth)), poses, views)
-                if len(place.visible_to) >= 2:
-                    found.append(place)
+                candidate = BoardCandidate(height, centre, float(np.degrees(azimuth)), poses, views)
+                if len(candidate.visible_to) >= 2:
+                    found.append(candidate)
     return found
 
 
-def candidate_azimuths(placings: Iterable[RigidTransform], two_faced: bool) -> list[float]:
+def candidate_azimuths(poses: Iterable[RigidTransform], two_faced: bool) -> list[float]:
     """Azimuths (radians) halfway between any two cameras, seen from the rig's axis."""
-    places = np.array([placing.translation[:2] for placing in placings])
-    towards = places / np.maximum(np.linalg.norm(places, axis=1, keepdims=True), 1e-9)
+    positions = np.array([pose.translation[:2] for pose in poses])
+    towards = positions / np.maximum(np.linalg.norm(positions, axis=1, keepdims=True), 1e-9)
     between = np.array([a + b for a, b in combinations(towards, 2)]).reshape(-1, 2)
     between = between[np.linalg.norm(between, axis=1) > 0.2]  # opposite cameras: nothing between
     degrees = np.degrees(np.arctan2(between[:, 1], between[:, 0]))
@@ -140,10 +140,10 @@ class RigInformation:
         scaled = information * np.outer(self._scale, self._scale)
         self._inverse = invert_scaled(scaled)
 
-    def information(self, place: BoardCandidate) -> Array:
+    def information(self, candidate: BoardCandidate) -> Array:
         """Information in one shot there, averaged over its tilts; scaled, free unknowns only."""
         total = np.zeros((len(self._free), len(self._free)))
-        for pose, views in zip(place.rig_from_board, place.views, strict=True):
+        for pose, views in zip(candidate.rig_from_board, candidate.views, strict=True):
             if len(views) < 2:  # a board seen by one camera adds nothing
                 continue
             shot = normal_equations(
@@ -157,10 +157,10 @@ class RigInformation:
                 camera_prior=False,
             )
             total += shot.without_boards().select(self._free).information
-        return total * np.outer(self._scale, self._scale) / len(place.views)
+        return total * np.outer(self._scale, self._scale) / len(candidate.views)
 
-    def after(self, information: Array, pair: str, most: int = MOST_SHOTS) -> SigmaReduction:
-        """How the variance of a pair's position falls with 1 to `most` shots of that information.
+    def after(self, information: Array, pair: str, max_shots: int = MAX_SHOTS) -> SigmaReduction:
+        """How the variance of a pair's position falls with 1 to `max_shots` shots of that information.
 
         Uses the matrix inversion lemma in the basis in which the added information is diagonal,
         which gives all numbers of shots at once.
@@ -175,14 +175,14 @@ class RigInformation:
         root = vectors[:, kept] * np.sqrt(values[kept])
         gain, basis = np.linalg.eigh(root.T @ self._inverse @ root)
         reach = np.sum((basis.T @ root.T @ self._inverse @ jacobian.T) ** 2, axis=1)
-        shots = np.arange(1, most + 1)[:, None]
+        shots = np.arange(1, max_shots + 1)[:, None]
         drop = np.sum(reach / (1.0 / shots + np.maximum(gain, 0.0)), axis=1)
         before = float(np.trace(jacobian @ self._inverse @ jacobian.T))
         variance = self._equations.variance_px2
         return SigmaReduction(variance * before, variance * (before - drop))
 
 
-def _tilted(board: Board, centre: Array, ahead: Array) -> Iterator[RigidTransform]:
+def _tilted_poses(board: Board, centre: Array, ahead: Array) -> Iterator[RigidTransform]:
     """`rig_from_board` of an upright board whose front looks along `ahead`, with small tilts."""
     down = np.array([0.0, 0.0, -1.0])
     upright = np.column_stack([np.cross(down, -ahead), down, -ahead])
@@ -200,15 +200,15 @@ def _views(
 ) -> Iterator[LocatedView]:
     """Views that each camera would have of the board, without noise."""
     corners, count = corner_points(board), corners_per_face(board)
-    for name, placing in rig_from_camera.items():
-        camera_from_board = placing.inverse() @ rig_from_board
+    for name, pose in rig_from_camera.items():
+        camera_from_board = pose.inverse() @ rig_from_board
         sight = camera_from_board.apply(corners[:count].mean(axis=0))
         facing = camera_from_board.rotation[:, 2] @ sight / np.linalg.norm(sight)
-        if abs(facing) < LEAST_FACING or (facing < 0 and board.faces == 1):
+        if abs(facing) < MIN_FACING or (facing < 0 and board.faces == 1):
             continue
         face = corners[:count] if facing > 0 else corners[-count:]
         points = camera_from_board.apply(face)
-        seen = is_in_image(cameras[name], points, EDGE_PX)
-        if seen.sum() >= FEWEST_CORNERS:
-            pixels = cameras[name].project(points[seen])
-            yield LocatedView(name, "more", board.name, face[seen], pixels, camera_from_board)
+        visible = is_in_image(cameras[name], points, EDGE_PX)
+        if visible.sum() >= MIN_CORNERS:
+            pixels = cameras[name].project(points[visible])
+            yield LocatedView(name, "more", board.name, face[visible], pixels, camera_from_board)

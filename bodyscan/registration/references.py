@@ -18,13 +18,13 @@ from bodyscan.boards.view import BoardView
 from bodyscan.errors import FailedWork
 from bodyscan.geometry.transforms import fit_rigid_transform
 from bodyscan.outcome import Outcome
-from bodyscan.registration.rig_calibration import OTHER_SIZE, REFUSED_SIZE
+from bodyscan.registration.rig_calibration import MAX_SIZE_ERROR, REFUSED_SIZE_ERROR
 from bodyscan.registration.rig_solve import RigSolution
 from bodyscan.rig.board import Board
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_frame import Reference
 
-FEWEST = 6
+MIN_CORNERS = 6
 """Corners of a board that two cameras must see: fewer give its middle poorly, and hide a wrong
 one."""
 DISAGREE_SIGMAS = 4.0
@@ -59,7 +59,7 @@ def select_solving_views(rig: Rig, views: Sequence[BoardView]) -> list[BoardView
     return [view for view in views if view.board not in certified]
 
 
-def find_rig_size(rig: Rig, placed: RigSolution, views: Sequence[BoardView]) -> Outcome[Size]:
+def find_rig_size(rig: Rig, solution: RigSolution, views: Sequence[BoardView]) -> Outcome[Size]:
     """The rig's size by all references together, with a note on each.
 
     Raises FailedWork for a size that no printer's error explains, or references that contradict
@@ -68,14 +68,14 @@ def find_rig_size(rig: Rig, placed: RigSolution, views: Sequence[BoardView]) -> 
     found: dict[str, Size] = {}
     notes: list[str] = []
     for reference in rig.references:
-        own = list(_readings(rig, reference, placed, views))
-        if not own:
+        readings = list(_readings(rig, reference, solution, views))
+        if not readings:
             notes.append(
                 f"reference {reference.name} was measured in no shot, so that the size is what "
-                f"square_mm says: two cameras have to see {FEWEST} corners of its boards at once"
+                f"square_mm says: two cameras have to see {MIN_CORNERS} corners of its boards at once"
             )
             continue
-        length, sigma = _mean(own)
+        length, sigma = _average(readings)
         size = Size(
             reference.length_mm / length,
             float(np.hypot(sigma / length, reference.sigma_mm / reference.length_mm)),
@@ -83,17 +83,17 @@ def find_rig_size(rig: Rig, placed: RigSolution, views: Sequence[BoardView]) -> 
         found[reference.name] = size
         notes.append(
             f"reference {reference.name}: {length:.3f} mm by square_mm (sigma {sigma:.3f}, "
-            f"{len(own)} shots) for {reference.length_mm:g} mm: {_words(size)}"
+            f"{len(readings)} shots) for {reference.length_mm:g} mm: {_format_size(size)}"
         )
     if not found:
         return Outcome(Size(), tuple(notes))
     weights = np.array([1.0 / size.sigma**2 for size in found.values()])
     factors = np.array([size.factor for size in found.values()])
     size = Size(float(weights @ factors / weights.sum()), float(weights.sum() ** -0.5))
-    _refuse(rig, found, size)
-    if abs(size.factor - 1.0) > OTHER_SIZE:
+    _refuse_contradictions(rig, found, size)
+    if abs(size.factor - 1.0) > MAX_SIZE_ERROR:
         notes.append(f"{size.words}, more than prints are off: is square_mm right, and length_mm?")
-    notes.append(f"size by references: {_words(size)}; every length is as uncertain")
+    notes.append(f"size by references: {_format_size(size)}; every length is as uncertain")
     return Outcome(size, tuple(notes))
 
 
@@ -104,24 +104,24 @@ def rescale_boards(rig: Rig, factor: float) -> Rig:
     return rig.model_copy(
         update={
             "boards": tuple(
-                board if board.name in certified and not alone else _times(board, factor)
+                board if board.name in certified and not alone else _scale_board(board, factor)
                 for board in rig.boards
             )
         }
     )
 
 
-def _times(board: Board, factor: float) -> Board:
+def _scale_board(board: Board, factor: float) -> Board:
     marker = None if board.marker_mm is None else board.marker_mm * factor
     return board.model_copy(update={"square_mm": board.square_mm * factor, "marker_mm": marker})
 
 
-def _words(size: Size) -> str:
+def _format_size(size: Size) -> str:
     return f"{100.0 * (size.factor - 1.0):+z.3f} % (sigma {100.0 * size.sigma:.3f} %)"
 
 
-def _refuse(rig: Rig, found: dict[str, Size], size: Size) -> None:
-    if abs(size.factor - 1.0) > REFUSED_SIZE:
+def _refuse_contradictions(rig: Rig, found: dict[str, Size], size: Size) -> None:
+    if abs(size.factor - 1.0) > REFUSED_SIZE_ERROR:
         raise FailedWork(
             size.words,
             where=f"rig {rig.name}",
@@ -129,15 +129,17 @@ def _refuse(rig: Rig, found: dict[str, Size], size: Size) -> None:
         )
     for name, one in found.items():
         if abs(one.factor - size.factor) > DISAGREE_SIGMAS * one.sigma:
-            said = "; ".join(f"{other}: {_words(own)}" for other, own in found.items())
+            figures = "; ".join(
+                f"{other}: {_format_size(other_size)}" for other, other_size in found.items()
+            )
             raise FailedWork(
-                f"the references contradict each other: {said}",
+                f"the references contradict each other: {figures}",
                 where=f"rig {rig.name}",
                 remedy=f"measure {name} anew, or leave out the one that is wrong",
             )
 
 
-def _mean(readings: Sequence[_Reading]) -> tuple[float, float]:
+def _average(readings: Sequence[_Reading]) -> tuple[float, float]:
     """Mean over all shots and its sigma, larger if shots scatter more than their sigmas say."""
     lengths = np.array([one.length_mm for one in readings])
     weights = np.array([one.sigma_mm**-2 for one in readings])
@@ -147,37 +149,39 @@ def _mean(readings: Sequence[_Reading]) -> tuple[float, float]:
 
 
 def _readings(
-    rig: Rig, reference: Reference, placed: RigSolution, views: Sequence[BoardView]
+    rig: Rig, reference: Reference, solution: RigSolution, views: Sequence[BoardView]
 ) -> Iterator[_Reading]:
     """One reading for each shot in which two cameras saw enough of all its boards."""
     for shot in sorted({view.shot for view in views if view.board in reference.boards}):
-        seen = []
+        boards = []
         for name in reference.boards:
-            own = [view for view in views if (view.shot, view.board) == (shot, name)]
-            ids, points = triangulate_corners(placed, own)
-            if len(ids) >= FEWEST:
-                seen.append((rig.board(name), ids, points))
-        if len(seen) < len(reference.boards):
+            of_board = [view for view in views if (view.shot, view.board) == (shot, name)]
+            ids, points = triangulate_corners(solution, of_board)
+            if len(ids) >= MIN_CORNERS:
+                boards.append((rig.board(name), ids, points))
+        if len(boards) < len(reference.boards):
             continue
-        if len(seen) == 1:
-            yield _along(*seen[0], placed.variance_inflation)
+        if len(boards) == 1:
+            yield _measure_board(*boards[0], solution.variance_inflation)
         else:
-            yield _between([_Middle.of(*one) for one in seen], placed.variance_inflation)
+            yield _measure_separation(
+                [_Middle.of(*one) for one in boards], solution.variance_inflation
+            )
 
 
-def triangulate_corners(placed: RigSolution, views: Sequence[BoardView]) -> tuple[Indices, Array]:
+def triangulate_corners(solution: RigSolution, views: Sequence[BoardView]) -> tuple[Indices, Array]:
     """Triangulate the corners of one board that several solved cameras saw.
 
     Returns their numbers (N,) and positions (N, 3) mm, rig frame, nearest to all rays.
     """
-    views = [view for view in views if view.pair in placed.rig_from_camera]
+    views = [view for view in views if view.pair in solution.rig_from_camera]
     if len({view.pair for view in views}) < 2:
         return np.zeros(0, np.int64), np.zeros((0, 3))
     ids = np.concatenate([view.corner_ids for view in views])
     across, centres = [], []
     for view in views:
-        at = placed.rig_from_camera[view.pair]
-        rays = at.rotate(placed.cameras[view.pair].rays(view.pixels))
+        at = solution.rig_from_camera[view.pair]
+        rays = at.rotate(solution.cameras[view.pair].rays(view.pixels))
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         across.append(np.eye(3) - rays[:, :, None] * rays[:, None, :])
         centres.append(np.broadcast_to(at.translation, rays.shape))
@@ -191,17 +195,19 @@ def triangulate_corners(placed: RigSolution, views: Sequence[BoardView]) -> tupl
     return known[twice].astype(np.int64), found
 
 
-def _along(board: Board, ids: Indices, points: Array, variance_inflation: float) -> _Reading:
+def _measure_board(
+    board: Board, ids: Indices, points: Array, variance_inflation: float
+) -> _Reading:
     """The length of one board, from the scale of a similarity onto its layout."""
     layout = corner_points(board)
     length = board_length(board)
-    own, found = layout[ids], fit_rigid_transform(layout[ids], points).inverse().apply(points)
-    spread = own - own.mean(axis=0)
-    scale = float(np.sum(spread * found) / np.sum(spread**2))
-    left = found - found.mean(axis=0) - scale * spread
+    described, found = layout[ids], fit_rigid_transform(layout[ids], points).inverse().apply(points)
+    arms = described - described.mean(axis=0)
+    scale = float(np.sum(arms * found) / np.sum(arms**2))
+    residuals = found - found.mean(axis=0) - scale * arms
     # Corners err less along the board than towards the cameras.
-    sigma = np.sqrt(variance_inflation * np.sum(np.sum(spread * left, axis=1) ** 2)) / np.sum(
-        spread**2
+    sigma = np.sqrt(variance_inflation * np.sum(np.sum(arms * residuals, axis=1) ** 2)) / np.sum(
+        arms**2
     )
     return _Reading(scale * length, float(sigma) * length)
 
@@ -227,16 +233,19 @@ class _Middle:
 
     @staticmethod
     def of(board: Board, ids: Indices, points: Array) -> _Middle:
-        own = corner_points(board)[ids]
-        rig_from_board = fit_rigid_transform(own, points)
+        described = corner_points(board)[ids]
+        rig_from_board = fit_rigid_transform(described, points)
         width, height = board.size_mm
-        middle, spread = np.array([0.5 * width, 0.5 * height, 0.0]), own - own.mean(axis=0)
-        lever = np.linalg.norm(middle - own.mean(axis=0)) / np.sqrt(np.mean(spread**2) * 3.0)
-        left = rig_from_board.apply(own) - points
+        middle, arms = (
+            np.array([0.5 * width, 0.5 * height, 0.0]),
+            described - described.mean(axis=0),
+        )
+        lever = np.linalg.norm(middle - described.mean(axis=0)) / np.sqrt(np.mean(arms**2) * 3.0)
+        left = rig_from_board.apply(described) - points
         return _Middle(rig_from_board.apply(middle), left, float(lever))
 
 
-def _between(middles: Sequence[_Middle], variance_inflation: float) -> _Reading:
+def _measure_separation(middles: Sequence[_Middle], variance_inflation: float) -> _Reading:
     one, other = middles
     length = float(np.linalg.norm(one.place - other.place))
     along = (one.place - other.place) / length

@@ -71,19 +71,19 @@ class RigCalibration:
         pair = self.rig.frame_pair
         if pair is None or pair.nominal is not None:
             return FLOOR_AXES
-        placed = self.rig_from_camera.get(pair.name, RigidTransform.identity())
+        pose = self.rig_from_camera.get(pair.name, RigidTransform.identity())
         named = not self.is_import or self.rig.rig_frame.pair is not None
-        if not named and not np.array_equal(placed.matrix, np.eye(4)):
+        if not named and not np.array_equal(pose.matrix, np.eye(4)):
             return "that of the imported files, wherever it lies"
         return (
             f"that of camera {pair.name}: x to the right in its picture, y down, z the way it looks"
         )
 
 
-OTHER_SIZE, REFUSED_SIZE = 0.03, 0.10
+MAX_SIZE_ERROR, REFUSED_SIZE_ERROR = 0.03, 0.10
 """Relative error of the distances between cameras, as measured with a tape. Girths are wrong by the
 same share: 27 mm of 900 at 3 %."""
-LEAST_APART_MM = 100.0
+MIN_SEPARATION_MM = 100.0
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ class NominalSize:
     def mark(self) -> Mark:
         """Bad if the ratio is off by more than any tape measure errs."""
         off = abs(self.ratio - 1.0)
-        return "bad" if off > REFUSED_SIZE else "usable" if off > OTHER_SIZE else "good"
+        return "bad" if off > REFUSED_SIZE_ERROR else "usable" if off > MAX_SIZE_ERROR else "good"
 
     @property
     def words(self) -> str:
@@ -127,7 +127,7 @@ def nominal_size(rig: Rig, rig_from_camera: Mapping[str, RigidTransform]) -> Nom
             / np.linalg.norm(nominal[a] - nominal[b])
         )
         for a, b in combinations(sorted(set(nominal) & set(rig_from_camera)), 2)
-        if np.linalg.norm(nominal[a] - nominal[b]) > LEAST_APART_MM
+        if np.linalg.norm(nominal[a] - nominal[b]) > MIN_SEPARATION_MM
     ]
     return NominalSize(float(np.median(ratios)), rig.boards) if ratios else None
 

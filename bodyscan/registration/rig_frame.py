@@ -14,10 +14,10 @@ from bodyscan.rig.pair import NominalPose, Pair
 from bodyscan.rig.rig import Rig
 
 
-def nominal_pose(placing: NominalPose) -> RigidTransform:
+def nominal_pose(nominal: NominalPose) -> RigidTransform:
     """`rig_from_camera` of a camera that looks from one point at another, upright."""
-    position = np.array(placing.position_mm)
-    forward = np.array(placing.look_at_mm) - position
+    position = np.array(nominal.position_mm)
+    forward = np.array(nominal.look_at_mm) - position
     forward /= np.linalg.norm(forward)
     up = np.array([0.0, 0.0, 1.0]) if abs(forward[2]) < 0.999 else np.array([1.0, 0.0, 0.0])
     right = np.cross(forward, up)
@@ -61,17 +61,17 @@ def frame_board_turn(
     ):
         return RigidTransform.identity()
 
-    def astray(turn: RigidTransform) -> float:
-        turned = {target: root_from_board[target] @ turn.inverse()}
-        to_rig = rig_from_root(rig, root_from_camera, turned)
+    def total_displacement(turn: RigidTransform) -> float:
+        rotated = {target: root_from_board[target] @ turn.inverse()}
+        to_rig = rig_from_root(rig, root_from_camera, rotated)
         total = 0.0
-        for name, placing in root_from_camera.items():
-            place, nominal = (to_rig @ placing).translation, rig.pair(name).nominal
-            meant = nominal.position_mm if nominal else [*place[:2], abs(place[2])]
-            total += float(np.linalg.norm(place - np.array(meant)))
+        for name, root_from_camera_pose in root_from_camera.items():
+            position, nominal = (to_rig @ root_from_camera_pose).translation, rig.pair(name).nominal
+            meant = nominal.position_mm if nominal else [*position[:2], abs(position[2])]
+            total += float(np.linalg.norm(position - np.array(meant)))
         return total
 
-    return min(board_symmetries(rig.board(target[1])), key=astray)
+    return min(board_symmetries(rig.board(target[1])), key=total_displacement)
 
 
 def rig_from_root(
@@ -99,7 +99,7 @@ def rig_from_root(
         rig_from_board = RigidTransform(axes, np.array(frame.origin_mm))
         return rig_from_board @ root_from_board[target].inverse()
     assert pair is not None
-    return _at_its_nominal_pose(rig, pair, root_from_camera)
+    return _place_at_nominal_pose(rig, pair, root_from_camera)
 
 
 def rig_from_world(
@@ -113,10 +113,10 @@ def rig_from_world(
     pair = rig.frame_pair
     if pair is None or (rig.rig_frame.pair is None and pair.nominal is None):
         return None
-    return _at_its_nominal_pose(rig, pair, world_from_camera, "imported", "its `known`")
+    return _place_at_nominal_pose(rig, pair, world_from_camera, "imported", "its `known`")
 
 
-def _at_its_nominal_pose(
+def _place_at_nominal_pose(
     rig: Rig,
     pair: Pair,
     from_camera: Mapping[str, RigidTransform],
@@ -133,5 +133,5 @@ def _at_its_nominal_pose(
             where=f"rig {rig.name}",
             remedy=f"correct {source}, or name another pair in rig_frame",
         )
-    placed = nominal_pose(pair.nominal) if pair.nominal else RigidTransform.identity()
-    return placed @ from_camera[pair.name].inverse()
+    rig_from_camera = nominal_pose(pair.nominal) if pair.nominal else RigidTransform.identity()
+    return rig_from_camera @ from_camera[pair.name].inverse()

@@ -54,32 +54,34 @@ class ChosenLenses:
 
 
 def choose_lenses(rig: Rig, views: Sequence[LocatedView], solution: JointSolution) -> ChosenLenses:
-    """Choose each camera's lens by its own held-out boards, or as all cameras of its make show.
+    """Choose each camera's lens by its held-out boards, or by those of all cameras of its make.
 
     A lens that the rig file names stays.
 
     views: with points where the boards' corners really lie.
     """
     open_lens = {pair.name for pair in rig.pairs if pair.camera.lens == AUTO}
-    looked = {
-        name: _Looked.of(name, views, solution)
+    candidates = {
+        name: _Candidate.of(name, views, solution)
         for name in sorted(solution.cameras)
         if solution.cameras[name].prior is None  # otherwise another program gave it
         and any(view.pair == name for view in views)
     }
     kinds = {
-        name: family_up_to(own.kind) if name in open_lens else (own.kind,)
-        for name, own in looked.items()
+        name: family_up_to(candidate.kind) if name in open_lens else (candidate.kind,)
+        for name, candidate in candidates.items()
     }
-    names = list(looked)
-    own = map_threads(lambda name: looked[name].choose(kinds[name]), names, stage="choosing lenses")
-    chosen = dict(zip(names, own, strict=True))
-    for alike in _group_by_make(looked):
-        chosen |= _pool_decentring({name: chosen[name] for name in alike}, looked, kinds)
+    names = list(candidates)
+    candidate = map_threads(
+        lambda name: candidates[name].choose(kinds[name]), names, stage="choosing lenses"
+    )
+    chosen = dict(zip(names, candidate, strict=True))
+    for make in _group_by_make(candidates):
+        chosen |= _pool_decentring({name: chosen[name] for name in make}, candidates, kinds)
     cameras = {
         name: lens.fit.camera
         for name, lens in chosen.items()
-        if type(lens.fit.camera.lens) is not looked[name].kind
+        if type(lens.fit.camera.lens) is not candidates[name].kind
     }
     return ChosenLenses(
         replace(solution, cameras=solution.cameras | cameras),
@@ -89,7 +91,7 @@ def choose_lenses(rig: Rig, views: Sequence[LocatedView], solution: JointSolutio
 
 
 @dataclass(frozen=True, eq=False)
-class _Looked:
+class _Candidate:
     """A camera solved with the richest lens, its views and their `camera_from_board`."""
 
     camera: Camera
@@ -97,13 +99,13 @@ class _Looked:
     views: list[PlanarView]
 
     @staticmethod
-    def of(name: str, views: Sequence[LocatedView], solution: JointSolution) -> _Looked:
-        own = [view for view in views if view.pair == name]
+    def of(name: str, views: Sequence[LocatedView], solution: JointSolution) -> _Candidate:
+        of_pair = [view for view in views if view.pair == name]
         camera_from_root = solution.root_from_camera[name].inverse()
-        return _Looked(
+        return _Candidate(
             solution.cameras[name],
-            [camera_from_root @ solution.root_from_board[view.target] for view in own],
-            [PlanarView(view.shot, view.points, view.pixels) for view in own],
+            [camera_from_root @ solution.root_from_board[view.target] for view in of_pair],
+            [PlanarView(view.shot, view.points, view.pixels) for view in of_pair],
         )
 
     @property
@@ -114,16 +116,19 @@ class _Looked:
         return choose_lens(kinds, self.camera, self.poses, self.views)
 
 
-def _group_by_make(looked: Mapping[str, _Looked]) -> Iterator[list[str]]:
+def _group_by_make(candidates: Mapping[str, _Candidate]) -> Iterator[list[str]]:
     """Groups of cameras with images of one size, as far as images show which are of one make."""
-    size = {name: (own.camera.width, own.camera.height) for name, own in looked.items()}
+    size = {
+        name: (candidate.camera.width, candidate.camera.height)
+        for name, candidate in candidates.items()
+    }
     for one in sorted(set(size.values())):
-        yield [name for name in looked if size[name] == one]
+        yield [name for name in candidates if size[name] == one]
 
 
 def _pool_decentring(
     chosen: Mapping[str, ChosenLens],
-    looked: Mapping[str, _Looked],
+    candidates: Mapping[str, _Candidate],
     kinds: Mapping[str, Sequence[type[Lens]]],
 ) -> dict[str, ChosenLens]:
     """Brown's lens in place of the chapter's, if the cameras together are decentred beyond chance.
@@ -143,7 +148,7 @@ def _pool_decentring(
         return {}
     found = {}
     for name in open_:
-        again = looked[name].choose(kinds[name][kinds[name].index(Brown) :])
+        again = candidates[name].choose(kinds[name][kinds[name].index(Brown) :])
         found[name] = replace(again, trials=_with_what_followed(chosen[name].trials, again))
     return found
 

@@ -118,22 +118,26 @@ def solve_rig(
     start, left_out = initial_poses(views, sorted(cameras))
     while True:
         names = sorted(start)
-        own = [view for view in views if view.pair in start]
-        solved = _solve(rig, own, {n: cameras[n] for n in names}, start, choose)
-        strangers = _strangers(solved.shaped.views, solved.dropped)
-        if not strangers:
+        shared = [view for view in views if view.pair in start]
+        solved = _solve(rig, shared, {n: cameras[n] for n in names}, start, choose)
+        unsynchronised = _find_unsynchronised(solved.shaped.views, solved.dropped)
+        if not unsynchronised:
             break
-        if 2 * len(strangers) >= len(names):
+        if 2 * len(unsynchronised) >= len(names):
             raise RigDisconnected(
                 describe_unsynchronised(names),
                 remedy="synchronise the cameras, or hold the board still until all have taken "
                 "their picture; check the board's description in the rig file too",
             )
-        left_out |= {name: describe_unsynchronised([name]) for name in strangers}
-        start = {name: placing for name, placing in start.items() if name not in strangers}
-    placed = _placed(rig, solved, len(start) > 1)
-    notes = (*solved.judged.notes, *solved.shaped.notes, *lens_notes(placed.lenses))
-    return Outcome(placed, notes, left_out)
+        left_out |= {name: describe_unsynchronised([name]) for name in unsynchronised}
+        start = {
+            name: rig_from_camera
+            for name, rig_from_camera in start.items()
+            if name not in unsynchronised
+        }
+    solution = _transfer_to_rig_frame(rig, solved, len(start) > 1)
+    notes = (*solved.judged.notes, *solved.shaped.notes, *lens_notes(solution.lenses))
+    return Outcome(solution, notes, left_out)
 
 
 def _solve(
@@ -149,9 +153,9 @@ def _solve(
     graph = view_graph(views, names)
     root = max(names, key=lambda name: (graph.degree(name), name))
     to_root = start[root].inverse()
-    placed = {name: to_root @ placing for name, placing in start.items()}
-    resolved, boards, doubtful = locate_boards_jointly(views, placed)
-    solution = JointSolution(placed, boards, cameras)
+    root_from_camera = {name: to_root @ pose for name, pose in start.items()}
+    resolved, boards, doubtful = locate_boards_jointly(views, root_from_camera)
+    solution = JointSolution(root_from_camera, boards, cameras)
     gross = find_inconsistent_views(
         [view for view in resolved if view.target in doubtful], solution, COARSE_PX
     ).wrong
@@ -170,7 +174,7 @@ def _solve(
     shaped = ShapedSolution(judged.solution, judged.kept(resolved), {}, ())
     lenses: ChosenLenses | None = None
     # If pairs are to be left out, the others are solved again anyway.
-    if several and not _strangers(shaped.views, _dropped(resolved, judged)):
+    if several and not _find_unsynchronised(shaped.views, _select_rejected(resolved, judged)):
         shaped = estimate_board_shapes(
             shaped.views, judged.solution, root=root, refine_cameras=True
         )
@@ -184,26 +188,26 @@ def _solve(
             shaped = reestimate_board_shapes(
                 judged.kept(resolved), judged.solution, shaped, root=root
             )
-    return _Solved(judged, shaped, _dropped(resolved, judged), lenses)
+    return _Solved(judged, shaped, _select_rejected(resolved, judged), lenses)
 
 
-def _dropped(views: Sequence[LocatedView], judged: ConsistentSolve) -> list[LocatedView]:
+def _select_rejected(views: Sequence[LocatedView], judged: ConsistentSolve) -> list[LocatedView]:
     return [view for view in views if view.key in judged.wrong]
 
 
-def _strangers(kept: Sequence[LocatedView], dropped: Sequence[LocatedView]) -> list[str]:
+def _find_unsynchronised(kept: Sequence[LocatedView], dropped: Sequence[LocatedView]) -> list[str]:
     """Pairs most of whose shared views had to be dropped."""
     everything = [*kept, *dropped]
     count = Counter(view.target for view in everything)
     shared = Counter(view.pair for view in everything if count[view.target] > 1)
-    out = Counter(view.pair for view in dropped if count[view.target] > 1)
-    return sorted(name for name, number in shared.items() if 2 * out[name] > number)
+    dropped_count = Counter(view.pair for view in dropped if count[view.target] > 1)
+    return sorted(name for name, number in shared.items() if 2 * dropped_count[name] > number)
 
 
-def _placed(rig: Rig, solved: _Solved, refine: bool) -> RigSolution:
+def _transfer_to_rig_frame(rig: Rig, solved: _Solved, refine: bool) -> RigSolution:
     """The solution carried into the rig frame, with its covariance there."""
     shaped = solved.shaped
-    solution, kept = _frame_board_turned(rig, shaped.solution, shaped.views)
+    solution, kept = _orient_frame_board(rig, shaped.solution, shaped.views)
     to_rig = rig_from_root(rig, solution.root_from_camera, solution.root_from_board)
     rig_from_camera = {name: to_rig @ t for name, t in solution.root_from_camera.items()}
     rig_from_board = {target: to_rig @ t for target, t in solution.root_from_board.items()}
@@ -217,7 +221,7 @@ def _placed(rig: Rig, solved: _Solved, refine: bool) -> RigSolution:
         cameras_free=refine,
         shapes={name: shape.free for name, shape in shaped.shapes.items()},
     )
-    known = cluster_robust_covariance(equations, cluster_board_poses(kept, rig_from_board))
+    covariance = cluster_robust_covariance(equations, cluster_board_poses(kept, rig_from_board))
     rms = {
         name: _robust_rms(
             [
@@ -232,31 +236,31 @@ def _placed(rig: Rig, solved: _Solved, refine: bool) -> RigSolution:
         rig_from_camera,
         rig_from_board,
         solution.cameras,
-        known.poses,
+        covariance.poses,
         rms,
         tuple(kept),
         shaped.shapes,
         solved.lenses.trials if solved.lenses else {},
-        known.cameras,
-        known.variance_inflation,
+        covariance.cameras,
+        covariance.variance_inflation,
         {
-            name: rays.inflate_noise(known.variance_inflation)
+            name: rays.inflate_noise(covariance.variance_inflation)
             for name, rays in (solved.lenses.rays if solved.lenses else {}).items()
         },
     )
 
 
-def _frame_board_turned(
+def _orient_frame_board(
     rig: Rig, solution: JointSolution, views: list[LocatedView]
 ) -> tuple[JointSolution, list[LocatedView]]:
     target = frame_target(rig)
     turn = frame_board_turn(rig, solution.root_from_camera, solution.root_from_board)
     boards = {
-        key: placing @ turn.inverse() if key == target else placing
-        for key, placing in solution.root_from_board.items()
+        key: root_from_board @ turn.inverse() if key == target else root_from_board
+        for key, root_from_board in solution.root_from_board.items()
     }
-    turned = [view.resolve(turn) if view.target == target else view for view in views]
-    return replace(solution, root_from_board=boards), turned
+    rotated = [view.resolve(turn) if view.target == target else view for view in views]
+    return replace(solution, root_from_board=boards), rotated
 
 
 def corner_residuals(
@@ -278,23 +282,25 @@ def _robust_rms(parts: Sequence[Array]) -> float:
     return float(np.sqrt(2.0 * CORNERS.mean_square(residuals)))
 
 
-def collect_corners(placed: RigSolution, names: Iterable[str]) -> dict[str, ObservedCorners]:
-    """The corners by pair, for those of `names` that were placed."""
-    number = {target: k for k, target in enumerate(sorted(placed.rig_from_board))}
-    found = {}
-    for name in sorted(set(names) & set(placed.rig_from_camera)):
-        own = [view for view in placed.views if view.pair == name]
-        if not own:
+def collect_corners(solution: RigSolution, names: Iterable[str]) -> dict[str, ObservedCorners]:
+    """The corners by pair, for those of `names` that were solved."""
+    number = {target: k for k, target in enumerate(sorted(solution.rig_from_board))}
+    corners = {}
+    for name in sorted(set(names) & set(solution.rig_from_camera)):
+        of_pair = [view for view in solution.views if view.pair == name]
+        if not of_pair:
             continue
         residuals = [
-            corner_residuals(view, placed.cameras, placed.rig_from_camera, placed.rig_from_board)
-            for view in own
+            corner_residuals(
+                view, solution.cameras, solution.rig_from_camera, solution.rig_from_board
+            )
+            for view in of_pair
         ]
-        found[name] = ObservedCorners(
-            np.concatenate([view.pixels for view in own]).astype(np.float32),
+        corners[name] = ObservedCorners(
+            np.concatenate([view.pixels for view in of_pair]).astype(np.float32),
             np.concatenate(residuals).astype(np.float32),
-            np.repeat([number[v.target] for v in own], [len(v.pixels) for v in own]).astype(
+            np.repeat([number[v.target] for v in of_pair], [len(v.pixels) for v in of_pair]).astype(
                 np.int16
             ),
         )
-    return found
+    return corners

@@ -24,10 +24,10 @@ from bodyscan.stripes.stripe_code import StripeCode
 ORTHONORMAL = 1e-6  # rounding leaves 1e-15; at 2 m this is 2 um
 SYMMETRIC, POSITIVE = 1e-6, -1e-6  # of a correlation, which is 1 at most; solves leave 1e-9
 NARROWEST, WIDEST = 0.0175, 7.5  # width over focal length: fields of view of 1 and 150 degrees
-MOST_UNLIKE = 2.0  # ratio of the two focal lengths: cameras that skip every other line
-MOST_SKEW = 0.1  # of the focal length: axes 6 degrees off a right angle; sensors are cut far better
-FARTHEST_MM = 1e5  # 100 m from the rig's centre
-SEES = 0.5  # of an image that rays pass through: less is a slip, not a lens
+MAX_ASPECT = 2.0  # ratio of the two focal lengths: cameras that skip every other line
+MAX_SKEW = 0.1  # of the focal length: axes 6 degrees off a right angle; sensors are cut far better
+MAX_DISTANCE_MM = 1e5  # 100 m from the rig's centre
+MIN_SHARE = 0.5  # of an image that rays pass through: less is a slip, not a lens
 
 Fault = tuple[str, str]
 """Where, as in `pairs.p1.camera`, and what is wrong, in words that follow it."""
@@ -35,32 +35,32 @@ Fault = tuple[str, str]
 
 def find_faults(calibration: RigCalibration) -> Iterator[Fault]:
     """Everything in a calibration that no calibration can have."""
-    yield from _names(calibration)
+    yield from _name_faults(calibration)
     known = {pair.name: pair for pair in calibration.rig.pairs}
     for name, pair in calibration.pairs.items():
-        place = f"pairs.{name}"
+        where = f"pairs.{name}"
         if name not in known:
-            yield place, f"is not a pair of rig {calibration.rig.name}"
+            yield where, f"is not a pair of rig {calibration.rig.name}"
             continue
-        yield from camera_faults(pair.camera, known[name], f"{place}.camera")
+        yield from camera_faults(pair.camera, known[name], f"{where}.camera")
         size = len(pair.camera.parameters)
         yield from covariance_faults(pair.camera_covariance, size, f"{name}/camera_covariance")
-        yield from pose_faults(calibration.rig_from_camera[name], f"{place}.rig_from_camera")
-        yield from _light(pair, known[name])
+        yield from pose_faults(calibration.rig_from_camera[name], f"{where}.rig_from_camera")
+        yield from _light_faults(pair, known[name])
     size = 6 * len(calibration.covariance.names)
     yield from covariance_faults(calibration.covariance.matrix, size, "placing_covariance")
     for (shot, board), pose in calibration.rig_from_board.items():
         yield from pose_faults(pose, f"boards: {board} in {shot}")
-    for name, seen in calibration.seen.items():
-        yield from _seen(seen, len(calibration.rig_from_board), f"{name}/seen")
+    for name, corners in calibration.seen.items():
+        yield from _corner_faults(corners, len(calibration.rig_from_board), f"{name}/seen")
 
 
-def camera_faults(camera: Camera, pair: Pair, place: str) -> Iterator[Fault]:
+def camera_faults(camera: Camera, pair: Pair, where: str) -> Iterator[Fault]:
     """Faults of a camera, given the image size and pair that the rig file describes."""
     size = (camera.width, camera.height)
     if size != (pair.camera.width, pair.camera.height):
         yield (
-            place,
+            where,
             (
                 f"is of {size[0]} x {size[1]} pixels, but its rig says "
                 f"{pair.camera.width} x {pair.camera.height}"
@@ -70,53 +70,53 @@ def camera_faults(camera: Camera, pair: Pair, place: str) -> Iterator[Fault]:
     for name, length in (("alpha", size[0]), ("beta", size[1])):
         focal = getattr(camera, name)
         if not length / WIDEST < focal < length / NARROWEST:
-            yield f"{place}.{name}", f"is not a focal length for {length} pixels (got {focal:g})"
+            yield f"{where}.{name}", f"is not a focal length for {length} pixels (got {focal:g})"
             return
-    if not 1.0 / MOST_UNLIKE < camera.alpha / camera.beta < MOST_UNLIKE:
-        yield place, f"has focal lengths too unlike (got {camera.alpha:g}, {camera.beta:g})"
-    if not abs(camera.gamma) < MOST_SKEW * camera.alpha:
-        yield f"{place}.gamma", f"is more skew than a sensor has (got {camera.gamma:g})"
+    if not 1.0 / MAX_ASPECT < camera.alpha / camera.beta < MAX_ASPECT:
+        yield where, f"has focal lengths too unlike (got {camera.alpha:g}, {camera.beta:g})"
+    if not abs(camera.gamma) < MAX_SKEW * camera.alpha:
+        yield f"{where}.gamma", f"is more skew than a sensor has (got {camera.gamma:g})"
     for name, value, length in zip(("u0", "v0"), (camera.u0, camera.v0), size, strict=True):
         # It may lie outside an image that was cropped from a larger one.
         if not -length < value < 2.0 * length:
-            yield f"{place}.{name}", f"lies far outside of the picture (got {value:g})"
-    if not np.all(np.isfinite(camera.lens.coefficients)) or _drawn(camera) < SEES:
+            yield f"{where}.{name}", f"lies far outside of the picture (got {value:g})"
+    if not np.all(np.isfinite(camera.lens.coefficients)) or _share_of_rays(camera) < MIN_SHARE:
         values = ", ".join(f"{value:g}" for value in camera.lens.coefficients)
-        yield place, f"has a lens that folds its picture over (got {values})"
+        yield where, f"has a lens that folds its picture over (got {values})"
 
 
-def pose_faults(pose: RigidTransform, place: str) -> Iterator[Fault]:
+def pose_faults(pose: RigidTransform, where: str) -> Iterator[Fault]:
     """Faults of a pose: it must be a rotation with a translation of plausible size."""
     rotation = pose.rotation
     if not (np.all(np.isfinite(rotation)) and np.all(np.isfinite(pose.translation))):
-        yield place, "holds what is not a number"
+        yield where, "holds what is not a number"
     elif np.abs(rotation @ rotation.T - np.eye(3)).max() > ORTHONORMAL:
-        yield place, "is not a rotation: its rows are not of length 1 and square to each other"
+        yield where, "is not a rotation: its rows are not of length 1 and square to each other"
     elif np.linalg.det(rotation) < 0.0:
-        yield place, "is not a rotation: it mirrors"
-    elif np.abs(pose.translation).max() > FARTHEST_MM:
-        yield place, f"lies more than {FARTHEST_MM / 1000.0:g} m away"
+        yield where, "is not a rotation: it mirrors"
+    elif np.abs(pose.translation).max() > MAX_DISTANCE_MM:
+        yield where, f"lies more than {MAX_DISTANCE_MM / 1000.0:g} m away"
 
 
-def covariance_faults(matrix: Array, size: int, place: str) -> Iterator[Fault]:
+def covariance_faults(matrix: Array, size: int, where: str) -> Iterator[Fault]:
     """Faults of a covariance (size, size); all zero is allowed (nothing is uncertain)."""
     if not isinstance(matrix, np.ndarray) or matrix.shape != (size, size):
-        yield place, f"is of shape {np.shape(matrix)}, but {size} x {size} is wanted"
+        yield where, f"is of shape {np.shape(matrix)}, but {size} x {size} is wanted"
     elif matrix.dtype.kind not in "fiu" or not np.all(np.isfinite(matrix)):
-        yield place, "holds what is not a number"
+        yield where, "holds what is not a number"
     elif matrix.diagonal().min(initial=0.0) < 0.0:
-        yield place, "holds a negative variance"
+        yield where, "holds a negative variance"
     else:
         matrix = matrix.astype(np.float64)
         sigmas = np.sqrt(matrix.diagonal())
         correlation = matrix / np.outer(*[np.where(sigmas > 0.0, sigmas, 1.0)] * 2)
         if np.abs(correlation - correlation.T).max(initial=0.0) > SYMMETRIC:
-            yield place, "is not symmetric"
+            yield where, "is not symmetric"
         elif size and np.linalg.eigvalsh(correlation).min() < POSITIVE * size:
-            yield place, "is not a covariance: it is not positive semidefinite"
+            yield where, "is not a covariance: it is not positive semidefinite"
 
 
-def _names(calibration: RigCalibration) -> Iterator[Fault]:
+def _name_faults(calibration: RigCalibration) -> Iterator[Fault]:
     rig, pairs = calibration.rig, set(calibration.pairs)
     order = calibration.covariance.names
     if not pairs:
@@ -131,7 +131,7 @@ def _names(calibration: RigCalibration) -> Iterator[Fault]:
             yield "boards", f"names no board of rig {rig.name} (got {board!r} in {shot!r})"
 
 
-def _light(pair: PairCalibration, described: Pair) -> Iterator[Fault]:
+def _light_faults(pair: PairCalibration, described: Pair) -> Iterator[Fault]:
     code = described.projector
     if (pair.sheets is None) != (code is None):
         yield (
@@ -143,74 +143,80 @@ def _light(pair: PairCalibration, described: Pair) -> Iterator[Fault]:
         ("light", pair.sheets, code),
         ("crossing", pair.crossing, code.crossing if code else None),
     )
-    for what, light, shown in sheets:
-        place = f"pairs.{pair.name}.{what}"
+    for what, light, described_code in sheets:
+        where = f"pairs.{pair.name}.{what}"
         if light is None:
             continue
-        if shown is None:
-            yield place, "is of stripes that the rig's projector does not show"
-        elif (light.direction, light.stripes) != (shown.direction, shown.stripes):
+        if described_code is None:
+            yield where, "is of stripes that the rig's projector does not show"
+        elif (light.direction, light.stripes) != (described_code.direction, described_code.stripes):
             yield (
-                place,
+                where,
                 (
                     f"is of {light.stripes} {light.direction} stripes, but the rig's projector shows "
-                    f"{shown.stripes} {shown.direction}"
+                    f"{described_code.stripes} {described_code.direction}"
                 ),
             )
         elif isinstance(light, LightPlanes):
-            yield from _planes(light, place)
+            yield from _plane_faults(light, where)
         elif isinstance(light, SmoothSheets):
-            yield from _smooth(light, place)
+            yield from _smooth_faults(light, where)
 
 
-def _planes(light: LightPlanes, place: str) -> Iterator[Fault]:
+def _plane_faults(light: LightPlanes, where: str) -> Iterator[Fault]:
     planes, covariance = light.coefficients, light.covariance
     if planes.shape != (light.stripes + 1, 4) or covariance.shape != (light.stripes + 1, 4, 4):
-        yield place, f"has arrays of shapes {planes.shape} and {covariance.shape}"
+        yield where, f"has arrays of shapes {planes.shape} and {covariance.shape}"
         return
     measured = ~np.isnan(planes).all(axis=1)
-    known, spread = planes[measured], covariance[measured]
+    known, variances = planes[measured], covariance[measured]
     if not known.size:
-        yield place, "has no plane at all"
-    elif not (np.all(np.isfinite(known)) and np.all(np.isfinite(spread))):
-        yield place, "holds what is not a number"
+        yield where, "has no plane at all"
+    elif not (np.all(np.isfinite(known)) and np.all(np.isfinite(variances))):
+        yield where, "holds what is not a number"
     elif np.abs(np.linalg.norm(known[:, :3], axis=1) - 1.0).max() > ORTHONORMAL:
-        yield place, "has planes whose normals are not of length 1"
-    elif np.abs(spread - spread.transpose(0, 2, 1)).max() > SYMMETRIC * np.abs(spread).max():
-        yield place, "has a covariance that is not symmetric"
-    elif np.any(np.linalg.eigvalsh(spread)[:, 0] < POSITIVE * np.abs(spread).max(axis=(1, 2))):
-        yield place, "has a covariance that is not positive semidefinite"
+        yield where, "has planes whose normals are not of length 1"
+    elif (
+        np.abs(variances - variances.transpose(0, 2, 1)).max() > SYMMETRIC * np.abs(variances).max()
+    ):
+        yield where, "has a covariance that is not symmetric"
+    elif np.any(
+        np.linalg.eigvalsh(variances)[:, 0] < POSITIVE * np.abs(variances).max(axis=(1, 2))
+    ):
+        yield where, "has a covariance that is not positive semidefinite"
 
 
-def _smooth(light: SmoothSheets, place: str) -> Iterator[Fault]:
+def _smooth_faults(light: SmoothSheets, where: str) -> Iterator[Fault]:
     parameters = light.parameters
     size = len(parameters)
     if isinstance(light, LensSheets):
         size += FRAME
         if not SCALE <= len(parameters) <= SCALE + len(LENS_SPREAD):
-            yield place, f"has {len(parameters)} parameters"
+            yield where, f"has {len(parameters)} parameters"
             return
     if parameters.ndim != 1 or light.middle.shape != (3,):
-        yield place, f"has arrays of shapes {parameters.shape} and {light.middle.shape}"
+        yield where, f"has arrays of shapes {parameters.shape} and {light.middle.shape}"
     elif not (np.all(np.isfinite(parameters)) and np.all(np.isfinite(light.middle))):
-        yield place, "holds what is not a number"
+        yield where, "holds what is not a number"
     else:
-        yield from pose_faults(light.projector_from_camera, f"{place}: projector_from_camera")
-        yield from covariance_faults(light.covariance, size, f"{place}: covariance")
+        yield from pose_faults(light.projector_from_camera, f"{where}: projector_from_camera")
+        yield from covariance_faults(light.covariance, size, f"{where}: covariance")
 
 
-def _seen(seen: ObservedCorners, boards: int, place: str) -> Iterator[Fault]:
-    count = len(seen.target)
-    shapes = (seen.pixels.shape, seen.residuals_px.shape, seen.target.shape)
+def _corner_faults(corners: ObservedCorners, boards: int, where: str) -> Iterator[Fault]:
+    count = len(corners.target)
+    shapes = (corners.pixels.shape, corners.residuals_px.shape, corners.target.shape)
     if shapes != ((count, 2), (count, 2), (count,)):
-        yield place, f"has arrays of shapes {', '.join(map(str, shapes))}"
-    elif not (np.all(np.isfinite(seen.pixels)) and np.all(np.isfinite(seen.residuals_px))):
-        yield place, "holds what is not a number"
-    elif seen.target.dtype.kind not in "iu" or np.any((seen.target < 0) | (seen.target >= boards)):
-        yield place, "names boards that there are not"
+        yield where, f"has arrays of shapes {', '.join(map(str, shapes))}"
+    elif not (np.all(np.isfinite(corners.pixels)) and np.all(np.isfinite(corners.residuals_px))):
+        yield where, "holds what is not a number"
+    elif corners.target.dtype.kind not in "iu" or np.any(
+        (corners.target < 0) | (corners.target >= boards)
+    ):
+        yield where, "names boards that there are not"
 
 
-def _drawn(camera: Camera) -> float:
+def _share_of_rays(camera: Camera) -> float:
     """Share of the image that rays pass through."""
     across = (np.arange(9) + 0.5) / 9.0
     pixels = np.stack(np.meshgrid(across * camera.width, across * camera.height), axis=-1)

@@ -38,7 +38,7 @@ WITHOUT_HASH = 1
 """The previous version, also read: it had no hash of the JSON itself."""
 HASH = "sha256"
 EDITED = "the calibration was edited by hand, and the change accepted"
-MOST_FAULTS = 5  # how many an error lists
+MAX_FAULTS = 5  # how many an error lists
 FILE_NAME = "calibration.json"
 HISTORY = "history"
 ARRAYS_NAME = "calibration.npz"
@@ -101,9 +101,9 @@ def save_calibration(calibration: RigCalibration, folder: Path) -> Path:
         if pair.rays is not None:
             arrays[f"{name}/rays/noise_px"] = pair.rays.noise_px
             arrays[f"{name}/rays/lens_px"] = pair.rays.lens_px
-    for name, seen in calibration.seen.items():
-        for part in fields(seen):
-            arrays[f"{name}/seen/{part.name}"] = getattr(seen, part.name)
+    for name, corners in calibration.seen.items():
+        for part in fields(corners):
+            arrays[f"{name}/seen/{part.name}"] = getattr(corners, part.name)
     write_npz(folder / ARRAYS_NAME, **arrays)
     content = {
         "schema": SCHEMA,
@@ -169,7 +169,7 @@ def load_calibration(path: Path, *, accept_changed: bool = False) -> RigCalibrat
             where=str(file),
             remedy="restore the file from a copy, or calibrate again",
         ) from error
-    faults = list(islice(find_faults(calibration), MOST_FAULTS))
+    faults = list(islice(find_faults(calibration), MAX_FAULTS))
     if faults:
         raise CalibrationFileError(
             "holds what no calibration can be like:"

@@ -24,14 +24,14 @@ from bodyscan.registration.bundle_adjustment import refine_solution
 from bodyscan.registration.joint_solve import JointSolution
 from bodyscan.registration.view_graph import by_target
 
-TIMES_OWN = 6.0
-LEAST_BAD_PX = 0.2
-OTHER_SIZE = 0.005
+MAX_RATIO = 6.0
+MIN_ERROR_PX = 0.2
+MIN_SIZE_ERROR = 0.005
 """A board whose squares seem to differ by this share is another board."""
-SAME_SIZE_SHOTS = 3
+MIN_SHOTS = 3
 STEPS = 15
 SETTLED = 1e-2  # variances: far less than separates a wrong view from a right one
-CORNERS = Noise("corners", group=2, min_scale=0.1 * LEAST_BAD_PX)
+CORNERS = Noise("corners", group=2, min_scale=0.1 * MIN_ERROR_PX)
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,9 +77,9 @@ def single_view_errors(views: Iterable[LocatedView], cameras: Mapping[str, Camer
     )
 
 
-def error_limit(own: Array) -> float:
-    """Error in px beyond which a view does not fit the rig. own: (V,) from `single_view_errors`."""
-    return max(TIMES_OWN * float(np.median(own)), LEAST_BAD_PX)
+def error_limit(errors: Array) -> float:
+    """Error in px above which a view is inconsistent; errors: (V,) from `single_view_errors`."""
+    return max(MAX_RATIO * float(np.median(errors)), MIN_ERROR_PX)
 
 
 def find_inconsistent_views(
@@ -89,7 +89,7 @@ def find_inconsistent_views(
     found = [
         _examine_board(group, solution, limit_px)
         for group in by_target(views).values()
-        if max(_error(view, solution, _placing(group, solution)) for view in group) > limit_px
+        if max(_error(view, solution, _board_pose(group, solution)) for view in group) > limit_px
     ]
     sizes = tuple(size for one in found for size in one.sizes)
     return InconsistentViews(
@@ -102,12 +102,15 @@ def find_inconsistent_views(
 def _wrong_squares(sizes: Sequence[tuple[str, float]]) -> Iterator[str]:
     """One line for each board that seems to have the same other size in shot after shot."""
     for name in sorted({name for name, _ in sizes}):
-        own = np.array([size for board, size in sizes if board == name])
-        usual = float(np.median(own))
-        if len(own) >= SAME_SIZE_SHOTS and np.mean(np.abs(own - usual) < OTHER_SIZE) > 0.5:
+        sizes_of_board = np.array([size for board, size in sizes if board == name])
+        median = float(np.median(sizes_of_board))
+        if (
+            len(sizes_of_board) >= MIN_SHOTS
+            and np.mean(np.abs(sizes_of_board - median) < MIN_SIZE_ERROR) > 0.5
+        ):
             yield (
-                f"board {name} has squares {usual:.3f} times as large as the rig file says, measured "
-                f"by the other boards in {len(own)} shots: correct its square_mm"
+                f"board {name} has squares {median:.3f} times as large as the rig file says, measured "
+                f"by the other boards in {len(sizes_of_board)} shots: correct its square_mm"
             )
 
 
@@ -116,34 +119,35 @@ def _examine_board(
 ) -> InconsistentViews:
     """Find which of one board's views at one moment are wrong, given that not all can be true."""
     shot, board = group[0].target
-    start = _placing(group, solution)
-    own = [_fit_from_both([view], solution, start).rms_px[0] for view in group]
-    bad = [view for view, error in zip(group, own, strict=True) if error > limit_px]
+    start = _board_pose(group, solution)
+    errors = [_fit_from_two_starts([view], solution, start).rms_px[0] for view in group]
+    bad = [view for view, error in zip(group, errors, strict=True) if error > limit_px]
     notes = [
         f"{view.pair}: board {board} in shot {shot} fits no pose "
         f"({error:.2f} px) with any lens that the other views allow; corners may be mixed up; not used"
-        for view, error in zip(group, own, strict=True)
+        for view, error in zip(group, errors, strict=True)
         if error > limit_px
     ]
     kept = [view for view in group if view not in bad]
-    together = _fit_from_both(kept, solution, start) if kept else None
-    if together is None or together.rms_px.max() <= limit_px:
+    joint_fit = _fit_from_two_starts(kept, solution, start) if kept else None
+    if joint_fit is None or joint_fit.rms_px.max() <= limit_px:
         return InconsistentViews(tuple(bad), tuple(notes))
-    resized = _fit_from_both(kept, solution, start, free_size=True)
-    if resized.rms_px.max() <= limit_px and abs(resized.size - 1.0) > OTHER_SIZE:
-        said = (
-            f"shot {shot}: what {_names(kept)} took for board {board} has squares {resized.size:.3f} "
-            "times as large: another board? not used"
+    scaled_fit = _fit_from_two_starts(kept, solution, start, free_size=True)
+    if scaled_fit.rms_px.max() <= limit_px and abs(scaled_fit.size - 1.0) > MIN_SIZE_ERROR:
+        note = (
+            f"shot {shot}: the squares of board {board} seen by {_names(kept)} are "
+            f"{scaled_fit.size:.3f} times as large as described; not used. Possible cause: another "
+            "board"
         )
-        return InconsistentViews(tuple(group), (*notes, said), ((board, resized.size),))
+        return InconsistentViews(tuple(group), (*notes, note), ((board, scaled_fit.size),))
     agreeing = _largest_agreement(kept, solution, start, limit_px)
     others = [view for view in kept if view not in agreeing]
-    said = (
-        f"shot {shot}: board {board} stood elsewhere when {_names(others)} saw it "
-        f"({together.rms_px.max():.2f} px off, usual is below {limit_px:.2f}, whatever the lens): it "
-        "moved, or the pictures were not taken together; not used"
+    note = (
+        f"shot {shot}: the pose of board {board} differs for {_names(others)} "
+        f"({joint_fit.rms_px.max():.2f} px, limit {limit_px:.2f}, with any lens); not used. Possible "
+        "causes: the board moved, or the pictures were not taken at the same moment"
     )
-    return InconsistentViews((*bad, *others), (*notes, said))
+    return InconsistentViews((*bad, *others), (*notes, note))
 
 
 def _largest_agreement(
@@ -159,7 +163,7 @@ def _largest_agreement(
     kept = list(views)
     while len(kept) > 2:
         rests = [[view for view in kept if view is not out] for out in kept]
-        fits = [_fit_from_both(rest, solution, start).rms_px for rest in rests]
+        fits = [_fit_from_two_starts(rest, solution, start).rms_px for rest in rests]
         best = int(np.argmin([np.sum(rms**2) for rms in fits]))
         kept = rests[best]
         if fits[best].max() <= limit_px:
@@ -167,7 +171,7 @@ def _largest_agreement(
     return []
 
 
-def _fit_from_both(
+def _fit_from_two_starts(
     views: Sequence[LocatedView],
     solution: JointSolution,
     start: RigidTransform,
@@ -175,8 +179,8 @@ def _fit_from_both(
     free_size: bool = False,
 ) -> BoardFit:
     """The board pose (and size) that fits all views, begun from the first view's or `start`."""
-    own = solution.root_from_camera[views[0].pair] @ views[0].camera_from_board
-    first = fit_board(views, solution, own, free_size=free_size)
+    root_from_view = solution.root_from_camera[views[0].pair] @ views[0].camera_from_board
+    first = fit_board(views, solution, root_from_view, free_size=free_size)
     if len(views) == 1:
         return first
     second = fit_board(views, solution, start, free_size=free_size)
@@ -186,14 +190,14 @@ def _fit_from_both(
 def fit_board(
     views: Sequence[LocatedView],
     solution: JointSolution,
-    placing: RigidTransform,
+    root_from_board: RigidTransform,
     *,
     free_size: bool = False,
 ) -> BoardFit:
-    """The board pose (and size) that fits all views, starting from `placing`."""
+    """The board pose (and size) that fits all views, starting from `root_from_board`."""
     unknowns = 7 if free_size else 6
     fitted = minimize(
-        (placing, 1.0),
+        (root_from_board, 1.0),
         lambda state: [_corners(view, solution, state, unknowns) for view in views],
         lambda state, step: (state[0].retract(step[:6]), state[1] + float(np.sum(step[6:]))),
         unknowns=unknowns,
@@ -209,14 +213,14 @@ def _corners(
     view: LocatedView, solution: JointSolution, state: tuple[RigidTransform, float], unknowns: int
 ) -> Block:
     """Reprojection errors, px; derivatives by the board's motion and size."""
-    (placing, size), camera = state, solution.cameras[view.pair]
+    (root_from_board, size), camera = state, solution.cameras[view.pair]
     camera_from_root = solution.root_from_camera[view.pair].inverse()
-    in_root = placing.apply(size * view.points)
+    in_root = root_from_board.apply(size * view.points)
     in_camera = camera_from_root.apply(in_root)
 
     def linearize() -> Array:
         by_root = camera.jacobians(in_camera)[1] @ camera_from_root.rotation
-        by_size = by_root @ placing.rotate(view.points)[..., None]
+        by_size = by_root @ root_from_board.rotate(view.points)[..., None]
         jacobian = np.concatenate([by_root @ twist_jacobian(in_root), by_size], axis=2)
         return jacobian.reshape(-1, 7)[:, :unknowns]
 
@@ -224,17 +228,17 @@ def _corners(
     return Block(residuals, linearize, slice(0, unknowns), CORNERS)
 
 
-def _error(view: LocatedView, solution: JointSolution, placing: RigidTransform) -> float:
+def _error(view: LocatedView, solution: JointSolution, root_from_board: RigidTransform) -> float:
     camera_from_root = solution.root_from_camera[view.pair].inverse()
-    camera_from_board = camera_from_root @ placing
-    seen = solution.cameras[view.pair].project(camera_from_board.apply(view.points))
-    return rms_length(seen - view.pixels)
+    camera_from_board = camera_from_root @ root_from_board
+    projected = solution.cameras[view.pair].project(camera_from_board.apply(view.points))
+    return rms_length(projected - view.pixels)
 
 
-def _placing(group: Sequence[LocatedView], solution: JointSolution) -> RigidTransform:
-    """Pose of the views' board; if none took part in the solve, the first view's own."""
-    own = solution.root_from_camera[group[0].pair] @ group[0].camera_from_board
-    return solution.root_from_board.get(group[0].target, own)
+def _board_pose(group: Sequence[LocatedView], solution: JointSolution) -> RigidTransform:
+    """Pose of the views' board; if none took part in the solve, that of the first view."""
+    root_from_view = solution.root_from_camera[group[0].pair] @ group[0].camera_from_board
+    return solution.root_from_board.get(group[0].target, root_from_view)
 
 
 def _names(views: Sequence[LocatedView]) -> str:
@@ -276,7 +280,7 @@ def solve_consistently(
     for turn in range(ROUNDS):
         kept = at.kept(views)
         solved = refine_solution(
-            kept, _boards_of(kept, at.solution), root=root, refine_cameras=refine_cameras
+            kept, _with_boards_of(kept, at.solution), root=root, refine_cameras=refine_cameras
         )
         found = find_inconsistent_views(views, solved, limit_px)
         now = frozenset(view.key for view in found.wrong)
@@ -290,12 +294,12 @@ def solve_consistently(
     return at
 
 
-def _boards_of(views: Sequence[LocatedView], solution: JointSolution) -> JointSolution:
+def _with_boards_of(views: Sequence[LocatedView], solution: JointSolution) -> JointSolution:
     """The solution with poses of exactly those boards that the views show."""
-    own = {
+    poses = {
         view.target: solution.root_from_camera[view.pair] @ view.camera_from_board for view in views
     }
     return replace(
         solution,
-        root_from_board={k: solution.root_from_board.get(k, start) for k, start in own.items()},
+        root_from_board={k: solution.root_from_board.get(k, start) for k, start in poses.items()},
     )

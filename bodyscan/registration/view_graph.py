@@ -18,11 +18,11 @@ from bodyscan.geometry.transforms import RigidTransform
 
 AGREEMENT = 0.04
 """Poses that differ by this share of the usual distance of boards agree: the graph is rough."""
-FEWEST_VOTES = 3
-FEWEST_APART = 3
+MIN_VOTES = 3
+MIN_CONFLICTING = 3
 """shots: among this many, taken together, two agree, whichever end they are numbered from."""
 BOARD_REACH = 0.3
-MOST_CANDIDATES = 12
+MAX_CANDIDATES = 12
 
 Target = tuple[str, str]
 Group = dict[str, RigidTransform]
@@ -59,8 +59,8 @@ class RelativePose:
         on another: with this pose the rest turn out to fit more closely than the graph can tell, or
         to be wrong.
         """
-        most = self.votes > self.rivals and 2 * self.votes > len(self.targets)
-        return most or (self.votes >= FEWEST_VOTES and self.rivals <= 1)
+        majority = self.votes > self.rivals and 2 * self.votes > len(self.targets)
+        return majority or (self.votes >= MIN_VOTES and self.rivals <= 1)
 
     @property
     def strength(self) -> tuple[bool, int, int]:
@@ -92,7 +92,7 @@ def initial_poses(
     of which no two agree.
     """
     _refuse_disconnected(view_graph(views, pairs))
-    targets, reach = by_target(views), _usual_distance(views)
+    targets, reach = by_target(views), _median_distance(views)
     groups: list[Group] = [{name: RigidTransform.identity()} for name in pairs]
     ties: dict[tuple[int, int], RelativePose | None] = {}
     while len(groups) > 1:
@@ -104,9 +104,10 @@ def initial_poses(
         if not best.decided:
             if any(tie.ambiguous for tie in found.values()):
                 raise _open_tie(groups[i], groups[j], best)
-            return _most(groups, best)
+            return _keep_majority(groups, best)
         merged = groups[i] | {
-            name: best.first_from_second @ placing for name, placing in groups[j].items()
+            name: best.first_from_second @ group_from_camera
+            for name, group_from_camera in groups[j].items()
         }
         kept = [k for k in range(len(groups)) if k not in (i, j)]
         ties = {
@@ -127,7 +128,7 @@ def describe_unsynchronised(names: Iterable[str]) -> str:
     )
 
 
-def _most(groups: Sequence[Group], best: RelativePose) -> tuple[Group, dict[str, str]]:
+def _keep_majority(groups: Sequence[Group], best: RelativePose) -> tuple[Group, dict[str, str]]:
     """The group with most pairs, if it has more than half of them; the others are left out."""
     largest = max(groups, key=len)
     others = sorted(name for group in groups if group is not largest for name in group)
@@ -149,53 +150,56 @@ def locate_boards_jointly(
     """
     kept: list[LocatedView] = []
     boards: dict[Target, RigidTransform] = {}
-    doubtful: set[Target] = set()
-    reach = _usual_distance(views)
+    inconsistent: set[Target] = set()
+    reach = _median_distance(views)
     for target, group in by_target(views).items():
-        placing = _agreed_placing(group, root_from_camera, reach)
-        boards[target] = placing
+        root_from_board = _find_supported_pose(group, root_from_camera, reach)
+        boards[target] = root_from_board
         for view in group:
-            readings = _readings(view, root_from_camera, placing, reach)
+            readings = _readings(view, root_from_camera, root_from_board, reach)
             gap, resolved = min(readings, key=itemgetter(0))
             kept.append(resolved)
             if gap > 2.0 * AGREEMENT * reach:
-                doubtful.add(target)
-    return kept, boards, doubtful
+                inconsistent.add(target)
+    return kept, boards, inconsistent
 
 
 def _readings(
     view: LocatedView,
     root_from_camera: Mapping[str, RigidTransform],
-    placing: RigidTransform,
+    root_from_board: RigidTransform,
     reach: float,
 ) -> list[tuple[float, LocatedView]]:
     """Every numbering of a view's board, with its distance (mm) from a given pose."""
     readings = [view.resolve(choice) for choice in view.alternatives]
     root = root_from_camera[view.pair]
     return [
-        (max_displacement_mm(root @ one.camera_from_board, placing, BOARD_REACH * reach), one)
+        (
+            max_displacement_mm(root @ one.camera_from_board, root_from_board, BOARD_REACH * reach),
+            one,
+        )
         for one in readings
     ]
 
 
-def _agreed_placing(
+def _find_supported_pose(
     group: Sequence[LocatedView], root_from_camera: Mapping[str, RigidTransform], reach: float
 ) -> RigidTransform:
     """The pose of a board that most corners of its views support."""
     candidates = [root_from_camera[view.pair] @ view.camera_from_board for view in group]
 
-    def support(placing: RigidTransform) -> int:
+    def support(root_from_board: RigidTransform) -> int:
         return sum(
             len(view.pixels)
             for view in group
-            if min(gap for gap, _ in _readings(view, root_from_camera, placing, reach))
+            if min(gap for gap, _ in _readings(view, root_from_camera, root_from_board, reach))
             < AGREEMENT * reach
         )
 
     return max(candidates, key=support)
 
 
-def _usual_distance(views: Sequence[LocatedView]) -> float:
+def _median_distance(views: Sequence[LocatedView]) -> float:
     """Usual distance of boards from cameras, mm: the unit of all agreement, because the squares of
     a board may be given in any unit."""
     distances = [float(np.linalg.norm(view.camera_from_board.translation)) for view in views]
@@ -217,9 +221,9 @@ def _tie(
     proposals: dict[Target, list[RigidTransform]] = {}
     corners: dict[Target, int] = {}
     ambiguous = False
-    for target, seen in targets.items():
-        a = max((v for v in seen if v.pair in first), key=_size, default=None)
-        b = max((v for v in seen if v.pair in second), key=_size, default=None)
+    for target, views in targets.items():
+        a = max((v for v in views if v.pair in first), key=_size, default=None)
+        b = max((v for v in views if v.pair in second), key=_size, default=None)
         if a is None or b is None:
             continue
         to_board = first[a.pair] @ a.camera_from_board
@@ -232,7 +236,7 @@ def _tie(
         return None
     everything = [p for proposal in proposals.values() for p in proposal]
     owner = np.repeat(np.arange(len(proposals)), [len(p) for p in proposals.values()])
-    clearest = sorted(proposals, key=lambda target: -corners[target])[:MOST_CANDIDATES]
+    clearest = sorted(proposals, key=lambda target: -corners[target])[:MAX_CANDIDATES]
     candidates = [p for target in clearest for p in proposals[target]]
     gaps = np.array([_gaps(candidate, everything, reach) for candidate in candidates])
     voters = [np.unique(owner[gap < 2.0 * AGREEMENT * reach]) for gap in gaps]
@@ -284,7 +288,7 @@ def _open_tie(first: Group, second: Group, tie: RelativePose) -> RigDisconnected
         "board, or one whose columns and rows differ in parity"
     )
     found = f"shots {_shots(tie.targets)}"
-    if tie.votes == 1 and len(tie.targets) >= FEWEST_APART:
+    if tie.votes == 1 and len(tie.targets) >= MIN_CONFLICTING:
         return RigDisconnected(
             f"no two shots agree on the relative pose of {', '.join(sorted(first))} and "
             f"{', '.join(sorted(second))}, whichever end their board is numbered from ({found})",

@@ -19,7 +19,7 @@ from bodyscan.registration.advice import (
     advise,
     minimum_spanning_links,
 )
-from bodyscan.registration.more_shots import MOST_SHOTS, BoardCandidate, SigmaReduction
+from bodyscan.registration.more_shots import MAX_SHOTS, BoardCandidate, SigmaReduction
 
 
 def more(**changes: Any) -> ShotSuggestion:
@@ -46,12 +46,12 @@ def test_what_alone_ties_a_rig_together_is_told_first() -> None:
     assert advice(
         Link("a", "b", 1, 0.2), Link("a", "c", 4, 0.1), weak=(Link("c", "d", 2, 0.9),)
     ) == [
-        "1 shot in common is all that ties a to b, and with them the parts of the rig on either side",
-        "4 shots in common is all that ties a to c, and with them the parts of the rig on either side",
-        "without any one of these shots the rig would fall apart: s1 (b), s4 (b)",
-        "weak link: d is known to 0.900 mm from c (2 shots in common), and no other link ties their "
-        "sides better",
-        "d is known least in the rig frame: sigma 0.312 mm",
+        "a and b, with 1 shot in common, are the only link between two parts of the rig",
+        "a and c, with 4 shots in common, are the only link between two parts of the rig",
+        "without any one of these shots the rig is disconnected: s1 (b), s4 (b)",
+        "weak link: sigma of d relative to c is 0.900 mm (2 shots in common), and no other link "
+        "between their parts is better",
+        "d has the largest sigma in the rig frame: 0.312 mm",
     ]
     assert len(advice()) == 1
 
@@ -70,7 +70,7 @@ def test_further_shots_are_told_with_where_to_hold_the_board() -> None:
     assert said(shots=1).startswith("1 more shot seen")
     assert said(after_mm=0.4).startswith("3 more shots seen")  # four fifths is worth it
     assert said(after_mm=0.401) == (
-        "further shots of this board would not help a much: 3 more bring its sigma from 0.500 to "
+        "further shots of this board would improve a little: 3 more reduce its sigma from 0.500 to "
         "0.401 mm"
     )
 
@@ -118,12 +118,12 @@ def test_a_sigma_is_halved_where_its_variance_is_a_quarter() -> None:
 
 def test_fewest_shots_are_preferred_and_then_what_gains_most() -> None:
     def gained(*after: float) -> SigmaReduction:
-        rest = [after[-1]] * (MOST_SHOTS - len(after))
+        rest = [after[-1]] * (MAX_SHOTS - len(after))
         return SigmaReduction(1.0, np.array([*after, *rest]))
 
     two, three = gained(0.5, 0.2), gained(0.5, 0.3, 0.2)
     sharper, never, hardly = gained(0.5, 0.1), gained(0.4), gained(0.9)
-    last = SigmaReduction(1.0, np.array([0.9] * (MOST_SHOTS - 1) + [0.2]))
+    last = SigmaReduction(1.0, np.array([0.9] * (MAX_SHOTS - 1) + [0.2]))
     order = sorted([hardly, three, last, never, two, sharper], key=_preference)
     assert order == [sharper, two, three, last, never, hardly]
 

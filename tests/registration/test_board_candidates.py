@@ -12,7 +12,7 @@ from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.more_shots import (
-    _tilted,
+    _tilted_poses,
     _views,
     candidate_azimuths,
     propose_board_poses,
@@ -40,7 +40,7 @@ def seen(pose: RigidTransform, board: Board = BOARD, **placed: RigidTransform) -
 
 def facing(azimuth_deg: float, board: Board = BOARD, centre: Any = FACE) -> list[RigidTransform]:
     at = np.radians(azimuth_deg)
-    return list(_tilted(board, np.array(centre), np.array([np.cos(at), np.sin(at), 0.0])))
+    return list(_tilted_poses(board, np.array(centre), np.array([np.cos(at), np.sin(at), 0.0])))
 
 
 def test_boards_face_halfway_between_any_two_cameras_in_steps_of_15_degrees() -> None:

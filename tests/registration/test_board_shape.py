@@ -12,7 +12,7 @@ from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import LocatedView, PlanarView
 from bodyscan.calibration.camera import locate_board
 from bodyscan.outcome import Outcome
-from bodyscan.registration.board_shape import BoardShape, _gain_per_unknown, _said
+from bodyscan.registration.board_shape import BoardShape, _describe, _gain_per_unknown
 from bodyscan.registration.joint_solve import JointSolution
 from bodyscan.registration.rig_solve import RigSolution, solve_rig
 
@@ -92,10 +92,10 @@ def test_a_flat_board_is_left_alone(
     assert not flat.notes
 
 
-def test_nothing_is_not_said_with_a_minus() -> None:
+def test_nothing_is_not_describe_with_a_minus() -> None:
     points = np.array([[0.0, 0, 0], [100.0, 0, 0], [0.0, 80, 0], [100.0, 80, 0]])
     shape = BoardShape(points, points * [-1e-7, 0.0, 0.0])
-    assert " +0.00 per mille wider than high" in _said("b", shape)
+    assert " +0.00 per mille wider than high" in _describe("b", shape)
 
 
 @pytest.mark.parametrize("noise_px", [0.01, 0.03, 0.3])

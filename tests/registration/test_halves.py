@@ -16,8 +16,8 @@ from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.registration import halves
 from bodyscan.registration.halves import (
     _centre_sigmas,
-    _over_expected,
-    _without_common_motion,
+    _common_motion_projector,
+    _normalized_rms,
     compare_halves,
     split_shots,
 )
@@ -98,7 +98,7 @@ def test_a_pair_that_a_half_does_not_tell_of_is_left_out_and_named() -> None:
     own = sorted({view.shot for view in placed.views if view.pair == "p3-1"})
     few = tuple(v for v in placed.views if v.pair != "p3-1" or v.shot in own[:5])
     found = compare_halves(rig, replace(placed, views=few))
-    assert found.apart == ("p3-1",)
+    assert found.excluded == ("p3-1",)
     assert "p3-1" not in found.names
     assert len(found.names) == 5
     assert "without p3-1, not known from a half" in found.summary
@@ -121,7 +121,7 @@ def test_a_pair_that_does_not_fit_in_a_half_is_left_out_and_named() -> None:
         moved(view) if view.pair == "p2-2" and view.shot in first else view for view in placed.views
     )
     found = compare_halves(rig, replace(placed, views=views))
-    assert found.apart == ("p2-2",)
+    assert found.excluded == ("p2-2",)
     # Of the other pairs, 30 differences that are not quite independent: 1 +- 0.15 at least.
     assert 0.65 < found.over_expected < 1.4
 
@@ -202,12 +202,12 @@ def test_halves_that_know_the_rig_five_times_worse_say_nothing_of_the_whole(
 def test_differences_are_counted_in_sigmas_with_their_correlation() -> None:
     """Two that go together by four fifths: 1 and -1 sigma is as far as five sigmas of variance 1."""
     together = np.array([[1.0, 1.6], [1.6, 4.0]])
-    assert _over_expected(np.array([1.0, -2.0]), together) == pytest.approx(np.sqrt(5.0))
-    assert _over_expected(np.array([-1.0, 2.0]), together) == pytest.approx(np.sqrt(5.0))
+    assert _normalized_rms(np.array([1.0, -2.0]), together) == pytest.approx(np.sqrt(5.0))
+    assert _normalized_rms(np.array([-1.0, 2.0]), together) == pytest.approx(np.sqrt(5.0))
     # (1, 1) sigmas have a square of 2 / 1.8 in the direction that has it all, of two.
-    assert _over_expected(np.array([1.0, 2.0]), together) == pytest.approx(np.sqrt(1.0 / 1.8))
+    assert _normalized_rms(np.array([1.0, 2.0]), together) == pytest.approx(np.sqrt(1.0 / 1.8))
     # What the frame took out, here their difference, counts neither way.
-    assert _over_expected(np.array([3.0, 1.0]), np.ones((2, 2))) == pytest.approx(2.0)
+    assert _normalized_rms(np.array([3.0, 1.0]), np.ones((2, 2))) == pytest.approx(2.0)
 
 
 def test_the_frame_taken_out_of_many_pairs_leaves_the_rounding_of_their_largest_variance() -> None:
@@ -216,7 +216,7 @@ def test_the_frame_taken_out_of_many_pairs_leaves_the_rounding_of_their_largest_
     together = (1.0 - 1e-8) * np.ones((40, 40)) + 1e-8 * np.eye(40)
     alike, apart = np.ones(40), np.zeros(40)
     apart[:2] = 1e-3, -1e-3
-    assert _over_expected(alike + apart, together) == pytest.approx(1.0, rel=1e-6)
+    assert _normalized_rms(alike + apart, together) == pytest.approx(1.0, rel=1e-6)
 
 
 def test_a_centres_sigma_is_that_of_its_shift_and_of_the_turn_about_the_origin() -> None:
@@ -233,8 +233,8 @@ def test_what_all_pairs_do_alike_is_taken_out_and_half_of_what_one_of_two_does()
     ahead = -centres / np.linalg.norm(centres, axis=1)[:, None]
     alike = np.tile([1e-3, -2e-3, 5e-4, 0.3, -0.2, 0.1], 2)
     # Of motions up to 0.3, solved to rounding.
-    np.testing.assert_allclose(_without_common_motion(centres, ahead) @ alike, 0.0, atol=1e-12)
+    np.testing.assert_allclose(_common_motion_projector(centres, ahead) @ alike, 0.0, atol=1e-12)
     # Twins in either place, of which one moves and the other does not.
-    keep = _without_common_motion(centres[[0, 0, 1, 1]], ahead[[0, 0, 1, 1]])
+    keep = _common_motion_projector(centres[[0, 0, 1, 1]], ahead[[0, 0, 1, 1]])
     moves = np.kron([1.0, 0.0, 1.0, 0.0], alike[:6])
     np.testing.assert_allclose(keep @ moves, moves - 0.5 * np.tile(alike, 2), atol=1e-12)

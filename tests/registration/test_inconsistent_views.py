@@ -12,7 +12,7 @@ from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.joint_solve import JointSolution
 from bodyscan.registration.view_consistency import (
     InconsistentViews,
-    _placing,
+    _board_pose,
     find_inconsistent_views,
     single_view_errors,
 )
@@ -57,7 +57,7 @@ def test_views_that_agree_are_all_right() -> None:
 def test_a_board_that_stood_elsewhere_for_one_camera_costs_that_view() -> None:
     found = judged(*(view(pair, aside_mm=5.0 if pair == "c" else 0.0) for pair in "abcd"))
     assert [one.pair for one in found.wrong] == ["c"]
-    assert "shot s1: board board stood elsewhere when c saw it" in found.notes[0]
+    assert "shot s1: the pose of board board differs for c" in found.notes[0]
     # A tenth of a millimetre is a tenth of a pixel.
     assert not judged(*(view(pair, aside_mm=0.1 if pair == "c" else 0.0) for pair in "abcd")).wrong
 
@@ -73,7 +73,7 @@ def test_a_board_with_other_squares_is_another_board(size: float) -> None:
     views = [view(pair, size=size) for pair in "abcd"]
     found = judged(*views)
     assert len(found.wrong) == 4
-    assert f"has squares {size:.3f} times as large: another board?" in found.notes[0]
+    assert f"are {size:.3f} times as large as described" in found.notes[0]
     ((name, seen),) = found.sizes
     assert name == "board"
     assert seen == pytest.approx(size, abs=1e-3)
@@ -84,7 +84,7 @@ def test_squares_off_by_less_than_half_a_percent_are_of_no_other_board() -> None
     found = judged(*(view(pair, size=1.004) for pair in "abcd"), limit_px=0.1)
     assert found.sizes == ()
     assert "another board" not in " ".join(found.notes)
-    assert "stood elsewhere" in found.notes[0]
+    assert "differs for" in found.notes[0]
 
 
 def test_the_same_other_size_in_three_shots_is_the_boards() -> None:
@@ -96,7 +96,7 @@ def test_the_same_other_size_in_three_shots_is_the_boards() -> None:
 
 def test_a_board_that_took_no_part_is_where_the_first_view_has_it() -> None:
     seen = [view("b", aside_mm=3.0), view("a")]
-    none = _placing(seen, JointSolution(PLACED, {}, CAMERAS))
+    none = _board_pose(seen, JointSolution(PLACED, {}, CAMERAS))
     moved = RigidTransform(np.eye(3), np.array([1.8, 2.4, 0.0])) @ BOARD
     np.testing.assert_allclose(none.matrix, moved.matrix, atol=1e-9)
-    assert _placing(seen, JointSolution(PLACED, {("s1", "board"): BOARD}, CAMERAS)) is BOARD
+    assert _board_pose(seen, JointSolution(PLACED, {("s1", "board"): BOARD}, CAMERAS)) is BOARD

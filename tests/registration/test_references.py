@@ -15,12 +15,12 @@ from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.registration.references import (
     Size,
-    _along,
-    _between,
-    _mean,
+    _average,
+    _format_size,
+    _measure_board,
+    _measure_separation,
     _Middle,
     _Reading,
-    _words,
     board_length,
     find_rig_size,
     rescale_boards,
@@ -167,8 +167,8 @@ def test_boards_of_references_do_not_place_the_rig() -> None:
 
 
 def test_a_size_is_told_in_per_cent_with_its_sigma() -> None:
-    assert _words(Size(1.00123, 0.00045)) == "+0.123 % (sigma 0.045 %)"
-    assert _words(Size(0.998, 0.0002)) == "-0.200 % (sigma 0.020 %)"
+    assert _format_size(Size(1.00123, 0.00045)) == "+0.123 % (sigma 0.045 %)"
+    assert _format_size(Size(0.998, 0.0002)) == "-0.200 % (sigma 0.020 %)"
 
 
 PLAIN = Board(name="plain", columns=12, rows=11, square_mm=30)
@@ -195,9 +195,9 @@ def test_the_less_of_a_board_was_seen_the_farther_off_its_middle_may_be() -> Non
             _Middle.of(PLAIN, FEW, layout + [x, 0, 0] + own)
             for x, own in zip((0, 500), noise, strict=True)
         ]
-        lengths.append(_between(both, 1.0).length_mm)
-        sigmas.append(_between(both, 1.0).sigma_mm)
-        worse.append(_between(both, 4.0).sigma_mm)
+        lengths.append(_measure_separation(both, 1.0).length_mm)
+        sigmas.append(_measure_separation(both, 1.0).sigma_mm)
+        worse.append(_measure_separation(both, 4.0).sigma_mm)
     assert np.mean(lengths) == pytest.approx(500.0, abs=0.02)
     # A fit takes 1 / 15 of the residuals' variance by its shift, and a quarter of that by its turn; the
     # spread of 600 draws is known to 3 %.
@@ -210,7 +210,7 @@ def test_the_length_of_one_board_is_as_uncertain_as_its_corners_make_it() -> Non
     layout, rng, every = corner_points(PLAIN), np.random.default_rng(0), np.arange(110)
     read = [
         [
-            _along(PLAIN, every, layout + noise, variance_inflation)
+            _measure_board(PLAIN, every, layout + noise, variance_inflation)
             for variance_inflation in (1.0, 4.0)
         ]
         for noise in rng.normal(0.0, 0.05, (300, 110, 3))
@@ -228,12 +228,12 @@ def test_shots_that_scatter_by_more_than_their_sigmas_make_a_mean_as_uncertain_a
 ):
     lengths = 400.0 + np.array([0.3, -0.2, 0.1, -0.4, 0.2])
     for sigma, expected in ((0.01, np.std(lengths, ddof=1)), (0.9, 0.9)):
-        mean, own = _mean([_Reading(length, sigma) for length in lengths])
+        mean, own = _average([_Reading(length, sigma) for length in lengths])
         assert mean == pytest.approx(np.mean(lengths))
         assert own == pytest.approx(expected / np.sqrt(5.0))
     # The better one counts more, by the square of their sigmas; one alone is as good as it says.
-    assert _mean([_Reading(400.0, 0.1), _Reading(400.01, 0.2)])[0] == pytest.approx(400.002)
-    assert _mean([_Reading(400.0, 0.1)]) == pytest.approx((400.0, 0.1))
+    assert _average([_Reading(400.0, 0.1), _Reading(400.01, 0.2)])[0] == pytest.approx(400.002)
+    assert _average([_Reading(400.0, 0.1)]) == pytest.approx((400.0, 0.1))
 
 
 @pytest.mark.parametrize(("sigmas", "refused"), [(3.9, False), (4.1, True)])
