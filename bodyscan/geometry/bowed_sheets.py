@@ -34,8 +34,6 @@ PLANE_SPREAD = (1.0, 0.03, 0.03)
 BOW_SPREAD = (0.1, 0.03, 0.03)
 """Standard deviations, before any data, of p, q, r and of b2, b3, ...: coefficient m of a
 polynomial is expected to be FALL times as large as coefficient m - 1."""
-ASIDE = 0.3
-"""Standard deviation of the boards' middle along the stripes, as a share of its distance."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +87,8 @@ class BowedSheets(SmoothSheets):
         spread += [size * late for size in BOW_SPREAD[: self.bow_terms]]
         deviation = self.parameters
         if self.bow_terms:
-            spread.append(np.array([ASIDE * self.distance_mm]))
+            # The boards' middle along the stripes is known to 30 % of its distance.
+            spread.append(np.array([0.3 * self.distance_mm]))
             middle = self.projector_from_camera.apply(self.middle)[0]
             deviation = np.append(deviation[:-1], middle + deviation[-1])
         size = np.concatenate(spread)
@@ -145,7 +144,6 @@ class BowedSheets(SmoothSheets):
 
 
 NODES_PER_STRIPE = 8
-NEWTON_STEPS = 5
 EXACT, CONVERGED = 1e-7, 1e-6  # relative: the next step would be about the square of the last
 
 
@@ -250,7 +248,7 @@ def _depth(frame: Array, row: Array, terms: int, x: float, y: float) -> tuple[fl
     if terms == 3:
         return depth, rise
     step = slope = np.nan
-    for _ in range(NEWTON_STEPS):
+    for _ in range(5):
         shift = depth * along + aside
         ratio = shift / (depth * forward + behind)
         value, slope, power = depth * rise + start, rise, ratio

@@ -18,7 +18,6 @@ MATRIX = ("alpha", "beta", "gamma", "u0", "v0")
 MATRIX_PRIOR_PX = (50.0, 50.0, 5.0, 50.0, 50.0)
 """Standard deviations of A's entries before the rig's own shots: at worst, what the few boards of
 one pair leave open."""
-MATRIX_STEP_PX = 1e-2
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +74,7 @@ class Camera:
     @property
     def difference_steps(self) -> Array:
         """Parameter steps (P,) for numerical derivatives."""
-        return np.array([*[MATRIX_STEP_PX] * len(MATRIX), *self.lens.difference_steps])
+        return np.array([*[1e-2] * len(MATRIX), *self.lens.difference_steps])
 
     def retract(self, step: Array) -> Camera:
         """The camera after a step (P,) is added to its parameters."""

@@ -13,8 +13,6 @@ from bodyscan.compiled import compiled
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.quadratic_table import QuadraticTable, Table
 
-TOLERANCE_PX = 1e-4
-"""A five-hundredth of the precision to which corners and boundaries are found."""
 CELLS_PX = (32, 16, 8)
 """Cell widths; the widest that keeps the tolerance is used. The first is enough for a scanner's
 lens; the last holds one that nearly folds within its image to about 1e-3 px."""
@@ -68,7 +66,8 @@ def _within_tolerance(
     for cell in CELLS_PX:
         cells = -(-camera.width // cell), -(-camera.height // cell)
         found = QuadraticTable.fit(function, low, high, cells, outside)
-        if found.error * px_per_unit < TOLERANCE_PX:
+        # A five-hundredth of the precision to which corners and boundaries are found.
+        if found.error * px_per_unit < 1e-4:
             break
     return found.table
 

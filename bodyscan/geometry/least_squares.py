@@ -29,8 +29,6 @@ from bodyscan.geometry.robust import cauchy_cost, cauchy_weights, robust_scale
 Columns = Indices | slice
 State = TypeVar("State")
 
-TRIES = 10
-"""How often the damping is raised before a step is given up; by then nothing moves any more."""
 FASTER, SLOWER = 10.0, 10.0
 """A step that lowers the cost divides the damping by the first; one that does not multiplies it by
 the second."""
@@ -198,7 +196,8 @@ def minimize(
         cost = _cost(blocks, blocks, scales)
         normal, gradient = _equations(blocks, weights, scales, unknowns)
         promised = 0.0
-        for attempt in range(TRIES):
+        # After ten increases of the damping nothing moves any more.
+        for attempt in range(10):
             step = -solve_scaled(normal, gradient, damping)
             promised = promised if attempt else -float(step @ gradient)
             candidate = retract(state, step)

@@ -159,7 +159,6 @@ def _frame_and_scale(above: Array, below: Array, x: float) -> tuple[RigidTransfo
 
 Vector = tuple[float, float, float]
 
-NEWTON_STEPS = 5
 EXACT, CONVERGED = 1e-7, 1e-6  # relative: the next step would be about the square of the last
 
 
@@ -243,7 +242,7 @@ def _depth(frame: Array, lens: Array, distance: float, x: float, y: float, s: fl
     if not 0.0 < depth < np.inf:
         depth = (distance - frame[2, 3]) / forward
     step = reach = rise = np.nan
-    for _ in range(NEWTON_STEPS):
+    for _ in range(5):
         seen = _seen(frame, x * depth, y * depth, depth)
         bent = _bent(lens, seen[0], seen[1])
         reach, rise, off = seen[2], bent[2], lens[0] * bent[0] + lens[1] - s

@@ -65,7 +65,6 @@ boards a smooth model only guesses."""
 GUESSED = 3.0
 """A depth is a guess if it is this many times as uncertain as amid the boards. What a few boards
 leave open of all depths alike is in their sigma and is no guess."""
-SAMPLES = 400
 BAND = 16  # rows at a time: what fits into a processor's cache
 
 
@@ -120,7 +119,7 @@ def measure_stripe_residual(
 def _sampled(s: Floats, wanted: Mask) -> tuple[Array, Array]:
     """Some of the pixels wanted, (N, 2), and their s (N,)."""
     every = np.flatnonzero(wanted)
-    some = every[:: max(len(every) // SAMPLES, 1)]
+    some = every[:: max(len(every) // 400, 1)]
     rows, columns = np.unravel_index(some, s.shape)
     return np.column_stack([columns, rows]).astype(float), s.ravel()[some].astype(float)
 

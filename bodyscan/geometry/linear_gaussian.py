@@ -42,8 +42,11 @@ class LinearGaussianSystem:
 
         jacobian: (..., N, P). observed, weights: (..., N).
         """
-        weighted = np.swapaxes(jacobian * weights[..., None], -1, -2)
-        return LinearGaussianSystem(weighted @ jacobian, (weighted @ observed[..., None])[..., 0])
+        weighted = jacobian * weights[..., None]
+        return LinearGaussianSystem(
+            np.swapaxes(jacobian, -1, -2) @ weighted,
+            (np.swapaxes(weighted, -1, -2) @ observed[..., None])[..., 0],
+        )
 
     @staticmethod
     def from_prior(information: Array) -> LinearGaussianSystem:

@@ -15,9 +15,6 @@ from bodyscan.geometry.lenses import lens_from_opencv
 from bodyscan.geometry.light_planes import Axis
 from bodyscan.geometry.transforms import RigidTransform
 
-DISTANCE = 5.0
-"""Where a camera and a projector whose axes do not meet are assumed to look, in baselines."""
-
 
 def sheets_from_projector(
     projector: Camera,
@@ -98,7 +95,8 @@ def intersect_central_rays(
     if abs(np.linalg.det(normal)) > 1e-6:
         depth, reach = np.linalg.solve(normal, np.array([ray @ start, light @ start]))
     meets = min(depth, reach) > 0.5 * baseline
-    return np.asarray(ray * (depth if meets else DISTANCE * baseline), float)
+    # If the axes do not meet, the view is assumed to be five baselines away.
+    return np.asarray(ray * (depth if meets else 5.0 * baseline), float)
 
 
 def _across(projector: Camera, direction: Axis) -> tuple[Array, float, int]:

@@ -20,7 +20,6 @@ from bodyscan.geometry.transforms import RigidTransform
 Sheets = TypeVar("Sheets", bound="SmoothSheets")
 
 NEWTON_STEPS = 5
-EXACT, CONVERGED = 1e-11, 1e-6
 CHUNK = 1 << 17
 
 
@@ -152,7 +151,7 @@ class SmoothSheets(ABC):
                 slope = np.sum(offset.by_point * rays, axis=-1) * offset.reach
                 step = offset.value * offset.reach / (slope + offset.value * forward)
                 depth = depth - step
-                if not np.any(np.abs(step) > EXACT * np.abs(depth)):
+                if not np.any(np.abs(step) > 1e-11 * np.abs(depth)):
                     break
-            good = (np.abs(step) < CONVERGED * depth) & (offset.reach > 0.0)
+            good = (np.abs(step) < 1e-6 * depth) & (offset.reach > 0.0)
             return np.where(good & (s >= 0.0) & (s <= self.stripes), depth, np.nan)

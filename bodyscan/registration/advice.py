@@ -24,11 +24,6 @@ from bodyscan.registration.rig_solve import RigSolution
 from bodyscan.registration.view_graph import Target, view_graph
 from bodyscan.rig.rig import Rig
 
-WORTH = 0.8
-"""Further shots that leave more than this share of a sigma are not worth taking."""
-WEAK_TIMES = 2.0
-"""A link is weak if its sigma is this many times the usual one of the best chain."""
-
 
 @dataclass(frozen=True)
 class Link:
@@ -120,11 +115,12 @@ def advise(rig: Rig, solution: RigSolution) -> Advice:
         for name, t in solution.rig_from_camera.items()
     }
     worst = max(sorted(sigmas), key=lambda name: sigmas[name])
+    # A link is weak at twice the median sigma of the chain.
     return Advice(
         links,
         chain,
         tuple(link for link in links if {link.first, link.second} in bridging),
-        tuple(link for link in chain if link.sigma_mm > WEAK_TIMES * median),
+        tuple(link for link in chain if link.sigma_mm > 2.0 * median),
         find_articulation_shots(solution),
         worst,
         sigmas[worst],
@@ -244,7 +240,8 @@ def _shots(count: int) -> str:
 
 
 def _sentence(more: ShotSuggestion) -> str:
-    if more.after_mm > WORTH * more.before_mm:
+    # Not worth taking: they leave more than 80 % of the sigma.
+    if more.after_mm > 0.8 * more.before_mm:
         return (
             f"further shots of this board would improve {more.pair} little: {more.shots} more reduce "
             f"its sigma from {more.before_mm:.3f} to {more.after_mm:.3f} mm"

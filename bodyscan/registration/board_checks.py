@@ -12,9 +12,6 @@ from bodyscan.boards.view import BoardView
 from bodyscan.rig.board import Board
 from bodyscan.rig.rig import Rig
 
-SELDOM = 0.5
-"""Boards are doubted if fewer of their corners are found in the usual view, and no pose fits."""
-
 
 def describe_board(board: Board) -> str:
     """The board as the rig file describes it, for a message."""
@@ -45,20 +42,17 @@ def describe_findings(rig: Rig, views: Sequence[BoardView], images: int) -> str:
             len(view.pixels) / corners_per_face(board) for view in views if view.board == board.name
         ]
         if shares:
+            # The description may be wrong if the median view shows less than half of the corners.
             lines.append(
                 f"{describe_board(board)} was found in {len(shares)} of {images} images, with "
                 f"{100 * float(np.median(shares)):.0f} % of its corners in the median view"
                 + (
                     ": its columns, rows or square_mm in the rig file may not be those of the board"
-                    if np.median(shares) < SELDOM
+                    if np.median(shares) < 0.5
                     else ""
                 )
             )
     return "\n  ".join(lines)
-
-
-LEAST_VIEWS = 3
-"""Views in which the neighbouring line must be seen before a last line never seen is doubted."""
 
 
 def drop_inconsistently_mirrored(views: Sequence[BoardView]) -> tuple[list[BoardView], list[str]]:
@@ -151,7 +145,8 @@ def _find_unobserved_lines(board: Board, views: Sequence[BoardView]) -> Iterator
             neighbour = (
                 counts_by_corner[used[-1]] if name == "row" else counts_by_corner[:, used[-1]]
             )
-            if missing and np.median(neighbour) >= LEAST_VIEWS:
+            # The line beside it must be in three views before a missing last line counts.
+            if missing and np.median(neighbour) >= 3:
                 lines = "line" if missing == 1 else f"{missing} lines"
                 yield (
                     f"board {board.name}: the last {lines} of corners along its {name}s was never "

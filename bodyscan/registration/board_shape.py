@@ -27,18 +27,9 @@ from bodyscan.registration.joint_solve import JointSolution
 from bodyscan.registration.normal_equations import CORNERS, FreeShape, view_sigmas
 from bodyscan.registration.view_consistency import fit_board
 
-ROUNDS = 30
-HASTE = 1.6
-"""Over-relaxation of the corner steps: cameras and poses follow the corners."""
-SETTLED = 2e-6
-"""RMS of a step, as a share of the board's diagonal: at twice that a stretch was found to 88 %."""
 PRIOR = 4e-3
 """Prior sigma of a corner's place, as a share of the board's diagonal (a millimetre in 250),
 because boards may be given in any unit."""
-SUSPECT = 1.25
-"""Offsets are examined if they lower the squared residuals by this many variances each: noise alone
-lowers them by one, and with 48 corners or more by 1.25 once in 700 times."""
-FEWEST_TARGETS = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +118,9 @@ def estimate_board_shapes(
     """Estimate board shapes if the residuals call for it; keep them if held-out boards agree."""
     plain = ShapedSolution(solution, list(views), {}, ())
     targets = sorted({view.target for view in views})
-    if len(targets) < FEWEST_TARGETS or _gain_per_unknown(views, solution) < SUSPECT:
+    # Each freed coordinate lowers the squared residuals by one variance by noise alone, and with
+    # 48 corners or more by 1.25 once in 700 times.
+    if len(targets) < 6 or _gain_per_unknown(views, solution) < 1.25:
         return plain
     held_out = _hold_out(views, solution, root, refine_cameras)
     shaped = _estimate(views, solution, root, refine_cameras)
@@ -189,10 +182,11 @@ def _estimate(
         }
     shaped = [apply_shape(view, shapes) for view in views]
     numbers = [shapes[view.board].numbers(view.points) for view in views]
-    for _ in range(ROUNDS):
+    for _ in range(30):
         steps = _corner_steps(shaped, numbers, shapes, solution, equal_noise)
+        # Over-relaxation of the corner steps: cameras and poses follow the corners.
         shapes = {
-            name: _without_motion(replace(shape, offsets=shape.offsets + HASTE * steps[name]))
+            name: _without_motion(replace(shape, offsets=shape.offsets + 1.6 * steps[name]))
             for name, shape in shapes.items()
         }
         shaped = [
@@ -203,7 +197,9 @@ def _estimate(
             shaped, solution, root=root, refine_cameras=refine_cameras, equal_noise=equal_noise
         )
         moved = (np.sqrt(np.mean(steps[name] ** 2)) / s.diagonal for name, s in shapes.items())
-        if max(moved) < SETTLED:
+        # RMS of a step, as a share of the board's diagonal: at twice that a stretch was found to
+        # 88 %.
+        if max(moved) < 2e-6:
             break
     return ShapedSolution(solution, shaped, shapes, ())
 

@@ -21,11 +21,6 @@ from bodyscan.geometry.least_squares import EXACT, Block, minimize
 from bodyscan.registration.joint_solve import JointSolution
 from bodyscan.registration.normal_equations import CORNERS, reprojection_errors, view_sigmas
 
-MOST_STEPS = 12
-SETTLED = 1e-3
-"""Convergence, in variances: before the last step all unknowns were within 0.03 standard deviations
-of the minimum; that step leaves a few thousandths."""
-
 
 def refine_solution(
     views: Sequence[LocatedView],
@@ -43,13 +38,15 @@ def refine_solution(
     of_pair = [
         [view for view in views if view.pair == name] for name in sorted({v.pair for v in views})
     ]
+    # Convergence, in variances: before the last step all unknowns were within 0.03 standard
+    # deviations of the minimum; that step leaves a few thousandths.
     return minimize(
         solution,
         lambda state: _blocks(of_pair, state, unknowns, equal_noise),
         unknowns.retract,
         unknowns=unknowns.count,
-        steps=MOST_STEPS,
-        tolerance=SETTLED,
+        steps=12,
+        tolerance=1e-3,
         damping=1e-9,
     ).state
 

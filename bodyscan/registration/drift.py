@@ -26,10 +26,6 @@ Group = tuple[str, tuple[str, ...]]
 
 SIGNIFICANT = 45.0
 """Chi-squared with six degrees of freedom exceeds this once in twenty million by chance."""
-LEAST_MM, LEAST_DEG = 0.1, 0.005
-"""Smaller moves, however significant, harm no scan."""
-MOST_STEPS = 10
-SETTLED = 1e-3  # of chi-squared, compared with SIGNIFICANT
 CORRELATED = 3.0
 """Corners of one view share errors of lens and detector: this many count as one."""
 
@@ -135,10 +131,11 @@ def find_drift(
             break
         moved.append(group)
         fit = best
+    # Moves below 0.1 mm and 0.005 degrees, however significant, harm no scan.
     moves = tuple(
         move
         for number, group in enumerate(moved)
-        if (move := state.move(group, fit, number)).shift_mm > LEAST_MM or move.turn_deg > LEAST_DEG
+        if (move := state.move(group, fit, number)).shift_mm > 0.1 or move.turn_deg > 0.005
     )
     freedoms = max(6 * (len(shared) - len(fit.rig_from_board)), 1)
     return Drift(
@@ -226,13 +223,14 @@ class _State:
             [RigidTransform.identity()] * len(groups),
             self.start_boards,
         )
+        # The tolerance is in units of chi-squared, of which SIGNIFICANT is 45.
         solution = minimize(
             start,
             lambda placings: self._blocks(groups, placings),
             _Unknowns.retract,
             unknowns=first_board + 6 * len(start.boards),
-            steps=MOST_STEPS,
-            tolerance=SETTLED,
+            steps=10,
+            tolerance=1e-3,
             damping=1e-9,
         )
         columns, found = slice(first_group, first_board), solution.state

@@ -20,16 +20,8 @@ from bodyscan.registration.view_graph import view_graph
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_frame import RigFrame
 
-REACH_MM = 1300.0
-"""Distance ahead of a camera at which its pose matters: about where the subject stands."""
-ATTEMPTS = 200
 MIN_BOARDS = 3
 """Fewest boards per camera in a half: fewer do not determine its lens and focal length."""
-TIMES_WHOLE = 5.0
-"""Limit on the expected difference of two halves, in sigmas of the whole. They should differ by
-twice that sigma, since each has half of the evidence and both err. Beyond the limit a half lacks
-something that holds the rig together, not only shots, and says nothing about the whole."""
-RANK_SHARE = 1e-9  # smaller eigenvalues are those of the frame, which was removed
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +90,9 @@ def compare_halves(rig: Rig, solution: RigSolution, *, seed: int = 0) -> HalvesC
     shifts = np.einsum("pij,pj->pi", twist_jacobian(centres), differences.reshape(-1, 6))
     sigmas = _centre_sigmas(covariance, centres)
     expected, whole = rms_length(sigmas), rms_length(_centre_sigmas(prior, centres))
-    if expected > TIMES_WHOLE * whole:
+    # Halves should differ by twice the sigma of the whole, since each has half of the information
+    # and both err. Far beyond that a half lacks a connection of the rig, not only shots.
+    if expected > 5.0 * whole:
         raise FailedWork(
             f"halves of the shots should differ by {expected:.2g} mm where all shots know the rig to "
             f"{whole:.2g} mm: too few boards, or too much alike, in a half",
@@ -120,7 +114,7 @@ def split_shots(
     shots = sorted({view.shot for view in views})
     rng = np.random.default_rng(seed)
     best: tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]] = ((), (), ())
-    for _ in range(ATTEMPTS):
+    for _ in range(200):
         order = [shots[k] for k in rng.permutation(len(shots))]
         halves = set(order[: len(order) // 2]), set(order[len(order) // 2 :])
         connected = _largest_connected(
@@ -197,7 +191,8 @@ def _common_motion_projector(centres: Array, ahead: Array) -> Array:
 
     Least squares over each camera's centre and the place it looks at.
     """
-    points = np.concatenate([centres, centres + REACH_MM * ahead])
+    # 1300 mm ahead of a camera is about where the subject stands.
+    points = np.concatenate([centres, centres + 1300.0 * ahead])
     jacobians = twist_jacobian(points).reshape(2, len(centres), 3, 6)
     weights = np.einsum("kpij,kpil->pjl", jacobians, jacobians)  # (P, 6, 6)
     common = np.linalg.solve(weights.sum(axis=0), np.concatenate(list(weights), axis=1))
@@ -208,6 +203,7 @@ def _normalized_rms(differences: Array, covariance: Array) -> float:
     """RMS of the differences in their standard deviations, with correlations."""
     scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
-    known = values > RANK_SHARE * values[-1]
+    # Smaller eigenvalues are those of the common motion, which was removed.
+    known = values > 1e-9 * values[-1]
     parts = vectors[:, known].T @ (differences / scale)
     return float(np.sqrt(np.mean(parts**2 / values[known])))

@@ -28,9 +28,6 @@ from bodyscan.rig.rig import Volume
 HEIGHTS_MM = {"knee": 500.0, "waist": 1000.0, "chest": 1350.0}
 # Shots at one place differ a little, as hand-held boards do: about x, y and the board's normal.
 TILTS_DEG = ((20.0, 0.0, 0.0), (-20.0, 0.0, 15.0), (0.0, 20.0, -15.0))
-MIN_FACING = 0.4  # cosine between the board's normal and the line of sight
-MIN_CORNERS = 12
-EDGE_PX = 5.0
 MAX_SHOTS = 60
 OFFSETS = 0.35  # of the volume's radius: boards are also tried this far off the middle
 STEP_DEG = 15.0
@@ -204,11 +201,12 @@ def _views(
         camera_from_board = pose.inverse() @ rig_from_board
         sight = camera_from_board.apply(corners[:count].mean(axis=0))
         facing = camera_from_board.rotation[:, 2] @ sight / np.linalg.norm(sight)
-        if abs(facing) < MIN_FACING or (facing < 0 and board.faces == 1):
+        # The cosine between the board's normal and the line of sight.
+        if abs(facing) < 0.4 or (facing < 0 and board.faces == 1):
             continue
         face = corners[:count] if facing > 0 else corners[-count:]
         points = camera_from_board.apply(face)
-        visible = is_in_image(cameras[name], points, EDGE_PX)
-        if visible.sum() >= MIN_CORNERS:
+        visible = is_in_image(cameras[name], points, 5.0)
+        if visible.sum() >= 12:
             pixels = cameras[name].project(points[visible])
             yield LocatedView(name, "more", board.name, face[visible], pixels, camera_from_board)

@@ -27,8 +27,6 @@ from bodyscan.rig.rig_frame import Reference
 MIN_CORNERS = 6
 """Corners of a board that two cameras must see: fewer give its middle poorly, and hide a wrong
 one."""
-DISAGREE_SIGMAS = 4.0
-"""References that differ by more contradict each other: once in 10,000 by chance."""
 
 
 @dataclass(frozen=True)
@@ -128,7 +126,8 @@ def _refuse_contradictions(rig: Rig, found: dict[str, Size], size: Size) -> None
             remedy="correct square_mm of the boards, or length_mm of the references",
         )
     for name, one in found.items():
-        if abs(one.factor - size.factor) > DISAGREE_SIGMAS * one.sigma:
+        # References that differ by more contradict each other: once in 10,000 by chance.
+        if abs(one.factor - size.factor) > 4.0 * one.sigma:
             figures = "; ".join(
                 f"{other}: {_format_size(other_size)}" for other, other_size in found.items()
             )

@@ -83,7 +83,6 @@ class RigCalibration:
 MAX_SIZE_ERROR, REFUSED_SIZE_ERROR = 0.03, 0.10
 """Relative error of the distances between cameras, as measured with a tape. Girths are wrong by the
 same share: 27 mm of 900 at 3 %."""
-MIN_SEPARATION_MM = 100.0
 
 
 @dataclass(frozen=True)
@@ -127,7 +126,7 @@ def nominal_size(rig: Rig, rig_from_camera: Mapping[str, RigidTransform]) -> Nom
             / np.linalg.norm(nominal[a] - nominal[b])
         )
         for a, b in combinations(sorted(set(nominal) & set(rig_from_camera)), 2)
-        if np.linalg.norm(nominal[a] - nominal[b]) > MIN_SEPARATION_MM
+        if np.linalg.norm(nominal[a] - nominal[b]) > 100.0
     ]
     return NominalSize(float(np.median(ratios)), rig.boards) if ratios else None
 

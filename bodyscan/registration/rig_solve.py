@@ -54,8 +54,6 @@ from bodyscan.rig.rig import Rig
 LOSSES_PX = (10.0, 0.3)
 """The first is as wide as a start from one wrong view is off: with the second alone a pair stays
 with the few views that it was placed by, and all others seem wrong."""
-COARSE_PX = 30.0
-"""What a view may be off while the pairs are placed by the graph alone."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,8 +154,9 @@ def _solve(
     root_from_camera = {name: to_root @ pose for name, pose in start.items()}
     resolved, boards, doubtful = locate_boards_jointly(views, root_from_camera)
     solution = JointSolution(root_from_camera, boards, cameras)
+    # The graph's poses alone are rough: 30 px.
     gross = find_inconsistent_views(
-        [view for view in resolved if view.target in doubtful], solution, COARSE_PX
+        [view for view in resolved if view.target in doubtful], solution, 30.0
     ).wrong
     kept = [view for view in resolved if view not in gross]
     # A single camera was solved with its skew already, and there is nothing to join.

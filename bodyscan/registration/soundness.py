@@ -23,11 +23,8 @@ from bodyscan.stripes.stripe_code import StripeCode
 
 ORTHONORMAL = 1e-6  # rounding leaves 1e-15; at 2 m this is 2 um
 SYMMETRIC, POSITIVE = 1e-6, -1e-6  # of a correlation, which is 1 at most; solves leave 1e-9
-NARROWEST, WIDEST = 0.0175, 7.5  # width over focal length: fields of view of 1 and 150 degrees
 MAX_ASPECT = 2.0  # ratio of the two focal lengths: cameras that skip every other line
-MAX_SKEW = 0.1  # of the focal length: axes 6 degrees off a right angle; sensors are cut far better
 MAX_DISTANCE_MM = 1e5  # 100 m from the rig's centre
-MIN_SHARE = 0.5  # of an image that rays pass through: less is a slip, not a lens
 
 Fault = tuple[str, str]
 """Where, as in `pairs.p1.camera`, and what is wrong, in words that follow it."""
@@ -69,18 +66,21 @@ def camera_faults(camera: Camera, pair: Pair, where: str) -> Iterator[Fault]:
         return
     for name, length in (("alpha", size[0]), ("beta", size[1])):
         focal = getattr(camera, name)
-        if not length / WIDEST < focal < length / NARROWEST:
+        # Fields of view of 150 and 1 degrees.
+        if not length / 7.5 < focal < length / 0.0175:
             yield f"{where}.{name}", f"is not a focal length for {length} pixels (got {focal:g})"
             return
     if not 1.0 / MAX_ASPECT < camera.alpha / camera.beta < MAX_ASPECT:
         yield where, f"has focal lengths too unlike (got {camera.alpha:g}, {camera.beta:g})"
-    if not abs(camera.gamma) < MAX_SKEW * camera.alpha:
+    # Axes 6 degrees off a right angle; sensors are cut far better.
+    if not abs(camera.gamma) < 0.1 * camera.alpha:
         yield f"{where}.gamma", f"is more skew than a sensor has (got {camera.gamma:g})"
     for name, value, length in zip(("u0", "v0"), (camera.u0, camera.v0), size, strict=True):
         # It may lie outside an image that was cropped from a larger one.
         if not -length < value < 2.0 * length:
             yield f"{where}.{name}", f"lies far outside of the picture (got {value:g})"
-    if not np.all(np.isfinite(camera.lens.coefficients)) or _share_of_rays(camera) < MIN_SHARE:
+    # Rays must pass through half of the image: less is a slip, not a lens.
+    if not np.all(np.isfinite(camera.lens.coefficients)) or _share_of_rays(camera) < 0.5:
         values = ", ".join(f"{value:g}" for value in camera.lens.coefficients)
         yield where, f"has a lens that folds its picture over (got {values})"
 

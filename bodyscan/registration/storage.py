@@ -38,7 +38,6 @@ WITHOUT_HASH = 1
 """The previous version, also read: it had no hash of the JSON itself."""
 HASH = "sha256"
 EDITED = "the calibration was edited by hand, and the change accepted"
-MAX_FAULTS = 5  # how many an error lists
 FILE_NAME = "calibration.json"
 HISTORY = "history"
 ARRAYS_NAME = "calibration.npz"
@@ -169,7 +168,8 @@ def load_calibration(path: Path, *, accept_changed: bool = False) -> RigCalibrat
             where=str(file),
             remedy="restore the file from a copy, or calibrate again",
         ) from error
-    faults = list(islice(find_faults(calibration), MAX_FAULTS))
+    # An error lists five.
+    faults = list(islice(find_faults(calibration), 5))
     if faults:
         raise CalibrationFileError(
             "holds what no calibration can be like:"

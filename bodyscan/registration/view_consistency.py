@@ -24,13 +24,9 @@ from bodyscan.registration.bundle_adjustment import refine_solution
 from bodyscan.registration.joint_solve import JointSolution
 from bodyscan.registration.view_graph import by_target
 
-MAX_RATIO = 6.0
 MIN_ERROR_PX = 0.2
 MIN_SIZE_ERROR = 0.005
 """A board whose squares seem to differ by this share is another board."""
-MIN_SHOTS = 3
-STEPS = 15
-SETTLED = 1e-2  # variances: far less than separates a wrong view from a right one
 CORNERS = Noise("corners", group=2, min_scale=0.1 * MIN_ERROR_PX)
 
 
@@ -79,7 +75,7 @@ def single_view_errors(views: Iterable[LocatedView], cameras: Mapping[str, Camer
 
 def error_limit(errors: Array) -> float:
     """Error in px above which a view is inconsistent; errors: (V,) from `single_view_errors`."""
-    return max(MAX_RATIO * float(np.median(errors)), MIN_ERROR_PX)
+    return max(6.0 * float(np.median(errors)), MIN_ERROR_PX)
 
 
 def find_inconsistent_views(
@@ -105,7 +101,7 @@ def _wrong_squares(sizes: Sequence[tuple[str, float]]) -> Iterator[str]:
         sizes_of_board = np.array([size for board, size in sizes if board == name])
         median = float(np.median(sizes_of_board))
         if (
-            len(sizes_of_board) >= MIN_SHOTS
+            len(sizes_of_board) >= 3
             and np.mean(np.abs(sizes_of_board - median) < MIN_SIZE_ERROR) > 0.5
         ):
             yield (
@@ -196,13 +192,14 @@ def fit_board(
 ) -> BoardFit:
     """The board pose (and size) that fits all views, starting from `root_from_board`."""
     unknowns = 7 if free_size else 6
+    # The tolerance, in variances, is far less than separates a wrong view from a right one.
     fitted = minimize(
         (root_from_board, 1.0),
         lambda state: [_corners(view, solution, state, unknowns) for view in views],
         lambda state, step: (state[0].retract(step[:6]), state[1] + float(np.sum(step[6:]))),
         unknowns=unknowns,
-        steps=STEPS,
-        tolerance=SETTLED,
+        steps=15,
+        tolerance=1e-2,
         damping=1e-9,
     )
     residuals = tuple(block.residuals.reshape(-1, 2) for block in fitted.blocks)

@@ -18,11 +18,6 @@ from bodyscan.geometry.transforms import RigidTransform
 
 AGREEMENT = 0.04
 """Poses that differ by this share of the usual distance of boards agree: the graph is rough."""
-MIN_VOTES = 3
-MIN_CONFLICTING = 3
-"""shots: among this many, taken together, two agree, whichever end they are numbered from."""
-BOARD_REACH = 0.3
-MAX_CANDIDATES = 12
 
 Target = tuple[str, str]
 Group = dict[str, RigidTransform]
@@ -60,7 +55,7 @@ class RelativePose:
         to be wrong.
         """
         majority = self.votes > self.rivals and 2 * self.votes > len(self.targets)
-        return majority or (self.votes >= MIN_VOTES and self.rivals <= 1)
+        return majority or (self.votes >= 3 and self.rivals <= 1)
 
     @property
     def strength(self) -> tuple[bool, int, int]:
@@ -175,7 +170,7 @@ def _readings(
     root = root_from_camera[view.pair]
     return [
         (
-            max_displacement_mm(root @ one.camera_from_board, root_from_board, BOARD_REACH * reach),
+            max_displacement_mm(root @ one.camera_from_board, root_from_board, 0.3 * reach),
             one,
         )
         for one in readings
@@ -236,7 +231,7 @@ def _tie(
         return None
     everything = [p for proposal in proposals.values() for p in proposal]
     owner = np.repeat(np.arange(len(proposals)), [len(p) for p in proposals.values()])
-    clearest = sorted(proposals, key=lambda target: -corners[target])[:MAX_CANDIDATES]
+    clearest = sorted(proposals, key=lambda target: -corners[target])[:12]
     candidates = [p for target in clearest for p in proposals[target]]
     gaps = np.array([_gaps(candidate, everything, reach) for candidate in candidates])
     voters = [np.unique(owner[gap < 2.0 * AGREEMENT * reach]) for gap in gaps]
@@ -288,7 +283,8 @@ def _open_tie(first: Group, second: Group, tie: RelativePose) -> RigDisconnected
         "board, or one whose columns and rows differ in parity"
     )
     found = f"shots {_shots(tie.targets)}"
-    if tie.votes == 1 and len(tie.targets) >= MIN_CONFLICTING:
+    # Of three shots taken at the same moments two agree, whichever end they are numbered from.
+    if tie.votes == 1 and len(tie.targets) >= 3:
         return RigDisconnected(
             f"no two shots agree on the relative pose of {', '.join(sorted(first))} and "
             f"{', '.join(sorted(second))}, whichever end their board is numbered from ({found})",

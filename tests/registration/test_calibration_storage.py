@@ -283,7 +283,7 @@ def bomb(says: int) -> bytes:
 
 
 @pytest.mark.parametrize(
-    ("says", "refusal"), [(8_000_000, "unpacks to"), (1 << 42, "does not hold what it says")]
+    ("says", "refusal"), [(8_000_000, "unpacks to"), (1 << 42, "header that does not fit")]
 )
 def test_arrays_that_would_fill_the_memory_are_not_read(
     says: int, refusal: str, tmp_path: Path

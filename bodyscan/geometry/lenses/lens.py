@@ -22,9 +22,6 @@ NEWTON_STEPS = 20
 """Five or six reach rounding; close to where a lens folds it takes more."""
 SETTLED, NOT_FOUND = 1e-14, 1e-9
 """A millionth of a pixel is about 1e-9."""
-NEAREST_STEPS = 3
-NEAREST_HOLD = 1e-5
-"""Keeps small what the points leave undetermined of the nearest lens: one sigma costs 0.01 px."""
 FARTHEST, DIRECTIONS = 20.0, 16
 """A lens is examined up to 87 degrees from its axis (radius 20), in 16 directions."""
 
@@ -80,12 +77,13 @@ class Lens(ABC):
     def fit_to(self, other: Lens, ideal: Array) -> Self:
         """Fit this kind of lens, starting here, to what `other` does to the points (N, 2)."""
         lens, wanted = self, other.distort(ideal)
-        for _ in range(NEAREST_STEPS):
+        for _ in range(3):
             by_coefficient = lens.by_coefficients(ideal).reshape(-1, len(lens.names))
             missing = (wanted - lens.distort(ideal)).ravel()
-            held = np.diag(NEAREST_HOLD / lens.prior_sigmas)
-            rows = np.concatenate([by_coefficient, held])
-            right = np.concatenate([missing, -held @ lens.coefficients])
+            # A weak prior on what the points leave undetermined: one sigma costs 0.01 px.
+            prior = np.diag(1e-5 / lens.prior_sigmas)
+            rows = np.concatenate([by_coefficient, prior])
+            right = np.concatenate([missing, -prior @ lens.coefficients])
             step = np.linalg.lstsq(rows, right, rcond=None)[0]
             lens = lens.with_coefficients(lens.coefficients + step)
         return lens
