@@ -1,4 +1,4 @@
-"""Where the head ends under hair: an ellipsoid through the visible skin, with usual head sizes.
+"""Estimate the top of the head under hair: fit an ellipsoid to the visible skin, with prior sizes.
 
 Forehead and temples lie on the braincase, which is an ellipsoid to within a few millimetres; what
 they leave open is taken from heads in general. Hair only adds on top of the head.
@@ -16,19 +16,10 @@ from bodyscan.geometry.least_squares import EXACT, Block, Noise, Solution, minim
 
 BRAINCASE_MM = 85.0
 """Below the top of the hair: brows begin 95 to 125 mm below the top of an adult's head."""
-CELL_MM = 15.0
-"""Size of a braincase's smallest dents and bulges: closer points err alike."""
-MISFIT_MM = 4.0
-"""Standard deviation of a braincase from an ellipsoid."""
-FEWEST = 12
-"""Cells: 27 cm2 of skin, half a forehead."""
 AXES_MM = np.array([97.0, 76.0, 97.0])
 """Half the length and breadth of heads (ANSUR II, both sexes: 195 and 151 mm), and the height from
 the brows to the top."""
-SIZE, SHAPE = 0.06, 0.04
-"""Relative standard deviations: of all three axes together (children included), and of each."""
 SKIN = Noise("skin from a braincase", cauchy=2.5, known=1.0)
-FAR_MM = 100.0  # prior of the centre about its start, which says nothing
 
 
 @dataclass(frozen=True)
@@ -41,7 +32,7 @@ class HeadTop:
 
 @dataclass(frozen=True, eq=False)
 class _Ellipsoid:
-    """centre: (3,) mm.  size: logarithms of the axes over the usual, common and for each, (4,)."""
+    """centre: (3,) mm.  size: logarithms of the axes over AXES_MM, common and for each, (4,)."""
 
     centre: Array
     size: Array
@@ -76,38 +67,42 @@ def estimate_head_top(skin: Array, hair_top_mm: float) -> HeadTop | None:
     if not len(skin):
         return None
     case, low = skin[skin[:, 2] > hair_top_mm - BRAINCASE_MM], float(skin[:, 2].max())
-    _, first = np.unique(np.floor(case / CELL_MM).astype(int), axis=0, return_index=True)
-    if len(first) < FEWEST:
+    # One point per cell of 15 mm, a braincase's smallest dents: closer points have correlated errors.
+    _, first = np.unique(np.floor(case / 15.0).astype(int), axis=0, return_index=True)
+    if len(first) < 12:  # 27 cm2 of skin, half a forehead
         return HeadTop(0.5 * (low + hair_top_mm), float((hair_top_mm - low) / np.sqrt(12.0)))
     solution = _fit(case[first], hair_top_mm)
     covariance = solution.covariance
     by_top = np.zeros(7)
     by_top[2], by_top[3], by_top[6] = 1.0, solution.state.axes[2], solution.state.axes[2]
     sigma = float(np.sqrt(by_top @ covariance @ by_top))
-    return _between(solution.state.top_mm, sigma, low, hair_top_mm)
+    return _truncate(solution.state.top_mm, sigma, low, hair_top_mm)
 
 
-def _fit(places: Array, hair_top_mm: float) -> Solution[_Ellipsoid]:
-    """Fit an ellipsoid to skin at places (N, 3), with usual head sizes as priors."""
-    middle = np.array([places[:, 0].max() - AXES_MM[0], places[:, 1].mean(), 0.0])
+def _fit(points: Array, hair_top_mm: float) -> Solution[_Ellipsoid]:
+    """Fit an ellipsoid to points of skin (N, 3), with head sizes in general as prior."""
+    middle = np.array([points[:, 0].max() - AXES_MM[0], points[:, 1].mean(), 0.0])
     middle[2] = hair_top_mm - AXES_MM[2]
-    known = np.concatenate([np.full(3, FAR_MM), [SIZE], np.full(3, SHAPE)])
+    # Centre (uninformative), common size (children included), and each axis by itself.
+    prior = np.concatenate([np.full(3, 100.0), [0.06], np.full(3, 0.04)])
 
     def blocks(head: _Ellipsoid) -> list[Block]:
-        distances, rows = head.distances(places)
-        off = np.concatenate([head.centre - middle, head.size])
+        distances, rows = head.distances(points)
+        deviation = np.concatenate([head.centre - middle, head.size])
         return [
-            Block(distances, lambda: rows, slice(0, 7), SKIN, MISFIT_MM),
-            Block(off, lambda: np.eye(7), slice(0, 7), EXACT, known),
+            Block(
+                distances, lambda: rows, slice(0, 7), SKIN, 4.0
+            ),  # mm, of a braincase from an ellipsoid
+            Block(deviation, lambda: np.eye(7), slice(0, 7), EXACT, prior),
         ]
 
-    def moved(head: _Ellipsoid, step: Array) -> _Ellipsoid:
+    def retract(head: _Ellipsoid, step: Array) -> _Ellipsoid:
         return _Ellipsoid(head.centre + step[:3], head.size + step[3:])
 
-    return minimize(_Ellipsoid(middle, np.zeros(4)), blocks, moved, unknowns=7)
+    return minimize(_Ellipsoid(middle, np.zeros(4)), blocks, retract, unknowns=7)
 
 
-def _between(estimate: float, sigma: float, low: float, high: float) -> HeadTop:
+def _truncate(estimate: float, sigma: float, low: float, high: float) -> HeadTop:
     """Truncate a normal distribution to the range that skin and hair leave open."""
     ends = (low - estimate) / sigma, (high - estimate) / sigma
     left = truncnorm(*ends, loc=estimate, scale=sigma)

@@ -11,19 +11,13 @@ from bodyscan.arrays import Array, Bytes, Mask
 from bodyscan.errors import BadInput
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.measurement.head import HeadTop, estimate_head_top
-from bodyscan.measurement.outline import Range, holds_middle, outline
+from bodyscan.measurement.outline import Range, find_outline, holds_middle
 from bodyscan.mesh.body import HAIR, REGION_NAMES, SKIN, UNSURE, BodyMesh, compute_region_shares
 from bodyscan.mesh.slices import Loop, slice_mesh
 from bodyscan.mesh.topology import LAYER_MM, face_areas, find_handles, signed_volume
 
-STEP_MM = 100.0
-SPECK_MM2 = 50.0  # less than a fingertip
 CROWN_MM = 20.0
-MOSTLY = 0.5
-HEAD_MM, FACE_MM = 150.0, 250.0
-"""Largest sideways reach of a head from its crown, and largest distance down to the chin."""
-HAND_MM = 200.0
-"""Below the height where a hand first touches the body, it may keep touching this far down."""
+"""Height of the crown below the top."""
 
 
 @dataclass(frozen=True)
@@ -120,7 +114,7 @@ def measure(
     contacts = _contacts(vertices, mesh)
     if heights_mm is None:
         # If only part of a body was seen, whatever there is of it.
-        every = np.arange(STEP_MM, stature, STEP_MM).tolist()
+        every = np.arange(100.0, stature, 100.0).tolist()
         slices = [_slice(vertices, mesh, height, contacts) for height in every]
     else:
         every = [float(height) for height in heights_mm]
@@ -135,14 +129,14 @@ def measure(
     if fuller is not None:
         more = frame.inverse().apply(fuller.vertices)
         slices = [
-            found and _doubted(found, _slice(more, mesh, height, contacts))
+            found and _add_breath_sigmas(found, _slice(more, mesh, height, contacts))
             for found, height in zip(slices, every, strict=True)
         ]
     areas = face_areas(mesh.vertices, mesh.faces)
     crown = mesh.vertices[mesh.faces, 2].max(axis=1) > stature - CROWN_MM
     kinds, crown_measured = mesh.face_regions, _share(areas, ~mesh.filled, crown)
     top = _crown_region(areas, kinds, crown & ~mesh.filled)
-    head = _head_top(vertices, mesh, stature, top) if crown_measured > MOSTLY else None
+    head = _head_top(vertices, mesh, stature, top) if crown_measured > 0.5 else None
     return Measurements(
         stature,
         crown_measured,
@@ -163,7 +157,7 @@ def _crown_region(areas: Array, kinds: Bytes | None, crown: Mask) -> str | None:
     if kinds is None or not crown.any():
         return None
     found = compute_region_shares(kinds[crown], areas[crown])
-    return next((name for name, share in found.items() if share > MOSTLY), REGION_NAMES[UNSURE])
+    return next((name for name, share in found.items() if share > 0.5), REGION_NAMES[UNSURE])
 
 
 def _head_top(vertices: Array, mesh: BodyMesh, stature: float, crown: str | None) -> HeadTop | None:
@@ -176,12 +170,13 @@ def _head_top(vertices: Array, mesh: BodyMesh, stature: float, crown: str | None
     top = vertices[:, 2] > stature - CROWN_MM
     if crown == REGION_NAMES[SKIN]:
         return HeadTop(stature, float(np.nanmedian(mesh.sigma_mm[top])))
-    beside = np.linalg.norm(vertices[:, :2] - np.median(vertices[top, :2], axis=0), axis=1)
-    skin = (mesh.regions == SKIN) & (beside < HEAD_MM) & (vertices[:, 2] > stature - FACE_MM)
+    # A head reaches 150 mm sideways from its crown, and 250 mm down to the chin.
+    radius = np.linalg.norm(vertices[:, :2] - np.median(vertices[top, :2], axis=0), axis=1)
+    skin = (mesh.regions == SKIN) & (radius < 150.0) & (vertices[:, 2] > stature - 250.0)
     return estimate_head_top(vertices[skin], stature)
 
 
-def _doubted(level: Slice, fuller: Slice | None) -> Slice:
+def _add_breath_sigmas(level: Slice, fuller: Slice | None) -> Slice:
     """The slice with sigmas: how much longer girths are on a body one sigma of breath fuller."""
     girths = []
     for girth in level.girths:
@@ -210,6 +205,8 @@ class _Contact:
     """An arm whose hand touches the trunk at heights from low_mm to high_mm.
 
     y_mm: of the arm's middle just above, body frame.
+
+    Below the height where a hand first touches the body, it may keep touching for 200 mm.
     """
 
     side: str
@@ -233,14 +230,14 @@ def _contacts(vertices: Array, mesh: BodyMesh) -> list[_Contact]:
         for part, loop in zip(name_parts(loops), loops, strict=True):
             if part == f"{side} arm":
                 y = float(loop.centre[1])
-                found.append(_Contact(side, ring.low_mm - HAND_MM, above, y))
+                found.append(_Contact(side, ring.low_mm - 200.0, above, y))
                 break
     return found
 
 
 def _loops(vertices: Array, mesh: BodyMesh, height_mm: float) -> tuple[Loop, ...]:
     loops = slice_mesh(vertices, mesh.faces, height_mm, mesh.filled, mesh.face_regions)
-    return tuple(loop for loop in loops if loop.area_mm2 > SPECK_MM2)
+    return tuple(loop for loop in loops if loop.area_mm2 > 50.0)  # less is a fingertip
 
 
 def _slice(
@@ -278,7 +275,7 @@ def name_parts(loops: Sequence[Loop]) -> list[str]:
 
 
 def _girth(part: str, meshed: Loop) -> Girth:
-    found = outline(meshed)
+    found = find_outline(meshed)
     loop = found.loop
     corners = loop.segments[:, 0]
     depth, width = np.ptp(corners, axis=0)
@@ -298,17 +295,15 @@ def _girth(part: str, meshed: Loop) -> Girth:
     )
 
 
-UPPER_BODY = 0.45  # of the stature: hips, trunk and arms, which together are wider than deep
-
-
 def rig_from_body(vertices: Array) -> RigidTransform:
-    """Pose of a standing body in the rig frame, from evenly spread vertices (V, 3) mm.
+    """Estimate the pose of a standing body in the rig frame from evenly spread vertices (V, 3) mm.
 
-    It is only turned about the vertical and moved along the floor. The upper body is widest from
-    side to side; of the two directions across that, the subject faces the one nearer to the rig's
-    x.
+    The body's frame has z = 0 on the floor, its origin under the body, x where it faces and y to its
+    left. The upper body is widest from side to side; of the two directions across that, the subject
+    faces the one nearer to the rig's x.
     """
-    upper = vertices[vertices[:, 2] > UPPER_BODY * vertices[:, 2].max(), :2]
+    # Hips, trunk and arms, which together are wider than deep.
+    upper = vertices[vertices[:, 2] > 0.45 * vertices[:, 2].max(), :2]
     middle = 0.5 * (np.percentile(upper, 2, axis=0) + np.percentile(upper, 98, axis=0))
     _, axes = np.linalg.eigh(np.cov((upper - upper.mean(axis=0)).T))
     forward = axes[:, 0] * (1.0 if axes[0, 0] >= 0 else -1.0)

@@ -16,11 +16,6 @@ import numpy as np
 from bodyscan.arrays import Array
 from bodyscan.mesh.slices import Loop, Run, join_runs, split_runs
 
-LIMB = 2.0 / np.pi
-"""Chord over arc of half a circle: a limb goes round by more, the trunk's own side by less."""
-INSIDE = 0.15
-"""of its width: least distance of the body's middle (y = 0) from a trunk's edges."""
-
 Range = tuple[float, float]
 
 
@@ -37,21 +32,21 @@ class Outline:
     tape_range_mm: Range
 
 
-def outline(loop: Loop) -> Outline:
-    """The outline of a slice's loop, body frame."""
+def find_outline(loop: Loop) -> Outline:
+    """Cut limbs that filled surface joins to the trunk from a slice's loop, body frame."""
     runs = split_runs(loop)
     kept = _trunk_alone(loop, runs) if holds_middle(loop.segments[..., 1]) else runs
-    own = join_runs(loop, kept) if len(kept) < len(runs) else loop
+    cut = join_runs(loop, kept) if len(kept) < len(runs) else loop
     known = join_runs(loop, [run for run in kept if run.measured] or kept)
-    girths = own.girth_mm, known.girth_mm, loop.girth_mm
-    tapes = own.tape_mm, known.tape_mm, loop.tape_mm
-    return Outline(own, (min(girths), max(girths)), (min(tapes), max(tapes)))
+    girths = cut.girth_mm, known.girth_mm, loop.girth_mm
+    tapes = cut.tape_mm, known.tape_mm, loop.tape_mm
+    return Outline(cut, (min(girths), max(girths)), (min(tapes), max(tapes)))
 
 
 def holds_middle(y: Array) -> bool:
-    """Whether an outline's points (y to the left) lie on both sides of the body's middle."""
+    """Whether points (y to the left) lie on both sides of y = 0, by 0.15 of their width or more."""
     low, high = float(y.min()), float(y.max())
-    return min(high, -low) > INSIDE * (high - low)
+    return min(high, -low) > 0.15 * (high - low)
 
 
 def _trunk_alone(loop: Loop, runs: Sequence[Run]) -> Sequence[Run]:
@@ -75,8 +70,9 @@ def _in_two(runs: Sequence[Run]) -> Iterator[tuple[Sequence[Run], Sequence[Run]]
 def _is_limb(loop: Loop, runs: Sequence[Run]) -> bool:
     """Whether the runs lie on one side of the middle and go round more than half way."""
     arc = sum(loop.lengths[run.segments].sum() for run in runs)
-    across = loop.segments[runs[0].first, 0] - loop.segments[runs[-1].last, 1]
-    return bool(np.linalg.norm(across) < LIMB * arc) and not _on_both_sides(loop, runs)
+    chord = np.linalg.norm(loop.segments[runs[0].first, 0] - loop.segments[runs[-1].last, 1])
+    # Half a circle has a chord of 2 / pi of its arc.
+    return bool(chord < 2.0 / np.pi * arc) and not _on_both_sides(loop, runs)
 
 
 def _on_both_sides(loop: Loop, runs: Sequence[Run]) -> bool:

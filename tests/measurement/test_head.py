@@ -9,7 +9,7 @@ import pytest
 from made_bodies import cylinder, mesh_of
 from ray_cast_scan import ROOT, load_body
 
-from bodyscan.measurement.head import BRAINCASE_MM, _between, _Ellipsoid, _fit, estimate_head_top
+from bodyscan.measurement.head import BRAINCASE_MM, _Ellipsoid, _fit, _truncate, estimate_head_top
 from bodyscan.measurement.measurements import measure
 from bodyscan.mesh.body import DARK_CLOTH, HAIR, SKIN, UNSURE, BodyMesh
 from bodyscan.report.measurements import tables
@@ -60,7 +60,7 @@ def test_under_hair_the_head_is_where_its_sigma_says(bald: BodyMesh, thick_mm: f
     assert found.head.height_mm < found.stature_mm
 
 
-def test_where_no_forehead_shows_the_head_is_somewhere_between(bald: BodyMesh) -> None:
+def test_where_no_forehead_shows_the_head_is_somewhere_truncate(bald: BodyMesh) -> None:
     body = haired(bald, 30.0, line=0.91)
     found = measure(body, [1000.0])
     assert found.head is not None
@@ -70,13 +70,13 @@ def test_where_no_forehead_shows_the_head_is_somewhere_between(bald: BodyMesh) -
 
 
 @pytest.mark.parametrize(("low", "high"), [(1692.0, 1720.0), (1650.0, 1703.0), (1704.0, 1709.0)])
-def test_of_an_estimate_only_what_lies_between_skin_and_hair_counts(
+def test_of_an_estimate_only_what_lies_truncate_skin_and_hair_counts(
     low: float, high: float
 ) -> None:
     heights = np.linspace(low, high, 20001)
     weight = np.exp(-0.5 * ((heights - 1700.0) / 5.0) ** 2)
     mean = np.average(heights, weights=weight)
-    found = _between(1700.0, 5.0, low, high)
+    found = _truncate(1700.0, 5.0, low, high)
     assert found.height_mm == pytest.approx(mean, abs=0.01)
     spread = np.sqrt(np.average((heights - mean) ** 2, weights=weight))
     assert found.sigma_mm == pytest.approx(spread, abs=0.01)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bodyscan.arrays import Array, Mask
-from bodyscan.measurement.outline import Outline, holds_middle, outline
+from bodyscan.measurement.outline import Outline, find_outline, holds_middle
 from bodyscan.mesh.slices import Loop, slice_mesh
 
 TRUNK_MM, ARM_MM, ARM_AT_MM = 150.0, 45.0, 230.0
@@ -48,7 +48,7 @@ def with_arms(sides: tuple[int, ...] = (1, -1)) -> Outline:
     points = np.concatenate(parts)
     filled = np.zeros(len(points), bool)
     filled[np.cumsum([len(part) for part in parts]) - 1] = True
-    return outline(wall(points, filled))
+    return find_outline(wall(points, filled))
 
 
 def test_a_trunk_is_cut_from_the_arms_that_filled_surface_joins_to_it() -> None:
@@ -76,7 +76,7 @@ def test_a_strip_of_the_trunk_between_two_gaps_is_no_limb() -> None:
     points = arc(TRUNK_MM, 0.0, 0.0, 359.0)
     degrees = np.arange(len(points))
     filled = ((degrees > 40) & (degrees < 60)) | ((degrees > 120) & (degrees < 140))
-    found = outline(wall(points, filled))
+    found = find_outline(wall(points, filled))
     assert found.loop.girth_mm == pytest.approx(2.0 * np.pi * TRUNK_MM, rel=1e-3)
     assert found.girth_range_mm[0] < found.loop.girth_mm - 0.2
     assert found.loop.measured_share == pytest.approx(1.0 - 38.0 / 360.0, abs=0.01)
@@ -84,7 +84,7 @@ def test_a_strip_of_the_trunk_between_two_gaps_is_no_limb() -> None:
 
 def test_what_was_measured_all_round_has_no_range() -> None:
     points = arc(TRUNK_MM, 0.0, 0.0, 359.0)
-    found = outline(wall(points, np.zeros(len(points), bool)))
+    found = find_outline(wall(points, np.zeros(len(points), bool)))
     assert np.ptp(found.girth_range_mm) == pytest.approx(0.0, abs=1e-9)
     assert np.ptp(found.tape_range_mm) == pytest.approx(0.0, abs=1e-9)
 
@@ -93,13 +93,13 @@ def test_small_holes_do_not_count() -> None:
     """5 mm of 942 that nobody measured: a straight line across is as good."""
     points = arc(TRUNK_MM, 0.0, 0.0, 359.0)
     filled = np.isin(np.arange(len(points)), [10, 11, 200])
-    assert np.ptp(outline(wall(points, filled)).girth_range_mm) == pytest.approx(0.0, abs=1e-9)
+    assert np.ptp(find_outline(wall(points, filled)).girth_range_mm) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_a_limb_that_is_seen_in_part_lies_between_chord_and_fill() -> None:
     points = arc(60.0, 100.0, 0.0, 359.0)
     degrees = np.arange(len(points))
-    found = outline(wall(points, (degrees > 200) & (degrees < 280)))
+    found = find_outline(wall(points, (degrees > 200) & (degrees < 280)))
     chord = 60.0 * (2.0 * np.pi - np.radians(79.0)) + 120.0 * np.sin(np.radians(39.5))
     assert found.girth_range_mm == pytest.approx((chord, 2.0 * np.pi * 60.0), rel=2e-3)
 
@@ -110,7 +110,7 @@ def test_a_strip_that_is_itself_seen_in_two_parts_is_no_limb_either() -> None:
     degrees = np.arange(len(points))
     gaps = ((40, 60), (85, 95), (120, 140))
     filled = np.any([(degrees > low) & (degrees < high) for low, high in gaps], axis=0)
-    found = outline(wall(points, filled))
+    found = find_outline(wall(points, filled))
     assert found.loop.girth_mm == pytest.approx(2.0 * np.pi * TRUNK_MM, rel=1e-3)
 
 
@@ -131,7 +131,7 @@ def test_a_limb_goes_round_by_more_than_half(
     filled = np.zeros(len(points), bool)
     ends = np.cumsum([141, len(arm)]) - 1
     filled[ends] = True
-    found = outline(wall(points, filled))
+    found = find_outline(wall(points, filled))
     assert (found.loop.segments[..., 1].max() < ARM_AT_MM) == limb
     assert np.sin(turned) / turned < 0.68  # chord over arc, 0.64 of half a circle
 
@@ -147,7 +147,7 @@ def test_a_strip_across_the_front_is_no_trunk_with_the_rest_for_a_limb() -> None
     """Both hold the middle, and the rest goes round by far more than half."""
     points = arc(TRUNK_MM, 0.0, -180.0, 179.0)
     degrees = np.arange(len(points)) - 180
-    found = outline(wall(points, (abs(degrees) > 30) & (abs(degrees) < 50)))
+    found = find_outline(wall(points, (abs(degrees) > 30) & (abs(degrees) < 50)))
     assert found.loop.girth_mm == pytest.approx(2.0 * np.pi * TRUNK_MM, rel=1e-3)
 
 
@@ -157,4 +157,4 @@ def test_of_two_legs_that_filled_surface_joins_neither_is_the_trunk() -> None:
     points = np.concatenate(legs)
     filled = np.isin(np.arange(len(points)), [len(legs[0]) - 1, len(points) - 1])
     whole = wall(points, filled)
-    assert outline(whole).loop.girth_mm == pytest.approx(whole.girth_mm)
+    assert find_outline(whole).loop.girth_mm == pytest.approx(whole.girth_mm)
