@@ -30,7 +30,7 @@ def boundaries(
     )
 
 
-def test_sigmas_that_claim_too_little_are_told_by_how_much() -> None:
+def test_ratio_of_observed_to_predicted_scatter() -> None:
     # Of 10,000 overlapping fives the robust ratio is known to 2 %.
     for times in (0.5, 1.0, 1.1):
         assert estimate_scatter(boundaries(10_000, claimed=0.05 / times)) == 1.0
@@ -40,18 +40,13 @@ def test_sigmas_that_claim_too_little_are_told_by_how_much() -> None:
         )
 
 
-def test_a_thousand_fives_tell_and_fewer_do_not() -> None:
+def test_a_thousand_runs_of_five_are_needed() -> None:
     assert estimate_scatter(boundaries(1004, claimed=0.02)) > 2.0
     assert estimate_scatter(boundaries(1003, claimed=0.02)) == 1.0
     assert estimate_scatter(boundaries(4, claimed=0.02)) == 1.0
     # Of lines of twelve, eight starts each.
     assert estimate_scatter(boundaries(12 * 125, claimed=0.02, line=12)) > 2.0
     assert estimate_scatter(boundaries(12 * 125 - 1, claimed=0.02, line=12)) == 1.0
-
-
-def test_five_boundaries_that_reach_over_twelve_pixels_are_no_neighbours() -> None:
-    assert estimate_scatter(boundaries(2000, claimed=0.02, apart_px=2.9)) > 2.0
-    assert estimate_scatter(boundaries(2000, claimed=0.02, apart_px=3.1)) == 1.0
 
 
 def patch(rough: float) -> Boundaries:
@@ -63,7 +58,7 @@ def patch(rough: float) -> Boundaries:
     return replace(even, position=position)
 
 
-def test_only_where_boundaries_scatter_are_their_sigmas_too_small() -> None:
+def test_local_scatter() -> None:
     found = estimate_local_scatter(patch(2.0)).reshape(100, 50)
     # Windows of 31 lines: those of the first 35 and the last 35 lines see one kind alone.
     assert np.all(found[:35] == 1.0)
@@ -77,7 +72,7 @@ def test_only_where_boundaries_scatter_are_their_sigmas_too_small() -> None:
     assert np.all(estimate_local_scatter(stray) == 1.0)
 
 
-def test_a_little_scatter_or_hardly_any_boundaries_say_nothing_of_a_place() -> None:
+def test_insignificant_local_scatter_is_ignored() -> None:
     assert np.all(estimate_local_scatter(patch(1.1)) == 1.0)
     for count in (0, 4, 5):
         assert np.all(estimate_local_scatter(boundaries(count, claimed=0.02)) == 1.0)

@@ -40,7 +40,7 @@ def waves(stripes: int = 64, **keys: Any) -> PhaseShift:
 @pytest.mark.parametrize(
     ("words", "bits"), [(2, 1), (3, 2), (4, 2), (5, 3), (256, 8), (257, 9), (65536, 16)]
 )
-def test_so_many_words_need_so_many_bits(words: int, bits: int) -> None:
+def test_number_of_bits(words: int, bits: int) -> None:
     assert bits_needed(words) == bits
 
 
@@ -63,7 +63,7 @@ def test_so_many_words_need_so_many_bits(words: int, bits: int) -> None:
         ("phase-shift", {"stripes": 6}, {"phase": 4}),
     ],
 )
-def test_a_code_has_so_many_images(
+def test_number_of_images_by_kind(
     code: str, keys: dict[str, Any], expected: dict[str, int]
 ) -> None:
     found = described(code, **keys)
@@ -74,7 +74,7 @@ def test_a_code_has_so_many_images(
     assert found.needs_lit is (black or code == "stripe-index")
 
 
-def test_the_finest_bits_are_shown_in_the_middle_with_their_inverses_beside() -> None:
+def test_show_order_has_the_finest_bits_in_the_middle() -> None:
     assert described("gray", inverses=False).show_order == (1, 3, 5, 4, 2, 0)
     assert described("gray", 32, inverses=False).show_order == (0, 2, 4, 3, 1)
     assert described("gray", 4).show_order == (1, 3, 0, 2)
@@ -82,7 +82,7 @@ def test_the_finest_bits_are_shown_in_the_middle_with_their_inverses_beside() ->
     assert waves(inverses=False).show_order == tuple(range(8))
 
 
-def test_a_map_stands_for_the_moment_of_the_finest_bit_or_the_middle_of_all() -> None:
+def test_time_at_which_a_stripe_map_holds() -> None:
     times = {"pattern": np.array([9.0, 1.0, 2.0]), "inverse": np.array([8.0, 7.0, 5.0])}
     assert described("gray", 8).moment(times) == 3.5
     assert waves().moment(times) == 5.0
@@ -108,7 +108,7 @@ def test_a_map_stands_for_the_moment_of_the_finest_bit_or_the_middle_of_all() ->
         ("phase-shift", {"start_deg": 360, "origin": 65535}),
     ],
 )
-def test_what_can_be_is_taken(code: str, keys: dict[str, Any]) -> None:
+def test_valid_keys(code: str, keys: dict[str, Any]) -> None:
     described(code, **keys)
 
 
@@ -136,13 +136,13 @@ def test_what_can_be_is_taken(code: str, keys: dict[str, Any]) -> None:
         ("phase-shift", {"origin": 65536}, "less than or equal to 65535"),
     ],
 )
-def test_what_cannot_be_is_refused(code: str, keys: dict[str, Any], said: str) -> None:
+def test_invalid_keys(code: str, keys: dict[str, Any], said: str) -> None:
     with pytest.raises(ValidationError) as caught:
         described(code, **keys)
     assert said in str(caught.value)
 
 
-def test_waves_nearly_alike_again_are_told_apart_by_no_camera() -> None:
+def test_waves_that_nearly_repeat_are_refused() -> None:
     # After 8 waves of 8 a wave of 63.75 is 64 / 63.75 = 1.0039 turns on; of 63.73, 1.0042.
     with pytest.raises(ValidationError, match="repeat after 64"):
         waves(70, period=(8, 63.75))
@@ -168,9 +168,7 @@ def test_waves_are_as_described() -> None:
     ("stripes", "period", "halves"),
     [(64, 8.0, 16), (64, 7.0, 19), (60, 40.0, 3), (61, 40.0, 4), (100, 0.1 * 30, 67)],
 )
-def test_half_periods_are_counted_the_last_one_perhaps_in_part(
-    stripes: int, period: float, halves: int
-) -> None:
+def test_number_of_half_periods(stripes: int, period: float, halves: int) -> None:
     assert waves(stripes, period=period).half_periods == halves
 
 
@@ -231,7 +229,7 @@ def test_crossing_stripes_run_the_other_way_and_are_no_more_than_two() -> None:
 
 
 @given(st.integers(2, 65535))
-def test_code_words_are_turned_back_into_stripes(stripes: int) -> None:
+def test_gray_words_are_decoded(stripes: int) -> None:
     stripe = np.unique(np.linspace(0, stripes - 1, 50).astype(np.int64))
     gray = gray_from_stripe(stripe)
     assert gray.max() < 2 ** bits_needed(stripes)

@@ -44,7 +44,7 @@ def test_s_is_exact_whatever_the_blur(blur: float) -> None:
 
 
 @pytest.mark.parametrize(("noise", "ramp"), [(1.5, 0.0), (3.5, 0.0), (0.7, 0.03)])
-def test_its_sigma_is_how_far_noise_puts_it_off(noise: float, ramp: float) -> None:
+def test_sigma_matches_the_noise(noise: float, ramp: float) -> None:
     found = swept(0.6, noise, ramp=ramp)
     known = np.isfinite(off(found))
     assert known.mean() > 0.9
@@ -52,15 +52,6 @@ def test_its_sigma_is_how_far_noise_puts_it_off(noise: float, ramp: float) -> No
     # The median of what is off over its sigma, for which outliers do not count.
     ratio = np.median(np.abs(off(found)[known]) / sigma) / 0.6745
     assert ratio == pytest.approx(1.0, abs=0.25)
-
-
-def test_a_broad_line_puts_s_off_to_neither_side() -> None:
-    """With light seen in seven images; as many count before the brightest as after it."""
-    found = off(swept(1.2))
-    assert np.isfinite(found).mean() > 0.98
-    # Rounding to whole grey levels leaves 0.008 of each pixel, and of the mean nothing; without
-    # the last image it is 0.027.
-    assert abs(np.nanmean(found)) < 0.005
 
 
 def read(numbers: Indices, stripes: int = 40) -> StripeMap:
@@ -166,14 +157,7 @@ def test_images_in_any_order_are_refused_and_rims_are_not() -> None:
         check(np.tile([2, 2, 9, 9], (20, 1)))
 
 
-def test_three_of_five_changes_in_step_are_enough() -> None:
-    line = np.array([0, 1, 2, 5, 6, 9])
-    check(np.tile(np.repeat(line, 4), (30, 1)))
-    with pytest.raises(DecodingFailed, match="in 50% of the cases only"):
-        check(np.tile(np.repeat(line[1:], 4), (30, 1)))
-
-
-def test_what_is_not_good_does_not_count() -> None:
+def test_bad_pixels_are_ignored() -> None:
     numbers, good = shown_in_order(), np.ones((30, 48), bool)
     numbers[:, 21], good[:, 21] = 11, False
     check(numbers, good)

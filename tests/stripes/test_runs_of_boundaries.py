@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d
@@ -62,7 +60,7 @@ def interpolated(boundaries: Boundaries, off: int = 0) -> tuple[np.ndarray, np.n
     return s[1], sigma[1]
 
 
-def test_between_boundaries_of_a_bent_surface_s_is_exact() -> None:
+def test_s_between_boundaries_on_a_curved_surface_is_exact() -> None:
     s, sigma = interpolated(run(POSITION, INDEX))
     within = (POSITION[1] < X) & (POSITION[-2] > X)
     np.testing.assert_allclose(s[within], bent(X)[within], atol=1e-5)
@@ -72,7 +70,7 @@ def test_between_boundaries_of_a_bent_surface_s_is_exact() -> None:
     np.testing.assert_allclose(sigma[within][wide], 0.02 / width[wide], rtol=1e-5)
 
 
-def test_beside_the_last_boundary_s_goes_on_for_four_tenths_of_a_stripe() -> None:
+def test_s_is_extrapolated_by_up_to_0_4_stripes() -> None:
     s, sigma = interpolated(run(POSITION, INDEX))
     true = bent(X)
     for beside in ((true > 25.0) & (true < 25.4), (true > 2.6) & (true < 3.0)):
@@ -83,7 +81,7 @@ def test_beside_the_last_boundary_s_goes_on_for_four_tenths_of_a_stripe() -> Non
     assert np.isnan(sigma[np.isnan(s)]).all()
 
 
-def test_beside_a_run_s_is_three_times_as_uncertain_and_by_all_of_its_bend() -> None:
+def test_sigma_of_extrapolated_s_includes_the_curvature() -> None:
     s, sigma = interpolated(run(POSITION, INDEX, sigma=0.002))
     for end, side, segment in ((0, -1.0, 0), (-1, 1.0, -1)):
         away = side * (X - POSITION[end])
@@ -96,18 +94,7 @@ def test_beside_a_run_s_is_three_times_as_uncertain_and_by_all_of_its_bend() -> 
         assert expected.max() > (1.2 if end == 0 else 1.0) * alone
 
 
-def test_a_boundary_by_itself_at_the_beginning_tells_nothing_either() -> None:
-    """Though on the next line a run ends beside its place."""
-    line = np.array([0, 1, 1, 1, 1])
-    place, index = np.array([30.0, 15.0, 20.0, 25.0, 30.0]), np.array([7, 4, 5, 6, 7])
-    some = replace(run(place, index), line=line, joined=line[1:] == line[:-1])
-    codes = np.tile(np.floor(1.0 + 0.2 * X).astype(np.int32), (2, 1))
-    s, _ = interpolate_stripes(some, codes, np.ones(codes.shape, bool))
-    assert np.isnan(s[0]).all()
-    assert np.isfinite(s[1, 31])
-
-
-def test_s_that_contradicts_the_pixels_code_is_none() -> None:
+def test_s_that_contradicts_the_code_is_nan() -> None:
     s, _ = interpolated(run(POSITION, INDEX), off=1)
     # A code is a sixth of a stripe off at most: what is left lies so near to the next stripe.
     known = np.isfinite(s)
@@ -117,7 +104,7 @@ def test_s_that_contradicts_the_pixels_code_is_none() -> None:
     assert known[(near > 0.85 + 1e-3) & (bent(X) > 3.0) & (bent(X) < 25.0)].all()
 
 
-def test_blur_lifts_s_where_it_bends() -> None:
+def test_bias_by_blur_is_proportional_to_the_curvature() -> None:
     s, _ = interpolated(run(POSITION, INDEX))
     blurred, _ = interpolated(run(POSITION, INDEX, blur2=2.0))
     within = (POSITION[1] < X) & (POSITION[-2] > X)
@@ -130,7 +117,7 @@ def test_blur_lifts_s_where_it_bends() -> None:
     np.testing.assert_allclose((s - most)[within & np.isfinite(most)], 0.05, atol=1e-5)
 
 
-def test_slopes_are_those_of_parabolas_through_neighbours() -> None:
+def test_end_slopes_are_those_of_parabolas_through_neighbours() -> None:
     x = np.array([0.0, 2.0, 5.0, 6.0])
     y = 1.0 + 3.0 * x + 0.5 * x**2
     secant, width = np.diff(y) / np.diff(x), np.diff(x)
@@ -162,18 +149,7 @@ def test_narrow_stripes_are_smoothed_along_their_run() -> None:
     np.testing.assert_array_equal(position[[0, 1, -2, -1]], seen[[0, 1, -2, -1]])
 
 
-def test_a_run_is_not_smoothed_with_the_end_of_another() -> None:
-    """Even though the last run ends where the first would have gone on."""
-    last = 2.0 * np.arange(10)
-    both = np.concatenate([last + 20.0, last])
-    joined = np.arange(19) != 9
-    _, sigma = smooth_runs(run(both, np.arange(20)), joined)
-    smoothed = np.arange(10) % 9 > 1
-    smoothed[8] = False  # two of either end
-    np.testing.assert_array_equal(sigma < 0.02, np.tile(smoothed, 2))
-
-
-def test_smoothing_stops_at_the_ends_of_a_run_and_at_what_noise_does_not_explain() -> None:
+def test_smoothing_stops_at_the_ends_of_runs_and_at_outliers() -> None:
     place = 1.5 * np.arange(40)
     joined = np.ones(39, bool)
     joined[19] = False
@@ -197,7 +173,7 @@ def test_smoothing_stops_at_the_ends_of_a_run_and_at_what_noise_does_not_explain
     assert np.all(smooth_runs(run(nearly, np.arange(40)), np.ones(39, bool))[1][2:-2] < 0.02)
 
 
-def test_a_gentle_gradient_is_that_of_the_plane_through_what_is_usable() -> None:
+def test_gradient_is_that_of_the_plane_through_usable_pixels() -> None:
     rng = np.random.default_rng(0)
     v, u = np.indices((40, 50))
     image = (2.0 + 0.03 * u - 0.05 * v).astype(np.float32)
@@ -212,7 +188,7 @@ def test_a_gentle_gradient_is_that_of_the_plane_through_what_is_usable() -> None
     assert not fit_gradient(image, np.zeros_like(usable))[0].any()
 
 
-def test_twelve_pixels_that_spread_tell_a_gradient_and_fewer_or_a_line_do_not() -> None:
+def test_gradient_needs_twelve_pixels_on_two_lines() -> None:
     v, u = np.indices((20, 30))
     image = (0.03 * u - 0.05 * v).astype(np.float32)
     for columns, known in ((4, True), (3, False)):
@@ -230,7 +206,7 @@ def flat_brightness(across: float) -> Brightness:
     return Brightness(none, none, np.full(shape, across, np.float32), none)
 
 
-def test_an_edge_along_the_lines_pulls_s_by_blur_times_slope() -> None:
+def test_s_is_corrected_by_blur_times_slope_at_edges_along_the_lines() -> None:
     v, u = np.indices((6, 8))
     s = (3.0 + 0.5 * u + 0.4 * v).astype(np.float32)
     s[3, 5] = np.nan  # its neighbours know one side alone
@@ -264,7 +240,7 @@ def beside_edges(count: int, blur2: float, steep: float = 0.8) -> tuple[float, n
     return edges(along).estimate_blur2(position, np.ones(len(along) - 1, bool)), along
 
 
-def test_blur_is_told_from_boundaries_on_edges_where_there_are_enough() -> None:
+def test_blur_is_estimated_from_a_hundred_boundaries_on_edges() -> None:
     assert beside_edges(100, 0.7)[0] == pytest.approx(0.7)
     assert beside_edges(99, 0.7)[0] == 0.45
     assert beside_edges(100, 2.5)[0] == 2.0
@@ -281,19 +257,8 @@ def test_blur_is_told_from_boundaries_on_edges_where_there_are_enough() -> None:
     assert edges(along).estimate_blur2(position, joined) == 0.45
 
 
-def test_a_shift_is_doubted_by_three_tenths_and_by_noise_no_larger_than_itself() -> None:
-    along, across = np.array([0.4, 0.4, 0.01]), np.array([0.3, 0.3, 0.0])
-    ones = np.ones(3)
-    found = BoundaryBrightness(ones, ones, along, across, np.array([0.0, 0.2, 0.2])).shift_sigma(
-        0.5
-    )
-    np.testing.assert_allclose(
-        found, 0.5 * np.sqrt([0.15**2, 0.15**2 + 0.04, 0.003**2 + 0.0001]), rtol=1e-9
-    )
-
-
 @pytest.mark.parametrize("of", [np.uint8, np.float32])
-def test_brightness_beside_a_boundary_is_lit_less_dark_on_either_side(of: type) -> None:
+def test_brightness_around_a_boundary_is_lit_minus_dark(of: type) -> None:
     lit: Greys = np.full((8, 20), 120).astype(of)
     lit[:, 10:] = 60
     dark: Greys = np.full((8, 20), 20).astype(of)
@@ -310,7 +275,7 @@ def test_brightness_beside_a_boundary_is_lit_less_dark_on_either_side(of: type) 
     assert abs(noisy.at_boundaries(np.array([69])).along[0] - sharp.shading.ravel()[69]) < 0.05
 
 
-def test_an_edge_from_line_to_line_is_seen_where_noise_does_not_explain_it() -> None:
+def test_edges_across_lines_are_significant_differences() -> None:
     lit = np.full((20, 8), 120, np.uint8)
     lit[10:] = 60
     images = ScanLines(lit, np.full_like(lit, 20), lit[None], None, False)
@@ -322,9 +287,7 @@ def test_an_edge_from_line_to_line_is_seen_where_noise_does_not_explain_it() -> 
 @pytest.mark.parametrize(
     ("down", "right"), [(0.08, 0.0), (-0.08, 0.0), (0.0, 0.005), (0.0, -0.005)]
 )
-def test_a_boundary_lies_where_the_light_of_its_pixels_has_its_middle(
-    down: float, right: float
-) -> None:
+def test_boundaries_are_shifted_to_the_centroid_of_the_light(down: float, right: float) -> None:
     """A surface that gets brighter by so much from pixel to pixel, as a logarithm, shows more of its
     bright side: by the lens' usual blur squared, towards it."""
     line, place = np.mgrid[:15, :160].astype(float)
@@ -349,7 +312,7 @@ def test_a_boundary_lies_where_the_light_of_its_pixels_has_its_middle(
     np.testing.assert_allclose(moved[inner], 0.45 * right, atol=1e-3)
 
 
-def test_on_relief_boundaries_are_left_in_place() -> None:
+def test_boundaries_on_relief_are_not_smoothed() -> None:
     position = 2.0 * np.arange(1, 41) + 0.05 * np.random.default_rng(0).normal(size=40)
     codes = np.tile(np.searchsorted(position, X).astype(np.int32), (2, 1))
     rough = np.arange(40) >= 20
@@ -370,7 +333,7 @@ def test_on_relief_boundaries_are_left_in_place() -> None:
 
 
 @pytest.mark.parametrize("width", [2.2, 5.0])
-def test_pixels_share_the_noise_of_the_boundaries_around_them(width: float) -> None:
+def test_correlation_length_of_noise_along_lines(width: float) -> None:
     """As measured on many runs of noisy boundaries: narrow stripes are smoothed, wide ones are not."""
     rng, index = np.random.default_rng(2), np.arange(int(WIDTH / width) - 1)
     even, codes = (index + 1) * width, np.floor(X / width).astype(np.int32) - 1

@@ -38,7 +38,7 @@ def test_horizontal_stripes_make_lines_of_columns() -> None:
 
 @pytest.mark.parametrize("of", [np.uint8, np.float32])
 @pytest.mark.parametrize("inverses", [True, False])
-def test_bits_are_what_is_brighter_the_first_the_most_significant(inverses: bool, of: type) -> None:
+def test_words_have_the_first_pattern_as_most_significant_bit(inverses: bool, of: type) -> None:
     images = frames(inverses, of)
     lit, dark = images.lit.astype(float), images.dark.astype(float)
     patterns = images.patterns.astype(float)

@@ -35,13 +35,6 @@ def test_pixels_beside_a_jump_of_more_than_one_are_marked_in_all_four_directions
     assert not find_code_jumps(codes, every).any()
 
 
-def test_jumps_at_the_pictures_own_rim_are_seen() -> None:
-    codes = np.zeros((3, 4), np.int32)
-    codes[0, 0] = codes[2, 3] = 5
-    expected = np.array([[1, 1, 0, 0], [1, 0, 0, 1], [0, 0, 1, 1]], bool)
-    assert np.array_equal(find_code_jumps(codes, np.ones(codes.shape, bool)), expected)
-
-
 def test_a_pixel_at_the_rim_that_is_much_darker_than_its_neighbour_is_half_covered() -> None:
     contrast = np.full((6, 8), 100, np.uint8)
     contrast[:, 5:] = 0
@@ -66,7 +59,7 @@ def seen(lit: float, dark: float, of: type, *, code: int = 3, variance: float = 
     return bool(find_usable_pixels(images, codes, levels, 8, 0)[1][4, 4])
 
 
-def test_what_is_shown_is_clear_of_noise_of_rounding_and_of_saturation() -> None:
+def test_usable_pixels_have_contrast_and_are_not_saturated() -> None:
     assert seen(105, 100, np.uint8)
     assert not seen(104, 100, np.uint8)  # noise of 1: five sigmas
     assert seen(104, 100, np.uint8, variance=0.1)  # four whole grey levels at least
@@ -79,7 +72,7 @@ def test_what_is_shown_is_clear_of_noise_of_rounding_and_of_saturation() -> None
     assert min_contrast(np.dtype(np.float32)) == 0.0
 
 
-def test_only_codes_that_were_projected_are_shown() -> None:
+def test_codes_that_were_not_projected_are_unusable() -> None:
     assert [seen(200, 20, np.uint8, code=code) for code in (-1, 0, 7, 8)] == [
         False, True, True, False,
     ]  # fmt: skip
@@ -105,7 +98,7 @@ def test_s_passes_whole_numbers_where_a_line_between_pixels_does() -> None:
     assert found.blur2 == 0.4
 
 
-def test_a_whole_number_is_known_as_well_as_the_pixels_beside_it() -> None:
+def test_sigma_of_a_boundary_follows_from_its_pixels() -> None:
     s = np.array([[0.0, 0.5, 1.5], [0.0, 0.75, 1.75]], np.float32)
     sigma = np.array([[9.0, 0.3, 0.4], [9.0, 0.3, 0.4]], np.float32)
     found = find_whole_numbers(s, sigma, 0.0)

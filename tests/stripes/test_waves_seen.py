@@ -44,15 +44,8 @@ def test_a_waves_turn_is_s_over_its_period_whatever_its_start(wave: Wave) -> Non
     np.testing.assert_allclose(seen.mean, 55.0, rtol=1e-5)
 
 
-def test_a_wave_that_says_no_more_is_brightest_at_zero_first_and_moves_forward() -> None:
-    k = np.arange(4)[:, None, None]
-    images = 50.0 + 40.0 * np.cos(2.0 * np.pi * (S / 12.0 - k / 4.0))
-    off = measure_wave(images.astype(np.float32), Wave(12.0, 4)).turn - S / 12.0
-    np.testing.assert_allclose(off - np.rint(off), 0.0, atol=1e-5)
-
-
 @pytest.mark.parametrize(("wave", "noise"), [(Wave(12.0, 3), 2.0), (Wave(12.0, 8), 2.0)])
-def test_sigma_is_how_far_noise_turns_a_wave(wave: Wave, noise: float) -> None:
+def test_sigma_of_a_turn_matches_its_noise(wave: Wave, noise: float) -> None:
     clean, rng = shown(wave), np.random.default_rng(0)
     off = []
     for _ in range(60):
@@ -73,7 +66,7 @@ def test_where_there_is_no_light_the_amplitude_is_not_zero() -> None:
     assert np.isfinite(seen.sigma(np.ones((3, 20), np.float32))).all()
 
 
-def test_lit_and_dark_are_the_waves_own_highest_and_lowest() -> None:
+def test_white_and_black_are_mean_plus_and_minus_amplitude() -> None:
     waves = (Wave(12.0, 3), Wave(40.0, 5))
     images = np.concatenate([shown(wave) for wave in waves])
     parts = split_waves(images, waves)
@@ -109,13 +102,7 @@ def test_lit_and_dark_are_the_waves_own_highest_and_lowest() -> None:
         ((17.0, 17.17), 1000, 17.0),
     ],
 )
-def test_waves_are_alike_again_after_what_they_have_in_common(
+def test_waves_repeat_after_their_common_multiple(
     periods: tuple[float, ...], stripes: int, again: float | None
 ) -> None:
     assert find_repetition(periods, stripes, 0.05) == again
-
-
-def test_a_wave_finer_than_a_stripe_is_followed_over_all_stripes() -> None:
-    # Alike again after eight periods of half a stripe: more of them than stripes.
-    assert find_repetition((0.5, 4.0), 5, 0.05) == 4.0
-    assert find_repetition((0.5, 4.0), 4, 0.05) is None
