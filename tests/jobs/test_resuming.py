@@ -67,7 +67,7 @@ def test_a_second_batch_on_the_same_folder_is_refused(
     _wait_for(lambda: (out / "a" / "lock").exists())
     second = run_cheap(scans, out)
     assert second.code != 0
-    assert f"another batch is at work here (process {first.pid}" in second.errors
+    assert f"another batch is running here (process {first.pid}" in second.errors
     assert first.wait(timeout=60) == 0
     assert run_cheap(scans, out).endings()["a"]["stages"] == []
 

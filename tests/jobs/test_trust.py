@@ -120,7 +120,7 @@ def test_a_forgetting_that_was_cut_short_can_be_taken_up(day: Path) -> None:
 def test_a_batch_at_work_is_not_disturbed(day: Path) -> None:
     with (
         lock_file(day / "out" / "batch.lock", wait=False),
-        pytest.raises(BadInput, match="at work"),
+        pytest.raises(BadInput, match="is running here"),
     ):
         forget_subject("mallow", day)
     assert len(jobs_of(day / "scans", day / "out")) == 4
