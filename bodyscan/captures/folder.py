@@ -289,20 +289,7 @@ def _open(
         sequence for shot in shots for sequence in _collect_sequences(rig, listing, template, shot)
     )
     if not sequences:
-        above = _find_folder_above(rig, folder, template)
-        if above is not None:
-            raise CaptureError(
-                f"is one shot of rig {rig.name}, by the template {template}",
-                where=str(folder),
-                remedy=f"Give the folder above it, {above}, or take {{shot}}/ out of `files`.",
-            )
-        example = fill(first, shot="SHOT", pair=rig.pairs[0].name, frame=_choose_frame(rig))
-        raise CaptureError(
-            f"holds no image of rig {rig.name} by the template {template}",
-            where=str(folder),
-            remedy=f"An image should be named such as {example}{_find_some_image(folder)}; correct "
-            "`files` in the rig file (capitals and small letters count).",
-        )
+        raise _no_image_error(rig, folder, template, first)
     captures = Captures(rig, (folder,), names, sequences, base=folder)
     if file is None:
         return captures
@@ -314,6 +301,24 @@ def _open(
         simulated=bool(file.simulated),
         times=times,
         described_in=(folder / FILE_NAME, *times_file),
+    )
+
+
+def _no_image_error(rig: Rig, folder: Path, template: str, first: str) -> CaptureError:
+    """Make the error for a folder without images; first: the template of the first exposure."""
+    above = _find_folder_above(rig, folder, template)
+    if above is not None:
+        return CaptureError(
+            f"is one shot of rig {rig.name}, by the template {template}",
+            where=str(folder),
+            remedy=f"Give the folder above it, {above}, or take {{shot}}/ out of `files`.",
+        )
+    example = fill(first, shot="SHOT", pair=rig.pairs[0].name, frame=_choose_frame(rig))
+    return CaptureError(
+        f"holds no image of rig {rig.name} by the template {template}",
+        where=str(folder),
+        remedy=f"An image should be named such as {example}{_find_some_image(folder)}; correct "
+        "`files` in the rig file (capitals and small letters count).",
     )
 
 
