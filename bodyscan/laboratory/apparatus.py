@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import IntEnum
 
 import numpy as np
 
@@ -36,37 +37,7 @@ BOARD = Board(name="board", columns=9, rows=7, square_mm=20, margin_mm=15)
 """8 x 6 = 48 inner corners, 20 mm apart."""
 RADIUS_MM = 25.0
 DISTANCE_MM = 400.0
-PROJECTOR_AT = (-150.0, 0.0, -25.0)
-"""Behind the camera's lens, so that baselines decrease with the stripe's number (Fig. 6)."""
-SWEPT_MM = (375.0, 400.0, 430.0)
-"""The stripes cover the image exactly at these distances."""
-BOARD_TURNS = ((0.0, 0.45, 0.02), (0.42, -0.1, -0.03), (-0.3, -0.38, 0.02))
-BOARD_MIDDLES = ((-11.0, -17.0, 400.0), (-11.0, -17.0, 405.0), (-11.0, -17.0, 400.0))
-MORE_TURNS = (
-    (0.35, 0.3, 0.1),
-    (-0.4, 0.25, -0.2),
-    (0.1, -0.5, 0.4),
-    (-0.1, 0.55, -0.35),
-    (0.5, -0.35, 0.15),
-    (0.0, 0.05, 0.8),
-    (-0.25, -0.2, -0.6),
-)
-"""For further boards, if three are not considered enough."""
-MORE_MIDDLES = (
-    (-20.0, -10.0, 380.0),
-    (5.0, -25.0, 420.0),
-    (-15.0, -20.0, 430.0),
-    (-5.0, -10.0, 390.0),
-    (-25.0, -20.0, 415.0),
-    (-11.0, -17.0, 410.0),
-    (0.0, -25.0, 395.0),
-)
-BOARDS = len(BOARD_TURNS)
-STAGE_TURN = (0.12, -0.16, 0.02)
-STAGE_MIDDLE = (-11.0, -17.0, 400.0)
-STAGE_MM = (-60.0, -40.0, -20.0, 0.0, 20.0, 40.0, 60.0)
-STAGE_ERROR_MM = 0.01
-"""Standard deviation of where the slide really stops."""
+BOARDS = 3
 CENTRES = np.array(
     [
         [-73.0, -50.0, 405.0],
@@ -77,12 +48,15 @@ CENTRES = np.array(
     ]
 )
 """No. 1 to 5, from top left to bottom right."""
-PLATE_TURN = (0.15, 0.1, 0.0)
-PLATE_MM = (160.0, 120.0)
-PLATE_MIDDLE = (-11.0, -17.0, 402.0)
-_PROJECTOR_SEED = 1
-RAYS, BOARD_MAKING, STAGE, NOISE = range(1, 5)
-"""Purposes of random numbers: each has its own stream."""
+
+
+class Stream(IntEnum):
+    """Streams of random numbers by purpose."""
+
+    RAYS = 1
+    BOARD_MAKING = 2
+    STAGE = 3
+    NOISE = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,21 +98,22 @@ def real_settings(samples: int = 5) -> SimulationSettings:
 
 def chapter_setup(settings: SimulationSettings, seed: int = 0) -> ChapterSetup:
     """Build the set-up; its projector is the same whatever the seed."""
-    x, _, z = PROJECTOR_AT
+    # Behind the camera's lens, so that baselines decrease with the stripe's number (Fig. 6).
+    x, y, z = -150.0, 0.0, -25.0
     turn = [0.0, float(np.arctan2(-x, DISTANCE_MM - z)), 0.0]
     projector = build_mirror(
-        RigidTransform.from_rotation_vector(turn, PROJECTOR_AT),
+        RigidTransform.from_rotation_vector(turn, [x, y, z]),
         PROJECTOR.stripes,
         False,
-        sample_view_volume(CAMERA, SWEPT_MM),
+        sample_view_volume(CAMERA, (375.0, 400.0, 430.0)),
         settings.projection,
-        np.random.default_rng(_PROJECTOR_SEED),
+        np.random.default_rng(1),
     )
     return ChapterSetup(
         settings,
         projector,
-        make_board(BOARD, settings.board, np.random.default_rng([seed, BOARD_MAKING])),
-        View.from_camera(CAMERA, settings.optics, np.random.default_rng([seed, RAYS])),
+        make_board(BOARD, settings.board, np.random.default_rng([seed, Stream.BOARD_MAKING])),
+        View.from_camera(CAMERA, settings.optics, np.random.default_rng([seed, Stream.RAYS])),
         seed,
     )
 
@@ -150,20 +125,32 @@ def true_planes(setup: ChapterSetup) -> Array:
 
 def board_poses(count: int = BOARDS) -> list[RigidTransform]:
     """List camera_from_board of the three poses, or of `count` poses."""
-    middles, turns = (*BOARD_MIDDLES, *MORE_MIDDLES), (*BOARD_TURNS, *MORE_TURNS)
-    return [pose_about(m, t) for m, t in zip(middles[:count], turns[:count], strict=True)]
+    # The board's middle, mm, and its rotation; the first three, and more if they are not enough.
+    poses = (
+        ((-11.0, -17.0, 400.0), (0.0, 0.45, 0.02)),
+        ((-11.0, -17.0, 405.0), (0.42, -0.1, -0.03)),
+        ((-11.0, -17.0, 400.0), (-0.3, -0.38, 0.02)),
+        ((-20.0, -10.0, 380.0), (0.35, 0.3, 0.1)),
+        ((5.0, -25.0, 420.0), (-0.4, 0.25, -0.2)),
+        ((-15.0, -20.0, 430.0), (0.1, -0.5, 0.4)),
+        ((-5.0, -10.0, 390.0), (-0.1, 0.55, -0.35)),
+        ((-25.0, -20.0, 415.0), (0.5, -0.35, 0.15)),
+        ((-11.0, -17.0, 410.0), (0.0, 0.05, 0.8)),
+        ((0.0, -25.0, 395.0), (-0.25, -0.2, -0.6)),
+    )
+    return [pose_about(middle, turn) for middle, turn in poses[:count]]
 
 
-def stage_readings(count: int = len(STAGE_MM)) -> Array:
+def stage_readings(count: int = 7) -> Array:
     """Space the slide stage's nominal stops, mm, evenly over its range."""
-    return np.linspace(STAGE_MM[0], STAGE_MM[-1], count)
+    return np.linspace(-60.0, 60.0, count)
 
 
 def stage_poses(readings: Array, seed: int) -> list[RigidTransform]:
     """List camera_from_board at each stop, along the board's normal, with the stage's errors."""
-    rng = np.random.default_rng([seed, STAGE])
-    stage = pose_about(STAGE_MIDDLE, STAGE_TURN)
-    stops = readings + STAGE_ERROR_MM * rng.standard_normal(len(readings))
+    rng = np.random.default_rng([seed, Stream.STAGE])
+    stage = pose_about((-11.0, -17.0, 400.0), (0.12, -0.16, 0.02))
+    stops = readings + 0.01 * rng.standard_normal(len(readings))
     slides = [RigidTransform.from_translation([0.0, 0.0, stop]) for stop in stops]
     return [stage @ slide for slide in slides]
 

@@ -50,8 +50,8 @@ def sphere_scene() -> list[Surface]:
 
 def plate_scene() -> list[Surface]:
     """Build a flat white plate, smaller than the board: no calibration reaches farther."""
-    pose = apparatus.pose_about(apparatus.PLATE_MIDDLE, apparatus.PLATE_TURN, middle=np.zeros(3))
-    width, height = apparatus.PLATE_MM
+    pose = apparatus.pose_about((-11.0, -17.0, 402.0), (0.15, 0.1, 0.0), middle=np.zeros(3))
+    width, height = 160.0, 120.0
     across, down = np.array([width, 0.0, 0.0]), np.array([0.0, height, 0.0])
     plate = grid_surface(-0.5 * (across + down), across, down, albedo=0.8)
     return [replace(plate, open_to_light=True).transform(pose), _wall()]
@@ -64,7 +64,7 @@ def expose_scene(
 
     times: how often the sensor's noise is drawn anew on the same light (jitter and speckle too).
     """
-    rng = np.random.default_rng([setup.seed, apparatus.NOISE, number])
+    rng = np.random.default_rng([setup.seed, apparatus.Stream.NOISE, number])
     settings = setup.settings
     lamps = Lamps(255.0, 13.0, apparatus.DISTANCE_MM * 1.05, apparatus.DISTANCE_MM)
     images = render_pair(
