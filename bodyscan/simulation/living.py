@@ -254,9 +254,7 @@ def load_body(motion: dict[str, Any], path: Path) -> LivingBody:
     ]
     breath = Breath(**{**motion["breath"], "phases": tuple(motion["breath"]["phases"])})
     rest = Surface(kept["vertices"], kept["triangles"].astype(np.int64))
-    return LivingBody(
-        rest, tuple(joints[:-1]), kept["breath_modes"].astype(float), breath, joints[-1]
-    )
+    return LivingBody(rest, tuple(joints[:-1]), kept["swells"].astype(float), breath, joints[-1])
 
 
 def _signal_from_fields(fields: dict[str, Any]) -> RandomSignal:
