@@ -114,31 +114,3 @@ def test_what_lies_above_the_planes_of_a_crown_is_outside() -> None:
     np.testing.assert_array_equal(
         Crown(highest, normals[:0], offsets[:0]).compute_heights_above(highest + off), 0.0
     )
-
-
-@pytest.mark.parametrize(
-    ("radius", "depth", "least"), [(90.0, 65.0, 0.5), (90.0, 50.0, 0.75), (120.0, 30.0, 0.5)]
-)
-def test_planes_hold_that_are_no_steeper_than_sixty_degrees_and_that_no_part_of_the_head_exceeds(
-    radius: float, depth: float, least: float
-) -> None:
-    """A ball with a rim around it. What lies 60 mm lower, or 100 mm aside, is no part of the head;
-    else planes whose normals have z hold if radius sqrt(1 - z^2) + (80 - depth) z < 80."""
-    turn = np.linspace(0.0, 2.0 * np.pi, 200)
-    rim = np.column_stack([radius * np.cos(turn), radius * np.sin(turn), np.full(200, TOP - depth)])
-    whole = head(lambda points: np.ones(len(points), bool), noise_mm=0.0, tilt=0.0)
-    found = Crown.from_cloud(
-        np.concatenate([whole.points, rim]),
-        np.concatenate([whole.normals, np.tile([1.0, 0.0, 0.0], (200, 1))]),
-    )
-    # Of cells 8 mm wide, a twentieth of the ball's radius to either side.
-    assert found.normals[:, 2].min() == pytest.approx(least, abs=0.06)
-    assert found.normals[:, 2].min() > 0.5
-
-
-@pytest.mark.parametrize(("higher_mm", "planes"), [(0.4, 2), (0.6, 1)])
-def test_a_plane_that_points_exceed_by_half_a_millimetre_holds_nothing(
-    higher_mm: float, planes: int
-) -> None:
-    points = np.array([[0.0, 0.0, TOP], [30.0, 0.0, TOP + higher_mm]])
-    assert len(Crown.from_cloud(points, np.tile([0.0, 0.0, 1.0], (2, 1))).offsets) == planes

@@ -54,29 +54,3 @@ def test_a_faint_line_stays() -> None:
 
 def test_noise_on_something_dark_stays() -> None:
     assert not find_dark_gaps(photographed(np.full((200, 200), DARK), noise=5.0)).any()
-
-
-@pytest.mark.parametrize("turned", [False, True])
-@pytest.mark.parametrize(("width", "gap"), [(6, True), (7, False)])
-def test_a_gap_narrower_than_seven_pixels_is_found_with_one_more_on_either_side(
-    turned: bool, width: int, gap: bool
-) -> None:
-    grey = np.full((40, 50), 160, np.uint8)
-    grey[:, 20 : 20 + width] = 20
-    found = find_dark_gaps(grey.T.copy()).T if turned else find_dark_gaps(grey)
-    expected = np.zeros(grey.shape, bool)
-    if gap:
-        expected[:, 19 : 21 + width] = True
-    np.testing.assert_array_equal(found, expected)
-
-
-@pytest.mark.parametrize(
-    ("bright", "dark", "gap"),
-    [(200, 99, True), (200, 101, False), (58, 28, True), (56, 27, False)],
-)
-def test_a_gap_is_half_as_bright_and_thirty_levels_darker(
-    bright: int, dark: int, gap: bool
-) -> None:
-    grey = np.full((30, 30), bright, np.uint8)
-    grey[:, 14:17] = dark
-    assert find_dark_gaps(grey).any() == gap

@@ -117,24 +117,6 @@ def test_what_lies_before_or_behind_measured_surface_is_a_shadow_and_no_gap(dept
     assert found == [22, 23, 24, *range(30, 39)]
 
 
-def test_no_gap_is_wider_than_two_hands() -> None:
-    """200 mm are 66 rays 3 mm apart: from further off nothing is told."""
-    wide = Camera(100.0, 100.0, 0.0, 30.0, 10.0, Radial(), 160, 20)
-    for gap, some in ((100, True), (140, False)):
-        left, right = 79.5 - gap / 2, 79.5 + gap / 2
-        guess = plates(
-            (0.5, left, 1000.0, False), (left, right, 1000.0, True), (right, 159.5, 1000.0, False)
-        )
-        grey = np.zeros((20, 160), np.uint8)
-        nothing = np.full((20, 160, 3), np.nan, np.float32)
-        image = RangeImage("p", wide, nothing, nothing, nothing[..., 0], grey)
-        found = find_gaps(guess, image, HERE, 1, np.s_[0:20, 0:160])[0]
-        reached = COLUMN_OF_160[found]
-        assert bool(len(reached)) is some
-        if some:  # within 66 of both rims
-            assert (reached.min(), reached.max()) == (right - 0.5 + 1 - 66, left - 0.5 + 66)
-
-
 def test_what_is_beside_or_behind_the_camera_was_not_seen_through() -> None:
     measured = np.ones(60, bool)
     guess = plates((0.5, 59.5, 500.0, True))
@@ -153,13 +135,3 @@ def test_what_is_beside_or_behind_the_camera_was_not_seen_through() -> None:
     with np.errstate(all="raise"):  # nothing is divided by a depth of 0
         through = find_free_points(points, guess, shown(measured), HERE, 10.0)
     assert through.tolist() == [True, True, False, False, False, False, False]
-
-
-def test_the_pictures_outermost_pixels_see_as_well_as_others() -> None:
-    guess = plates((0.5, 59.5, 500.0, True))
-    pixels = np.array([[0, 0], [59, 0], [0, 19], [59, 19], [-1, 5], [60, 5], [5, -1], [5, 20]])
-    points = 500.0 * np.column_stack([(pixels - [30, 10]) / 100.0, np.ones(len(pixels))])
-    through = find_free_points(
-        points.astype(np.float32), guess, shown(np.ones(60, bool)), HERE, margin_mm=10.0
-    )
-    assert through.tolist() == [True] * 4 + [False] * 4

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.linalg import block_diag
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.fusion.pose_variance import add_motion_variance, add_pose_variance
@@ -147,23 +146,3 @@ def looking_from(cosine: float, azimuth_deg: float) -> RigidTransform:
 
 
 POINT = np.array([40.0, -30.0, 1200.0])
-
-
-@pytest.mark.parametrize("azimuth_deg", [0.0, 90.0, 200.0])
-def test_pairs_that_see_a_point_too_flat_have_no_part_in_its_error_bar(azimuth_deg: float) -> None:
-    """From a cosine of 0.2 on; of those that do, the mean of their variances along the normal."""
-    one = BodyCloud(
-        POINT[None], np.array([[0, 0, 1.0]], np.float32), np.zeros(1, np.float32),
-        np.zeros((1, 3), np.uint8), np.ones(1, np.uint8),
-    )  # fmt: skip
-    turned = np.diag([1e-8, 4e-8, 0.0, 0.3, 0.7, 2.0])  # about x by 1e-4 at y = -30: 3 um
-    shifted = np.diag([0.0] * 5 + [1.0])
-    prior = PoseCovariance(("a", "b"), np.asarray(block_diag(turned, shifted), np.float64))
-    steep = looking_from(1.0, 0.0)
-    for cosine, variance in ((0.21, 1.5), (0.19, 2.0)):
-        found = add_pose_variance(one, {"a": steep, "b": looking_from(cosine, azimuth_deg)}, prior)
-        assert found.sigma_mm[0] ** 2 == pytest.approx(variance, rel=1e-3)
-    alone = add_pose_variance(one, {"b": looking_from(0.1, azimuth_deg)}, prior)
-    assert alone.sigma_mm[0] == 0.0
-    single = add_pose_variance(one, {"b": looking_from(0.9, azimuth_deg)}, prior)
-    assert single.sigma_mm[0] == pytest.approx(1.0)

@@ -115,25 +115,6 @@ def test_a_surface_behind_takes_no_part_however_large(beside: int, sigmas: float
     same(fitted(offset), by_numpy(offset, ~behind))
 
 
-@pytest.mark.parametrize(("residual", "accepted"), [(3.7, True), (-3.7, True), (4.3, False)])
-def test_a_pixel_four_sigmas_off_its_own_fit_is_not_of_the_surface(
-    residual: float, accepted: bool
-) -> None:
-    offset = 0.0 * DU - residual
-    offset[REACH, REACH] = 0.0
-    found = fitted(offset)
-    assert found[0][0] == pytest.approx(-residual, abs=0.05)
-    assert found[2] == accepted
-
-
-@pytest.mark.parametrize(("count", "accepted"), [(14, False), (15, True)])
-def test_fifteen_samples_make_a_fit(count: int, accepted: bool) -> None:
-    nearest = np.argsort(DU**2 + DV**2, axis=None, kind="stable")[:count]
-    there = np.zeros(SIDE * SIDE, bool)
-    there[nearest] = True
-    assert fitted(curved(0.1), there.reshape(SIDE, SIDE))[2] == accepted
-
-
 def test_each_pixel_is_fitted_by_the_window_around_it() -> None:
     height, width = 16, 20
     v, u = np.mgrid[:height, :width].astype(float)

@@ -53,20 +53,6 @@ def test_an_overlap_tells_how_much_brighter_one_pair_is_than_the_other() -> None
     assert len(many.ratio) == 4000  # a third of them tell as much
 
 
-@pytest.mark.parametrize(("level", "clear"), [(8, False), (9, True), (249, True), (250, False)])
-def test_what_is_nearly_black_or_white_says_nothing(level: int, clear: bool) -> None:
-    some, rest = np.full(500, level), np.full(300, 100)
-    for ours, theirs in ((100, some), (some, 100)):
-        one, other = (np.concatenate([np.broadcast_to(part, 500), rest]) for part in (ours, theirs))
-        (found,) = overlap(one, other)
-        assert found.spots == (800 if clear else 300)
-
-
-@pytest.mark.parametrize(("count", "told"), [(199, False), (200, True)])
-def test_two_hundred_spots_make_an_overlap(count: int, told: bool) -> None:
-    assert bool(overlap(np.full(count, 100), np.full(count, 120))) == told
-
-
 def test_an_overlap_counts_for_as_many_spots_as_it_stands_for() -> None:
     """Two pairs tied twice, saying 1 and 1.5, the first of three times as many spots: 1.107."""
     found = solve_gains([(0, 1, 0.0, 300), (0, 1, float(np.log(1.5)), 100)], 2)

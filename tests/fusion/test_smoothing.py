@@ -12,9 +12,7 @@ from hypothesis import strategies as st
 from bodyscan.fusion.smoothing import (
     SmoothSurface,
     distance_to_rim,
-    estimate_pixel_size,
     smooth,
-    window_reach,
 )
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
@@ -248,21 +246,3 @@ def test_rims_are_where_nothing_lies_beside_or_something_behind(turns: int) -> N
     depth[12:] = 1000.0 * (1.0 + np.float32(0.009))
     flat = np.rot90(distance_to_rim(np.ascontiguousarray(np.rot90(depth, turns)), 0.01), -turns)
     assert flat[11, 9] > 5.0
-
-
-def test_windows_are_as_wide_as_asked_within_two_to_six_pixels() -> None:
-    assert [window_reach(pixel, 7.0) for pixel in (0.4, 0.6, 0.75, 1.0, 1.6, 3.0)] == [
-        6,
-        6,
-        5,
-        4,
-        2,
-        2,
-    ]
-
-
-def test_a_pixel_is_as_wide_as_it_appears_half_way_deep() -> None:
-    depth = np.full((40, 40), 500.0)
-    depth[:, :10] = 5000.0
-    inverse = np.where(np.arange(40) > 35, 0.0, 1.0 / depth).astype(np.float32)
-    assert estimate_pixel_size(inverse, CAMERA) == pytest.approx(500.0 / CAMERA.alpha, rel=1e-6)

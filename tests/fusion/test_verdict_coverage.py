@@ -74,15 +74,6 @@ def test_a_camera_is_asked_for_what_another_measured_and_for_that_alone() -> Non
     assert np.mean(alone.filled) == pytest.approx(0.5, abs=0.03)
 
 
-@pytest.mark.parametrize(("shift_mm", "measured"), [(9.5, True), (-9.5, True), (10.5, False)])
-def test_what_lies_within_a_centimetre_of_the_mesh_is_measured(
-    shift_mm: float, measured: bool
-) -> None:
-    found = checked(seen("a", shift_mm=shift_mm), seen("b", left_of=0))
-    assert found.filled_share == (0.0 if measured else 1.0)
-    assert found.yields == ({"b": 0.0} if measured else {})
-
-
 @pytest.mark.parametrize(("lean_deg", "asked"), [(58.0, True), (62.0, False)])
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_a_camera_should_measure_what_faces_it_by_60_degrees(
@@ -97,13 +88,6 @@ def test_a_camera_should_measure_what_faces_it_by_60_degrees(
     found = checked(seen("a"), seen("b", left_of=0), columns=2, rows=13, turn=turn)
     assert found.filled_share == 0.0
     assert ("b" in found.yields) == asked
-
-
-@pytest.mark.parametrize(("rows", "told"), [(24, False), (25, True)])
-def test_a_pair_that_looks_at_fewer_than_fifty_spots_is_not_judged(rows: int, told: bool) -> None:
-    tall = Camera(250.0, 250.0, 0.0, 60.0, 40.0, Radial(), 121, 81)
-    found = checked(seen("a", camera=tall), seen("b", left_of=0, camera=tall), columns=1, rows=rows)
-    assert ("b" in found.yields) == told
 
 
 def test_white_is_counted_from_254_on_among_what_it_should_have_measured() -> None:

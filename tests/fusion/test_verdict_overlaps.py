@@ -188,15 +188,6 @@ def test_sigmas_of_patches_say_how_far_their_medians_scatter() -> None:
     assert np.median(np.abs(found)) < 0.5
 
 
-def test_a_patch_of_eight_matches_counts() -> None:
-    points = np.zeros((15, 3))
-    points[8:, 0] = 400.0
-    matches = Matches(points, points, np.full(15, -2.0), np.ones(15), np.arange(15))
-    found, sigma = patch_medians(matches)
-    assert found.tolist() == [2.0]
-    assert sigma.tolist() == [0.0]
-
-
 def test_a_step_is_what_three_of_four_patches_keep_to() -> None:
     apart = np.array([0.0, 1.0, 2.0, 3.0, 50.0])
     assert estimate_step([Seam(("a", "b"), apart, np.zeros(5))]) == pytest.approx(3.0)
