@@ -1,4 +1,4 @@
-"""Skin, hair and dark cloth told apart by how dark and how rough they are, and where."""
+"""Skin, hair and dark cloth of a cloud, and which of its points are on the head."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ import pytest
 from ray_cast_scan import Scan, cast_scan, load_body, load_rig
 
 from bodyscan.arrays import Bytes, Mask
-from bodyscan.fusion.regions import CELL_MM, Regions, find_in_cells, label_regions
+from bodyscan.fusion.regions import CELL_MM, Regions, find_head, find_in_cells, label_regions
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import DARK_CLOTH, HAIR, SKIN, UNSURE, BodyCloud, compute_cover_shares
+from bodyscan.motion.body_parts import NECK
 from bodyscan.reconstruction.range_image import RangeImage
 
 BRIGHT = 120
@@ -246,3 +247,18 @@ def test_pixels_that_are_looked_at_lie_in_the_cells_asked_about() -> None:
     nearest = np.clip(cell, 0, np.array(asked.shape) - 1)
     expected = np.isfinite(sigma_mm) & asked[tuple(np.moveaxis(nearest, -1, 0))]
     np.testing.assert_array_equal(wanted, expected)
+
+
+def test_a_head_is_above_the_neck_and_near_the_middle_of_the_upper_body() -> None:
+    z = np.linspace(0.0, 1700.0, 1701)
+    points = np.column_stack([np.where(z < 840.0, 600.0, 50.0), np.full(1701, -30.0), z])
+    # Most of what is seen are legs far ahead, which say nothing of where the upper body is.
+    points = np.vstack([points, points[:840], points[:840]])
+    wide, neck = 0.12 * 1700.0, NECK * 1700.0
+    places = np.array(
+        [
+            [50.0, -30.0, neck + 1.0], [50.0, -30.0, neck - 1.0], [50.0 + wide - 1.0, -30.0, 1600.0],
+            [50.0 + wide + 1.0, -30.0, 1600.0], [50.0, -31.0 - wide, 1600.0], [50.0, -30.0, 1700.0],
+        ]
+    )  # fmt: skip
+    assert find_head(points, places).tolist() == [True, False, True, False, False, True]

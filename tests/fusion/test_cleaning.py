@@ -1,15 +1,27 @@
-"""Range images of a body on a floor, with flying pixels: what stays is the body."""
+"""What cleaning removes: the room, flying pixels, speckles and bridges over dark gaps."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from ray_cast_scan import Scan, load_rig
 
 from bodyscan.evaluation.surface import signed_distances
-from bodyscan.fusion.cleaning import _inside, clean, cut_to_volume, drop_flying_pixels, find_inside
+from bodyscan.fusion.cleaning import (
+    _inside,
+    clean,
+    cut_to_volume,
+    drop_flying_pixels,
+    drop_speckles,
+    find_dark_gaps,
+    find_foreground,
+    find_inside,
+)
 from bodyscan.fusion.verdict.coverage import measure_coverage
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyMesh
@@ -179,3 +191,106 @@ def test_a_rim_keeps_its_pixels_and_what_juts_out_of_it_goes() -> None:
     assert np.isfinite(drop_flying_pixels(depth, 2.0)[10, 20])
     depth[12, 21] = np.nan
     assert np.isnan(drop_flying_pixels(depth, 2.0)[10, 20])
+
+
+NAN = np.float32(np.nan)
+
+
+def depth_of(patch: int) -> np.ndarray:
+    """A patch of so many pixels, a gap and a wall of 300."""
+    depth = np.full((20, 30), NAN)
+    depth[:, 15:] = 1000.0
+    rows, columns = np.divmod(np.arange(patch), 10)
+    depth[rows, columns] = 1000.0
+    return depth
+
+
+@pytest.mark.parametrize(("patch", "kept"), [(49, 0), (51, 51)])
+def test_patches_of_fewer_pixels_are_speckles(patch: int, kept: int) -> None:
+    found = drop_speckles(depth_of(patch), 4.0, 50.0)
+    assert found[:, :10].sum() == kept
+    assert found[:, 15:].all()
+    assert not found[:, 10:15].any(), "nothing was measured there"
+
+
+@pytest.mark.parametrize("near_mm", [500.0, 2000.0, 7900.0])
+@pytest.mark.parametrize(("jump_mm", "one"), [(3.75, True), (4.5, False)])
+def test_a_jump_in_depth_parts_what_is_side_by_side(
+    near_mm: float, jump_mm: float, one: bool
+) -> None:
+    """Depths are compared in quarters of a millimetre: two halves of 300 pixels each, or 600."""
+    depth = np.full((20, 30), near_mm, np.float32)
+    depth[:, 15:] += np.float32(jump_mm)
+    found = drop_speckles(depth, 4.0, 400.0)
+    assert found.all() if one else not found.any()
+
+
+def test_what_stands_before_the_nearest_of_an_empty_rooms_pixels_around_is_no_background() -> None:
+    room = np.full((9, 11), 3000.0, np.float32)
+    room[4, 5] = 2000.0  # the edge of a shelf
+    room[0, 0] = 0.0  # nothing was seen there
+    empty: Any = SimpleNamespace(open_depth=room)
+    points = np.zeros((5, 7, 3), np.float32)
+    points[..., 2] = 1997.0
+    image: Any = SimpleNamespace(points=points, part=np.s_[2:7, 2:9])
+    found = find_foreground(image, empty)
+    assert not found[1:4, 2:5].any(), "beside the shelf"
+    found[1:4, 2:5] = True
+    assert found.all()
+    points[..., 2] = 1995.0
+    assert find_foreground(image, empty).all()
+    points[2, 3, 2] = NAN
+    assert not find_foreground(image, empty)[2, 3]
+    points[..., 2] = 4000.0
+    nothing: Any = SimpleNamespace(open_depth=np.zeros((9, 11), np.float32))
+    assert find_foreground(image, nothing).all(), (
+        "where a room is seen nowhere, all stands before it"
+    )
+
+
+SKIN, DARK = 150, 12
+
+
+def photographed(grey: np.ndarray, noise: float = 2.0) -> np.ndarray:
+    """Through a lens whose blur has a sigma of a pixel, with noise."""
+    blurred = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), 1.0)
+    blurred += np.random.default_rng(0).normal(0.0, noise, grey.shape)
+    return np.clip(np.rint(blurred), 0, 255).astype(np.uint8)
+
+
+def skin_with_a_band(width: int, level: int = DARK) -> np.ndarray:
+    """An image of skin with a dark upright band in its middle."""
+    grey = np.full((60, 80), SKIN)
+    grey[:, 40 - width // 2 : 40 + (width + 1) // 2] = level
+    return grey
+
+
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("width", [2, 3, 5])
+def test_a_narrow_gap_is_found(width: int, turned: bool) -> None:
+    grey = skin_with_a_band(width)
+    found = find_dark_gaps(photographed(grey.T if turned else grey))
+    found = found.T if turned else found
+    assert found[10:-10, 40].all()
+    # The skin on both sides stays, but for the two pixels into which the dark is blurred.
+    assert not found[:, : 40 - width // 2 - 2].any()
+    assert not found[:, 40 + (width + 1) // 2 + 2 :].any()
+
+
+@pytest.mark.parametrize("width", [12, 30])
+def test_something_dark_and_wide_stays(width: int) -> None:
+    assert not find_dark_gaps(photographed(skin_with_a_band(width))).any()
+
+
+def test_a_silhouette_before_a_dark_room_stays() -> None:
+    grey = np.full((60, 80), DARK)
+    grey[:, 30:] = SKIN
+    assert not find_dark_gaps(photographed(grey)).any()
+
+
+def test_a_faint_line_stays() -> None:
+    assert not find_dark_gaps(photographed(skin_with_a_band(3, SKIN // 2 + 10))).any()
+
+
+def test_noise_on_something_dark_stays() -> None:
+    assert not find_dark_gaps(photographed(np.full((200, 200), DARK), noise=5.0)).any()
