@@ -82,7 +82,6 @@ def faults() -> Iterator[Fault]:
     yield from _image_faults()
     yield Fault("two people hand in hand", ("two people", "two bodies", "person"), _two_people)
     yield Fault("one person behind another", ("two people", "two bodies", "person"), _behind)
-    yield Fault("a backpack", ("carried",), _backpack)
     yield Fault("hand on hip", ("closed ring",), _hand_on_hip)
     yield Fault("long hair, black", ("nothing was measured",), _hair)
     yield Fault("a stick beside the legs", ("stick",), _stick)
@@ -255,17 +254,6 @@ def _two_people(sound: Sound) -> Case:
 def _behind(sound: Sound) -> Case:
     """Two people chest to back, 330 mm from middle to middle."""
     parts = [(sound.vertices + [side * 165.0, 0.0, 0.0], sound.faces) for side in (-1.0, 1.0)]
-    return _cast(sound, parts)
-
-
-def _backpack(sound: Sound) -> Case:
-    """A backpack 160 mm deep, from the waist to the shoulders."""
-    height = 0.72 * float(sound.vertices[:, 2].max())
-    x, y, z = sound.vertices.T
-    back = float(x[(np.abs(z - height) < 60.0) & (np.abs(y) < 100.0)].min())
-    made = o3d.geometry.TriangleMesh.create_box(160.0, 300.0, 420.0)
-    bag = np.asarray(made.vertices) + [back - 150.0, -150.0, height - 210.0]
-    parts = [(sound.vertices, sound.faces), (bag, np.asarray(made.triangles).astype(np.int64))]
     return _cast(sound, parts)
 
 
