@@ -30,8 +30,8 @@ from bodyscan.geometry.smooth_sheets import Offset, SmoothSheets
 
 PLANE_DEGREE, BOW_DEGREE = 7, 3
 FALL = 0.3
-PLANE_SPREAD = (1.0, 0.03, 0.03)
-BOW_SPREAD = (0.1, 0.03, 0.03)
+PLANE_SIGMAS = (1.0, 0.03, 0.03)
+BOW_SIGMAS = (0.1, 0.03, 0.03)
 """Standard deviations, before any data, of p, q, r and of b2, b3, ...: coefficient m of a
 polynomial is expected to be FALL times as large as coefficient m - 1."""
 
@@ -83,15 +83,15 @@ class BowedSheets(SmoothSheets):
         fall = FALL ** np.arange(PLANE_DEGREE + 1)
         # A lens bows the sheets above and below its axis in opposite directions: b2 grows with s.
         late = FALL ** np.maximum(np.arange(BOW_DEGREE + 1) - 1, 0)
-        spread = [size * fall for size in PLANE_SPREAD]
-        spread += [size * late for size in BOW_SPREAD[: self.bow_terms]]
+        sigmas = [size * fall for size in PLANE_SIGMAS]
+        sigmas += [size * late for size in BOW_SIGMAS[: self.bow_terms]]
         deviation = self.parameters
         if self.bow_terms:
             # The boards' middle along the stripes is known to 30 % of its distance.
-            spread.append(np.array([0.3 * self.distance_mm]))
+            sigmas.append(np.array([0.3 * self.distance_mm]))
             middle = self.projector_from_camera.apply(self.middle)[0]
             deviation = np.append(deviation[:-1], middle + deviation[-1])
-        size = np.concatenate(spread)
+        size = np.concatenate(sigmas)
         return deviation / size, np.diag(1.0 / size)
 
     def retract(self, step: Array) -> BowedSheets:
@@ -105,10 +105,14 @@ class BowedSheets(SmoothSheets):
         return SheetsAtStripe(basis @ polynomials.T, basis[..., :-1] @ slopes.T, basis)
 
     def offset(self, points: Array, sheet: SheetsAtStripe, *, parameters: bool = False) -> Offset:
-        seen = self.projector_from_camera.apply(points)
-        reach = seen[..., 2]
+        in_projector = self.projector_from_camera.apply(points)
+        reach = in_projector[..., 2]
         shift = self.parameters[-1] if self.bow_terms else 0.0
-        x, y, w = (seen[..., 0] + shift) / reach, seen[..., 1] / reach, self.distance_mm / reach
+        x, y, w = (
+            (in_projector[..., 0] + shift) / reach,
+            in_projector[..., 1] / reach,
+            self.distance_mm / reach,
+        )
         powers = [np.ones_like(x), x]
         for _ in range(self.bow_terms):
             powers.append(powers[-1] * x)
@@ -169,11 +173,11 @@ class SheetTable:
         terms, aside = 3 + sheets.bow_terms, sheets.bow_terms > 0
         by_parameter = _by_parameter(at, terms, len(sheets.parameters))
         # A small matrix per node: two large products do all nodes.
-        spread = (by_parameter.reshape(-1, len(sheets.covariance)) @ sheets.covariance).reshape(
+        variances = (by_parameter.reshape(-1, len(sheets.covariance)) @ sheets.covariance).reshape(
             by_parameter.shape
         ) @ by_parameter.transpose(0, 2, 1)
         above = np.triu_indices(terms + aside)
-        rows = np.concatenate([at.value, at.slope, spread[:, above[0], above[1]]], axis=1)
+        rows = np.concatenate([at.value, at.slope, variances[:, above[0], above[1]]], axis=1)
         shift = float(sheets.parameters[-1]) if aside else 0.0
         frame = sheets.projector_from_camera.matrix[:3].ravel()
         return SheetTable(rows, terms, np.append(frame, [shift, sheets.distance_mm]))
@@ -207,11 +211,11 @@ def _measure(frame: Array, rows: Array, terms: int, rays: Array, s: Array, found
     last, row, by = len(rows) - 1, np.empty(rows.shape[1]), np.empty(terms + 1)
     for n in range(len(s)):
         found[0, n] = found[1, n] = found[2, n] = np.nan
-        place = s[n] * NODES_PER_STRIPE
-        if not (place >= 0.0 and place <= last):
+        position = s[n] * NODES_PER_STRIPE
+        if not (position >= 0.0 and position <= last):
             continue
-        node = min(int(place), last - 1)
-        share = place - node
+        node = min(int(position), last - 1)
+        share = position - node
         for k in range(len(row)):
             row[k] = rows[node, k] + share * (rows[node + 1, k] - rows[node, k])
         depth, rise = _depth(frame, row, terms, rays[n, 0], rays[n, 1])
@@ -237,9 +241,9 @@ def _depth(frame: Array, row: Array, terms: int, x: float, y: float) -> tuple[fl
     """z where the ray (x, y, 1) meets the sheet whose coefficients begin the row, and dG/dz there;
     NaN where Newton's method does not settle."""
     along, across, forward = (
-        _turned(frame, 0, x, y),
-        _turned(frame, 1, x, y),
-        _turned(frame, 2, x, y),
+        _rotate_direction(frame, 0, x, y),
+        _rotate_direction(frame, 1, x, y),
+        _rotate_direction(frame, 2, x, y),
     )
     aside, behind = frame[3] + frame[12], frame[11]
     rise = (row[0] - row[2]) * forward + row[1] * along - across
@@ -264,7 +268,7 @@ def _depth(frame: Array, row: Array, terms: int, x: float, y: float) -> tuple[fl
 
 
 @compiled
-def _turned(frame: Array, axis: int, x: float, y: float) -> float:
+def _rotate_direction(frame: Array, axis: int, x: float, y: float) -> float:
     """One coordinate, in the sheets' frame, of the direction (x, y, 1)."""
     return frame[4 * axis] * x + frame[4 * axis + 1] * y + frame[4 * axis + 2]
 
@@ -272,7 +276,7 @@ def _turned(frame: Array, axis: int, x: float, y: float) -> float:
 @compiled
 def _at(frame: Array, axis: int, x: float, y: float, depth: float) -> float:
     """One coordinate, in the sheets' frame, of the ray's point at the depth."""
-    return depth * _turned(frame, axis, x, y) + frame[4 * axis + 3]
+    return depth * _rotate_direction(frame, axis, x, y) + frame[4 * axis + 3]
 
 
 @compiled

@@ -78,12 +78,12 @@ class Camera:
 
     def retract(self, step: Array) -> Camera:
         """The camera after a step (P,) is added to its parameters."""
-        own = {
+        matrix = {
             name: getattr(self, name) + float(change)
             for name, change in zip(MATRIX, step[: len(MATRIX)], strict=True)
         }
         lens = self.lens.with_coefficients(self.lens.coefficients + step[len(MATRIX) :])
-        return replace(self, **own, lens=lens)
+        return replace(self, **matrix, lens=lens)
 
     def project(self, points: Array) -> Array:
         """Project points (..., 3), camera frame, z > 0, to real image coordinates (..., 2), px."""
@@ -156,10 +156,10 @@ SIZE = ("width", "height")
 
 def camera_to_fields(camera: Camera) -> dict[str, Any]:
     """alpha, beta, gamma, u0, v0, the kind of lens, its coefficients by name, width and height."""
-    own = {name: getattr(camera, name) for name in (*MATRIX, *SIZE)}
+    matrix = {name: getattr(camera, name) for name in (*MATRIX, *SIZE)}
     lens = {name: getattr(camera.lens, name) for name in camera.lens.names}
     kind = {} if camera.lens.kind == Radial.kind else {"lens": camera.lens.kind}
-    return own | lens | kind
+    return matrix | lens | kind
 
 
 def camera_from_fields(content: Mapping[str, Any]) -> Camera:

@@ -93,15 +93,15 @@ def _look_up_rays(table: Table, first_row: int, wanted: Mask, rays: Array) -> No
     n = 0
     for v in range(wanted.shape[0]):
         down = (first_row + v - frame[1]) * frame[3]
-        i, held = int(down), -1
+        i, column = int(down), -1
         y = down - i
         x_0 = x_1 = x_2 = y_0 = y_1 = y_2 = 0.0
         for u in range(wanted.shape[1]):
             if wanted[v, u]:
                 across = (u - frame[0]) * frame[2]
                 j = int(across)
-                if j != held:
-                    held, x_2, y_2 = j, c[i, j, 0, 5], c[i, j, 1, 5]
+                if j != column:
+                    column, x_2, y_2 = j, c[i, j, 0, 5], c[i, j, 1, 5]
                     x_0 = c[i, j, 0, 0] + y * (c[i, j, 0, 1] + y * c[i, j, 0, 2])
                     y_0 = c[i, j, 1, 0] + y * (c[i, j, 1, 1] + y * c[i, j, 1, 2])
                     x_1, y_1 = c[i, j, 0, 3] + y * c[i, j, 0, 4], c[i, j, 1, 3] + y * c[i, j, 1, 4]

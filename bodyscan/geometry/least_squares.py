@@ -32,7 +32,7 @@ State = TypeVar("State")
 FASTER, SLOWER = 10.0, 10.0
 """A step that lowers the cost divides the damping by the first; one that does not multiplies it by
 the second."""
-LEAST_DAMPING, FELT = 1e-12, 1e-4
+MIN_DAMPING, EFFECTIVE_DAMPING = 1e-12, 1e-4
 """Shares of the scaled diagonal: below the first, rounding dominates; below the second, damping has
 no effect, so a refused step raises it there at once."""
 
@@ -152,11 +152,11 @@ class Solution(Generic[State]):
     def normal(self, kinds: Collection[Noise]) -> Array:
         """Normal matrix (P, P), J^T W J over variances, of the blocks with these kinds of noise
         alone."""
-        own = [k for k, block in enumerate(self.blocks) if block.noise in kinds]
+        chosen = [k for k, block in enumerate(self.blocks) if block.noise in kinds]
         return _equations(
-            [self.blocks[k] for k in own],
-            [self.weights[k] for k in own],
-            [self.scales[k] for k in own],
+            [self.blocks[k] for k in chosen],
+            [self.weights[k] for k in chosen],
+            [self.scales[k] for k in chosen],
             self.unknowns,
         )[0]
 
@@ -205,17 +205,17 @@ def minimize(
             gained = cost - _cost(tried, blocks, scales)
             if gained > 0.0 or promised < tolerance:
                 break
-            damping = max(SLOWER * damping, FELT)
+            damping = max(SLOWER * damping, EFFECTIVE_DAMPING)
         if not gained > 0.0:
             ending = "settled" if promised < tolerance else "stuck"
             break
         state, blocks, taken = candidate, tried, taken + 1
-        damping = max(damping / FASTER, LEAST_DAMPING)
+        damping = max(damping / FASTER, MIN_DAMPING)
         weights, scales = _weigh(blocks)
         if gained < tolerance:
             ending = "settled"
             break
-    before, after = (_cost(own, blocks, scales) for own in (first, blocks))
+    before, after = (_cost(these, blocks, scales) for these in (first, blocks))
     report = Report(taken, before, after, ending)
     return Solution(state, blocks, weights, scales, unknowns, report)
 
@@ -307,11 +307,13 @@ def minimize_each(
         better = tried.cost < at.cost
         gained = at.cost - tried.cost
         # A small predicted gain that is due to damping says nothing.
-        converged |= (better & (gained < enough)) | ((promised < enough) & (strength <= FELT))
+        converged |= (better & (gained < enough)) | (
+            (promised < enough) & (strength <= EFFECTIVE_DAMPING)
+        )
         state = np.where(better[:, None], trial, state)
         at = tried.where(better, at)
-        eased, raised = np.maximum(strength / FASTER, LEAST_DAMPING), SLOWER * strength
-        strength = np.where(better, eased, np.maximum(raised, FELT))
+        eased, raised = np.maximum(strength / FASTER, MIN_DAMPING), SLOWER * strength
+        strength = np.where(better, eased, np.maximum(raised, EFFECTIVE_DAMPING))
         if converged.all():
             return StackedSolution(state, at, converged, taken + 1)
     return StackedSolution(state, at, converged, steps)
@@ -322,11 +324,11 @@ def _weigh(blocks: Sequence[Block]) -> tuple[tuple[Array, ...], tuple[float, ...
     weights: list[Array] = [np.empty(0)] * len(blocks)
     scales = [0.0] * len(blocks)
     for noise, numbers in _kinds(blocks).items():
-        scaled = _scaled(blocks, blocks, numbers)
+        scaled = _normalize_residuals(blocks, blocks, numbers)
         size = noise.estimate_scale(scaled)
         cuts = np.cumsum([len(blocks[k].residuals) for k in numbers])[:-1]
-        own = np.split(noise.weights(scaled / size), cuts)
-        for k, part in zip(numbers, own, strict=True):
+        parts = np.split(noise.weights(scaled / size), cuts)
+        for k, part in zip(numbers, parts, strict=True):
             weights[k], scales[k] = part, size
     return tuple(weights), tuple(scales)
 
@@ -336,7 +338,7 @@ def _cost(blocks: Sequence[Block], there: Sequence[Block], scales: Sequence[floa
     total = 0.0
     with np.errstate(all="ignore"):
         for noise, numbers in _kinds(blocks).items():
-            total += noise.cost(_scaled(blocks, there, numbers) / scales[numbers[0]])
+            total += noise.cost(_normalize_residuals(blocks, there, numbers) / scales[numbers[0]])
     return total
 
 
@@ -347,7 +349,9 @@ def _kinds(blocks: Sequence[Block]) -> dict[Noise, list[int]]:
     return kinds
 
 
-def _scaled(blocks: Sequence[Block], there: Sequence[Block], numbers: Sequence[int]) -> Array:
+def _normalize_residuals(
+    blocks: Sequence[Block], there: Sequence[Block], numbers: Sequence[int]
+) -> Array:
     return np.concatenate([blocks[k].residuals / there[k].sigma for k in numbers])
 
 
@@ -373,16 +377,16 @@ def _add_runs(block: Block, weighted: Array, normal: Array, gradient: Array) -> 
     """Add a block of several runs to the equations; weighted: its weighted Jacobian (N, C)."""
     assert block.runs is not None
     assert not isinstance(block.columns, slice)
-    turned = _stacked(weighted, block.runs).transpose(0, 2, 1)
-    parts = turned @ _stacked(block.jacobian, block.runs)
-    pulls = turned @ _stacked(block.residuals[:, None], block.runs)
+    transposed = _stack_runs(weighted, block.runs).transpose(0, 2, 1)
+    parts = transposed @ _stack_runs(block.jacobian, block.runs)
+    vectors = transposed @ _stack_runs(block.residuals[:, None], block.runs)
     unknowns, columns = len(gradient), block.columns
-    place = columns[:, :, None] * unknowns + columns[:, None, :]
-    normal += np.bincount(place.ravel(), parts.ravel(), normal.size).reshape(normal.shape)
-    gradient += np.bincount(columns.ravel(), pulls.ravel(), unknowns)
+    flat_index = columns[:, :, None] * unknowns + columns[:, None, :]
+    normal += np.bincount(flat_index.ravel(), parts.ravel(), normal.size).reshape(normal.shape)
+    gradient += np.bincount(columns.ravel(), vectors.ravel(), unknowns)
 
 
-def _stacked(rows: Array, runs: Indices) -> Array:
+def _stack_runs(rows: Array, runs: Indices) -> Array:
     """Consecutive runs of rows (N, C) as (G, M, C), short ones padded with zeros."""
     longest = int(runs.max())
     stacked = np.zeros((len(runs), longest, rows.shape[1]))

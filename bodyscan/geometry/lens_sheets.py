@@ -28,7 +28,7 @@ from bodyscan.geometry.transforms import RigidTransform, cross_matrix
 FRAME, SCALE = 6, 2
 CENTRE = FRAME + 1
 """Index of c among the freedoms."""
-LENS_SPREAD = (0.3, 0.3, 0.03, 0.03, 0.3, 0.3, 0.3, 0.3)
+LENS_SIGMAS = (0.3, 0.3, 0.03, 0.03, 0.3, 0.3, 0.3, 0.3)
 """Standard deviations of k1, k2, p1, p2, k3, k4, k5, k6 before any data."""
 ASIDE = 0.3
 """Standard deviation of the boards' middle along the stripes, as a share of its distance."""
@@ -86,11 +86,11 @@ class LensSheets(SmoothSheets):
     def prior(self) -> tuple[Array, Array]:
         lens = self.parameters[SCALE:]
         x, y, z = self.projector_from_camera.apply(self.middle)
-        spread = np.array(LENS_SPREAD[: len(lens)])
+        sigmas = np.array(LENS_SIGMAS[: len(lens)])
         jacobian = np.zeros((1 + len(lens), FRAME + len(self.parameters)))
         jacobian[0, [1, 2, 3]] = np.array([z, -y, 1.0]) / (ASIDE * z)
-        jacobian[1:, FRAME + SCALE :] = np.diag(1.0 / spread)
-        return np.append(x / (ASIDE * z), lens / spread), jacobian
+        jacobian[1:, FRAME + SCALE :] = np.diag(1.0 / sigmas)
+        return np.append(x / (ASIDE * z), lens / sigmas), jacobian
 
     def retract(self, step: Array) -> LensSheets:
         """Apply a step in the 2 x 4 matrix of the projector without its lens: there the valley in
@@ -138,7 +138,7 @@ class LensSheets(SmoothSheets):
     def _frame_and_lens(self) -> tuple[Array, Array]:
         """projector_from_camera (3, 4), and f, c, k1, ..., k6 (10,) with 0 for missing
         coefficients."""
-        lens = np.zeros(SCALE + len(LENS_SPREAD))
+        lens = np.zeros(SCALE + len(LENS_SIGMAS))
         lens[: len(self.parameters)] = self.parameters
         return np.ascontiguousarray(self.projector_from_camera.matrix[:3]), lens
 
@@ -180,15 +180,15 @@ def stripes_of_points(
     by_freedom: (N, P), derivatives by the freedoms of a fit; skipped if it has no columns.
     """
     for n in range(len(points)):
-        seen = _seen(frame, points[n, 0], points[n, 1], points[n, 2])
-        bent = _bent(lens, seen[0], seen[1])
-        by_z = -(bent[1] * seen[0] + bent[2] * seen[1])
+        point = _to_projector(frame, points[n, 0], points[n, 1], points[n, 2])
+        image = _distort(lens, point[0], point[1])
+        by_z = -(image[1] * point[0] + image[2] * point[1])
         for k in range(3):
-            turned = bent[1] * frame[0, k] + bent[2] * frame[1, k] + by_z * frame[2, k]
-            by_point[n, k] = turned / seen[2]
-        stripe[n], reach[n] = lens[0] * bent[0] + lens[1], seen[2]
+            derivative = image[1] * frame[0, k] + image[2] * frame[1, k] + by_z * frame[2, k]
+            by_point[n, k] = derivative / point[2]
+        stripe[n], reach[n] = lens[0] * image[0] + lens[1], point[2]
         if by_freedom.shape[1]:
-            _by_freedom(lens, seen, bent, by_freedom[n])
+            _by_freedom(lens, point, image, by_freedom[n])
 
 
 @compiled
@@ -215,17 +215,17 @@ def measure_rays(
         depth = _depth(frame, lens, distance, x, y, s[n])
         if not (depth > 0.0 and 0.0 <= s[n] <= stripes):
             continue
-        seen = _seen(frame, x * depth, y * depth, depth)
-        bent = _bent(lens, seen[0], seen[1])
-        per_stripe = seen[2] / _slope_times_reach(frame, seen, bent, x, y)
-        _by_freedom(lens, seen, bent, jacobian)
-        spread = 0.0
+        point = _to_projector(frame, x * depth, y * depth, depth)
+        image = _distort(lens, point[0], point[1])
+        per_stripe = point[2] / _slope_times_reach(frame, point, image, x, y)
+        _by_freedom(lens, point, image, jacobian)
+        variance = 0.0
         for i in range(len(jacobian)):
             row = 0.5 * covariance[i, i] * jacobian[i]
             for j in range(i):
                 row += covariance[i, j] * jacobian[j]
-            spread += 2.0 * row * jacobian[i]
-        found[0, n], found[1, n], found[2, n] = depth, per_stripe, spread * per_stripe**2
+            variance += 2.0 * row * jacobian[i]
+        found[0, n], found[1, n], found[2, n] = depth, per_stripe, variance * per_stripe**2
 
 
 @compiled
@@ -243,10 +243,12 @@ def _depth(frame: Array, lens: Array, distance: float, x: float, y: float, s: fl
         depth = (distance - frame[2, 3]) / forward
     step = reach = rise = np.nan
     for _ in range(5):
-        seen = _seen(frame, x * depth, y * depth, depth)
-        bent = _bent(lens, seen[0], seen[1])
-        reach, rise, off = seen[2], bent[2], lens[0] * bent[0] + lens[1] - s
-        step = off * reach / (_slope_times_reach(frame, seen, bent, x, y) + off * forward)
+        point = _to_projector(frame, x * depth, y * depth, depth)
+        image = _distort(lens, point[0], point[1])
+        reach, rise, residual = point[2], image[2], lens[0] * image[0] + lens[1] - s
+        step = (
+            residual * reach / (_slope_times_reach(frame, point, image, x, y) + residual * forward)
+        )
         depth -= step
         if not abs(step) > EXACT * abs(depth):
             break
@@ -254,7 +256,7 @@ def _depth(frame: Array, lens: Array, distance: float, x: float, y: float, s: fl
 
 
 @compiled
-def _seen(frame: Array, x: float, y: float, z: float) -> Vector:
+def _to_projector(frame: Array, x: float, y: float, z: float) -> Vector:
     """X/Z, Y/Z and Z, in the projector's frame, of a point in the camera's."""
     reach = frame[2, 0] * x + frame[2, 1] * y + frame[2, 2] * z + frame[2, 3]
     return (
@@ -265,7 +267,7 @@ def _seen(frame: Array, x: float, y: float, z: float) -> Vector:
 
 
 @compiled
-def _bent(lens: Array, x: float, y: float) -> Vector:
+def _distort(lens: Array, x: float, y: float) -> Vector:
     """(s - c) / f at x = X/Z, y = Y/Z, and the derivatives of s by x and by y."""
     focal, p1, p2 = lens[0], lens[4], lens[5]
     r2 = x * x + y * y
@@ -290,18 +292,18 @@ def _radial(lens: Array, r2: float) -> Vector:
 
 
 @compiled
-def _slope_times_reach(frame: Array, seen: Vector, bent: Vector, x: float, y: float) -> float:
+def _slope_times_reach(frame: Array, point: Vector, image: Vector, x: float, y: float) -> float:
     """ds/dz along the ray (x, y, 1), times the reach."""
     forward = frame[2, 0] * x + frame[2, 1] * y + frame[2, 2]
-    along = frame[0, 0] * x + frame[0, 1] * y + frame[0, 2] - seen[0] * forward
-    across = frame[1, 0] * x + frame[1, 1] * y + frame[1, 2] - seen[1] * forward
-    return bent[1] * along + bent[2] * across
+    along = frame[0, 0] * x + frame[0, 1] * y + frame[0, 2] - point[0] * forward
+    across = frame[1, 0] * x + frame[1, 1] * y + frame[1, 2] - point[1] * forward
+    return image[1] * along + image[2] * across
 
 
 @compiled
-def _by_freedom(lens: Array, seen: Vector, bent: Vector, jacobian: Array) -> None:
+def _by_freedom(lens: Array, point: Vector, image: Vector, jacobian: Array) -> None:
     """Fill ds (P,) by a small motion of the frame, f, c, and as many of k1, k2, p1, ... as fit."""
-    (x, y, reach), (slide, by_x, by_y) = seen, bent
+    (x, y, reach), (slide, by_x, by_y) = point, image
     by_z, r2 = -(by_x * x + by_y * y), x * x + y * y
     jacobian[0], jacobian[1] = y * by_z - by_y, by_x - x * by_z
     jacobian[2], jacobian[3] = x * by_y - y * by_x, by_x / reach

@@ -91,7 +91,7 @@ class LightPlanes:
 
     def at(self, s: Array) -> Array:
         """Planes (..., 4) at real s (...), interpolated linearly; NaN beside a missing one."""
-        below, share = self._between(s)
+        below, share = self._locate(s)
         share = share[..., None]
         # At a whole s only its own plane is needed, not the neighbour's.
         lower = np.where(share < 1.0, self.coefficients[below], 0.0)
@@ -112,7 +112,7 @@ class LightPlanes:
     def depth_per_stripe(self, rays: Array, s: Array, depth: Array | None = None) -> Array:
         """dz/ds (...) from the two planes around s; at the last plane, from the two before it."""
         depth = self.depth(rays, s) if depth is None else depth
-        below, share = self._between(s)
+        below, share = self._locate(s)
         step = self.coefficients[below + 1] - self.coefficients[below]
         before = self.coefficients[below] - self.coefficients[np.maximum(below - 1, 0)]
         alone = np.isnan(step[..., :1]) & (share[..., None] == 0.0) & (below[..., None] > 0)
@@ -123,7 +123,7 @@ class LightPlanes:
     def variance_mm2(self, rays: Array, s: Array, depth: Array | None = None) -> Array:
         """Neighbouring planes come from the same boards, so their errors are treated as one."""
         depth = self.depth(rays, s) if depth is None else depth
-        below, share = self._between(s)
+        below, share = self._locate(s)
         facing = np.sum(self.at(s)[..., :3] * rays, axis=-1)
         point = np.concatenate([rays * depth[..., None], np.ones_like(depth)[..., None]], axis=-1)
         lower, upper = (
@@ -133,7 +133,7 @@ class LightPlanes:
         lower, upper = np.where(share < 1.0, lower, 0.0), np.where(share > 0.0, upper, 0.0)
         return (((1.0 - share) * lower + share * upper) / facing) ** 2
 
-    def _between(self, s: Array) -> tuple[Indices, Array]:
+    def _locate(self, s: Array) -> tuple[Indices, Array]:
         """Index of the plane below s, and the fraction of the interval from it to s."""
         last = len(self.coefficients) - 2
         below = np.clip(np.nan_to_num(np.floor(s), nan=0.0).astype(np.int64), 0, last)

@@ -57,9 +57,9 @@ def sheets_from_arrays(kind: str, arrays: Mapping[str, Any], direction: Axis) ->
     return BowedSheets(frame, middle, stripes, direction, parameters, covariance, bow)
 
 
-Way = Callable[[Array, Array], tuple[Array, Array, Array]]
+Measure = Callable[[Array, Array], tuple[Array, Array, Array]]
 
-MOST_SIGMA = 1e-3
+MAX_RELATIVE_SIGMA = 1e-3
 """A sheet that leaves a larger share of the depth uncertain counts as missing: that far from all
 boards a smooth model only guesses."""
 GUESSED = 3.0
@@ -84,20 +84,20 @@ class RayDepths:
 
 def intersect_rays(sheets: LightSheets, rays: Array, s: Array) -> RayDepths:
     """Intersect rays (..., 3) with z = 1, camera frame, with the sheets at real s (...)."""
-    found = _way_to_measure(sheets)(rays.reshape(-1, 3), np.ravel(s))
-    unsure = found[2] > (_most_sigma(sheets) * found[0]) ** 2
+    found = _choose_measure(sheets)(rays.reshape(-1, 3), np.ravel(s))
+    unsure = found[2] > (_max_relative_sigma(sheets) * found[0]) ** 2
     return RayDepths(*(np.where(unsure, np.nan, some).reshape(np.shape(s)) for some in found))
 
 
 def stripes_per_pixel(sheets: LightSheets, camera: Camera, s: Floats) -> float:
     """Change of s, at constant depth, from one pixel to the next across the stripes: median over a
     sample of the pixels that have an s (height, width); 0 if none has."""
-    pixels, own = _sampled(s, np.isfinite(s))
-    here = intersect_rays(sheets, camera.rays(pixels), own)
-    beside = [intersect_rays(sheets, camera.rays(pixels + step), own) for step in np.eye(2)]
-    # Along its own sheet a neighbouring ray meets another depth: as if s had changed by this much
+    pixels, sampled = _sample_pixels(s, np.isfinite(s))
+    here = intersect_rays(sheets, camera.rays(pixels), sampled)
+    neighbours = [intersect_rays(sheets, camera.rays(pixels + step), sampled) for step in np.eye(2)]
+    # Along its sheet a neighbouring ray meets another depth: as if s had changed by this much
     # here.
-    changes = [(one.depth - here.depth) / here.per_stripe for one in beside]
+    changes = [(one.depth - here.depth) / here.per_stripe for one in neighbours]
     found = np.hypot(*changes)
     found = found[np.isfinite(found)]
     return float(np.median(found)) if found.size else 0.0
@@ -108,15 +108,15 @@ def measure_stripe_residual(
 ) -> float:
     """Distance in stripes between s (height, width) and the sheets through points (height, width,
     3): median over a sample of the pixels that have both; NaN if none has."""
-    pixels, own = _sampled(s, np.isfinite(s) & np.isfinite(points[..., 2]))
+    pixels, sampled = _sample_pixels(s, np.isfinite(s) & np.isfinite(points[..., 2]))
     columns, rows = pixels.astype(np.int64).T
-    found = intersect_rays(sheets, camera.rays(pixels), own)
-    off = np.abs((points[rows, columns, 2] - found.depth) / found.per_stripe)
-    off = off[np.isfinite(off)]
-    return float(np.median(off)) if off.size else np.nan
+    found = intersect_rays(sheets, camera.rays(pixels), sampled)
+    residuals = np.abs((points[rows, columns, 2] - found.depth) / found.per_stripe)
+    residuals = residuals[np.isfinite(residuals)]
+    return float(np.median(residuals)) if residuals.size else np.nan
 
 
-def _sampled(s: Floats, wanted: Mask) -> tuple[Array, Array]:
+def _sample_pixels(s: Floats, wanted: Mask) -> tuple[Array, Array]:
     """Some of the pixels wanted, (N, 2), and their s (N,)."""
     every = np.flatnonzero(wanted)
     some = every[:: max(len(every) // 400, 1)]
@@ -136,42 +136,42 @@ def triangulate_image(
     Returns points (height, width, 3), camera frame, mm, and their standard deviations along the
     viewing rays (height, width): sigma_mm, and common_mm, the part that neighbours share.
     """
-    way, pixels = _way_to_measure(sheets), ray_table(camera)
+    measure, pixels = _choose_measure(sheets), ray_table(camera)
     points, sigma_mm = np.empty((*s.shape, 3), np.float32), np.empty(s.shape, np.float32)
     common_mm = np.empty(s.shape, np.float32)
     shared = np.zeros((1, 1), np.float32) if shared is None else shared
     shared = np.broadcast_to(shared, s.shape)
-    most_sigma = _most_sigma(sheets)
+    max_relative_sigma = _max_relative_sigma(sheets)
     for first in range(0, len(s), BAND):
         rows = slice(first, first + BAND)
         wanted = np.isfinite(s[rows])
         rays = look_up_rays(pixels, wanted, first)
-        found = way(rays, s[rows][wanted].astype(np.float64))
+        found = measure(rays, s[rows][wanted].astype(np.float64))
         uncertain = sigma[rows], shared[rows]
         made = points[rows], sigma_mm[rows], common_mm[rows]
-        _place(wanted, rays, found, uncertain, most_sigma, made)
+        _fill_points(wanted, rays, found, uncertain, max_relative_sigma, made)
     return points, sigma_mm, common_mm
 
 
 @lru_cache(maxsize=64)
-def _most_sigma(sheets: LightSheets) -> float:
-    """MOST_SIGMA, or GUESSED times what the boards leave open where they were. A projector that was
+def _max_relative_sigma(sheets: LightSheets) -> float:
+    """MAX_RELATIVE_SIGMA, or GUESSED times the sigma amid the boards. A projector that was
     calibrated elsewhere is a guess nowhere, however roughly it may be known."""
     if isinstance(sheets, LensSheets) and sheets.only_centre_uncertain:
         return np.inf
     if not isinstance(sheets, SmoothSheets):
-        return MOST_SIGMA
+        return MAX_RELATIVE_SIGMA
     stripes = np.arange(sheets.stripes + 1.0)
     rays = np.tile(sheets.middle / sheets.middle[2], (len(stripes), 1))
     away = np.abs(sheets.depth(rays, stripes) - sheets.middle[2])
     if not np.isfinite(away).any():
-        return MOST_SIGMA
+        return MAX_RELATIVE_SIGMA
     nearest = slice(int(np.nanargmin(away)), None)
     variance = sheets.variance_mm2(rays[nearest][:1], stripes[nearest][:1])
-    return float(max(MOST_SIGMA, GUESSED * np.sqrt(variance[0]) / sheets.middle[2]))
+    return float(max(MAX_RELATIVE_SIGMA, GUESSED * np.sqrt(variance[0]) / sheets.middle[2]))
 
 
-def _way_to_measure(sheets: LightSheets) -> Way:
+def _choose_measure(sheets: LightSheets) -> Measure:
     """A function from rays (N, 3) at s (N,) to depth, dz/ds and variance, each (N,)."""
     if isinstance(sheets, BowedSheets):
         return SheetTable.from_sheets(sheets).measure
@@ -186,12 +186,12 @@ def _way_to_measure(sheets: LightSheets) -> Way:
 
 
 @compiled
-def _place(
+def _fill_points(
     wanted: Mask,
     rays: Array,
     found: tuple[Array, Array, Array],
     uncertain: tuple[Floats, Floats],
-    most_sigma: float,
+    max_relative_sigma: float,
     made: tuple[Floats, Floats, Floats],
 ) -> None:
     """Fill points (rows, W, 3), sigma_mm and common_mm (rows, W) of the N pixels `wanted` (rows,
@@ -217,6 +217,6 @@ def _place(
             common = variance + calibrated * calibrated
             along = np.sqrt((decoding * decoding + common) * longer)
             n += 1
-            if variance <= (most_sigma * depth) ** 2 and along < np.inf:
+            if variance <= (max_relative_sigma * depth) ** 2 and along < np.inf:
                 points[v, u, 0], points[v, u, 1], points[v, u, 2] = x * depth, y * depth, depth
                 sigma_mm[v, u], common_mm[v, u] = along, np.sqrt(common * longer)

@@ -36,7 +36,7 @@ def sheets_from_projector(
     this row becomes y, a projector with OpenCV's lens again has such a lens: its tangential part is
     r^2 q + 2 (q . x) x with q = (p2, p1), and q rotates as x does.
     """
-    row, centre, size = _across(projector, direction)
+    row, centre, size = _across_stripes(projector, direction)
     focal = float(np.linalg.norm(row))
     across = row / focal
     along = np.array([across[1], -across[0]])
@@ -99,7 +99,7 @@ def intersect_central_rays(
     return np.asarray(ray * (depth if meets else 5.0 * baseline), float)
 
 
-def _across(projector: Camera, direction: Axis) -> tuple[Array, float, int]:
+def _across_stripes(projector: Camera, direction: Axis) -> tuple[Array, float, int]:
     """The row of A that gives the coordinate across the stripes, its centre, and the image size
     there."""
     if direction == "vertical":

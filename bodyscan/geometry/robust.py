@@ -26,15 +26,15 @@ def robust_scale(residuals: Array, min_scale: float = 1e-12) -> float:
 
 def cauchy_weights(residuals: Array, group: int, scale: float) -> Array:
     """Weights (N,) of the Cauchy loss; `group` neighbouring residuals (u, v) share one weight."""
-    weights = 1.0 / (1.0 + _squared(residuals, group) / scale**2)
+    weights = 1.0 / (1.0 + _square(residuals, group) / scale**2)
     return np.repeat(weights, group) if group > 1 else weights
 
 
 def cauchy_cost(residuals: Array, group: int, scale: float) -> float:
     """Sum of the Cauchy loss over the groups; for small residuals, the sum of their squares."""
-    return float(np.sum(np.log1p(_squared(residuals, group) / scale**2)) * scale**2)
+    return float(np.sum(np.log1p(_square(residuals, group) / scale**2)) * scale**2)
 
 
-def _squared(residuals: Array, group: int) -> Array:
+def _square(residuals: Array, group: int) -> Array:
     squared = residuals**2
     return squared.reshape(-1, group).sum(axis=1) if group > 1 else squared

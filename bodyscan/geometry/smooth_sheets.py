@@ -115,8 +115,8 @@ class SmoothSheets(ABC):
             offset = self.offset(points[part], self.at(s[part]), parameters=True)
             jacobian = offset.by_parameter
             assert jacobian is not None
-            spread = np.sum((jacobian @ self.covariance) * jacobian, axis=-1)
-            variance[part] = spread / np.sum(offset.by_point * rays[part], axis=-1) ** 2
+            sheet_variance = np.sum((jacobian @ self.covariance) * jacobian, axis=-1)
+            variance[part] = sheet_variance / np.sum(offset.by_point * rays[part], axis=-1) ** 2
         return variance.reshape(shape)
 
     def tangent_planes(self, s: Array) -> Array:
@@ -124,14 +124,14 @@ class SmoothSheets(ABC):
         projector's image, at the boards' distance; (a, b, c) a unit vector, d >= 0."""
         camera_from_projector = self.projector_from_camera.inverse()
         s = np.asarray(s, float)
-        place = np.zeros((*s.shape, 3))
-        place[..., 2] = self.distance_mm
+        position = np.zeros((*s.shape, 3))
+        position[..., 2] = self.distance_mm
         across = camera_from_projector.rotation[:, 1]
         sheet = self.at(s)
         for _ in range(NEWTON_STEPS):
-            offset = self.offset(camera_from_projector.apply(place), sheet)
-            place[..., 1] -= offset.value / (offset.by_point @ across)
-        points = camera_from_projector.apply(place)
+            offset = self.offset(camera_from_projector.apply(position), sheet)
+            position[..., 1] -= offset.value / (offset.by_point @ across)
+        points = camera_from_projector.apply(position)
         normals = self.offset(points, sheet).by_point
         normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
         planes = np.concatenate([normals, -np.sum(normals * points, -1, keepdims=True)], axis=-1)

@@ -32,10 +32,10 @@ class PoseCovariance:
         rows = self._rows(names)
         return self.matrix[np.ix_(rows, rows)]
 
-    def add_independent_motions(self, names: Collection[str], own: Array) -> PoseCovariance:
-        """After each of these pairs made a motion of its own, of covariance (6, 6)."""
+    def add_independent_motions(self, names: Collection[str], covariance: Array) -> PoseCovariance:
+        """Add an independent motion of covariance (6, 6) to each of these pairs."""
         rows, matrix = self._rows(names), self.matrix.copy()
-        matrix[np.ix_(rows, rows)] += np.kron(np.eye(len(names)), own)
+        matrix[np.ix_(rows, rows)] += np.kron(np.eye(len(names)), covariance)
         return PoseCovariance(self.names, matrix)
 
     def relative(self, a: str, b: str) -> Array:

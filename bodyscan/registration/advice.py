@@ -42,7 +42,7 @@ class Link:
 
 @dataclass(frozen=True, eq=False)
 class ShotSuggestion:
-    """How far `shots` more of the board at `place` reduce the sigma of `pair`.
+    """How far `shots` more of the board at `candidate` reduce the sigma of `pair`.
 
     between: the two pairs whose common view of it matters most.
     before_mm, after_mm: the sigma without and with them.
@@ -52,7 +52,7 @@ class ShotSuggestion:
     pair: str
     shots: int
     between: tuple[str, str]
-    place: BoardCandidate
+    candidate: BoardCandidate
     before_mm: float
     after_mm: float
     halves: bool
@@ -247,7 +247,7 @@ def _sentence(more: ShotSuggestion) -> str:
             f"its sigma from {more.before_mm:.3f} to {more.after_mm:.3f} mm"
         )
     a, b = more.between
-    candidate = more.place
+    candidate = more.candidate
     x, y, z = candidate.centre_mm
     others = [name for name in candidate.visible_to if name not in more.between]
     also = f" (also by {', '.join(others)})" if others else ""

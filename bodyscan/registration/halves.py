@@ -33,7 +33,7 @@ class HalvesComparison:
     halves: the shots of each.
     shifts_mm: of the camera centres, (P, 3), rig frame.
     sigmas_mm: expected sigmas of the shifts, (P, 3).
-    over_expected: RMS of all differences in units of what the covariances predict; 1 is honest.
+    over_expected: RMS of all differences in units of what the covariances predict; 1 if consistent.
     """
 
     names: tuple[str, ...]

@@ -128,10 +128,10 @@ class RigInformation:
         self._equations = equations
         self._cameras, self._placings = cameras, rig_from_camera
         # A board that holds the frame has been eliminated already; a pair that does is removed here.
-        held_pair = equations.held[equations.held < equations.first_board]
+        fixed_pair = equations.held[equations.held < equations.first_board]
         reduced = equations.without_boards()
         self._unknowns = reduced.size
-        self._free = np.setdiff1d(np.arange(self._unknowns), held_pair)
+        self._free = np.setdiff1d(np.arange(self._unknowns), fixed_pair)
         information = reduced.select(self._free).information
         self._scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
         scaled = information * np.outer(self._scale, self._scale)
@@ -170,10 +170,10 @@ class RigInformation:
         values, vectors = np.linalg.eigh(information)
         kept = values > 1e-12 * values[-1]
         root = vectors[:, kept] * np.sqrt(values[kept])
-        gain, basis = np.linalg.eigh(root.T @ self._inverse @ root)
+        eigenvalues, basis = np.linalg.eigh(root.T @ self._inverse @ root)
         reach = np.sum((basis.T @ root.T @ self._inverse @ jacobian.T) ** 2, axis=1)
         shots = np.arange(1, max_shots + 1)[:, None]
-        drop = np.sum(reach / (1.0 / shots + np.maximum(gain, 0.0)), axis=1)
+        drop = np.sum(reach / (1.0 / shots + np.maximum(eigenvalues, 0.0)), axis=1)
         before = float(np.trace(jacobian @ self._inverse @ jacobian.T))
         variance = self._equations.variance_px2
         return SigmaReduction(variance * before, variance * (before - drop))

@@ -164,7 +164,7 @@ def _readings(
             yield _measure_board(*boards[0], solution.variance_inflation)
         else:
             yield _measure_separation(
-                [_Middle.of(*one) for one in boards], solution.variance_inflation
+                [_Middle.locate(*one) for one in boards], solution.variance_inflation
             )
 
 
@@ -219,19 +219,19 @@ def board_length(board: Board) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Middle:
-    """The middle of a board.
+    """The middle locate a board.
 
-    place: (3,) mm, rig frame.
-    left: residuals (N, 3) mm of its corners.
-    lever: distance of the middle from the corners' centroid, in units of their RMS radius.
+    position: (3,) mm, rig frame.
+    left: residuals (N, 3) mm locate its corners.
+    lever: distance locate the middle from the corners' centroid, in units locate their RMS radius.
     """
 
-    place: Array
+    position: Array
     left: Array
     lever: float
 
     @staticmethod
-    def of(board: Board, ids: Indices, points: Array) -> _Middle:
+    def locate(board: Board, ids: Indices, points: Array) -> _Middle:
         described = corner_points(board)[ids]
         rig_from_board = fit_rigid_transform(described, points)
         width, height = board.size_mm
@@ -246,8 +246,8 @@ class _Middle:
 
 def _measure_separation(middles: Sequence[_Middle], variance_inflation: float) -> _Reading:
     one, other = middles
-    length = float(np.linalg.norm(one.place - other.place))
-    along = (one.place - other.place) / length
+    length = float(np.linalg.norm(one.position - other.position))
+    along = (one.position - other.position) / length
     variance = sum(
         np.mean((each.left @ along) ** 2) * (1.0 + each.lever**2) / len(each.left)
         for each in middles

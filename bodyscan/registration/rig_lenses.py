@@ -62,7 +62,7 @@ def choose_lenses(rig: Rig, views: Sequence[LocatedView], solution: JointSolutio
     """
     open_lens = {pair.name for pair in rig.pairs if pair.camera.lens == AUTO}
     candidates = {
-        name: _Candidate.of(name, views, solution)
+        name: _Candidate.from_solution(name, views, solution)
         for name in sorted(solution.cameras)
         if solution.cameras[name].prior is None  # otherwise another program gave it
         and any(view.pair == name for view in views)
@@ -99,7 +99,9 @@ class _Candidate:
     views: list[PlanarView]
 
     @staticmethod
-    def of(name: str, views: Sequence[LocatedView], solution: JointSolution) -> _Candidate:
+    def from_solution(
+        name: str, views: Sequence[LocatedView], solution: JointSolution
+    ) -> _Candidate:
         of_pair = [view for view in views if view.pair == name]
         camera_from_root = solution.root_from_camera[name].inverse()
         return _Candidate(
@@ -143,8 +145,8 @@ def _pool_decentring(
         for name, lens in chosen.items()
         if (gain := _gain(lens, Brown)) is not None and -MIN_GAIN < gain < MIN_GAIN
     ]
-    off = np.array([_decentring(chosen[name].refused) for name in open_]).ravel()
-    if not open_ or np.mean(off**2) < 1.0 + MIN_GAIN * np.sqrt(2.0 / len(off)):
+    decentring = np.array([_decentring(chosen[name].refused) for name in open_]).ravel()
+    if not open_ or np.mean(decentring**2) < 1.0 + MIN_GAIN * np.sqrt(2.0 / len(decentring)):
         return {}
     found = {}
     for name in open_:
@@ -157,8 +159,8 @@ def _decentring(fit: CameraFit | None) -> Array:
     """p1 and p2 in their sigmas, (2,), of a fit with a lens that has them."""
     assert fit is not None
     names = fit.camera.parameter_names
-    own = [names.index("p1"), names.index("p2")]
-    return np.asarray(fit.camera.parameters[own] / np.sqrt(np.diag(fit.covariance)[own]))
+    columns = [names.index("p1"), names.index("p2")]
+    return np.asarray(fit.camera.parameters[columns] / np.sqrt(np.diag(fit.covariance)[columns]))
 
 
 def _gain(lens: ChosenLens, kind: type[Lens]) -> float | None:

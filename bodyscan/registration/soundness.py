@@ -13,7 +13,7 @@ import numpy as np
 from bodyscan.arrays import Array
 from bodyscan.calibration.pair import PairCalibration
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lens_sheets import FRAME, LENS_SPREAD, SCALE, LensSheets
+from bodyscan.geometry.lens_sheets import FRAME, LENS_SIGMAS, SCALE, LensSheets
 from bodyscan.geometry.light_planes import LightPlanes, LightSheets
 from bodyscan.geometry.smooth_sheets import SmoothSheets
 from bodyscan.geometry.transforms import RigidTransform
@@ -191,7 +191,7 @@ def _smooth_faults(light: SmoothSheets, where: str) -> Iterator[Fault]:
     size = len(parameters)
     if isinstance(light, LensSheets):
         size += FRAME
-        if not SCALE <= len(parameters) <= SCALE + len(LENS_SPREAD):
+        if not SCALE <= len(parameters) <= SCALE + len(LENS_SIGMAS):
             yield where, f"has {len(parameters)} parameters"
             return
     if parameters.ndim != 1 or light.middle.shape != (3,):

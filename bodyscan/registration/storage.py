@@ -173,7 +173,7 @@ def load_calibration(path: Path, *, accept_changed: bool = False) -> RigCalibrat
     if faults:
         raise CalibrationFileError(
             "holds what no calibration can be like:"
-            + "".join(f"\n  {place} {what}" for place, what in faults),
+            + "".join(f"\n  {where} {what}" for where, what in faults),
             where=str(file),
             remedy="restore the file from a copy, or calibrate again",
         )

@@ -235,7 +235,7 @@ def _tie(
     candidates = [p for target in clearest for p in proposals[target]]
     gaps = np.array([_gaps(candidate, everything, reach) for candidate in candidates])
     voters = [np.unique(owner[gap < 2.0 * AGREEMENT * reach]) for gap in gaps]
-    votes = [len(own) for own in voters]
+    votes = [len(targets_agreeing) for targets_agreeing in voters]
     best = int(np.argmax(votes))
     shared = tuple(proposals)
     rivals = [

@@ -10,7 +10,7 @@ from bodyscan.arrays import Array
 from bodyscan.geometry.bowed_sheets import BowedSheets, SheetTable
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
-from bodyscan.geometry.light_sheets import MOST_SIGMA, intersect_rays, triangulate_image
+from bodyscan.geometry.light_sheets import MAX_RELATIVE_SIGMA, intersect_rays, triangulate_image
 
 
 @pytest.fixture(params=[(3, 0), (4, 0), (5, 0), (3, 1), (4, 3)], ids=str)
@@ -85,7 +85,7 @@ def test_an_image_is_measured_as_its_rays_are(sheets: BowedSheets) -> None:
     variance = sheets.variance_mm2(rays, wide, depth)
     slope = sheets.depth_per_stripe(rays, wide, depth)
     along = np.sqrt((slope * sigma) ** 2 + variance) * np.linalg.norm(rays, axis=-1)
-    sure = variance <= (MOST_SIGMA * depth) ** 2
+    sure = variance <= (MAX_RELATIVE_SIGMA * depth) ** 2
     expected, known = sure & np.isfinite(along), np.isfinite(sigma_mm)
     np.testing.assert_array_equal(np.isfinite(points).all(axis=-1), known)
     # The table's variance is 1e-3 off: only what lies that close to the limit may fall otherwise.

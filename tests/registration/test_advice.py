@@ -77,7 +77,7 @@ def test_shots_as_advised_do_halve_the_sigma(ring: Ring) -> None:
     assert more is not None
     assert more.halves
     assert more.after_mm <= more.before_mm / 2
-    extra = captured(more.place, more.shots, placings, cameras, np.random.default_rng(5))
+    extra = captured(more.candidate, more.shots, placings, cameras, np.random.default_rng(5))
     again = solve_rig(rig, [*views, *extra], cameras).value
     centre = again.rig_from_camera[more.pair].translation
     sigma = np.linalg.norm(position_sigma(again.covariance, more.pair, centre))
@@ -90,7 +90,7 @@ def test_what_is_told_to_be_gained_is_gained_by_as_many_shots_as_are_told(ring: 
     more = advise(rig, placed).more
     assert more is not None
     knowledge = RigInformation(equations_of(placed), placed.cameras, placed.rig_from_camera)
-    told = knowledge.after(knowledge.information(more.place), more.pair, more.shots)
+    told = knowledge.after(knowledge.information(more.candidate), more.pair, more.shots)
     assert told.shots_to_halve == more.shots
     gained = np.sqrt(told.after_mm2[-1] / told.before_mm2)
     assert more.after_mm == pytest.approx(gained * more.before_mm)
@@ -109,7 +109,7 @@ def test_the_worst_pair_is_that_of_the_covariance(ring: Ring) -> None:
     assert len(advice.chain) == len(sigmas) - 1
     assert not advice.bridges
     assert not advice.crucial
-    assert set(advice.more.between) <= set(advice.more.place.visible_to)
+    assert set(advice.more.between) <= set(advice.more.candidate.visible_to)
     assert f"seen by both {' and '.join(advice.more.between)}" in advice.lines[-1]
 
 

@@ -30,7 +30,7 @@ def more(**changes: Any) -> ShotSuggestion:
     place = BoardCandidate(
         "knee", np.array([10.0, -20.0, 499.6]), 91.0, (RigidTransform.identity(),), views
     )
-    keys = {"pair": "a", "shots": 3, "between": ("a", "b"), "place": place, "before_mm": 0.5,
+    keys = {"pair": "a", "shots": 3, "between": ("a", "b"), "candidate": place, "before_mm": 0.5,
             "after_mm": 0.24, "halves": True}  # fmt: skip
     return ShotSuggestion(**cast(Any, keys | changes))
 
@@ -84,15 +84,15 @@ def test_further_shots_are_told_with_where_to_hold_the_board() -> None:
     ],
 )  # fmt: skip
 def test_ways_are_told_as_the_subject_has_them(degrees: float, way: str) -> None:
-    place = more().place
+    place = more().candidate
     turned = BoardCandidate(
         place.height, place.centre_mm, degrees, place.rig_from_board, place.views
     )
-    assert f"facing the subject's {way}," in said(place=turned)
+    assert f"facing the subject's {way}," in said(candidate=turned)
 
 
 def test_a_place_is_seen_by_those_who_see_every_tilt() -> None:
-    place = more().place
+    place = more().candidate
     assert place.visible_to == ("a", "b", "c")
     two = place.restrict_to(("a", "d"))
     assert two.visible_to == ("a",)

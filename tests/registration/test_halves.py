@@ -180,7 +180,7 @@ def test_halves_that_know_the_rig_five_times_worse_say_nothing_of_the_whole(
     names = tuple(sorted(placings))
     known = np.diag(np.tile([1e-16] * 3 + [1e-4] * 3, len(names)))
     half = PoseCovariance(names, 0.5 * times**2 * known)
-    monkeypatch.setattr(halves, "_placed_by", lambda *of: (dict(placings), half))
+    monkeypatch.setattr(halves, "_solve_half", lambda *of: (dict(placings), half))
     seen = [
         SimpleNamespace(pair=p, shot=f"s{k}", target=(f"s{k}", "b"))
         for p in names

@@ -179,8 +179,8 @@ FEW = np.flatnonzero((ROW < 3) & (abs(COLUMN - 5) < 3))
 
 def test_a_board_s_middle_is_where_it_is_whatever_corners_were_seen() -> None:
     at = RigidTransform.from_rotation_vector([0.3, -0.2, 0.9], [100.0, 200.0, 1300.0])
-    seen = _Middle.of(PLAIN, FEW, at.apply(corner_points(PLAIN)[FEW]))
-    np.testing.assert_allclose(seen.place, at.apply(np.array([180.0, 165.0, 0.0])), atol=1e-9)
+    seen = _Middle.locate(PLAIN, FEW, at.apply(corner_points(PLAIN)[FEW]))
+    np.testing.assert_allclose(seen.position, at.apply(np.array([180.0, 165.0, 0.0])), atol=1e-9)
     # 105 mm from the corners' own middle; these lie 30 sqrt(2 + 2 / 3) mm from it, RMS.
     assert seen.lever == pytest.approx(105.0 / (30.0 * np.sqrt(8.0 / 3.0)))
 
@@ -192,7 +192,7 @@ def test_the_less_of_a_board_was_seen_the_farther_off_its_middle_may_be() -> Non
     for _ in range(600):
         noise = rng.normal(0.0, 0.05, (2, *layout.shape))
         both = [
-            _Middle.of(PLAIN, FEW, layout + [x, 0, 0] + own)
+            _Middle.locate(PLAIN, FEW, layout + [x, 0, 0] + own)
             for x, own in zip((0, 500), noise, strict=True)
         ]
         lengths.append(_measure_separation(both, 1.0).length_mm)

@@ -20,7 +20,7 @@ from bodyscan.geometry.lenses.polynomials import split_coordinates, squared_radi
 
 NEWTON_STEPS = 20
 """Five or six reach rounding; close to where a lens folds it takes more."""
-SETTLED, NOT_FOUND = 1e-14, 1e-9
+TOLERANCE, NOT_FOUND = 1e-14, 1e-9
 """A millionth of a pixel is about 1e-9."""
 FARTHEST, DIRECTIONS = 20.0, 16
 """A lens is examined up to 87 degrees from its axis (radius 20), in 16 directions."""
@@ -106,8 +106,8 @@ class Lens(ABC):
             ideal = _at_most(real, 0.9 * self.fold_radius)
             for _ in range(NEWTON_STEPS):
                 (a, b), (c, d) = np.moveaxis(self.by_point(ideal), (-2, -1), (0, 1))
-                off = self.distort(ideal) - real
-                x, y, scale = off[..., 0], off[..., 1], a * d - b * c
+                residual = self.distort(ideal) - real
+                x, y, scale = residual[..., 0], residual[..., 1], a * d - b * c
                 step = np.empty_like(ideal)
                 step[..., 0], step[..., 1] = (d * x - b * y) / scale, (a * y - c * x) / scale
                 ideal = _at_most(
@@ -120,9 +120,9 @@ class Lens(ABC):
     def before_fold(self, ideal: Array, real: Array) -> Array:
         """Ideal points (..., 2), NaN where they lie beyond `fold_radius` or do not map to
         `real`."""
-        seen = squared_radius(self.distort(ideal) - real) < NOT_FOUND**2
-        seen &= np.sqrt(squared_radius(ideal)) < self.fold_radius
-        return np.where(seen[..., None], ideal, np.nan)
+        reached = squared_radius(self.distort(ideal) - real) < NOT_FOUND**2
+        reached &= np.sqrt(squared_radius(ideal)) < self.fold_radius
+        return np.where(reached[..., None], ideal, np.nan)
 
     def opencv(self) -> Array:
         """OpenCV's distortion coefficients k1, k2, p1, p2, k3, ... (5,) or more.
@@ -142,16 +142,16 @@ class Lens(ABC):
 
 def _at_most(points: Array, radius: Array | float) -> Array:
     """Points (..., 2), with those farther than `radius` (...) from the axis moved in to it."""
-    own = np.sqrt(squared_radius(points))
-    beyond = own > radius
+    radii = np.sqrt(squared_radius(points))
+    beyond = radii > radius
     if not beyond.any():
         return points
-    return points * np.where(beyond, radius / own, 1.0)[..., None]
+    return points * np.where(beyond, radius / radii, 1.0)[..., None]
 
 
 def has_converged(step: Array) -> bool:
     """Whether no Newton step moves anything any more; diverged (not finite) ones do not count."""
-    return bool(np.max(np.abs(step), initial=0.0, where=np.isfinite(step)) < SETTLED)
+    return bool(np.max(np.abs(step), initial=0.0, where=np.isfinite(step)) < TOLERANCE)
 
 
 @lru_cache(256)

@@ -49,8 +49,8 @@ class Radial(Lens):
     @property
     def fold_radius(self) -> float:
         """See `Lens.fold_radius`: the least r > 0 with 1 + 3 k1 r^2 + 5 k2 r^4 = 0."""
-        bend = 9.0 * self.k1**2 - 20.0 * self.k2
-        per_r2 = 0.5 * (np.sqrt(bend) - 3.0 * self.k1) if bend >= 0.0 else 0.0
+        discriminant = 9.0 * self.k1**2 - 20.0 * self.k2
+        per_r2 = 0.5 * (np.sqrt(discriminant) - 3.0 * self.k1) if discriminant >= 0.0 else 0.0
         return float(1.0 / np.sqrt(per_r2)) if per_r2 > 0.0 else np.inf
 
     def undistort(self, real: Array) -> Array:

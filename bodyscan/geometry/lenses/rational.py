@@ -47,10 +47,10 @@ class Rational(Brown):
         r2 = squared_radius(ideal)[..., None, None]
         below = self._below(r2)
         point = ideal[..., None] / below
-        turned = -point * self._above(r2) / below
+        by_divisor = -point * self._above(r2) / below
         powers = np.concatenate([r2, r2**2, r2**3], axis=-1)
         parts = [point * powers[..., :2], decentring(ideal), point * powers[..., 2:]]
-        return np.concatenate([*parts, turned * powers], axis=-1)
+        return np.concatenate([*parts, by_divisor * powers], axis=-1)
 
     def _below(self, r2: Array) -> Array:
         """The divisor at squared radii."""
