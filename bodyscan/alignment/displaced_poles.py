@@ -202,20 +202,27 @@ def find_displaced_pole(
         candidates.append((gain, DisplacedPole.from_motions(name, pairs, _mean_motions(motions))))
     if not candidates:
         return DisplacementSearch(None, np.inf)
-    gain, best = max(candidates, key=lambda one: one[0])
     if not ambiguous:
-        # If all poles moved outwards, none moved relative to the others, and the body is too thin.
         same_pole = _same_pole(seen.names, poles)
         each = _maximize_likelihood(seen, SWAYS_MM, same_pole, STEPS_MM)[0] - null
-        if each > max(gain, MIN_LOG_RATIO):
-            gain = each
-            farthest = max(
-                (one for _, one in candidates), key=lambda one: (len(one.pairs), one.shift_mm)
-            )
-            best = replace(farthest, all_moved=True)
+        candidates = _with_all_moved(candidates, each)
+    gain, best = max(candidates, key=lambda one: one[0])
     lever = np.radians(best.rotation_deg) * LEVER_MM
     displaced = gain > MIN_LOG_RATIO and np.hypot(best.shift_mm, lever) > MIN_STEP_MM
     return DisplacementSearch(best if displaced else None, detectable, sway_mm, offset_mm)
+
+
+def _with_all_moved(
+    candidates: Sequence[tuple[float, DisplacedPole]], gain: float
+) -> list[tuple[float, DisplacedPole]]:
+    """Replace the candidates by "every pole is displaced" if its log likelihood ratio is larger.
+
+    If all poles moved outwards, none moved relative to the others, and the body is too thin.
+    """
+    if gain <= max(MIN_LOG_RATIO, *(other for other, _ in candidates)):
+        return list(candidates)
+    farthest = max((one for _, one in candidates), key=lambda one: (len(one.pairs), one.shift_mm))
+    return [(gain, replace(farthest, all_moved=True))]
 
 
 def _mean_motions(motions: Sequence[Mapping[str, Array]]) -> dict[str, Array]:

@@ -18,9 +18,9 @@ import numpy as np
 from bodyscan.alignment.matching import Matches
 from bodyscan.alignment.overlaps import (
     COARSE,
-    OverlapEquations,
     OverlapPoints,
     find_connected_groups,
+    linearize,
     map_overlaps,
     match_overlap,
     motion_covariance,
@@ -156,12 +156,12 @@ def _register(
     """
     motion, sway = np.zeros((len(start), 6)), SwayPrior.from_settings(settings)
     reach, scale = settings.reach_mm, 1.0
-    linearize = partial(OverlapEquations.from_matches, correlated=settings.correlated)
+    measure = partial(linearize, correlated=settings.correlated)
     coarse, fine = clouds
     for remaining in range(settings.rounds, 0, -1):
         moved = [t.retract(m) for t, m in zip(start, motion, strict=True)]
         points = fine if remaining <= 2 else coarse
-        overlaps = _map_matches(linearize, pool, points, moved, reach, settings)
+        overlaps = _map_matches(measure, pool, points, moved, reach, settings)
         covariance = sway.covariance(names, prior, scale)
         motion = solve_motions(overlaps, motion, covariance)
         reach, scale = max(reach / 2.0, settings.min_reach_mm), sway.scale(motion)

@@ -16,7 +16,7 @@ import numpy as np
 import open3d as o3d
 
 from bodyscan.alignment.matching import MIN_NORMAL_COSINE, Matches, SampledPoints
-from bodyscan.alignment.overlaps import COARSE, OverlapEquations
+from bodyscan.alignment.overlaps import COARSE, linearize
 from bodyscan.alignment.sway_prior import SwayPrior
 from bodyscan.arrays import Array
 from bodyscan.geometry.linear_gaussian import solve_scaled
@@ -108,7 +108,7 @@ def _register_two(
     matches = _matches(source, target, found)
     if len(matches.distances) < settings.min_matches:
         return None
-    return _Edge(motion, OverlapEquations.from_matches(matches, settings.correlated).information)
+    return _Edge(motion, linearize(matches, settings.correlated).information)
 
 
 def _matches(

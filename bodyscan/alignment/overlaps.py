@@ -20,7 +20,7 @@ from bodyscan.alignment.matching import (
 )
 from bodyscan.arrays import Array, Mask
 from bodyscan.compiled import compiled
-from bodyscan.geometry.linear_gaussian import invert_scaled, solve_scaled
+from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
 from bodyscan.geometry.robust import robust_scale
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
@@ -103,31 +103,17 @@ def find_connected_groups(
     return list(nx.connected_components(graph))
 
 
-@dataclass(frozen=True, eq=False)
-class OverlapEquations:
-    """Normal equations of one overlap.
+def linearize(matches: Matches, correlated: float) -> LinearGaussianSystem:
+    """Normal equations of one overlap for the source's twist (6,); the target's acts oppositely.
 
-    With d the distances of matches and J their Jacobian by the source's twist; the target's twist
-    has the opposite effect.
+    Point-to-plane distances with Cauchy weights, at the present poses.
 
-    information: J^T W J, (6, 6).
-    gradient: J^T W d, (6,).
+    correlated: number of neighbouring matches that count as one.
     """
-
-    information: Array
-    gradient: Array
-
-    @staticmethod
-    def from_matches(matches: Matches, correlated: float) -> OverlapEquations:
-        """Sum over the matches, with Cauchy weights.
-
-        correlated: number of neighbouring matches that count as one.
-        """
-        information, gradient = np.zeros((6, 6)), np.zeros(6)
-        distances = matches.distances
-        surface = (matches.points, matches.normals, distances)
-        _accumulate(*surface, cauchy_weights(matches), information, gradient)
-        return OverlapEquations(information / correlated, gradient / correlated)
+    information, gradient = np.zeros((6, 6)), np.zeros(6)
+    surface = (matches.points, matches.normals, matches.distances)
+    _accumulate(*surface, cauchy_weights(matches), information, gradient)
+    return LinearGaussianSystem(information / correlated, -gradient / correlated)
 
 
 def cauchy_weights(matches: Matches) -> Array:
@@ -142,39 +128,42 @@ def cauchy_weights(matches: Matches) -> Array:
 
 
 def solve_motions(
-    overlaps: Mapping[tuple[int, int], OverlapEquations], motion: Array, covariance: Array
+    overlaps: Mapping[tuple[int, int], LinearGaussianSystem], motion: Array, covariance: Array
 ) -> Array:
     """Solve for the twists (P, 6) of all pairs in one Gauss-Newton step with a Gaussian prior.
 
     overlaps: by source and target, linearized at `motion` (P, 6).
     covariance: of the prior, whose mean is zero, (6P, 6P).
     """
-    right = np.zeros(motion.size)
-    for (a, b), overlap in overlaps.items():
-        # Linearized distance: d + J (x_a - m_a) - J (x_b - m_b).
-        vector = overlap.information @ (motion[a] - motion[b]) - overlap.gradient
-        right[6 * a : 6 * a + 6] += vector
-        right[6 * b : 6 * b + 6] -= vector
-    return solve_scaled(_information(overlaps, covariance), right).reshape(-1, 6)
+    system = _joint_system(overlaps, motion, covariance)
+    return system.solve().reshape(-1, 6)
 
 
 def motion_covariance(
-    overlaps: Mapping[tuple[int, int], OverlapEquations], covariance: Array
+    overlaps: Mapping[tuple[int, int], LinearGaussianSystem], covariance: Array
 ) -> Array:
     """Posterior covariance (6P, 6P) of the twists that `solve_motions` finds."""
-    return invert_scaled(_information(overlaps, covariance))
+    motion = np.zeros((len(covariance) // 6, 6))
+    return _joint_system(overlaps, motion, covariance).covariance()
 
 
-def _information(overlaps: Mapping[tuple[int, int], OverlapEquations], covariance: Array) -> Array:
-    """Information matrix (6P, 6P) of all twists: the prior's plus each overlap's."""
+def _joint_system(
+    overlaps: Mapping[tuple[int, int], LinearGaussianSystem], motion: Array, covariance: Array
+) -> LinearGaussianSystem:
+    """The prior and all overlaps, as one system of all twists."""
     information = np.asarray(np.linalg.inv(covariance), np.float64)
+    vector = np.zeros(motion.size)
     for (a, b), overlap in overlaps.items():
         i, j = slice(6 * a, 6 * a + 6), slice(6 * b, 6 * b + 6)
         information[i, i] += overlap.information
         information[j, j] += overlap.information
         information[i, j] -= overlap.information
         information[j, i] -= overlap.information
-    return information
+        # Linearized distance: d + J (x_a - m_a) - J (x_b - m_b).
+        offset = overlap.information @ (motion[a] - motion[b]) + overlap.vector
+        vector[i] += offset
+        vector[j] -= offset
+    return LinearGaussianSystem(information, vector)
 
 
 @compiled

@@ -21,6 +21,7 @@ from bodyscan.alignment.displaced_poles import (
 )
 from bodyscan.alignment.sway_prior import BODY_CENTRE, LEVER_MM
 from bodyscan.arrays import Array, Mask
+from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
 from bodyscan.geometry.transforms import RigidTransform
 
 MIN_LOG_RATIO = 12.0
@@ -47,25 +48,22 @@ class ScaleError:
 class PoseEvidence:
     """Normal equations of the pose errors of P pairs, marginalized over the subject's motion.
 
-    information, vector: (6P, 6P), (6P,), of twists, pair after pair, beyond the calibration's
-        uncertainty.
+    system: of the 6P twists, pair after pair, beyond the calibration's uncertainty.
     """
 
     names: tuple[str, ...]
-    information: Array
-    vector: Array
+    system: LinearGaussianSystem
 
     def fit(self, basis: Array) -> _DisplacementFit:
         """Fit displacements along `basis` (6P, k), with the prior size in mm of the best evidence."""
-        information, vector = basis.T @ self.information @ basis, basis.T @ self.vector
-        identity = np.eye(len(vector))
-        fits = []
-        for size_mm in STEPS_MM:
-            covariance = np.linalg.inv(information + identity / size_mm**2)
-            log_det = np.linalg.slogdet(identity + size_mm**2 * information)[1]
-            log_ratio = float(0.5 * vector @ covariance @ vector - 0.5 * log_det)
-            fits.append(_DisplacementFit(log_ratio, covariance @ vector, covariance))
-        return max(fits, key=lambda fit: fit.log_ratio)
+        steps = self.system.project(basis)
+        log_evidence = steps.log_evidence(STEPS_MM**2)
+        best = int(np.argmax(log_evidence))
+        prior = LinearGaussianSystem.from_prior(np.eye(steps.size) / STEPS_MM[best] ** 2)
+        posterior = steps + prior
+        return _DisplacementFit(
+            float(log_evidence[best]), posterior.solve(), posterior.covariance()
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,6 +18,7 @@ from scipy.linalg import cho_solve
 from scipy.linalg.lapack import dpotrf, dpotri, dtrtri, dtrtrs
 
 from bodyscan.arrays import Array, Indices
+from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
 from bodyscan.motion.body_cells import BodyCells
 from bodyscan.motion.breath import estimate_breath_covariance
 from bodyscan.motion.cell_equations import CellEquations
@@ -124,12 +125,13 @@ class BodyMotion:
         """
         current = self.displacements([kind.name for kind in self.kinds])
 
-        def project(overlap: tuple[tuple[int, int], CellEquations]) -> tuple[Array, Array]:
+        def project(overlap: tuple[tuple[int, int], CellEquations]) -> LinearGaussianSystem:
             (a, b), cells = overlap
             return self._project(cells.with_model_error(MODEL_ERROR_MM), current[a] - current[b])
 
         projected = map_threads(project, equations.items(), stage="aligning")
-        matrices, vectors = (np.array(values) for values in zip(*projected, strict=True))
+        matrices = np.array([system.information for system in projected])
+        vectors = np.array([system.vector for system in projected])
         first, second = np.array(list(equations)).T
         ends = np.cumsum([0, *(kind.fields.shape[2] for kind in self.kinds)])
         differences = [k.modes.values[first] - k.modes.values[second] for k in self.kinds]
@@ -164,8 +166,8 @@ class BodyMotion:
         )
         return replace(self, kinds=tuple(kinds))._solve().covariance
 
-    def pose_equations(self) -> tuple[Array, Array]:
-        """Normal equations (6P, 6P), (6P,) of pose errors beyond the calibration's uncertainty.
+    def pose_equations(self) -> LinearGaussianSystem:
+        """Normal equations of pose errors beyond the calibration's uncertainty.
 
         Twists (6,), pair after pair, marginalized over everything else (Schur complement).
         """
@@ -176,7 +178,7 @@ class BodyMotion:
         information = columns[pose] - columns.T @ self.covariance @ columns
         vector = self.vector[pose] - columns.T @ self.amplitudes
         by_pair = np.arange(len(vector)).reshape(6, -1).T.ravel()
-        return information[np.ix_(by_pair, by_pair)], vector[by_pair]
+        return LinearGaussianSystem(information, vector).select(by_pair)
 
     def error_factor(self, name: str, modes: Array, normals: Array) -> Array:
         """Factor L (C, n) of the covariance L L^T of one kind's displacement along normals (C, 3).
@@ -195,17 +197,14 @@ class BodyMotion:
             [_along_normals(k, cells, normals, k.modes_from_middle(pair)) for k in self.kinds]
         )
 
-    def _project(self, equations: CellEquations, offset: Array) -> tuple[Array, Array]:
-        """Project an overlap's normal equations onto the fields: (M, M), (M,).
+    def _project(self, equations: CellEquations, offset: Array) -> LinearGaussianSystem:
+        """Project an overlap's normal equations onto the M fields.
 
         offset: displacement (C, 12) of its pairs at present, at which they were linearized.
         """
-        fields = self.fields[equations.cells]
-        basis = fields.reshape(-1, fields.shape[2])
-        vector = np.einsum("cij,cj->ci", equations.information, offset[equations.cells])
-        vector -= equations.gradient
-        matrix = basis.T @ (equations.information @ fields).reshape(basis.shape)
-        return matrix, basis.T @ vector.ravel()
+        information, vector = equations.system.information, equations.system.vector
+        vector = np.einsum("cij,cj->ci", information, offset[equations.cells]) + vector
+        return LinearGaussianSystem(information, vector).project(self.fields[equations.cells])
 
     def _solve(self) -> BodyMotion:
         """Solve the normal equations with the prior, in place by LAPACK."""

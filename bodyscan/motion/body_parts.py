@@ -10,7 +10,6 @@ from bodyscan.motion.body_cells import BodyCells, modulate_fields, rigid_fields
 PARTS = ("trunk", "head", "left arm", "right arm", "left leg", "right leg")
 LEGS = PARTS[-2:]
 LIMBS = ("head", "left arm", "right arm")
-SHIFTS = tuple(f"{limb} shift" for limb in LIMBS)
 # Shares of the stature (Drillis and Contini 1966, rounded).
 NECK, CROTCH = 0.86, 0.47
 FOOT, ANKLE, SHIN = 0.03, 0.05, 0.15
@@ -75,14 +74,14 @@ def limb_weights(cells: BodyCells) -> dict[str, Array]:
 
 
 def limb_fields(cells: BodyCells, lever_mm: float) -> dict[str, Array]:
-    """Displacement fields (C, 12, 3) of each limb's rotation about its joint, and of its shift.
+    """Displacement fields (C, 12, 3) of each limb's rotation about its joint.
 
     The joint is the middle of the limb's border; limbs that were not measured have zero fields.
     """
     fields = {}
-    for (limb, weight), shift in zip(limb_weights(cells).items(), SHIFTS, strict=True):
+    for limb, weight in limb_weights(cells).items():
         border = weight * (1.0 - weight)
         joint = border @ cells.centres / max(border.sum(), 1e-12)
-        field = modulate_fields(rigid_fields(cells, joint, lever_mm), cells, weight[:, None])
-        fields[limb], fields[shift] = field[..., :3], field[..., 3:]
+        rotations = rigid_fields(cells, joint, lever_mm)[..., :3]
+        fields[limb] = modulate_fields(rotations, cells, weight[:, None])
     return fields

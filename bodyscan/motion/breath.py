@@ -6,6 +6,7 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 from bodyscan.arrays import Array
+from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
 from bodyscan.motion.body_cells import (
     BodyCells,
     modulate_fields,
@@ -78,11 +79,11 @@ def estimate_breath_covariance(
     def log_evidence(root: Array) -> Array:
         """Log evidence (S,) of one breath in all sizes."""
         projected = np.einsum("ai,manb,bj->minj", root, blocks, root, optimize=True)
-        values, directions = np.linalg.eigh(projected.reshape(2 * (count * root.shape[1],)))
-        along = (vector.reshape(-1, modes) @ root).ravel() @ directions
-        posterior = np.maximum(values, 0.0) + SIZES_MM[:, None] ** -2.0
-        log_det = np.log(posterior * SIZES_MM[:, None] ** 2).sum(axis=1)
-        return np.asarray(0.5 * (along**2 / posterior).sum(axis=1) - 0.5 * log_det)
+        system = LinearGaussianSystem(
+            projected.reshape(2 * (count * root.shape[1],)),
+            (vector.reshape(-1, modes) @ root).ravel(),
+        )
+        return system.log_evidence(SIZES_MM**2)
 
     log_evidences = np.array(map_threads(log_evidence, roots, stage="aligning"))
     # Neighbouring cells share errors of non-rigid calibrations, so that three count as one.

@@ -11,29 +11,26 @@ from bodyscan.alignment.matching import Matches
 from bodyscan.alignment.overlaps import cauchy_weights
 from bodyscan.arrays import Array, Indices
 from bodyscan.compiled import compiled
+from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
 
 
 @dataclass(frozen=True, eq=False)
 class CellEquations:
     """Normal equations of an overlap, cell by cell.
 
-    With d the distances from the second pair's surface to the first's, and J their Jacobian by the
-    first's displacement field in a cell (see `rigid_fields`).
-
     cells: those in which the pairs overlap, (c,).
-    information: J^T W J, (c, 12, 12).
-    gradient: J^T W d, (c, 12).
+    system: of the first pair's displacement field (12,) in each of them, a stack (c,); see
+        `rigid_fields`. The second pair's acts oppositely.
     """
 
     cells: Indices
-    information: Array
-    gradient: Array
+    system: LinearGaussianSystem
 
     @staticmethod
     def from_matches(
         matches: Matches, cell: Indices, centres: Array, correlated: float
     ) -> CellEquations:
-        """Sum the matches by cell (M,), weighted as in `OverlapEquations`."""
+        """Sum the matches by cell (M,), weighted as in `overlaps.linearize`."""
         occupied = np.bincount(cell, minlength=len(centres)) > 0
         cells, number = np.flatnonzero(occupied), (np.cumsum(occupied) - 1)[cell]
         information = np.zeros((len(cells), 12, 12))
@@ -46,31 +43,29 @@ class CellEquations:
             (information, gradient),
         )
         information += np.swapaxes(np.tril(information, -1), 1, 2)
-        return CellEquations(cells, information / correlated, gradient / correlated)
+        system = LinearGaussianSystem(information / correlated, -gradient / correlated)
+        return CellEquations(cells, system)
 
     def swap(self) -> CellEquations:
         """Exchange the first and the second pair."""
-        return CellEquations(self.cells, self.information, -self.gradient)
+        system = LinearGaussianSystem(self.system.information, -self.system.vector)
+        return CellEquations(self.cells, system)
 
     def with_model_error(self, sigma_mm: float) -> CellEquations:
         """Inflate each cell's variance of a shift along the normals by sigma_mm^2."""
-        weight = np.trace(self.information[:, :3, :3], axis1=1, axis2=2)
-        factor = 1.0 / (1.0 + sigma_mm**2 * weight)
-        return CellEquations(
-            self.cells, self.information * factor[:, None, None], self.gradient * factor[:, None]
-        )
+        return CellEquations(self.cells, self.system.inflate(sigma_mm**2, slice(3)))
 
     @staticmethod
     def sum(parts: Sequence[CellEquations]) -> CellEquations:
         """Add the equations of several overlaps."""
         cells = np.unique(np.concatenate([part.cells for part in parts]))
         information = np.zeros((len(cells), 12, 12))
-        gradient = np.zeros((len(cells), 12))
+        vector = np.zeros((len(cells), 12))
         for part in parts:
             at = np.searchsorted(cells, part.cells)
-            information[at] += part.information
-            gradient[at] += part.gradient
-        return CellEquations(cells, information, gradient)
+            information[at] += part.system.information
+            vector[at] += part.system.vector
+        return CellEquations(cells, LinearGaussianSystem(information, vector))
 
 
 @compiled

@@ -27,7 +27,7 @@ from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.mesh.body import BodyMesh, BreathAt
 from bodyscan.motion.body_cells import BodyCells, evaluate_field
 from bodyscan.motion.body_motion import BodyMotion
-from bodyscan.motion.body_parts import LIMBS, SHIFTS
+from bodyscan.motion.body_parts import LIMBS
 from bodyscan.motion.cell_equations import CellEquations
 from bodyscan.motion.motion_uncertainty import girth_sigmas, shape_sigmas
 from bodyscan.progress import THREADS
@@ -37,7 +37,7 @@ from bodyscan.settings import AlignmentSettings
 Result = TypeVar("Result")
 
 RIGID = ("lean", "sway")
-NON_RIGID = (*LIMBS, *SHIFTS, "parts", "breath")
+NON_RIGID = (*LIMBS, "parts", "breath")
 ROUNDS = 3  # the last with all points
 
 
@@ -140,15 +140,12 @@ def estimate_motion(
     names = [image.pair for image in images]
     seconds = [None if image.time_ms is None else 1e-3 * image.time_ms for image in images]
     with ThreadPoolExecutor(workers) as pool:
-        views = list(
-            pool.map(
-                lambda image: _View.from_image(
-                    rig_from_camera[image.pair], image, settings.spacing_mm
-                ),
-                images,
-            )
+        initial = [rig_from_camera[name] for name in names]
+        sample = partial(_View.from_image, spacing_mm=settings.spacing_mm)
+        views, cells = _divide_into_cells(
+            list(pool.map(sample, initial, images)),
+            [aligned.rig_from_camera[name] for name in names],
         )
-        views, cells = _divide_into_cells(views, [aligned.rig_from_camera[name] for name in names])
         observed = np.array(
             [np.bincount(view.cell, minlength=len(cells.centres)) > 0 for view in views]
         )
@@ -161,14 +158,13 @@ def estimate_motion(
         motion = solution.motion
         evidence = None
         if None not in seconds:
-            evidence = PoseEvidence(tuple(names), *motion.pose_equations())
+            evidence = PoseEvidence(tuple(names), motion.pose_equations())
         if solution.negligible:
             return aligned, None, evidence
-        coarse = [view.select(COARSE) for view in views]
         distances = _map_matches(
             lambda matches, cell: rms(matches.distances),
             pool,
-            coarse,
+            [view.select(COARSE) for view in views],
             (motion, cells),
             solution.reach_mm,
             settings,
@@ -179,17 +175,24 @@ def estimate_motion(
     no_closer = moved.rms_after_mm > 0.95 * aligned.rms_after_mm
     if no_closer and _is_rigid_negligible(motion, observed, settings):
         return aligned, None, evidence
+    return moved, _from_middle(images, motion, cells, observed), evidence
+
+
+def _from_middle(
+    images: Sequence[RangeImage], motion: BodyMotion, cells: BodyCells, observed: Mask
+) -> EstimatedMotion:
+    """The motion between each pair's moment and the middle of the scan."""
     known = [image.time_ms for image in images if image.time_ms is not None]
-    estimated = EstimatedMotion(
+    warps = motion.non_rigid(from_middle=True)
+    return EstimatedMotion(
         cells,
-        dict(zip(names, motion.non_rigid(from_middle=True), strict=True)),
+        {image.pair: warp for image, warp in zip(images, warps, strict=True)},
         motion.displacements((*RIGID, *NON_RIGID), from_middle=True)[..., :3],
         observed,
         shape_sigmas(motion, cells, observed),
         0.5 * (min(known) + max(known)) if known else None,
         _offset_to_mean_breath(motion, cells) if known else None,
     )
-    return moved, estimated, evidence
 
 
 def _divide_into_cells(

@@ -11,7 +11,7 @@ from bodyscan.alignment.sway_prior import BODY_CENTRE
 from bodyscan.arrays import Array, Mask
 from bodyscan.motion.body_cells import BodyCells
 from bodyscan.motion.body_motion import BodyMotion
-from bodyscan.motion.body_parts import LEGS, PARTS, SHIFTS, limb_weights, name_parts
+from bodyscan.motion.body_parts import LEGS, PARTS, limb_weights, name_parts
 
 
 def shape_sigmas(motion: BodyMotion, cells: BodyCells, observed: Mask) -> Array:
@@ -65,8 +65,8 @@ def _border_variance(motion: BodyMotion, cells: BodyCells, observed: Mask) -> Ar
     """
     variance = np.zeros(observed.shape)
     breath = _outward(motion, cells, ("breath",))
-    for (limb, weight), shift in zip(limb_weights(cells).items(), SHIFTS, strict=True):
-        with_limb = _outward(motion, cells, (limb, shift)) / np.maximum(weight, 1e-12)
+    for limb, weight in limb_weights(cells).items():
+        with_limb = _outward(motion, cells, (limb,)) / np.maximum(weight, 1e-12)
         variance += (with_limb - breath) ** 2 * weight * (1.0 - weight) / 3.0
     return np.asarray(
         np.sum(variance, axis=0, where=observed) / np.maximum(observed.sum(axis=0), 1)

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.arrays import Array, Floats
+from bodyscan.arrays import Array, Floats, Indices
 from bodyscan.compiled import compiled
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.motion.body_cells import BodyCells, field_in_camera
@@ -125,7 +125,6 @@ def _warp(
     that lie on another surface.
     """
     cell, depth = blocks
-    centres, fields = motion
     rows, columns = cell.shape
     above, before = corner[0] // size, corner[1] // size
     shift, slope = np.empty(3), np.empty((3, 3))
@@ -157,19 +156,34 @@ def _warp(
                 else:
                     found[count], weights[count] = number, weight
                     count += 1
-            shift[:] = 0.0
-            slope[:, :] = 0.0
             for n in range(count):
-                number, share = found[n], weights[n] / total
-                for k in range(3):
-                    shift[k] += share * fields[number, k]
-                    for axis in range(3):
-                        gradient = share * fields[number, 3 + 3 * axis + k]
-                        slope[axis, k] += gradient
-                        shift[k] += gradient * (points[v, u, axis] - centres[number, axis])
+                weights[n] /= total
+            _mix_fields(found[:count], weights[:count], motion, points[v, u], shift, slope)
             a, b, c = normals[v, u]
             for k in range(3):
                 points[v, u, k] += shift[k]
                 # A normal is carried by the inverse transpose of the deformation, here to first
                 # order.
                 normals[v, u, k] -= slope[k, 0] * a + slope[k, 1] * b + slope[k, 2] * c
+
+
+@compiled
+def _mix_fields(
+    cells: Indices,
+    weights: Array,
+    motion: tuple[Array, Array],
+    point: Floats,
+    shift: Array,
+    slope: Array,
+) -> None:
+    """Set the weighted mean displacement (3,) and gradient (3, 3) of some cells at a point (3,)."""
+    centres, fields = motion
+    shift[:] = 0.0
+    slope[:, :] = 0.0
+    for number, weight in zip(cells, weights):  # noqa: B905  (compiled)
+        for k in range(3):
+            shift[k] += weight * fields[number, k]
+            for axis in range(3):
+                gradient = weight * fields[number, 3 + 3 * axis + k]
+                slope[axis, k] += gradient
+                shift[k] += gradient * (point[axis] - centres[number, axis])

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 
-from bodyscan.arrays import Floats, Mask, crop_bounds, find_crop
+from bodyscan.arrays import Floats, Mask, find_crop
 from bodyscan.calibration.pair import PairCalibration
 from bodyscan.compiled import compiled
 from bodyscan.errors import BadInput
@@ -20,10 +21,6 @@ from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
 from bodyscan.reconstruction.crossing_stripes import Agreement, combine_directions
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.stripes.stripe_map import StripeMap
-
-NORMAL_WINDOW_PX = 5
-REACH = 2
-ZERO, ONE = np.float32(0.0), np.float32(1.0)
 
 
 def reconstruct_range_image(pair: PairCalibration, stripes: StripeMap) -> RangeImage:
@@ -160,95 +157,61 @@ def _triangulate(
 
 
 def grid_normals(points: Floats, measured: Mask | None = None) -> Floats:
-    """Unit normals (H, W, 3) towards the camera, from points (H, W, 3) in a small window.
+    """Unit normals (H, W, 3) towards the camera, from points (H, W, 3), in windows of 5 x 5 pixels.
 
     measured: where there are points, (H, W), if that is known.
 
-    Fits a plane to 1/z, which is affine in image coordinates on a plane; NaN where the window is
-    incomplete, because points at a rim are not reliable.
+    Fits a plane p X + q Y + r Z = 1, that is 1/z = p x/z + q y/z + r, by least squares over rows and
+    columns. NaN where the window is incomplete: points at the margin of a surface are unreliable.
     """
     normals = np.full(points.shape, np.nan, np.float32)
-    shown = find_crop(np.isfinite(points[..., 2]) if measured is None else measured)
-    if shown is not None:
-        _grid_normals(np.ascontiguousarray(points, np.float32), crop_bounds(shown), normals)
+    if measured is None:
+        measured = np.isfinite(points[..., 2])
+    box = find_crop(measured)
+    if box is None:
+        return normals
+    planes = np.empty((3, *measured[box].shape), np.float32)  # x/z, y/z and 1000/z
+    _divide_by_depth(points[box], planes)
+    ramp, total = np.arange(-2.0, 3.0), np.ones(5)
+    slopes_u = np.stack([cv2.sepFilter2D(plane, -1, ramp, total) for plane in planes])
+    slopes_v = np.stack([cv2.sepFilter2D(plane, -1, total, ramp) for plane in planes])
+    window, border = (
+        np.ones((5, 5), np.uint8),
+        {"borderType": cv2.BORDER_CONSTANT, "borderValue": 0},
+    )
+    inner = cv2.erode(measured[box].view(np.uint8), window, **border) > 0
+    _set_normals(planes, slopes_u, slopes_v, inner, normals[box])
     return normals
 
 
 @compiled
-def _grid_normals(points: Floats, box: tuple[int, int, int, int], normals: Floats) -> None:
-    """Set the normals (H, W, 3) of points (H, W, 3), row by row of a box that holds all points.
-
-    `recent` holds x/z, y/z and 1000/z of the last five rows. A NaN spreads to all windows it is in.
-    """
-    top, bottom, left, right = box
-    width = right - left
-    recent = np.full((3, NORMAL_WINDOW_PX, width), np.nan, np.float32)
-    middle = np.empty((3, width), np.float32)
-    slope_u, slope_v = np.empty_like(middle), np.empty_like(middle)
-    for v in range(top, bottom + REACH):
-        newest = v % NORMAL_WINDOW_PX
-        if v < bottom:
-            row = points[v, left:right]
-            _affine_in_image(row, recent[0, newest], recent[1, newest], recent[2, newest])
-        else:
-            recent[:, newest] = np.nan
-        if v >= top + REACH:
-            for k in range(3):
-                _slopes(recent[k], v - REACH, middle[k], slope_u[k], slope_v[k])
-            _normals(middle, slope_u, slope_v, normals[v - REACH, left:right])
+def _divide_by_depth(points: Floats, planes: Floats) -> None:
+    """Set x/z, y/z and 1000/z, which is as large, (3, h, w), of points (h, w, 3)."""
+    for v in range(planes.shape[1]):
+        for u in range(planes.shape[2]):
+            inverse = np.float32(1.0) / points[v, u, 2]
+            planes[0, v, u], planes[1, v, u] = points[v, u, 0] * inverse, points[v, u, 1] * inverse
+            planes[2, v, u] = np.float32(1000.0) * inverse
 
 
 @compiled
-def _affine_in_image(points: Floats, x: Floats, y: Floats, inverse: Floats) -> None:
-    """Set x/z, y/z and 1000/z (W,) of a row of points (W, 3)."""
-    for u in range(len(points)):
-        per_z = ONE / points[u, 2]
-        x[u], y[u] = points[u, 0] * per_z, points[u, 1] * per_z
-        inverse[u] = np.float32(1000.0) * per_z
+def _set_normals(
+    planes: Floats, slopes_u: Floats, slopes_v: Floats, inner: Mask, normals: Floats
+) -> None:
+    """Set the normals (h, w, 3) of inner pixels; slopes of the planes by column and row, (3, h, w).
 
-
-@compiled
-def _slopes(rows: Floats, v: int, middle: Floats, slope_u: Floats, slope_v: Floats) -> None:
-    """Slopes by column and row (W,) of planes fitted in the windows of row v, times 50; row v.
-
-    All are given for the windows' middles, which begin at column 2. Row w is rows[w % 5], (5, W).
+    Converts slopes by column and row to slopes by x/z and y/z by Cramer's rule.
     """
-    above2, above, here = rows[(v - 2) % 5], rows[(v - 1) % 5], rows[v % 5]
-    below, below2 = rows[(v + 1) % 5], rows[(v + 2) % 5]
-    width = len(here)
-    total, ramp = np.empty(width, np.float32), np.empty(width, np.float32)
-    for u in range(width):
-        total[u] = here[u] + ((above[u] + below[u]) + (above2[u] + below2[u]))
-        outer = below2[u] - above2[u]
-        ramp[u] = (below[u] - above[u]) + (outer + outer)
-    for u in range(width - 4):
-        outer = total[u + 4] - total[u]
-        slope_u[u] = (total[u + 3] - total[u + 1]) + (outer + outer)
-        slope_v[u] = ramp[u + 2] + ((ramp[u + 1] + ramp[u + 3]) + (ramp[u] + ramp[u + 4]))
-        middle[u] = here[u + 2]
-
-
-@compiled
-def _normals(middle: Floats, slope_u: Floats, slope_v: Floats, normals: Floats) -> None:
-    """Normals (W, 3) of a row from the results of `_slopes` for x/z, y/z and 1000/z (3, W).
-
-    1/z = p x + q y + r is the plane p X + q Y + r Z = 1, whose normal (p, q, r) points away. Slopes
-    by column and row are converted to slopes by x and y, all times the determinant.
-    """
-    x, y, inverse = middle[0], middle[1], middle[2]
-    x_u, y_u, inverse_u = slope_u[0], slope_u[1], slope_u[2]
-    x_v, y_v, inverse_v = slope_v[0], slope_v[1], slope_v[2]
-    windows = len(normals) - 2 * REACH
-    # With separate arrays, which the compiler knows not to overlap, it computes eight at once.
-    p, q = np.empty(windows, np.float32), np.empty(windows, np.float32)
-    r = np.empty(windows, np.float32)
-    for u in range(windows):
-        determinant = x_u[u] * y_v[u] - x_v[u] * y_u[u]
-        by_x = inverse_u[u] * y_v[u] - inverse_v[u] * y_u[u]
-        by_y = inverse_v[u] * x_u[u] - inverse_u[u] * x_v[u]
-        by_z = determinant * inverse[u] - by_x * x[u] - by_y * y[u]
-        size = np.sqrt(by_x * by_x + by_y * by_y + by_z * by_z)
-        scale = ONE / (-size if determinant > ZERO else size)
-        p[u], q[u], r[u] = by_x * scale, by_y * scale, by_z * scale
-    for u in range(windows):
-        normals[REACH + u, 0], normals[REACH + u, 1], normals[REACH + u, 2] = p[u], q[u], r[u]
+    for v in range(planes.shape[1]):
+        for u in range(planes.shape[2]):
+            if not inner[v, u]:
+                continue
+            x_u, y_u, inverse_u = slopes_u[0, v, u], slopes_u[1, v, u], slopes_u[2, v, u]
+            x_v, y_v, inverse_v = slopes_v[0, v, u], slopes_v[1, v, u], slopes_v[2, v, u]
+            determinant = x_u * y_v - x_v * y_u
+            p = inverse_u * y_v - inverse_v * y_u
+            q = inverse_v * x_u - inverse_u * x_v
+            r = determinant * planes[2, v, u] - p * planes[0, v, u] - q * planes[1, v, u]
+            length = np.sqrt(p * p + q * q + r * r)
+            scale = np.float32(1.0) / (-length if determinant > np.float32(0.0) else length)
+            normals[v, u, 0], normals[v, u, 1], normals[v, u, 2] = p * scale, q * scale, r * scale

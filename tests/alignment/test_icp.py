@@ -9,7 +9,7 @@ from ring import looking_at
 
 from bodyscan.alignment.icp import Alignment, Overlap, align
 from bodyscan.alignment.matching import Matches
-from bodyscan.alignment.overlaps import OverlapEquations
+from bodyscan.alignment.overlaps import linearize
 from bodyscan.errors import FailedWork
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
@@ -198,14 +198,14 @@ def test_the_normal_equations_are_those_of_the_distances_jacobian() -> None:
     spread = 1.4826 * np.median(np.abs(matches.distances))
     sigma = np.hypot(matches.sigma_mm, spread)
     weights = 1.0 / (1.0 + (matches.distances / (2.0 * sigma)) ** 2) / (sigma**2 * 5.0)
-    found = OverlapEquations.from_matches(matches, correlated=5.0)
+    found = linearize(matches, correlated=5.0)
     scale = np.sqrt(np.diag(found.information))  # rotations of 300 mm arms beside millimetres
     information = jacobian.T @ (weights[:, None] * jacobian)
     np.testing.assert_allclose(
         found.information / np.outer(scale, scale), information / np.outer(scale, scale), atol=1e-5
     )
     gradient = jacobian.T @ (weights * matches.distances)
-    np.testing.assert_allclose(found.gradient / scale, gradient / scale, atol=1e-4)
+    np.testing.assert_allclose(-found.vector / scale, gradient / scale, atol=1e-4)
 
 
 def test_distances_of_all_overlaps_count_by_their_points() -> None:

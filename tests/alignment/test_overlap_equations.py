@@ -9,10 +9,11 @@ from scipy import stats
 from bodyscan.alignment.displaced_poles import PairDrift, estimate_drift
 from bodyscan.alignment.matching import Matches
 from bodyscan.alignment.overlaps import (
-    OverlapEquations,
+    linearize,
     motion_covariance,
     solve_motions,
 )
+from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
 
 
 def matches(distances: np.ndarray, seed: int = 0, sigma_mm: float = 0.2) -> Matches:
@@ -35,12 +36,12 @@ def test_every_distance_pulls_by_its_own_variance_and_the_spread_of_all() -> Non
     jacobian = by_motion(found)
     spread = 1.4826 * 0.1
     weight = 1.0 / (0.2**2 + spread**2 + 0.25 * 0.1**2)
-    equations = OverlapEquations.from_matches(found, 4.0)
+    equations = linearize(found, 4.0)
     np.testing.assert_allclose(
         equations.information, weight * jacobian.T @ jacobian / 4.0, rtol=1e-9
     )
     np.testing.assert_allclose(
-        equations.gradient, weight * jacobian.T @ found.distances / 4.0, rtol=1e-9
+        -equations.vector, weight * jacobian.T @ found.distances / 4.0, rtol=1e-9
     )
 
 
@@ -48,14 +49,14 @@ def test_a_distance_far_beyond_the_others_counts_for_little() -> None:
     distances = np.full(51, 0.01)
     distances[50] = 100.0
     with_it, without = matches(distances), matches(distances[:50])
-    one, other = (OverlapEquations.from_matches(found, 1.0) for found in (with_it, without))
+    one, other = (linearize(found, 1.0) for found in (with_it, without))
     # Cauchy: its pull is at most d / (d^2 / 4) = 4 / d, here 0.04; plainly it would be 2,000.
-    pull = np.linalg.norm((one.gradient - other.gradient)[3:])
+    pull = np.linalg.norm((one.vector - other.vector)[3:])
     assert pull == pytest.approx(0.04, rel=0.01)
 
 
 def test_where_all_agree_exactly_no_weight_is_without_end() -> None:
-    equations = OverlapEquations.from_matches(matches(np.zeros(50), sigma_mm=0.0), 1.0)
+    equations = linearize(matches(np.zeros(50), sigma_mm=0.0), 1.0)
     # A hundredth of a millimetre is the least that distances spread.
     assert np.trace(equations.information[3:, 3:]) == pytest.approx(50 / 0.01**2)
 
@@ -69,7 +70,7 @@ def test_motions_bring_what_overlaps_together_and_nothing_else() -> None:
         # Source a lies off by what a's motion has to take out, less b's.
         off = -by_motion(found) @ (true[a] - true[b])
         apart = Matches(found.points, found.normals, off, found.sigma_mm, found.source)
-        overlaps[a, b] = OverlapEquations.from_matches(apart, 1.0)
+        overlaps[a, b] = linearize(apart, 1.0)
     wide = np.diag(([1.0] * 3 + [1e6] * 3) * 3)
     motion = solve_motions(overlaps, np.zeros((3, 6)), wide)
     # What all share stays near zero, where the prior holds it.
@@ -87,7 +88,7 @@ def test_a_step_starts_from_the_motions_so_far() -> None:
         found.points, found.normals, -by_motion(found) @ left, found.sigma_mm, found.source
     )
     wide = np.diag(([1.0] * 3 + [1e6] * 3) * 2)
-    motion = solve_motions({(0, 1): OverlapEquations.from_matches(apart, 1.0)}, so_far, wide)
+    motion = solve_motions({(0, 1): linearize(apart, 1.0)}, so_far, wide)
     np.testing.assert_allclose(motion[0] - motion[1], so_far[0] - so_far[1] + left, atol=1e-4)
 
 
@@ -135,7 +136,7 @@ def test_motions_are_known_by_the_prior_and_by_what_overlaps_say_of_their_differ
     """Two pairs, each known to a, tied along x to b: their mean keeps a / sqrt(2), their difference
     has 1 / (1 / 2 a^2 + 1 / b^2); along y, of which the overlap says nothing, all stays."""
     a, b = 0.3, 0.1
-    tie = OverlapEquations(np.diag([0.0, 0.0, 0.0, b**-2, 0.0, 0.0]), np.zeros(6))
+    tie = LinearGaussianSystem(np.diag([0.0, 0.0, 0.0, b**-2, 0.0, 0.0]), np.zeros(6))
     found = motion_covariance({(0, 1): tie}, a**2 * np.eye(12))
     mean, difference = np.zeros(12), np.zeros(12)
     mean[[3, 9]], difference[[3, 9]] = 0.5, (1.0, -1.0)

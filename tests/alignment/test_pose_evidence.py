@@ -9,6 +9,7 @@ from bodyscan.alignment.displaced_poles import DisplacedPole
 from bodyscan.alignment.pose_evidence import PoseEvidence, ScaleError, detect_displacement
 from bodyscan.alignment.sway_prior import BODY_CENTRE
 from bodyscan.arrays import Array
+from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
 from bodyscan.geometry.transforms import RigidTransform
 
 NAMES = tuple(f"p{pole}-{k}" for pole in (1, 2, 3) for k in (1, 2, 3, 4))
@@ -37,7 +38,7 @@ def evidence(shifts: Array, seed: int = 0, noise: float = 1.0) -> PoseEvidence:
     root = (ways * np.sqrt(np.maximum(sizes, 0.0))) @ ways.T  # the same on every processor
     astray = noise * root @ rng.standard_normal(len(sizes))
     twists = np.hstack([np.zeros((count, 3)), shifts]).ravel()
-    return PoseEvidence(NAMES, information, information @ twists + astray)
+    return PoseEvidence(NAMES, LinearGaussianSystem(information, information @ twists + astray))
 
 
 def off(
@@ -97,11 +98,7 @@ def test_of_three_pairs_any_may_have_moved() -> None:
     few = [NAMES.index(name) for name in ("p1-1", "p2-1", "p3-1")]
     places = np.concatenate([np.arange(6 * k, 6 * k + 6) for k in few])
     whole = evidence(of_pair("p1-1", [5.0, 0.0, 0.0]))
-    cut = PoseEvidence(
-        tuple(NAMES[k] for k in few),
-        whole.information[np.ix_(places, places)],
-        whole.vector[places],
-    )
+    cut = PoseEvidence(tuple(NAMES[k] for k in few), whole.system.select(places))
     found = detect_displacement(cut, PLACED, POLES)
     assert not isinstance(found, DisplacedPole) or found.all_moved
 
@@ -133,11 +130,7 @@ def test_of_three_pairs_two_that_stand_on_one_pole_and_moved_are_named() -> None
     places = np.concatenate([np.arange(6 * k, 6 * k + 6) for k in few])
     # Which of two sides moved, or both, only noise would decide.
     whole = evidence(of_pole("p1", [5.0, 0.0, 0.0]), noise=0.0)
-    cut = PoseEvidence(
-        tuple(NAMES[k] for k in few),
-        whole.information[np.ix_(places, places)],
-        whole.vector[places],
-    )
+    cut = PoseEvidence(tuple(NAMES[k] for k in few), whole.system.select(places))
     found = detect_displacement(cut, PLACED, POLES)
     assert isinstance(found, DisplacedPole)
     assert (found.name, found.all_moved) == ("pole p1", False)

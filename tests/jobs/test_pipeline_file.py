@@ -13,7 +13,7 @@ from bodyscan.jobs.pipeline import (
     PipelineError,
     load_pipeline,
 )
-from bodyscan.settings import ScanSettings
+from bodyscan.settings import AlignmentSettings, ScanSettings
 
 PIPELINES = sorted((Path(__file__).parents[2] / "pipelines").glob("*.yaml"))
 FUSE = next(path for path in PIPELINES if path.stem == "fuse")
@@ -85,3 +85,10 @@ def test_a_billion_laughs_end_early(tmp_path: Path) -> None:
     path.write_text("\n".join(lines))
     with pytest.raises(PipelineError):
         load_pipeline(path)
+
+
+def test_settings_of_earlier_releases_keep_their_meaning() -> None:
+    old = {"least_reach_mm": 2.0, "fewest": 40, "least_sway": 0.2, "most_sway": 3.0}
+    new = {"min_reach_mm": 2.0, "min_matches": 40, "min_sway": 0.2, "max_sway": 3.0}
+    validate = AlignmentSettings.model_validate
+    assert validate(old) == validate(new) != AlignmentSettings()

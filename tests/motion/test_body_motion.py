@@ -177,7 +177,8 @@ def test_parts_are_doubted_as_if_they_had_moved_as_in_people_who_breathe_so() ->
 def test_what_is_asked_of_poses_is_what_any_motion_leaves() -> None:
     """The least misfit of all motions, with each pair moved besides: its slope and its bend."""
     motion, square = seen()
-    information, pull = motion.pose_equations()
+    system = motion.pose_equations()
+    information, pull = system.information, system.vector
     order = np.arange(12).reshape(6, PAIRS).T.ravel()  # of amplitudes, pair after pair
 
     def misfit(moved: Array) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from bodyscan.alignment.matching import Matches
+from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
 from bodyscan.motion.cell_equations import CellEquations
 
 
@@ -13,10 +14,14 @@ def test_no_number_of_matches_makes_calibrations_straight() -> None:
     where it lies is the same."""
     along = np.zeros((2, 12, 12))
     along[:, 0, 0] = 1.0, 1e6  # to 1 mm, and to a thousandth
-    seen = CellEquations(np.array([3, 7]), along, along[:, 0] * 0.5)
+    seen = CellEquations(np.array([3, 7]), LinearGaussianSystem(along, along[:, 0] * 0.5))
     doubted = seen.with_model_error(0.07)
-    np.testing.assert_allclose(doubted.information[:, 0, 0] ** -0.5, np.hypot([1.0, 1e-3], 0.07))
-    np.testing.assert_allclose(doubted.gradient[:, 0], 0.5 * doubted.information[:, 0, 0])
+    np.testing.assert_allclose(
+        doubted.system.information[:, 0, 0] ** -0.5, np.hypot([1.0, 1e-3], 0.07)
+    )
+    np.testing.assert_allclose(
+        doubted.system.vector[:, 0], 0.5 * doubted.system.information[:, 0, 0]
+    )
 
 
 def test_the_evidence_of_a_cell_is_that_of_its_matches_by_its_displacement_field() -> None:
@@ -36,9 +41,11 @@ def test_the_evidence_of_a_cell_is_that_of_its_matches_by_its_displacement_field
     weights = 1.0 / (1.0 + (distances / (2.0 * sigma)) ** 2) / (sigma**2 * 5.0)
     for k in range(2):
         own, weight = jacobian[cell == k], weights[cell == k]
-        np.testing.assert_allclose(found.information[k], own.T @ (weight[:, None] * own), atol=1e-6)
         np.testing.assert_allclose(
-            found.gradient[k], own.T @ (weight * distances[cell == k]), atol=1e-6
+            found.system.information[k], own.T @ (weight[:, None] * own), atol=1e-6
+        )
+        np.testing.assert_allclose(
+            -found.system.vector[k], own.T @ (weight * distances[cell == k]), atol=1e-6
         )
     assert found.cells.tolist() == [0, 1]
 
@@ -50,5 +57,5 @@ def test_cells_that_no_match_lies_in_say_nothing() -> None:
     centres = np.array([[0.0, 0, 0], [40.0, 0, 0], [90.0, 0, 0], [130.0, 0, 0]])
     found = CellEquations.from_matches(matches, np.array([0, 2]), centres, correlated=1.0)
     assert found.cells.tolist() == [0, 2]
-    assert found.information.shape == (2, 12, 12)
-    assert (found.information[:, 2, 2] > 0.0).all()
+    assert found.system.information.shape == (2, 12, 12)
+    assert (found.system.information[:, 2, 2] > 0.0).all()

@@ -10,7 +10,7 @@ from scipy import sparse
 
 from bodyscan.arrays import Array
 from bodyscan.motion.body_cells import BodyCells
-from bodyscan.motion.body_parts import LIMBS, PARTS, SHIFTS, leftward, limb_fields, name_parts
+from bodyscan.motion.body_parts import LIMBS, PARTS, leftward, limb_fields, limb_weights, name_parts
 from bodyscan.motion.breath import breath_along_normals, breath_fields
 from bodyscan.motion.estimation import BreathOffset, EstimatedMotion
 from bodyscan.motion.person_motion import (
@@ -38,14 +38,10 @@ def person() -> BodyCells:
 def test_each_turns_about_its_joint_and_nothing_else_goes_along() -> None:
     cells = person()
     fields = limb_fields(cells, 400.0)
-    assert set(fields) == {*LIMBS, *SHIFTS}
+    assert set(fields) == set(LIMBS)
     hand, neck = int(np.argmax(cells.centres[:, 1])), at(cells, 0.0, 1450.0)
     other, foot = int(np.argmin(cells.centres[:, 1])), int(np.argmin(cells.centres[:, 2]))
-    for limb in ("left arm", "left arm shift"):
-        np.testing.assert_allclose(fields[limb][[other, foot], :3], 0.0, atol=1e-3)
-    # A shift carries all of the arm by 1 mm.
-    np.testing.assert_allclose(fields["left arm shift"][hand, :3], np.eye(3), atol=1e-3)
-    np.testing.assert_allclose(fields["right arm shift"][other, :3], np.eye(3), atol=1e-3)
+    np.testing.assert_allclose(fields["left arm"][[other, foot], :3], 0.0, atol=1e-3)
     # A turn about z carries a fingertip by the 644 mm of the arm / 400.
     left = fields["left arm"]
     assert left[hand, 0, 2] == pytest.approx(-644.0 / 400.0, abs=0.05)
@@ -242,7 +238,7 @@ def test_fullness_is_that_of_the_front_of_the_trunk() -> None:
 def test_over_a_border_what_moves_passes_into_what_does_not_as_a_bell_curve_sums() -> None:
     """An arm of 21 cells: 105 mm within it, 96 % of a cell are the arm's."""
     cells = person()
-    arm = limb_fields(cells, 400.0)["left arm shift"][:, 0, 0]
+    arm = limb_weights(cells)["left arm"]
     part = name_parts(cells) == PARTS.index("left arm")
     along = cells.centres[:, 1]
     border = along[part].min() - 15.0
