@@ -49,3 +49,4 @@ def test_files_that_a_room_names_are_there(room: Path) -> None:
     files = {path.stem for path in room.glob("*.py") if not path.stem.startswith("__")}
     folders = {path.name for path in room.iterdir() if path.is_dir()}
     assert {name for name in named if "_" in name} - files - folders == set()
+    assert files - named == set()

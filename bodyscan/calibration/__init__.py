@@ -1,5 +1,6 @@
 """One pair: its camera, and where in space its projector's light goes.
 
-Start with pair. The camera: zhang, camera, lens_choice. Its light: striped_view, stripe_agreement,
-boundary_points, light_sheets. Both at once: joint_refinement. Calibrated elsewhere: known_pair.
+Start with pair. The camera: zhang, camera, lens_choice, from board_views. Its light: striped_view,
+stripe_agreement, boundary_points, light_sheets (light_planes, sheet_fit, model_selection). Both at
+once: joint_refinement. known_pair: calibrated elsewhere. fitted_projector: for other programs.
 """

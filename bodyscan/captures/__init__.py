@@ -1,1 +1,5 @@
-"""Captures on disk: folders (`folder`), their images (`images`), a quick check of both (`check`)."""
+"""Captures on disk.
+
+folder: where each image lies (captures_file, listing). images: reads them (image_header, grey_png,
+grey_levels). check: a quick check of both. pattern_files: what the projectors show.
+"""

@@ -1,1 +1,4 @@
-"""Scans (`scan`), rigs (`rig`) and raw clouds (`e57`) as files for other programs."""
+"""Files for other programs: `scan` (a body_file in one of `formats`), `rig`, raw clouds (`e57`).
+
+defacing: removes the face before a body is passed on.
+"""

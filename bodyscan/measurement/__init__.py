@@ -1,1 +1,5 @@
-"""Measure a body mesh: stature, girths, volume, area, the top of the head under hair."""
+"""Measure a body mesh.
+
+measurements: stature, girths, volume, area (outline: girths across filled surface). head: its top
+under hair.
+"""

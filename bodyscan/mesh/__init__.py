@@ -1,1 +1,5 @@
-"""Triangle meshes of bodies: types (`body`), topology, repair, decimation, slices, PLY files."""
+"""Triangle meshes of bodies: the types (`body`), topology, repair, decimation, slices.
+
+ply: files. surface_nets: a mesh from signed distances. nearest_surface, depth_buffer: what
+is near, and what is visible.
+"""

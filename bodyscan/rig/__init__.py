@@ -1,1 +1,5 @@
-"""The rig file: what a rig consists of, how its images are named, and its mistakes by line."""
+"""The rig file (`rig`, read by rig_file): what a rig consists of, and its mistakes by line.
+
+board, pair, rig_frame: its parts; consistency: whether they fit. frame_names, templates: how images
+are named.
+"""
