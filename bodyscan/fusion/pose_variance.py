@@ -18,9 +18,7 @@ from bodyscan.progress import map_threads, split_range
 
 
 def add_pose_variance(
-    cloud: BodyCloud,
-    rig_from_camera: Mapping[str, RigidTransform],
-    prior: PoseCovariance,
+    cloud: BodyCloud, rig_from_camera: Mapping[str, RigidTransform], prior: PoseCovariance
 ) -> BodyCloud:
     """Add the variance of the pairs' poses along the normals to a cloud's sigmas.
 
@@ -58,12 +56,7 @@ def add_motion_variance(
 
 @compiled
 def _pose_sigmas(
-    points: Array,
-    normals: Floats,
-    pairs_seen: Bytes,
-    centres: Array,
-    joint: Array,
-    sigma_mm: Array,
+    points: Array, normals: Floats, pairs_seen: Bytes, centres: Array, joint: Array, sigma_mm: Array
 ) -> None:
     """Write standard deviations (N,) mm along the normals due to pose errors.
 

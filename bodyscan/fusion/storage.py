@@ -178,10 +178,7 @@ def save_failure(error: ScanFailed, folder: Path, origin: Origin) -> Path:
     for name in (FILE_NAME, CLOUD_NAME, MESH_NAME):
         (folder / name).unlink(missing_ok=True)
     reasons = tuple(line.strip() for line in str(error).splitlines())
-    write_json(
-        folder / FILE_NAME,
-        origin.facts | {"verdict": asdict(Verdict("repeat", reasons))},
-    )
+    write_json(folder / FILE_NAME, origin.facts | {"verdict": asdict(Verdict("repeat", reasons))})
     return folder / FILE_NAME
 
 

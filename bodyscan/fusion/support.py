@@ -179,13 +179,7 @@ class PointColumns:
         def find(part: slice) -> None:
             some = np.ascontiguousarray(queries[part])
             _find(
-                some,
-                self.points,
-                self.start,
-                self.low,
-                self.reach_mm,
-                distance[part],
-                near[part],
+                some, self.points, self.start, self.low, self.reach_mm, distance[part], near[part]
             )
 
         map_threads(find, split_range(len(queries)), stage="nearest points")

@@ -13,7 +13,7 @@ from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.measurement.head import HeadTop, estimate_head_top
 from bodyscan.measurement.outline import Range, find_outline, holds_middle
 from bodyscan.mesh.body import HAIR, REGION_NAMES, SKIN, UNSURE, BodyMesh, compute_region_shares
-from bodyscan.mesh.slices import Loop, slice_mesh
+from bodyscan.mesh.slices import Loop, MeshSlicer
 from bodyscan.mesh.topology import LAYER_MM, face_areas, find_handles, signed_volume
 
 CROWN_MM = 20.0
@@ -111,26 +111,22 @@ def measure(
     stature = float(mesh.vertices[:, 2].max())
     frame = rig_from_body(mesh.vertices)
     vertices = frame.inverse().apply(mesh.vertices)
-    contacts = _contacts(vertices, mesh)
-    if heights_mm is None:
-        # If only part of a body was seen, whatever there is of it.
-        every = np.arange(100.0, stature, 100.0).tolist()
-        slices = [_slice(vertices, mesh, height, contacts) for height in every]
-    else:
-        every = [float(height) for height in heights_mm]
-        slices = [_slice(vertices, mesh, height, contacts) for height in every]
-        for height, found in zip(heights_mm, slices, strict=True):
-            if found is None:
-                low, high = vertices[:, 2].min(), vertices[:, 2].max()
-                raise BadInput(
-                    f"there is no body at a height of {height:g} mm",
-                    remedy=f"Give heights between {low:.0f} and {high:.0f} mm.",
-                )
+    slicer = MeshSlicer(vertices, mesh.faces, mesh.filled, mesh.face_regions)
+    contacts = _contacts(slicer)
+    # If only part of a body was seen, whatever there is of it.
+    heights = np.arange(100.0, stature, 100.0).tolist() if heights_mm is None else heights_mm
+    slices = [_slice(slicer, float(height), contacts) for height in heights]
+    if heights_mm is not None and None in slices:
+        low, high = vertices[:, 2].min(), vertices[:, 2].max()
+        raise BadInput(
+            f"there is no body at a height of {heights_mm[slices.index(None)]:g} mm",
+            remedy=f"Give heights between {low:.0f} and {high:.0f} mm.",
+        )
     if fuller is not None:
-        more = frame.inverse().apply(fuller.vertices)
+        more = replace(slicer, vertices=frame.inverse().apply(fuller.vertices))
         slices = [
-            found and _add_breath_sigmas(found, _slice(more, mesh, height, contacts))
-            for found, height in zip(slices, every, strict=True)
+            found and _add_breath_sigmas(found, _slice(more, found.height_mm, contacts))
+            for found in slices
         ]
     areas = face_areas(mesh.vertices, mesh.faces)
     crown = mesh.vertices[mesh.faces, 2].max(axis=1) > stature - CROWN_MM
@@ -221,11 +217,11 @@ class _Contact:
         return self.low_mm <= height_mm <= self.high_mm and bool(beyond)
 
 
-def _contacts(vertices: Array, mesh: BodyMesh) -> list[_Contact]:
+def _contacts(slicer: MeshSlicer) -> list[_Contact]:
     found = []
-    for ring in find_handles(vertices, mesh.faces):
+    for ring in find_handles(slicer.vertices, slicer.faces):
         above = ring.low_mm + 1.5 * LAYER_MM
-        loops = _loops(vertices, mesh, above)
+        loops = _loops(slicer, above)
         side = "left" if ring.y_mm > 0 else "right"
         for part, loop in zip(name_parts(loops), loops, strict=True):
             if part == f"{side} arm":
@@ -235,19 +231,13 @@ def _contacts(vertices: Array, mesh: BodyMesh) -> list[_Contact]:
     return found
 
 
-def _loops(vertices: Array, mesh: BodyMesh, height_mm: float) -> tuple[Loop, ...]:
-    loops = slice_mesh(vertices, mesh.faces, height_mm, mesh.filled, mesh.face_regions)
-    return tuple(loop for loop in loops if loop.area_mm2 > 50.0)  # less is a fingertip
+def _loops(slicer: MeshSlicer, height_mm: float) -> list[Loop]:
+    return [loop for loop in slicer.slice(height_mm) if loop.area_mm2 > 50.0]  # less: a fingertip
 
 
-def _slice(
-    vertices: Array,
-    mesh: BodyMesh,
-    height_mm: float,
-    contacts: Sequence[_Contact],
-) -> Slice | None:
+def _slice(slicer: MeshSlicer, height_mm: float, contacts: Sequence[_Contact]) -> Slice | None:
     """The slice at one height, None if there is no body."""
-    loops = _loops(vertices, mesh, height_mm)
+    loops = _loops(slicer, height_mm)
     if not loops:
         return None
     girths = []

@@ -80,10 +80,7 @@ def test_what_one_pair_alone_saw_is_as_certain_as_it_says() -> None:
 
 def test_where_a_surface_ends_there_is_no_step() -> None:
     """Its weight rises from near 0 at its rim to that of its sigma over a window."""
-    surfaces = [
-        wall(WALL_MM, 100, RigidTransform.identity()),
-        wall(WALL_MM + 0.5, 100, ASIDE),
-    ]
+    surfaces = [wall(WALL_MM, 100, RigidTransform.identity()), wall(WALL_MM + 0.5, 100, ASIDE)]
     samples = take_samples(surfaces, 10**6)
     consistency = [
         compare_with_surface(samples, surface, k, 1.5, 6.0) for k, surface in enumerate(surfaces)

@@ -9,11 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bodyscan.fusion.smoothing import (
-    SmoothSurface,
-    distance_to_rim,
-    smooth,
-)
+from bodyscan.fusion.smoothing import SmoothSurface, distance_to_rim, smooth
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.transforms import RigidTransform

@@ -35,11 +35,7 @@ def test_as_many_as_wanted(wanted: int) -> None:
 
 
 @settings(max_examples=25, deadline=None)
-@given(
-    count=st.integers(1, 300),
-    size=st.floats(0.5, 50.0),
-    seed=st.integers(0, 1000),
-)
+@given(count=st.integers(1, 300), size=st.floats(0.5, 50.0), seed=st.integers(0, 1000))
 def test_one_from_each_voxel_and_the_best(count: int, size: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
     points = rng.uniform(-40.0, 40.0, (count, 3)).astype(np.float32)

@@ -258,21 +258,6 @@ def test_images_in_another_order_are_refused(change: str, said: str) -> None:
     assert said in str(refused.value)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("projected", "said"),
-    [
-        ({"start_deg": -90.0}, "or `start_deg: -90`"),
-        ({"backward": True, "start_deg": -90.0}, "`shift: backward` with `start_deg: -90`"),
-    ],
-)
-def test_keys_that_would_fit_are_named(projected: Keys, said: str) -> None:
-    lit, coded, _ = captured(HIERARCHICAL | projected)
-    with pytest.raises(DecodingFailed) as refused:
-        read(HIERARCHICAL, lit, coded)
-    assert said in str(refused.value)
-
-
 def test_a_list_of_one_wave_is_that_wave() -> None:
     for one, listed in (({"period": 16}, {"period": [16]}), ({"periods": 15}, {"periods": [15]})):
         assert described({**listed, "steps": [4]}).waves == described({**one, "steps": 4}).waves

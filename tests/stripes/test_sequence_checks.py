@@ -148,7 +148,7 @@ def test_stripes_count_one_way_along_the_lines(code: WordCode, down: int, wrong:
     stripe = np.tile(np.arange(64).repeat(5), (100, 1))
     stripe[:down] = stripe[:down, ::-1]
     if wrong:
-        with pytest.raises(DecodingFailed, match="stripes count up and down in turn"):
+        with pytest.raises(DecodingFailed, match="of the pixels count stripes the other way"):
             check(encoded(stripe, code), code, inverses=False)
     else:
         check(encoded(stripe, code), code, inverses=False)
@@ -200,5 +200,5 @@ def test_a_finest_pattern_brighter_or_darker_than_its_inverse_everywhere_is_name
 ) -> None:
     patterns, inverses = frame_pairs()
     patterns[5], inverses[5] = level, 140.0 - level
-    with pytest.raises(DecodingFailed, match=f"pattern 5 is {which} than its inverse nearly"):
+    with pytest.raises(DecodingFailed, match=f"finest pattern is {which} than its inverse nearly"):
         check_pairs(patterns, inverses)

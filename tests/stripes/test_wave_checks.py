@@ -11,11 +11,10 @@ import pytest
 from bodyscan.arrays import Array, Floats
 from bodyscan.errors import DecodingFailed
 from bodyscan.stripes.phase.decoding import (
+    check_agreement,
     check_phase,
     check_several_waves,
     check_wave_images,
-    is_consistent,
-    list_other_keys,
 )
 from bodyscan.stripes.scan_lines import ScanLines
 from bodyscan.stripes.stripe_code import Wave
@@ -108,18 +107,12 @@ def test_images_of_a_wave_that_differ_by_next_to_nothing_look_alike() -> None:
 
 
 @pytest.mark.parametrize(
-    ("agreed", "offset", "consistent"),
-    [(0.61, 0.0, True), (0.59, 0.0, False), (1.0, 0.059, True), (1.0, -0.061, False)],
+    ("agreed", "offset", "message"),
+    [(0.59, 0.0, "agree at only 59%"), (1.0, -0.061, "begin -0.06 of a period apart")],
 )
-def test_most_pixels_agree_and_waves_are_not_shifted_as_a_whole(
-    agreed: float, offset: float, consistent: bool
+def test_waves_that_disagree_or_are_shifted_as_a_whole_are_refused(
+    agreed: float, offset: float, message: str
 ) -> None:
-    order: Any = SimpleNamespace(agreed=agreed, offsets=(0.01, offset))
-    assert is_consistent(order) == consistent
-
-
-def test_other_starts_and_shifts_are_tried() -> None:
-    found = dict(list_other_keys((Wave(20.0, 3), Wave(240.0, 3))))
-    assert found["`shift: backward`"][1].shift == "backward"
-    assert found["`start_deg: -90`"][0].start == pytest.approx(np.radians(270.0))
-    assert len(found) == 2 * 11 + 1
+    check_agreement(SimpleNamespace(agreed=0.61, offsets=(0.01, 0.059)))  # type: ignore[arg-type]
+    with pytest.raises(DecodingFailed, match=message):
+        check_agreement(SimpleNamespace(agreed=agreed, offsets=(0.01, offset)))  # type: ignore[arg-type]

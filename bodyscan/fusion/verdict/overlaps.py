@@ -24,13 +24,7 @@ from bodyscan.alignment.matching import (
 )
 from bodyscan.alignment.overlaps import find_connected_groups
 from bodyscan.arrays import Array, Indices
-from bodyscan.fusion.verdict.evidence import (
-    GIRTH_PER_MM,
-    Finding,
-    ScanEvidence,
-    Seam,
-    SeamReport,
-)
+from bodyscan.fusion.verdict.evidence import GIRTH_PER_MM, Finding, ScanEvidence, Seam, SeamReport
 from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.progress import THREADS

@@ -22,10 +22,6 @@ FINE_BITS = 3
 CLEAR_SIGMAS = 4.0
 """Sigmas of pattern minus inverse beyond which noise alone cannot have decided a bit."""
 MIN_CHANGES = 50
-ORDER_REMEDY = (
-    "check that frames are in their order, that none is missing or taken twice, that pattern and "
-    "inverse lists are not exchanged, and that `stripes` and `first_code` are right"
-)
 
 
 def check_exposure(images: ScanLines) -> None:
@@ -35,7 +31,7 @@ def check_exposure(images: ScanLines) -> None:
     blurred patterns look brighter than sharp ones. Without an inverse, a pattern must nowhere be
     brighter than lit or darker than dark, or its threshold would be wrong.
     """
-    step = _sampling_step(images)
+    step = max(1, round(math.sqrt(images.lit.size / 50_000)))  # that many pixels are enough
     some = (slice(None, None, step), slice(None, None, step))
     lit, dark = images.lit[some].astype(np.int16), images.dark[some].astype(np.int16)
     contrast = lit - dark
@@ -63,11 +59,6 @@ def check_exposure(images: ScanLines) -> None:
             )
 
 
-def _sampling_step(images: ScanLines) -> int:
-    """Step along and across lines at which some 50,000 pixels represent the image."""
-    return max(1, round(math.sqrt(images.lit.size / 50_000)))
-
-
 def check_words(
     images: ScanLines, words: Codes, code: WordCode, stripes: int, variance: Floats
 ) -> None:
@@ -76,13 +67,10 @@ def check_words(
     words: (L, P) code words as read.
     variance: (256,) of each grey level.
 
-    Pattern and inverse must be of one bit. Where a code word changes from one pixel to the next, the
-    stripes must be neighbours: in Gray code, if just one bit differs, whichever it is. Along a line
-    of any camera stripes count one way; they do not if the first pattern is missing. Exchanging the
-    coarsest pattern and its inverse reverses the whole order; it shows only in codes beyond the last
-    stripe, and not at all if all codes are in use.
+    Where a code word changes from one pixel to the next, the stripes must be neighbours. An exchange
+    of the coarsest pattern and its inverse shows only in codes beyond the last stripe.
     """
-    bits, step = len(images.patterns), _sampling_step(images)
+    bits, step = len(images.patterns), max(1, round(math.sqrt(images.lit.size / 50_000)))
     contrast = cv2.subtract(images.lit, images.dark)
     sample = contrast[::step, ::step]
     # Darker pixels are misread too often to be evidence.
@@ -100,32 +88,32 @@ def check_words(
     # bit's changes out of step, even where they are clear of noise.
     min_share = 0.75 if images.inverses is None else 0.5 if code.single else 0.6
     worst = min(shares, key=lambda bit: shares[bit], default=0)
-    if shares and shares[worst] < min_share:
-        raise DecodingFailed(
-            "the patterns do not make a stripe code: frames are exchanged, lost or moved (where bit "
-            f"{worst} changes, only {shares[worst]:.0%} of neighbouring pixels are in neighbouring "
-            "stripes)",
-            remedy=ORDER_REMEDY,
-        )
-    numbers = code.stripes(used)
+    numbers, fault = code.stripes(used), ""
     beyond = float(np.mean((numbers < 0) | (numbers >= stripes))) if numbers.size else 0.0
-    if beyond > 0.05:
+    if shares and shares[worst] < min_share:
+        fault = f"where bit {worst} changes, only {shares[worst]:.0%} of neighbouring pixels"
+        fault += " are in neighbouring stripes"
+    elif beyond > 0.05:
+        fault = f"{beyond:.0%} of the codes lie beyond the last stripe"
+    else:
+        opposite = _measure_folds(code.stripes(words[:: 2 * step]), good[:: 2 * step])
+        if opposite > 0.15:
+            fault = f"{opposite:.0%} of the pixels count stripes the other way, as without bit 0"
+    if fault:
         raise DecodingFailed(
-            "the patterns do not make a stripe code: frames are exchanged, lost or moved "
-            f"({beyond:.0%} of the codes lie beyond the last stripe)",
-            remedy=ORDER_REMEDY,
+            f"the patterns do not make a stripe code: frames are exchanged, lost or moved ({fault})",
+            remedy="check that frames are in their order, that none is missing or taken twice, that "
+            "pattern and inverse lists are not exchanged, and that `stripes` and `first_code` are "
+            "right",
         )
-    _check_folds(code.stripes(words[:: 2 * step]), good[:: 2 * step])
 
 
 def _check_pairs(patterns: Greys, inverses: Greys, variance: Floats) -> Mask:
-    """Raise DecodingFailed if a pattern (bits, N) and its inverse are not of one bit, or not seen.
+    """Raise DecodingFailed if a pattern (bits, N) and its inverse are not of one bit, or not visible.
 
-    Blur, non-linear grey levels, light from other surfaces and noise all weaken fine patterns more
-    than coarse ones. Where a fine bit is clear, so is every coarser one, except for the few pixels at
-    its own boundaries. A pattern that is paired with another bit's inverse, or with the lit or the
-    dark frame, is bright in both or dark in both over half of the image, whatever the exposure;
-    nothing else does that.
+    Blur, indirect light and noise weaken fine patterns more than coarse ones: where a fine bit is
+    clear, so is every coarser one, except at its boundaries. A pattern paired with another bit's
+    inverse is as bright as that over half of the image.
 
     Returns where noise decided none but the finest bits, (N,).
     """
@@ -134,8 +122,19 @@ def _check_pairs(patterns: Greys, inverses: Greys, variance: Floats) -> Mask:
     levels = (each.astype(np.uint8, copy=False) for each in (patterns, inverses))
     sigma = np.sqrt(sum(variance[level] for level in levels))
     clear = contrast >= CLEAR_SIGMAS * sigma
+    shares = clear.mean(axis=1) if contrast.shape[1] >= 200 else ()
+    for bit, share in enumerate(shares):
+        blurred = bit >= bits - FINE_BITS and _is_even_grey(patterns, inverses, bit)
+        if share < 0.02 and not blurred:
+            raise DecodingFailed(
+                f"pattern and inverse of bit {bit} look alike: they differ in {share:.1%} of the lit "
+                "pixels",
+                remedy="check whether one of the two is missing or was taken twice; if the stripes "
+                "are finer than camera or projector can show, leave the finest bit out (half the "
+                "stripes)",
+            )
     if contrast.shape[1] >= 200:
-        _check_visibility(patterns, inverses, contrast, clear)
+        _check_finest(patterns, inverses, contrast)
     finer, strong, wrong = contrast[-1], contrast[-1] >= 8.0 * sigma[-1], ""
     for bit in range(bits - 2, -1, -1):
         # Blurred stripes of the finest bit are a quarter as strong or less in a seventh of their
@@ -155,31 +154,16 @@ def _check_pairs(patterns: Greys, inverses: Greys, variance: Floats) -> Mask:
     return np.asarray(clear[: max(bits - FINE_BITS, 1)].all(axis=0))
 
 
-def _check_visibility(patterns: Greys, inverses: Greys, contrast: Floats, clear: Mask) -> None:
-    """Raise DecodingFailed if a bit shows nowhere, or the finest pattern is brighter than its inverse
-    nearly everywhere.
-
-    contrast: |pattern - inverse| (bits, N).
-    clear: where noise alone cannot have decided a bit, (bits, N).
-    """
-    bits = len(patterns)
-    for bit, share in enumerate(clear.mean(axis=1)):
-        blurred = bit >= bits - FINE_BITS and _is_even_grey(patterns, inverses, bit)
-        if share < 0.02 and not blurred:
-            raise DecodingFailed(
-                f"pattern and inverse of bit {bit} look alike: they differ in {share:.1%} of the lit "
-                "pixels",
-                remedy="check whether one of the two is missing or was taken twice; if the stripes "
-                "are finer than camera or projector can show, leave the finest bit out (half the "
-                "stripes)",
-            )
-    coarse = max(bits - 1 - FINE_BITS, 0)
-    bright, coarse_bright = (np.mean(patterns[bit] > inverses[bit]) for bit in (bits - 1, coarse))
+def _check_finest(patterns: Greys, inverses: Greys, contrast: Floats) -> None:
+    """Raise DecodingFailed if the finest pattern is brighter or darker than its inverse nearly
+    everywhere, and a coarser one is not."""
+    coarse = max(len(patterns) - 1 - FINE_BITS, 0)
+    bright, coarse_bright = (np.mean(patterns[bit] > inverses[bit]) for bit in (-1, coarse))
     distinct = np.median(contrast[-1]) > 0.25 * np.median(contrast.max(axis=0))
     if distinct and abs(coarse_bright - 0.5) < 0.35 <= abs(bright - 0.5):
         raise DecodingFailed(
-            f"pattern {bits - 1} is {'brighter' if bright > 0.5 else 'darker'} than its inverse "
-            "nearly everywhere, though it is the finest",
+            f"the finest pattern is {'brighter' if bright > 0.5 else 'darker'} than its inverse "
+            "nearly everywhere",
             remedy="check whether one of the two is missing, or another image stands in for it",
         )
 
@@ -280,8 +264,8 @@ def _find_clear_changes(
     return clear, masks
 
 
-def _check_folds(stripes: NDArray[np.int32], good: Mask) -> None:
-    """Raise DecodingFailed if stripes (L, P) count up and down along lines: a pattern is missing."""
+def _measure_folds(stripes: NDArray[np.int32], good: Mask) -> float:
+    """Share of the pixels along whose lines stripes (L, P) count against the others' direction."""
     reach = 16
     jumps = np.cumsum(np.abs(np.diff(stripes, axis=1)) > 1, axis=1)
     gain = stripes[:, reach + 1 :] - stripes[:, 1:-reach]
@@ -289,9 +273,4 @@ def _check_folds(stripes: NDArray[np.int32], good: Mask) -> None:
     # More than two stripes over 16 pixels without a jump: more than misread pixels give.
     known = whole & (np.abs(gain) >= 3) & good[:, reach + 1 :] & good[:, 1:-reach]
     up, down = np.count_nonzero(gain[known] > 0), np.count_nonzero(gain[known] < 0)
-    if min(up, down) > max(0.15 * (up + down), MIN_CHANGES):
-        raise DecodingFailed(
-            "the patterns do not make a stripe code: stripes count up and down in turn "
-            f"({min(up, down) / (up + down):.0%} of the pixels against the others)",
-            remedy="check whether the pattern of bit 0 is missing or another one stands in for it",
-        )
+    return min(up, down) / (up + down) if min(up, down) > MIN_CHANGES else 0.0

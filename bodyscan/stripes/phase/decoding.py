@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -33,7 +31,7 @@ from bodyscan.stripes.phase.waves import (
     split_waves,
 )
 from bodyscan.stripes.scan_lines import ScanLines, transpose
-from bodyscan.stripes.stripe_code import Shift, Wave
+from bodyscan.stripes.stripe_code import Wave
 from bodyscan.stripes.stripe_map import StripeMap, assemble_from_pixels
 from bodyscan.stripes.usable_pixels import (
     MIN_CONTRAST_TO_NOISE,
@@ -49,7 +47,6 @@ from bodyscan.stripes.usable_pixels import (
 CORRELATION_PX = 1.2
 """Distance within which neighbours share noise after `smooth_phase`: the fit keeps all that varies
 slowly, so a mean of many pixels is as noisy as before."""
-MIN_SHARE_AGREED = 0.6
 MAX_OFFSET = 0.06
 """Share of the finest period, between waves overall; the smallest wrong start, 30 degrees, gives
 0.083 of it for any whole ratio of their periods except 12 k + 1."""
@@ -188,8 +185,7 @@ def decode_waves(
     read = WaveReading.from_images(lines, waves, stripes)
     check_illumination(read.bright, read.brightest)
     check_several_waves(read, stripes)
-    if not is_consistent(read.order):
-        raise _explain_inconsistency(lines, waves, stripes, read)
+    check_agreement(read.order)
     order, finest = read.order, read.waves[0]
     halves = np.floor(2.0 * np.nan_to_num(order.s) / finest.wave.period).astype(np.int32)
     check_direction(halves, order.certain, transposed)
@@ -277,47 +273,16 @@ def check_several_waves(read: WaveReading, stripes: int) -> None:
             _check_distinct(images[:, good].astype(np.float32), strength, message)
 
 
-def is_consistent(order: PhaseOrder) -> bool:
-    """Whether the waves of most pixels agree, and not by being shifted all over the image."""
-    offset = max(map(abs, order.offsets), default=0.0)
-    return order.agreed >= MIN_SHARE_AGREED and offset < MAX_OFFSET
-
-
-def _explain_inconsistency(
-    lines: Greys, waves: tuple[Wave, ...], stripes: int, read: WaveReading
-) -> DecodingFailed:
-    """The error to raise if the waves of most pixels do not agree, with keys that would fit."""
-    rows = np.flatnonzero(read.bright.sum(axis=1) > 0)
-    some = lines[:, rows[:: max(1, len(rows) // 20)]]  # enough to tell
-    orders = (
-        (key, WaveReading.from_images(some, tried, stripes).order)
-        for key, tried in list_other_keys(waves)
+def check_agreement(order: PhaseOrder) -> None:
+    """Raise DecodingFailed if the waves of most pixels disagree, or begin at different s."""
+    offset = max(order.offsets, key=abs, default=0.0)
+    if order.agreed >= 0.6 and abs(offset) < MAX_OFFSET:
+        return
+    what = f"the phases of the waves agree at only {order.agreed:.0%} of the pixels"
+    if order.agreed >= 0.6:
+        what = f"the waves begin {offset:.2f} of a period apart"
+    raise DecodingFailed(
+        what,
+        remedy="check whether the images are in their order, and `steps`, `period` or `periods`, "
+        "`start_deg` (for waves written as sines -90) and `shift` right",
     )
-    fitting = [(order.misfit, key) for key, order in orders if is_consistent(order)]
-    best = min((misfit for misfit, _ in fitting), default=0.0)
-    # Keys that mirror all stripes fit as well as those that do not: report both.
-    keys = [key for misfit, key in fitting if misfit <= 1.3 * best][:2]
-    what = f"the phases of the waves agree at only {read.order.agreed:.0%} of the pixels"
-    if read.order.agreed >= MIN_SHARE_AGREED:
-        what = f"the waves begin {max(read.order.offsets, key=abs):.2f} of a period apart"
-    remedy = "check whether the images are in their order, and `steps`, `period` or `periods`, "
-    remedy += "`start_deg` and `shift` right"
-    return DecodingFailed(
-        what, remedy="the images would fit " + " or ".join(keys) if keys else remedy
-    )
-
-
-def list_other_keys(waves: tuple[Wave, ...]) -> Iterator[tuple[str, tuple[Wave, ...]]]:
-    """List other values of the keys in the rig file, as people mistake them, and their waves.
-
-    Starts in steps of 30 degrees are for waves that are written as sines, or begin in the middle of a
-    step.
-    """
-    other: Shift = "backward" if waves[0].shift == "forward" else "forward"
-    for start in range(30, 360, 30):
-        moved = tuple(replace(wave, start=wave.start + math.radians(start)) for wave in waves)
-        degrees = (math.degrees(moved[0].start) + 180.0) % 360.0 - 180.0
-        yield f"`start_deg: {degrees:g}`", moved
-        back = tuple(replace(wave, shift=other) for wave in moved)
-        yield f"`shift: {other}` with `start_deg: {degrees:g}`", back
-    yield f"`shift: {other}`", tuple(replace(wave, shift=other) for wave in waves)

@@ -32,7 +32,6 @@ class PhaseOrder:
 
     agreed: share of the pixels whose waves agree, among those whose order noise leaves decidable.
     offsets: median difference of each other wave from the finest, in turns of the finest.
-    misfit: how many sigmas they differ by; 1 if noise explains it.
     """
 
     s: Floats
@@ -40,7 +39,6 @@ class PhaseOrder:
     certain: Mask
     agreed: float
     offsets: tuple[float, ...]
-    misfit: float
 
 
 def find_phase_order(
@@ -55,8 +53,7 @@ def find_phase_order(
     sample = turns[:, some], errors[:, some].copy()
     decidable = find_order_gap(sample[1], periods, float(stripes)) >= 3.0 * MIN_GAIN
     orders, _, _ = find_best_orders(*sample, periods, float(stripes))
-    growth = _estimate_growth(*sample, periods, orders)
-    errors *= growth[:, None]
+    errors *= _estimate_growth(*sample, periods, orders)[:, None]
     orders, best, second = find_best_orders(turns, errors, periods, float(stripes))
     residual, residual_sigma = _compute_residuals(turns, errors, periods, orders)
     agree = np.all(np.abs(residual) <= MAX_SIGMAS * residual_sigma, axis=0)
@@ -73,7 +70,7 @@ def find_phase_order(
     # On a dim background most pixels may be too noisy to decide; those do not count.
     judged = judged[decidable] if np.count_nonzero(decidable) >= MIN_PIXELS else judged
     agreed = float(np.mean(judged)) if judged.size else 0.0
-    return PhaseOrder(all_s, all_sigma, certain, agreed, tuple(medians), float(growth.max()))
+    return PhaseOrder(all_s, all_sigma, certain, agreed, tuple(medians))
 
 
 def _compute_residuals(
