@@ -43,10 +43,11 @@ def test_no_folder_of_the_machine_that_wrote_a_document_is_named(document: Path)
 
 
 @pytest.mark.parametrize("room", ROOMS, ids=lambda room: str(room.name))
-def test_files_that_a_room_names_are_there(room: Path) -> None:
+def test_a_room_says_where_each_of_its_files_belongs(room: Path) -> None:
     guide = ast.get_docstring(ast.parse((room / "__init__.py").read_text("utf-8"))) or ""
     named = set(re.findall(r"\w+", guide))
     files = {path.stem for path in room.glob("*.py") if not path.stem.startswith("__")}
     folders = {path.name for path in room.iterdir() if path.is_dir()}
+    assert files - named == set()
     assert {name for name in named if "_" in name} - files - folders == set()
     assert files - named == set()
