@@ -8,7 +8,17 @@ from rich.table import Table as ScreenTable
 
 from bodyscan.evaluation.acceptance import ALL, Figure, Readings, grade_acceptance
 from bodyscan.registration.rig_calibration import RigCalibration
-from bodyscan.report.page import Column, Lines, Number, Numbers, Page, Section, Table, format_value
+from bodyscan.report.page import (
+    Column,
+    Lines,
+    Number,
+    Numbers,
+    Page,
+    Paragraph,
+    Section,
+    Table,
+    format_value,
+)
 
 NO_STANDARD = (
     "Modelled on VDI/VDE 2634 parts 2 and 3 and ISO 20685-2; it is no test by these standards, "
@@ -45,7 +55,7 @@ def acceptance_page(
         (("calibration", calibration_id[:12]),),
         calibration.axes,
         [
-            Section("Figures", [_numbers(found)], NO_STANDARD),
+            Section("Figures", [Paragraph(NO_STANDARD), _numbers(found)]),
             Section("Spheres, all pairs merged", [_spheres(readings), _spacings(readings)]),
             Section("Plate", [_plates(readings)]),
             Section("Problems", [Lines(readings.problems or ("None.",))]),

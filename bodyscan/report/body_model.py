@@ -12,7 +12,7 @@ from bodyscan.evaluation.surface import Comparison
 from bodyscan.mesh.body import REGION_NAMES, BodyCloud, BodyMesh, compute_cover_shares
 from bodyscan.mesh.decimation import decimate
 from bodyscan.progress import THREADS
-from bodyscan.report.model import Layer, Shape, css, ramp_legend
+from bodyscan.report.model import Layer, css, ramp_legend
 from bodyscan.report.pictures import FILLED_TINT, blue_white_red, turbo
 
 UNKNOWN = (150, 150, 150)
@@ -40,7 +40,7 @@ def simplify_mesh(mesh: BodyMesh) -> BodyMesh | None:
     return None
 
 
-def layers(
+def colour_layers(
     small: BodyMesh,
     mesh: BodyMesh,
     cloud: BodyCloud,
@@ -55,12 +55,10 @@ def layers(
     sigma = _ramp(np.nan_to_num(small.sigma_mm / top), turbo()[:, ::-1])
     nearest = np.asarray(cKDTree(cloud.points).query(small.vertices, workers=THREADS)[1])
     pairs = np.array(PAIRS, np.uint8)[np.clip(cloud.pairs_seen[nearest], 1, len(PAIRS)) - 1]
-    tint = FILLED_TINT[::-1]
-    plain = np.full(small.vertices.shape, SKIN, np.uint8)
-    grey = (css(UNKNOWN), "filled, nothing measured")
+    tint, grey = FILLED_TINT[::-1], (css(UNKNOWN), "filled, nothing measured")
     found = [
         Layer("photo", small.colours, None, unlit=True),
-        Layer("shape", plain),
+        Layer("shape", np.full(small.vertices.shape, SKIN, np.uint8)),
         Layer("pairs", _without(pairs, made_up), {"caption": "pairs that measured it", "swatches": [
             *((css(c), f"{k}{' or more' if k == len(PAIRS) else ''}") for k, c in enumerate(PAIRS, 1)),
             grey,
@@ -82,11 +80,6 @@ def layers(
     return found
 
 
-def shape_of(mesh: BodyMesh) -> Shape:
-    """The mesh as the viewer takes it."""
-    return Shape(mesh.vertices, mesh.faces, mesh.normals)
-
-
 def _deviation(
     small: BodyMesh,
     mesh: BodyMesh,
@@ -99,16 +92,15 @@ def _deviation(
     tree = cKDTree(mesh.vertices[comparison.vertices])
     signed = comparison.signed_mm[np.asarray(tree.query(small.vertices, workers=THREADS)[1])]
     table = blue_white_red()[:, ::-1]
-    legend = ramp_legend(
+    caption, ends = (
         f"from {comparison.name}, mm (red: outside it)",
-        table,
         (f"−{limit_mm:g}", f"+{limit_mm:g}"),
     )
-    colours = _ramp(0.5 + 0.5 * signed / limit_mm, table)
+    legend = ramp_legend(caption, table, ends) | {
+        "swatches": [(css(UNKNOWN), "filled, not compared")]
+    }
     return Layer(
-        "deviation",
-        _without(colours, made_up),
-        legend | {"swatches": [(css(UNKNOWN), "filled, not compared")]},
+        "deviation", _without(_ramp(0.5 + 0.5 * signed / limit_mm, table), made_up), legend
     )
 
 

@@ -1,11 +1,8 @@
-"""Charts of a calibration: coverage, residuals, the light planes, models tried, the view graph."""
+"""Charts of a calibration: coverage, residuals, the light planes."""
 
 from __future__ import annotations
 
-from itertools import combinations
-
 import cv2
-import matplotlib
 import numpy as np
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
@@ -101,65 +98,9 @@ def planes_chart(calibration: RigCalibration) -> bytes:
     return svg(figure)
 
 
-def held_out_chart(calibration: RigCalibration) -> bytes:
-    """Mean error on held-out boards of every model tried, by pair; the model used is filled."""
-    tried = {n: pair.quality.held_out for n, pair in calibration.pairs.items()}
-    models = list(dict.fromkeys(one.model for every in tried.values() for one in every))
-    colours = matplotlib.colormaps["viridis"](np.linspace(0.0, 0.92, len(models)))
-    with style():
-        figure, axis = plt.subplots(figsize=(9.6, 3.4), constrained_layout=True)
-        for k, (model, colour) in enumerate(zip(models, colours, strict=True)):
-            shift = 0.6 * ((k + 0.5) / len(models) - 0.5)
-            trials = [
-                (column + shift, one.mean_mm, one.chosen)
-                for column, every in enumerate(tried.values())
-                for one in every
-                if one.model == model
-            ]
-            x, y, chosen = (np.array(part) for part in zip(*trials, strict=True))
-            axis.plot(x, y, "o", color=colour, markerfacecolor="none", markersize=5.0, label=model)
-            axis.plot(x[chosen], y[chosen], "o", color=colour, markersize=6.5)
-        axis.set_xticks(range(len(tried)), list(tried))
-        axis.set_yscale("log")
-        for ticks in (axis.yaxis.set_major_formatter, axis.yaxis.set_minor_formatter):
-            ticks("{x:g}")
-        axis.set_ylabel("mean error, mm")
-        axis.grid(axis="y", which="both", color=GREY, alpha=0.25, linewidth=0.6)
-        figure.legend(loc="outside right upper", frameon=False)
-    return svg(figure)
-
-
-def view_graph_chart(calibration: RigCalibration) -> bytes:
-    """Pairs around a circle, with lines between those that saw a board at the same moment: more
-    boards, thicker lines."""
-    names = list(calibration.seen)
-    shared = shared_boards(calibration)
-    turn = 2.0 * np.pi * np.arange(len(names)) / max(len(names), 1)
-    positions = np.stack([np.sin(turn), np.cos(turn)], axis=1)
-    colour, _ = line_styles(calibration)
-    top = max(float(np.max(shared, initial=0.0)), 1.0)
-    with style():
-        figure, axis = plt.subplots(figsize=(5.6, 5.2), constrained_layout=True)
-        for i, j in combinations(range(len(names)), 2):
-            if shared[i, j]:
-                share = shared[i, j] / top
-                axis.plot(
-                    *positions[[i, j]].T,
-                    color=INK,
-                    linewidth=0.4 + 4.0 * share,
-                    alpha=0.18 + 0.4 * share,
-                )
-        for position, name in zip(positions, names, strict=True):
-            axis.plot(*position, "o", color=colour[name], markersize=13.0)
-            axis.annotate(name, 1.17 * position, ha="center", va="center")
-        axis.set(xlim=(-1.35, 1.35), ylim=(-1.3, 1.3), aspect="equal")
-        axis.axis("off")
-    return svg(figure)
-
-
 def shared_boards(calibration: RigCalibration) -> Array:
-    """Number of boards (P, P) that two pairs saw at the same moment, in the order of `seen`; the
-    diagonal is NaN."""
+    """Number of boards (P, P) that two pairs saw at the same moment, in the order of `seen`; zero on
+    the diagonal."""
     seen = [set(one.target.tolist()) for one in calibration.seen.values()]
     count = np.array([[float(len(a & b)) for b in seen] for a in seen])
     np.fill_diagonal(count, 0.0)

@@ -3,30 +3,52 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import numpy as np
 
 from bodyscan.calibration.board_views import covered_share
 from bodyscan.geometry.uncertainty import position_sigma
 from bodyscan.registration.rig_calibration import RigCalibration, nominal_size
+from bodyscan.report.page import Column
 from bodyscan.verdict import Grade, Verdict
 
-CORNERS_RMS_PX = 0.3
-"""Corners are found to less than a tenth of a pixel in sharp, well-lit images."""
-SHEETS_RMS_MM, HELD_OUT_MM = 0.3, 0.5
-"""A scan's overlaps are doubted from 0.4 mm on (fusion/verdict/overlaps.py)."""
-COVERED_PERCENT = 40.0
-"""Share of the image: a lens is only known where boards were."""
-POSES, STRIPE_SHOTS = 6, 4
-STRIPES_PERCENT = 50.0
-SIGMA_MM = 0.5
+PAIR_COLUMNS = (
+    Column("pair"),
+    # Corners are found to less than a tenth of a pixel in sharp, well-lit images.
+    Column("corners", "px RMS", "distance of corners from where camera and pose put them.", 0.3),
+    Column("poses", "", "views of a board that were used.", 6, True, 0),
+    Column("covered", "% of picture", "by the boards' corners; the lens is extrapolated beyond.",
+           40.0, True, 0),
+    # A scan's overlaps are doubted from 0.4 mm on (fusion/verdict/overlaps.py).
+    Column("sheets", "mm RMS", "distance of stripe boundaries on boards from their sheet.", 0.3),
+    Column("held out", "mm mean", "distance of points from boards that the light was not fitted to; "
+           "outliers capped.", 0.5),
+    Column("striped", "", "boards on which stripes were decoded.", 4, True, 0),
+    Column("stripes", "% known", "boundaries between stripes that have a sheet, of those projected; "
+           "the others fell beyond the boards.", 50.0, True, 0),
+    Column("sigma", "mm", "of the camera's position in the rig frame, all axes together, from the "
+           "covariance of the joint solve.", 0.5),
+    Column("light", "", "model of the light sheets, chosen by held-out boards."),
+    Column("lens", "", "chosen by held-out boards, or named in the rig file; see below."),
+)  # fmt: skip
+REASONS = (
+    "corner residuals are {:.3g} px RMS",
+    "was calibrated from {:.3g} board poses",
+    "boards covered {:.3g} % of its picture",
+    "light sheets have residuals of {:.3g} mm RMS",
+    "held-out boards are missed by {:.3g} mm",
+    "stripes were decoded on {:.3g} boards",
+    "has planes for {:.3g} % of its stripes",
+    "its position has a sigma of {:.3g} mm",
+)
+"""What a verdict says of a figure beyond its limit, in the order of the columns with a limit."""
 
 
 @dataclass(frozen=True)
 class PairFigures:
-    """The figures by which a calibrated pair is judged, in the order of the report's columns; None
-    if not applicable or not stored."""
+    """The figures by which a calibrated pair is judged, in the order of `PAIR_COLUMNS`; None if not
+    applicable or not stored."""
 
     name: str
     corners_rms_px: float | None
@@ -40,31 +62,19 @@ class PairFigures:
 
     def beyond(self) -> Iterator[tuple[float, str]]:
         """Yield each limit that is exceeded: by what factor, and in words."""
-        checks = (
-            ("corner residuals are", self.corners_rms_px, CORNERS_RMS_PX, "px RMS", False),
-            ("was calibrated from", self.poses, POSES, "board poses", True),
-            ("boards covered", self.covered_percent, COVERED_PERCENT, "% of its picture", True),
-            ("light sheets have residuals of", self.sheets_rms_mm, SHEETS_RMS_MM, "mm RMS", False),
-            ("held-out boards are missed by", self.held_out_mm, HELD_OUT_MM, "mm", False),
-            ("stripes were decoded on", self.stripe_shots, STRIPE_SHOTS, "boards", True),
-            ("has planes for", self.stripes_percent, STRIPES_PERCENT, "% of its stripes", True),
-            ("its position has a sigma of", self.sigma_mm, SIGMA_MM, "mm", False),
-        )
-        for words, value, limit, unit, at_least in checks:
-            if value is None or (value >= limit if at_least else value <= limit):
-                continue
-            times = limit / max(value, 1e-9) if at_least else value / limit
-            side = "at least" if at_least else "at most"
-            yield times, f"{words} {value:.3g} {unit} ({side} {limit:g} is good)"
+        limited = (column for column in PAIR_COLUMNS if column.limit is not None)
+        for column, reason, value in zip(limited, REASONS, astuple(self)[1:], strict=True):
+            if column.cell(value).within_limit is False:
+                limit = float(column.limit or 0.0)
+                times = limit / max(value, 1e-9) if column.at_least else value / limit
+                side = "at least" if column.at_least else "at most"
+                yield times, f"{reason.format(value)} ({side} {limit:g} is good)"
 
 
 def figures_of(calibration: RigCalibration) -> list[PairFigures]:
     """Collect the figures of every calibrated pair, in the order of the rig."""
-    return [
-        _figures(calibration, pair.name)
-        for pair in calibration.rig.pairs
-        if pair.name in calibration.pairs
-    ]
+    names = [pair.name for pair in calibration.rig.pairs if pair.name in calibration.pairs]
+    return [_figures(calibration, name) for name in names]
 
 
 def grade_calibration(calibration: RigCalibration) -> Verdict:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -69,30 +69,6 @@ def histogram(values: Array, limit: float, label: str) -> bytes:
         axis.bar(middle, share, np.diff(edges), color=colours, edgecolor=GREY, linewidth=0.3)
         axis.axvline(float(np.mean(values)), color=INK, linewidth=1.0)
         axis.set(xlabel=label, ylabel="share, %", xlim=(-limit, limit))
-    return svg(figure)
-
-
-def bars(values: Mapping[str, float], label: str, limits: Sequence[float] = ()) -> bytes:
-    """One bar per name, with limits as lines where they are in range."""
-    with style():
-        width = min(10.0, 1.6 + 0.55 * len(values))
-        figure, axis = plt.subplots(figsize=(max(width, 4.0), 2.6), constrained_layout=True)
-        axis.bar(list(values), list(values.values()), color=BLUE, width=0.65)
-        top = max([*values.values(), 1e-9])
-        for limit in limits:
-            if limit < 4.0 * top:
-                axis.axhline(limit, color=RED, linewidth=1.0)
-                axis.annotate(
-                    f"limit {limit:g}",
-                    (1.0, limit),
-                    (-2, 2),
-                    xycoords=("axes fraction", "data"),
-                    textcoords="offset points",
-                    ha="right",
-                    color=RED,
-                )
-        axis.set_ylabel(label)
-        axis.tick_params(axis="x", length=0)
     return svg(figure)
 
 

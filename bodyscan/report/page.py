@@ -49,9 +49,8 @@ class Number:
     def limit_text(self) -> str:
         if self.limit is None:
             return "–"
-        return (
-            f"{'at least' if self.at_least else 'at most'} {format_value(self.limit, self.digits)}"
-        )
+        side = "at least" if self.at_least else "at most"
+        return f"{side} {format_value(self.limit, self.digits)}"
 
 
 @dataclass(frozen=True)
@@ -95,6 +94,12 @@ class Table:
 
 
 @dataclass(frozen=True)
+class Paragraph:
+    text: str
+    kind: Literal["paragraph"] = "paragraph"
+
+
+@dataclass(frozen=True)
 class Lines:
     """Sentences, one per line."""
 
@@ -133,25 +138,25 @@ class Viewer:
         return Markup(text.replace("<", "\\u003c"))
 
 
-Block = Numbers | Table | Lines | Picture | Viewer
+Block = Paragraph | Numbers | Table | Lines | Picture | Viewer
 
 
 @dataclass(frozen=True, eq=False)
 class Section:
     title: str
     blocks: Sequence[Block]
-    intro: str = ""
 
 
-def sections_of(parts: Mapping[str, Callable[[], Section]]) -> list[Section]:
-    """Make the sections of a report, by title; one that cannot be made is replaced by its reason."""
-    made: list[Section] = []
+def make_sections(parts: Mapping[str, Callable[[], Sequence[Block]]]) -> list[Section]:
+    """Make the sections of a report, by title; one that cannot be made holds the reason."""
+    sections: list[Section] = []
     for title, make in parts.items():
+        blocks: Sequence[Block] = ()
         notes: list[str] = []
         with optional(title, notes.append):
-            made.append(make())
-        made += [Section(title, [Lines((note,))]) for note in notes]
-    return made
+            blocks = make()
+        sections.append(Section(title, [Lines(tuple(notes))] if notes else blocks))
+    return sections
 
 
 @dataclass(frozen=True, eq=False)

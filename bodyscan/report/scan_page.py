@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import calendar
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import astuple
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,28 +18,29 @@ from bodyscan.fusion.storage import StoredScan, load_scan
 from bodyscan.fusion.verdict.coverage import MAX_FILLED
 from bodyscan.fusion.verdict.motion import MAX_MOTION_MM, MAX_RESIDUAL_MM
 from bodyscan.fusion.verdict.overlaps import MAX_DISAGREEMENT_MM
-from bodyscan.mesh.body import compute_cover_shares, find_filled_patches
+from bodyscan.mesh.body import BodyMesh, compute_cover_shares, find_filled_patches
 from bodyscan.mesh.topology import compute_topology
 from bodyscan.motion.person_motion import PartMotion, PersonMotion
 from bodyscan.registration.rig_calibration import FLOOR_AXES
 from bodyscan.report import charts
-from bodyscan.report.body_model import layers, shape_of, simplify_mesh
-from bodyscan.report.comparison_section import comparison_section, map_limit
-from bodyscan.report.model import pack
+from bodyscan.report.body_model import colour_layers, simplify_mesh
+from bodyscan.report.model import Shape, pack
 from bodyscan.report.page import (
+    Block,
     Column,
     Lines,
     Number,
     Numbers,
     Page,
+    Paragraph,
     Picture,
     Section,
     Table,
     Viewer,
     is_synthetic,
-    sections_of,
+    make_sections,
 )
-from bodyscan.report.pictures import draw_cloud, draw_mesh
+from bodyscan.report.pictures import draw_cloud, draw_deviation, draw_mesh
 from bodyscan.verdict import Verdict
 
 
@@ -51,8 +54,7 @@ def scan_page(folder: Path, other: Path | None = None) -> Page:
     sections: list[Section] = []
     if "sha256" in facts:
         scan = load_scan(folder)
-        found = compare_surfaces(scan.mesh, other) if other is not None else []
-        sections = _sections(scan, found)
+        sections = _sections(scan, compare_surfaces(scan.mesh, other) if other else [])
     return Page(
         f"Scan of {subject}" if subject else f"Scan {folder.resolve().name}",
         stored_verdict(facts)
@@ -84,16 +86,17 @@ def _in_words(when: str | None) -> str:
 def _sections(scan: StoredScan, found: list[Comparison]) -> list[Section]:
     # A person stands elsewhere in each scan, but a truth stands where it is true.
     shown = next((one for one in found if one.fitted == one.is_scan), None)
-    limit = map_limit(shown) if shown else 1.0
-    parts = {
-        "The body": lambda: Section("The body", [_viewer(scan, shown, limit)]),
-        "Figures": lambda: Section("Figures", [_numbers(scan)]),
+    # The map's scale ends at a round number above 95 % of the deviations.
+    limit = charts.round_up(max(shown.figures.p95_mm, 1e-3)) if shown else 1.0
+    parts: dict[str, Callable[[], Sequence[Block]]] = {
+        "The body": lambda: _body(scan, shown, limit),
+        "Figures": lambda: [_numbers(scan)],
     }
     if scan.facts.get("person"):
         parts["The person"] = lambda: _person(scan.facts["person"])
     if shown:
-        parts["Comparison"] = lambda: comparison_section(scan.mesh, found, shown, limit)
-    return sections_of(
+        parts[f"Compared with {shown.name}"] = lambda: _comparison(scan.mesh, found, shown, limit)
+    return make_sections(
         parts
         | {
             "Pictures": lambda: _pictures(scan),
@@ -103,17 +106,18 @@ def _sections(scan: StoredScan, found: list[Comparison]) -> list[Section]:
     )
 
 
-def _viewer(scan: StoredScan, shown: Comparison | None, limit: float) -> Viewer | Lines:
+def _body(scan: StoredScan, shown: Comparison | None, limit: float) -> list[Block]:
     small = simplify_mesh(scan.mesh)
     if small is None:
-        return Lines(("The mesh cannot be reduced without folds: there is no model to rotate.",))
-    return Viewer(
-        "Body model",
+        return [Lines(("The mesh cannot be reduced without folds: there is no model to rotate.",))]
+    caption = (
         f"The mesh reduced to {len(small.faces):,} faces, a few tenths of a millimetre from the full "
         f"one ({len(scan.mesh.faces):,}), which the figures are of. Colours are those of the measured "
-        "points: photo, number of pairs, sigma; grey or orange is what nothing measured.",
-        pack(shape_of(small), layers(small, scan.mesh, scan.cloud, shown, limit)),
+        "points: photo, number of pairs, sigma; grey or orange is what nothing measured."
     )
+    shape = Shape(small.vertices, small.faces, small.normals)
+    layers = colour_layers(small, scan.mesh, scan.cloud, shown, limit)
+    return [Viewer("Body model", caption, pack(shape, layers))]
 
 
 def _numbers(scan: StoredScan) -> Numbers:
@@ -197,9 +201,8 @@ def _alignment_numbers(facts: Mapping[str, Any]) -> list[Number]:
     ]
 
 
-def _person(person: Mapping[str, Any]) -> Section:
-    """The section on a person who moved while being scanned: what moved, how far, and how
-    certainly."""
+def _person(person: Mapping[str, Any]) -> list[Block]:
+    """What a person moved while being scanned, how far, and how certainly."""
     columns = (
         Column("part"),
         Column("moved", "mm", "most of it at most, against where it was in the middle.", digits=1),
@@ -212,57 +215,85 @@ def _person(person: Mapping[str, Any]) -> Section:
         ),
         Column("seen once", "%", "by a single pair: no other could measure its motion.", digits=0),
     )
-    rows = tuple(
-        (part["name"], part["moved_mm"], part["left_mm"], 100.0 * part["seen_once"])
-        for part in person["parts"]
-    )
     keys = ("name", "moved_mm", "left_mm", "seen_once")
-    motion = PersonMotion(
-        tuple(PartMotion(*(part[key] for key in keys)) for part in person["parts"]),
-        person["breathed_mm"],
-        person.get("moment_ms"),
-        person.get("fuller_mm"),
-        person.get("fuller_sigma_mm"),
-    )
+    parts = [PartMotion(*(part[key] for key in keys)) for part in person["parts"]]
+    rows = tuple((one.name, one.moved_mm, one.left_mm, 100.0 * one.seen_once) for one in parts)
+    whole = map(person.get, ("moment_ms", "fuller_mm", "fuller_sigma_mm"))
+    motion = PersonMotion(tuple(parts), person["breathed_mm"], *whole)
     when = "the mean of all pairs"
     if motion.moment_ms is not None:
         when = f"{motion.moment_ms / 1000.0:.2f} s after the scan began"
     what = motion.summary or "moved while being scanned"
     intro = f"The person {what}. Cloud and mesh show the body as of {when}."
-    return Section("The person", [Table(columns, rows), Lines(motion.breath_lines)], intro)
+    return [Paragraph(intro), Table(columns, rows), Lines(motion.breath_lines)]
 
 
-def _pictures(scan: StoredScan) -> Section:
-    cloud, mesh = scan.cloud, scan.mesh
-    views = "From the front, from the subject's left side, from the back. "
-    return Section(
-        "Pictures",
-        [
-            Picture(
-                "Measured points, as photographed",
-                views + "White: nothing was measured there.",
-                draw_cloud(cloud, height_px=charts.PICTURE_PX),
-            ),
-            Picture(
-                "Mesh",
-                views + "Orange: filled to close the mesh.",
-                draw_mesh(mesh, height_px=charts.PICTURE_PX),
-            ),
-            Picture(
-                "Sigma of the points",
-                views + "Standard deviation of each point along its normal, mm.",
-                draw_cloud(cloud, colour="sigma", height_px=charts.PICTURE_PX),
-            ),
-            Picture(
-                "Pairs",
-                views + "How many pairs measured each place.",
-                draw_cloud(cloud, colour="pairs_seen", height_px=charts.PICTURE_PX),
-            ),
-        ],
+def _comparison(
+    mesh: BodyMesh, found: list[Comparison], shown: Comparison, limit: float
+) -> list[Block]:
+    """Tabulate the comparisons, and map the one `shown`; limit: of the map's scale, mm."""
+    columns = (
+        Column("the scan"),
+        Column("bias", "mm", "mean signed distance, outside is positive."),
+        Column("median", "mm", "of the absolute distances."),
+        Column("RMS", "mm", "root of the mean squared distance."),
+        Column("95 %", "mm", "of the absolute distances are less."),
+        Column("worst", "mm", "the largest of the absolute distances.", digits=2),
     )
+    words = {True: "fitted rigidly to the other", False: "in its rig frame"}
+    rows = tuple((words[one.fitted], *astuple(one.figures)[1:]) for one in found)
+    points = mesh.vertices[shown.vertices]
+    fit = found[-1].other_from_scan
+    moved = float(np.linalg.norm(fit.apply(points.mean(axis=0)) - points.mean(axis=0)))
+    deviation_map = draw_deviation(
+        points,
+        mesh.normals[shown.vertices],
+        shown.signed_mm,
+        limit_mm=limit,
+        height_px=charts.PICTURE_PX,
+        caption="deviation, mm",
+    )
+    return [
+        Paragraph(
+            f"Distances of the {len(points):,} measured vertices of this scan's mesh from the "
+            f"surface of {shown.name}; what was filled is left out. To fit it, the scan was moved "
+            f"by {moved:.2f} mm and turned by {np.degrees(fit.angle):.3f} degrees as a whole."
+        ),
+        Table(columns, rows),
+        Picture(
+            "Deviation map",
+            f"Front, left side, back; the scan {words[shown.fitted]}. Red: outside of {shown.name}, "
+            "blue: inside. Values beyond the scale have the colour of its end.",
+            deviation_map,
+        ),
+        Picture(
+            "How the deviations are distributed",
+            "The line stands at their mean; the outermost bars hold all that lies beyond.",
+            charts.histogram(shown.signed_mm, limit, "signed distance, mm"),
+        ),
+    ]
 
 
-def _pairs(facts: Mapping[str, Any]) -> Section:
+def _pictures(scan: StoredScan) -> list[Block]:
+    views = "From the front, from the subject's left side, from the back."
+    draw = partial(draw_cloud, scan.cloud, height_px=charts.PICTURE_PX)
+    mesh = partial(draw_mesh, scan.mesh, height_px=charts.PICTURE_PX)
+    return [
+        Picture(title, f"{views} {caption}", drawn())
+        for title, caption, drawn in (
+            ("Measured points, as photographed", "White: nothing was measured there.", draw),
+            ("Mesh", "Orange: filled to close the mesh.", mesh),
+            (
+                "Sigma of the points",
+                "Standard deviation of each point along its normal, mm.",
+                partial(draw, colour="sigma"),
+            ),
+            ("Pairs", "How many pairs measured each place.", partial(draw, colour="pairs_seen")),
+        )
+    ]
+
+
+def _pairs(facts: Mapping[str, Any]) -> list[Block]:
     alignment = facts.get("alignment") or {"motion_mm": {}, "overlaps": [], "refused": {}}
     motion, overlaps = alignment["motion_mm"], alignment["overlaps"]
     rows = tuple(
@@ -278,7 +309,6 @@ def _pairs(facts: Mapping[str, Any]) -> Section:
             "by the alignment, at the body's middle: sway of the subject and error of the pair's "
             "pose together.",
             MAX_MOTION_MM,
-            digits=3,
         ),
         Column(
             "residual",
@@ -292,14 +322,12 @@ def _pairs(facts: Mapping[str, Any]) -> Section:
         f"{name} was left at its calibrated pose: alignment would have moved it by {sigmas:.1f} sigmas"
         for name, sigmas in alignment["refused"].items()
     ]
-    blocks: list[Any] = [Table(columns, rows)]
+    blocks: list[Block] = [Table(columns, rows)]
     if lost:
         blocks.append(Lines(tuple(lost)))
     if overlaps:
-        blocks += [_overlap_picture(overlaps)]
-    if motion:
-        blocks += [_sway_picture(motion)]
-    return Section("Pairs and their overlaps", blocks)
+        blocks.append(_overlap_picture(overlaps))
+    return blocks
 
 
 def _pair_residual(overlaps: list[dict[str, Any]], name: str) -> float | None:
@@ -324,15 +352,7 @@ def _overlap_picture(overlaps: list[dict[str, Any]]) -> Picture:
     )
 
 
-def _sway_picture(motion: Mapping[str, float]) -> Picture:
-    return Picture(
-        "Sway",
-        "How far the alignment moved each pair against the subject, at the body's middle.",
-        charts.bars(dict(sorted(motion.items())), "moved, mm", (MAX_MOTION_MM,)),
-    )
-
-
-def _holes(scan: StoredScan) -> Section:
+def _holes(scan: StoredScan) -> list[Block]:
     found = [hole for hole in find_filled_patches(scan.mesh) if hole.area_mm2 >= 100.0]
     rows = tuple(
         (str(k), hole.area_mm2 / 100.0, hole.centre[2], hole.centre[0], hole.centre[1], hole.facing)
@@ -341,14 +361,12 @@ def _holes(scan: StoredScan) -> Section:
     columns = (
         Column("hole"),
         Column("area", "cm²", digits=1),
-        Column("height", "mm", digits=0),
-        Column("x", "mm", digits=0),
-        Column("y", "mm", digits=0),
+        *(Column(name, "mm", digits=0) for name in ("height", "x", "y")),
         Column("faces"),
     )
-    intro = (
+    intro = Paragraph(
         f"Patches of at least 1 cm² that nothing measured and that were filled: {len(found)}"
         + (", of which the 8 largest are listed" if len(found) > 8 else "")
         + ". Height and place are of the patch's middle."
     )
-    return Section("Holes", [Table(columns, rows)] if rows else [], intro)
+    return [intro, Table(columns, rows)] if rows else [intro]

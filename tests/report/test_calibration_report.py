@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from ring import ring_of_cameras, ring_rig
 
-from bodyscan.calibration.camera import LensTrial
 from bodyscan.calibration.pair import PairCalibration, PairQuality
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform
@@ -19,7 +18,7 @@ from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.registration.rig_calibration import ObservedCorners, RigCalibration
 from bodyscan.registration.storage import load_calibration, save_calibration
 from bodyscan.report.calibration_charts import shared_boards
-from bodyscan.report.calibration_page import _lens_figure, calibration_page
+from bodyscan.report.calibration_page import calibration_page
 from bodyscan.report.calibration_verdict import grade_calibration
 from bodyscan.report.page import render
 from bodyscan.report.rig_model import rig_model
@@ -147,8 +146,3 @@ def test_a_calibration_of_before_has_a_report_too(
     text = render(calibration_page(tmp_path))
     assert "calibrate again to see where the boards lay" in text
     assert "Sigma over the scan volume" in text
-
-
-def test_a_lens_that_is_no_better_is_not_better_by_minus_nothing() -> None:
-    said = _lens_figure(LensTrial("brown", 0.06, -0.04))
-    assert said == "brown 0.060 px (+0.0 standard errors better)"

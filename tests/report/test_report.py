@@ -24,7 +24,7 @@ from bodyscan.files.atomic import write_json
 from bodyscan.fusion.storage import Origin
 from bodyscan.jobs.forgetting import find_subject
 from bodyscan.mesh.body import HAIR, SKIN, BodyCloud, find_filled_patches
-from bodyscan.report.body_model import layers
+from bodyscan.report.body_model import colour_layers
 from bodyscan.report.model import Layer, Shape, pack
 from bodyscan.report.page import Number, render
 from bodyscan.report.result_page import build_page
@@ -119,7 +119,7 @@ def test_what_covers_the_skin_is_a_layer_of_its_own() -> None:
     mesh = egg(20)
     hair = np.where(mesh.vertices[:, 2] > 1500.0, HAIR, SKIN).astype(np.uint8)
     cloud = BodyCloud(mesh.vertices, mesh.normals, mesh.sigma_mm, mesh.colours, mesh.colours[:, 0])
-    *_, last = layers(replace(mesh, regions=hair), mesh, cloud, None, 1.0)
+    *_, last = colour_layers(replace(mesh, regions=hair), mesh, cloud, None, 1.0)
     assert last.name == "regions"
     assert len(np.unique(last.colours, axis=0)) == 2
 

@@ -60,7 +60,7 @@ def test_the_scan_has_a_report_held_against_the_truth(workspace: Workspace, tmp_
         workspace, workspace.folder / "scan", "--out", tmp_path / "s.html", "--compare", truth
     )
     assert len(text) < 8_000_000
-    for part in ("synthetic", "Deviation map", "Residuals of the overlaps", "Sway", "Holes"):
+    for part in ("synthetic", "Deviation map", "Residuals of the overlaps", "sway", "Holes"):
         assert part in text
 
 
