@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from itertools import groupby
 from pathlib import Path
-from typing import Any, TypeVar
 
 from bodyscan.captures.folder import (
     IMAGE_SUFFIXES,
@@ -17,7 +15,6 @@ from bodyscan.captures.folder import (
     ImageSequence,
     join_captures,
     open_folder,
-    open_scan,
 )
 from bodyscan.captures.image_header import (
     NO_INVERSES,
@@ -27,12 +24,13 @@ from bodyscan.captures.image_header import (
     read_header,
 )
 from bodyscan.errors import BadInput, CaptureError
+from bodyscan.progress import map_threads
 from bodyscan.rig.board import Board
 from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig import Rig, find_unusual_lengths
 from bodyscan.rig.rig_file import load_rig
 
-Result = TypeVar("Result")
+WORKERS = 8  # threads, which wait for a disk or a server, not for a processor
 
 
 @dataclass(frozen=True)
@@ -49,11 +47,24 @@ class BadImage:
 class PairCount:
     """How many shots of the calibration captures a pair took part in, if all images are good."""
 
-    pair: str
-    pole: str | None
+    pair: Pair
     stripe_shots: int
     lit_shots: int
-    images: int
+
+    @property
+    def poses(self) -> int:
+        """Number of board poses that calibrate the pair."""
+        return self.stripe_shots + (0 if self.pair.projector else self.lit_shots)
+
+    def explain_too_few(self) -> str | None:
+        """The error if there are too few: Zhang (2000) needs three poses."""
+        if self.poses >= 3:
+            return None
+        kind = "whole stripe sequence" if self.pair.projector else "lit image"
+        return (
+            f"pair {self.pair.name}: has {_count(self.poses, kind)}; calibration needs 3 or more, "
+            "with the board tilted differently in each"
+        )
 
 
 @dataclass(frozen=True)
@@ -82,51 +93,49 @@ class CheckReport:
         return not (self.bad_images or self.errors)
 
 
-def check(
-    rig_path: Path, scans: Iterable[Path] = (), known_errors: Iterable[str] = ()
-) -> CheckReport:
-    """Check a rig file, the calibration captures it names, and scan folders if any are given.
+def check(rig_path: Path, known_errors: Iterable[str] = ()) -> CheckReport:
+    """Check a rig file and the calibration captures it names.
 
     known_errors: what is wrong with the files that the rig file names as `known`.
 
     Raises RigFileError if the rig file is wrong: then nothing else can be checked.
     """
-    rig = load_rig(rig_path)
-    errors = list(known_errors)
-    parts = [_attempt(errors, open_folder, rig, rig_path, entry) for entry in rig.calibration]
-    opened = tuple(part for part in parts if part is not None)
-    calibration = _attempt(errors, join_captures, opened) if opened else None
-    scanned = [_attempt(errors, open_scan, rig, Path(scan)) for scan in scans]
-    captures = [part for part in (calibration, *scanned) if part is not None]
-
-    sequences = [sequence for part in captures for sequence in part.sequences]
-    known = {path for part in captures for path in part.corners}
-    found = zip(sequences, _map(partial(_find_bad_images, rig, known), sequences), strict=True)
-    bad_of = dict(found)
-    good = [s for s in (calibration.sequences if calibration else ()) if not bad_of[s]]
+    rig, errors = load_rig(rig_path), list(known_errors)
+    opened: list[Captures] = []
+    captures = None
+    for entry in rig.calibration:
+        try:
+            opened.append(open_folder(rig, rig_path, entry))
+        except CaptureError as error:
+            errors.append(str(error))
+    try:
+        captures = join_captures(tuple(opened)) if opened else None
+    except CaptureError as error:
+        errors.append(str(error))
+    sequences = captures.sequences if captures else ()
+    find_bad = partial(_find_bad_images, rig, set(captures.corners if captures else ()))
+    found = map_threads(find_bad, sequences, stage="checking", workers=WORKERS)
+    good = [sequence for sequence, bad in zip(sequences, found, strict=True) if not bad]
     counts = tuple(_count_shots(pair, good) for pair in rig.pairs)
     order = {pair.name: index for index, pair in enumerate(rig.pairs)}
-    bad = sorted((bad for some in bad_of.values() for bad in some), key=lambda b: order[b.pair])
-    for part in captures:
-        taken = {sequence.shot for sequence in part.sequences}
-        empty = [shot for shot in part.shots if shot not in taken]
-        errors += [f"{part.folders[0]}: shot {shot}: no image" for shot in empty]
-    if calibration:
-        errors += _find_frame_errors(calibration, good)
+    if captures:
+        taken = {sequence.shot for sequence in sequences}
+        empty = [shot for shot in captures.shots if shot not in taken]
+        errors += [f"{captures.folders[0]}: shot {shot}: no image" for shot in empty]
+        errors += _find_frame_errors(captures, good)
         errors += _find_separate_groups(rig, good)
-        errors += (
-            () if rig.is_known else filter(None, map(_explain_too_few_shots, rig.pairs, counts))
-        )
+        if not rig.is_known:
+            errors += filter(None, (count.explain_too_few() for count in counts))
     return CheckReport(
         rig_path=Path(rig_path),
         rig=rig,
-        folders=tuple(folder for part in captures for folder in part.folders),
-        shots=calibration.shots if calibration else (),
+        folders=captures.folders if captures else (),
+        shots=captures.shots if captures else (),
         images=sum(len(sequence.paths) for sequence in sequences),
         pairs=counts,
-        bad_images=tuple(bad),
+        bad_images=tuple(sorted((b for bad in found for b in bad), key=lambda b: order[b.pair])),
         errors=tuple(errors),
-        warnings=tuple(_find_warnings(Path(rig_path), rig, captures, calibration, counts)),
+        warnings=tuple(_find_warnings(Path(rig_path), rig, captures, counts)),
     )
 
 
@@ -137,11 +146,10 @@ def format_report(report: CheckReport) -> list[str]:
     lines = [f"{report.rig_path}: rig {rig.name}: {counts}", *map(str, report.folders)]
     shots = _count(len(report.shots), "calibration shot")
     lines.append(f"{shots}, {_count(report.images, 'image')}")
-    width = max(len(pair.pair) for pair in report.pairs)
+    width = max(len(pair.name) for pair in rig.pairs)
     for count in report.pairs if report.folders else ():
-        has_stripes = rig.pair(count.pair).projector
-        stripes = f"{count.stripe_shots:4d} with stripes, " if has_stripes else ""
-        lines.append(f"  {count.pair:{width}}  {stripes}{count.lit_shots:4d} lit only")
+        stripes = f"{count.stripe_shots:4d} with stripes, " if count.pair.projector else ""
+        lines.append(f"  {count.pair.name:{width}}  {stripes}{count.lit_shots:4d} lit only")
     lines += _format_bad_images(report.bad_images)
     lines += [f"error: {text}" for text in report.errors]
     lines += [f"warning: {text}" for text in report.warnings]
@@ -150,97 +158,55 @@ def format_report(report: CheckReport) -> list[str]:
     return lines
 
 
-def _map(work: Callable[[Any], Result], items: Iterable[Any]) -> list[Result]:
-    """Map in threads, which wait for a disk or a server, not for a processor."""
-    with ThreadPoolExecutor(8) as pool:
-        return list(pool.map(work, items))
-
-
-def _attempt(errors: list[str], work: Callable[..., Captures], *args: object) -> Captures | None:
-    """Call `work`; if the captures cannot be opened, add the reason to `errors`."""
-    try:
-        return work(*args)
-    except CaptureError as error:
-        errors.append(str(error))
-        return None
-
-
-def _find_bad_images(rig: Rig, known: set[Path], sequence: ImageSequence) -> tuple[BadImage, ...]:
+def _find_bad_images(rig: Rig, known: set[Path], sequence: ImageSequence) -> list[BadImage]:
     """Find the unusable images of a sequence; none is needed if its corners are `known`."""
     camera, missing = rig.pair(sequence.pair).camera, set(sequence.missing)
-    bad = []
-    for path in sequence.paths:
-        if path in known:
-            continue
-        if path in missing:
-            fault: str | None = describe_missing(path)
-        else:
-            fault = find_header_fault(path, camera.width, camera.height)
-        if fault:
-            bad.append(BadImage(path, sequence.pair, sequence.shot, fault))
-    return tuple(bad)
+    faults = {
+        path: describe_missing(path)
+        if path in missing
+        else find_header_fault(path, camera.width, camera.height)
+        for path in sequence.paths
+        if path not in known
+    }
+    return [
+        BadImage(path, sequence.pair, sequence.shot, what) for path, what in faults.items() if what
+    ]
 
 
 def _count_shots(pair: Pair, good: list[ImageSequence]) -> PairCount:
-    taken = [sequence for sequence in good if sequence.pair == pair.name]
-    stripes = sum(sequence.has_stripes for sequence in taken)
-    images = sum(len(sequence.paths) for sequence in taken)
-    return PairCount(pair.name, pair.pole, stripes, len(taken) - stripes, images)
-
-
-def _count_poses(pair: Pair, count: PairCount) -> int:
-    """Count the board poses that calibrate a pair."""
-    return count.stripe_shots + (0 if pair.projector else count.lit_shots)
-
-
-def _explain_too_few_shots(pair: Pair, count: PairCount) -> str | None:
-    """The error if a pair has too few shots. It needs three board poses with stripes, a camera
-    alone three lit ones (Zhang 2000)."""
-    have = _count_poses(pair, count)
-    if have >= 3:
-        return None
-    kind = "whole stripe sequence" if pair.projector else "lit image"
-    return (
-        f"pair {pair.name}: has {_count(have, kind)}; calibration needs 3 or more, "
-        "with the board tilted differently in each"
-    )
+    taken = [sequence.has_stripes for sequence in good if sequence.pair == pair.name]
+    return PairCount(pair, sum(taken), len(taken) - sum(taken))
 
 
 def _find_warnings(
-    rig_path: Path,
-    rig: Rig,
-    captures: list[Captures],
-    calibration: Captures | None,
-    counts: tuple[PairCount, ...],
+    rig_path: Path, rig: Rig, captures: Captures | None, counts: tuple[PairCount, ...]
 ) -> Iterator[str]:
     """Find what should be checked, though calibration can start."""
-    sequences = [sequence for part in captures for sequence in part.sequences]
     if not (rig.calibration or rig.is_known):
         yield f"{rig_path}: names no calibration captures"
     yield from find_unusual_lengths(rig)
-    if calibration and rig.is_known and any(map(_explain_too_few_shots, rig.pairs, counts)):
+    if captures and rig.is_known and any(count.explain_too_few() for count in counts):
         yield "all pairs are `known`: `bodyscan import` takes them as they are"
+    sequences = captures.sequences if captures else ()
     if any(s.missing and set(s.missing) == set(s.inverses) for s in sequences):
         yield NO_INVERSES
     yield from _warn_of_jpeg(sequences)
-    yield from filter(None, map(describe_unlisted_images, captures))
+    yield from filter(None, [captures and describe_unlisted_images(captures)])
     if len(rig.pairs) > 1:  # a single camera cannot disagree
         yield from (_describe_symmetry(board) for board in rig.boards if board.is_ambiguous)
-    if calibration and not rig.is_known:
-        for pair, count in zip(rig.pairs, counts, strict=True):
-            have = _count_poses(pair, count)
-            if 3 <= have < 6:
-                yield f"pair {pair.name}: {have} board poses will do, 6 or more are better"
+    for count in counts if captures and not rig.is_known else ():
+        if 3 <= count.poses < 6:
+            yield f"pair {count.pair.name}: {count.poses} board poses will do, 6 or more are better"
 
 
-def _warn_of_jpeg(sequences: list[ImageSequence]) -> Iterator[str]:
+def _warn_of_jpeg(sequences: Iterable[ImageSequence]) -> Iterator[str]:
     """Warn of low-quality JPEG, judged by the first image of each pair.
 
     Boundaries and corners rise by some 40 grey levels per pixel, so four levels of rounding move
     them by 0.1 px, several times the effect of a camera's own noise.
     """
-    firsts = {s.pair: path for s in reversed(sequences) for path in s.paths[:1]}
-    errors = dict(zip(firsts, _map(_read_rounding_error, firsts.values()), strict=True))
+    firsts = {s.pair: path for s in reversed(tuple(sequences)) for path in s.paths[:1]}
+    errors = {pair: _read_rounding_error(path) for pair, path in firsts.items()}
     coarse = [pair for pair, grey in errors.items() if grey > 4.0]
     if coarse:
         yield (
@@ -289,10 +255,10 @@ def _find_separate_groups(rig: Rig, good: list[ImageSequence]) -> list[str]:
     ]
 
 
-def _find_frame_errors(calibration: Captures, good: list[ImageSequence]) -> list[str]:
+def _find_frame_errors(captures: Captures, good: list[ImageSequence]) -> list[str]:
     """The error if the shot that fixes the rig frame is missing or unusable."""
-    frame = calibration.rig.rig_frame
-    if missing := frame.missing_shot(calibration.shots):
+    frame = captures.rig.rig_frame
+    if missing := frame.missing_shot(captures.shots):
         return [missing]
     if frame.shot is None or any(sequence.shot == frame.shot for sequence in good):
         return []
@@ -324,19 +290,8 @@ def _count(count: int, noun: str) -> str:
 
 
 def describe_unlisted_images(captures: Captures) -> str | None:
-    """Describe images that the rig file does not name, often in a renamed folder; None if none."""
-    found = _find_unlisted_images(captures)
-    if not found:
-        return None
-    number = "1 image belongs" if len(found) == 1 else f"{len(found)} images belong"
-    return (
-        f"{number} to no pair and frame of the rig file, such as {found[0]}: check the spelling of "
-        "its names"
-    )
-
-
-def _find_unlisted_images(captures: Captures) -> list[Path]:
-    """Find images next to those of the shots that belong to no pair and frame of the rig file.
+    """Describe images next to those of the shots that the rig file does not name, often in a renamed
+    folder; None if there are none.
 
     Shots that are not wanted are ignored, unless nothing is left of one that is: it may have been
     renamed.
@@ -347,15 +302,20 @@ def _find_unlisted_images(captures: Captures) -> list[Path]:
     folders = {path.parent.parent for path in wanted} | {path.parent for path in wanted}
     named = {(len(path.parts), path.stem) for path in wanted}
     suffixes = {path.suffix for path in wanted}
-    unlisted = []
+    found = []
     for folder in captures.folders:
-        for root, _, names in os.walk(folder):
-            for path in (Path(root, name) for name in names):
-                if path.suffix.lower() not in IMAGE_SUFFIXES or path in wanted:
-                    continue
-                of_shot = set(path.relative_to(folder).parts[:-1]) & set(captures.shots)
-                # of another shot whose name differs only in its suffix
-                other = path.suffix not in suffixes and (len(path.parts), path.stem) in named
-                if renamed or of_shot or path.parent in folders or other:
-                    unlisted.append(path)
-    return sorted(unlisted)
+        for path in (Path(root, name) for root, _, names in os.walk(folder) for name in names):
+            if path.suffix.lower() not in IMAGE_SUFFIXES or path in wanted:
+                continue
+            of_shot = set(path.relative_to(folder).parts[:-1]) & set(captures.shots)
+            # of another shot whose name differs only in its suffix
+            other = path.suffix not in suffixes and (len(path.parts), path.stem) in named
+            if renamed or of_shot or path.parent in folders or other:
+                found.append(path)
+    if not found:
+        return None
+    number = "1 image belongs" if len(found) == 1 else f"{len(found)} images belong"
+    return (
+        f"{number} to no pair and frame of the rig file, such as {min(found)}: check the spelling of "
+        "its names"
+    )

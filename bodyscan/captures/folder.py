@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from functools import cached_property
@@ -43,10 +43,9 @@ class ImageSequence:
     coded: the images of the stripe code, in the order of `FrameNames.code_names`; () if only the lit
         or the board image was taken.
     missing: the paths that do not exist.
+    exposure: its name, if the rig file names several; longer: the same images with the others.
     inverses: those among `coded`.
-    exposure: its name, if the rig file names several.
-    longer: the same images with the longer exposures, in their order.
-    crossing: those among `coded` that show the crossing stripes.
+    crossing: images that show the crossing stripes, of all exposures.
     """
 
     pair: str
@@ -64,16 +63,14 @@ class ImageSequence:
     @property
     def lacks_crossing(self) -> bool:
         """Whether images are missing, all of them of crossing stripes, which can be spared."""
-        crossing = {path for one in (self, *self.longer) for path in one.crossing}
-        return bool(self.missing) and crossing.issuperset(self.missing)
+        return bool(self.missing) and set(self.crossing).issuperset(self.missing)
 
     @property
     def without_crossing(self) -> ImageSequence:
         """The same sequence without its crossing stripes."""
-        crossing = {path for one in (self, *self.longer) for path in one.crossing}
 
         def rest(paths: tuple[Path, ...]) -> tuple[Path, ...]:
-            return tuple(path for path in paths if path not in crossing)
+            return tuple(path for path in paths if path not in self.crossing)
 
         return replace(
             self,
@@ -92,9 +89,8 @@ class ImageSequence:
     @property
     def paths(self) -> tuple[Path, ...]:
         """Lit, dark and board image if there are any, the code's, then those of longer exposures."""
-        single = (self.lit, self.dark, self.board)
-        paths = (*(path for path in single if path is not None), *self.coded)
-        return paths + tuple(path for longer in self.longer for path in longer.paths)
+        single = filter(None, (self.lit, self.dark, self.board))
+        return (*single, *self.coded, *(path for longer in self.longer for path in longer.paths))
 
     @property
     def board_path(self) -> Path:
@@ -132,15 +128,12 @@ class Captures:
         return {(sequence.pair, sequence.shot): sequence for sequence in self.sequences}
 
     def sequence(self, pair: str, shot: str) -> ImageSequence | None:
-        """Return the sequence of a pair in a shot, or None."""
         return self._by_pair_and_shot.get((pair, shot))
 
     def pair_sequences(self, pair: str) -> tuple[ImageSequence, ...]:
-        """Return a pair's sequences in the order of the shots."""
         return tuple(sequence for sequence in self.sequences if sequence.pair == pair)
 
     def shot_sequences(self, shot: str) -> tuple[ImageSequence, ...]:
-        """Return a shot's sequences in the order of the rig's pairs."""
         return tuple(sequence for sequence in self.sequences if sequence.shot == shot)
 
     def frame_ms(self, shot: str, pair: str) -> dict[str, float] | None:
@@ -306,19 +299,14 @@ def _open(
 
 def _no_image_error(rig: Rig, folder: Path, template: str, first: str) -> CaptureError:
     """Make the error for a folder without images; first: the template of the first exposure."""
-    above = _find_folder_above(rig, folder, template)
-    if above is not None:
-        return CaptureError(
-            f"is one shot of rig {rig.name}, by the template {template}",
-            where=str(folder),
-            remedy=f"Give the folder above it, {above}, or take {{shot}}/ out of `files`.",
-        )
-    example = fill(first, shot="SHOT", pair=rig.pairs[0].name, frame=_choose_frame(rig))
+    frame = next(iter(rig.frames.sequence_names(rig.pairs[0].projector)), "")
+    example = fill(first, shot="SHOT", pair=rig.pairs[0].name, frame=frame)
     return CaptureError(
-        f"holds no image of rig {rig.name} by the template {template}",
+        f"holds no image of rig {rig.name} by the template {template}, such as {example}",
         where=str(folder),
-        remedy=f"An image should be named such as {example}{_find_some_image(folder)}; correct "
-        "`files` in the rig file (capitals and small letters count).",
+        remedy="Possible causes: it is the folder of a single shot (give the folder above it, or take "
+        "{shot}/ out of `files` in the rig file); `files` does not say how images are named (capitals "
+        "and small letters count).",
     )
 
 
@@ -343,30 +331,6 @@ def _read_times(
     }
     times_file = () if timing.times is None else (listing.root / timing.times,)
     return compute_frame_times(timing, captures.rig, taken, listing.root), times_file
-
-
-def _find_folder_above(rig: Rig, folder: Path, template: str) -> Path | None:
-    """Return the parent folder if, by the template, this folder is one of its shots."""
-    here = Path(os.path.abspath(folder))
-    if not (template.startswith("{shot}/") and re.fullmatch(SHOT, here.name)):
-        return None
-    listing, shot = Listing(here.parent, follow_links=rig.follow_links), ShotEntry(name=here.name)
-    return here.parent if any(_collect_sequences(rig, listing, template, shot)) else None
-
-
-def _find_some_image(folder: Path) -> str:
-    """Find an image in the folder, to show its name beside the expected one."""
-    for root, _, names in os.walk(folder):
-        for name in sorted(names):
-            if Path(name).suffix.lower() in IMAGE_SUFFIXES:
-                return f", but one is named {os.path.relpath(os.path.join(root, name), folder)}"
-    return ""
-
-
-def _choose_frame(rig: Rig) -> str:
-    """Return the name of an image that every pair should have."""
-    code = rig.pairs[0].projector
-    return rig.frames.board_image or (rig.frames.code_names(code)[0] if code else "")
 
 
 def _discover_shots(rig: Rig, listing: Listing, template: str) -> tuple[str, ...]:
@@ -420,101 +384,71 @@ def _collect_sequences(
 ) -> Iterator[ImageSequence]:
     """Collect what each pair took in a shot, by captures.yaml or, without a list, by the files."""
     look = shot.stripes is None and shot.lit is None
-    templates = [with_exposure(template, name) for name in rig.exposures]
-    template = templates[0] if templates else template
+    templates = {name: with_exposure(template, name) for name in rig.exposures} or {"": template}
     for pair in rig.pairs:
-        whole = _collect_sequence(rig, listing, template, shot.name, pair)
-        if whole.coded and templates:
-            whole = _add_exposures(whole, rig, listing, templates)
-        alone = _board_image_alone(rig, listing, template, shot.name, pair)
-        if look:
-            if set(whole.coded) - set(whole.missing):
-                yield whole
-            elif alone is not None and not alone.missing:
-                yield alone
-        elif pair.name in (shot.stripes or ()):
-            if not has_field(template, "frame"):
-                raise CaptureError(
-                    f"says that pair {pair.name} took stripes in shot {shot.name}, but the"
-                    f" template {template} has no {{frame}}",
-                    where=str(listing.root / FILE_NAME),
-                    remedy="List the pair in `lit`, or put {frame} into the template.",
-                )
+        whole = _collect_stripes(rig, listing, templates, shot.name, pair)
+        alone = _collect_board_image(rig, listing, next(iter(templates.values())), shot.name, pair)
+        stripes, lit = pair.name in (shot.stripes or ()), pair.name in (shot.lit or ())
+        if (stripes and not whole.coded) or (lit and alone is None):
+            raise CaptureError(
+                f"lists pair {pair.name} in `{'stripes' if stripes else 'lit'}` of shot {shot.name}, "
+                f"but the rig file names no such image (template {template})",
+                where=str(listing.root / FILE_NAME),
+                remedy="Possible causes: its `files` has no {frame}; it has `lit: null`.",
+            )
+        if stripes or (look and set(whole.coded) - set(whole.missing)):
             yield whole
-        elif pair.name in (shot.lit or ()):
-            if alone is None:
-                raise CaptureError(
-                    f"says that pair {pair.name} took the lit image alone in shot {shot.name}, but"
-                    " the rig file has `lit: null`",
-                    where=str(listing.root / FILE_NAME),
-                    remedy="List the pair in `stripes`, or name the image in `frames`.",
-                )
+        elif alone is not None and (lit or (look and not alone.missing)):
             yield alone
 
 
-def _collect_sequence(
-    rig: Rig, listing: Listing, template: str, shot: str, pair: Pair
+def _collect_stripes(
+    rig: Rig, listing: Listing, templates: Mapping[str, str], shot: str, pair: Pair
 ) -> ImageSequence:
-    """Collect the whole sequence; empty for a camera without a projector."""
-    frames = rig.frames
-    code = pair.projector if has_field(template, "frame") else None
-    if code is None:
-        return ImageSequence(pair.name, shot, None, None, (), ())
-    files = _Files(listing, template, shot, pair.name)
-    dark_name = frames.dark if any(one.uses_dark for one in code.directions) else None
-    lit, dark, board = map(files.path, (frames.lit, dark_name, frames.board))
-    coded = tuple(filter(None, map(files.path, frames.code_names(code))))
-    counts = [each for one in code.directions for each in one.image_counts.items()]
-    kinds = [kind.name for kind, count in counts for _ in range(count)]
-    inverses = tuple(p for p, kind in zip(coded, kinds, strict=True) if kind == "inverse")
-    crossing = coded[sum(code.image_counts.values()) :]
-    missing = tuple(files.missing)
-    return ImageSequence(
-        pair.name, shot, lit, dark, coded, missing, board, inverses=inverses, crossing=crossing
-    )
-
-
-def _add_exposures(
-    whole: ImageSequence, rig: Rig, listing: Listing, templates: list[str]
-) -> ImageSequence:
-    """Add the longer exposures to a sequence."""
-    first, *others = zip(rig.exposures, templates, strict=True)
-    longer = tuple(
-        replace(
-            _collect_sequence(rig, listing, template, whole.shot, rig.pair(whole.pair)),
-            exposure=name,
+    """Collect the whole sequence, templates by exposure; empty for a camera without a projector."""
+    found = []
+    for exposure, template in templates.items():
+        code = pair.projector if has_field(template, "frame") else None
+        if code is None:
+            return ImageSequence(pair.name, shot, None, None, (), ())
+        frames, names = rig.frames.sequence_names(code), rig.frames
+        paths, missing = _locate(listing, template, shot, pair, frames)
+        path_of = dict(zip(frames, paths, strict=True))
+        lit, dark, board = (
+            path_of.get(name or "") for name in (names.lit, names.dark, names.board)
         )
-        for name, template in others
+        coded = tuple(path_of[name] for name in names.code_names(code))
+        counts = [each for one in code.directions for each in one.image_counts.items()]
+        kinds = [kind.name for kind, count in counts for _ in range(count)]
+        inverses = tuple(p for p, kind in zip(coded, kinds, strict=True) if kind == "inverse")
+        crossing = coded[sum(code.image_counts.values()) :]
+        found.append(
+            ImageSequence(
+                pair.name, shot, lit, dark, coded, missing, board, exposure, (), inverses, crossing
+            )
+        )
+    return replace(
+        found[0],
+        missing=tuple(path for one in found for path in one.missing),
+        longer=tuple(found[1:]),
+        crossing=tuple(path for one in found for path in one.crossing),
     )
-    missing = whole.missing + tuple(path for each in longer for path in each.missing)
-    return replace(whole, missing=missing, exposure=first[0], longer=longer)
 
 
-def _board_image_alone(
+def _collect_board_image(
     rig: Rig, listing: Listing, template: str, shot: str, pair: Pair
 ) -> ImageSequence | None:
     """Collect the board image alone; None if none is taken."""
-    frames, files = rig.frames, _Files(listing, template, shot, pair.name)
-    path = files.path(frames.board_image if has_field(template, "frame") else "")
-    if path is None:
-        return None
-    return ImageSequence(pair.name, shot, path, None, (), tuple(files.missing))
+    frames = rig.frames.sequence_names(None) if has_field(template, "frame") else ("",)
+    paths, missing = _locate(listing, template, shot, pair, frames)
+    return ImageSequence(pair.name, shot, paths[0], None, (), missing) if paths else None
 
 
-class _Files:
-    """Paths of one pair's images in one shot; collects those that do not exist in `missing`."""
-
-    def __init__(self, listing: Listing, template: str, shot: str, pair: str) -> None:
-        self.listing, self.template, self.shot, self.pair = listing, template, shot, pair
-        self.missing: list[Path] = []
-
-    def path(self, frame: str | None) -> Path | None:
-        """Return the path of a frame, None for no frame, and note whether it is missing."""
-        if frame is None:
-            return None
-        wanted = fill(self.template, shot=self.shot, pair=self.pair, frame=frame)
-        name = self.listing.find(wanted)
-        path = self.listing.root / name
-        if not self.listing.has(name):
-            self.missing.append(path)
-        return path
+def _locate(
+    listing: Listing, template: str, shot: str, pair: Pair, frames: Iterable[str]
+) -> tuple[tuple[Path, ...], tuple[Path, ...]]:
+    """Locate a pair's images in a shot: all paths, and those that do not exist."""
+    wanted = (fill(template, shot=shot, pair=pair.name, frame=frame) for frame in frames)
+    names = [listing.find(name) for name in wanted]
+    missing = tuple(listing.root / name for name in names if not listing.has(name))
+    return tuple(listing.root / name for name in names), missing

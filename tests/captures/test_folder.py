@@ -72,13 +72,6 @@ def test_files_tell_what_each_pair_took(tmp_path: Path) -> None:
     assert captures.missing() == ()
 
 
-def test_a_missing_image_is_named_by_file_pair_and_shot(tmp_path: Path) -> None:
-    rig_path = write_small_captures(tmp_path)
-    gone = tmp_path / "captures" / "b2" / "p1" / "bit01.png"
-    gone.unlink()
-    assert opened(rig_path).missing() == (gone,)
-
-
 def test_a_pair_without_stripes_took_the_lit_image_alone(tmp_path: Path) -> None:
     rig_path = write_small_captures(tmp_path)
     for frame in FRAMES:
@@ -166,7 +159,7 @@ def test_a_template_without_frame_holds_lit_images(tmp_path: Path) -> None:
     ]
     write(tmp_path / "captures" / "captures.yaml",
           "kind: calibration\nshots: [{name: '00', stripes: [p1]}]")  # fmt: skip
-    with pytest.raises(CaptureError, match=r"p1 took stripes in shot 00, but .* no \{frame\}"):
+    with pytest.raises(CaptureError, match=r"lists pair p1 in `stripes` of shot 00"):
         opened(tmp_path / "rig.yaml")
 
 
@@ -256,24 +249,13 @@ def test_folders_that_are_not_there_or_hold_nothing(tmp_path: Path) -> None:
     with pytest.raises(CaptureError, match="captures: the capture folder does not exist"):
         opened(rig_path)
     write(tmp_path / "captures" / "b1" / "p1" / "lit.jpg", b"")
-    with pytest.raises(CaptureError, match=r"holds no image of rig small[^\n]*\n.*SHOT/p1/lit.png"):
+    with pytest.raises(CaptureError, match=r"holds no image of rig small.*SHOT/p1/lit.png"):
         opened(rig_path)
     with pytest.raises(CaptureError, match="is not a folder"):
         open_scan(load_rig(rig_path), rig_path)
     with_rig(tmp_path, RIG.replace("calibration:\n  - folder: captures\n", ""))
     with pytest.raises(CaptureError, match="names no calibration captures"):
         opened(rig_path)
-
-
-def test_a_shots_own_folder_is_told_from_the_one_above(tmp_path: Path) -> None:
-    rig = load_rig(write_small_captures(tmp_path))
-    above = tmp_path / "captures"
-    with pytest.raises(CaptureError, match=f"Give the folder above it, {above}, or") as caught:
-        open_scan(rig, above / "b1")
-    assert "correct `files`" not in caught.value.remedy
-    write(tmp_path / "other" / "b1" / "x.png", b"")
-    with pytest.raises(CaptureError, match="correct `files`"):
-        open_scan(rig, tmp_path / "other" / "b1")
 
 
 def test_a_rig_that_is_known_is_imported(tmp_path: Path) -> None:
