@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal, TypeAlias
 
@@ -24,7 +25,6 @@ from bodyscan.rig.rig import Rig
 from bodyscan.rig.templates import path_fault
 
 FILE_NAME = "captures.yaml"
-_REMEDY = "Correct captures.yaml; docs/formats.md explains every key."
 _TIMES_REMEDY = "Correct the file of times; docs/formats.md explains its columns."
 
 Sequences: TypeAlias = Mapping[tuple[str, str], tuple[str, ...]]
@@ -86,13 +86,10 @@ class ShotEntry(Model):
     def problems(self) -> Iterator[Problem]:
         for index, name in find_duplicates(self.stripes or ()):
             yield ("stripes", index), f"lists a pair twice (got {name!r})"
-        named = (*(self.stripes or ()), *(self.lit or ()))
-        for index, name in find_duplicates(named):
-            if index >= len(self.stripes or ()):
-                yield (
-                    ("lit", index - len(self.stripes or ())),
-                    f"lists a pair that is listed already (got {name!r})",
-                )
+        before = len(self.stripes or ())
+        for index, name in find_duplicates((*(self.stripes or ()), *(self.lit or ()))):
+            if index >= before:
+                yield ("lit", index - before), f"lists a pair that is listed already (got {name!r})"
 
 
 class CapturesFile(Model):
@@ -122,14 +119,9 @@ def load_captures_file(folder: Path, rig: Rig) -> CapturesFile:
 
     Raises CaptureError, which lists every problem by line.
     """
-    path = folder / FILE_NAME
-    return load_model(
-        path,
-        CapturesFile,
-        CaptureError,
-        remedy=_REMEDY,
-        also=lambda file: _find_unknown_names(file, rig),
-    )
+    remedy = "Correct captures.yaml; docs/formats.md explains every key."
+    also = partial(_find_unknown_names, rig=rig)
+    return load_model(folder / FILE_NAME, CapturesFile, CaptureError, remedy=remedy, also=also)
 
 
 def write_captures_file(folder: Path, captures: CapturesFile) -> None:
@@ -151,11 +143,11 @@ def _find_unknown_names(captures: CapturesFile, rig: Rig) -> Iterator[Problem]:
                 elif key == "stripes" and pairs[name].projector is None:
                     yield where, f"names a camera without projector (got {name!r}): list it in lit"
     if captures.timing:
-        for inside, text in find_timing_problems(captures.timing, rig):
+        for inside, text in _find_timing_problems(captures.timing, rig):
             yield ("timing", *inside), text
 
 
-def find_timing_problems(timing: Timing, rig: Rig) -> Iterator[Problem]:
+def _find_timing_problems(timing: Timing, rig: Rig) -> Iterator[Problem]:
     """Find frames or pairs that the rig does not have, or that are left out."""
     known = [name for pair in rig.pairs for name in rig.frames.sequence_names(pair.projector)]
     order = known if timing.order is None else timing.order
@@ -214,18 +206,14 @@ def _read_times(path: Path, rig: Rig, sequences: Sequences) -> FrameTimes:
     """Read and check a file of times."""
     try:
         content = read_regular(path, MAX_BYTES)
+        if len(content) > MAX_BYTES:
+            raise CaptureError(f"is longer than {MAX_BYTES:,} bytes", where=str(path))
         lines = content.decode("utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         what = f"the file of times cannot be read as text: {error}"
         raise CaptureError(what, where=str(path), remedy=_TIMES_REMEDY) from None
-    if len(content) > MAX_BYTES:
-        what = f"is longer than {MAX_BYTES:,} bytes: this cannot be right"
-        raise CaptureError(what, where=str(path), remedy=_TIMES_REMEDY)
     found: dict[tuple[str, str], dict[str, float]] = {}
-    problems = [
-        YamlProblem(Place(line, 1), "", text)
-        for line, text in _parse_rows(lines, rig, sequences, found)
-    ]
+    problems = list(_parse_rows(lines, rig, sequences, found))
     for (shot, pair), frames in sequences.items():
         times = found.get((shot, pair), {})
         absent = [name for name in frames if times and name not in times]
@@ -242,26 +230,22 @@ def _parse_rows(
     rig: Rig,
     sequences: Sequences,
     found: dict[tuple[str, str], dict[str, float]],
-) -> Iterator[tuple[int, str]]:
-    """Parse rows into `found`; yields line and text of what is wrong."""
-    rows = csv.reader(lines)
-    header = tuple(word.strip() for word in next(rows, []))
-    columns = ("shot", "pair", "frame", "ms")
+) -> Iterator[YamlProblem]:
+    """Parse rows into `found`; yields what is wrong."""
+    rows, columns = csv.reader(lines), ["shot", "pair", "frame", "ms"]
+    header = [word.strip() for word in next(rows, [])]
     if header != columns:
-        yield (
-            1,
-            f"must begin with the line {','.join(columns)} (got {','.join(header) or 'nothing'})",
-        )
+        got = ",".join(header) or "nothing"
+        text = f"must begin with the line {','.join(columns)} (got {got})"
+        yield YamlProblem(Place(1, 1), "", text)
         return
-    shots = list(dict.fromkeys(shot for shot, _ in sequences))
-    pairs = [pair.name for pair in rig.pairs]
     for row in rows:
         words = [word.strip() for word in row]
         if not any(words):
             continue
-        fault = _find_row_fault(words, shots, pairs, sequences, found)
+        fault = _find_row_fault(words, rig, sequences, found)
         if fault:
-            yield rows.line_num, fault
+            yield YamlProblem(Place(rows.line_num, 1), "", fault)
         else:
             shot, pair, frame, ms = words
             found.setdefault((shot, pair), {})[frame] = float(ms)
@@ -269,8 +253,7 @@ def _parse_rows(
 
 def _find_row_fault(
     words: Sequence[str],
-    shots: Sequence[str],
-    pairs: Sequence[str],
+    rig: Rig,
     sequences: Sequences,
     found: Mapping[tuple[str, str], Mapping[str, float]],
 ) -> str | None:
@@ -278,12 +261,10 @@ def _find_row_fault(
     if len(words) != 4:
         return f"has {len(words)} columns, not 4"
     shot, pair, frame, ms = words
-    frames = sequences.get((shot, pair), ())
-    for what, name, known in (("shot", shot, shots), ("pair", pair, pairs)):
+    shots, frames = dict.fromkeys(shot for shot, _ in sequences), sequences.get((shot, pair), ())
+    for what, name, known in (("shot", shot, shots), ("pair", pair, [p.name for p in rig.pairs])):
         if name not in known:
             return f"names no {what} of these captures{did_you_mean(name, known)} (got {name!r})"
-    if not frames:
-        return f"pair {pair} took nothing in shot {shot}"
     if frame not in frames:
         hint = did_you_mean(frame, frames)
         return f"names no frame that pair {pair} took in shot {shot}{hint} (got {frame!r})"
@@ -303,7 +284,6 @@ def _find_row_fault(
 
 def _is_time(text: str) -> bool:
     try:
-        value = float(text)
+        return 0.0 <= float(text) <= 1e13
     except ValueError:
         return False
-    return 0.0 <= value <= 1e13

@@ -61,6 +61,11 @@ class ImageSequence:
     crossing: tuple[Path, ...] = ()
 
     @property
+    def where(self) -> str:
+        """Pair and shot, for messages."""
+        return f"pair {self.pair}, shot {self.shot}"
+
+    @property
     def lacks_crossing(self) -> bool:
         """Whether images are missing, all of them of crossing stripes, which can be spared."""
         return bool(self.missing) and set(self.crossing).issuperset(self.missing)

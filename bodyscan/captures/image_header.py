@@ -156,42 +156,26 @@ def describe_missing(path: Path) -> str:
     matches = sorted(found.name for found in path.parent.glob(pattern))
     if ANYTHING in path.name and len(matches) > 1:
         return f"matches {len(matches)} files, such as {matches[0]} and {matches[1]}"
-    siblings = path.parent.iterdir() if path.parent.is_dir() else ()
-    if any(other.name.casefold() == path.name.casefold() for other in siblings):
-        return "is there with other capitals"
     return "is missing"
 
 
-def image_error(what: str, path: Path, pair: str, shot: str, *, remedy: str = "") -> ImageError:
+def image_error(what: str, path: Path, where: str, *, remedy: str = "") -> ImageError:
     """Make an ImageError that names file, pair and shot, and what to do."""
-    taken = ", ".join(f"{kind} {name}" for kind, name in (("pair", pair), ("shot", shot)) if name)
-    where = f"{path} ({taken})" if taken else str(path)
-    return ImageError(what, where=where, remedy=remedy or _choose_remedy(what))
+    remedy = remedy or (
+        "Possible causes: it was not taken, or is damaged (copy it again, take the shot again, or "
+        "leave it out of captures.yaml); the rig file has another name for it (`files`, `frames`; "
+        "capitals count) or another size (`camera`); the software saves other kinds of files."
+    )
+    return ImageError(what, where=f"{path} ({where})" if where else str(path), remedy=remedy)
 
 
-def missing_error(
-    missing: Sequence[Path], inverses: Sequence[Path], pair: str, shot: str
-) -> ImageError:
+def missing_error(missing: Sequence[Path], inverses: Sequence[Path], where: str) -> ImageError:
     """Make an ImageError for missing images, which names the first of them.
 
     inverses: those of the sequence, missing or not.
     """
     what = describe_missing(missing[0])
-    remedy = NO_INVERSES if set(missing) == set(inverses) else _choose_remedy(what)
+    remedy = NO_INVERSES if set(missing) == set(inverses) else ""
     if len(missing) > 1:
         what += f", and {len(missing) - 1} more of this shot cannot be found"
-    return image_error(what, missing[0], pair, shot, remedy=remedy)
-
-
-def _choose_remedy(what: str) -> str:
-    if what.startswith("matches "):
-        return "Keep one of them, or say more of the name in `files` or `frames` of the rig file."
-    if "capitals" in what:
-        return "Rename it, or write `files` and `frames` of the rig file as the files are named."
-    if what == "is missing":
-        return "Copy it here, take the shot again, or leave it out of captures.yaml."
-    if "the rig file says" in what:
-        return "Check the camera's width and height in the rig file, and which camera took this."
-    if "bits a sample" in what:
-        return "Save whole numbers of 8 or 16 bits; the camera's software can choose them."
-    return "Copy it again from where it was taken, or take the shot again."
+    return image_error(what, missing[0], where, remedy=remedy)

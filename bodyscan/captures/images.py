@@ -49,10 +49,11 @@ def read_image(
 
     Raises ImageError as `_read_raw` and `find_full_scale`.
     """
-    raw = _read_raw(path, camera, pair, shot)
-    image = whole_grey(convert_to_greys(raw, _find_scale([raw], camera, path, pair, shot)))
+    where = ", ".join(f"{kind} {name}" for kind, name in (("pair", pair), ("shot", shot)) if name)
+    raw = _read_raw(path, camera, where)
+    image = whole_grey(convert_to_greys(raw, _find_scale([raw], camera, path, where)))
     if lit:
-        _refuse_black(image, path, pair, shot)
+        _refuse_black(image, path, where)
     return image
 
 
@@ -64,12 +65,12 @@ def read_board_image(sequence: ImageSequence, pair: Pair) -> Bytes:
     """
     path = sequence.board or sequence.lit
     if path is not None or pair.projector is None:
-        names = {"pair": sequence.pair, "shot": sequence.shot}
-        return read_image(sequence.board_path, pair.camera, lit=True, **names)
+        path, shot = sequence.board_path, sequence.shot
+        return read_image(path, pair.camera, pair=pair.name, shot=shot, lit=True)
     code = pair.projector.model_copy(update={"crossing": None})
     images = read_sequence(sequence.without_crossing, pair.camera)
     made = whole_grey(code.lit_from(images_by_kind(code, images.coded)[0]))
-    _refuse_black(made, sequence.board_path, sequence.pair, sequence.shot)
+    _refuse_black(made, sequence.board_path, sequence.where)
     return made
 
 
@@ -84,19 +85,17 @@ def read_sequence(
     if not sequence.has_stripes:
         raise ImageError(
             "is a lit image alone; there is no stripe sequence",
-            where=f"{sequence.lit} (pair {sequence.pair}, shot {sequence.shot})",
+            where=f"{sequence.lit} ({sequence.where})",
             remedy="Take the stripes as well, or leave this pair out of this shot.",
         )
-    stacks = [
-        _read_stack(exposure, camera, crop, workers) for exposure in (sequence, *sequence.longer)
-    ]
-    names = [exposure.exposure for exposure in (sequence, *sequence.longer)]
-    where = f"pair {sequence.pair}, shot {sequence.shot}"
-    whole = stacks[0] if len(stacks) == 1 else merge_exposures(stacks, names, where)
+    exposures = (sequence, *sequence.longer)
+    stacks = [_read_stack(exposure, camera, crop, workers) for exposure in exposures]
+    names = [exposure.exposure for exposure in exposures]
+    whole = stacks[0] if len(stacks) == 1 else merge_exposures(stacks, names, sequence.where)
     singles = iter(whole)
     lit, dark = (next(singles) if path else None for path in (sequence.lit, sequence.dark))
     if lit is not None and sequence.lit is not None:
-        _refuse_black(whole_grey(lit), sequence.lit, sequence.pair, sequence.shot)
+        _refuse_black(whole_grey(lit), sequence.lit, sequence.where)
     coded = whole[len(whole) - len(sequence.coded) :]
     return StripeImages(sequence.pair, sequence.shot, lit, dark, coded)
 
@@ -107,10 +106,8 @@ def _read_stack(sequence: ImageSequence, camera: CameraSpec, crop: Crop, workers
     paths = (*taken, *sequence.coded)
     missing = [path for path in paths if path in sequence.missing]
     if missing:
-        raise missing_error(missing, sequence.inverses, sequence.pair, sequence.shot)
-    read = partial(
-        _read_raw, camera=camera, pair=sequence.pair, shot=sequence.shot, rows=crop[0].stop
-    )
+        raise missing_error(missing, sequence.inverses, sequence.where)
+    read = partial(_read_raw, camera=camera, where=sequence.where, rows=crop[0].stop)
     first = read(paths[0])
     # In 16-bit files white is found from all numbers, so these are cropped afterwards.
     early, late = (crop, WHOLE) if first.dtype == np.uint8 else (WHOLE, crop)
@@ -120,27 +117,26 @@ def _read_stack(sequence: ImageSequence, camera: CameraSpec, crop: Crop, workers
     def read_into(k: int) -> None:
         image = read(paths[k])
         if image.dtype != first.dtype:
-            bits = (
-                f"{8 * image.itemsize} bits a sample, but {paths[0].name} has {8 * first.itemsize}"
-            )
-            raise image_error(f"has {bits}", paths[k], sequence.pair, sequence.shot)
+            bits, others = 8 * image.itemsize, 8 * first.itemsize
+            what = f"has {bits} bits a sample, but {paths[0].name} has {others}"
+            raise image_error(what, paths[k], sequence.where)
         stack[k] = image[early]
 
     with ThreadPoolExecutor(workers) as pool:
         list(pool.map(read_into, range(1, len(paths))))
-    scale = _find_scale(list(stack), camera, paths[0], sequence.pair, sequence.shot)
+    scale = _find_scale(list(stack), camera, paths[0], sequence.where)
     return convert_to_greys(np.ascontiguousarray(stack[(slice(None), *late)]), scale)
 
 
-def _find_scale(images: list[Raw], camera: CameraSpec, path: Path, pair: str, shot: str) -> float:
+def _find_scale(images: list[Raw], camera: CameraSpec, path: Path, where: str) -> float:
     """Call `find_full_scale` so that its errors name the file."""
     try:
         return find_full_scale(images, camera.bits)
     except ImageError as error:
-        raise image_error(error.what, path, pair, shot, remedy=error.remedy or "") from None
+        raise image_error(error.what, path, where, remedy=error.remedy) from None
 
 
-def _read_raw(path: Path, camera: CameraSpec, pair: str, shot: str, rows: int | None = None) -> Raw:
+def _read_raw(path: Path, camera: CameraSpec, where: str, rows: int | None = None) -> Raw:
     """Read the numbers in an image file, (height, width) uint8 or uint16.
 
     Of a colour image those of the camera's channel are read, where grey is luma.
@@ -153,29 +149,22 @@ def _read_raw(path: Path, camera: CameraSpec, pair: str, shot: str, rows: int | 
     """
     width, height = camera.width, camera.height
     fault = find_header_fault(path, width, height)
-    if fault:
-        raise image_error(fault, path, pair, shot)
-    data = read_regular(path)
+    data = b"" if fault else read_regular(path)
     is_png = data.startswith(b"\x89PNG")
-    damage = png_damage(data) if is_png else None
-    if damage:
-        raise image_error(damage, path, pair, shot)
+    fault = fault or (png_damage(data) if is_png else None)
+    if fault:
+        raise image_error(fault, path, where)
     image = decode_grey_png(data, width, height, rows) if is_png else None
     if image is not None and camera.channel == "grey":
         return image
     found = _decode(data, camera.channel)
     if found is None or found.shape[:2] != (height, width):
-        raise image_error("cannot be decoded", path, pair, shot)
+        raise image_error("cannot be decoded", path, where)
     if found.ndim == 3:
         found = found[:, :, ("blue", "green", "red").index(camera.channel)]
     elif camera.channel != "grey":
-        raise image_error(
-            f"is grey, but the rig file says `channel: {camera.channel}`",
-            path,
-            pair,
-            shot,
-            remedy="Leave `channel` out for this camera.",
-        )
+        what = f"is grey, but the rig file says `channel: {camera.channel}`"
+        raise image_error(what, path, where, remedy="Leave `channel` out for this camera.")
     return cast(Raw, np.ascontiguousarray(found))
 
 
@@ -189,13 +178,9 @@ def _decode(data: bytes, channel: str) -> Raw | None:
     return cast(Raw, image)
 
 
-def _refuse_black(image: Bytes, path: Path, pair: str, shot: str) -> None:
+def _refuse_black(image: Bytes, path: Path, where: str) -> None:
     brightest = int(image.max())
     if brightest <= 8:  # the sensor's offset and noise
-        raise image_error(
-            f"shows nothing: its brightest pixel is {brightest} of 255",
-            path,
-            pair,
-            shot,
-            remedy="Check the exposure, the lens cap, and that the projector was on; then retake.",
-        )
+        what = f"shows nothing: its brightest pixel is {brightest} of 255"
+        remedy = "Check the exposure, the lens cap, and that the projector was on; then retake."
+        raise image_error(what, path, where, remedy=remedy)

@@ -91,7 +91,6 @@ class Listing:
             raise CaptureError(what, where=str(folder), remedy="Check its permissions.") from None
 
     def _refuse_if_outside(self, path: Path) -> None:
-        """Raise CaptureError if a symbolic link leads out of the capture folder."""
         real = os.path.realpath(path)
         if not Path(real).is_relative_to(self._real_root):
             raise CaptureError(
