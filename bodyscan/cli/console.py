@@ -92,9 +92,9 @@ class Output:
         """Report notes; without --verbose the first line of the first 20."""
         every = list(notes)
         self._notes += every
-        for note in every if self.verbose else every[:20]:
-            shown = note if self.verbose else note.partition("\n")[0]
-            self._print(f"{what}: {shown}", style="yellow")
+        shown = every if self.verbose else [note.partition("\n")[0] for note in every[:20]]
+        for note in shown:
+            self._print(f"{what}: {note}", style="yellow")
         if len(every) > 20 and not self.verbose:
             self._print(f"and {len(every) - 20} more: see --verbose", style="yellow")
 

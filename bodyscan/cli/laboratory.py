@@ -22,6 +22,30 @@ def register(app: typer.Typer) -> None:
         add_command(app, PANEL, command)
 
 
+SubjectPreset = Annotated[
+    Literal["mannequin", "standing", "restless", "child"],
+    typer.Option(help="How the subject moves while frames are taken."),
+]
+Look = Annotated[
+    Literal["matt", "skin", "dressed"],
+    typer.Option(help="Matt all over, like skin, or skin with dark hair and shorts."),
+]
+MannequinSway = Annotated[
+    float,
+    typer.Option(
+        min=0.0, help="How far a mannequin moves, as a rigid body, between the pairs' captures."
+    ),
+]
+TruthChanges = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Change a number, such as person.breath_mm=5; repeatable. truth/truth.json lists all.",
+    ),
+]
+
+
 def simulate(
     output: Output,
     rig_file: RigFile,
@@ -41,28 +65,10 @@ def simulate(
         Literal["ideal", "workshop"],
         typer.Option(help="Devices without faults, or as people build them."),
     ] = "workshop",
-    subject_preset: Annotated[
-        Literal["mannequin", "standing", "restless", "child"],
-        typer.Option(help="How the subject moves while frames are taken."),
-    ] = "standing",
-    look: Annotated[
-        Literal["matt", "skin", "dressed"],
-        typer.Option(help="Matt all over, like skin, or skin with dark hair and shorts."),
-    ] = "matt",
-    sway_mm: Annotated[
-        float,
-        typer.Option(
-            min=0.0, help="How far a mannequin moves, as a rigid body, between the pairs' captures."
-        ),
-    ] = 0.0,
-    changes: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="KEY=VALUE",
-            help="Change a number, such as person.breath_mm=5; repeatable. truth/truth.json lists all.",
-        ),
-    ] = None,
+    subject_preset: SubjectPreset = "standing",
+    look: Look = "matt",
+    sway_mm: MannequinSway = 0.0,
+    changes: TruthChanges = None,
     board_shots: Annotated[
         int | None,
         typer.Option(min=0, help="Number of board poses; 40 for twelve pairs, 0 for none."),
@@ -80,24 +86,15 @@ def simulate(
     from bodyscan.simulation import settings_for
     from bodyscan.simulation import simulate as run
 
+    settings = settings_for(
+        projector, preset=preset, subject=subject_preset, look=look, sway_mm=sway_mm,
+        changes=changes or (),
+    )  # fmt: skip
     with output.stages() as progress:
         run(
-            rig_file,
-            out,
-            subject=subject,
-            scale=scale,
-            seed=seed,
-            settings=settings_for(
-                projector,
-                preset=preset,
-                subject=subject_preset,
-                look=look,
-                sway_mm=sway_mm,
-                changes=changes or (),
-            ),
-            board_shots=board_shots,
-            progress=progress,
-        )
+            rig_file, out, subject=subject, scale=scale, seed=seed, settings=settings,
+            board_shots=board_shots, progress=progress,
+        )  # fmt: skip
     output.add_files("captures", out / "captures")
     output.add_files("rig file", out / "rig.yaml")
 
@@ -121,30 +118,35 @@ def evaluate(
     output.say(*text.splitlines())
 
 
+Artefact = Annotated[
+    Path | None,
+    typer.Argument(metavar="ARTEFACT.YAML", help="The calibrated artefacts, and limits."),
+]
+AcceptedCalibration = Annotated[
+    Path | None,
+    typer.Option(help="What calibrate-rig wrote. Default with --simulate: the one beside the rig."),
+]
+Spheres = Annotated[
+    list[Path] | None,
+    typer.Option(metavar="FOLDER", help="Scan of the spheres at one place; repeatable."),
+]
+Plate = Annotated[
+    list[Path] | None,
+    typer.Option(metavar="FOLDER", help="Scan of the plate at one place; repeatable."),
+]
+SimulatedRig = Annotated[
+    Path | None,
+    typer.Option(metavar="WORKSPACE", help="Simulate the artefacts in this simulated rig."),
+]
+
+
 def accept(
     output: Output,
-    artefact: Annotated[
-        Path | None,
-        typer.Argument(metavar="ARTEFACT.YAML", help="The calibrated artefacts, and limits."),
-    ] = None,
-    calibration: Annotated[
-        Path | None,
-        typer.Option(
-            help="What calibrate-rig wrote. Default with --simulate: the one beside the rig."
-        ),
-    ] = None,
-    spheres: Annotated[
-        list[Path] | None,
-        typer.Option(metavar="FOLDER", help="Scan of the spheres at one place; repeatable."),
-    ] = None,
-    plate: Annotated[
-        list[Path] | None,
-        typer.Option(metavar="FOLDER", help="Scan of the plate at one place; repeatable."),
-    ] = None,
-    simulate: Annotated[
-        Path | None,
-        typer.Option(metavar="WORKSPACE", help="Simulate the artefacts in this simulated rig."),
-    ] = None,
+    artefact: Artefact = None,
+    calibration: AcceptedCalibration = None,
+    spheres: Spheres = None,
+    plate: Plate = None,
+    simulate: SimulatedRig = None,
     repeats: Annotated[int, typer.Option(min=1, help="Simulated shots at each place.")] = 2,
     places: Annotated[
         int | None, typer.Option(min=1, help="Simulate only this many of the places.")
@@ -169,9 +171,7 @@ def accept(
     captured = [*(spheres or ()), *(plate or ())]
     if bool(captured) == (simulate is not None):
         raise BadInput(
-            "captures and --simulate exclude each other"
-            if captured
-            else "there is nothing to measure",
+            "either captures or --simulate must be given",
             remedy="give --spheres and --plate folders, or --simulate WORKSPACE",
         )
     if calibration is None and simulate is None:
@@ -228,6 +228,5 @@ def reproduce(
             out, seed=seed, quick=quick, real_light=real_light, boards=boards, progress=progress
         )
     output.say(*text.splitlines())
-    output.add_files(
-        "written", *(out / name for name in (text_name(real_light), *figure_names(real_light)))
-    )
+    names = (text_name(real_light), *figure_names(real_light))
+    output.add_files("written", *(out / name for name in names))

@@ -37,12 +37,21 @@ if TYPE_CHECKING:
     from bodyscan.jobs.supervision import Listen
 
 PANEL = "Operator: scan people"
+DEFAULTS = ScanSettings()
 
 
 def register(app: typer.Typer) -> None:
     """Add these commands to the command line, in the order of a day."""
     for command in (scan, report, measure, export, batch, watch, verify, forget):
         add_command(app, PANEL, command)
+
+
+Matching = Annotated[
+    Literal["projected", "open3d", "none"],
+    typer.Option(
+        help="How to align range images: by projection, by Open3D (ICP, pose graph), or not at all."
+    ),
+]
 
 
 def scan(
@@ -52,13 +61,8 @@ def scan(
     out: Annotated[Path | None, typer.Option(help="Default: FOLDER-model.")] = None,
     points: Annotated[
         int, typer.Option(min=1000, help="Number of points in the body cloud.")
-    ] = FusionSettings().points,
-    align: Annotated[
-        Literal["projected", "open3d", "none"],
-        typer.Option(
-            help="How to align range images: by projection, by Open3D (ICP, pose graph), or not at all."
-        ),
-    ] = AlignmentSettings().matching,
+    ] = DEFAULTS.fusion.points,
+    align: Matching = DEFAULTS.alignment.matching,
     empty: Annotated[
         Path | None,
         typer.Option(help="Captures of the empty rig; whatever they show is removed."),
@@ -80,13 +84,9 @@ def scan(
     out = out or folder.with_name(f"{folder.name}-model")
     require_writable(out)
     make_room(out, overwrite)
-    settings = apply_settings(
-        ScanSettings(
-            fusion=FusionSettings(points=points), alignment=AlignmentSettings(matching=align)
-        ),
-        changes or (),
-        BadInput,
-    )
+    fusion, alignment = FusionSettings(points=points), AlignmentSettings(matching=align)
+    settings = ScanSettings(fusion=fusion, alignment=alignment)
+    settings = apply_settings(settings, changes or (), BadInput)
     with output.stages() as progress:
         found, saved, pictures = scan_folder(
             folder, calibration, out, settings, progress, empty=empty, follow_links=follow_links
@@ -105,12 +105,8 @@ def scan(
         from bodyscan.fusion.storage import load_scan
 
         facts = load_scan(out).facts
-        export_raw_clouds(
-            out / "raw.e57",
-            found,
-            subject=facts["subject"],
-            calibration_id=facts["calibration_id"],
-        )
+        origin = {key: facts[key] for key in ("subject", "calibration_id")}
+        export_raw_clouds(out / "raw.e57", found, **origin)
         output.add_files("raw clouds", out / "raw.e57")
 
 
@@ -202,15 +198,22 @@ def export(
         output.add_files("export", path)
 
 
+BatchOut = Annotated[
+    str, typer.Option(help="Folder (or URL) to write one job folder for each into.")
+]
+Cluster = Annotated[
+    str | None,
+    typer.Option(metavar="tcp://HOST:PORT", help="Address of a dask scheduler to send jobs to."),
+]
+
+
 def batch(
     output: Output,
     pipeline: Annotated[
         Path, typer.Argument(metavar="PIPELINE.YAML", help="The pipeline file; see pipelines/.")
     ],
     scans: Annotated[str, typer.Option(help="Folder (or URL) of scan folders, or of rigs.")],
-    out: Annotated[
-        str, typer.Option(help="Folder (or URL) to write one job folder for each into.")
-    ],
+    out: BatchOut,
     calibration: Annotated[
         str | None,
         typer.Option(help="Default: `calibration` in the folder of scans, beside it or above it."),
@@ -222,12 +225,7 @@ def batch(
     workers: Annotated[
         int | None, typer.Option(min=1, help="Number of jobs at the same time.")
     ] = None,
-    cluster: Annotated[
-        str | None,
-        typer.Option(
-            metavar="tcp://HOST:PORT", help="Address of a dask scheduler to send jobs to."
-        ),
-    ] = None,
+    cluster: Cluster = None,
     explain: Annotated[
         bool, typer.Option("--explain", help="Say why each stage would run, and run nothing.")
     ] = False,
@@ -246,13 +244,13 @@ def batch(
     last = until or every[-1].name
     stages = stages_until(every, last)
     if not is_url(scans) and not is_url(out):
-        folder, given = Path(out), Path(calibration) if calibration else None
-        jobs = find_jobs(settings, Path(scans), folder, given, last)
+        given = Path(calibration) if calibration else None
+        jobs = find_jobs(settings, Path(scans), Path(out), given, last)
         if explain:
             _explain(output, jobs, stages)
-            return
-        require_writable(folder)
-        _run(output, jobs, folder, workers, cluster)
+        else:
+            require_writable(Path(out))
+            _run(output, jobs, Path(out), workers, cluster)
         return
     fuses = settings.kind == "fuse"
     if explain or not (is_url(scans) and is_url(out)) or (fuses and not is_url(calibration or "")):

@@ -26,23 +26,17 @@ def times_table(seconds: dict[str, float]) -> Table:
 
 def calibration_table(calibration: RigCalibration) -> Table:
     """One row a pair: residuals, stripes, position and its sigma in the rig frame."""
-    table = Table(title=f"rig {calibration.rig.name}")
+    table = Table("pair", title=f"rig {calibration.rig.name}")
     for heading in (
-        "pair",
-        "corners RMS px",
-        "poses",
-        "lens",
-        "light",
-        "sheets RMS mm",
-        "stripes",
-        "position mm (x, y, z)",
-        "sigma mm",
+        *("corners RMS px", "poses", "lens", "light", "sheets RMS mm", "stripes"),
+        *("position mm (x, y, z)", "sigma mm"),
     ):
-        table.add_column(heading, justify="left" if heading == "pair" else "right")
+        table.add_column(heading, justify="right")
     for name, pair in calibration.pairs.items():
         quality = pair.quality
         position = calibration.rig_from_camera[name].translation
         sigma = position_sigma(calibration.covariance, name, position)
+        stripes = f"{quality.stripes_calibrated} of {quality.stripes_projected}"
         table.add_row(
             name,
             "-" if quality.corners_rms_px is None else f"{quality.corners_rms_px:.3f}",
@@ -50,9 +44,7 @@ def calibration_table(calibration: RigCalibration) -> Table:
             pair.camera.lens.kind,
             quality.light_model or "-",
             "-" if quality.planes_rms_mm is None else f"{quality.planes_rms_mm:.3f}",
-            f"{quality.stripes_calibrated} of {quality.stripes_projected}"
-            if pair.sheets is not None
-            else "-",
+            "-" if pair.sheets is None else stripes,
             " ".join(f"{value:.1f}" for value in position),
             "not known" if quality.unjudged else " ".join(f"{value:.3f}" for value in sigma),
         )

@@ -5,7 +5,7 @@ Orthographic views side by side in one PNG.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -30,20 +30,20 @@ AZIMUTHS_DEG = {"front": 0.0, "side": 90.0, "back": 180.0}
 """Where the viewer of each view stands, from the subject's front towards its left."""
 
 
-def cloud_pictures(cloud: BodyCloud) -> Pictures:
-    """Draw the cloud by photo, sigma and number of pairs."""
-    return _draw_each(
-        {
-            "cloud.png": partial(draw_cloud, cloud, colour="photo"),
-            "sigma.png": partial(draw_cloud, cloud, colour="sigma"),
-            "pairs.png": partial(draw_cloud, cloud, colour="pairs_seen"),
-        }
-    )
-
-
-def mesh_pictures(mesh: BodyMesh) -> Pictures:
-    """Draw the mesh with its filled faces marked."""
-    return _draw_each({"mesh.png": partial(draw_mesh, mesh)})
+def draw_pictures(body: BodyCloud | BodyMesh) -> Pictures:
+    """Draw a cloud by photo, sigma and number of pairs, or a mesh with its filled faces marked;
+    pictures that fail are noted."""
+    if isinstance(body, BodyMesh):
+        tasks = {"mesh.png": partial(draw_mesh, body)}
+    else:
+        colours = {"cloud.png": "photo", "sigma.png": "sigma", "pairs.png": "pairs_seen"}
+        tasks = {name: partial(draw_cloud, body, colour=colour) for name, colour in colours.items()}
+    drawn: dict[str, bytes] = {}
+    notes: list[str] = []
+    for name, draw in tasks.items():
+        with optional(name, notes.append):
+            drawn[name] = draw()
+    return Outcome(drawn, tuple(notes))
 
 
 def write_pictures(pictures: Iterable[Pictures], folder: Path) -> Outcome[list[Path]]:
@@ -59,16 +59,6 @@ def write_pictures(pictures: Iterable[Pictures], folder: Path) -> Outcome[list[P
     return Outcome(written, tuple(notes))
 
 
-def _draw_each(pictures: Mapping[str, Callable[[], bytes]]) -> Pictures:
-    """Draw pictures by name; those that fail are noted."""
-    drawn: dict[str, bytes] = {}
-    notes: list[str] = []
-    for name, draw in pictures.items():
-        with optional(name, notes.append):
-            drawn[name] = draw()
-    return Outcome(drawn, tuple(notes))
-
-
 def draw_mesh(
     mesh: BodyMesh, views: Sequence[str] = tuple(AZIMUTHS_DEG), *, height_px: int = 900
 ) -> bytes:
@@ -76,10 +66,7 @@ def draw_mesh(
     base = np.full((len(mesh.faces), 3), 210, np.uint8)
     base[mesh.filled] = FILLED_TINT
     frames = _frames(mesh.vertices, views, height_px)
-    return png(
-        _write_name(_draw_faces(mesh, base, frame), view)
-        for view, frame in zip(views, frames, strict=True)
-    )
+    return png([_draw_faces(mesh, base, frame) for frame in frames], views)
 
 
 def draw_cloud(
@@ -128,11 +115,9 @@ def _draw_points(
 ) -> bytes:
     """Draw points (N, 3) with colours (N, 3) blue, green, red; those facing away are left out."""
     dot_mm = _dot_size(points)
-    panels = [
-        _write_name(_splat_view(points, normals, colours, frame, dot_mm), view)
-        for view, frame in zip(views, _frames(points, views, height_px), strict=True)
-    ]
-    return png(panels if scale is None else [*panels, colour_bar(scale, height_px)])
+    frames = _frames(points, views, height_px)
+    panels = [_splat_view(points, normals, colours, frame, dot_mm) for frame in frames]
+    return png(panels if scale is None else [*panels, colour_bar(scale, height_px)], views)
 
 
 @dataclass(frozen=True)
@@ -177,12 +162,6 @@ def _axes(view: str) -> Array:
     right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
     towards = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     return np.stack([right, np.cross(towards, right), towards])
-
-
-def _write_name(panel: Bytes, view: str) -> Bytes:
-    """Write the name of the view in the upper left corner of the panel."""
-    write_label(panel, view, (6, 16))
-    return panel
 
 
 def _draw_faces(mesh: BodyMesh, base: Bytes, frame: _Frame) -> Bytes:
@@ -285,9 +264,11 @@ def blue_white_red() -> Bytes:
     return np.rint(white + np.abs(share) ** 0.8 * (ends - white)).astype(np.uint8)
 
 
-def png(panels: Iterable[Bytes]) -> bytes:
-    """Encode panels of equal height, side by side, as PNG."""
-    ok, data = cv2.imencode(".png", np.concatenate(list(panels), axis=1))
+def png(panels: Sequence[Bytes], views: Sequence[str]) -> bytes:
+    """Encode panels of equal height, side by side, as PNG, each with its view's name if it has one."""
+    for panel, view in zip(panels, views, strict=False):
+        write_label(panel, view, (6, 16))
+    ok, data = cv2.imencode(".png", np.concatenate(panels, axis=1))
     if not ok:
         raise ValueError("no PNG could be made")
     return data.tobytes()

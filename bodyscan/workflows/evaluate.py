@@ -86,9 +86,7 @@ def load_truth(folder: Path) -> Truth:
         facts = json.loads((folder / "truth.json").read_text("utf-8"))
     except (OSError, ValueError) as error:
         raise BadInput(
-            "has no truth.json"
-            if isinstance(error, FileNotFoundError)
-            else "has a truth.json that cannot be read",
+            f"truth.json cannot be read: {error}",
             where=str(folder),
             remedy="only workspaces made by `bodyscan simulate` can be compared with the truth",
         ) from error
@@ -97,14 +95,10 @@ def load_truth(folder: Path) -> Truth:
         return Truth(facts, None, None)
     mesh = o3d.io.read_triangle_mesh(str(surface))
     faces = np.asarray(mesh.triangles).astype(np.int64)
-    breath_along_normals = folder / "subject-mean-breath.ply"
-    mean = (
-        o3d.io.read_triangle_mesh(str(breath_along_normals)).vertices
-        if breath_along_normals.exists()
-        else None
-    )
-    at_mean_breath = None if mean is None else np.asarray(mean)
-    return Truth(facts, np.asarray(mesh.vertices), faces, at_mean_breath)
+    path, mean_breath = folder / "subject-mean-breath.ply", None
+    if path.exists():
+        mean_breath = np.asarray(o3d.io.read_triangle_mesh(str(path)).vertices)
+    return Truth(facts, np.asarray(mesh.vertices), faces, mean_breath)
 
 
 def compare_rig(calibration: RigCalibration, truth: Truth) -> RigDeviation:
@@ -154,13 +148,12 @@ def evaluate_workspace(workspace: Path, body_at: BodyAt | None = None) -> str:
     if body_at is not None and moment_ms is not None:
         truth = replace(truth, vertices=body_at(moment_ms))
     lines += _scan_lines(stored, folder, calibration, truth)
-    exported = [workspace / "export"] if (workspace / "export").is_dir() else []
     lines += [
         "results:",
         f"  calibration {workspace / 'calibration' / 'calibration.json'}",
         f"  cloud       {folder / 'cloud.ply'}",
         f"  mesh        {folder / 'mesh.ply'}",
-        *(f"  exports     {path}" for path in exported),
+        *(f"  exports     {path}" for path in workspace.glob("export")),
         f"  pictures    {', '.join(str(path) for path in sorted(folder.glob('*.png')))}",
     ]
     return "\n".join(lines)
@@ -200,16 +193,19 @@ def _scan_lines(
             girths = girth_errors(body, truth.at_mean_breath, truth.faces, mean_breath=True)
             lines.append(f"  ... against mean breath {_girth_figures(girths)}")
     with part("coverage"):
-        lines.append(_coverage_line(*measure_visible_coverage(points, *surface, pairs)))
+        visible, covered = measure_visible_coverage(points, *surface, pairs)
+        lines.append(
+            f"  covered within 1 mm     {100.0 * covered:.1f} % of the {100.0 * visible:.1f} % of "
+            "the surface that a camera and its projector see"
+        )
     lines.append(
         f"  pairs to each other     {sway.rms_mm:.3f} mm RMS over the body, along and across"
     )
-    with part("cloud-deviation.png"):
-        drawn = draw_deviation(stored.cloud.points, stored.cloud.normals, cloud)
-        write_bytes(folder / "cloud-deviation.png", drawn)
-    with part("mesh-deviation.png"):
-        drawn = draw_deviation(in_rig.vertices[measured], in_rig.normals[measured], mesh)
-        write_bytes(folder / "mesh-deviation.png", drawn)
+    of_cloud = stored.cloud.points, stored.cloud.normals, cloud
+    of_mesh = in_rig.vertices[measured], in_rig.normals[measured], mesh
+    for name, points_drawn in (("cloud", of_cloud), ("mesh", of_mesh)):
+        with part(f"{name}-deviation.png"):
+            write_bytes(folder / f"{name}-deviation.png", draw_deviation(*points_drawn))
     return lines
 
 
@@ -230,13 +226,6 @@ def _mesh_lines(signed_mm: Array, mesh: BodyMesh) -> Iterator[str]:
         f"{'manifold' if shape.manifold else 'not manifold'}, {shape.components} piece(s), "
         f"{'outward' if shape.volume_mm3 > 0 else 'inward'} faces, "
         f"{shape.volume_mm3 / 1e6:.2f} litres"
-    )
-
-
-def _coverage_line(visible: float, covered: float) -> str:
-    return (
-        f"  covered within 1 mm     {100.0 * covered:.1f} % of the {100.0 * visible:.1f} % of the "
-        "surface that a camera and its projector see"
     )
 
 

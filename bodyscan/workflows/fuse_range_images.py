@@ -43,27 +43,27 @@ class _Subject:
     """Range images that show something of the subject, carried to one moment if it moved.
 
     rig_from_camera: the pairs' poses after alignment; as calibrated for those that saw nothing.
-    known: covariance of these poses.
-    together: what alignment found; None if it took no part.
+    covariance: of these poses.
+    aligned: what alignment found; None if it took no part.
     """
 
     images: Sequence[RangeImage]
     rig_from_camera: dict[str, RigidTransform]
-    known: PoseCovariance
-    together: PersonAlignment | None = None
+    covariance: PoseCovariance
+    aligned: PersonAlignment | None = None
 
     @property
-    def there(self) -> dict[str, RigidTransform]:
+    def image_poses(self) -> dict[str, RigidTransform]:
         """Poses of the images' own pairs."""
         return {image.pair: self.rig_from_camera[image.pair] for image in self.images}
 
     @property
-    def followed(self) -> EstimatedMotion | None:
-        return self.together.motion if self.together else None
+    def motion(self) -> EstimatedMotion | None:
+        return self.aligned.motion if self.aligned else None
 
     @cached_property
     def person(self) -> PersonMotion | None:
-        return PersonMotion.from_motion(self.followed) if self.followed else None
+        return PersonMotion.from_motion(self.motion) if self.motion else None
 
 
 def fuse(
@@ -101,7 +101,7 @@ def fuse(
             RigEvidence.from_calibration(calibration),
             _image_evidence(calibration, measured, cleaned, subject, merged.contradictions),
             settings.use,
-            together=subject.together,
+            together=subject.aligned,
             person=subject.person,
         )
         announce(judged(), final=False)
@@ -111,7 +111,7 @@ def fuse(
     return Scan(
         cloud,
         mesh,
-        subject.together.alignment if subject.together else None,
+        subject.aligned.alignment if subject.aligned else None,
         {image.pair: int(image.valid.sum()) for image in cleaned},
         dict(measured.failures),
         verdict,
@@ -126,28 +126,28 @@ def _align(
     calibrated: _Subject, calibration: RigCalibration, settings: AlignmentSettings
 ) -> _Subject:
     """Align the images and carry them to one moment."""
-    images, start, boards = calibrated.images, calibrated.rig_from_camera, calibrated.known
+    images, start, boards = calibrated.images, calibrated.rig_from_camera, calibrated.covariance
     found = align(images, start, boards, settings)
-    together = align_person(images, start, found, boards, calibration.rig.poles, settings)
-    rig_from_camera = start | together.alignment.rig_from_camera
-    images = warp_to_middle(images, rig_from_camera, together.motion)
-    moved, known, aligned = together.alignment.motion_mm, boards, together.alignment.covariance
-    if aligned is not None:
+    aligned = align_person(images, start, found, boards, calibration.rig.poles, settings)
+    rig_from_camera = start | aligned.alignment.rig_from_camera
+    images = warp_to_middle(images, rig_from_camera, aligned.motion)
+    moved, covariance = aligned.alignment.motion_mm, boards
+    if aligned.alignment.covariance is not None:
         # As the boards left them, if nobody moved; as the overlaps left them, whoever moved.
-        known = select_tighter(boards, aligned, moved)
+        covariance = select_tighter(boards, aligned.alignment.covariance, moved)
     unaligned = {image.pair for image in images} - moved.keys()
-    known = SwayPrior.from_settings(settings).loosen(known, unaligned)
-    return _Subject(images, rig_from_camera, known, together)
+    covariance = SwayPrior.from_settings(settings).loosen(covariance, unaligned)
+    return _Subject(images, rig_from_camera, covariance, aligned)
 
 
 def _merge(subject: _Subject, settings: FusionSettings) -> MergedCloud:
     """Merge to one cloud; its sigmas include those of the pairs' poses and the person's motion."""
     # Following a person fits the pairs to each other: what it leaves between them is not the poses'.
-    poses = None if subject.followed else subject.known
+    poses = None if subject.motion else subject.covariance
     merged = merge(subject.images, subject.rig_from_camera, settings, poses=poses)
-    cloud = add_pose_variance(merged.cloud, subject.there, subject.known)
-    if subject.followed:
-        cloud = add_motion_variance(merged.cloud, cloud, subject.followed)
+    cloud = add_pose_variance(merged.cloud, subject.image_poses, subject.covariance)
+    if subject.motion:
+        cloud = add_motion_variance(merged.cloud, cloud, subject.motion)
     return replace(merged, cloud=cloud)
 
 
@@ -158,17 +158,16 @@ def _image_evidence(
     subject: _Subject,
     contradictions: Contradictions,
 ) -> ImageEvidence:
-    poles, tried = calibration.rig.poles, [image.pair for image in cleaned]
-    shifted = subject.together.displaced if subject.together else ()
-    moved = {name for one in shifted for name in one.pairs}
+    poles = calibration.rig.poles
+    tried = [*(image.pair for image in cleaned), *measured.failures]
+    displaced = subject.aligned.displaced if subject.aligned else ()
+    moved = {name for one in displaced for name in one.pairs}
     unmoved = [image for image in measured.value if image.pair not in moved]
     return ImageEvidence(
         measured.failures,
-        find_silent_poles(
-            poles, [*tried, *measured.failures], [image.pair for image in subject.images]
-        ),
+        find_silent_poles(poles, tried, [image.pair for image in subject.images]),
         {image.pair: image.agreement for image in measured.value if image.agreement},
-        find_seams(subject.images, subject.there, poles),
+        find_seams(subject.images, subject.image_poses, poles),
         contradictions,
         find_floor(unmoved, calibration.rig_from_camera, calibration.rig.volume),
     )
@@ -184,7 +183,9 @@ def _mesh(
     """Label the cloud's regions, and mesh it; the mesh holds its displacement to mean breath."""
 
     def label() -> BodyCloud:
-        regions = label_regions(cloud, subject.images, subject.there, settings.fusion.window_mm)
+        regions = label_regions(
+            cloud, subject.images, subject.image_poses, settings.fusion.window_mm
+        )
         # A smooth surface leaves out how far strands of hair stand off it.
         sigma_mm = np.hypot(cloud.sigma_mm, regions.relief_mm)
         known = replace(cloud, sigma_mm=sigma_mm, regions=regions.numbers)
@@ -197,8 +198,8 @@ def _mesh(
         shape = closed_surface(cloud, settings.mesh, measured, subject.rig_from_camera)
         known = labelling.result()
     mesh = attach_attributes(*shape, known, settings.mesh.reach_mm)
-    if subject.followed:
-        mesh = subject.followed.add_breath(mesh)
+    if subject.motion:
+        mesh = subject.motion.add_breath(mesh)
     made(mesh)
     return known, mesh
 

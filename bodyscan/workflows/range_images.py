@@ -16,7 +16,6 @@ from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.reconstruction.scan_volume import stripes_in_volume
 from bodyscan.reconstruction.triangulation import reconstruct_range_image
 from bodyscan.registration.rig_calibration import RigCalibration
-from bodyscan.rig.rig import Rig
 from bodyscan.stripes.stripe_map import ResponseShare
 from bodyscan.workflows.decode import crossing_notes, decode_sequence, response_notes, responses_in
 
@@ -60,26 +59,24 @@ def reconstruct_range_images(
 ) -> Outcome[list[RangeImage]]:
     """The range image of every calibrated pair; pairs that gave none are in `failures`.
 
-    Range images show the scan volume and a little around it.
-
     made: range images made already, while other sequences were still arriving.
     volume_only: see `reconstruct_sequence`.
 
     Raises ScanFailed if no pair gives one, BadInput if no pair has a projector.
     """
-    _require_projector(calibration.rig)
-    failed = {
-        pair.name: calibration.failed.get(pair.name, "is not calibrated")
-        for pair in calibration.rig.pairs
-        if pair.projector and pair.name not in calibration.pairs
-    }
-    failed |= {
-        pair.name: "took no stripe sequence in this scan"
-        for pair in calibration.rig.pairs
-        if pair.projector
-        and pair.name not in failed
-        and not any(s.has_stripes for s in captures.pair_sequences(pair.name))
-    }
+    if not any(pair.projector for pair in calibration.rig.pairs):
+        raise BadInput(
+            "no pair has a projector, and cameras alone measure no surface here",
+            where=f"rig {calibration.rig.name}",
+            remedy="give a pair a `projector` in the rig file and calibrate it; a calibration of "
+            "cameras alone is for other programs (`bodyscan export-rig`)",
+        )
+    failed = {}
+    for name in (pair.name for pair in calibration.rig.pairs if pair.projector):
+        if name not in calibration.pairs:
+            failed[name] = calibration.failed.get(name, "is not calibrated")
+        elif not any(s.has_stripes for s in captures.pair_sequences(name)):
+            failed[name] = "took no stripe sequence in this scan"
     sequences = [s for s in captures.sequences if s.has_stripes and s.pair not in failed]
 
     def reconstruct(sequence: ImageSequence) -> Reconstructed:
@@ -100,13 +97,3 @@ def reconstruct_range_images(
     notes = [f"{image.pair}: {image.agreement}" for image in images if image.agreement is not None]
     notes += map(captures.relative, crossing_notes({one: made[-1] for one, made in found.items()}))
     return Outcome(images, (*notes, *response_notes(responses)), failed)
-
-
-def _require_projector(rig: Rig) -> None:
-    if not any(pair.projector for pair in rig.pairs):
-        raise BadInput(
-            "no pair has a projector, and cameras alone measure no surface here",
-            where=f"rig {rig.name}",
-            remedy="give a pair a `projector` in the rig file and calibrate it; a calibration of "
-            "cameras alone is for other programs (`bodyscan export-rig`)",
-        )

@@ -35,14 +35,8 @@ def refine_rig(
             calibration.rig.poles,
         )
     if not found.better:
-        raise FailedWork(
-            "\n".join(
-                [
-                    "the overlaps do not come closer, or hardly: the calibration stays as it is",
-                    *(f"  {line}" for line in found.lines),
-                ]
-            )
-        )
+        what = "the overlaps do not come closer, or hardly: the calibration stays as it is"
+        raise FailedWork("\n  ".join([what, *found.lines]))
     notes = (*calibration.notes, *(f"refined on {name}: {line}" for line in found.lines))
     refined = replace(calibration, rig_from_camera=found.rig_from_camera, notes=notes)
     return Outcome(refined, tuple(found.lines), measured.failures)

@@ -15,7 +15,7 @@ from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, background, silent, step
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.storage import calibration_id, load_calibration
-from bodyscan.report.pictures import Pictures, cloud_pictures, mesh_pictures, write_pictures
+from bodyscan.report.pictures import Pictures, draw_pictures, write_pictures
 from bodyscan.settings import ScanSettings
 from bodyscan.verdict import Announce, say_nothing
 from bodyscan.workflows.fuse_range_images import fuse
@@ -46,16 +46,10 @@ def scan_person(
         calibration, captures, progress, made=reconstructed, volume_only=True
     )
     nobody = empty and reconstruct_range_images(calibration, empty, progress, volume_only=True)
-    background = nobody.value if nobody else ()
     return fuse(
-        calibration,
-        images,
-        settings,
-        progress,
-        empty=background,
-        announce=announce,
-        made=made,
-    )
+        calibration, images, settings, progress,
+        empty=nobody.value if nobody else (), announce=announce, made=made,
+    )  # fmt: skip
 
 
 def scan_folder(
@@ -84,9 +78,7 @@ def scan_folder(
     Raises ScanFailed after recording it in scan.json.
     """
     rig = preparation.calibration if preparation else load_calibration(calibration)
-    described = rig.rig
-    if follow_links:
-        described = described.model_copy(update={"follow_links": True})
+    described = rig.rig.model_copy(update={"follow_links": True}) if follow_links else rig.rig
     captures = open_scan(described, folder)
     nobody = open_scan(described, empty) if empty else None
     reconstructed = preparation.take(captures) if preparation else {}
@@ -97,22 +89,13 @@ def scan_folder(
     with background() as other:
 
         def draw(body: BodyCloud | BodyMesh) -> None:
-            if isinstance(body, BodyCloud):
-                drawn.append(other.submit(cloud_pictures, body))
-            else:
-                drawn.append(other.submit(mesh_pictures, body))
+            drawn.append(other.submit(draw_pictures, body))
 
         try:
             scan = scan_person(
-                rig,
-                captures,
-                settings,
-                progress,
-                empty=nobody,
-                reconstructed=reconstructed,
-                announce=announce,
-                made=draw,
-            )
+                rig, captures, settings, progress,
+                empty=nobody, reconstructed=reconstructed, announce=announce, made=draw,
+            )  # fmt: skip
         except ScanFailed as error:
             clear(out)
             save_failure(error, out, origin)

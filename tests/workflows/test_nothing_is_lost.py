@@ -88,7 +88,7 @@ def test_a_picture_that_cannot_be_drawn_costs_itself_alone(
     scan = make_scan(tmp_path / "scan")
     before = {name: file_hash(scan.folder / name) for name in ("cloud.ply", "mesh.ply")}
     monkeypatch.setattr(pictures, "draw_mesh", broken)
-    every = pictures.cloud_pictures(scan.cloud), pictures.mesh_pictures(scan.mesh)
+    every = pictures.draw_pictures(scan.cloud), pictures.draw_pictures(scan.mesh)
     drawn = pictures.write_pictures(every, scan.folder)
     assert [path.name for path in drawn.value] == ["cloud.png", "sigma.png", "pairs.png"]
     assert all(path.exists() for path in drawn.value)
