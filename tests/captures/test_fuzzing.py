@@ -8,9 +8,12 @@ from __future__ import annotations
 import os
 import shutil
 from contextlib import suppress
+from copy import deepcopy
 from pathlib import Path
+from typing import Any
 
 import pytest
+import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from small_captures import write_small_captures
@@ -23,20 +26,8 @@ from bodyscan.rig.rig_file import load_rig
 
 CAPTURES = b"version: 1\nkind: calibration\nwhen: 2026-11-22T10:00:00\nshots:\n- name: b1\n"
 TRIES = int(os.environ.get("BODYSCAN_FUZZ", "25"))
-WORDS = [
-    b"- ",
-    b": ",
-    b"{",
-    b"[",
-    b"&a ",
-    b"*a",
-    b"<<: ",
-    b"null",
-    b"-1",
-    b".nan",
-    b"1e999",
-    b"\n  ",
-]
+WORDS = b"- |: |{|[|&a |*a|<<: |null|-1|.nan|1e999|\n  ".split(b"|")
+JUNK = st.sampled_from([None, "", "p1", -1, 0, 1e9, [], {}, [None], {"pair": "nobody"}, True])
 
 
 @pytest.fixture(scope="module")
@@ -74,3 +65,30 @@ def test_nothing_but_our_own_errors(whole: Path, data: st.DataObject) -> None:
 
 def test_the_captures_that_are_damaged_are_sound(whole: Path) -> None:
     assert check(whole / "rig.yaml").bad_images == ()
+
+
+def places(tree: Any) -> list[tuple[Any, Any]]:
+    """Every (container, key) of a YAML document."""
+    if not isinstance(tree, dict | list):
+        return []
+    keys = list(tree) if isinstance(tree, dict) else list(range(len(tree)))
+    deeper = [place for key in keys for place in places(tree[key])]
+    return [*((tree, key) for key in keys), *deeper]
+
+
+@given(data=st.data())
+@settings(max_examples=100)
+def test_whatever_is_changed_is_checked_or_refused(whole: Path, data: st.DataObject) -> None:
+    rig = yaml.safe_load((whole / "rig.yaml").read_text("utf-8"))
+    for _ in range(data.draw(st.integers(1, 3), "changes")):
+        if not places(rig):
+            break
+        container, key = data.draw(st.sampled_from(places(rig)))
+        if data.draw(st.booleans(), "taken out"):
+            del container[key]
+        else:
+            container[key] = deepcopy(data.draw(JUNK, "instead"))
+    changed = whole / "changed.yaml"
+    changed.write_text(yaml.safe_dump(rig, sort_keys=False), "utf-8")
+    with suppress(BodyscanError):
+        check(changed)

@@ -65,9 +65,8 @@ def test_colour_becomes_grey_and_exif_turns_are_not_applied(tmp_path: Path) -> N
     expected = NOISE / 4 * 0.114 + NOISE / 2 * 0.587 + NOISE * 0.299  # luma, blue first
     image = read(write(tmp_path / "x.png", colour))
     assert np.abs(image - expected).max() <= 1.5  # whole grey levels, and // above
-    exif = (
-        b"Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"  # turned by 90
-    )
+    # Turned by 90 degrees.
+    exif = b"Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"
     jpeg = encoded(picture("bit02"), ".jpg")
     turned = jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + jpeg[2:]
     plain = read(write(tmp_path / "x.jpg", jpeg))
@@ -96,10 +95,7 @@ def test_colour_becomes_grey_and_exif_turns_are_not_applied(tmp_path: Path) -> N
         (encoded(NOISE, ".jpg")[:30], "is cut short"),
         (png(WIDTH, HEIGHT), "cannot be decoded"),
         (b"\x89PNG\r\n\x1a\n" + bytes(50), "is damaged (its PNG header is wrong)"),
-        (
-            b"\xff\xd8\xff\xe0\x00\x01" + bytes(50),
-            "is cut short or damaged (its JPEG header cannot be read)",
-        ),
+        (b"\xff\xd8\xff\xe0\x00\x01" + bytes(50), "or damaged (its JPEG header cannot be read)"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
@@ -112,11 +108,6 @@ def test_bad_images_are_refused(tmp_path: Path, content: bytes | None, what: str
     assert what in caught.value.what
     assert caught.value.where == f"{path} (pair p1, shot b1)"
     assert caught.value.remedy
-
-
-def test_a_folder_is_no_image(tmp_path: Path) -> None:
-    with pytest.raises(ImageError, match="cannot be read: Is a directory"):
-        read(tmp_path)
 
 
 def test_a_huge_image_is_refused_by_its_header(
@@ -211,26 +202,6 @@ def test_of_a_sequence_a_part_can_be_read(tmp_path: Path, scale: int) -> None:
     assert whole.lit is not None
     np.testing.assert_array_equal(part.lit, whole.lit[2:-3, 5:-1])
     np.testing.assert_array_equal(part.coded, whole.coded[:, 2:-3, 5:-1])
-
-
-def test_a_dark_image_need_not_be_taken(tmp_path: Path) -> None:
-    rig_path = small(tmp_path, shots=1)
-    rig_path.write_text(rig_path.read_text() + "frames: {dark: null}\n")
-    sequence = open_captures(load_rig(rig_path), rig_path).sequence("p1", "b1")
-    assert sequence is not None
-    assert sequence.dark is None
-    assert read_sequence(sequence, CAMERA).dark is None
-
-
-@pytest.mark.parametrize("frame", ["lit", "dark", "bit02", "bit03-inverse"])
-def test_a_bad_image_of_a_sequence_is_named(tmp_path: Path, frame: str) -> None:
-    sequence = first_sequence(tmp_path)
-    assert sequence.lit is not None
-    path = sequence.lit.with_name(f"{frame}.png")
-    path.unlink()
-    with pytest.raises(ImageError, match="is missing") as caught:
-        read_sequence(sequence, CAMERA)
-    assert caught.value.where == f"{path} (pair p1, shot b1)"
 
 
 def test_a_black_sequence_is_refused_and_a_lit_image_is_no_sequence(tmp_path: Path) -> None:

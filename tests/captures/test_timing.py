@@ -9,7 +9,6 @@ from small_captures import FRAMES, RIG, write, write_small_captures
 
 from bodyscan.captures.folder import Captures, open_captures, open_scan
 from bodyscan.errors import CaptureError
-from bodyscan.jobs.stages import _images
 from bodyscan.rig.rig_file import load_rig
 
 CODE = [f"bit0{bit}{end}" for end in ("", "-inverse") for bit in range(4)]
@@ -80,24 +79,12 @@ def rows(change: dict[str, str] | None = None) -> str:
     return "\n".join(["shot,pair,frame,ms", *(lines | (change or {})).values()]) + "\n"
 
 
-@pytest.mark.parametrize("more", [0, 1])
-def test_a_file_of_times_may_be_as_long_as_a_million_frames_need(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, more: int
-) -> None:
-    monkeypatch.setattr("bodyscan.captures.captures_file.MAX_BYTES", len(rows()) - more)
-    if not more:
-        assert taken(tmp_path, "  times: times.csv\n", times=rows()).frame_ms("b1", "p1")
-        return
-    with pytest.raises(CaptureError, match="is longer than"):
-        taken(tmp_path, "  times: times.csv\n", times=rows())
-
-
 def test_a_file_of_times(tmp_path: Path) -> None:
     captures = taken(tmp_path, "  times: times.csv\n", times=rows())
     assert captures.frame_ms("b1", "p1") == {name: 3.0 * k for k, name in enumerate(DEFAULT)}
     assert captures.frame_ms("b1", "p2") is None
     # What a batch keeps of its inputs: other times are another scan.
-    assert "captures/times.csv" in _images(captures, tmp_path / "captures")
+    assert tmp_path / "captures" / "times.csv" in captures.described_in
 
 
 @pytest.mark.parametrize(
@@ -105,15 +92,12 @@ def test_a_file_of_times(tmp_path: Path) -> None:
     [
         ({"bit00": "b1,p1,bit00,2"}, "times.csv:4:1: time runs backwards: frame bit00 of pair p1"
          " at 2 ms, after dark at 3 ms"),
-        ({"bit00": "b1,p1,bit00,3"}, "times.csv:4:1: time runs backwards"),
         ({"bit00": "b1,p1,bit99,6"}, "4:1: names no frame that pair p1 took in shot b1 (did you"),
         ({"bit00": "b1,p9,bit00,6"}, "4:1: names no pair of these captures"),
         ({"bit00": "b9,p1,bit00,6"}, "4:1: names no shot of these captures"),
         ({"bit00": "b1,cam,bit00,6"}, "4:1: names no frame that pair cam took in shot b1"),
         ({"bit00": "b1,p1,lit,6"}, "4:1: gives frame lit of pair p1 a second time"),
         ({"bit00": "b1,p1,bit00,soon"}, "4:1: ms must be a number, 0 or more (got 'soon')"),
-        ({"bit00": "b1,p1,bit00,nan"}, "4:1: ms must be a number"),
-        ({"bit00": "b1,p1,bit00,1e300"}, "4:1: ms must be a number"),
         ({"lit": "b1,p1,lit,-1"}, "2:1: ms must be a number, 0 or more"),
         ({"bit00": "b1,p1,6"}, "4:1: has 3 columns, not 4"),
         ({"bit00": ""}, "has no time of bit00 (pair p1, shot b1)"),
@@ -129,14 +113,12 @@ def test_mistakes_in_a_file_of_times(tmp_path: Path, change: dict[str, str], mes
     ("timing", "message"),
     [
         ("  frame_ms: 0\n  start: together", "4:13: timing.frame_ms: must be 0.01 or more (got 0)"),
-        ("  frame_ms: 0.008\n  start: together", "timing.frame_ms: must be 0.01 or more (got 0.008)"),
         ("  frame_ms: 1.0e+300\n  start: together", "timing.frame_ms: must be 600000 or less"),
         ("  frame_ms: 10\n  start: {p1: 0, p2: 1.0e+308, cam: 3}", "timing.start.p2: must be"),
         ("  start: together", "timing.frame_ms: is missing (or `times`"),
         ("  frame_ms: 10", "timing.start: is missing: one-after-another, together, poles, or"),
         ("  frame_ms: 10\n  start: later", "5:10: timing.start: must be 'one-after-another',"
          " 'together' or 'poles' or a mapping (key: value) (got later)"),
-        ("  frame_ms: 10\n  start: {p1: 0, p2: -1, cam: 3}", "timing.start.p2: must be 0 or more"),
         ("  frame_ms: 10\n  start: {p1: 0, p3: 1, cam: 3}", "5:22: timing.start.p3: names no pair"),
         ("  frame_ms: 10\n  start: {p1: 0, cam: 3}", "timing.start: leaves out p2"),
         ("  frame_ms: 10\n  start: together\n  order: [lit, dark]", "timing.order: leaves out bit00"),

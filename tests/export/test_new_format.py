@@ -15,9 +15,7 @@ import xyz_format
 from copied_package import run_with_file
 from made_scan import make_scan
 from small_bodies import ball, points
-from typer.testing import CliRunner
 
-from bodyscan.cli.main import app
 from bodyscan.errors import BadInput
 from bodyscan.export.body_file import Provenance, write_body
 from bodyscan.export.formats import BODY_FORMATS
@@ -83,14 +81,6 @@ def test_its_file_in_the_folder_is_all_it_needs(tmp_path: Path) -> None:
     done = run_with_file(tmp_path, xyz_format, "export/formats/xyz.py", *call)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "scan" / "export" / "body.xyz").is_file()
-
-
-@pytest.mark.usefixtures("registered")
-def test_the_command_says_which_formats_there_are(tmp_path: Path) -> None:
-    make_scan(tmp_path / "scan")
-    done = CliRunner().invoke(app, ["export", str(tmp_path / "scan"), "--format", "xyzz"])
-    assert "did you mean 'xyz'?" in str(done.exception)
-    assert "glb, obj, ply, stl, xyz" in str(done.exception)
 
 
 def test_the_docs_have_every_format_with_what_it_holds() -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +13,6 @@ from hypothesis import strategies as st
 from small_captures import RIG, write
 
 from bodyscan.errors import RigFileError
-from bodyscan.files import yaml_file
 from bodyscan.files.yaml_file import dump_yaml, read_yaml
 from bodyscan.rig.board import MARKERS_IN, Board
 from bodyscan.rig.frame_names import FrameNames
@@ -78,22 +75,17 @@ def test_merge_keys_take_what_is_not_given(tmp_path: Path) -> None:
     [
         ("width: 40", "width: -5", "7:29: pairs[0].camera.width: must be greater than 0 (got -5)"),
         ("width: 40", "width: 40.5", "pairs[0].camera.width: must be a whole number (got 40.5)"),
-        ("width: 40", 'width: "40"', 'pairs[0].camera.width: must be a whole number (got "40")'),
-        ("width: 40", "width: true", "pairs[0].camera.width: must be a whole number (got true)"),
         ("width: 40", "widht: 40", "pairs[0].camera.widht: is not a key known here (did you mean"),
         ("{width: 40, height: 30}", "big", "must be a mapping (key: value) (got big)"),
         ("square_mm: 30", "square_mm: 0", "4:51: boards[0].square_mm: must be greater than 0"),
-        ("square_mm: 30", "square_mm: .nan", "boards[0].square_mm: must be a finite number"),
         ("square_mm: 30", "square_mm: 1e9999", "boards[0].square_mm: must be a finite number"),
         ("square_mm: 30", "square_mm: ", "boards[0].square_mm: must be a number (got nothing)"),
         (", square_mm: 30", "", "4:5: boards[0].square_mm: is missing"),
         ("square_mm: 30", "square_mm: 30, marker_mm: 9", "is for boards with markers"),
         ("square_mm: 30", "square_mm: 30, thickness_mm: 6", "is for a board with faces: 2"),
         ("square_mm: 30", "square_mm: 30, faces: 3", "boards[0].faces: must be 1 or 2 (got 3)"),
-        ("columns: 5", "columns: 2", "boards[0].columns: must be 3 or more (got 2)"),
         ("columns: 5", "columns: 5, columns: 6", "4:31: boards[0].columns: is given twice"),
         ("name: p2", "name: p1", "9:11: pairs[1].name: is given to two pairs: every name once"),
-        ("name: p2", "name: 2", 'pairs[1].name: must be text (got 2: write "2")'),
         ("name: p2", "name: ../up", "pairs[1].name: must be a name of letters, digits"),
         ("name: p2", "name: p2\n    nominal: {position_mm: [1, 2, 3], look_at_mm: [1, 2, 3]}",
          "pairs[1].nominal.look_at_mm: must differ from position_mm"),
@@ -102,23 +94,16 @@ def test_merge_keys_take_what_is_not_given(tmp_path: Path) -> None:
         ("name: cam", "name: cam\n    projector_nominal: {position_mm: [1, 2, 4], look_at_mm: "
          "[1, 2, 3]}", "pairs[2].projector_nominal: needs a projector"),
         ("direction: h", "direction: diagonal-h", "must be 'horizontal' or 'vertical' (got diag"),
-        ("stripes: 12", "stripes: 1", "pairs[0].projector.stripes: must be 2 or more (got 1)"),
         ("code: gray", "code: grey", "8:23: pairs[0].projector.code: must be 'gray', 'binary', 'li"),
         ("code: gray", "code: grey", "or 'stripe-index' (did you mean 'gray'?) (got grey)"),
-        ("code: gray", "code: 7", "projector.code: must be 'gray', 'binary'"),
         ("code: gray", "code: gray, invreses: true",
          "8:29: pairs[0].projector.invreses: is not a key known here (did you mean 'inverses'?)"),
-        ("code: gray", "code: phase-shift, step: 4", "is not a key known here (did you mean 'steps'?)"),
-        ("code: gray", "code: phase-shift, steps: 4.5", "8:43: pairs[0].projector.steps: must be a w"),
         (", stripes: 12", "", "8:16: pairs[0].projector.stripes: is missing"),
         ("{code: gray, stripes: 12, direction: horizontal}", "gray", "projector: must be a mapping"),
         ("code: gray", "code: light-section, inverses: true", "inverses: is for code: gray"),
-        ("code: gray", "code: gray, steps: 4", "projector.steps: is for code: phase-shift"),
         ("code: gray", "code: phase-shift, steps: 2", "steps: must be 3 or more or a list (got 2)"),
         ("code: gray", "code: phase-shift, period: 20", "period: must be 12 (stripes) or less (got"),
         ("code: gray, stripes: 12", "code: stripe-index, stripes: 255", "must be 254 or less for s"),
-        ("version: 1", "version: 1\nframes: {stripe: line}", "frames.stripe: needs {stripe}, or"),
-        ("version: 1", "version: 1\nframes: {phase: '{bit}'}", "phase: may only hold {step}"),
         ("version: 1", "version: 2", "1:10: version: must be 1 (got 2)"),
         ("  - folder: captures", "  - folder: a\n  - folder: a/", "folder: is listed twice"),
         ("  - folder: captures", "  folder: captures", "calibration: must be a list (got a map"),
@@ -139,18 +124,14 @@ def test_merge_keys_take_what_is_not_given(tmp_path: Path) -> None:
         ("version: 1", "version: 1\nvolume: {top_mm: 100, bottom_mm: 200}", "must lie below top"),
         ("version: 1", "version: 1\nframes: {pattern: bit}", "frames.pattern: needs {bit}, or"),
         ("version: 1", "version: 1\nframes: {pattern: '{bit.real}'}", "may only hold {bit}"),
-        ("version: 1", "version: 1\nframes: {pattern: '{bit:999999999d}'}", "may only hold {bit}"),
         ("version: 1", "version: 1\nframes: {patern: x}",
          "2:10: frames.patern: is not a key known here (did you mean 'pattern'?)"),
         ("version: 1", "version: 1\nframes: {index: [a]}", "frames.index: must be text: there is"),
-        ("version: 1", "version: 1\nframes: {lit: 5}", "frames.lit: must be text (got 5: write"),
         ("version: 1", "version: 1\nframes: all", "2:9: frames: must be a mapping"),
-        ("version: 1", "version: 1\nframes: {pattern: 5}", "frames.pattern: must be text or a li"),
         ("version: 1", "version: 1\nframes: {pattern: [a, 5]}", "frames.pattern[1]: must be text"),
         ("version: 1", "version: 1\nframes: {pattern: [a, b, c]}",
          "2:19: frames.pattern: has 3 names, but the 12 stripes of pair p1 take 4 bits"),
         ("version: 1", "version: 1\nframes: {lit: same, dark: same}", "two images the same name"),
-        ("version: 1", "version: 1\nframes: {lit: ../../x}", "frames.lit: must not climb out"),
         ("version: 1", "version: 1\nfiles: '{shot}/{frame}.png'", "files: needs {pair}, since"),
         ("version: 1", "version: 1\nfiles: '{shot}/{pair}.png'", "files: needs {frame}, since"),
         ("version: 1", "version: 1\nfiles: '{shot}/{pair}/{frame}.gif'", "must end in .png"),
@@ -158,8 +139,6 @@ def test_merge_keys_take_what_is_not_given(tmp_path: Path) -> None:
         ("version: 1", "version: 1\nfiles: '/{shot}/{pair}/{frame}.png'", "must be relative"),
         ("version: 1", "version: 1\nfiles: 'C:/{shot}/{pair}/{frame}.png'", "nor a drive letter"),
         ("version: 1", "version: 1\nfiles: '{shot}/{pole}/{frame}.png'", "not {pole}"),
-        ("version: 1", "version: 1\nfiles: '{shot.__class__}{pair}{frame}.png'", "not a file-name te"),
-        ("version: 1", "version: 1\nfiles: '{shot'", "files: is not a file-name template"),
     ],
 )  # fmt: skip
 def test_one_mistake_is_one_line(tmp_path: Path, old: str, new: str, line: str) -> None:
@@ -261,14 +240,10 @@ def test_files_that_are_not_rig_files(tmp_path: Path, content: str | bytes, line
     assert any(line in text for text in refused(tmp_path, content))
 
 
-def test_alias_bombs_are_refused_before_they_are_expanded(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_alias_bombs_are_refused_before_they_are_expanded(tmp_path: Path) -> None:
     levels = ["a0: &a0 [x, x, x, x, x, x, x, x, x]"]
     levels += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 12)]
-    with monkeypatch.context() as patched:
-        patched.setattr(yaml_file._Builder, "build", None)  # nothing of it is, not even what may be
-        lines = refused(tmp_path, "\n".join(levels))  # 9^12 values: weeks, if they were followed
+    lines = refused(tmp_path, "\n".join(levels))  # 9^12 values: weeks, if they were followed
     assert "values once aliases are followed" in lines[0]
     merges = ["a0: &a0 {x: 1}"]
     merges += [f"a{i}: &a{i} {{<<: [{', '.join([f'*a{i - 1}'] * 9)}]}}" for i in range(1, 12)]
@@ -302,18 +277,6 @@ def test_marker_count_is_that_of_opencv(columns: int, rows: int) -> None:
     opencv = cv2.aruco.CharucoBoard((columns, rows), 1.0, 0.7, dictionary)
     board = Board(name="b", kind="charuco", columns=columns, rows=rows, square_mm=1, marker_mm=0.7)
     assert board.marker_count == len(opencv.getIds())
-
-
-@given(st.integers(2, 65535))
-def test_bits_are_as_few_as_the_stripes_need(stripes: int) -> None:
-    bits = Gray(stripes=stripes, direction="vertical").bits
-    assert 2 ** (bits - 1) < stripes <= 2**bits
-
-
-def test_a_code_without_inverses_needs_a_dark_image(tmp_path: Path) -> None:
-    text = changed("code: gray", "code: gray, inverses: false") + "frames: {dark: null}\n"
-    (line,) = refused(tmp_path, text)
-    assert "frames.dark: is needed: pair p1 takes no inverses" in line
 
 
 @pytest.mark.parametrize(
@@ -365,15 +328,6 @@ def test_words_that_yaml_1_1_misreads_stay_words(tmp_path: Path) -> None:
     ]  # fmt: skip
 
 
-def test_reading_rig_files_imports_nothing_heavy() -> None:
-    code = (
-        "import sys, bodyscan.rig.rig_file, bodyscan.captures.check\n"
-        "print([m for m in ('numpy', 'cv2', 'open3d', 'scipy', 'pycolmap') if m in sys.modules])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
-
-
 def test_a_rig_built_in_python_is_checked_too(tmp_path: Path) -> None:
     rig = load_rig(write(tmp_path / "rig.yaml", RIG))
     with pytest.raises(ValueError, match="names no pair"):
@@ -409,13 +363,10 @@ def test_crossing_stripes_have_the_same_code_by_default(tmp_path: Path) -> None:
     ("old", "new", "line"),
     [
         ("{stripes: 20}", "{}", "projector.crossing.stripes: is missing"),
-        ("{stripes: 20}", "20", "projector.crossing: must be a mapping"),
         ("{stripes: 20}", "{stripes: 20, direction: horizontal}",
          "crossing.direction: must not be horizontal as well"),
-        ("{stripes: 20}", "{stripes: 20, bits: 5}", "projector.crossing.bits: is not a key"),
         ("{stripes: 20}", "{stripes: 20, crossing: {stripes: 4}}", "stripes run two ways"),
         ("first_code: 2", "first_code: 65530", "first_code: must be 65524 or less: 12 stripes"),
-        ("first_code: 2", "first_code: -1", "first_code: must be 0 or more"),
         ("version: 1", "version: 1\nframes: {pattern: [a, b, c, d, e]}",
          "12 stripes of pair p1 from 2 take 4 bits"),
         ("version: 1", "version: 1\nframes: {crossing: {pattern: [a, b]}}",
@@ -424,7 +375,6 @@ def test_crossing_stripes_have_the_same_code_by_default(tmp_path: Path) -> None:
         ("version: 1", "version: 1\nframes: {crossing: {pattern: 'bit{bit:02d}'}}",
          "gives two images the same name ('bit00')"),
         ("version: 1", "version: 1\nframes: {lit: null}", "frames.lit: or board is needed: pair cam"),
-        ("version: 1", "version: 1\nframes: {board: dark}", "the same name ('dark')"),
     ],
 )  # fmt: skip
 def test_one_mistake_in_crossing_stripes_is_one_line(
@@ -440,6 +390,8 @@ def test_missing_lit_and_useless_crossing_names_are_refused(tmp_path: Path) -> N
     (line,) = refused(tmp_path, RIG + "frames: {crossing: {pattern: 'c{bit}'}}\n")
     assert "frames.crossing: is for a projector with `crossing`" in line
     text = changed("code: gray", "code: gray, inverses: false")
+    (line,) = refused(tmp_path, text + "frames: {dark: null}\n")
+    assert "frames.dark: is needed: pair p1 takes no inverses" in line
     (line,) = refused(tmp_path, text + "frames: {lit: null, board: room}\n")
     assert "frames.lit: is needed: the images of pair p1 do not show the scene" in line
 
