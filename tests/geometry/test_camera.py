@@ -1,36 +1,12 @@
+from dataclasses import replace
+
 import cv2
 import numpy as np
+from any_camera import cameras, pixels_of
 from hypothesis import given
-from hypothesis import strategies as st
 
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
-
-cameras = st.builds(
-    Camera,
-    # Shorter lenses with so strong a distortion fold the image over: no ray belongs to its corners.
-    alpha=st.floats(800.0, 3000.0),
-    beta=st.floats(800.0, 3000.0),
-    gamma=st.floats(-3.0, 3.0),
-    u0=st.floats(300.0, 340.0),
-    v0=st.floats(220.0, 260.0),
-    lens=st.builds(Radial, k1=st.floats(-0.2, 0.2), k2=st.floats(-0.1, 0.1)),
-    width=st.just(640),
-    height=st.just(480),
-)
-
-
-def pixels_of(camera: Camera) -> np.ndarray:
-    u, v = np.meshgrid(np.linspace(0, camera.width - 1, 9), np.linspace(0, camera.height - 1, 7))
-    return np.stack([u, v], axis=-1)
-
-
-@given(cameras)
-def test_projecting_a_ray_gives_its_pixel_back(camera: Camera) -> None:
-    pixels = pixels_of(camera)
-    again = camera.project(camera.rays(pixels) * 1234.5)
-    # Newton's method has converged to rounding: 1e-8 px is far below any corner's noise.
-    assert np.max(np.abs(again - pixels)) < 1e-8
 
 
 @given(cameras)
@@ -45,7 +21,8 @@ def test_slopes_of_rays_are_derivatives_by_their_pixels(camera: Camera) -> None:
 
 @given(cameras)
 def test_distortion_is_that_of_equations_3_to_5(camera: Camera) -> None:
-    points = camera.rays(pixels_of(camera)).reshape(-1, 3) * 700.0
+    camera = replace(camera, lens=Radial(-0.1, 0.05))
+    points = camera.rays(pixels_of(camera)) * 700.0
     ideal = points @ camera.matrix.T
     u, v = (ideal[:, :2] / ideal[:, 2:]).T
     normalized = np.linalg.solve(camera.matrix, np.stack([u, v, np.ones_like(u)]))
@@ -59,7 +36,8 @@ def test_distortion_is_that_of_equations_3_to_5(camera: Camera) -> None:
 
 @given(cameras)
 def test_shearing_makes_it_opencvs_camera(camera: Camera) -> None:
-    points = camera.rays(pixels_of(camera)).reshape(-1, 3) * 700.0
+    camera = replace(camera, lens=Radial(-0.1, 0.05))
+    points = camera.rays(pixels_of(camera)) * 700.0
     matrix = camera.matrix
     matrix[0, 1] = 0.0
     still = np.zeros(3)

@@ -20,8 +20,7 @@ from bodyscan.geometry.least_squares import (
     minimize,
     minimize_each,
 )
-from bodyscan.geometry.linear_gaussian import invert_scaled, solve_scaled
-from bodyscan.geometry.robust import cauchy_cost, cauchy_weights, rms, rms_length, robust_scale
+from bodyscan.geometry.robust import cauchy_cost, cauchy_weights, robust_scale
 
 TIME = np.linspace(0.0, 3.0, 60)
 TRUE = np.array([2.0, 0.7, -0.5])
@@ -235,14 +234,6 @@ def test_steps_that_are_refused_ask_for_no_jacobian() -> None:
     assert len(asked) <= solution.report.steps + 1
 
 
-def test_the_jacobian_of_these_tests_is_that_of_their_residuals() -> None:
-    state, step = np.array([1.3, 0.9, 0.2]), 1e-6
-    differences = [
-        (decay(state + step * unit) - decay(state - step * unit)) / (2 * step) for unit in np.eye(3)
-    ]
-    assert np.allclose(decay_jacobian(state), np.stack(differences, axis=1), atol=1e-8)
-
-
 @dataclass(frozen=True)
 class Many:
     """Decays of different length and noise, some points missing."""
@@ -289,23 +280,6 @@ def test_of_many_problems_those_cut_short_are_named() -> None:
     assert solution.converged.tolist() == [True, True, True, False, True]
 
 
-def test_unknowns_of_very_different_size_are_solved_and_inverted_alike() -> None:
-    rng = np.random.default_rng(7)
-    jacobian = rng.normal(size=(30, 4)) * [1e9, 1.0, 1e-4, 1e-8]
-    matrix, truth = jacobian.T @ jacobian, np.array([1e-9, 1.0, 1e4, 1e8])
-    assert np.allclose(solve_scaled(matrix, matrix @ truth), truth, rtol=1e-9)
-    stacked = solve_scaled(np.stack([matrix, 4.0 * matrix]), np.stack([matrix @ truth] * 2))
-    assert np.allclose(stacked, [truth, truth / 4.0], rtol=1e-9)
-    outer = np.sqrt(np.outer(np.diag(matrix), np.diag(matrix)))
-    assert np.allclose((invert_scaled(matrix) * outer) @ (matrix / outer), np.eye(4), atol=1e-9)
-
-
-def test_what_nothing_ties_gets_the_shortest_solution_and_no_infinite_covariance() -> None:
-    matrix = np.array([[4.0, 4.0], [4.0, 4.0]])
-    assert np.allclose(solve_scaled(matrix, np.array([8.0, 8.0])), [1.0, 1.0])
-    assert np.allclose(invert_scaled(matrix), np.full((2, 2), 1.0 / 16.0))
-
-
 def test_the_spread_is_a_standard_deviation_that_outliers_do_not_sway() -> None:
     values = np.random.default_rng(9).normal(0.0, 2.0, 20000)
     assert robust_scale(values) == pytest.approx(2.0, rel=0.02)
@@ -326,8 +300,3 @@ def test_cauchy_weights_are_the_slope_of_the_cost(group: int) -> None:
     assert cauchy_cost(1e-3 * residuals, group, 3.0) == pytest.approx(
         1e-6 * residuals @ residuals, 1e-4
     )
-
-
-def test_root_mean_squares_are_of_values_and_of_lengths() -> None:
-    assert rms(np.array([3.0, -4.0])) == pytest.approx(np.sqrt(12.5))
-    assert rms_length(np.array([[3.0, 4.0], [0.0, 0.0]])) == pytest.approx(np.sqrt(12.5))

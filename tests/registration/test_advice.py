@@ -1,3 +1,10 @@
+"""Which links hold a rig together, and which further shots are suggested."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any, cast
+
 import numpy as np
 import pytest
 from ring import CHARUCO, ring_of_cameras, ring_rig, ring_views
@@ -5,14 +12,30 @@ from ring import CHARUCO, ring_of_cameras, ring_rig, ring_views
 from bodyscan.boards.board_layout import corner_points, corners_per_face
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.linear_gaussian import invert_scaled
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import position_sigma
-from bodyscan.registration.advice import advise, find_articulation_shots
-from bodyscan.registration.more_shots import BoardCandidate, RigInformation
+from bodyscan.registration.advice import (
+    Advice,
+    Link,
+    ShotSuggestion,
+    advise,
+    find_articulation_shots,
+    minimum_spanning_links,
+)
+from bodyscan.registration.more_shots import (
+    BoardCandidate,
+    RigInformation,
+    candidate_azimuths,
+    propose_board_poses,
+)
 from bodyscan.registration.normal_equations import NormalEquations, normal_equations
+from bodyscan.registration.rig_frame import nominal_pose
 from bodyscan.registration.rig_solve import RigSolution, solve_rig
-from bodyscan.rig.rig import Rig
+from bodyscan.rig.board import Board
+from bodyscan.rig.pair import NominalPose
+from bodyscan.rig.rig import Rig, Volume
 
 NOISE_PX = 0.03
 
@@ -163,3 +186,115 @@ def test_eliminating_boards_keeps_the_covariance(ring: Ring, by_board: bool) -> 
     # The unknowns' correlations lose half of double precision's digits.
     np.testing.assert_allclose(got / np.outer(scale, scale), expected / np.outer(scale, scale),
                                atol=1e-5)  # fmt: skip
+
+
+def more(**changes: Any) -> ShotSuggestion:
+    views = tuple(
+        tuple(cast(Any, SimpleNamespace(pair=name)) for name in names)
+        for names in (("a", "b", "c"), ("c", "b", "a", "d"))
+    )
+    place = BoardCandidate(
+        "knee", np.array([10.0, -20.0, 499.6]), 91.0, (RigidTransform.identity(),), views
+    )
+    keys = {"pair": "a", "shots": 3, "between": ("a", "b"), "candidate": place, "before_mm": 0.5,
+            "after_mm": 0.24, "halves": True}  # fmt: skip
+    return ShotSuggestion(**cast(Any, keys | changes))
+
+
+def advice(
+    *bridges: Link, weak: tuple[Link, ...] = (), shots: ShotSuggestion | None = None
+) -> list[str]:
+    crucial = (("s1", "b"), ("s4", "b")) if bridges else ()
+    return Advice((), (), bridges, weak, crucial, "d", 0.3123, shots).lines
+
+
+def test_what_alone_ties_a_rig_together_is_told_first() -> None:
+    assert advice(
+        Link("a", "b", 1, 0.2), Link("a", "c", 4, 0.1), weak=(Link("c", "d", 2, 0.9),)
+    ) == [
+        "a and b, with 1 shot in common, are the only link between two parts of the rig",
+        "a and c, with 4 shots in common, are the only link between two parts of the rig",
+        "without any one of these shots the rig is disconnected: s1 (b), s4 (b)",
+        "weak link: sigma of d relative to c is 0.900 mm (2 shots in common), and no other link "
+        "between their parts is better",
+        "d has the largest sigma in the rig frame: 0.312 mm",
+    ]
+    assert len(advice()) == 1
+
+
+def said(**changes: Any) -> str:
+    return advice(shots=more(**changes))[-1]
+
+
+def test_further_shots_are_told_with_where_to_hold_the_board() -> None:
+    assert said() == (
+        "3 more shots seen by both a and b (also by c), board at knee height (middle at 10, -20, 500 "
+        "mm, facing the subject's left, tilted in turn in all directions), would halve the sigma of "
+        "a: 0.500 to 0.240 mm"
+    )
+    assert "would improve a, though not by half: 0.500 to 0.300" in said(after_mm=0.3, halves=False)
+    assert said(shots=1).startswith("1 more shot seen")
+    assert said(after_mm=0.4).startswith("3 more shots seen")  # four fifths is worth it
+    assert said(after_mm=0.401) == (
+        "further shots of this board would improve a little: 3 more reduce its sigma from 0.500 to "
+        "0.401 mm"
+    )
+
+
+def test_a_place_is_seen_by_those_who_see_every_tilt() -> None:
+    place = more().candidate
+    assert place.visible_to == ("a", "b", "c")
+    two = place.restrict_to(("a", "d"))
+    assert two.visible_to == ("a",)
+    assert [len(tilt) for tilt in two.views] == [1, 2]
+
+
+def test_the_best_chain_leaves_out_what_others_do_better() -> None:
+    links = [
+        Link("a", "b", 3, 0.1), Link("b", "c", 3, 0.3), Link("a", "c", 9, 0.4), Link("c", "d", 1, 2.0),
+    ]  # fmt: skip
+    assert minimum_spanning_links(links) == (links[3], links[1], links[0])
+    assert minimum_spanning_links([]) == ()
+
+
+CAMERA = Camera(900.0, 900.0, 0.0, 319.5, 239.5, Radial(), 640, 480)
+BOARD = Board(name="b", kind="checkerboard", columns=9, rows=7, square_mm=40)
+
+
+def stood(azimuth_deg: float, height_mm: float = 1000.0, away_mm: float = 1500.0) -> RigidTransform:
+    """A camera that looks at the rig's axis."""
+    at = np.radians(azimuth_deg)
+    place = (away_mm * np.cos(at), away_mm * np.sin(at), height_mm)
+    return nominal_pose(NominalPose(position_mm=place, look_at_mm=(0.0, 0.0, height_mm)))
+
+
+def test_boards_face_halfway_between_any_two_cameras_in_steps_of_15_degrees() -> None:
+    found = np.degrees(candidate_azimuths([stood(0.0), stood(60.0), stood(130.0)], two_faced=False))
+    np.testing.assert_allclose(found, [30.0, 60.0, 90.0])  # 65 and 95 lie nearer to these
+    # However far away either stands.
+    apart = [stood(0.0), stood(60.0, away_mm=500.0)]
+    np.testing.assert_allclose(np.degrees(candidate_azimuths(apart, two_faced=False)), [30.0])
+    # Opposite each other they have no way between; of two faces either will do.
+    np.testing.assert_allclose(candidate_azimuths([stood(0.0), stood(180.0)], two_faced=False), [])
+    behind = [stood(200.0), stood(260.0)]
+    np.testing.assert_allclose(
+        np.degrees(candidate_azimuths(behind, two_faced=False)), [225.0 + 0.0]
+    )
+    np.testing.assert_allclose(np.degrees(candidate_azimuths(behind, two_faced=True)), [45.0])
+
+
+def test_places_are_those_that_two_pairs_would_see_within_the_volume() -> None:
+    placed = {"a": stood(-25.0), "b": stood(25.0), "c": stood(180.0)}
+    places = propose_board_poses(BOARD, Volume(), dict.fromkeys(placed, CAMERA), placed)
+    assert places
+    heights = {"knee": 500.0, "waist": 1000.0, "chest": 1350.0}
+    assert {place.height for place in places} <= set(heights)
+    for place in places:
+        assert set(place.visible_to) == {"a", "b"}
+        assert place.facing_deg == pytest.approx(0.0)
+        assert place.centre_mm[2] == heights[place.height]
+    radius = Volume().radius_mm
+    along = sorted(place.centre_mm[0] for place in places if place.height == "waist")
+    np.testing.assert_allclose(along, [-0.35 * radius, 0.0, 0.35 * radius])
+    alone = {"a": placed["a"], "c": placed["c"]}
+    assert not propose_board_poses(BOARD, Volume(), dict.fromkeys(alone, CAMERA), alone)

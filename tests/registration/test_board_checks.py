@@ -1,15 +1,127 @@
-"""A board that is not what the rig file says is named, and what to look at."""
+"""Notes on boards that look otherwise than the rig file describes them, or were not found."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 
-from bodyscan.boards.view import BoardView
-from bodyscan.registration.board_checks import boards_not_found, describe_findings
+from bodyscan.boards.board_layout import corner_grid
+from bodyscan.boards.view import Appearance, BoardView
+from bodyscan.registration.board_checks import (
+    appearance_notes,
+    boards_not_found,
+    describe_findings,
+    drop_inconsistently_mirrored,
+)
 from bodyscan.rig.board import Board
 from bodyscan.rig.rig import Rig
 
+MARKED = Board(name="m", kind="charuco", columns=9, rows=8, square_mm=50, marker_mm=40)
 RIG = Rig.model_validate(
+    {
+        "name": "r",
+        "boards": (MARKED,),
+        "pairs": [{"name": "p", "camera": {"width": 9, "height": 9}}],
+    }
+)
+COLUMNS, ROWS = corner_grid(MARKED)
+
+
+def view(columns: int, rows: int, appearance: Appearance | None = None) -> BoardView:
+    """The first corners of the board."""
+    ids = (np.arange(rows)[:, None] * COLUMNS + np.arange(columns)).ravel()
+    of = () if appearance is None else (False, appearance)
+    return BoardView("p", "s", "m", ids, np.zeros((len(ids), 2)), *of)
+
+
+def said(*views: BoardView) -> Sequence[str]:
+    return appearance_notes(RIG, views)
+
+
+def test_a_last_line_that_three_views_lack_is_not_there() -> None:
+    short = view(COLUMNS, ROWS - 1)
+    (note,) = said(short, short, short)
+    assert note.startswith("board m: the last line of corners along its rows was never found")
+    assert note.endswith("in 3 views. Possible cause: fewer than 8 rows")
+    assert not said(short, short)
+    assert not said(short, short, short, view(COLUMNS, ROWS))
+    narrow = view(COLUMNS - 2, ROWS)
+    (note,) = said(narrow, narrow, narrow)
+    assert "the last 2 lines of corners along its columns" in note
+    assert note.endswith("fewer than 9 columns")
+
+
+def test_a_line_beside_it_that_was_mostly_hidden_says_nothing() -> None:
+    """The median of its corners counts."""
+    part = view(COLUMNS // 2 - 1, ROWS - 1)
+    rest = view(COLUMNS, ROWS - 2)
+    assert not any("rows" in note for note in said(part, part, part, rest, rest, rest)[:1])
+
+
+def test_every_other_look_is_told_with_how_many_views_had_it() -> None:
+    looks = {
+        "white on black in 2 views (p)": Appearance(inverted=True),
+        "mirrored in 2 views (p)": Appearance(mirrored=True),
+        "legacy_layout: true) in 2 views (p)": Appearance(other_layout=True),
+        "markers below its last row in 2 views (p)": Appearance(more_rows=True),
+    }
+    for words, look in looks.items():
+        plain, other = view(COLUMNS, ROWS), view(COLUMNS, ROWS, look)
+        (note,) = said(plain, other, other)
+        assert words in note
+        assert "Other cameras" not in note  # the same camera saw it both ways
+    assert not said(view(COLUMNS, ROWS))
+
+
+def test_of_the_line_beside_the_missing_ones_it_counts_how_often_it_was_seen() -> None:
+    """However often those before it were."""
+    for last, before in ((view(COLUMNS - 1, ROWS), view(COLUMNS - 2, ROWS)),
+                         (view(COLUMNS, ROWS - 1), view(COLUMNS, ROWS - 2))):  # fmt: skip
+        assert not said(*[last] * 2, *[before] * 5)
+        (note,) = said(*[last] * 3, *[before] * 5)
+        assert "the last line of corners" in note
+        assert "in 3 views" in note
+
+
+def test_either_face_of_a_board_may_lack_lines_and_a_plain_board_is_seen_whole_or_not_at_all() -> (
+    None
+):
+    both = MARKED.model_copy(update={"faces": 2})
+    ids = (np.arange(ROWS - 1)[:, None] * COLUMNS + np.arange(COLUMNS)).ravel()
+    for face in (0, 1):
+        of_face = BoardView("p", "s", "m", ids + face * COLUMNS * ROWS, np.zeros((len(ids), 2)))
+        whole = np.arange(COLUMNS * ROWS) + (1 - face) * COLUMNS * ROWS
+        of_other = BoardView("p", "s", "m", whole, np.zeros((len(whole), 2)))
+        rig = RIG.model_copy(update={"boards": (both,)})
+        (note,) = appearance_notes(rig, [of_face] * 3 + [of_other] * 3)
+        assert "fewer than 8 rows" in note
+    plain = MARKED.model_copy(update={"kind": "checkerboard", "marker_mm": None})
+    assert not appearance_notes(
+        RIG.model_copy(update={"boards": (plain,)}), [view(COLUMNS, ROWS - 1)] * 5
+    )
+
+
+def test_where_a_camera_saw_a_board_both_ways_round_the_rarer_is_left_out() -> None:
+    usual, flipped = view(COLUMNS, ROWS), view(COLUMNS, ROWS, Appearance(mirrored=True))
+    for views, odd in (([usual] * 3 + [flipped], True), ([usual] + [flipped] * 3, False),
+                       ([usual] * 2 + [flipped] * 2, True)):  # fmt: skip
+        views = [replace(each) for each in views]  # each an image of its own
+        kept, notes = drop_inconsistently_mirrored(views)
+        assert all(one.appearance.mirrored is not odd for one in kept)
+        assert len(kept) + len(notes) == len(views)
+        assert ("is mirrored in shot s" in notes[0]) is odd
+        assert ("is not mirrored in shot s" in notes[0]) is not odd
+    # Another camera may stand behind the glass.
+    elsewhere = replace(flipped, pair="q")
+    assert drop_inconsistently_mirrored([usual] * 3 + [elsewhere]) == (
+        [usual] * 3 + [elsewhere],
+        [],
+    )
+
+
+TWO_BOARDS = Rig.model_validate(
     {
         "name": "one",
         "boards": (
@@ -21,21 +133,21 @@ RIG = Rig.model_validate(
 )
 
 
-def view(count: int) -> BoardView:
+def partial_view(count: int) -> BoardView:
     return BoardView("a", "s1", "seen", np.arange(count), np.zeros((count, 2)))
 
 
 def test_a_board_never_found_is_named_with_what_the_rig_file_says() -> None:
-    (note,) = boards_not_found(RIG, [view(48)], 30)
+    (note,) = boards_not_found(TWO_BOARDS, [partial_view(48)], 30)
     assert "board unseen" in note
     assert "10 columns x 7 rows" in note
     assert "none of 30 images" in note
 
 
 def test_a_board_of_which_little_is_found_is_doubted() -> None:
-    said = describe_findings(RIG, [view(10), view(12), view(48)], 30)
-    assert "found in 3 of 30 images, with 25 % of its corners in the usual one" in said
+    said = describe_findings(TWO_BOARDS, [partial_view(10), partial_view(12), partial_view(48)], 30)
+    assert "found in 3 of 30 images, with 25 % of its corners in the median view" in said
     assert "may not be those" in said
-    assert "may not be those" in describe_findings(RIG, [view(23)], 30)
-    assert "may not be those" not in describe_findings(RIG, [view(24)], 30)
-    assert "may not be those" not in describe_findings(RIG, [view(45)], 30)
+    assert "may not be those" in describe_findings(TWO_BOARDS, [partial_view(23)], 30)
+    assert "may not be those" not in describe_findings(TWO_BOARDS, [partial_view(24)], 30)
+    assert "may not be those" not in describe_findings(TWO_BOARDS, [partial_view(45)], 30)

@@ -53,51 +53,37 @@ def exchange(content: dict[str, Any], part: str) -> None:
 CAMERA = ("pairs", "p1-2", "camera")
 MISTAKES: dict[str, Callable[[dict[str, Any]], Any]] = {
     "a focal length that is NaN": lambda c: set_(c, *CAMERA, "alpha", to=float("nan")),
-    "an infinite focal length": lambda c: set_(c, *CAMERA, "beta", to=float("inf")),
     "a negative focal length": lambda c: set_(c, *CAMERA, "alpha", to=-755.0),
-    "a focal length of zero": lambda c: set_(c, *CAMERA, "beta", to=0),
-    "a focal length ten times too long": lambda c: set_(c, *CAMERA, "alpha", to=7559.0),
     "a focal length as text": lambda c: set_(c, *CAMERA, "alpha", to="755.9"),
     "a camera without k1": lambda c: c["pairs"]["p1-2"]["camera"].pop("k1"),
     "a lens that folds over": lambda c: set_(c, *CAMERA, "k1", to=-4.0),
     "a principal point far outside": lambda c: set_(c, *CAMERA, "u0", to=3155.0),
-    "an axis that is askew": lambda c: set_(c, *CAMERA, "gamma", to=300.0),
     "a picture of another size": lambda c: set_(c, *CAMERA, "width", to=1280),
     "an unknown lens": lambda c: set_(c, *CAMERA, "lens", to="magic"),
     "a mirrored rotation": lambda c: pose(c, lambda m: m @ np.diag([1.0, 1.0, -1.0, 1.0])),
-    "a scaled rotation": lambda c: pose(c, lambda m: m @ np.diag([1.01, 1.01, 1.01, 1.0])),
-    "a sheared rotation": lambda c: pose(c, lambda m: m + np.eye(4, k=1) * 0.01),
     "a matrix turned over": lambda c: pose(c, np.transpose),
     "a note that is no text": lambda c: set_(c, "notes", to=["\ud800"]),
     "a matrix of three rows": lambda c: pose(c, lambda m: m[:3]),
-    "a pose that is empty": lambda c: set_(c, "pairs", "p1-2", "rig_from_camera", to=[]),
     "a pose beyond the horizon": lambda c: set_(
         c, "pairs", "p1-2", "rig_from_camera", 0, 3, to=1e9
     ),
-    "a pose of texts": lambda c: set_(c, "pairs", "p1-2", "rig_from_camera", 0, to=["a"] * 4),
     "a pair that the rig has not": lambda c: set_(c, "pairs", "p9", to=c["pairs"].pop("p1-2")),
     "a pair too few": lambda c: c["pairs"].clear(),
     "a pair calibrated and failed": lambda c: set_(c, "failed", "p1-2", to="lost"),
-    "a failure that is a number": lambda c: set_(c, "failed", "p1-2", to=3),
     "no order of the covariance": lambda c: c.pop("placing_covariance_order"),
     "an order that leaves one out": lambda c: c["placing_covariance_order"].pop(),
-    "an order with one twice": lambda c: set_(c, "placing_covariance_order", 0, to="p2-3"),
     "an order with a stranger": lambda c: set_(c, "placing_covariance_order", 0, to="p9"),
-    "an order that is a text": lambda c: set_(c, "placing_covariance_order", to="p1-2"),
     "a board that the rig has not": lambda c: set_(c, "boards", 0, "board", to="other"),
     "a board listed twice": lambda c: c["boards"].append(c["boards"][0]),
     "fewer boards than were seen": lambda c: c["boards"].clear(),
     "a mirrored board": lambda c: set_(c, "boards", 0, "rig_from_board", 2, to=[0, 0, 0, 0]),
     "light of unknown kind": lambda c: set_(c, "pairs", "p1-2", "light", "kind", to="magic"),
-    "light of another kind": lambda c: set_(c, "pairs", "p1-2", "light", "kind", to="planes"),
     "light the other way": lambda c: set_(c, "pairs", "p1-2", "light", "direction", to="vertical"),
     "light that is gone": lambda c: set_(c, "pairs", "p1-2", "light", to=None),
     "stripes of another number": lambda c: set_(
         c, "rig", "pairs", 0, "projector", "stripes", to=160
     ),
-    "a rig of another size": lambda c: set_(c, "rig", "pairs", 0, "camera", "width", to=641),
     "a rig that is none": lambda c: set_(c, "rig", to={}),
-    "poses that are a text": lambda c: set_(c, "pairs", "p1-2", "quality", "poses", to="nine"),
     "a quality unheard of": lambda c: set_(c, "pairs", "p1-2", "quality", "beauty", to=1.0),
     "notes that are a text": lambda c: set_(c, "notes", to="all well"),
     "pairs that are a list": lambda c: set_(c, "pairs", to=[]),
@@ -141,22 +127,15 @@ ARRAYS: dict[str, Callable[[dict[str, Any]], Any]] = {
         to=(np.eye(24) + 2.0 * (np.eye(24, k=1) + np.eye(24, k=-1))).astype(np.float16),
     ),
     "the wrong shape": lambda a: set_(a, "placing_covariance", to=np.eye(6)),
-    "a negative variance": lambda a: set_(a, "p1-2/camera_covariance", to=-np.eye(7)),
-    "no symmetry": lambda a: set_(a, "p1-2/camera_covariance", to=np.eye(7) + np.eye(7, k=1)),
     "correlations beyond one": lambda a: set_(
         a, "p1-2/camera_covariance", to=np.eye(7) + 2.0 * (np.eye(7, k=1) + np.eye(7, k=-1))
     ),
-    "texts": lambda a: set_(a, "p1-2/camera_covariance", to=np.full((7, 7), "a")),
     "a mirrored projector": lambda a: set_(
         a, "p1-2/light/projector_from_camera", to=np.diag([1.0, 1.0, -1.0, 1.0])
-    ),
-    "a projector of three rows": lambda a: set_(
-        a, "p1-2/light/projector_from_camera", to=np.eye(3)
     ),
     "parameters too few": lambda a: set_(a, "p1-2/light/parameters", to=np.zeros(2)),
     "other stripes": lambda a: set_(a, "p1-2/light/stripes", to=np.array(7.0)),
     "no stripes": lambda a: a.pop("p1-2/light/stripes"),
-    "a middle that is a number": lambda a: set_(a, "p1-2/light/middle", to=np.array(1.0)),
     "corners of too few": lambda a: set_(a, "p1-2/seen/pixels", to=np.zeros((3, 2))),
     "corners on boards unheard of": lambda a: set_(
         a, "p1-2/seen/target", to=np.full_like(a["p1-2/seen/target"], 99)
@@ -249,7 +228,7 @@ def test_a_calibration_that_nobody_edited_stays_as_it_is(stored_now: Path, tmp_p
     before = {path.name: path.read_bytes() for path in copy.iterdir()}
     done = run("accept-changed", copy)
     assert done.exit_code == 0
-    assert "nothing was changed" in done.output
+    assert "was not edited" in done.output
     assert {path.name: path.read_bytes() for path in copy.iterdir()} == before
 
 

@@ -6,7 +6,7 @@ from ring import ring_of_cameras, ring_rig, ring_views
 
 from bodyscan.arrays import Array
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.registration.drift import Drift, _groups, find_drift, observe_pose
+from bodyscan.registration.drift import Drift, find_drift, observe_pose
 from bodyscan.registration.rig_solve import RigSolution, solve_rig
 
 NOISE_PX = 0.03
@@ -92,11 +92,3 @@ def test_a_board_that_one_pair_alone_sees_says_nothing(calibrated: RigSolution) 
     drift = find_drift(poses, calibrated.rig_from_camera, calibrated.covariance, POLES)
     assert drift.moves == ()
     assert drift.lonely == ("p1-1",)
-
-
-def test_pairs_and_poles_of_several_may_have_moved_but_not_everything() -> None:
-    poles = {"a1": "a", "a2": "a", "b1": "b", "c1": "c", "c2": "c"}
-    found = _groups(("a1", "a2", "b1", "c1"), poles)
-    assert [name for name, _ in found] == ["pair a1", "pair a2", "pair b1", "pair c1", "pole a"]
-    assert found[-1][1] == ("a1", "a2")
-    assert [name for name, _ in _groups(("a1", "a2"), poles)] == ["pair a1", "pair a2"]

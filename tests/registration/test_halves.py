@@ -12,15 +12,7 @@ from seen_boards import seen_boards
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.errors import FailedWork
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.geometry.uncertainty import PoseCovariance
-from bodyscan.registration import halves
-from bodyscan.registration.halves import (
-    _centre_sigmas,
-    _common_motion_projector,
-    _normalized_rms,
-    compare_halves,
-    split_shots,
-)
+from bodyscan.registration.halves import compare_halves, split_shots
 from bodyscan.registration.rig_solve import RigSolution, solve_rig
 from bodyscan.rig.rig import Rig
 from bodyscan.workflows.find_boards import calibrate_cameras, locate_views
@@ -170,71 +162,3 @@ def test_of_many_draws_those_halves_are_taken_that_tie_most_pairs(seed: int) -> 
     # Where no draw ties all three, the two that most draws tie.
     few = [view for view in seen if view.pair != "c" or view.shot < "s05"]
     assert split_shots(cast(Any, few), ("a", "b", "c"), seed=seed)[0] == ("a", "b")
-
-
-@pytest.mark.parametrize(("times", "told"), [(4.9, True), (5.1, False)])
-def test_halves_that_know_the_rig_five_times_worse_say_nothing_of_the_whole(
-    monkeypatch: pytest.MonkeyPatch, times: float, told: bool
-) -> None:
-    placings, _ = ring_of_cameras()
-    names = tuple(sorted(placings))
-    known = np.diag(np.tile([1e-16] * 3 + [1e-4] * 3, len(names)))
-    half = PoseCovariance(names, 0.5 * times**2 * known)
-    monkeypatch.setattr(halves, "_solve_half", lambda *of: (dict(placings), half))
-    seen = [
-        SimpleNamespace(pair=p, shot=f"s{k}", target=(f"s{k}", "b"))
-        for p in names
-        for k in range(8)
-    ]
-    placed: Any = SimpleNamespace(
-        rig_from_camera=placings, views=seen, covariance=PoseCovariance(names, known)
-    )
-    if told:
-        found = compare_halves(ring_rig(placings), placed)
-        assert found.over_expected == pytest.approx(0.0, abs=1e-6)
-        # But for what all have in common, a twelfth of the variance and what turns them alike.
-        assert found.sigmas_mm == pytest.approx(times * 0.01, rel=0.2)
-        return
-    with pytest.raises(FailedWork, match=r"halves of the shots should differ by 0\.0"):
-        compare_halves(ring_rig(placings), placed)
-
-
-def test_differences_are_counted_in_sigmas_with_their_correlation() -> None:
-    """Two that go together by four fifths: 1 and -1 sigma is as far as five sigmas of variance 1."""
-    together = np.array([[1.0, 1.6], [1.6, 4.0]])
-    assert _normalized_rms(np.array([1.0, -2.0]), together) == pytest.approx(np.sqrt(5.0))
-    assert _normalized_rms(np.array([-1.0, 2.0]), together) == pytest.approx(np.sqrt(5.0))
-    # (1, 1) sigmas have a square of 2 / 1.8 in the direction that has it all, of two.
-    assert _normalized_rms(np.array([1.0, 2.0]), together) == pytest.approx(np.sqrt(1.0 / 1.8))
-    # What the frame took out, here their difference, counts neither way.
-    assert _normalized_rms(np.array([3.0, 1.0]), np.ones((2, 2))) == pytest.approx(2.0)
-
-
-def test_the_frame_taken_out_of_many_pairs_leaves_the_rounding_of_their_largest_variance() -> None:
-    """Forty that go together have 40 times their own variance in common, which is known to 40 times
-    its rounding: 1e-8 of their own is nothing, and a difference there says nothing."""
-    together = (1.0 - 1e-8) * np.ones((40, 40)) + 1e-8 * np.eye(40)
-    alike, apart = np.ones(40), np.zeros(40)
-    apart[:2] = 1e-3, -1e-3
-    assert _normalized_rms(alike + apart, together) == pytest.approx(1.0, rel=1e-6)
-
-
-def test_a_centres_sigma_is_that_of_its_shift_and_of_the_turn_about_the_origin() -> None:
-    covariance = np.zeros((12, 12))
-    covariance[range(6), range(6)] = [1e-6, 4e-6, 9e-6, 0.25, 0.25, 0.25]
-    covariance[range(6, 12), range(6, 12)] = [1e-6, 1e-6, 1e-6, 1.0, 4.0, 9.0]
-    found = _centre_sigmas(covariance, np.array([[0.0, 0.0, 1000.0], [0.0, 0.0, 0.0]]))
-    # A turn about x moves what is 1000 mm up along y, and about y along x; about z nowhere.
-    np.testing.assert_allclose(found**2, [[4.25, 1.25, 0.25], [1.0, 4.0, 9.0]])
-
-
-def test_what_all_pairs_do_alike_is_taken_out_and_half_of_what_one_of_two_does() -> None:
-    centres = np.array([[1300.0, 0.0, 900.0], [-700.0, 1100.0, 400.0]])
-    ahead = -centres / np.linalg.norm(centres, axis=1)[:, None]
-    alike = np.tile([1e-3, -2e-3, 5e-4, 0.3, -0.2, 0.1], 2)
-    # Of motions up to 0.3, solved to rounding.
-    np.testing.assert_allclose(_common_motion_projector(centres, ahead) @ alike, 0.0, atol=1e-12)
-    # Twins in either place, of which one moves and the other does not.
-    keep = _common_motion_projector(centres[[0, 0, 1, 1]], ahead[[0, 0, 1, 1]])
-    moves = np.kron([1.0, 0.0, 1.0, 0.0], alike[:6])
-    np.testing.assert_allclose(keep @ moves, moves - 0.5 * np.tile(alike, 2), atol=1e-12)

@@ -12,7 +12,6 @@ from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.joint_solve import JointSolution
 from bodyscan.registration.view_consistency import (
     InconsistentViews,
-    _board_pose,
     find_inconsistent_views,
     single_view_errors,
 )
@@ -92,11 +91,3 @@ def test_the_same_other_size_in_three_shots_is_the_boards() -> None:
     found = judged(*shots)
     assert found.notes[0].startswith("board board has squares 1.020 times as large")
     assert len(found.wrong) == 12
-
-
-def test_a_board_that_took_no_part_is_where_the_first_view_has_it() -> None:
-    seen = [view("b", aside_mm=3.0), view("a")]
-    none = _board_pose(seen, JointSolution(PLACED, {}, CAMERAS))
-    moved = RigidTransform(np.eye(3), np.array([1.8, 2.4, 0.0])) @ BOARD
-    np.testing.assert_allclose(none.matrix, moved.matrix, atol=1e-9)
-    assert _board_pose(seen, JointSolution(PLACED, {("s1", "board"): BOARD}, CAMERAS)) is BOARD

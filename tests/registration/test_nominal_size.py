@@ -52,25 +52,6 @@ def test_a_size_that_no_tape_measure_errs_by_is_refused(factor: float) -> None:
     assert "square_mm may be wrong" in str(refused.value)
 
 
-@pytest.mark.parametrize(
-    ("factor", "mark"),
-    [
-        (0.899, "bad"),
-        (0.901, "usable"),
-        (0.969, "usable"),
-        (0.971, "good"),
-        (1.029, "good"),
-        (1.031, "usable"),
-        (1.099, "usable"),
-        (1.101, "bad"),
-    ],
-)
-def test_a_calibration_in_use_is_marked(factor: float, mark: str) -> None:
-    size = nominal_size(RIG, placed(factor))
-    assert size is not None
-    assert size.mark == mark
-
-
 def test_a_rig_without_boards_is_told_as_well() -> None:
     """What another program calibrated: only `nominal` can be mended here."""
     (note,) = check_nominal_size(RIG.model_copy(update={"boards": ()}), placed(1.05))

@@ -14,13 +14,6 @@ from bodyscan.errors import FailedWork
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.registration.references import (
-    Size,
-    _average,
-    _format_size,
-    _measure_board,
-    _measure_separation,
-    _Middle,
-    _Reading,
     board_length,
     find_rig_size,
     rescale_boards,
@@ -125,11 +118,6 @@ def test_a_size_that_no_print_is_off_by_is_asked_about(scale: float, said: str) 
     assert ("is square_mm right" in " ".join(found.notes)) == (scale < 0.97)
 
 
-def test_a_rig_in_centimetres_is_refused() -> None:
-    with pytest.raises(FailedWork, match=r"10\.0\d\d times as large as square_mm says"):
-        find_rig_size(small_rig(bar()), placed(0.1), bar_views(np.random.default_rng(0)))
-
-
 def test_a_reference_that_nobody_saw_leaves_the_size_and_is_named() -> None:
     found = find_rig_size(small_rig(bar()), placed(1.0), [])
     assert found.value.factor == 1.0
@@ -166,74 +154,8 @@ def test_boards_of_references_do_not_place_the_rig() -> None:
     assert select_solving_views(alone, views) == views
 
 
-def test_a_size_is_told_in_per_cent_with_its_sigma() -> None:
-    assert _format_size(Size(1.00123, 0.00045)) == "+0.123 % (sigma 0.045 %)"
-    assert _format_size(Size(0.998, 0.0002)) == "-0.200 % (sigma 0.020 %)"
-
-
-PLAIN = Board(name="plain", columns=12, rows=11, square_mm=30)
 ROW, COLUMN = np.divmod(np.arange(110), 11)
-FEW = np.flatnonzero((ROW < 3) & (abs(COLUMN - 5) < 3))
 """Corners of the middle of the first three rows: 15, 120 by 60 mm."""
-
-
-def test_a_board_s_middle_is_where_it_is_whatever_corners_were_seen() -> None:
-    at = RigidTransform.from_rotation_vector([0.3, -0.2, 0.9], [100.0, 200.0, 1300.0])
-    seen = _Middle.locate(PLAIN, FEW, at.apply(corner_points(PLAIN)[FEW]))
-    np.testing.assert_allclose(seen.position, at.apply(np.array([180.0, 165.0, 0.0])), atol=1e-9)
-    # 105 mm from the corners' own middle; these lie 30 sqrt(2 + 2 / 3) mm from it, RMS.
-    assert seen.lever == pytest.approx(105.0 / (30.0 * np.sqrt(8.0 / 3.0)))
-
-
-def test_the_less_of_a_board_was_seen_the_farther_off_its_middle_may_be() -> None:
-    """Corners that err turn a board about themselves. Two middles, as they err in 600 draws."""
-    layout, rng = corner_points(PLAIN)[FEW], np.random.default_rng(0)
-    lengths, sigmas, worse = [], [], []
-    for _ in range(600):
-        noise = rng.normal(0.0, 0.05, (2, *layout.shape))
-        both = [
-            _Middle.locate(PLAIN, FEW, layout + [x, 0, 0] + own)
-            for x, own in zip((0, 500), noise, strict=True)
-        ]
-        lengths.append(_measure_separation(both, 1.0).length_mm)
-        sigmas.append(_measure_separation(both, 1.0).sigma_mm)
-        worse.append(_measure_separation(both, 4.0).sigma_mm)
-    assert np.mean(lengths) == pytest.approx(500.0, abs=0.02)
-    # A fit takes 1 / 15 of the residuals' variance by its shift, and a quarter of that by its turn; the
-    # spread of 600 draws is known to 3 %.
-    left = np.sqrt(1.0 - 1.25 / 15.0)
-    assert np.sqrt(np.mean(np.square(sigmas))) == pytest.approx(left * np.std(lengths), rel=0.09)
-    np.testing.assert_allclose(worse, 2.0 * np.array(sigmas))
-
-
-def test_the_length_of_one_board_is_as_uncertain_as_its_corners_make_it() -> None:
-    layout, rng, every = corner_points(PLAIN), np.random.default_rng(0), np.arange(110)
-    read = [
-        [
-            _measure_board(PLAIN, every, layout + noise, variance_inflation)
-            for variance_inflation in (1.0, 4.0)
-        ]
-        for noise in rng.normal(0.0, 0.05, (300, 110, 3))
-    ]
-    lengths = [one.length_mm for one, _ in read]
-    assert np.mean(lengths) == pytest.approx(300.0, abs=0.002)
-    sigmas = np.array([[one.sigma_mm, other.sigma_mm] for one, other in read])
-    # The spread of 300 draws is known to 4 %.
-    assert np.sqrt(np.mean(sigmas[:, 0] ** 2)) == pytest.approx(np.std(lengths), rel=0.12)
-    np.testing.assert_allclose(sigmas[:, 1], 2.0 * sigmas[:, 0])
-
-
-def test_shots_that_scatter_by_more_than_their_sigmas_make_a_mean_as_uncertain_as_they_say() -> (
-    None
-):
-    lengths = 400.0 + np.array([0.3, -0.2, 0.1, -0.4, 0.2])
-    for sigma, expected in ((0.01, np.std(lengths, ddof=1)), (0.9, 0.9)):
-        mean, own = _average([_Reading(length, sigma) for length in lengths])
-        assert mean == pytest.approx(np.mean(lengths))
-        assert own == pytest.approx(expected / np.sqrt(5.0))
-    # The better one counts more, by the square of their sigmas; one alone is as good as it says.
-    assert _average([_Reading(400.0, 0.1), _Reading(400.01, 0.2)])[0] == pytest.approx(400.002)
-    assert _average([_Reading(400.0, 0.1)]) == pytest.approx((400.0, 0.1))
 
 
 @pytest.mark.parametrize(("sigmas", "refused"), [(3.9, False), (4.1, True)])

@@ -2,26 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import Any, cast
 
 import numpy as np
 import pytest
 from ring import as_found, ring_of_cameras, ring_rig, ring_views
 
 from bodyscan.boards.view import BoardView
-from bodyscan.calibration.camera import LensTrial
-from bodyscan.calibration.lens_choice import ChosenLens
-from bodyscan.geometry.lenses import family_up_to
 from bodyscan.geometry.lenses.brown import Brown
-from bodyscan.geometry.lenses.lens import Lens
-from bodyscan.geometry.lenses.radial import Radial
-from bodyscan.geometry.lenses.rational import Rational
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import position_sigma
-from bodyscan.registration.rig_lenses import _pool_decentring
 from bodyscan.registration.rig_solve import RigSolution, solve_rig
 from bodyscan.rig.rig import Rig
 from bodyscan.workflows.find_boards import calibrate_cameras, locate_views
@@ -107,46 +97,3 @@ def test_one_wrong_view_takes_no_other_with_it(views: list[BoardView]) -> None:
     assert f"shot {shot}" in note
     assert views[wrong].pair in note
     assert len(placed.views) == located - 1
-
-
-@pytest.mark.parametrize(
-    ("sigmas_off", "gains", "changed"),
-    [
-        # Of eight values the mean square is 1 by chance, give or take a half: 2.5 is three of these.
-        ((1.55, 1.55, 1.55, 1.55), (0.0, 0.0, 0.0, 0.0), ""),
-        ((1.6, 1.6, 1.6, 1.6), (0.0, 0.0, 0.0, 0.0), "abcd"),
-        ((0.0, 0.0, 0.0, 3.3), (1.0, -1.0, 2.9, 0.0), "abcd"),
-        ((9.0, 9.0, 9.0, 9.0), (9.0, None, -3.1, 0.0), "d"),  # proven, not tried, spoken against
-        ((9.0, 0.5, 0.5, 0.5), (9.0, 0.0, 0.0, 0.0), ""),  # what one proves for itself says no more
-        ((9.0, 9.0, 9.0, 9.0), (None, None, None, None), ""),
-    ],
-)
-def test_cameras_of_one_make_show_together_that_they_are_decentred(
-    sigmas_off: tuple[float, ...], gains: tuple[float | None, ...], changed: str
-) -> None:
-    chosen, looked = {}, {}
-    for name, off, gain in zip("abcd", sigmas_off, gains, strict=True):
-        tried = () if gain is None else (LensTrial("brown", 0.05, gain),)
-        brown = lens(Brown(p1=1e-4, p2=-1e-4), 1e-4 / max(off, 1e-9), LensTrial("brown", 0.05))
-        radial = lens(Radial(), 1.0, LensTrial("radial", 0.06, None, True), *tried)
-        chosen[name] = replace(radial, refused=brown.fit)
-
-        def again(kinds: Sequence[Any], brown: ChosenLens = brown) -> ChosenLens:
-            assert [kind.kind for kind in kinds] == ["brown", "rational"]
-            return brown
-
-        looked[name] = SimpleNamespace(choose=again)
-    kinds: Any = {name: family_up_to(Rational) for name in chosen}
-    found = _pool_decentring(chosen, cast(Any, looked), kinds)
-    assert "".join(found) == changed
-    for name in changed:
-        first, second = chosen[name].trials
-        assert found[name].trials == (replace(first, chosen=False), replace(second, chosen=True))
-
-
-def lens(kind: Lens, sigma: float, *trials: LensTrial) -> ChosenLens:
-    camera = replace(CAMERAS[BENT], lens=kind)
-    covariance = sigma**2 * np.eye(len(camera.parameters))
-    fit: Any = SimpleNamespace(camera=camera, covariance=covariance)
-    rays: Any = None
-    return ChosenLens(fit, trials, rays)

@@ -3,13 +3,13 @@ from typing import Literal
 
 import numpy as np
 import pytest
-from ring import CHARUCO, ring_of_cameras, ring_rig, ring_views
+from ring import ring_of_cameras, ring_rig, ring_views
 
 from bodyscan.arrays import Array
 from bodyscan.errors import RigDisconnected
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import position_sigma
-from bodyscan.registration.rig_solve import RigSolution, _robust_rms, solve_rig
+from bodyscan.registration.rig_solve import RigSolution, solve_rig
 from bodyscan.rig.board import Board
 from bodyscan.rig.pair import NominalPose
 from bodyscan.rig.rig_frame import RigFrame
@@ -49,28 +49,6 @@ def test_sigmas_of_positions_are_honest() -> None:
                 normalized.append(error / sigma)
     # 6 x 5 x 3 draws, correlated within a seed (6 x 6 independent ones at worst): 1 +- 0.12.
     assert 0.75 < np.sqrt(np.mean(np.square(normalized))) < 1.3
-
-
-@pytest.mark.slow
-def test_wrong_views_are_found_and_named() -> None:
-    placings, cameras = ring_of_cameras(heights=(700, 1200))
-    views, _ = ring_views(placings, cameras, shots=24)
-    clean = rms(centre_errors(solve_rig(ring_rig(placings), views, cameras).value, placings))
-    number = next(i for i, v in enumerate(views) if v.pair == "p2-2" and len(v.pixels) > 30)
-    shuffled = views[number].pixels.copy()
-    shuffled[[3, 20]] = shuffled[[20, 3]]
-    shuffled += 4.0
-    views[number] = type(views[number])(
-        "p2-2",
-        views[number].shot,
-        "board",
-        views[number].points,
-        shuffled,
-        views[number].camera_from_board,
-    )
-    outcome = solve_rig(ring_rig(placings), views, cameras)
-    assert any("p2-2" in note and views[number].shot in note for note in outcome.notes)
-    assert rms(centre_errors(outcome.value, placings)) < 1.2 * clean + 0.02
 
 
 def test_two_cameras_are_refined_too() -> None:
@@ -161,50 +139,6 @@ def test_shots_that_are_all_numbered_further_on_are_told_from_an_open_numbering(
     assert "one camera's numbers one further on" in str(caught.value)
 
 
-def test_exchanged_shots_of_an_ambiguous_board_are_told_from_the_others() -> None:
-    board = Board(name="plain", columns=9, rows=7, square_mm=70)
-    placings, cameras = ring_of_cameras(poles=1, heights=(900, 1100))
-    views, _ = ring_views(placings, cameras, shots=60, board=board)
-    seen = [{view.shot for view in views if view.pair == name} for name in placings]
-    a, b, c, d, *_ = shots = sorted(seen[0] & seen[1])[:6]
-    # Of six shots four bear each other's names, in one camera.
-    names = {a: b, b: c, c: d, d: a}
-    views = [
-        replace(view, shot=names.get(view.shot, view.shot)) if view.pair == "p1-1" else view
-        for view in views
-        if view.shot in shots
-    ]
-    rig = ring_rig(placings).model_copy(update={"boards": (board,)})
-    with pytest.raises(RigDisconnected) as caught:
-        solve_rig(rig, views, cameras)
-    assert f"at best {shots[4]}, {shots[5]} agree" in str(caught.value)
-    assert "two shots exchanged" in str(caught.value)
-
-
-@pytest.mark.slow
-def test_the_board_can_fix_the_frame() -> None:
-    placings, cameras = ring_of_cameras(heights=(700, 1200))
-    views, truth = ring_views(placings, cameras, shots=20)
-    fixed = truth["s00", "board"]
-    rig = ring_rig(placings).model_copy(
-        update={
-            "rig_frame": ring_rig(placings).rig_frame.model_copy(
-                update={
-                    "pair": None,
-                    "shot": "s00",
-                    "board": CHARUCO.name,
-                    "origin_mm": tuple(fixed.translation),
-                    "x_axis": tuple(fixed.rotation[:, 0]),
-                    "y_axis": tuple(fixed.rotation[:, 1]),
-                }
-            )
-        }
-    )
-    placed = solve_rig(rig, views, cameras).value
-    # One board of 48 corners in a few views holds the frame: its own pose is good to 1e-4 rad.
-    assert rms(centre_errors(placed, placings)) < 0.5
-
-
 def test_a_corner_seen_only_once_does_no_harm() -> None:
     placings, cameras = ring_of_cameras(heights=(700, 1200))
     views, _ = ring_views(placings, cameras, shots=20)
@@ -272,13 +206,3 @@ def test_skew_and_aspect_that_were_not_known_neither_harm_nor_stay_unsaid() -> N
     assert np.sqrt(np.mean(np.square(errors))) < 0.3
     # 4 x 6 independent draws at worst: 1 +- 0.15.
     assert 0.6 < np.sqrt(np.mean(np.square(normalized))) < 1.45
-
-
-def test_how_far_corners_are_off_is_a_length_that_outliers_hardly_change() -> None:
-    """0.3 px along either axis are 0.3 sqrt(2) px."""
-    off = 0.3 * np.random.default_rng(0).choice([-1.0, 1.0], (200, 2))
-    assert _robust_rms([off[:80], off[80:]]) == pytest.approx(0.3 * np.sqrt(2.0))
-    off[7] = 30.0
-    # One of 400 numbers, a hundred times as far off, would by itself make 2.2 px of it; a twentieth.
-    assert _robust_rms([off]) == pytest.approx(0.3 * np.sqrt(2.0), rel=0.05)
-    assert np.isnan(_robust_rms([]))

@@ -7,13 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bodyscan.calibration.board_views import LocatedView, max_displacement_mm
+from bodyscan.calibration.board_views import LocatedView
 from bodyscan.errors import RigDisconnected
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.view_graph import (
-    RelativePose,
-    _gaps,
-    _open_tie,
     initial_poses,
     locate_boards_jointly,
     view_graph,
@@ -49,18 +46,6 @@ def test_pairs_are_tied_by_the_boards_they_saw_at_one_moment() -> None:
     assert sorted(map(sorted, graph.edges)) == [["a", "b"], ["b", "c"]]
     assert graph.edges["a", "b"]["targets"] == [("s1", "board")]
     assert set(graph.nodes) == set("abcd")
-
-
-def test_displacements_of_many_are_those_of_each() -> None:
-    rng = np.random.default_rng(2)
-    several = [
-        RigidTransform.from_rotation_vector(rng.uniform(-1.5, 1.5, 3), rng.uniform(-90, 90, 3))
-        for _ in range(9)
-    ]
-    found = _gaps(several[0], several, 700.0)
-    truth = [max_displacement_mm(several[0], other, 700.0) for other in several]
-    np.testing.assert_allclose(found, truth, atol=0.1)
-    assert found.max() > 900.0
 
 
 def test_poses_follow_along_a_chain_of_shared_boards() -> None:
@@ -119,29 +104,6 @@ def test_a_board_numbered_from_its_other_end_is_numbered_as_the_other_pairs_see_
         seen = PLACED[one.pair] @ one.camera_from_board
         np.testing.assert_allclose(seen.matrix, boards["s1", "board"].matrix, atol=1e-6)
         np.testing.assert_allclose(one.points, kept[0].points, atol=1e-9)
-
-
-def said_of(shots: int, agreeing: int) -> str:
-    """What is said of a tie that boards which may be numbered from either end leave open."""
-    targets = tuple((f"s{k}", "b") for k in range(shots))
-    pose = RigidTransform.identity()
-    tie = RelativePose(pose, targets, targets[:agreeing], agreeing, 40, True)
-    return str(_open_tie(dict.fromkeys("ba", pose), {"c": pose}, tie))
-
-
-def test_what_leaves_a_tie_open_is_told() -> None:
-    for shots in (1, 2):
-        words = said_of(shots, 1)
-        assert "the relative pose of a, b and c stays open" in words
-        assert "at best" not in words
-    words = said_of(3, 1)
-    assert "no two shots agree on the relative pose of a, b and c" in words
-    assert "(shots s0, s1, s2)" in words
-    words = said_of(4, 2)
-    assert "stays open" in words
-    assert "(shots s0, s1, s2, s3; at best s0, s1 agree)" in words
-    assert "at best" not in said_of(2, 2)
-    assert "(shots s0, s1, s2, s3, s4, s5; at best s0, s1 agree)" in said_of(9, 2)
 
 
 def test_one_board_with_one_numbering_ties_two_pairs() -> None:

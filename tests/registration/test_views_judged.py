@@ -21,8 +21,6 @@ from bodyscan.registration.rig_lenses import (
 from bodyscan.registration.rig_solve import collect_corners
 from bodyscan.registration.view_consistency import (
     ConsistentSolve,
-    _wrong_squares,
-    error_limit,
     solve_consistently,
 )
 
@@ -77,62 +75,33 @@ def keys_of(numbers: Set[int]) -> set[ViewKey]:
 ALL = set(range(8))
 
 
-def test_a_solve_that_finds_nothing_wrong_stands(monkeypatch: pytest.MonkeyPatch) -> None:
-    found, given = solve(monkeypatch, [set()])
-    assert given == [ALL]
-    assert found.wrong == frozenset()
-    assert found.kept(VIEWS) == VIEWS
-
-
-def test_a_wrong_view_is_left_out_of_the_next_solve(monkeypatch: pytest.MonkeyPatch) -> None:
-    found, given = solve(monkeypatch, [{3}, {3}])
-    assert given == [ALL, ALL - {3}]
-    assert found.wrong == keys_of({3})
-    assert found.notes == ("[3]",)
-    assert found.kept(VIEWS) == [one for one in VIEWS if one.shot != "s3"]
-
-
-def test_a_view_comes_back_in_where_it_fits_after_all(monkeypatch: pytest.MonkeyPatch) -> None:
-    found, given = solve(monkeypatch, [{3, 5}, {3}, {3}])
-    assert given == [ALL, ALL - {3, 5}, ALL - {3}]
-    assert found.wrong == keys_of({3})
-    found, given = solve(monkeypatch, [set(), set()], wrong={2})
-    assert given == [ALL - {2}, ALL]
-    assert found.wrong == frozenset()
-
-
-def test_what_comes_and_goes_is_out_in_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    found, given = solve(monkeypatch, [{3}, {5}, {3}, {5}])
-    # From the third round on none comes back.
-    assert given == [ALL, ALL - {3}, ALL - {5}, ALL - {3, 5}]
-    assert found.wrong == keys_of({3, 5})
-
-
-def test_where_most_views_are_wrong_no_further_solve_is_asked(
+@pytest.mark.parametrize(
+    ("before", "judged", "without", "wrong"),
+    [
+        (set(), [set()], [set()], set()),
+        (set(), [{3}, {3}], [set(), {3}], {3}),
+        (set(), [{3, 5}, {3}, {3}], [set(), {3, 5}, {3}], {3}),  # a view that fits after all
+        ({2}, [set(), set()], [{2}, set()], set()),
+        # From the third round on none comes back.
+        (set(), [{3}, {5}, {3}, {5}], [set(), {3}, {5}, {3, 5}], {3, 5}),
+        # Where most views are wrong no further solve follows.
+        ({7}, [{0, 1, 2, 3, 4}], [{7}], {0, 1, 2, 3, 4, 7}),
+        (set(), [{0, 1, 2, 3}, {0, 1, 2, 3}], [set(), {0, 1, 2, 3}], {0, 1, 2, 3}),
+    ],
+)
+def test_wrong_views_are_left_out_and_come_back_where_they_fit(
+    before: set[int],
+    judged: list[set[int]],
+    without: list[set[int]],
+    wrong: set[int],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    found, given = solve(monkeypatch, [{0, 1, 2, 3, 4}], wrong={7})
-    assert given == [ALL - {7}]
-    assert found.wrong == keys_of({0, 1, 2, 3, 4, 7})
-    half, given = solve(monkeypatch, [{0, 1, 2, 3}, {0, 1, 2, 3}])
-    assert len(given) == 2
-    assert half.wrong == keys_of({0, 1, 2, 3})
-
-
-def test_a_view_is_wrong_from_six_times_the_usual_error_and_a_fifth_of_a_pixel_on() -> None:
-    assert error_limit(np.array([0.05, 0.1, 3.0])) == pytest.approx(0.6)
-    assert error_limit(np.array([0.02, 0.03, 0.03])) == 0.2
-
-
-def test_a_board_of_the_same_other_size_in_three_shots_has_other_squares() -> None:
-    same = [("b", 1.021), ("b", 1.020), ("b", 1.024), ("c", 0.9), ("c", 0.9)]
-    (said,) = _wrong_squares(same)
-    assert said.startswith("board b has squares 1.021 times as large as the rig file says")
-    assert "in 3 shots" in said
-    assert list(_wrong_squares([("b", 1.02), ("b", 1.03), ("b", 1.01), ("b", 1.04)])) == []
-    # Most of them must agree to half a percent.
-    (said,) = _wrong_squares([("b", 1.020), ("b", 1.022), ("b", 1.018), ("b", 1.06)])
-    assert "1.021 times" in said
+    """judged: the wrong views that each round finds; without: those that each solve leaves out."""
+    found, given = solve(monkeypatch, judged, wrong=before)
+    assert given == [ALL - out for out in without]
+    assert found.wrong == keys_of(wrong)
+    assert found.notes == (f"{sorted(judged[-1])}",)
+    assert found.kept(VIEWS) == [one for k, one in enumerate(VIEWS) if k not in wrong]
 
 
 def test_lenses_that_boards_call_for_are_told_with_what_speaks_for_them() -> None:
