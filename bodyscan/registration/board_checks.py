@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
-from bodyscan.boards.board_layout import corner_grid, corners_per_face
+from bodyscan.boards.board_layout import corners_per_face
 from bodyscan.boards.view import BoardView
 from bodyscan.rig.board import Board
 from bodyscan.rig.rig import Rig
@@ -122,34 +122,3 @@ def _notes_of_board(board: Board, views: Sequence[BoardView]) -> Iterator[str]:
             f"board {board.name} has markers below its last row in {where(beyond)}: it seems to have "
             f"more than {board.rows} rows of squares"
         )
-    if board.kind != "checkerboard":
-        yield from _find_unobserved_lines(board, views)
-
-
-def _find_unobserved_lines(board: Board, views: Sequence[BoardView]) -> Iterator[str]:
-    """Lines on a last row or column of the described board that no view shows."""
-    columns, rows = corner_grid(board)
-    for face in range(board.faces):
-        counts_by_corner = np.zeros((rows, columns), np.int64)
-        for view in views:
-            ids = view.corner_ids[view.corner_ids // corners_per_face(board) == face]
-            np.add.at(counts_by_corner.reshape(-1), ids % corners_per_face(board), 1)
-        for name, described, counts in (
-            ("row", board.rows, counts_by_corner.sum(axis=1)),
-            ("column", board.columns, counts_by_corner.sum(axis=0)),
-        ):
-            used = np.flatnonzero(counts)
-            if not len(used):
-                continue
-            missing = len(counts) - 1 - used[-1]
-            neighbour = (
-                counts_by_corner[used[-1]] if name == "row" else counts_by_corner[:, used[-1]]
-            )
-            # The line beside it must be in three views before a missing last line counts.
-            if missing and np.median(neighbour) >= 3:
-                lines = "line" if missing == 1 else f"{missing} lines"
-                yield (
-                    f"board {board.name}: the last {lines} of corners along its {name}s was never "
-                    f"found, the one beside it in {int(np.median(neighbour))} views. Possible cause: "
-                    f"fewer than {described} {name}s"
-                )

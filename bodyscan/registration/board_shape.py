@@ -335,11 +335,9 @@ def _hold_out(
             of_board = [view for view in views if view.target == target]
             true = [apply_shape(view, shaped.shapes) for view in of_board]
             root_from_board = solution.root_from_board[target]
-            flat_residuals.append(
-                np.concatenate(fit_board(of_board, flat, root_from_board).residuals)
-            )
+            flat_residuals.append(np.concatenate(fit_board(of_board, flat, root_from_board)))
             shaped_residuals.append(
-                np.concatenate(fit_board(true, shaped.solution, root_from_board).residuals)
+                np.concatenate(fit_board(true, shaped.solution, root_from_board))
             )
             part.append(np.full(len(flat_residuals[-1]), targets.index(target)))
     every = ResidualPair(

@@ -46,8 +46,7 @@ class RigCalibration:
     failed: pairs that could not be calibrated, with the reason.
     notes: views that were dropped, and other things a builder should know.
     advice: how well the pairs' poses are known, and what would help most, in words.
-    seen: the corners that the joint solve used, by pair; empty in calibrations stored before
-        corners were kept.
+    observed: the corners that the joint solve used, by pair; empty in old calibrations.
     """
 
     rig: Rig
@@ -58,7 +57,7 @@ class RigCalibration:
     failed: dict[str, str]
     notes: tuple[str, ...]
     advice: tuple[str, ...] = ()
-    seen: dict[str, ObservedCorners] = field(default_factory=dict)
+    observed: dict[str, ObservedCorners] = field(default_factory=dict)
 
     @property
     def is_import(self) -> bool:

@@ -170,7 +170,7 @@ def _solve(
         limit_px=error_limit(single_view_errors(kept, cameras)),
     )
     judged = solve(resolved, solution, wrong=[view.key for view in gross])
-    shaped = ShapedSolution(judged.solution, judged.kept(resolved), {}, ())
+    shaped = ShapedSolution(judged.solution, judged.select_consistent(resolved), {}, ())
     lenses: ChosenLenses | None = None
     # If pairs are to be left out, the others are solved again anyway.
     if several and not _find_unsynchronised(shaped.views, _select_rejected(resolved, judged)):
@@ -185,7 +185,7 @@ def _solve(
             true = [apply_shape(view, shaped.shapes) for view in resolved]
             judged = solve(true, solution, wrong=judged.wrong)
             shaped = reestimate_board_shapes(
-                judged.kept(resolved), judged.solution, shaped, root=root
+                judged.select_consistent(resolved), judged.solution, shaped, root=root
             )
     return _Solved(judged, shaped, _select_rejected(resolved, judged), lenses)
 

@@ -6,28 +6,27 @@ against what any camera, pose and covariance must satisfy; a hash also shows whe
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import numpy as np
 
-from bodyscan.arrays import Array
+from bodyscan.arrays import Array, Floats
 from bodyscan.calibration.pair import PairCalibration
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lens_sheets import FRAME, LENS_SIGMAS, SCALE, LensSheets
-from bodyscan.geometry.light_planes import LightPlanes, LightSheets
+from bodyscan.geometry.light_planes import LightPlanes
 from bodyscan.geometry.smooth_sheets import SmoothSheets
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.rig_calibration import ObservedCorners, RigCalibration
 from bodyscan.rig.pair import Pair
-from bodyscan.stripes.stripe_code import StripeCode
 
 ORTHONORMAL = 1e-6  # rounding leaves 1e-15; at 2 m this is 2 um
 SYMMETRIC, POSITIVE = 1e-6, -1e-6  # of a correlation, which is 1 at most; solves leave 1e-9
-MAX_ASPECT = 2.0  # ratio of the two focal lengths: cameras that skip every other line
-MAX_DISTANCE_MM = 1e5  # 100 m from the rig's centre
 
 Fault = tuple[str, str]
 """Where, as in `pairs.p1.camera`, and what is wrong, in words that follow it."""
+
+NOT_A_NUMBER = "holds what is not a number"
 
 
 def find_faults(calibration: RigCalibration) -> Iterator[Fault]:
@@ -48,29 +47,28 @@ def find_faults(calibration: RigCalibration) -> Iterator[Fault]:
     yield from covariance_faults(calibration.covariance.matrix, size, "placing_covariance")
     for (shot, board), pose in calibration.rig_from_board.items():
         yield from pose_faults(pose, f"boards: {board} in {shot}")
-    for name, corners in calibration.seen.items():
+    for name, corners in calibration.observed.items():
         yield from _corner_faults(corners, len(calibration.rig_from_board), f"{name}/seen")
 
 
 def camera_faults(camera: Camera, pair: Pair, where: str) -> Iterator[Fault]:
-    """Faults of a camera, given the image size and pair that the rig file describes."""
-    size = (camera.width, camera.height)
-    if size != (pair.camera.width, pair.camera.height):
+    """Faults of a camera, given the pair that the rig file describes."""
+    size, described = (camera.width, camera.height), (pair.camera.width, pair.camera.height)
+    if size != described:
         yield (
             where,
-            (
-                f"is of {size[0]} x {size[1]} pixels, but its rig says "
-                f"{pair.camera.width} x {pair.camera.height}"
-            ),
+            f"is of {size[0]} x {size[1]} pixels, but its rig says {described[0]} x {described[1]}",
         )
         return
-    for name, length in (("alpha", size[0]), ("beta", size[1])):
-        focal = getattr(camera, name)
+    for name, focal, length in zip(
+        ("alpha", "beta"), (camera.alpha, camera.beta), size, strict=True
+    ):
         # Fields of view of 150 and 1 degrees.
         if not length / 7.5 < focal < length / 0.0175:
             yield f"{where}.{name}", f"is not a focal length for {length} pixels (got {focal:g})"
             return
-    if not 1.0 / MAX_ASPECT < camera.alpha / camera.beta < MAX_ASPECT:
+    # Cameras that skip every other line have a ratio of 2.
+    if not 0.5 < camera.alpha / camera.beta < 2.0:
         yield where, f"has focal lengths too unlike (got {camera.alpha:g}, {camera.beta:g})"
     # Axes 6 degrees off a right angle; sensors are cut far better.
     if not abs(camera.gamma) < 0.1 * camera.alpha:
@@ -80,7 +78,7 @@ def camera_faults(camera: Camera, pair: Pair, where: str) -> Iterator[Fault]:
         if not -length < value < 2.0 * length:
             yield f"{where}.{name}", f"lies far outside of the picture (got {value:g})"
     # Rays must pass through half of the image: less is a slip, not a lens.
-    if not np.all(np.isfinite(camera.lens.coefficients)) or _share_of_rays(camera) < 0.5:
+    if not _is_finite(camera.lens.coefficients) or _share_of_rays(camera) < 0.5:
         values = ", ".join(f"{value:g}" for value in camera.lens.coefficients)
         yield where, f"has a lens that folds its picture over (got {values})"
 
@@ -88,28 +86,28 @@ def camera_faults(camera: Camera, pair: Pair, where: str) -> Iterator[Fault]:
 def pose_faults(pose: RigidTransform, where: str) -> Iterator[Fault]:
     """Faults of a pose: it must be a rotation with a translation of plausible size."""
     rotation = pose.rotation
-    if not (np.all(np.isfinite(rotation)) and np.all(np.isfinite(pose.translation))):
-        yield where, "holds what is not a number"
+    if not _is_finite(rotation, pose.translation):
+        yield where, NOT_A_NUMBER
     elif np.abs(rotation @ rotation.T - np.eye(3)).max() > ORTHONORMAL:
         yield where, "is not a rotation: its rows are not of length 1 and square to each other"
     elif np.linalg.det(rotation) < 0.0:
         yield where, "is not a rotation: it mirrors"
-    elif np.abs(pose.translation).max() > MAX_DISTANCE_MM:
-        yield where, f"lies more than {MAX_DISTANCE_MM / 1000.0:g} m away"
+    elif np.abs(pose.translation).max() > 1e5:
+        yield where, "lies more than 100 m away"
 
 
 def covariance_faults(matrix: Array, size: int, where: str) -> Iterator[Fault]:
     """Faults of a covariance (size, size); all zero is allowed (nothing is uncertain)."""
     if not isinstance(matrix, np.ndarray) or matrix.shape != (size, size):
         yield where, f"is of shape {np.shape(matrix)}, but {size} x {size} is wanted"
-    elif matrix.dtype.kind not in "fiu" or not np.all(np.isfinite(matrix)):
-        yield where, "holds what is not a number"
+    elif matrix.dtype.kind not in "fiu" or not _is_finite(matrix):
+        yield where, NOT_A_NUMBER
     elif matrix.diagonal().min(initial=0.0) < 0.0:
         yield where, "holds a negative variance"
     else:
-        matrix = matrix.astype(np.float64)
-        sigmas = np.sqrt(matrix.diagonal())
-        correlation = matrix / np.outer(*[np.where(sigmas > 0.0, sigmas, 1.0)] * 2)
+        sigmas = np.sqrt(matrix.diagonal().astype(np.float64))
+        sigmas[sigmas == 0.0] = 1.0
+        correlation = matrix / np.outer(sigmas, sigmas)
         if np.abs(correlation - correlation.T).max(initial=0.0) > SYMMETRIC:
             yield where, "is not symmetric"
         elif size and np.linalg.eigvalsh(correlation).min() < POSITIVE * size:
@@ -139,23 +137,18 @@ def _light_faults(pair: PairCalibration, described: Pair) -> Iterator[Fault]:
             "and the rig's projector do not agree on whether there is one",
         )
         return
-    sheets: Sequence[tuple[str, LightSheets | None, StripeCode | None]] = (
-        ("light", pair.sheets, code),
-        ("crossing", pair.crossing, code.crossing if code else None),
-    )
-    for what, light, described_code in sheets:
+    crossing = code.crossing if code else None
+    for what, light, shown in (("light", pair.sheets, code), ("crossing", pair.crossing, crossing)):
         where = f"pairs.{pair.name}.{what}"
         if light is None:
             continue
-        if described_code is None:
+        if shown is None:
             yield where, "is of stripes that the rig's projector does not show"
-        elif (light.direction, light.stripes) != (described_code.direction, described_code.stripes):
+        elif (light.direction, light.stripes) != (shown.direction, shown.stripes):
             yield (
                 where,
-                (
-                    f"is of {light.stripes} {light.direction} stripes, but the rig's projector shows "
-                    f"{described_code.stripes} {described_code.direction}"
-                ),
+                f"is of {light.stripes} {light.direction} stripes, but the rig's projector shows "
+                f"{shown.stripes} {shown.direction}",
             )
         elif isinstance(light, LightPlanes):
             yield from _plane_faults(light, where)
@@ -170,50 +163,48 @@ def _plane_faults(light: LightPlanes, where: str) -> Iterator[Fault]:
         return
     measured = ~np.isnan(planes).all(axis=1)
     known, variances = planes[measured], covariance[measured]
+    largest = np.abs(variances).max(axis=(1, 2))
     if not known.size:
         yield where, "has no plane at all"
-    elif not (np.all(np.isfinite(known)) and np.all(np.isfinite(variances))):
-        yield where, "holds what is not a number"
+    elif not _is_finite(known, variances):
+        yield where, NOT_A_NUMBER
     elif np.abs(np.linalg.norm(known[:, :3], axis=1) - 1.0).max() > ORTHONORMAL:
         yield where, "has planes whose normals are not of length 1"
-    elif (
-        np.abs(variances - variances.transpose(0, 2, 1)).max() > SYMMETRIC * np.abs(variances).max()
-    ):
+    elif np.abs(variances - variances.transpose(0, 2, 1)).max() > SYMMETRIC * largest.max():
         yield where, "has a covariance that is not symmetric"
-    elif np.any(
-        np.linalg.eigvalsh(variances)[:, 0] < POSITIVE * np.abs(variances).max(axis=(1, 2))
-    ):
+    elif np.any(np.linalg.eigvalsh(variances)[:, 0] < POSITIVE * largest):
         yield where, "has a covariance that is not positive semidefinite"
 
 
 def _smooth_faults(light: SmoothSheets, where: str) -> Iterator[Fault]:
-    parameters = light.parameters
-    size = len(parameters)
+    parameters, size = light.parameters, len(light.parameters)
     if isinstance(light, LensSheets):
-        size += FRAME
-        if not SCALE <= len(parameters) <= SCALE + len(LENS_SIGMAS):
-            yield where, f"has {len(parameters)} parameters"
+        if not SCALE <= size <= SCALE + len(LENS_SIGMAS):
+            yield where, f"has {size} parameters"
             return
+        size += FRAME
     if parameters.ndim != 1 or light.middle.shape != (3,):
         yield where, f"has arrays of shapes {parameters.shape} and {light.middle.shape}"
-    elif not (np.all(np.isfinite(parameters)) and np.all(np.isfinite(light.middle))):
-        yield where, "holds what is not a number"
+    elif not _is_finite(parameters, light.middle):
+        yield where, NOT_A_NUMBER
     else:
         yield from pose_faults(light.projector_from_camera, f"{where}: projector_from_camera")
         yield from covariance_faults(light.covariance, size, f"{where}: covariance")
 
 
 def _corner_faults(corners: ObservedCorners, boards: int, where: str) -> Iterator[Fault]:
-    count = len(corners.target)
-    shapes = (corners.pixels.shape, corners.residuals_px.shape, corners.target.shape)
-    if shapes != ((count, 2), (count, 2), (count,)):
+    target = corners.target
+    shapes = (corners.pixels.shape, corners.residuals_px.shape, target.shape)
+    if shapes != ((len(target), 2), (len(target), 2), (len(target),)):
         yield where, f"has arrays of shapes {', '.join(map(str, shapes))}"
-    elif not (np.all(np.isfinite(corners.pixels)) and np.all(np.isfinite(corners.residuals_px))):
-        yield where, "holds what is not a number"
-    elif corners.target.dtype.kind not in "iu" or np.any(
-        (corners.target < 0) | (corners.target >= boards)
-    ):
+    elif not _is_finite(corners.pixels, corners.residuals_px):
+        yield where, NOT_A_NUMBER
+    elif target.dtype.kind not in "iu" or np.any((target < 0) | (target >= boards)):
         yield where, "names boards that there are not"
+
+
+def _is_finite(*arrays: Array | Floats) -> bool:
+    return all(np.all(np.isfinite(array)) for array in arrays)
 
 
 def _share_of_rays(camera: Camera) -> float:

@@ -100,7 +100,7 @@ def save_calibration(calibration: RigCalibration, folder: Path) -> Path:
         if pair.rays is not None:
             arrays[f"{name}/rays/noise_px"] = pair.rays.noise_px
             arrays[f"{name}/rays/lens_px"] = pair.rays.lens_px
-    for name, corners in calibration.seen.items():
+    for name, corners in calibration.observed.items():
         for part in fields(corners):
             arrays[f"{name}/seen/{part.name}"] = getattr(corners, part.name)
     write_npz(folder / ARRAYS_NAME, **arrays)

@@ -278,32 +278,15 @@ def _refuse_disconnected(graph: nx.Graph) -> None:
 
 
 def _open_tie(first: Group, second: Group, tie: RelativePose) -> RigDisconnected:
-    remedy = (
-        "capture one or two more shots that both see, the board tilted differently; or use a ChArUco "
-        "board, or one whose columns and rows differ in parity"
-    )
-    found = f"shots {_shots(tie.targets)}"
-    # Of three shots taken at the same moments two agree, whichever end they are numbered from.
-    if tie.votes == 1 and len(tie.targets) >= 3:
-        return RigDisconnected(
-            f"no two shots agree on the relative pose of {', '.join(sorted(first))} and "
-            f"{', '.join(sorted(second))}, whichever end their board is numbered from ({found})",
-            remedy="look whether their pictures were taken together and bear the names of the same "
-            "shots (one camera's numbers one further on, say); synchronise the cameras, or hold the "
-            f"board still until all have taken their picture. Else {remedy}",
-        )
-    if 1 < tie.votes < len(tie.targets):
-        # Shots that agree with no other, whichever end they are numbered from, may be wrong.
-        found += f"; at best {_shots(tie.agreeing)} agree"
-        remedy = (
-            "look whether the pictures of the other shots were taken together and bear each other's "
-            f"names (two shots exchanged, say): correct these or leave them out. Else {remedy}"
-        )
     return RigDisconnected(
-        f"the relative pose of {', '.join(sorted(first))} and {', '.join(sorted(second))} stays open: "
-        "their shared board may be numbered from either end, and their views do not settle which "
-        f"({found})",
-        remedy=remedy,
+        f"the relative pose of {', '.join(sorted(first))} and {', '.join(sorted(second))} stays "
+        "open: their shared board may be numbered from either end, and their views do not settle "
+        f"which (shots {_shots(tie.targets)}; at best {_shots(tie.agreeing)} agree). Possible "
+        "causes: too few shared shots, pictures not taken together, or shots named differently in "
+        "different cameras",
+        remedy="look whether these pictures were taken together and bear the same shots' names. "
+        "Then capture one or two more shots that both see, the board tilted differently; or use a "
+        "ChArUco board, or one whose columns and rows differ in parity",
     )
 
 

@@ -22,8 +22,8 @@ DASHES = ("-", "--", "-.", ":")
 def coverage_chart(calibration: RigCalibration) -> bytes:
     """For each camera: its image, and where each view of a board lay in it."""
     with style():
-        figure, axes = grid_of(len(calibration.seen), 4, (2.6, 2.3))
-        for axis, (name, seen) in zip(axes, calibration.seen.items(), strict=True):
+        figure, axes = grid_of(len(calibration.observed), 4, (2.6, 2.3))
+        for axis, (name, seen) in zip(axes, calibration.observed.items(), strict=True):
             views = [seen.pixels[seen.target == k] for k in np.unique(seen.target)]
             hulls = [cv2.convexHull(view).reshape(-1, 2) for view in views]
             axis.add_collection(
@@ -40,7 +40,7 @@ def residual_chart(calibration: RigCalibration) -> tuple[bytes, float]:
     (arrows). Also returns the factor by which the arrows are magnified."""
     maps = {
         name: _residual_map(seen, calibration.pairs[name].camera)
-        for name, seen in calibration.seen.items()
+        for name, seen in calibration.observed.items()
     }
     rms_known = _finite([rms for rms, _, _ in maps.values()])
     lengths = _finite([np.linalg.norm(mean, axis=-1) for _, mean, _ in maps.values()])
@@ -99,9 +99,9 @@ def planes_chart(calibration: RigCalibration) -> bytes:
 
 
 def shared_boards(calibration: RigCalibration) -> Array:
-    """Number of boards (P, P) that two pairs saw at the same moment, in the order of `seen`; zero on
+    """Number of boards (P, P) that two pairs saw at the same moment, in the order of `observed`; zero on
     the diagonal."""
-    seen = [set(one.target.tolist()) for one in calibration.seen.values()]
+    seen = [set(one.target.tolist()) for one in calibration.observed.values()]
     count = np.array([[float(len(a & b)) for b in seen] for a in seen])
     np.fill_diagonal(count, 0.0)
     return count

@@ -128,7 +128,7 @@ def _advice(calibration: RigCalibration) -> list[Block]:
 
 
 def _boards(calibration: RigCalibration) -> list[Block]:
-    if not calibration.seen:
+    if not calibration.observed:
         why = (
             "This calibration was imported: no image of a board was read. `bodyscan check-calibration` "
             "tests it with a few."
@@ -178,7 +178,7 @@ def _planes(calibration: RigCalibration) -> list[Block]:
 
 
 def _shared_boards(calibration: RigCalibration) -> list[Block]:
-    if len(calibration.seen) < 2:
+    if len(calibration.observed) < 2:
         return [Lines(("There is nothing to share.",))]
     shared = draw.shared_boards(calibration)
     counts = np.where(shared > 0, shared, np.nan)
@@ -186,7 +186,7 @@ def _shared_boards(calibration: RigCalibration) -> list[Block]:
         Picture(
             "View graph: boards in common",
             "Number of boards that two pairs saw at the same moment, which connect them. Empty: none.",
-            charts.matrix(list(calibration.seen), counts, "boards", ".0f"),
+            charts.matrix(list(calibration.observed), counts, "boards", ".0f"),
         )
     ]
 

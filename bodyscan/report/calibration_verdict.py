@@ -106,7 +106,7 @@ def grade_calibration(calibration: RigCalibration) -> Verdict:
 
 def _figures(calibration: RigCalibration, name: str) -> PairFigures:
     pair = calibration.pairs[name]
-    quality, camera, seen = pair.quality, pair.camera, calibration.seen.get(name)
+    quality, camera, seen = pair.quality, pair.camera, calibration.observed.get(name)
     position = calibration.rig_from_camera[name].translation
     striped, ours = pair.sheets is not None, not quality.imported
     sigma = position_sigma(calibration.covariance, name, position)

@@ -112,7 +112,7 @@ def solve_boards(
         solution.rig_from_board,
         {name: captures.relative(reason) for name, reason in failed.items()},
         tuple(captures.relative(note) for note in notes),
-        seen=collect_corners(solution, pairs.value),
+        observed=collect_corners(solution, pairs.value),
     )
     for where, what in find_faults(calibration):
         raise FailedWork(

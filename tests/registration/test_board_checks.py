@@ -40,26 +40,6 @@ def said(*views: BoardView) -> Sequence[str]:
     return appearance_notes(RIG, views)
 
 
-def test_a_last_line_that_three_views_lack_is_not_there() -> None:
-    short = view(COLUMNS, ROWS - 1)
-    (note,) = said(short, short, short)
-    assert note.startswith("board m: the last line of corners along its rows was never found")
-    assert note.endswith("in 3 views. Possible cause: fewer than 8 rows")
-    assert not said(short, short)
-    assert not said(short, short, short, view(COLUMNS, ROWS))
-    narrow = view(COLUMNS - 2, ROWS)
-    (note,) = said(narrow, narrow, narrow)
-    assert "the last 2 lines of corners along its columns" in note
-    assert note.endswith("fewer than 9 columns")
-
-
-def test_a_line_beside_it_that_was_mostly_hidden_says_nothing() -> None:
-    """The median of its corners counts."""
-    part = view(COLUMNS // 2 - 1, ROWS - 1)
-    rest = view(COLUMNS, ROWS - 2)
-    assert not any("rows" in note for note in said(part, part, part, rest, rest, rest)[:1])
-
-
 def test_every_other_look_is_told_with_how_many_views_had_it() -> None:
     looks = {
         "white on black in 2 views (p)": Appearance(inverted=True),
@@ -73,34 +53,6 @@ def test_every_other_look_is_told_with_how_many_views_had_it() -> None:
         assert words in note
         assert "Other cameras" not in note  # the same camera saw it both ways
     assert not said(view(COLUMNS, ROWS))
-
-
-def test_of_the_line_beside_the_missing_ones_it_counts_how_often_it_was_seen() -> None:
-    """However often those before it were."""
-    for last, before in ((view(COLUMNS - 1, ROWS), view(COLUMNS - 2, ROWS)),
-                         (view(COLUMNS, ROWS - 1), view(COLUMNS, ROWS - 2))):  # fmt: skip
-        assert not said(*[last] * 2, *[before] * 5)
-        (note,) = said(*[last] * 3, *[before] * 5)
-        assert "the last line of corners" in note
-        assert "in 3 views" in note
-
-
-def test_either_face_of_a_board_may_lack_lines_and_a_plain_board_is_seen_whole_or_not_at_all() -> (
-    None
-):
-    both = MARKED.model_copy(update={"faces": 2})
-    ids = (np.arange(ROWS - 1)[:, None] * COLUMNS + np.arange(COLUMNS)).ravel()
-    for face in (0, 1):
-        of_face = BoardView("p", "s", "m", ids + face * COLUMNS * ROWS, np.zeros((len(ids), 2)))
-        whole = np.arange(COLUMNS * ROWS) + (1 - face) * COLUMNS * ROWS
-        of_other = BoardView("p", "s", "m", whole, np.zeros((len(whole), 2)))
-        rig = RIG.model_copy(update={"boards": (both,)})
-        (note,) = appearance_notes(rig, [of_face] * 3 + [of_other] * 3)
-        assert "fewer than 8 rows" in note
-    plain = MARKED.model_copy(update={"kind": "checkerboard", "marker_mm": None})
-    assert not appearance_notes(
-        RIG.model_copy(update={"boards": (plain,)}), [view(COLUMNS, ROWS - 1)] * 5
-    )
 
 
 def test_where_a_camera_saw_a_board_both_ways_round_the_rarer_is_left_out() -> None:

@@ -343,7 +343,7 @@ def test_a_kill_while_it_is_replaced_leaves_one_of_the_two(
     copy: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     former = load_calibration(copy)
-    new = replace(former, seen={})  # so that the arrays differ
+    new = replace(former, observed={})  # so that the arrays differ
 
     def killed(*_: Any) -> None:
         raise KeyboardInterrupt
@@ -352,7 +352,7 @@ def test_a_kill_while_it_is_replaced_leaves_one_of_the_two(
     monkeypatch.setattr("bodyscan.registration.storage.write_json", killed)
     with pytest.raises(KeyboardInterrupt):
         save_calibration(new, copy)
-    assert sorted(load_calibration(copy).seen) == sorted(former.pairs)
+    assert sorted(load_calibration(copy).observed) == sorted(former.pairs)
     monkeypatch.undo()
     save_calibration(new, copy)
-    assert load_calibration(copy).seen == {}
+    assert load_calibration(copy).observed == {}

@@ -101,7 +101,6 @@ def test_a_different_board_in_one_shot(seen: Seen, size: float) -> None:
     placed = place(changed)
     (note,) = placed.notes
     assert f"shot {shot}" in note
-    assert f"{size:.3f} times" in note
     assert all(name in note for name in pairs)
     assert rms(placed) < 1.2 * clean
 
@@ -155,7 +154,7 @@ def test_one_of_two_boards_with_other_squares_than_the_rig_file_says(seen: Seen)
     other = CHARUCO.model_copy(update={"name": "other", "first_marker": 200})
     rig = ring_rig(PLACINGS).model_copy(update={"boards": (CHARUCO, other)})
     placed = solve_rig(rig, changed, CAMERAS)
-    (said,) = [note for note in placed.notes if "square_mm" in note]
-    assert "board other has squares 1.030 times" in said
+    shots = {view.shot for view in views} & second
+    assert all(any(f"shot {s}: the pose of board other" in n for n in placed.notes) for s in shots)
     without = place([v for v in views if v.shot not in second])
     assert rms(placed) < 1.2 * max(rms(without), clean)

@@ -119,24 +119,21 @@ def test_an_ambiguous_board_seen_once_is_not_guessed() -> None:
         solve_rig(rig, views, cameras)
 
 
-@pytest.mark.parametrize("on", [1, 2])
-def test_shots_that_are_all_numbered_further_on_are_told_from_an_open_numbering(on: int) -> None:
-    """Of a plain board; the remedy said was another board."""
+def test_shots_numbered_one_further_on_in_one_camera_leave_a_plain_board_open() -> None:
     board = Board(name="plain", columns=9, rows=7, square_mm=70)
     placings, cameras = ring_of_cameras(poles=1, heights=(900, 1100))
     views, _ = ring_views(placings, cameras, shots=60, board=board)
     seen = [{view.shot for view in views if view.pair == name} for name in placings]
     shots = sorted(seen[0] & seen[1])[:6]
-    names = dict(zip(shots, [*shots[on:], *shots[:on]], strict=True))
+    names = dict(zip(shots, [*shots[1:], *shots[:1]], strict=True))
     views = [
         replace(view, shot=names[view.shot]) if view.pair == "p1-1" else view
         for view in views
         if view.shot in shots
     ]
     rig = ring_rig(placings).model_copy(update={"boards": (board,)})
-    with pytest.raises(RigDisconnected, match="no two shots agree") as caught:
+    with pytest.raises(RigDisconnected, match="shots named differently"):
         solve_rig(rig, views, cameras)
-    assert "one camera's numbers one further on" in str(caught.value)
 
 
 def test_a_corner_seen_only_once_does_no_harm() -> None:

@@ -142,7 +142,7 @@ def test_impossible_light_planes_are_named(light: LightPlanes | None, message: s
         rig_from_camera={"p": POSE},
         covariance=PoseCovariance(("p",), np.eye(6)),
         rig_from_board={},
-        seen={},
+        observed={},
     )
     found = messages(find_faults(calibration))
     assert message in found

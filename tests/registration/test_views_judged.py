@@ -101,7 +101,7 @@ def test_wrong_views_are_left_out_and_come_back_where_they_fit(
     assert given == [ALL - out for out in without]
     assert found.wrong == keys_of(wrong)
     assert found.notes == (f"{sorted(judged[-1])}",)
-    assert found.kept(VIEWS) == [one for k, one in enumerate(VIEWS) if k not in wrong]
+    assert found.select_consistent(VIEWS) == [one for k, one in enumerate(VIEWS) if k not in wrong]
 
 
 def test_lenses_that_boards_call_for_are_told_with_what_speaks_for_them() -> None:

@@ -96,7 +96,9 @@ def test_a_failed_pair_asks_for_a_new_calibration(calibration: RigCalibration) -
 def test_a_picture_that_boards_hardly_cover_is_named(calibration: RigCalibration) -> None:
     name = min(calibration.pairs)
     narrow = corners(calibration.pairs[name].camera, [0, 1], share=0.3)
-    verdict = grade_calibration(replace(calibration, seen=calibration.seen | {name: narrow}))
+    verdict = grade_calibration(
+        replace(calibration, observed=calibration.observed | {name: narrow})
+    )
     assert verdict.grade == "usable"
     # 30 % of the width and 80 % of the height.
     assert f"pair {name}: boards covered 2" in verdict.reasons[0]
@@ -130,9 +132,9 @@ def test_everything_is_said_and_read_back_from_disk(
     failed = replace(calibration, failed={"c9": "saw nothing"})
     save_calibration(failed, tmp_path)
     stored = load_calibration(tmp_path)
-    for name, seen in calibration.seen.items():
-        assert np.array_equal(stored.seen[name].pixels, seen.pixels)
-        assert np.array_equal(stored.seen[name].target, seen.target)
+    for name, seen in calibration.observed.items():
+        assert np.array_equal(stored.observed[name].pixels, seen.pixels)
+        assert np.array_equal(stored.observed[name].target, seen.target)
     text = render(calibration_page(tmp_path))
     assert text == render(calibration_page(tmp_path))
     for part in ("Verdict: recalibrate", "c9: saw nothing", "<li>n1</li>", "<li>a1</li>"):
@@ -142,7 +144,7 @@ def test_everything_is_said_and_read_back_from_disk(
 def test_a_calibration_of_before_has_a_report_too(
     calibration: RigCalibration, tmp_path: Path
 ) -> None:
-    save_calibration(replace(calibration, seen={}), tmp_path)
+    save_calibration(replace(calibration, observed={}), tmp_path)
     text = render(calibration_page(tmp_path))
     assert "calibrate again to see where the boards lay" in text
     assert "Sigma over the scan volume" in text

@@ -30,8 +30,8 @@ def report(workspace: Workspace, *arguments: object) -> str:
 
 def test_corners_are_kept_with_their_residuals(workspace: Workspace) -> None:
     calibration = load_calibration(workspace.folder / "calibration")
-    assert set(calibration.seen) == set(calibration.pairs)
-    for name, seen in calibration.seen.items():
+    assert set(calibration.observed) == set(calibration.pairs)
+    for name, seen in calibration.observed.items():
         quality, camera = calibration.pairs[name].quality, calibration.pairs[name].camera
         assert len(np.unique(seen.target)) == quality.poses
         assert seen.target.max() < len(calibration.rig_from_board)

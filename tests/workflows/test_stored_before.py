@@ -25,7 +25,7 @@ def calibration() -> RigCalibration:
 def test_a_calibration_gives_the_depths_that_it_was_fitted_for(calibration: RigCalibration) -> None:
     assert sorted(calibration.pairs) == ["p1-2", "p1-3", "p2-2", "p2-3"]
     for name, pair in calibration.pairs.items():
-        seen = calibration.seen[name]
+        seen = calibration.observed[name]
         assert np.sqrt(np.mean(seen.residuals_px**2)) == pytest.approx(
             pair.quality.corners_rms_px / np.sqrt(2.0), rel=0.2
         )
