@@ -9,14 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
 
 import numpy as np
 
 from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.least_squares import EXACT, Block, minimize
+from bodyscan.geometry.least_squares import EXACT, Block, Solution, minimize
 from bodyscan.geometry.transforms import RigidTransform, adjoint, twist_jacobian
 from bodyscan.geometry.uncertainty import PoseCovariance, point_covariance
 from bodyscan.registration.view_graph import Target
@@ -24,40 +23,29 @@ from bodyscan.registration.view_graph import Target
 Group = tuple[str, tuple[str, ...]]
 """A name to show, and the pairs that move as one."""
 
-SIGNIFICANT = 45.0
-"""Chi-squared with six degrees of freedom exceeds this once in twenty million by chance."""
-CORRELATED = 3.0
-"""Corners of one view share errors of lens and detector: this many count as one."""
-
 
 @dataclass(frozen=True, eq=False)
 class ObservedPose:
     """A board as one pair sees it.
 
-    covariance: (6, 6) of its motion in the camera frame (rotation vector in radians, translation in
-        mm).
+    whitener: (6, 6), from a motion of the board in the camera frame (rotation vector in radians,
+        translation in mm) to independent standard deviations.
     """
 
     pair: str
     target: Target
     camera_from_board: RigidTransform
-    covariance: Array
-
-    @cached_property
-    def whitener(self) -> Array:
-        return _whitener(self.covariance)
+    whitener: Array
 
 
 def observe_pose(view: LocatedView, camera: Camera, sigma_px: float) -> ObservedPose:
-    """A board's pose from a view's corners, each off by `sigma_px`, correlated as in CORRELATED."""
+    """A board's pose from a view's corners, each off by `sigma_px`."""
     points = view.camera_from_board.apply(view.points)
-    jacobian = camera.jacobians(points)[1] @ twist_jacobian(points)
-    jacobian = jacobian.reshape(-1, 6)
-    information = jacobian.T @ jacobian / (CORRELATED * sigma_px**2)
-    covariance = np.linalg.inv(information)
-    return ObservedPose(
-        view.pair, view.target, view.camera_from_board, np.asarray(covariance, np.float64)
-    )
+    jacobian = (camera.jacobians(points)[1] @ twist_jacobian(points)).reshape(-1, 6)
+    # Corners of one view share errors of lens and detector: three count as one.
+    information = jacobian.T @ jacobian / (3.0 * sigma_px**2)
+    whitener = np.linalg.cholesky(information).T
+    return ObservedPose(view.pair, view.target, view.camera_from_board, whitener)
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +55,6 @@ class Move:
     motion: in the rig frame, `new rig_from_camera = motion @ old`.
     covariance: (6, 6) of the motion's twist.
     shift_mm, sigma_mm: shift of the cameras' centroid, and its sigma over all axes.
-    turn_deg: angle of the rotation.
     """
 
     name: str
@@ -76,7 +63,11 @@ class Move:
     covariance: Array
     shift_mm: float
     sigma_mm: float
-    turn_deg: float
+
+    @property
+    def turn_deg(self) -> float:
+        """Angle of the rotation."""
+        return float(np.degrees(self.motion.angle))
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +76,7 @@ class Drift:
 
     moves: in the order found, the clearest first.
     rig_from_board: of the boards used.
-    misfit_before, misfit: RMS of what the views are off, in sigmas, before and after all moves.
+    misfit_before, misfit: RMS error of the views in sigmas, before and after all moves.
     lonely: pairs that share no board with another.
     """
 
@@ -112,37 +103,27 @@ def find_drift(
     shared = [pose for pose in poses if len({p.pair for p in poses if p.target == pose.target}) > 1]
     pairs = tuple(sorted({pose.pair for pose in shared}))
     lonely = tuple(sorted({pose.pair for pose in poses} - set(pairs)))
-    groups = _groups(pairs, poles)
-    state = _State.start(shared, pairs, rig_from_camera, prior)
-    fit = before = state.solve([])
+    problem = _Problem(shared, pairs, rig_from_camera, _whiten_prior(prior, pairs))
+    candidates = _groups(pairs, poles)
+    fit = before = problem.solve([])
     moved: list[Group] = []
-    while True:
-        candidates = [
-            group
-            for group in groups
-            if group not in moved
-            and not set(group[1]) & {p for _, group_pairs in moved for p in group_pairs}
-        ]
-        tried = [(state.solve([*moved, group]), group) for group in candidates]
-        if not tried:
-            break
-        best, group = min(tried, key=lambda one: one[0].cost)
-        if fit.cost - best.cost < SIGNIFICANT:
+    while candidates:
+        tried = [(problem.solve([*moved, group]), group) for group in candidates]
+        best, group = min(tried, key=lambda one: one[0].report.cost_after)
+        # Chi-squared with six degrees of freedom exceeds 45 once in twenty million by chance.
+        if fit.report.cost_after - best.report.cost_after < 45.0:
             break
         moved.append(group)
         fit = best
-    # Moves below 0.1 mm and 0.005 degrees, however significant, harm no scan.
-    moves = tuple(
-        move
-        for number, group in enumerate(moved)
-        if (move := state.move(group, fit, number)).shift_mm > 0.1 or move.turn_deg > 0.005
-    )
-    freedoms = max(6 * (len(shared) - len(fit.rig_from_board)), 1)
+        candidates = [other for other in candidates if not set(other[1]) & set(group[1])]
+    moves = (problem.move(group, fit, number) for number, group in enumerate(moved))
+    freedoms = max(6 * (len(shared) - len(fit.state.boards)), 1)
     return Drift(
-        moves,
-        fit.rig_from_board,
-        float(np.sqrt(before.cost / freedoms)),
-        float(np.sqrt(fit.cost / freedoms)),
+        # Moves below 0.1 mm and 0.005 degrees, however significant, harm no scan.
+        tuple(move for move in moves if move.shift_mm > 0.1 or move.turn_deg > 0.005),
+        fit.state.boards,
+        float(np.sqrt(before.report.cost_after / freedoms)),
+        float(np.sqrt(fit.report.cost_after / freedoms)),
         lonely,
     )
 
@@ -157,167 +138,106 @@ def _groups(pairs: Sequence[str], poles: Mapping[str, str]) -> list[Group]:
     return groups
 
 
-@dataclass(frozen=True, eq=False)
-class _Fit:
-    """cost: chi-squared.  motions: of each freed group, covariance (6G, 6G) of their twists."""
-
-    cost: float
-    motions: list[RigidTransform]
-    covariance: Array
-    rig_from_board: dict[Target, RigidTransform]
+def _whiten_prior(prior: PoseCovariance, pairs: Sequence[str]) -> Array:
+    """The matrix (6P, 6P) from the pairs' twists to independent standard deviations."""
+    if not pairs:
+        return np.zeros((0, 0))
+    # The pair that fixes the rig frame has zero covariance: give it a micron.
+    micron = np.diag(np.tile([1e-6**2] * 3 + [1e-3**2] * 3, len(pairs)))
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(prior.select(pairs) + micron)), np.float64)
 
 
 @dataclass(frozen=True, eq=False)
 class _Unknowns:
-    """Unknowns: small twists (P, 6) of the pairs, motions of the groups, poses of the boards."""
+    """Twists (P, 6) of the pairs within the calibration's covariance, motions of the groups, poses
+    of the boards; all in the rig frame."""
 
-    small: Array
+    twists: Array
     motions: list[RigidTransform]
     boards: dict[Target, RigidTransform]
 
     def retract(self, step: Array) -> _Unknowns:
-        twists, count = step.reshape(-1, 6), len(self.small)
+        twists, count = step.reshape(-1, 6), len(self.twists)
         of_groups, of_boards = np.split(twists[count:], [len(self.motions)])
         boards = zip(self.boards.items(), of_boards, strict=True)
         return _Unknowns(
-            self.small + twists[:count],
+            self.twists + twists[:count],
             [motion.retract(twist) for motion, twist in zip(self.motions, of_groups, strict=True)],
             {target: board.retract(twist) for (target, board), twist in boards},
         )
 
 
 @dataclass(frozen=True, eq=False)
-class _State:
-    """prior_root: (6P, 6P), square root of the information on the pairs' twists."""
+class _Problem:
+    """Poses of boards that several pairs see; prior: `_whiten_prior`."""
 
-    poses: tuple[ObservedPose, ...]
+    poses: Sequence[ObservedPose]
     pairs: tuple[str, ...]
     rig_from_camera: Mapping[str, RigidTransform]
-    prior_root: Array
-    start_boards: dict[Target, RigidTransform]
+    prior: Array
 
-    @staticmethod
-    def start(
-        poses: Sequence[ObservedPose],
-        pairs: tuple[str, ...],
-        rig_from_camera: Mapping[str, RigidTransform],
-        prior: PoseCovariance,
-    ) -> _State:
-        # The pair that fixes the rig frame has zero covariance: give it a micron.
-        covariance = prior.select(pairs) + np.diag(
-            np.tile([1e-6**2] * 3 + [1e-3**2] * 3, len(pairs))
-        )
-        boards = {
-            target: _majority_pose([p for p in poses if p.target == target], rig_from_camera)
-            for target in sorted({pose.target for pose in poses})
-        }
-        return _State(tuple(poses), pairs, rig_from_camera, _whitener(covariance), boards)
-
-    def solve(self, groups: Sequence[Group]) -> _Fit:
-        """Solve for pair motions within the calibration's covariance, free motions of the groups,
-        and boards; all as twists in the rig frame."""
-        first_group = 6 * len(self.pairs)
-        first_board = first_group + 6 * len(groups)
+    def solve(self, groups: Sequence[Group]) -> Solution[_Unknowns]:
+        """Fit all unknowns, with free motions of these groups."""
+        boards = {target: self._majority_pose(target) for target in {p.target for p in self.poses}}
         start = _Unknowns(
             np.zeros((len(self.pairs), 6)),
             [RigidTransform.identity()] * len(groups),
-            self.start_boards,
+            dict(sorted(boards.items())),
         )
-        # The tolerance is in units of chi-squared, of which SIGNIFICANT is 45.
-        solution = minimize(
+        return minimize(
             start,
-            lambda placings: self._blocks(groups, placings),
+            lambda state: self._blocks(groups, state),
             _Unknowns.retract,
-            unknowns=first_board + 6 * len(start.boards),
+            unknowns=6 * (len(self.pairs) + len(groups) + len(boards)),
             steps=10,
-            tolerance=1e-3,
+            tolerance=1e-3,  # of chi-squared
             damping=1e-9,
-        )
-        columns, found = slice(first_group, first_board), solution.state
-        return _Fit(
-            solution.report.cost_after,
-            found.motions,
-            solution.covariance[columns, columns],
-            found.boards,
         )
 
     def _blocks(self, groups: Sequence[Group], state: _Unknowns) -> Iterator[Block]:
         """The prior on the pairs, then for each view the offset of its board."""
-        pairs, targets = list(self.pairs), list(state.boards)
-        of_group = {name: g for g, (_, members) in enumerate(groups) for name in members}
-        small_twists = state.small.ravel()
-        yield Block(
-            self.prior_root @ small_twists,
-            lambda: self.prior_root,
-            slice(0, small_twists.size),
-            EXACT,
-        )
+        twists, targets = state.twists.ravel(), list(state.boards)
+        yield Block(self.prior @ twists, lambda: self.prior, slice(0, twists.size), EXACT)
+        group_of = {name: g for g, (_, members) in enumerate(groups) for name in members}
         for pose in self.poses:
-            pair, group = pairs.index(pose.pair), of_group.get(pose.pair)
-            camera = self.rig_from_camera[pose.pair].retract(state.small[pair])
-            board = len(pairs) + len(groups) + targets.index(pose.target)
-            touched = [pair, board]
+            pair, group = self.pairs.index(pose.pair), group_of.get(pose.pair)
+            camera = self.rig_from_camera[pose.pair].retract(state.twists[pair])
+            touched = [pair, len(self.pairs) + len(groups) + targets.index(pose.target)]
             if group is not None:
                 camera = state.motions[group] @ camera
-                touched.append(len(pairs) + group)
-            residuals, root = _gap(pose, camera, state.boards[pose.target])
-            signs = np.array([1.0, -1.0, 1.0])[: len(touched)]
+                touched.append(len(self.pairs) + group)
+            residuals, root = _offset(pose, camera, state.boards[pose.target])
+            jacobian = np.concatenate([root, -root, root][: len(touched)], axis=1)
             columns = (6 * np.array(touched)[:, None] + np.arange(6)).ravel()
-            yield Block(residuals, partial(_side_by_side, signs, root), columns, EXACT)
+            yield Block(residuals, lambda jacobian=jacobian: jacobian, columns, EXACT)
 
-    def move(self, group: Group, fit: _Fit, number: int) -> Move:
+    def _majority_pose(self, target: Target) -> RigidTransform:
+        """`rig_from_board` by the view from which the median of all views differs least."""
+        poses = [pose for pose in self.poses if pose.target == target]
+
+        def median_distance(board: RigidTransform) -> float:
+            offsets = [_offset(p, self.rig_from_camera[p.pair], board)[0] for p in poses]
+            return float(np.median(np.sum(np.square(offsets), axis=1)))
+
+        boards = (self.rig_from_camera[pose.pair] @ pose.camera_from_board for pose in poses)
+        return min(boards, key=median_distance)
+
+    def move(self, group: Group, fit: Solution[_Unknowns], number: int) -> Move:
+        """The motion of the group that was freed as that number."""
         name, pairs = group
-        motion = fit.motions[number]
-        rows = slice(6 * number, 6 * number + 6)
-        covariance = fit.covariance[rows, rows]
+        motion, first = fit.state.motions[number], 6 * (len(self.pairs) + number)
+        covariance = fit.covariance[first : first + 6, first : first + 6]
         middle = np.mean([self.rig_from_camera[pair].translation for pair in pairs], axis=0)
-        covariance_mm2 = point_covariance(covariance, middle)
-        return Move(
-            name,
-            pairs,
-            motion,
-            covariance,
-            float(np.linalg.norm(motion.apply(middle) - middle)),
-            float(np.sqrt(np.trace(covariance_mm2))),
-            float(np.degrees(motion.angle)),
-        )
+        shift_mm = float(np.linalg.norm(motion.apply(middle) - middle))
+        sigma_mm = float(np.sqrt(np.trace(point_covariance(covariance, middle))))
+        return Move(name, pairs, motion, covariance, shift_mm, sigma_mm)
 
 
-def _gap(
+def _offset(
     pose: ObservedPose, rig_from_camera: RigidTransform, rig_from_board: RigidTransform
 ) -> tuple[Array, Array]:
-    """Offset of a view's board from its current pose, and how twists change it.
-
-    (6,): the offset as a twist in the rig frame, in standard deviations.
-    (6, 6): the matrix that brings twists to standard deviations.
-    """
-    gap = rig_from_camera @ pose.camera_from_board @ rig_from_board.inverse()
+    """Offset of a view's board from a pose (6,), in standard deviations, and the matrix (6, 6) that
+    brings twists in the rig frame to standard deviations."""
+    offset = rig_from_camera @ pose.camera_from_board @ rig_from_board.inverse()
     root = pose.whitener @ adjoint(rig_from_camera.inverse())
-    return root @ gap.twist, root
-
-
-def _side_by_side(signs: Array, root: Array) -> Array:
-    """The matrix (6, 6), repeated with each of S signs, (6, 6 S)."""
-    return np.concatenate([sign * root for sign in signs], axis=1)
-
-
-def _whitener(covariance: Array) -> Array:
-    """The matrix that maps a vector of this covariance to independent standard deviations."""
-    if not len(covariance):
-        return covariance
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)), np.float64)
-
-
-def _majority_pose(
-    poses: Sequence[ObservedPose], rig_from_camera: Mapping[str, RigidTransform]
-) -> RigidTransform:
-    """A board's pose by majority: the view from which the others differ least."""
-
-    def median_distance(board: RigidTransform) -> float:
-        """Median squared distance of all views from a pose, in sigmas squared."""
-        gaps = (_gap(pose, rig_from_camera[pose.pair], board) for pose in poses)
-        return float(np.median([sigmas @ sigmas for sigmas, _ in gaps]))
-
-    return min(
-        (rig_from_camera[pose.pair] @ pose.camera_from_board for pose in poses), key=median_distance
-    )
+    return root @ offset.twist, root

@@ -30,7 +30,6 @@ class HalvesComparison:
 
     names: the pairs compared.
     excluded: pairs not compared, which saw too few boards in a half or could not be solved from it.
-    halves: the shots of each.
     shifts_mm: of the camera centres, (P, 3), rig frame.
     sigmas_mm: expected sigmas of the shifts, (P, 3).
     over_expected: RMS of all differences in units of what the covariances predict; 1 if consistent.
@@ -38,7 +37,6 @@ class HalvesComparison:
 
     names: tuple[str, ...]
     excluded: tuple[str, ...]
-    halves: tuple[tuple[str, ...], tuple[str, ...]]
     shifts_mm: Array
     sigmas_mm: Array
     over_expected: float
@@ -46,14 +44,13 @@ class HalvesComparison:
     @property
     def summary(self) -> str:
         """The comparison in one line."""
-        shift, sigma = rms_length(self.shifts_mm), rms_length(self.sigmas_mm)
         without = (
             f" (without {', '.join(self.excluded)}, not known from a half)" if self.excluded else ""
         )
         return (
-            f"solved from either half of the shots, cameras{without} differ by {shift:.3f} mm RMS "
-            f"({sigma:.3f} expected); all differences are {self.over_expected:.2f} times what is "
-            "expected"
+            f"solved from either half of the shots, cameras{without} differ by "
+            f"{rms_length(self.shifts_mm):.3f} mm RMS ({rms_length(self.sigmas_mm):.3f} expected); "
+            f"all differences are {self.over_expected:.2f} times what is expected"
         )
 
 
@@ -70,25 +67,23 @@ def compare_halves(rig: Rig, solution: RigSolution, *, seed: int = 0) -> HalvesC
     if len(everyone) < 2:
         raise FailedWork("one pair alone has no pose to compare", where=f"rig {rig.name}")
     connected, *halves = split_shots(solution.views, everyone, seed=seed)
-    holder = (
-        rig.frame_pair.name if rig.frame_pair and rig.frame_pair.name in connected else connected[0]
+    frame_pair = rig.frame_pair.name if rig.frame_pair else ""
+    holder = frame_pair if frame_pair in connected else connected[0]
+    (first, first_covariance), (second, second_covariance) = (
+        _solve_half(rig, solution, connected, shots, holder) for shots in halves
     )
-    first, second = (_solve_half(rig, solution, connected, shots, holder) for shots in halves)
-    names = tuple(name for name in connected if name in first[0] and name in second[0])
+    names = tuple(name for name in connected if name in first and name in second)
     if len(names) < 2:
         raise _cannot_halve(len({view.shot for view in solution.views}))
     # (6P,): twists about the rig's origin that carry each first pose to the second.
-    differences = np.concatenate(
-        [(second[0][name] @ first[0][name].inverse()).twist for name in names]
-    )
-    centres = np.array([solution.rig_from_camera[name].translation for name in names])
-    ahead = np.array([solution.rig_from_camera[name].rotation[:, 2] for name in names])
-    keep = _common_motion_projector(centres, ahead)
-    differences = keep @ differences
-    covariance = keep @ (first[1].select(names) + second[1].select(names)) @ keep.T
-    prior = keep @ solution.covariance.select(names) @ keep.T
-    shifts = np.einsum("pij,pj->pi", twist_jacobian(centres), differences.reshape(-1, 6))
+    twists = np.concatenate([(second[name] @ first[name].inverse()).twist for name in names])
+    poses = [solution.rig_from_camera[name] for name in names]
+    centres = np.array([pose.translation for pose in poses])
+    keep = _common_motion_projector(centres, np.array([pose.rotation[:, 2] for pose in poses]))
+    differences = keep @ twists
+    covariance = keep @ (first_covariance.select(names) + second_covariance.select(names)) @ keep.T
     sigmas = _centre_sigmas(covariance, centres)
+    prior = keep @ solution.covariance.select(names) @ keep.T
     expected, whole = rms_length(sigmas), rms_length(_centre_sigmas(prior, centres))
     # Halves should differ by twice the sigma of the whole, since each has half of the information
     # and both err. Far beyond that a half lacks a connection of the rig, not only shots.
@@ -98,9 +93,13 @@ def compare_halves(rig: Rig, solution: RigSolution, *, seed: int = 0) -> HalvesC
             f"{whole:.2g} mm: too few boards, or too much alike, in a half",
             remedy="capture more shots that all pairs see, differently tilted",
         )
-    excluded = tuple(name for name in everyone if name not in names)
-    ratio = _normalized_rms(differences, covariance)
-    return HalvesComparison(names, excluded, (halves[0], halves[1]), shifts, sigmas, ratio)
+    return HalvesComparison(
+        names,
+        tuple(name for name in everyone if name not in names),
+        np.einsum("pij,pj->pi", twist_jacobian(centres), differences.reshape(-1, 6)),
+        sigmas,
+        _normalized_rms(differences, covariance),
+    )
 
 
 def split_shots(
@@ -108,7 +107,7 @@ def split_shots(
 ) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
     """Split the shots at random into two halves that both tie as many pairs together as possible.
 
-    Returns the pairs connected together in both, with enough boards for each, and the shots of the two
+    Returns the pairs connected in both, with enough boards for each, and the shots of the two
     halves: the best of many draws. Raises FailedWork if no draw ties two pairs.
     """
     shots = sorted({view.shot for view in views})
@@ -116,12 +115,12 @@ def split_shots(
     best: tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]] = ((), (), ())
     for _ in range(200):
         order = [shots[k] for k in rng.permutation(len(shots))]
-        halves = set(order[: len(order) // 2]), set(order[len(order) // 2 :])
+        first, second = sorted(order[: len(order) // 2]), sorted(order[len(order) // 2 :])
         connected = _largest_connected(
-            [[v for v in views if v.shot in half] for half in halves], names
+            [[v for v in views if v.shot in half] for half in (first, second)], names
         )
         if len(connected) > len(best[0]):
-            best = connected, tuple(sorted(halves[0])), tuple(sorted(halves[1]))
+            best = connected, tuple(first), tuple(second)
         if len(connected) == len(names):
             break
     if len(best[0]) < 2:
@@ -171,11 +170,13 @@ def _solve_half(
         raise FailedWork(f"{holder} does not fit the others in a half of the shots") from error
     to_rig = solution.rig_from_camera[holder] @ half.rig_from_camera[holder].inverse()
     carry = np.kron(np.eye(len(half.covariance.names)), adjoint(to_rig))
-    rig_from_camera = {name: to_rig @ t for name, t in half.rig_from_camera.items()}
-    # The variance_inflation over independent corners is better determined by all boards.
+    # The inflation over independent corners is better determined by all boards.
     more_inflation = max(solution.variance_inflation / half.variance_inflation, 1.0)
     matrix = more_inflation * carry @ half.covariance.matrix @ carry.T
-    return rig_from_camera, PoseCovariance(half.covariance.names, matrix)
+    return (
+        {name: to_rig @ pose for name, pose in half.rig_from_camera.items()},
+        PoseCovariance(half.covariance.names, matrix),
+    )
 
 
 def _centre_sigmas(covariance: Array, centres: Array) -> Array:
@@ -187,10 +188,8 @@ def _centre_sigmas(covariance: Array, centres: Array) -> Array:
 
 
 def _common_motion_projector(centres: Array, ahead: Array) -> Array:
-    """(6P, 6P): removes from the pairs' motions the part common to all.
-
-    Least squares over each camera's centre and the place it looks at.
-    """
+    """(6P, 6P): removes from the pairs' motions the part common to all, by least squares over each
+    camera's centre and the position it looks at."""
     # 1300 mm ahead of a camera is about where the subject stands.
     points = np.concatenate([centres, centres + 1300.0 * ahead])
     jacobians = twist_jacobian(points).reshape(2, len(centres), 3, 6)
