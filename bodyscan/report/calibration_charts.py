@@ -99,8 +99,8 @@ def planes_chart(calibration: RigCalibration) -> bytes:
 
 
 def shared_boards(calibration: RigCalibration) -> Array:
-    """Number of boards (P, P) that two pairs saw at the same moment, in the order of `observed`; zero on
-    the diagonal."""
+    """Number of boards (P, P) that two pairs saw at the same moment, in the order of `observed`; zero
+    on the diagonal."""
     seen = [set(one.target.tolist()) for one in calibration.observed.values()]
     count = np.array([[float(len(a & b)) for b in seen] for a in seen])
     np.fill_diagonal(count, 0.0)
