@@ -162,7 +162,7 @@ def around(one: Path, count: int, folder: Path) -> Path:
             tuple(names), np.diag(np.tile([2e-5] * 3 + [0.05] * 3, count) ** 2)
         ),
         rig_from_board={},
-        seen={},
+        observed={},
     )
     save_calibration(calibration, folder / "calibration")
     person = folder / "captures" / "person"

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -44,7 +45,7 @@ def observe_pose(view: LocatedView, camera: Camera, sigma_px: float) -> Observed
     jacobian = (camera.jacobians(points)[1] @ twist_jacobian(points)).reshape(-1, 6)
     # Corners of one view share errors of lens and detector: three count as one.
     information = jacobian.T @ jacobian / (3.0 * sigma_px**2)
-    whitener = np.linalg.cholesky(information).T
+    whitener = np.asarray(np.linalg.cholesky(information).T, np.float64)
     return ObservedPose(view.pair, view.target, view.camera_from_board, whitener)
 
 
@@ -209,7 +210,7 @@ class _Problem:
             residuals, root = _offset(pose, camera, state.boards[pose.target])
             jacobian = np.concatenate([root, -root, root][: len(touched)], axis=1)
             columns = (6 * np.array(touched)[:, None] + np.arange(6)).ravel()
-            yield Block(residuals, lambda jacobian=jacobian: jacobian, columns, EXACT)
+            yield Block(residuals, partial(np.asarray, jacobian), columns, EXACT)
 
     def _majority_pose(self, target: Target) -> RigidTransform:
         """`rig_from_board` by the view from which the median of all views differs least."""

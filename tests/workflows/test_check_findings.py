@@ -144,7 +144,7 @@ def test_pairs_of_a_repaired_pole_are_as_well_known_to_each_other_as_before() ->
     rig = SimpleNamespace(poles={name: name[:2] for name in names})
     calibration: Any = Placed(rig, placing, known, ("as it was",))
     motion = RigidTransform(np.eye(3), np.array([3.0, 0.0, 4.0]))
-    move = Move("pole p1", names[:2], motion, np.diag([1e-6] * 3 + [0.25] * 3), 5.0, 0.9, 0.0)
+    move = Move("pole p1", names[:2], motion, np.diag([1e-6] * 3 + [0.25] * 3), 5.0, 0.9)
     mended = apply_moves(calibration, [move])
     after = mended.covariance
     np.testing.assert_allclose(after.relative("p1-1", "p1-2"), known.relative("p1-1", "p1-2"))
