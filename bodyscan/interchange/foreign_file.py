@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -47,33 +47,31 @@ class ForeignFile:
         except OSError as fault:
             raise empty.error(f"cannot be read: {fault.strerror or fault}") from None
 
-    def where(self, word: str = "", after: str = "") -> str:
-        """The file and the line of the first occurrence of a word, preferably as a key.
+    def where(self, name: str = "") -> str:
+        """The file, and the line of a name in it, preferably as a key.
 
-        after: another word, after which it occurs.
+        name: such as `cam0`, or `cam0.intrinsics` for the first `intrinsics` after `cam0`.
         """
-        position = 0
-        for part in filter(None, (after, word)):
-            alone = rf"(?<![\w.-]){re.escape(part)}(?![\w-])"
-            as_key = rf"{alone}(?=[\"']?\s*[:=\]>]|\s+type_id)"
-            for pattern in (as_key, alone):
-                found = re.compile(pattern).search(self.text, position)
-                if found:
-                    break
-            else:
-                return str(self.path)
-            position = found.start()
-        line = self.text.count("\n", 0, position) + 1
-        return f"{self.path}:{line}" if after or word else str(self.path)
+        after, _, word = name.rpartition(".")
+        first = self._find(name, 0)
+        outer = self._find(after, 0) if first is None and after else 0
+        found = self._find(word, outer) if first is None and outer is not None else first
+        if not name or found is None:
+            return str(self.path)
+        line = self.text.count("\n", 0, found) + 1
+        return f"{self.path}:{line}"
 
-    def error(
-        self, what: str, word: str = "", remedy: str = "", *, after: str = ""
-    ) -> CalibrationFileError:
-        """An error about the file, or about what a word in it names."""
-        named = f"{after + '.' if after else ''}{word}: " if word else ""
+    def _find(self, word: str, start: int) -> int | None:
+        alone = rf"(?<![\w.-]){re.escape(word)}(?![\w-])"
+        as_key = rf"{alone}(?=[\"']?\s*[:=\]>]|\s+type_id)"
+        matches = (re.compile(pattern).search(self.text, start) for pattern in (as_key, alone))
+        return next((match.start() for match in matches if match), None)
+
+    def error(self, what: str, name: str = "", remedy: str = "") -> CalibrationFileError:
+        """An error about the file, or about what a name in it stands for."""
         return CalibrationFileError(
-            named + what,
-            where=self.where(word, after),
+            f"{name}: {what}" if name else what,
+            where=self.where(name),
             remedy=remedy or "give the file as that program wrote it",
         )
 
@@ -83,90 +81,74 @@ class ForeignFile:
             if word not in table:
                 raise self.error(f"has no {word}", key, f"it has {', '.join(table)}")
 
-    def numbers(self, value: Any, word: str, counts: Sequence[int], *, after: str = "") -> Array:
-        """`value` as a flat array of one of these lengths; of any length if there are none."""
+    def numbers(self, value: Any, name: str, *counts: int) -> Array:
+        """`value` as a flat array of one of these lengths."""
         try:
             array: Array = np.asarray(value, np.float64).ravel()
         except (TypeError, ValueError):
-            raise self.error(
-                f"holds what is not a number ({value!r:.60})", word, after=after
-            ) from None
-        if counts and len(array) not in counts:
+            raise self.error(f"holds what is not a number ({value!r:.60})", name) from None
+        if len(array) not in counts:
             wanted = " or ".join(map(str, counts))
-            raise self.error(f"holds {len(array)} numbers, not {wanted}", word, after=after)
+            raise self.error(f"holds {len(array)} numbers, not {wanted}", name)
         if not np.all(np.isfinite(array)):
-            raise self.error("holds a number that is not finite", word, after=after)
+            raise self.error("holds a number that is not finite", name)
         return array
 
-    def matrix(self, value: Any, word: str, *, after: str = "") -> Array:
+    def matrix(self, value: Any, name: str) -> Array:
         """A of Eq. 1, (3, 3), from nine numbers row by row."""
-        matrix = self.numbers(value, word, (9,), after=after).reshape(3, 3)
+        matrix = self.numbers(value, name, 9).reshape(3, 3)
         if not (matrix[0, 0] > 0.0 and matrix[1, 1] > 0.0):
-            raise self.error(
-                f"has focal lengths {matrix[0, 0]:g} and {matrix[1, 1]:g}, which must be positive",
-                word,
-                after=after,
-            )
+            focal = f"{matrix[0, 0]:g} and {matrix[1, 1]:g}"
+            raise self.error(f"has focal lengths {focal}, which must be positive", name)
         if matrix[1, 0] != 0.0 or not np.array_equal(matrix[2], [0.0, 0.0, 1.0]):
-            raise self.error(
-                "is not a camera matrix, which has zeros below its diagonal and 1 at its end", word,
-                "check that it is not transposed, nor a projection of three by four", after=after,
-            )  # fmt: skip
+            what = "is not a camera matrix, which has zeros below its diagonal and 1 at its end"
+            remedy = "check that it is not transposed, nor a projection of three by four"
+            raise self.error(what, name, remedy)
         return matrix
 
-    def pinhole_matrix(self, value: Any, word: str, *, after: str = "") -> Array:
+    def pinhole_matrix(self, value: Any, name: str) -> Array:
         """A of Eq. 1 from fx, fy, cx, cy."""
-        fx, fy, cx, cy = self.numbers(value, word, (4,), after=after)
-        return self.matrix([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0], word, after=after)
+        fx, fy, cx, cy = self.numbers(value, name, 4)
+        return self.matrix([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0], name)
 
-    def lens(self, value: Any, word: str, *, after: str = "") -> Lens:
+    def lens(self, value: Any, name: str) -> Lens:
         """The lens with OpenCV's coefficients in OpenCV's order, 0 to 14 of them."""
-        given = self.numbers(value, word, (0, 1, 2, 3, 4, 5, 8, 12, 14), after=after)
+        given = self.numbers(value, name, 0, 1, 2, 3, 4, 5, 8, 12, 14)
         coefficients = np.zeros(max(len(given), 5))
         coefficients[: len(given)] = given
         try:
             return lens_from_opencv(coefficients)
         except ValueError as error:
-            raise self.error(
-                str(error), word, "calibrate it with a supported lens", after=after
-            ) from None
+            raise self.error(str(error), name, "calibrate it with a supported lens") from None
 
-    def size(self, value: Any, word: str, *, after: str = "") -> tuple[int, int]:
+    def size(self, value: Any, name: str) -> tuple[int, int]:
         """Width and height of an image, px."""
-        width, height = self.numbers(value, word, (2,), after=after)
+        width, height = self.numbers(value, name, 2)
         if width != int(width) or height != int(height) or width < 1 or height < 1:
-            raise self.error(
-                f"is not the size of a picture ({width:g} x {height:g})", word, after=after
-            )
+            raise self.error(f"is not the size of a picture ({width:g} x {height:g})", name)
         return int(width), int(height)
 
-    def pose(
-        self, rotation: Any, translation: Any, words: tuple[str, str], *, after: str = ""
-    ) -> RigidTransform:
-        """A pose from a rotation (vector, or matrix row by row) and a translation.
+    def pose(self, rotation: Any, translation: Any, *names: str) -> RigidTransform:
+        """A pose from a rotation (vector, or matrix row by row) and a translation, and their names.
 
         A matrix is replaced by the nearest rotation.
         """
-        given = self.numbers(rotation, words[0], (3, 9), after=after)
-        shift = self.numbers(translation, words[1], (3,), after=after)
+        given, shift = (
+            self.numbers(rotation, names[0], 3, 9),
+            self.numbers(translation, names[-1], 3),
+        )
         if len(given) == 3:
             return RigidTransform.from_rotation_vector(given, shift)
         matrix = given.reshape(3, 3)
         # Four digits suffice; a milliradian is a millimetre at a metre.
         deviation = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
         if deviation > 1e-3:
-            raise self.error(
-                f"is not a rotation: R times its transpose differs from 1 by {deviation:.2g}",
-                words[0],
-                after=after,
-            )
+            what = f"is not a rotation: R times its transpose differs from 1 by {deviation:.2g}"
+            raise self.error(what, names[0])
         if np.linalg.det(matrix) < 0.0:
-            raise self.error(
-                "is a reflection (its determinant is -1), which no camera's pose is",
-                words[0],
-                "check whether an axis, such as y or z, has the opposite direction",
-                after=after,
-            )
+            what = "is a reflection (its determinant is -1), which no camera's pose is"
+            remedy = "check whether an axis, such as y or z, has the opposite direction"
+            raise self.error(what, names[0], remedy)
         return RigidTransform.from_matrix(np.column_stack([matrix, shift]))
 
 
@@ -191,18 +173,16 @@ def read_camera_table(file: ForeignFile, table: dict[str, Any], key: str) -> Fou
     """Read the camera in a table; key: of the table, as written in the file."""
     file.require(table, ("size", "matrix", "distortions"), key)
     if table.get("fisheye", False):
-        raise file.error(
-            "is OpenCV's fisheye lens, which is not supported", "fisheye",
-            "calibrate it with an ordinary lens", after=key,
-        )  # fmt: skip
+        what = "is OpenCV's fisheye lens, which is not supported"
+        raise file.error(what, f"{key}.fisheye", "calibrate it with an ordinary lens")
     pose = None
     if "rotation" in table and "translation" in table:
-        words = "rotation", "translation"
-        pose = file.pose(table["rotation"], table["translation"], words, after=key)
+        names = f"{key}.rotation", f"{key}.translation"
+        pose = file.pose(table["rotation"], table["translation"], *names)
     return FoundCamera(
-        file.matrix(table["matrix"], "matrix", after=key),
-        file.lens(table["distortions"], "distortions", after=key),
-        file.size(table["size"], "size", after=key),
+        file.matrix(table["matrix"], f"{key}.matrix"),
+        file.lens(table["distortions"], f"{key}.distortions"),
+        file.size(table["size"], f"{key}.size"),
         pose,
         file.where(key),
     )

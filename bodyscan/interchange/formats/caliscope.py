@@ -43,10 +43,12 @@ def read_caliscope(path: Path) -> dict[str, FoundCamera]:
         if not isinstance(table, dict):
             raise file.error("is not a camera as caliscope writes it", f"cameras.{key}")
         if table.get("rotation_count", 0):
-            raise file.error(
-                "rotates the pictures before they are used; bodyscan takes them as they are",
-                "rotation_count", "rotate the pictures, or calibrate without", after=f"cameras.{key}",
-            )  # fmt: skip
+            what = "rotates the pictures before they are used; bodyscan takes them as they are"
+            name, remedy = (
+                f"cameras.{key}.rotation_count",
+                "rotate the pictures, or calibrate without",
+            )
+            raise file.error(what, name, remedy)
         found[key] = read_camera_table(file, table, f"cameras.{key}")
     named = {str(table["name"]): found[key] for key, table in tables.items() if "name" in table}
     return found | named

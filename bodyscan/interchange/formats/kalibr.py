@@ -96,8 +96,9 @@ def _compute_next_pose(
     """Compute the next camera's pose; after a gap in the chain there is none."""
     if "T_cn_cnm1" not in entry or before is None:
         return None
-    matrix = file.numbers(entry["T_cn_cnm1"], "T_cn_cnm1", (16,), after=key).reshape(4, 4)
-    step = file.pose(matrix[:3, :3], matrix[:3, 3], ("T_cn_cnm1", "T_cn_cnm1"), after=key)
+    name = f"{key}.T_cn_cnm1"
+    matrix = file.numbers(entry["T_cn_cnm1"], name, 16).reshape(4, 4)
+    step = file.pose(matrix[:3, :3], matrix[:3, 3], name)
     return step @ before
 
 
@@ -106,23 +107,18 @@ def _read_camera(
 ) -> FoundCamera:
     words = ("camera_model", "intrinsics", "distortion_model", "resolution")
     file.require(entry, words, key)
-    if entry["camera_model"] != "pinhole":
-        raise file.error(
-            f"{entry['camera_model']!r} is a model that is not supported, pinhole is",
-            "camera_model", "calibrate it with pinhole-radtan", after=key,
-        )  # fmt: skip
-    if entry["distortion_model"] not in ("radtan", "none"):
-        raise file.error(
-            f"{entry['distortion_model']!r} is a lens that is not supported, radtan is",
-            "distortion_model", "calibrate it with pinhole-radtan", after=key,
-        )  # fmt: skip
+    supported = {"camera_model": ("model", "pinhole"), "distortion_model": ("lens", "radtan")}
+    for word, (what, wanted) in supported.items():
+        if entry[word] not in (wanted, "none" if what == "lens" else wanted):
+            wrong = f"{entry[word]!r} is a {what} that is not supported, {wanted} is"
+            raise file.error(wrong, f"{key}.{word}", "calibrate it with pinhole-radtan")
     lens = entry.get("distortion_coeffs", []) if entry["distortion_model"] == "radtan" else []
-    matrix = file.pinhole_matrix(entry["intrinsics"], "intrinsics", after=key)
-    matrix[0, 1] = file.numbers(entry.get("skew", 0.0), "skew", (1,), after=key)[0]
+    matrix = file.pinhole_matrix(entry["intrinsics"], f"{key}.intrinsics")
+    matrix[0, 1] = file.numbers(entry.get("skew", 0.0), f"{key}.skew", 1)[0]
     return FoundCamera(
         matrix,
-        file.lens(lens, "distortion_coeffs", after=key),
-        file.size(entry["resolution"], "resolution", after=key),
+        file.lens(lens, f"{key}.distortion_coeffs"),
+        file.size(entry["resolution"], f"{key}.resolution"),
         pose,
         file.where(key),
     )

@@ -51,11 +51,8 @@ def _format_model(name: str, camera: Any, rig_from_camera: Any) -> str:
     used = int(rest[-1]) + 1 if len(rest) else 0
     model = next((m for m, count in COEFFICIENTS.items() if count >= used), None)
     if model is None:
-        raise BadInput(
-            f"mrcal has no lens like {camera.lens.kind!r}",
-            where=f"pair {name}",
-            remedy="choose another format",
-        )
+        what = f"mrcal has no lens like {camera.lens.kind!r}"
+        raise BadInput(what, where=f"pair {name}", remedy="choose another format")
     lens = np.append(coefficients, np.zeros(12))[: COEFFICIENTS[model]]
     intrinsics = [camera.alpha, camera.beta, camera.u0, camera.v0, *lens.tolist()]
     camera_from_rig = rig_from_camera.inverse()
@@ -84,21 +81,20 @@ def _read_model(path: Path) -> FoundCamera:
         if word not in content:
             raise file.error(f"has no {word!r}", remedy=f"it has {', '.join(map(str, content))}")
     if kind not in COEFFICIENTS:
-        raise file.error(
-            f"{model!r} is a lens that is not supported", "lensmodel",
-            f"mrcal-convert-lensmodel makes one of LENSMODEL_{', LENSMODEL_'.join(COEFFICIENTS)}",
-        )  # fmt: skip
-    numbers = file.numbers(content["intrinsics"], "intrinsics", (4 + COEFFICIENTS[kind],))
+        known = ", ".join(f"LENSMODEL_{name}" for name in COEFFICIENTS)
+        remedy = f"mrcal-convert-lensmodel makes one of {known}"
+        raise file.error(f"{model!r} is a lens that is not supported", "lensmodel", remedy)
+    numbers = file.numbers(content["intrinsics"], "intrinsics", 4 + COEFFICIENTS[kind])
     matrix = file.pinhole_matrix(numbers[:4], "intrinsics")
     skew = re.search(rf"^# {SKEW}(\S+)$", file.text, re.MULTILINE)
     if skew:
-        matrix[0, 1] = file.numbers(skew[1], "skew", (1,))[0]
-    pose = file.numbers(content["extrinsics"], "extrinsics", (6,))
+        matrix[0, 1] = file.numbers(skew[1], "skew", 1)[0]
+    pose = file.numbers(content["extrinsics"], "extrinsics", 6)
     return FoundCamera(
         matrix,
         file.lens(numbers[4:], "intrinsics"),
         file.size(content["imagersize"], "imagersize"),
-        file.pose(pose[:3], pose[3:], ("extrinsics", "extrinsics")),
+        file.pose(pose[:3], pose[3:], "extrinsics"),
         file.where("intrinsics"),
     )
 

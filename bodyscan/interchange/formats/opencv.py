@@ -112,11 +112,11 @@ def _read_camera(file: ForeignFile, entry: Any, name: str, label: str) -> FoundC
 
     size = [numbers("image_width"), numbers("image_height")]
     return FoundCamera(
-        file.matrix(numbers("camera_matrix"), "camera_matrix", after=label),
-        file.lens(numbers("distortion_coefficients"), "distortion_coefficients", after=label),
-        file.size(size, "image_width", after=label),
-        file.pose(numbers("R"), numbers("T"), ("R", "T"), after=label),
-        file.where("camera_matrix", label),
+        file.matrix(numbers("camera_matrix"), f"{label}.camera_matrix"),
+        file.lens(numbers("distortion_coefficients"), f"{label}.distortion_coefficients"),
+        file.size(size, f"{label}.image_width"),
+        file.pose(numbers("R"), numbers("T"), f"{label}.R", f"{label}.T"),
+        file.where(f"{label}.camera_matrix"),
     )
 
 
@@ -134,12 +134,10 @@ def read_nodes(path: Path, nodes: Nodes) -> FoundCamera:
         size = file.size([values("width"), values("height")], nodes["width"])
     pose = None
     if "rotation" in nodes:
-        words = nodes["rotation"], nodes["translation"]
-        pose = file.pose(values("rotation"), values("translation"), words)
-    lens = file.lens(
-        values("distortion") if "distortion" in nodes else [],
-        nodes.get("distortion", nodes["matrix"]),
-    )
+        names = nodes["rotation"], nodes["translation"]
+        pose = file.pose(values("rotation"), values("translation"), *names)
+    coefficients = values("distortion") if "distortion" in nodes else []
+    lens = file.lens(coefficients, nodes.get("distortion", nodes["matrix"]))
     matrix = file.matrix(values("matrix"), nodes["matrix"])
     return FoundCamera(matrix, lens, size, pose, file.where(nodes["matrix"].split("/")[-1]))
 
