@@ -23,13 +23,12 @@ UNEXPLAINED = 0.3
 
 @dataclass(frozen=True, eq=False)
 class Brightness:
-    """How bright the surface is, at the pixels of scan lines.
+    """Logarithm of the surface's brightness at the pixels of scan lines, (L, P) each.
 
-    logarithm: (L, P) of lit minus dark.
-    noise2: (L, P), its variance.
-    across: (L, P) its gradient from line to line, 1/px, shrunk towards that of the shading where
-        noise may explain the difference.
-    shading: (L, P) its gradient along the line, smoothed over 7 x 7 pixels.
+    logarithm, noise2: of lit minus dark, and its variance.
+    across: gradient from line to line, 1/px, shrunk to that of the shading where noise may explain
+        the difference.
+    shading: gradient along the line, smoothed over 7 x 7 pixels.
     """
 
     logarithm: Floats
@@ -39,11 +38,8 @@ class Brightness:
 
     @staticmethod
     def from_images(images: ScanLines, variance: Floats, usable: Mask) -> Brightness:
-        """Measure the brightness.
-
-        variance: (256,) of each grey level.
-        usable: (L, P) pixels on a lit surface.
-        """
+        """Measure it. variance: (256,) of each grey level; usable: (L, P) pixels on a lit
+        surface."""
         if images.lit.dtype == np.uint8:
             logarithms = np.log(np.maximum(np.arange(256), 1)).astype(np.float32)
             logarithm, noise2 = _measure(images.lit, images.dark, variance, logarithms)
@@ -65,12 +61,12 @@ class Brightness:
 
 @dataclass(frozen=True, eq=False)
 class BoundaryBrightness:
-    """The surface's brightness where N stripe boundaries pass between two pixels of a scan line.
+    """The surface's brightness where N stripe boundaries pass between two pixels of a line, (N,)
+    each.
 
-    before, behind: (N,) grey levels (lit minus dark) of the two pixels, brought together where
-        noise may explain their difference.
-    along, across: (N,) grad(ln a), 1/px, along the line and from line to line, likewise.
-    sigma: (N,) the noise of `along`.
+    before, behind: lit minus dark of the two pixels, brought together where noise may explain their
+        difference.
+    along, across: grad(ln a), 1/px, along the line and from line to line; sigma: of `along`.
     """
 
     before: Array
@@ -80,12 +76,10 @@ class BoundaryBrightness:
     sigma: Array
 
     def estimate_blur2(self, position: Array, joined: Mask) -> float:
-        """Estimate blur^2, px^2, that makes boundaries at edges line up with their neighbours.
+        """Estimate blur^2, px^2, such that boundaries at edges line up with their neighbours.
 
-        position: (N,) px along the scan line.
-        joined: (N - 1,) whether the next boundary is the next of the same run.
-
-        With fewer than 100 edges, that of a lens of 0.6 px and a pixel.
+        position: (N,) px along the line; joined: (N - 1,) whether the next boundary is of the same
+            run. With fewer than 100 edges, that of a lens of 0.6 px and a pixel.
         """
         shifts = _measure_shifts(self.along, self.sigma, position, joined)
         return 0.45 if shifts.size < 100 else float(np.clip(-np.median(shifts), 0.0, 2.0))
@@ -98,10 +92,10 @@ class BoundaryBrightness:
 def correct_across_lines(
     s: Floats, sigma: Floats, brightness: Brightness, blur2: float
 ) -> tuple[Floats, Floats]:
-    """Correct s (L, P) for edges of brightness that run along the scan lines.
+    """Correct s (L, P) for edges of brightness that run along the scan lines; return s and its
+    sigma.
 
-    A pixel shows s at its light's centroid, which lies off the line by blur2 * across. Returns s and
-    its standard deviation.
+    A pixel shows s at its light's centroid, which lies off the line by blur2 * across.
     """
     corrected, total = np.empty(s.shape, np.float32), np.empty(s.shape, np.float32)
     s, sigma, across = map(np.ascontiguousarray, (s, sigma, brightness.across))
@@ -111,7 +105,7 @@ def correct_across_lines(
 
 def fit_gradient(image: Floats, usable: Mask) -> tuple[Floats, Floats]:
     """Fit a plane to the usable pixels in 7 x 7 windows: its gradient along and across the lines
-    (L, P), 1/px; 0 at pixels that are not usable or have fewer than 12 of them around.
+    (L, P), 1/px; 0 at unusable pixels and with fewer than 12 usable ones.
 
     Loops over lines take a quarter of the time of OpenCV's separable filters.
     """
@@ -126,9 +120,7 @@ def fit_gradient(image: Floats, usable: Mask) -> tuple[Floats, Floats]:
 def _fit_gradient(image: Floats, usable: Mask, along: Floats, across: Floats) -> None:
     """Write the gradient (L, P) line by line.
 
-    inside, values: for the last 7 lines, which pixels are usable (1 or 0) and their values there,
-        with zeros on both sides.
-    columns: see `_sum_columns`, of both.
+    inside, values: usability (1 or 0) and values of the last 7 lines, with zeros on both sides.
     """
     lines, width = image.shape
     inside = np.zeros((7, width + 6), np.float32)
@@ -172,9 +164,8 @@ def _sum_columns(rows: Floats, middle: int, sums: Floats) -> None:
 def _solve_windows(columns: Floats, usable: Mask, along: Floats, across: Floats) -> None:
     """Write the gradient of a line (P,) from the sums over its columns, (2, 3, P + 6).
 
-    Intermediate results have arrays of their own: only then does the compiler know that they do not
-    overlap, and computes eight pixels at once. An area of 0.5 px^4 is half of that of pixels on two
-    lines.
+    Only with arrays of their own for intermediate results does the compiler know that they do not
+    overlap, and computes eight pixels at once. An area of 0.5 px^4 is half of that of two lines.
     """
     ones, ones_y, values = columns[0, 0], columns[0, 1], columns[1, 0]
     n, sum_x, sum_xx = _sum_row(ones), _sum_row_x(ones), _sum_row_x2(ones)

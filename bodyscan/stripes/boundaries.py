@@ -28,14 +28,13 @@ _NEIGHBOURS_PX = (3, 4, 5, 6)
 
 @dataclass(frozen=True, eq=False)
 class Boundaries:
-    """Boundaries, sorted by scan line and by position along it.
+    """Boundaries, sorted by scan line and by position along it, (N,) each.
 
-    line: (N,) scan line.
-    before: (N,) the pixel before the crossing.
-    position: (N,) px along the line.
-    line_position: (N,) px across lines; a fraction off `line` where an edge of brightness shifts it.
-    sigma_px: (N,) standard deviation across the stripes.
-    index: (N,) boundary i lies between stripes i - 1 and i.
+    before: the pixel before the crossing.
+    position, line_position: px along the line, and across lines (off `line` at edges of
+        brightness).
+    sigma_px: standard deviation across the stripes.
+    index: boundary i lies between stripes i - 1 and i.
     joined: (N - 1,) whether the next boundary ends the stripe that this one begins.
     blur2: px^2, of lens and pixel, see `albedo_edges`.
     """
@@ -51,10 +50,8 @@ class Boundaries:
 
 
 def bit_that_flips(boundary: Indices, bits: int) -> Indices:
-    """Compute which bit (0 the most significant) flips at boundary i > 0, between numbers i - 1 and i.
-
-    In the plain code, where several flip, the coarsest of them.
-    """
+    """Compute which bit (0 the most significant) flips at boundary i > 0; in the plain code,
+    where several flip, the coarsest."""
     lowest_set = np.frexp((boundary & -boundary).astype(np.float64))[1].astype(np.int64) - 1
     return bits - 1 - lowest_set
 
@@ -70,13 +67,11 @@ def find_boundaries(
 ) -> Boundaries:
     """Locate the boundaries wherever the code changes by one between two usable pixels of a line.
 
-    Only one bit flips there. Its pattern minus its inverse, divided by lit minus dark (which
-    removes most of the surface's own black and white) and less its imbalance by indirect light, is
-    an error function of the distance from the boundary, whatever the blur; the inverse error
-    function turns it into a straight line, whose zero is the boundary.
+    The pattern of the bit that flips minus its inverse, divided by lit minus dark and less its
+    imbalance by indirect light, is an error function of the distance from the boundary. The inverse
+    error function turns it into a straight line, whose zero is the boundary.
 
-    variance: (256,) of each grey level.
-    finest_run, first: see `WordCode`.
+    variance: (256,) of each grey level. finest_run, first: see `WordCode`.
     """
     pixels = _find_changes(codes, usable)
     line, before = np.divmod(pixels, codes.shape[1])
@@ -110,11 +105,9 @@ def find_boundaries(
 def join_runs(
     line: Indices, before: Indices, position: Array, index: Indices, usable: Mask
 ) -> Mask:
-    """Find whether each boundary's stripe ends at the next boundary, (N - 1,).
-
-    All pixels between the two must be usable (L, P): at one that is not, the surface may end and
-    another, which happens to show the next stripe, begin.
-    """
+    """Find whether each boundary's stripe ends at the next boundary, (N - 1,), with all pixels
+    between usable (L, P): else another surface that happens to show the next stripe may begin
+    there."""
     joined = np.zeros(max(line.size - 1, 0), np.bool_)
     for k in range(joined.size):
         if line[k + 1] != line[k] or abs(index[k + 1] - index[k]) != 1:
@@ -152,8 +145,7 @@ def _find_zeros(
 ) -> tuple[Array, Array]:
     """Find where the difference equals the imbalance, px behind the first pixel, and its sigma.
 
-    difference, noise: (N, 2) in the pixels before and behind.
-    before, behind: (N,) lit minus dark.
+    difference, noise: (N, 2) in the pixels before and behind; before, behind: lit minus dark.
     """
     fraction, sigma = np.empty(before.size), np.empty(before.size)
     for k in range(before.size):
@@ -195,16 +187,14 @@ def measure_imbalance(
 ) -> tuple[Array, Array]:
     """Measure the imbalance J / (D + I) at boundaries `index` (N,) of `bit` (N,), and its sigma.
 
-    With direct light D and light I by way of other surfaces, a pattern minus its inverse is
-    +-D + J; J is the part of I that differs between the two: little if stripes are fine, anything up
-    to I if they are broad (Nayar et al. 2006). So the boundary lies where the difference is J: the
-    mean of the values on its two sides.
+    With direct light D and indirect light I, a pattern minus its inverse is +-D + J; J, the part of
+    I that differs between the two, is up to I for broad stripes (Nayar et al. 2006). The boundary
+    lies where the difference is J, the mean of the values on both sides.
 
     pixels: (N,) flat pixels before the boundaries.
     reach: (N,) number of stripes on either side in which the bit surely keeps its value.
 
-    It is 0 where noise may explain it, and for the finest bit, which has no room next to its
-    boundaries and whose J is smallest.
+    0 where noise may explain it, and for the finest bit, which has no room next to its boundaries.
     """
     mean, sigma = np.zeros(len(pixels)), np.zeros(len(pixels))
     wide = np.flatnonzero(reach >= 2)
@@ -222,8 +212,8 @@ def measure_imbalance(
 def _find_neighbours(
     codes: NDArray[np.int32], usable: Mask, pixels: Indices, index: Indices, reach: Indices
 ) -> Indices:
-    """Flat pixels (N, 8) on both sides of boundaries, clear of their blur and of where the bit flips
-    again; -1 in place of both if one is not."""
+    """Flat pixels (N, 8) on both sides of boundaries, clear of their blur and of the bit's next
+    flips; -1 for both if one is not."""
     width = codes.shape[1]
     around = np.full((pixels.size, 2 * len(_NEIGHBOURS_PX)), -1)
     for k in range(pixels.size):

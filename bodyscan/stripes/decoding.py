@@ -28,13 +28,12 @@ def decode_stripes(
     """Compute the stripe coordinate of every pixel from one pair's images of one shot.
 
     lit, dark: (H, W); None if the code can do without (see docs/formats.md).
-    coded: (F, H, W), the images of the code in the order of its `image_counts`, then those of the
-        crossing stripes, which give the map's `crossing`.
+    coded: (F, H, W) in the order of the code's `image_counts`, then those of the crossing stripes.
     limits: the stripes that matter; others get no s.
     bands: the lines on which boundaries are wanted, and no s.
 
-    Raises DecodingFailed for inconsistent images. If only those of the crossing stripes are
-    inconsistent, the map is that of the others and says why.
+    Raises DecodingFailed for inconsistent images; the map's `crossing_fault` says so of crossing
+    ones.
     """
     try:
         images, *crossing_images = images_by_kind(code, coded)
@@ -86,7 +85,7 @@ def restrict(stripes: StripeMap, limits: StripeLimits) -> StripeMap:
 def images_by_kind(code: StripeCode, coded: Greys) -> list[dict[ImageKind, Greys]]:
     """Split the images (F, H, W) of a code by kind, and those of the crossing stripes.
 
-    Raises DecodingFailed if there are too few or too many.
+    Raises DecodingFailed for a wrong number.
     """
     counts = [direction.image_counts for direction in code.directions]
     ends = np.cumsum([number for each in counts for number in each.values()])

@@ -20,10 +20,8 @@ MIN_PIXELS = 500
 def measure_noise(images: ScanLines) -> Floats:
     """Measure the variance (256,) of one image's grey level, for each grey level.
 
-    Away from the few edges of the coarsest pattern, the brighter of it and its inverse equals the
-    lit frame, and the other the dark frame (without inverses the pattern equals one of the two): the
-    difference is noise. It is measured in bands of grey levels because light itself is noisy (laser
-    speckle more so), and smoothed by `fit_variance`.
+    Away from the coarsest pattern's edges, the brighter of it and its inverse equals the lit frame,
+    the other the dark frame; differences are noise, measured in bands of grey levels.
     """
     empty = np.empty((0, 0), images.lit.dtype)
     inverse = empty if images.inverses is None else images.inverses[0]
@@ -51,15 +49,13 @@ def measure_noise(images: ScanLines) -> Floats:
 
 
 def fit_variance(grey: Array, variance: Array, count: Array, dtype: np.dtype[Any]) -> Floats:
-    """Fit the variance (256,) of each grey level to that of bands: it nowhere decreases and stays
-    above the rounding of images of type `dtype`.
+    """Fit the variance (256,) of each grey level to that of bands: nowhere decreasing, and above
+    the rounding of images of type `dtype`.
 
-    grey, variance, count: (N,) mean grey level, variance and number of pixels of N bands, the
-        darkest first.
+    grey, variance, count: (N,) mean grey level, variance and pixels of N bands, the darkest first.
 
-    The fit is a straight line for whole grey levels and isotonic for finer ones: merged exposures are
-    tens of times less noisy in the dark than where the longer one is white, and a straight line is
-    negative there.
+    The fit is linear for whole grey levels and isotonic for finer ones: merged exposures are tens
+    of times less noisy in the dark, where a line would be negative.
     """
     # Rounding to whole levels (1/12) with a margin; for 12 bits, 16 times finer.
     min_variance = 0.15 if dtype == np.uint8 else 0.15 / 16.0**2
@@ -89,10 +85,11 @@ def _sum_differences(
     share: float,
     max_difference: Array,
 ) -> Array:
-    """Sum 1, d, d^2 and the grey level (4, BANDS) over pairs of frames that differ by noise d alone.
+    """Sum 1, d, d^2 and the grey level (4, BANDS) over pairs of frames that differ by noise d
+    alone.
 
-    Of every other pixel on every other line. Without an inverse (0, 0), `bright` (L, P) says where
-    the pattern equals the lit frame.
+    Of every other pixel on every other line. `bright` (L, P) stands in for a missing inverse (0,
+    0).
     """
     sums = np.zeros((4, max_difference.size))
     for line in range(0, lit.shape[0], 2):
@@ -112,11 +109,8 @@ def _sum_differences(
 def _add(
     sums: Array, first: float, second: float, band: Indices, share: float, max_difference: Array
 ) -> None:
-    """Add one difference to its band.
-
-    band: (256,) of each grey level.
-    share: weight of the second frame in the grey level that chooses the band.
-    """
+    """Add one difference to its band (256,); share: weight of the second frame in the band's
+    level."""
     difference = np.float64(second) - np.float64(first)
     level = np.float64(first) + share * difference
     k = band[np.int64(level)]

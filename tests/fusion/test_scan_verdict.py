@@ -329,15 +329,6 @@ def test_alignment_takes_no_part_if_not_wanted(images: list[RangeImage]) -> None
     assert scan.verdict.grade == "good"
 
 
-def test_how_much_is_filled_does_not_depend_on_the_points_asked_for(
-    images: list[RangeImage],
-) -> None:
-    """5,000 points lie 20 mm apart: by them next to nothing of the mesh was measured."""
-    settings = NOT_FOLLOWED.model_copy(update={"fusion": FusionSettings(points=5_000)})
-    scan = fused(images, settings=settings)
-    assert scan.verdict.grade == "good", said(scan)
-
-
 def test_a_pair_that_gives_less_than_it_looks_at_is_named(images: list[RangeImage]) -> None:
     """Half of its picture is dark; white where it was overexposed."""
     rng = np.random.default_rng(2)

@@ -26,8 +26,7 @@ _CODES: dict[str, type[StripeCode]] = {}
 
 
 def register(*codes: type[StripeCode]) -> None:
-    """Add codes. Raises ValueError for a name, of a code or
-    kind, that already means something else."""
+    """Add codes. Raises ValueError if the name of a code or kind already means something else."""
     for code in codes:
         name = code.model_fields["code"].default
         if _CODES.get(name, code) is not code:
@@ -45,7 +44,7 @@ def image_kinds() -> tuple[ImageKind, ...]:
 
 
 def parse_stripe_code(keys: Any) -> Any:
-    """Parse the StripeCode that a rig file's `projector` describes; anything but a mapping is returned
+    """Parse the StripeCode that a rig file's `projector` describes; return all but a mapping
     unchanged.
 
     Keys without a value (null) count as not given. Raises pydantic's ValidationError.
@@ -83,8 +82,7 @@ def parse_stripe_code(keys: Any) -> Any:
 def _split_crossing(
     keys: dict[str, Any],
 ) -> tuple[dict[str, Any], StripeCode | None, list[InitErrorDetails]]:
-    """Split off `crossing` from a projector's keys; returns the others, the code that it describes,
-    and its errors.
+    """Split off `crossing` from a projector's keys: the other keys, its code, and its errors.
 
     Crossing stripes of the same code share its keys, except those that no two directions share.
     """

@@ -77,11 +77,7 @@ class _NumberedStripes(StripeCode):
     @property
     def show_order(self) -> tuple[int, ...]:
         """The finest pattern in the middle, coarser ones alternately before and after it, inverses
-        adjacent.
-
-        Half of all boundaries belong to the finest and a quarter to the next: this order keeps the
-        error from motion smallest.
-        """
+        adjacent. As half of all boundaries are the finest's, motion does the least harm so."""
         finest_first = range(self.bits - 1, -1, -1)
         bits = (*finest_first[2::2][::-1], finest_first[0], *finest_first[1::2])
         if not self.inverses:

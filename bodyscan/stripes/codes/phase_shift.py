@@ -31,12 +31,9 @@ Count = Annotated[float, Field(gt=0, le=65535)]
 class PhaseShift(StripeCode):
     """One wave or several, given by their periods.
 
-    period: stripes per period of the wave, or of each wave; alternatively
-    periods: how many periods the stripes make.
-    steps: images of each wave.
-    shift: which way the waves move from image to image.
-    start_deg: the phase, in degrees, at `origin` in image 0.
-    origin: s where the waves begin.
+    period: stripes per period of each wave; alternatively periods: how many the stripes make.
+    steps: images of each wave. shift: which way waves move from image to image.
+    start_deg: the phase, degrees, at `origin` (stripes) in image 0.
     inverses: whether to show those of the Gray code, which exists for a single wave that repeats.
     """
 
@@ -109,8 +106,7 @@ class PhaseShift(StripeCode):
 
     @property
     def half_periods(self) -> int:
-        """Number of half periods of the single wave in all stripes, the last one perhaps
-        incomplete."""
+        """Number of half periods of the single wave, the last one perhaps incomplete."""
         return math.ceil(2.0 * self.stripes / self._lengths[0] - 1e-9)
 
     @property
@@ -170,8 +166,8 @@ class PhaseShift(StripeCode):
 def find_repetition(
     periods: tuple[float, ...], stripes: int, min_change: float = 0.004
 ) -> float | None:
-    """Find by how many stripes s can move, fewer than `stripes`, without any wave changing by as much
-    as `min_change` of its period; None if it cannot, in which case the waves determine s.
+    """Find by how many stripes s can move, fewer than `stripes`, without any wave changing by as
+    much as `min_change` of its period; None if the waves determine s.
 
     The default is 8 times the minimum sigma of a phase, so that an order can be found at all.
     """

@@ -31,9 +31,7 @@ from bodyscan.stripes.usable_pixels import MIN_CONTRAST, find_usable_pixels
 def decode_bits(
     code: WordCode, images: ScanLines, lit: Greys, stripes: int, limits: StripeLimits | None
 ) -> StripeMap:
-    """Compute the stripe map from images that `lay_out` prepared.
-
-    lit: (H, W) in the camera's layout.
+    """Compute the stripe map from images laid out by `lay_out`; lit: (H, W) in the camera's layout.
 
     Raises DecodingFailed if the images are inconsistent.
     """
@@ -78,11 +76,11 @@ def lay_out(
     direction: str,
     bands: LineBands | None = None,
 ) -> ScanLines:
-    """Lay out patterns (bits, H, W), and inverses if any, as scan lines: all, or those near `bands`.
+    """Lay out patterns (bits, H, W), and inverses if any, as scan lines: all, or those near
+    `bands`.
 
-    A missing dark frame is made from the patterns and their inverses: every stripe is dark in one of
-    each two. So are both lit and dark if they were exposed differently. Raises DecodingFailed if
-    there are no inverses either.
+    A missing dark frame is made from the patterns and their inverses, and so are both lit and dark
+    if they were exposed differently. Raises DecodingFailed if there are neither inverses nor dark.
     """
     transposed, selected = direction == "horizontal", None
     if bands is not None:
@@ -107,12 +105,11 @@ def lay_out(
 
 
 def _is_equally_exposed(lit: Greys, dark: Greys, patterns: Greys, inverses: Greys) -> bool:
-    """Whether the brighter of a coarse pattern and its inverse is as bright as the lit frame, and
-    the darker as dark as the dark one; a camera with automatic exposure makes them differ.
+    """Whether coarse patterns and inverses are as bright as the lit frame and as dark as the dark
+    one.
 
-    Beyond a quarter of the contrast boundaries would move by that share of their blur, a tenth of a
-    pixel. Finer patterns than the first three may be blurred; non-linear grey levels then brighten
-    both pattern and inverse.
+    Automatic exposure makes them differ; beyond a quarter of the contrast boundaries would move by
+    a tenth of a pixel. Patterns finer than the first three may be blurred.
     """
     step = max(1, math.isqrt(lit.size // 20_000))
     some = (slice(None, None, step), slice(None, None, step))
@@ -135,9 +132,7 @@ def _is_equally_exposed(lit: Greys, dark: Greys, patterns: Greys, inverses: Grey
 def read_words(
     code: WordCode, images: ScanLines, count: int, variance: Floats
 ) -> NDArray[np.uint16]:
-    """Read the code words (L, P), of which there are `count`.
-
-    variance: (256,) of each grey level.
+    """Read the code words (L, P), of which there are `count`; variance: (256,) of each grey level.
 
     Raises DecodingFailed if the frames are inconsistent.
     """
@@ -152,10 +147,9 @@ def fill_from_codes(s: Floats, sigma: Floats, codes: NDArray[np.int32], coded: M
     """Write s and its standard deviation (L, P) into `coded` pixels that have none, from a line
     fitted to the codes of the pixels around.
 
-    Where stripes are narrower than two pixels, or so blurred that noise flips the finest bits, the
-    code jumps by two or three from pixel to pixel, and a run of boundaries breaks at each jump.
-    Codes are still right to about a stripe, and a line through several of them to a fraction. A
-    pixel whose code is a stripe off the line of its neighbours gets none.
+    Where stripes are so narrow or blurred that codes jump by two or three, runs of boundaries
+    break; codes are still right to about a stripe. A pixel whose code is a stripe off the line gets
+    none.
     """
     for row in range(codes.shape[0]):
         for x in range(codes.shape[1]):
@@ -167,9 +161,10 @@ def fill_from_codes(s: Floats, sigma: Floats, codes: NDArray[np.int32], coded: M
 
 @compiled
 def _fit_codes(codes: NDArray[np.int32], coded: Mask, middle: int) -> tuple[float, float]:
-    """Fit a line to the codes (P,) within 4 pixels: its offset from the pixel's own code, and sigma.
+    """Fit a line to the codes (P,) within 4 pixels: its offset from the pixel's own code, and
+    sigma.
 
-    Sigma is 0 if there is no line, or no jump that would break a run of boundaries.
+    Sigma is 0 without a line, or without a jump that would break a run of boundaries.
     """
     first, last = max(middle - 4, 0), min(middle + 4, codes.size - 1)
     jumps, last_code = False, 0

@@ -29,10 +29,9 @@ def stripe_from_gray(gray: NDArray[np.uint16]) -> NDArray[np.int32]:
 class WordCode:
     """Conversion between stripe numbers and code words.
 
-    encode, decode: numbers to words and back.
     single: whether the words of neighbouring stripes differ in one bit.
-    blur_sigma_px: added to the sigma of boundaries where the finest pattern's stripes are one wide
-        instead of two and blur into each other (measured on synthetic images).
+    blur_sigma_px: added to the sigma of boundaries where the finest stripes are one wide and blur
+        into each other (measured on synthetic images).
     first: the number of stripe 0.
     """
 

@@ -25,12 +25,8 @@ MIN_CHANGES = 50
 
 
 def check_exposure(images: ScanLines) -> None:
-    """Raise DecodingFailed for frames that are black or overexposed.
-
-    The sum of a pattern and its inverse is not checked: cameras and projectors are non-linear, so
-    blurred patterns look brighter than sharp ones. Without an inverse, a pattern must nowhere be
-    brighter than lit or darker than dark, or its threshold would be wrong.
-    """
+    """Raise DecodingFailed for frames that are black or overexposed, or, without inverses, for a
+    pattern brighter than lit or darker than dark, whose threshold would be wrong."""
     step = max(1, round(math.sqrt(images.lit.size / 50_000)))  # that many pixels are enough
     some = (slice(None, None, step), slice(None, None, step))
     lit, dark = images.lit[some].astype(np.int16), images.dark[some].astype(np.int16)
@@ -169,11 +165,9 @@ def _check_finest(patterns: Greys, inverses: Greys, contrast: Floats) -> None:
 
 
 def _is_even_grey(patterns: Greys, inverses: Greys, bit: int) -> bool:
-    """Whether a pattern is an even grey between the darkest and the brightest that each pixel sees.
-
-    Then projector or lens could not show its stripes, and the pixels are judged one by one; a
-    pattern used as its own inverse is black and white, or exactly equal to it.
-    """
+    """Whether a pattern is an even grey between the darkest and the brightest that each pixel
+    sees: too fine for projector or lens. A pattern used as its own inverse is not, or exactly
+    equal to it."""
     if np.mean(patterns[bit] == inverses[bit]) > 0.9:
         return False
     low = np.minimum(patterns, inverses).min(axis=0).astype(np.float32)
@@ -189,7 +183,7 @@ def _share_in_step(
     """Compute for each bit the share of its changes along lines that lead to a neighbouring stripe.
 
     A change belongs to the coarsest bit that differs; bits with fewer than 50 changes are left out.
-    In Gray code with inverses only changes that are clear of noise count: noise flips single bits.
+    In Gray code with inverses only changes that are clear of noise count.
     """
     bits = len(images.patterns)
     some = slice(None, None, 1 + words.size // 600_000)
@@ -225,10 +219,9 @@ def _find_clear_changes(
 ) -> tuple[Mask, Codes]:
     """Find changes of a bit between pixels (N,) and the next ones that are clear of noise and rims.
 
-    Every coarser bit and the next finer one must be clear in both pixels. Returned besides are masks
-    (N,) of the finer bits that noise may have flipped. A coarse bit must be clear and unchanged 4 px
-    to either side too: where it is weak throughout, noise flips it to and fro. Where the brightness
-    doubles, the change may be a rim, behind which another surface may show any stripe.
+    Every coarser bit and the next finer one must be clear in both pixels; a coarse bit also clear
+    and unchanged 4 px to either side. Where the brightness doubles, the change may be a rim. Also
+    returns masks (N,) of the finer bits that noise may have flipped.
     """
     patterns, inverses = images.patterns, images.inverses
     assert inverses is not None
