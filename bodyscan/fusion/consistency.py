@@ -168,32 +168,16 @@ def _compare(
     limits_mm: of agreement, and of a double surface.
     """
     points, normals = samples
-    surface_points, surface_normals, numbers = surface
+    surface_points, surface_normals, _ = surface
     index, at, shifts, against_index, against_at = found
     centre = -camera_from_rig[0].T @ camera_from_rig[1]
     agreed = contradicted = 0
     for n in range(len(points)):
         if excluded[0] <= n < excluded[1] or not _faces(points[n], normals[n], centre):
             continue
-        x, y, z = _in_camera(points[n], camera_from_rig)
-        if z <= 1.0:  # mm
-            continue
-        u, v = look_up(projection, x / z, y / z)
-        column, row = int(np.rint(u)) - corner[0], int(np.rint(v)) - corner[1]
-        if not (0 <= column < numbers.shape[1] and 0 <= row < numbers.shape[0]):
-            continue
-        there = numbers[row, column]
+        there = _find_point(points[n], surface, corner, projection, camera_from_rig, warped)
         if there < 0:
             continue
-        if warped:
-            x, y, z = _in_camera(surface_points[there], camera_from_rig)
-            at_u, at_v = look_up(projection, x / z, y / z)
-            column, row = column + int(np.rint(u - at_u)), row + int(np.rint(v - at_v))
-            if not (0 <= column < numbers.shape[1] and 0 <= row < numbers.shape[0]):
-                continue
-            there = numbers[row, column]
-            if there < 0:
-                continue
         cosine = outward = 0.0
         for k in range(3):
             normal = surface_normals[there, k]
@@ -210,6 +194,37 @@ def _compare(
             against_index[contradicted], against_at[contradicted] = n, there
             contradicted += 1
     return agreed, contradicted
+
+
+@compiled
+def _find_point(
+    point: Floats,
+    surface: tuple[Floats, Floats, Numbers],
+    corner: tuple[int, int],
+    projection: Table,
+    camera_from_rig: tuple[Array, Array],
+    warped: bool,
+) -> int:
+    """Number of the surface's point at the pixel that shows a point of the rig frame, or -1."""
+    surface_points, _, numbers = surface
+    x, y, z = _in_camera(point, camera_from_rig)
+    if z <= 1.0:  # mm
+        return -1
+    u, v = look_up(projection, x / z, y / z)
+    column, row = int(np.rint(u)) - corner[0], int(np.rint(v)) - corner[1]
+    there = _number_at(numbers, row, column)
+    if warped and there >= 0:
+        x, y, z = _in_camera(surface_points[there], camera_from_rig)
+        at_u, at_v = look_up(projection, x / z, y / z)
+        column, row = column + int(np.rint(u - at_u)), row + int(np.rint(v - at_v))
+        there = _number_at(numbers, row, column)
+    return there
+
+
+@compiled
+def _number_at(numbers: Numbers, row: int, column: int) -> int:
+    inside = 0 <= column < numbers.shape[1] and 0 <= row < numbers.shape[0]
+    return int(numbers[row, column]) if inside else -1
 
 
 @compiled

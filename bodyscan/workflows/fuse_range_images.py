@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 
@@ -19,10 +19,9 @@ from bodyscan.fusion.regions import label_regions
 from bodyscan.fusion.storage import Made, Scan, no_use
 from bodyscan.fusion.verdict import grade_scan
 from bodyscan.fusion.verdict.coverage import measure_coverage
-from bodyscan.fusion.verdict.evidence import Coverage, ImageEvidence, RigEvidence
-from bodyscan.fusion.verdict.floor import find_floor
+from bodyscan.fusion.verdict.evidence import Coverage, ImageEvidence, RigEvidence, ScanEvidence
 from bodyscan.fusion.verdict.overlaps import find_seams
-from bodyscan.fusion.verdict.rig import find_silent_poles
+from bodyscan.fusion.verdict.rig import find_floor, find_silent_poles
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.mesh.body import BodyCloud, BodyMesh
@@ -95,19 +94,19 @@ def fuse(
     with step(progress, "merging"):
         merged = _merge(subject, settings.fusion)
     with step(progress, "judging"):
-        judged = partial(
-            grade_scan,
+        evidence = ScanEvidence(
             merged.cloud,
             RigEvidence.from_calibration(calibration),
             _image_evidence(calibration, measured, cleaned, subject, merged.contradictions),
             settings.use,
-            together=subject.aligned,
-            person=subject.person,
+            subject.aligned,
+            subject.person,
         )
-        announce(judged(), final=False)
+        announce(grade_scan(evidence), final=False)
     with step(progress, "meshing"):
         cloud, mesh = _mesh(merged.cloud, measured.value, subject, settings, made)
-        verdict = judged(mesh=mesh, coverage=_coverage(mesh, cleaned, subject))
+        seen = _coverage(mesh, cleaned, subject)
+        verdict = grade_scan(replace(evidence, mesh=mesh, coverage=seen))
     return Scan(
         cloud,
         mesh,

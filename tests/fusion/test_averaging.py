@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -168,20 +166,3 @@ def test_surfaces_that_look_other_ways_are_not_one() -> None:
     found = compare_with_surface(replace(samples, starts=samples.starts), turned, 1, 1.5, 6.0)
     own = found.index[found.index < samples.starts[1]]
     assert not own.size
-
-
-def test_how_far_pairs_scatter_is_told_against_their_sigmas_where_they_overlap() -> None:
-    """A robust ratio of 3, of every eighth sample; 1 at least, and where nobody sees the same."""
-    rng = np.random.default_rng(0)
-    count = 40_000
-    samples: Any = SimpleNamespace(sigma_mm=np.full(count, 0.3))
-    surface: Any = SimpleNamespace(sigma_mm=np.full(count, 0.4))
-
-    def seen(mm: float, some: int = count) -> Any:
-        every = np.arange(some)
-        return SimpleNamespace(index=every, at=every, shift_mm=mm * rng.standard_normal(some))
-
-    assert estimate_sigma_inflation(samples, [surface], [seen(1.5)]) == pytest.approx(3.0, rel=0.05)
-    assert estimate_sigma_inflation(samples, [surface], [seen(0.2)]) == 1.0
-    assert estimate_sigma_inflation(samples, [surface], [seen(1.5, 0)]) == 1.0
-    assert estimate_sigma_inflation(samples, [], []) == 1.0

@@ -12,7 +12,6 @@ from ray_cast_scan import Scan
 
 from bodyscan.arrays import Array
 from bodyscan.fusion.brightness import (
-    equalize_brightness,
     estimate_light_power,
     find_overlaps,
     log_irradiance,
@@ -55,11 +54,6 @@ def test_light_that_the_room_gives_is_not_taken_for_more_than_matt() -> None:
     shade = np.linspace(-1.0, 1.0, 500).astype(np.float32)
     assert estimate_light_power([(-0.5 * shade, shade)]) == 0.0
     assert estimate_light_power([(3.0 * shade, shade)]) == 1.0
-
-
-def test_one_grey_under_light_that_falls_alike_tells_no_power() -> None:
-    ratio, shade = np.full((2, 500), 0.3, np.float32)
-    assert estimate_light_power([(ratio, shade)]) == 0.0
 
 
 def test_no_seams_between_exposures(scan: Scan, cleaned: list[RangeImage]) -> None:
@@ -125,51 +119,3 @@ def test_an_overlap_tells_how_much_brighter_one_pair_is_than_the_other() -> None
     (many,) = overlap(np.full(12_000, 100), np.full(12_000, 150))
     assert many.spots == 12_000
     assert len(many.ratio) == 4000  # a third of them tell as much
-
-
-def test_an_overlap_counts_for_as_many_spots_as_it_stands_for() -> None:
-    """Two pairs tied twice, saying 1 and 1.5, the first of three times as many spots: 1.107."""
-    found = solve_gains([(0, 1, 0.0, 300), (0, 1, float(np.log(1.5)), 100)], 2)
-    assert found[0] / found[1] == pytest.approx(1.5**0.25, rel=1e-3)
-
-
-def test_a_pair_that_a_thousandth_of_the_overlaps_ties_is_held_by_as_much() -> None:
-    """Two that are tied closely, and a third, each held by a thousandth: w / (w + 2/3 h) of the way. A
-    pair that nothing ties keeps its own brightness, however bright the others are."""
-    found = solve_gains([(0, 1, 0.0, 99_900), (1, 2, float(np.log(2.0)), 100)], 4)
-    assert found[1] / found[2] == pytest.approx(2.0**0.6, rel=0.01)
-    assert found[0] == pytest.approx(found[1], rel=1e-3)
-
-
-def test_two_exposures_of_a_matt_surface_come_out_alike() -> None:
-    """Grey levels that are the light times 0.8 of it, and twice the exposure of one pair."""
-    rng = np.random.default_rng(1)
-    count = 600
-    points = np.column_stack([rng.uniform(-300, 300, (count, 2)), np.zeros(count)]).astype(
-        np.float32
-    )
-    normals = np.tile([0.0, 0.0, 1.0], (count, 1)).astype(np.float32)
-    centres = np.array([[0.0, 0.0, 900.0], [800.0, 0.0, 500.0]])
-    greys = []
-    for centre, exposure in zip(centres, (1.0, 2.0), strict=True):
-        light = np.exp(log_irradiance(points, normals, centre) + np.log(900.0**2))
-        greys.append(np.rint(60.0 * exposure * light).astype(np.uint8))
-    samples: Any = SimpleNamespace(
-        points=points, normals=normals, colours=greys[0], starts=np.array([0, count, count])
-    )
-    surfaces: Any = [
-        SimpleNamespace(
-            points=points, normals=normals, colours=grey,
-            rig_from_camera=SimpleNamespace(translation=centre),
-        )
-        for grey, centre in zip(greys, centres, strict=True)
-    ]  # fmt: skip
-    none = SimpleNamespace(index=np.zeros(0, np.int64), at=np.zeros(0, np.int64))
-    seen: Any = [none, SimpleNamespace(index=np.arange(count), at=np.arange(count))]
-    found = equalize_brightness(samples, surfaces, seen)
-    assert np.median(found.surfaces[1] / found.samples) == pytest.approx(1.0, rel=0.02)
-    assert np.std(np.log(found.samples)) < 0.03, "whichever part of it faces the light"
-    assert np.std(np.log(greys[0])) > 0.05
-    # As bright as the body is on the whole, between both exposures.
-    typical = 60.0 * np.sqrt(2.0) * np.exp(np.mean(np.log(greys[0] / 60.0)))
-    assert np.median(found.samples) == pytest.approx(typical, rel=0.05)

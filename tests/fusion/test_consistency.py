@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 from flat_walls import ASIDE, WALL_MM, wall
 
-from bodyscan.fusion.brightness import EqualizedGrey
 from bodyscan.fusion.consistency import Consistency, compare_with_surface
-from bodyscan.fusion.merging import average
 from bodyscan.fusion.smoothing import SmoothSurface
 from bodyscan.fusion.voxel_thinning import Samples, take_samples
 from bodyscan.geometry.transforms import RigidTransform
@@ -53,26 +51,6 @@ def test_a_wall_in_front_says_nothing() -> None:
     _, _, consistency = seen_beside(-40.0)
     assert not consistency.index.size
     assert not consistency.against_index.size
-
-
-def test_means_by_weight() -> None:
-    samples, surfaces, consistency = seen_beside(0.8)
-    nothing = compare_with_surface(samples, surfaces[0], 0, 0.0, 0.0)
-    own = [surface.colours.astype(np.float32) for surface in surfaces]
-    grey = EqualizedGrey(samples.colours.astype(np.float32), own)
-    cloud = average(samples, surfaces, [nothing, consistency], grey)
-    assert len(cloud.points) == len(samples.points)
-    inner = np.zeros(len(cloud.points), bool)
-    inner[consistency.index] = True
-    ours, theirs = samples.weight[consistency.index], surfaces[1].weight[consistency.at]
-    share = theirs / (ours + theirs)
-    np.testing.assert_allclose(cloud.points[inner, 2], WALL_MM + 0.8 * share, atol=2e-3)
-    np.testing.assert_allclose(cloud.colours[inner, 0], 100 + 20 * share, atol=0.51)
-    np.testing.assert_allclose(cloud.normals, [[0.0, 0.0, -1.0]] * len(cloud.points), atol=1e-3)
-    assert (cloud.pairs_seen[inner] == 2).all()
-    assert (cloud.pairs_seen[~inner] == 1).all()
-    # 0.8 mm apart with sigmas of 0.025: everything is that much less certain.
-    assert np.median(cloud.sigma_mm) > 0.2
 
 
 def test_a_surface_that_was_bent_is_asked_where_its_points_went() -> None:

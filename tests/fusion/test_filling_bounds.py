@@ -106,14 +106,6 @@ def test_what_was_measured_on_one_side_only_leaves_no_gap() -> None:
     assert open_columns(plates(*BETWEEN[1:]), measured) == []
 
 
-def test_a_single_pixel_that_was_measured_closes_a_gap_around_it() -> None:
-    image = shown((COLUMN < 21) | (COLUMN > 39))
-    image.points[10, 30, 2], image.sigma_mm[10, 30] = 1000.0, 0.1
-    found = find_gaps(plates(*BETWEEN), image, HERE, 1, np.s_[0:20, 0:60])
-    closed = np.argwhere(~found[:, 22:39]) + [0, 22]
-    assert closed.tolist() == [[row, column] for row in (9, 10, 11) for column in (29, 30, 31)]
-
-
 @pytest.mark.parametrize("depth", [900.0, 1100.0])
 def test_what_lies_before_or_behind_measured_surface_is_a_shadow_and_no_gap(depth: float) -> None:
     measured = (COLUMN < 21) | (COLUMN > 39)

@@ -47,39 +47,6 @@ def test_a_pair_that_is_shifted_along_x_errs_where_it_looks_along_x(cloud: BodyC
     assert found.points is cloud.points
 
 
-def test_a_pair_counts_wherever_it_stands_before_the_surface(cloud: BodyCloud) -> None:
-    """Along y too, where the point's normal has no other part."""
-    covariance = np.diag([0.0, 0.0, 0.0, 0.0, 0.04**2, 0.0])
-    for side in (1.0, -1.0):
-        found = add_pose_variance(
-            cloud, placed([0, 1300 * side, 900]), PoseCovariance(("p0",), covariance)
-        )
-        seen = side * cloud.normals[:, 1] > 0.999
-        assert found.sigma_mm[seen] == pytest.approx(0.05, rel=1e-3)
-        assert found.sigma_mm[side * cloud.normals[:, 1] < 0.0] == pytest.approx(0.03)
-
-
-def test_draws_of_the_placing_spread_by_the_error_bar(cloud: BodyCloud) -> None:
-    rng = np.random.default_rng(4)
-    # A turn of 4e-5 moves what is 900 mm away by more than the shift does.
-    root = rng.normal(size=(6, 6)) * np.array([4e-5] * 3 + [0.02] * 3)[:, None]
-    prior = PoseCovariance(("p0",), root @ root.T)
-    place = placed([1300, 0, 900])
-    points = rng.uniform([-300.0, -300.0, 0.0], [300.0, 300.0, 1800.0], (73, 3))
-    normals = rng.normal(size=points.shape)
-    normals /= np.linalg.norm(normals, axis=1)[:, None]
-    alone = replace(
-        cloud, points=points, normals=normals.astype(np.float32), sigma_mm=0 * cloud.sigma_mm
-    )
-    sigma = add_pose_variance(alone, place, prior).sigma_mm
-    twists = rng.normal(size=(4000, 6)) @ root.T
-    moved = np.array([RigidTransform.identity().retract(t).apply(points) for t in twists])
-    along = np.einsum("knc,nc->kn", moved - points, normals)
-    seen = sigma > 0
-    assert seen.sum() > 20
-    assert sigma[seen] == pytest.approx(along.std(axis=0)[seen], rel=0.06)
-
-
 @pytest.mark.parametrize(
     ("seen", "alike", "share"),
     [(1, 0.0, 1.0), (2, 0.0, 0.5), (2, 1.0, 1.0), (2, 0.5, 0.75), (1, 0.5, 1.0), (5, 0.0, 0.5)],
@@ -136,13 +103,3 @@ def test_what_moves_a_followed_body_as_a_whole_stays_in_its_sigmas(cloud: BodyCl
         followed: Any = SimpleNamespace(cells=Cells(), sigma_mm=np.array([motion_mm]))
         found = add_motion_variance(cloud, by_boards, followed)
         assert found.sigma_mm == pytest.approx(expected, rel=1e-6)
-
-
-def looking_from(cosine: float, azimuth_deg: float) -> RigidTransform:
-    """A camera a metre from the point that sees its surface under that cosine."""
-    sine, turn = np.sqrt(1.0 - cosine**2), np.radians(azimuth_deg)
-    away = np.array([sine * np.cos(turn), sine * np.sin(turn), cosine])
-    return RigidTransform(np.eye(3), POINT + 1000.0 * away)
-
-
-POINT = np.array([40.0, -30.0, 1200.0])

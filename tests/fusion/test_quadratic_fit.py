@@ -115,22 +115,6 @@ def test_a_surface_behind_takes_no_part_however_large(beside: int, sigmas: float
     same(fitted(offset), by_numpy(offset, ~behind))
 
 
-def test_each_pixel_is_fitted_by_the_window_around_it() -> None:
-    height, width = 16, 20
-    v, u = np.mgrid[:height, :width].astype(float)
-    image = (CENTRE + SIGMA * (1.5 * u - 2.5 * v)).astype(np.float32)
-    fit, accepted = blank(height, width), np.zeros((height, width), bool)
-    noise = np.full((height, width), SIGMA, np.float32)
-    wanted = u > 1
-    pixels = np.flatnonzero(wanted.ravel())
-    fit_trimmed_windows(image, noise, pixels, REACH, PIXEL_MM, fit, accepted)
-    np.testing.assert_array_equal(accepted, wanted)
-    assert np.all(fit.sigma[~wanted] == 0.0)
-    np.testing.assert_allclose(fit.value[wanted], image[wanted], atol=0.02 * SIGMA)
-    np.testing.assert_allclose(fit.slope_u[wanted], 1.5 * SIGMA, atol=0.02 * SIGMA)
-    np.testing.assert_allclose(fit.slope_v[wanted], -2.5 * SIGMA, atol=0.02 * SIGMA)
-
-
 def test_a_window_cut_by_a_rim_is_fitted_exactly() -> None:
     """A quadratic in the pixels fits a quadratic exactly, however much of the window is missing."""
     v, u = np.mgrid[:60, :60].astype(np.float32)

@@ -69,29 +69,6 @@ def test_a_damaged_one_raises_nothing_but_our_own_errors(
         export_scan(load_scan(folder), folder / "out", ["stl"], ["full"])
 
 
-@pytest.mark.parametrize(
-    ("rows", "columns", "fault"),
-    [
-        (4, 4, ""),
-        (3, 4, "at least 4"),
-        (5, 4, "at most 4"),
-        (4, 3, "at least 4"),
-        (4, 5, "at most 4"),
-    ],
-)
-def test_where_cameras_stood_is_told_by_matrices_of_four_by_four(
-    rows: int, columns: int, fault: str, tmp_path: Path
-) -> None:
-    facts = json.loads((STORED / "scan.json").read_text("utf-8"))
-    facts["alignment"]["rig_from_camera"] = {"p1-2": [[0.0] * columns] * rows}
-    (tmp_path / "scan.json").write_text(json.dumps(facts), "utf-8")
-    if not fault:
-        assert read_facts(tmp_path) == facts
-        return
-    with pytest.raises(ResultError, match=rf"alignment\.rig_from_camera\.p1-2.*{fault}"):
-        read_facts(tmp_path)
-
-
 def test_the_first_fault_is_named_and_a_calibration_has_a_name(tmp_path: Path) -> None:
     facts = json.loads((STORED / "scan.json").read_text("utf-8"))
     facts |= {"calibration_id": "", "failed": {"p1-2": 3}}

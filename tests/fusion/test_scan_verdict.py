@@ -16,7 +16,7 @@ from bodyscan.errors import ScanFailed
 from bodyscan.fusion.cleaning import apply_mask
 from bodyscan.fusion.meshing import closed_surface
 from bodyscan.fusion.storage import Scan
-from bodyscan.fusion.verdict.floor import find_floor
+from bodyscan.fusion.verdict.rig import find_floor
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.outcome import Outcome

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bodyscan.fusion.smoothing import SmoothSurface, distance_to_rim, smooth
+from bodyscan.fusion.smoothing import SmoothSurface, smooth
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.transforms import RigidTransform
@@ -220,25 +220,3 @@ def _directions(surface: SmoothSurface) -> np.ndarray:
     rows, columns = np.nonzero(surface.number >= 0)
     rays = RAYS[rows + top, columns + left]
     return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
-
-
-@pytest.mark.parametrize("turns", range(4))
-def test_rims_are_where_nothing_lies_beside_or_something_behind(turns: int) -> None:
-    """A hundredth of the depth behind; the surface behind ends nowhere there."""
-    depth = np.full((20, 20), 1000.0, np.float32)
-    depth[12:] = 1000.0 * (1.0 + np.float32(0.011))
-    depth[3, 5] = 0.0
-    rims = np.rot90(distance_to_rim(np.ascontiguousarray(np.rot90(depth, turns)), 0.01), -turns)
-    expected = np.minimum(np.arange(20)[:, None] + 1, np.arange(20) + 1).astype(float)
-    expected = np.minimum(expected, expected[::-1, ::-1])
-    assert rims[11, 9] == 1.0
-    assert rims[12, 9] == pytest.approx(2.0, abs=0.1), "what lies behind goes on"
-    assert rims[9, 10] == pytest.approx(3.0, abs=0.2)
-    assert rims[3, 5] == 1.0
-    assert rims[3, 6] == pytest.approx(2.0, abs=0.1)
-    assert rims[19, 10] == pytest.approx(2.0, abs=0.1)
-    np.testing.assert_array_less(rims[13:], expected[13:] + 1.1)
-    assert rims[15, 10] == pytest.approx(5.0, rel=0.05)
-    depth[12:] = 1000.0 * (1.0 + np.float32(0.009))
-    flat = np.rot90(distance_to_rim(np.ascontiguousarray(np.rot90(depth, turns)), 0.01), -turns)
-    assert flat[11, 9] > 5.0

@@ -61,15 +61,6 @@ def test_the_surface_ends_a_little_after_the_points() -> None:
     assert found.shift_mm[-1] == 0.0
 
 
-def test_a_thin_cloud_still_measures_what_lies_between_its_points() -> None:
-    cloud = cloud_of(sheet(spacing=3.5, size=40), UP)
-    rng = np.random.default_rng(0)
-    vertices = np.column_stack(
-        [rng.uniform(-30, -10, 200), rng.uniform(-20, 20, 200), np.zeros(200)]
-    )
-    assert asked(cloud, vertices.tolist()).measured.all()
-
-
 def test_between_two_surfaces_that_disagree_nothing_is_measured() -> None:
     """Two toes seen from above end in a gap; the mesh dips into it, near to points of both."""
     left = sheet()
@@ -147,17 +138,6 @@ def test_no_face_folds_over() -> None:
     assert cosines(vertices + shifts[:, None] * normals).min() < 0.3
     assert cosines(moved).min() > 0.3
     assert np.mean(np.abs(moved - vertices - shifts[:, None] * normals).max(axis=1) < 1e-12) > 0.8
-
-
-def test_a_points_weight_falls_off_as_a_gaussian_and_as_it_turns_away() -> None:
-    for off in (0.0, 1.0, 2.0, 3.0):
-        found = asked(cloud_of(np.array([[off, 0.0, 0.0]]), UP), [[0.0, 0.0, 0.0]])
-        # Half of the reach is one standard deviation.
-        assert found.weight[0] == pytest.approx(np.exp(-0.5 * (off / 2.0) ** 2))
-    for degrees in (0, 30, 60, 80):
-        turned = np.array([np.sin(np.radians(degrees)), 0.0, np.cos(np.radians(degrees))])
-        found = asked(cloud_of(np.zeros((1, 3)), turned), [[0.0, 0.0, 0.0]])
-        assert found.weight[0] == pytest.approx(turned[2] ** 2, rel=1e-5)
 
 
 def test_shift_and_spread_are_weighted_means_of_the_planes_around() -> None:

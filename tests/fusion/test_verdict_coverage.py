@@ -90,14 +90,6 @@ def test_a_camera_should_measure_what_faces_it_by_60_degrees(
     assert ("b" in found.yields) == asked
 
 
-def test_white_is_counted_from_254_on_among_what_it_should_have_measured() -> None:
-    image = seen("b", left_of=0)
-    image.lit[:, :61] = 254
-    image.lit[:, 61:] = 253
-    found = checked(seen("a"), image)
-    assert found.saturated["b"] == pytest.approx(0.5, abs=0.03)
-
-
 def test_spots_beside_the_picture_or_behind_the_camera_are_not_looked_at() -> None:
     """A wall of twice the picture's width: a camera that measured nothing is asked for its half."""
     wide = Camera(250.0, 250.0, 0.0, 60.0, 40.0, Radial(), 121, 81)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from bodyscan.arrays import Array
-from bodyscan.fusion.verdict.floor import find_floor
+from bodyscan.fusion.verdict.rig import find_floor
 from bodyscan.geometry.transforms import RigidTransform
 
 WITHIN: Any = SimpleNamespace(radius_mm=700.0)

@@ -9,7 +9,7 @@ import pytest
 from made_bodies import cylinder, mesh_of
 from ray_cast_scan import ROOT, load_body
 
-from bodyscan.measurement.head import BRAINCASE_MM, _Ellipsoid, _fit, _truncate, estimate_head_top
+from bodyscan.measurement.head import estimate_head_top
 from bodyscan.measurement.measurements import measure
 from bodyscan.mesh.body import DARK_CLOTH, HAIR, SKIN, UNSURE, BodyMesh
 from bodyscan.report.measurements import tables
@@ -69,19 +69,6 @@ def test_where_no_forehead_shows_the_head_is_somewhere_truncate(bald: BodyMesh) 
     assert found.head.sigma_mm == pytest.approx((found.stature_mm - low) / np.sqrt(12.0), abs=1.0)
 
 
-@pytest.mark.parametrize(("low", "high"), [(1692.0, 1720.0), (1650.0, 1703.0), (1704.0, 1709.0)])
-def test_of_an_estimate_only_what_lies_truncate_skin_and_hair_counts(
-    low: float, high: float
-) -> None:
-    heights = np.linspace(low, high, 20001)
-    weight = np.exp(-0.5 * ((heights - 1700.0) / 5.0) ** 2)
-    mean = np.average(heights, weights=weight)
-    found = _truncate(1700.0, 5.0, low, high)
-    assert found.height_mm == pytest.approx(mean, abs=0.01)
-    spread = np.sqrt(np.average((heights - mean) ** 2, weights=weight))
-    assert found.sigma_mm == pytest.approx(spread, abs=0.01)
-
-
 def test_a_head_that_nothing_shows_of_is_not_estimated() -> None:
     assert estimate_head_top(np.empty((0, 3)), 1700.0) is None
 
@@ -116,32 +103,6 @@ def test_what_was_filled_is_of_no_region() -> None:
     assert found.regions is not None
     assert found.regions["unsure"] == 1.0
     assert UNSURE == 0
-
-
-def test_the_sigma_of_the_top_is_that_of_centre_and_height_together() -> None:
-    """By differences of the top, and cut by what skin and hair leave open, against truncated sums."""
-    turn, down = np.meshgrid(np.linspace(-1.2, 1.2, 7), np.linspace(0.3, 0.75, 3))
-    ways = [np.cos(down) * np.cos(turn), np.cos(down) * np.sin(turn), np.sin(down)]
-    skin = np.stack(ways, axis=-1).reshape(-1, 3) * [99.0, 77.0, 95.0] + [0.0, 0.0, 1600.0]
-    hair = 1705.0
-    case = skin[skin[:, 2] > hair - BRAINCASE_MM]
-    fitted = _fit(case, hair)
-    steps = 1e-4 * np.eye(7)
-    top = [
-        (_Ellipsoid(fitted.state.centre + s[:3], fitted.state.size + s[3:]).top_mm
-         - _Ellipsoid(fitted.state.centre - s[:3], fitted.state.size - s[3:]).top_mm) / 2e-4
-        for s in steps
-    ]  # fmt: skip
-    sigma = float(np.sqrt(top @ fitted.covariance @ top))
-    heights = np.linspace(skin[:, 2].max(), hair, 20_001)
-    weights = np.exp(-0.5 * ((heights - fitted.state.top_mm) / sigma) ** 2)
-    mean = np.average(heights, weights=weights)
-    found = estimate_head_top(skin, hair)
-    assert found is not None
-    # Sums of 20,000 steps; cells of 15 mm hold one place each.
-    assert found.height_mm == pytest.approx(mean, abs=1e-2)
-    spread = np.sqrt(np.average((heights - mean) ** 2, weights=weights))
-    assert found.sigma_mm == pytest.approx(spread, rel=1e-3)
 
 
 def test_where_a_head_leans_to_changes_nothing() -> None:

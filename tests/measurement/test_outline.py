@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bodyscan.arrays import Array, Mask
-from bodyscan.measurement.outline import Outline, find_outline, holds_middle
+from bodyscan.measurement.outline import Outline, find_outline
 from bodyscan.mesh.slices import Loop, slice_mesh
 
 TRUNK_MM, ARM_MM, ARM_AT_MM = 150.0, 45.0, 230.0
@@ -104,16 +104,6 @@ def test_a_limb_that_is_seen_in_part_lies_between_chord_and_fill() -> None:
     assert found.girth_range_mm == pytest.approx((chord, 2.0 * np.pi * 60.0), rel=2e-3)
 
 
-def test_a_strip_that_is_itself_seen_in_two_parts_is_no_limb_either() -> None:
-    """From the first part's beginning to the last one's end it is as straight as the whole strip."""
-    points = arc(TRUNK_MM, 0.0, 0.0, 359.0)
-    degrees = np.arange(len(points))
-    gaps = ((40, 60), (85, 95), (120, 140))
-    filled = np.any([(degrees > low) & (degrees < high) for low, high in gaps], axis=0)
-    found = find_outline(wall(points, filled))
-    assert found.loop.girth_mm == pytest.approx(2.0 * np.pi * TRUNK_MM, rel=1e-3)
-
-
 @pytest.mark.parametrize("segments", [None, 3])
 @pytest.mark.parametrize(("half_deg", "limb"), [(85.0, False), (95.0, True)])
 def test_a_limb_goes_round_by_more_than_half(
@@ -134,13 +124,6 @@ def test_a_limb_goes_round_by_more_than_half(
     found = find_outline(wall(points, filled))
     assert (found.loop.segments[..., 1].max() < ARM_AT_MM) == limb
     assert np.sin(turned) / turned < 0.68  # chord over arc, 0.64 of half a circle
-
-
-@pytest.mark.parametrize(("across", "both"), [(0.14, False), (0.16, True)])
-def test_a_trunk_holds_the_middle_by_a_seventh_of_its_width(across: float, both: bool) -> None:
-    y = np.array([-300.0 * across, 300.0 * (1.0 - across)])
-    assert holds_middle(y) == both
-    assert holds_middle(-y) == both
 
 
 def test_a_strip_across_the_front_is_no_trunk_with_the_rest_for_a_limb() -> None:

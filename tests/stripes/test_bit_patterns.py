@@ -122,18 +122,3 @@ def test_scattered_codes_and_two_surfaces_give_no_line() -> None:
     # Leaps, but no slope: a line says nothing.
     level = np.where(PLACES % 3 == 0, 22, 20)
     assert np.isnan(filled(level)[0]).all()
-
-
-def test_sigma_follows_how_codes_scatter_where_that_is_more_than_rounding() -> None:
-    codes = np.floor(20.3 + 1.7 * PLACES)
-    codes[26::9] += 1
-    found, sigma = filled(codes)
-    near = np.flatnonzero(np.isfinite(found) & (PLACES > 30) & (PLACES < 50))
-    assert len(near) > 10
-    x = np.arange(-4, 5)
-    for place in near:
-        around = codes[place - 4 : place + 5]
-        line = np.polyfit(x, around, 1)
-        rms = np.sqrt(np.sum((around - np.polyval(line, x)) ** 2) / 7.0)
-        assert sigma[place] == pytest.approx(max(rms, 12.0**-0.5) / 3.0, rel=1e-5)
-        assert found[place] == pytest.approx(line[1] + 0.5, abs=1e-4)

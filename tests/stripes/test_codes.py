@@ -16,7 +16,6 @@ from bodyscan.geometry.light_planes import Axis
 from bodyscan.stripes.boundaries import bit_that_flips
 from bodyscan.stripes.codes import parse_stripe_code
 from bodyscan.stripes.codes.gray import Gray, bits_needed
-from bodyscan.stripes.codes.light_section import LightSection
 from bodyscan.stripes.codes.phase_shift import PhaseShift
 from bodyscan.stripes.codes.stripe_index import StripeIndex
 from bodyscan.stripes.gray.bit_words import BINARY, GRAY, gray_from_stripe, stripe_from_gray
@@ -35,13 +34,6 @@ def waves(stripes: int = 64, **keys: Any) -> PhaseShift:
     code = described("phase-shift", stripes, **keys)
     assert isinstance(code, PhaseShift)
     return code
-
-
-@pytest.mark.parametrize(
-    ("words", "bits"), [(2, 1), (3, 2), (4, 2), (5, 3), (256, 8), (257, 9), (65536, 16)]
-)
-def test_number_of_bits(words: int, bits: int) -> None:
-    assert bits_needed(words) == bits
 
 
 @pytest.mark.parametrize(
@@ -90,63 +82,24 @@ def test_time_at_which_a_stripe_map_holds() -> None:
 
 
 @pytest.mark.parametrize(
-    ("code", "keys"),
-    [
-        ("gray", {"stripes": 2}),
-        ("gray", {"stripes": 65535}),
-        ("gray", {"first_code": 65472}),
-        ("stripe-index", {"stripes": 254}),
-        ("phase-shift", {"steps": 3}),
-        ("phase-shift", {"steps": 64}),
-        ("phase-shift", {"period": 2}),
-        ("phase-shift", {"period": [64]}),
-        ("phase-shift", {"periods": [1], "steps": [3]}),
-        ("phase-shift", {"periods": 32}),
-        ("phase-shift", {"periods": 0.5}),
-        ("phase-shift", {"period": [8, 64, 9, 10, 11, 12, 13, 14], "steps": [3] * 8}),
-        ("phase-shift", {"start_deg": -360, "origin": -65535}),
-        ("phase-shift", {"start_deg": 360, "origin": 65535}),
-    ],
-)
-def test_valid_keys(code: str, keys: dict[str, Any]) -> None:
-    described(code, **keys)
-
-
-@pytest.mark.parametrize(
     ("code", "keys", "said"),
     [
         ("gray", {"stripes": 1}, "greater than or equal to 2"),
-        ("gray", {"stripes": 65536}, "less than or equal to 65535"),
-        ("gray", {"first_code": -1}, "greater than or equal to 0"),
         ("gray", {"first_code": 65473}, "must be 65472 or less"),
         ("stripe-index", {"stripes": 255}, "must be 254 or less"),
         ("phase-shift", {"steps": 2}, "greater than or equal to 3"),
-        ("phase-shift", {"steps": 65}, "less than or equal to 64"),
-        ("phase-shift", {"period": 1.9}, "greater than or equal to 2"),
         ("phase-shift", {"period": []}, "at least 1 item"),
-        ("phase-shift", {"period": [64] * 9}, "at most 8 items"),
         ("phase-shift", {"period": 65}, "must be 64 (stripes) or less (got 65)"),
         ("phase-shift", {"periods": 33}, "gives waves of 1.93939 stripes"),
-        ("phase-shift", {"periods": 0}, "greater than 0"),
         ("phase-shift", {"period": 8, "periods": 8}, "repeats what period gives"),
         ("phase-shift", {"period": [8, 64], "steps": [3]}, "has 1 numbers, but there are 2 waves"),
         ("phase-shift", {"period": [8, 32]}, "repeat after 32 of 64"),
-        ("phase-shift", {"start_deg": -361}, "greater than or equal to -360"),
-        ("phase-shift", {"start_deg": 361}, "less than or equal to 360"),
-        ("phase-shift", {"origin": 65536}, "less than or equal to 65535"),
     ],
 )
 def test_invalid_keys(code: str, keys: dict[str, Any], said: str) -> None:
     with pytest.raises(ValidationError) as caught:
         described(code, **keys)
     assert said in str(caught.value)
-
-
-def test_waves_that_nearly_repeat_are_refused() -> None:
-    # After 8 waves of 8 a wave of 63.75 is 64 / 63.75 = 1.0039 turns on; of 63.73, 1.0042.
-    with pytest.raises(ValidationError, match="repeat after 64"):
-        waves(70, period=(8, 63.75))
-    assert len(waves(70, period=(8, 63.73)).waves) == 2
 
 
 def test_waves_are_as_described() -> None:
@@ -162,14 +115,6 @@ def test_waves_are_as_described() -> None:
     (only,) = waves(6).waves
     assert only.period == 6.0
     assert (only.start, only.origin, only.sign, only.steps) == (0.0, 0.0, 1.0, 4)
-
-
-@pytest.mark.parametrize(
-    ("stripes", "period", "halves"),
-    [(64, 8.0, 16), (64, 7.0, 19), (60, 40.0, 3), (61, 40.0, 4), (100, 0.1 * 30, 67)],
-)
-def test_number_of_half_periods(stripes: int, period: float, halves: int) -> None:
-    assert waves(stripes, period=period).half_periods == halves
 
 
 def test_patterns_show_a_stripes_number_in_bits_the_coarsest_first() -> None:
@@ -303,30 +248,8 @@ def test_a_stripe_index_image_is_one_of_an_instrument() -> None:
     assert not code.uses_dark
     assert not code.is_projected
     assert not code.has_edges
-    with pytest.raises(ValidationError, match="must be 254 or less"):
-        StripeIndex(stripes=255, direction="vertical")
     with pytest.raises(BadInput, match="the output of an instrument"):
         code.pattern_images(640, 480)
-
-
-def test_of_a_light_section_each_stripe_is_lit_in_its_own_image() -> None:
-    code = LightSection(stripes=5, direction="vertical")
-    assert not code.uses_dark
-    frames = code.pattern_images(10, 3)
-    np.testing.assert_array_equal(frames[:, 1], 255 * np.eye(5, dtype=np.uint8).repeat(2, axis=1))
-
-
-@pytest.mark.parametrize("direction", ["vertical", "horizontal"])
-def test_stripes_divide_the_projectors_picture_evenly(direction: Axis) -> None:
-    code = Gray.model_validate({"stripes": 8, "direction": direction, "inverses": False})
-    size = (16, 4) if direction == "vertical" else (4, 16)
-    frames = code.pattern_images(*size)
-    assert frames.shape == (3, size[1], size[0])
-    lines = frames[:, 0] if direction == "vertical" else frames[:, :, 0]
-    np.testing.assert_array_equal(lines[0], [0] * 8 + [255] * 8)
-    np.testing.assert_array_equal(lines[2], ([0] * 2 + [255] * 4 + [0] * 2) * 2)
-    crossed = frames if direction == "vertical" else frames.transpose(0, 2, 1)
-    assert np.all(crossed == crossed[:, :1])
 
 
 def test_stripes_are_a_pixel_wide_at_least() -> None:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from stripe_rendering import Field, checkered, code_light, render, white
+from stripe_rendering import Field, checkered, code_light, render
 
 from bodyscan.arrays import Array, Bytes, Indices
 from bodyscan.geometry.light_planes import Axis
@@ -217,14 +217,6 @@ def test_too_bright_and_doubly_lit_pixels_have_no_value_in_a_light_section() -> 
     assert np.isnan(seen.s[twice]).all()
 
 
-@pytest.mark.parametrize("code", [SECTION, PHASE], ids=name)
-def test_the_same_images_give_the_same_bytes(code: Code) -> None:
-    images = captured(code, wavy(3.0), 64, shape=(100, 120), albedo=white)
-    one, other = read(code, images, 64), read(code, images, 64)
-    assert one.s.tobytes() == other.s.tobytes()
-    assert one.boundary_pixels.tobytes() == other.boundary_pixels.tobytes()
-
-
 @pytest.mark.parametrize("code", [{"code": "gray"}, *ALL], ids=name)
 @pytest.mark.parametrize("rising", [True, False])
 def test_limits_do_not_change_s_within_them(code: Code, rising: bool) -> None:
@@ -248,11 +240,3 @@ def test_limits_do_not_change_s_within_them(code: Code, rising: bool) -> None:
     assert part.beyond[deep].mean() > 0.99
     assert not part.beyond[whole.s < 34.0 if rising else whole.s > 21.0].any()
     assert whole.beyond is None
-
-
-@pytest.mark.parametrize(
-    ("code", "edges"), [(c, c not in (INDEX, PHASE, THREE_PHASES)) for c in ALL]
-)
-def test_which_codes_have_edges(code: Code, edges: bool) -> None:
-    """An instrument that numbers its stripes says nothing of pixels either."""
-    assert spec_of(code, 64).has_edges is edges

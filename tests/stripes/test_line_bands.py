@@ -12,7 +12,7 @@ from bodyscan.geometry.light_planes import Axis
 from bodyscan.stripes.codes.gray import Gray
 from bodyscan.stripes.decoding import decode_stripes
 from bodyscan.stripes.scan_lines import LineBands
-from bodyscan.stripes.stripe_map import ResponseShare, StripeMap
+from bodyscan.stripes.stripe_map import StripeMap
 
 STRIPES, WIDTH = 100, 16
 LEFT, TOP = 37, 21
@@ -64,13 +64,6 @@ def test_boundaries_in_bands_are_those_of_the_whole_picture(
     assert not some.s.size
 
 
-def test_one_band_in_one_is_everything(sequence: Sequence) -> None:
-    bands = LineBands(WIDTH, 1, 0, (TOP, LEFT))
-    some, every = read(sequence, "horizontal", bands), read(sequence, "horizontal", None)
-    assert np.array_equal(some.boundary_pixels, every.boundary_pixels)
-    assert np.array_equal(some.boundary_sigma_px, every.boundary_sigma_px)
-
-
 @pytest.mark.parametrize("turned", [False, True])
 def test_lines_beside_a_band_are_looked_at_on_both_sides(turned: bool) -> None:
     """Bands of ten, the second of every five, counted from the picture's own first line."""
@@ -83,9 +76,3 @@ def test_lines_beside_a_band_are_looked_at_on_both_sides(turned: bool) -> None:
     np.testing.assert_array_equal(found.number, beside)
     near = np.r_[np.arange(first - 2, first + 12), np.arange(later[0] - 2, 60)]
     np.testing.assert_array_equal(found.number[found.wanted], near)
-
-
-def test_what_the_response_did_is_told_by_its_share_of_the_variance() -> None:
-    said = str(ResponseShare(0.03, 0.04))
-    assert "an error of s of 0.03 stripes RMS" in said
-    assert "(36% of the variance; the rest is noise of 0.04 stripes)" in said

@@ -7,7 +7,7 @@ import pytest
 from scipy.special import erf
 
 from bodyscan.arrays import Indices
-from bodyscan.errors import DecodingFailed, WrongDirection
+from bodyscan.errors import DecodingFailed
 from bodyscan.stripes.numbered_stripes import check_order, decode_index, decode_sweep
 from bodyscan.stripes.stripe_map import StripeMap
 
@@ -88,16 +88,6 @@ def test_beside_pixels_without_a_number_there_is_no_boundary() -> None:
     assert not np.any((found.boundary_pixels[:, 0] > 59.0) & (found.boundary_pixels[:, 0] < 68.0))
 
 
-@pytest.mark.parametrize(("most", "refused"), [(30, False), (29, True)])
-def test_the_last_number_is_that_of_the_last_stripe(most: int, refused: bool) -> None:
-    numbers = np.arange(1, 31).repeat(4)
-    if refused:
-        with pytest.raises(DecodingFailed, match="3% of the pixels have a stripe number above 29"):
-            read(numbers, most)
-    else:
-        assert np.nanmax(read(numbers, most).s) > 29.0
-
-
 ORDERED = 12
 
 
@@ -110,25 +100,10 @@ def check(numbers: np.ndarray, good: np.ndarray | None = None, *, transposed: bo
     check_order(numbers, known, transposed, ORDERED)
 
 
-def exchanged(first: int, second: int) -> np.ndarray:
-    swapped = np.arange(ORDERED)
-    swapped[[first, second]] = second, first
-    return swapped[shown_in_order()]
-
-
 def test_stripes_that_follow_each_other_are_in_order_either_way() -> None:
     check(shown_in_order())
     check(shown_in_order()[:, ::-1])
     check(np.zeros((30, 40), int))
-
-
-def test_two_exchanged_images_are_named() -> None:
-    with pytest.raises(DecodingFailed) as caught:
-        check(exchanged(3, 8))
-    assert "the lines of stripes 3, 8 are not next" in str(caught.value)
-    with pytest.raises(DecodingFailed) as caught:
-        check(exchanged(9, 2)[:, ::-1])
-    assert "the lines of stripes 2, 9 are not next" in str(caught.value)
 
 
 def test_a_missing_image_is_named() -> None:
@@ -137,12 +112,7 @@ def test_a_missing_image_is_named() -> None:
     with pytest.raises(DecodingFailed, match="stripe 5 shows no line"):
         check(without)
     # Seen by one in ten of those that see its neighbours, it is there: they lie at a rim.
-    few = np.vstack([without[:27, :44], shown_in_order()[:4, :44]])
-    check(few)
-    # Seen by one in twenty it is there as well.
-    check(np.vstack([np.tile(without[0], (40, 1)), shown_in_order(lines=1)[:, :44]]))
-    # In fewer than 20 lines nothing is said.
-    check(without[:19])
+    check(np.vstack([without[:27, :44], shown_in_order()[:4, :44]]))
 
 
 def test_images_in_any_order_are_refused_and_rims_are_not() -> None:
@@ -161,11 +131,3 @@ def test_bad_pixels_are_ignored() -> None:
     numbers, good = shown_in_order(), np.ones((30, 48), bool)
     numbers[:, 21], good[:, 21] = 11, False
     check(numbers, good)
-
-
-def test_stripes_that_run_along_the_lines_are_of_another_direction() -> None:
-    along = np.repeat(np.arange(ORDERED), 4)[:, None] * np.ones((1, 40), int)
-    with pytest.raises(WrongDirection, match="run horizontally in the picture, not vertically"):
-        check(along)
-    with pytest.raises(WrongDirection, match="run vertically in the picture, not horizontally"):
-        check(along, transposed=True)

@@ -7,8 +7,6 @@ import pytest
 
 from bodyscan.stripes.phase.phase_order import (
     PhaseOrder,
-    find_best_orders,
-    find_order_gap,
     find_phase_order,
 )
 from bodyscan.stripes.phase.waves import MeasuredWave
@@ -114,29 +112,3 @@ def test_a_single_wave_gives_s_within_its_period() -> None:
     assert np.std((found.s - S)[found.certain]) == pytest.approx(240.0 * 0.005, rel=0.05)
     assert found.offsets == ()
     assert order_of((240.0,), usable=np.zeros(SHAPE, bool)).agreed == 0.0
-
-
-@pytest.mark.parametrize("known", [(18.0, 20.0, 23.0), (20.0, 400.0)])
-def test_orders_are_ranked_by_chi_squared_of_the_other_waves(known: tuple[float, ...]) -> None:
-    """All that begin before the last stripe; and by how much others are worse than the true one."""
-    rng, periods = np.random.default_rng(4), np.array(known)
-    order = np.arange(np.ceil(STRIPES / periods[0]))[:, None]
-    turns = rng.random((len(known), 200)).astype(np.float32)
-    sigmas = rng.uniform(0.01, 0.05, turns.shape).astype(np.float32)
-    whole = (turns[0].astype(float) + order) * periods[0]
-    doubt = np.hypot(sigmas[1:], sigmas[0] * periods[0] / periods[1:, None])
-
-    def chi_squared(off: np.ndarray) -> np.ndarray:
-        return np.asarray(np.sum(((off - np.rint(off)) / doubt[:, None]) ** 2, axis=0))
-
-    costs = chi_squared(turns[1:, None] - whole / periods[1:, None, None])
-    costs[whole >= STRIPES] = np.inf
-    found, best, second = find_best_orders(turns, sigmas, periods, float(STRIPES))
-    np.testing.assert_array_equal(found, np.argmin(costs, axis=0))
-    ranked = np.sort(costs, axis=0)
-    np.testing.assert_allclose(best, ranked[0], rtol=1e-4, atol=1e-4)
-    np.testing.assert_allclose(second, ranked[1], rtol=1e-4, atol=1e-4)
-    exact = order[1:] * periods[0] / periods[1:, None, None]
-    gaps = chi_squared(np.repeat(exact, 200, axis=2))
-    least = find_order_gap(sigmas, periods, float(STRIPES))
-    np.testing.assert_allclose(least, gaps.min(axis=0), rtol=1e-5)

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pydantic import ValidationError
 from stripe_rendering import code_light, render
 
 from bodyscan.errors import DecodingFailed
@@ -258,33 +257,10 @@ def test_images_in_another_order_are_refused(change: str, said: str) -> None:
     assert said in str(refused.value)
 
 
-def test_a_list_of_one_wave_is_that_wave() -> None:
-    for one, listed in (({"period": 16}, {"period": [16]}), ({"periods": 15}, {"periods": [15]})):
-        assert described({**listed, "steps": [4]}).waves == described({**one, "steps": 4}).waves
-
-
 def test_wrong_periods_are_refused() -> None:
     lit, coded, _ = captured(HIERARCHICAL)
     with pytest.raises(DecodingFailed, match="agree at only"):
         read({"period": (21.5, 240), "steps": 3}, lit, coded)
-
-
-@pytest.mark.parametrize(
-    ("keys", "said"),
-    [
-        ({"period": [20, 60]}, "repeat after 60 of 240; one must cover all of them"),
-        ({"periods": [12, 4]}, "waves of 20, 60 stripes repeat after 60 of 240"),
-        ({"period": [16, 18]}, "repeat after 144 of 240"),
-        ({"period": [20, 240], "periods": [12, 1]}, "repeats what period gives"),
-        ({"period": [20, 240], "steps": [3, 3, 3]}, "has 3 numbers, but there are 2 waves"),
-        ({"period": 300}, "must be 240 (stripes) or less (got 300)"),
-    ],
-    ids=str,
-)
-def test_ambiguous_waves_are_refused(keys: Keys, said: str) -> None:
-    with pytest.raises(ValidationError) as refused:
-        parse_stripe_code({"code": "phase-shift", "stripes": 240, "direction": "vertical", **keys})
-    assert said in str(refused.value)
 
 
 def test_periods_may_be_counted() -> None:

@@ -17,7 +17,6 @@ from bodyscan.stripes.boundaries import Boundaries, find_boundaries
 from bodyscan.stripes.scan_lines import ScanLines
 from bodyscan.stripes.stripe_coordinates import (
     correlation_along_lines,
-    estimate_end_slopes,
     interpolate_stripes,
     smooth_runs,
 )
@@ -117,22 +116,6 @@ def test_bias_by_blur_is_proportional_to_the_curvature() -> None:
     np.testing.assert_allclose((s - most)[within & np.isfinite(most)], 0.05, atol=1e-5)
 
 
-def test_end_slopes_are_those_of_parabolas_through_neighbours() -> None:
-    x = np.array([0.0, 2.0, 5.0, 6.0])
-    y = 1.0 + 3.0 * x + 0.5 * x**2
-    secant, width = np.diff(y) / np.diff(x), np.diff(x)
-    slope_in, slope_out = estimate_end_slopes(secant, width)
-    np.testing.assert_allclose(slope_in, 3.0 + x[:-1])
-    np.testing.assert_allclose(slope_out, 3.0 + x[1:])
-    # Where s runs the other way, and where there is nothing, a segment is alone.
-    nan = np.nan
-    slope_in, slope_out = estimate_end_slopes(
-        np.array([2.0, -3.0, nan, 5.0]), np.array([1.0, 2, nan, 1.0])
-    )
-    np.testing.assert_array_equal(slope_in, [2.0, -3.0, nan, 5.0])
-    np.testing.assert_array_equal(slope_out, [2.0, -3.0, nan, 5.0])
-
-
 def test_narrow_stripes_are_smoothed_along_their_run() -> None:
     rng = np.random.default_rng(0)
     count, noise = 4000, 0.05
@@ -186,18 +169,6 @@ def test_gradient_is_that_of_the_plane_through_usable_pixels() -> None:
     np.testing.assert_allclose(along[usable], 0.03, atol=2e-5)
     np.testing.assert_allclose(across[usable], -0.05, atol=2e-5)
     assert not fit_gradient(image, np.zeros_like(usable))[0].any()
-
-
-def test_gradient_needs_twelve_pixels_on_two_lines() -> None:
-    v, u = np.indices((20, 30))
-    image = (0.03 * u - 0.05 * v).astype(np.float32)
-    for columns, known in ((4, True), (3, False)):
-        usable = (np.abs(v - 9) <= 1) & (u >= 10) & (u < 10 + columns)
-        along, across = fit_gradient(image, usable)
-        np.testing.assert_allclose(along[9, 11], 0.03 * known, atol=1e-5)
-        np.testing.assert_allclose(across[9, 11], -0.05 * known, atol=1e-5)
-    line = (v == 9) & (u > 5)
-    assert not fit_gradient(image, line)[0].any()
 
 
 def flat_brightness(across: float) -> Brightness:

@@ -90,14 +90,3 @@ def test_a_share_is_the_difference_and_its_noise_over_all_light_in_128ths(of: ty
     expected = np.minimum(128.0 * (np.abs(pattern - inverse) + noise) / light, 255.0)
     assert np.abs(share.astype(float) - np.floor(expected)).max() <= 1.0
     assert np.median(share) < 255
-
-
-@pytest.mark.parametrize(("of", "least"), [(np.uint8, 1.0), (np.float32, 0.02)])
-def test_where_there_is_no_light_a_share_is_of_the_least_there_can_be(
-    of: type, least: float
-) -> None:
-    level: Greys = np.full(SHAPE, 20).astype(of)
-    images = ScanLines(level, level, level[None], level[None], False)
-    quiet = np.full(256, (0.5 * least) ** 2 / 2.0, np.float32)
-    # Noise of half the least light.
-    assert set(images.direct_share(0, quiet).ravel().tolist()) == {64}

@@ -11,7 +11,7 @@ import numpy as np
 from bodyscan.alignment.displaced_poles import DisplacementSearch
 from bodyscan.alignment.icp import Alignment
 from bodyscan.fusion.verdict import grade_scan
-from bodyscan.fusion.verdict.evidence import Coverage, ImageEvidence, RigEvidence
+from bodyscan.fusion.verdict.evidence import Coverage, ImageEvidence, RigEvidence, ScanEvidence
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.motion.person_alignment import PersonAlignment
 from bodyscan.motion.person_motion import PersonMotion
@@ -46,9 +46,7 @@ def verdict_given(
     rig, images = _evidence(RigEvidence, given), _evidence(ImageEvidence, given)
     together = _evidence(PersonAlignment, given)
     assert not given, f"no evidence has {', '.join(given)}"
-    return grade_scan(
-        cloud, rig, images, use, together=together, person=person, mesh=mesh, coverage=coverage
-    )
+    return grade_scan(ScanEvidence(cloud, rig, images, use, together, person, mesh, coverage))
 
 
 def _evidence(kind: type[Evidence], given: dict[str, Any]) -> Evidence:
