@@ -12,9 +12,9 @@ from benchmarks.pinhole_opencv import fit_pinhole_opencv
 from bodyscan.arrays import Array
 from bodyscan.boards.board_layout import corner_points
 from bodyscan.boards.view import BoardView
-from bodyscan.calibration.board_views import LocatedView
+from bodyscan.calibration.board_views import LocatedView, planar_view
 from bodyscan.calibration.boundary_points import BoundaryPoints, concatenate
-from bodyscan.calibration.camera import CameraCalibration
+from bodyscan.calibration.camera import CameraCalibration, locate_board
 from bodyscan.calibration.light_sheets import fit_light_sheets, fit_planes
 from bodyscan.calibration.sheet_fit import fit_pinhole, fit_sheets
 from bodyscan.calibration.striped_view import BoardBoundaries, StripedView, on_board
@@ -108,7 +108,8 @@ def _shots(rig: Rig, captures: Captures, pair: str) -> tuple[CameraCalibration, 
         if sequence is None or not sequence.has_stripes:
             continue
         stripes = decode_sequence(sequence, spec, workers=2)
-        pose, board = camera.camera_from_board[view.shot], rig.board(view.board)
+        board = rig.board(view.board)
+        pose = locate_board(camera.camera, planar_view(view, board))[0]
         corners = corner_points(board)[view.corner_ids]
         located = LocatedView(pair, view.shot, view.board, corners, view.pixels, pose)
         boundaries = BoardBoundaries(

@@ -18,7 +18,7 @@ from bodyscan.geometry.robust import rms
 from bodyscan.laboratory import apparatus
 from bodyscan.laboratory.approaches import calibrate_by_reference_plane
 from bodyscan.laboratory.calibrating import calibrate_ours
-from bodyscan.laboratory.chapter_captures import TARGET, take_captures
+from bodyscan.laboratory.chapter_captures import take_captures
 from bodyscan.laboratory.measuring import (
     ApproachAccuracy,
     PointSigma,
@@ -87,9 +87,7 @@ def _unit(boards: int, real_light: bool, seed: int) -> UnitErrors:
     settings = apparatus.real_settings() if real_light else apparatus.ideal_settings()
     setup = apparatus.chapter_setup(settings, seed)
     captures = take_captures(setup, boards=boards, stage_stops=0)
-    ours, covariance, *_ = calibrate_ours(
-        captures, *calibrate_by_reference_plane(TARGET, captures.boards)
-    )
+    ours, covariance, *_ = calibrate_ours(captures, *calibrate_by_reference_plane(captures.boards))
     true = camera_from_fields(describe_camera(apparatus.CAMERA)).parameters
     off = (ours.camera.parameters - true) / np.sqrt(np.diag(covariance))
     print_ppm = compare_centre_distances(

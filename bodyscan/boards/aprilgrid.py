@@ -47,7 +47,7 @@ def find_aprilgrid(image: Bytes, board: Board, *, thorough: bool = True) -> Dete
         return None
     pixels, good = _refine(image, board, best)
     ids = np.flatnonzero(good).astype(np.int64)
-    return DetectedCorners(ids, pixels[good], board_layout.corners_per_face(board))
+    return DetectedCorners(ids, pixels[good])
 
 
 def _candidate_positions(image: Bytes, board: Board, thorough: bool) -> Iterator[GridPosition]:

@@ -113,13 +113,12 @@ def locate_charuco(
     if len(nearby) < 4:
         return None
     pixels, good = _refine(image, board, position.board_map, nearby, position.printed)
-    count = board_layout.corners_per_face(board)
-    ids = nearby[good] + position.face * count
+    ids = nearby[good] + position.face * board_layout.corners_per_face(board)
     appearance = Appearance(
         other_layout=position.board.legacy_layout != board.legacy_layout,
         more_rows=_has_more_rows(position, markers),
     )
-    return DetectedCorners(ids, pixels[good], count, appearance)
+    return DetectedCorners(ids, pixels[good], appearance)
 
 
 def _has_more_rows(position: FacePosition, markers: Markers) -> bool:

@@ -6,12 +6,12 @@ two ends, and its first square (0, 0) is BLACK, as OpenCV prints it; that fixes 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import cv2
 import numpy as np
 
-from bodyscan.arrays import Array, Bytes, Floats, Indices
+from bodyscan.arrays import Array, Bytes, Indices
 from bodyscan.boards import board_layout
 from bodyscan.boards.board_map import BoardMap, fit_board_map
 from bodyscan.boards.corners import DetectedCorners, refine_corners
@@ -84,7 +84,7 @@ def _refine(image: Bytes, board: Board, candidate: Array) -> DetectedCorners | N
         start = board_map.apply(printed)
     if good.mean() < 0.8 or _is_part_of_larger(image, board, board_map, first_is_black):
         return None
-    return DetectedCorners(np.flatnonzero(good).astype(np.int64), pixels[good], len(printed))
+    return DetectedCorners(np.flatnonzero(good).astype(np.int64), pixels[good])
 
 
 def _is_part_of_larger(
@@ -130,55 +130,43 @@ def _candidates(image: Bytes, board: Board, quick: bool) -> Iterator[Array]:
     """
     size = (board.columns - 1, board.rows - 1)
     whole = Region(0, 0, image.shape[1], image.shape[0])
-    yield from _detect(_classic, image, size, whole, 1.0)
+    yield from _detect(image, size, whole)
     if not quick and not shows_lattice(image, size):
         return
-    yield from _detect(_adaptive, image, size, whole, 1.0)
+    adaptive = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+    yield from _detect(image, size, whole, flags=adaptive)
     if quick:
         return
     regions = board_regions(image, size[0] * size[1])
     small = [region for region in regions if 2 * region.area < image.size]
     for region in small:
-        yield from _detect(_classic, image, size, region, 2.0)
+        yield from _detect(image, size, region, scale=2.0)
     for region in regions:
-        yield from _detect(_classic, image, size, region, 1.0)
+        yield from _detect(image, size, region)
     for region in (*regions, whole):
-        yield from _detect(_sector_based, image, size, region, 1.0)
+        yield from _detect(image, size, region, sector_based=True)
     for region in regions[:1]:
-        yield from _detect(_sector_based_enlarged, image, size, region, 1.0)
-
-
-Detector = Callable[[Bytes, tuple[int, int]], tuple[bool, Floats | None]]
+        yield from _detect(image, size, region, flags=cv2.CALIB_CB_ACCURACY, sector_based=True)
 
 
 def _detect(
-    detector: Detector, image: Bytes, size: tuple[int, int], region: Region, scale: float
+    image: Bytes,
+    size: tuple[int, int],
+    region: Region,
+    *,
+    scale: float = 1.0,
+    flags: int = 0,
+    sector_based: bool = False,
 ) -> Iterator[Array]:
     """Yield the corners that a detector finds in a region of the image, enlarged by `scale`."""
     part = region.cut(image)
     if scale != 1.0:
         part = cv2.resize(part, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
-    found, corners = detector(part, size)
+    detect = cv2.findChessboardCornersSB if sector_based else cv2.findChessboardCorners
+    found, corners = detect(part, size, flags=flags)
     if found and corners is not None:
         pixels = np.asarray(corners, float).reshape(-1, 2)
         yield (pixels + 0.5) / scale - 0.5 + [region.left, region.top]
-
-
-def _classic(image: Bytes, size: tuple[int, int]) -> tuple[bool, Floats | None]:
-    return cv2.findChessboardCorners(image, size, flags=0)
-
-
-def _adaptive(image: Bytes, size: tuple[int, int]) -> tuple[bool, Floats | None]:
-    flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
-    return cv2.findChessboardCorners(image, size, flags=flags)
-
-
-def _sector_based(image: Bytes, size: tuple[int, int]) -> tuple[bool, Floats | None]:
-    return cv2.findChessboardCornersSB(image, size)
-
-
-def _sector_based_enlarged(image: Bytes, size: tuple[int, int]) -> tuple[bool, Floats | None]:
-    return cv2.findChessboardCornersSB(image, size, flags=cv2.CALIB_CB_ACCURACY)
 
 
 def _number_as_printed(

@@ -41,12 +41,10 @@ class DetectedCorners:
 
     ids: (N,) int64.
     pixels: (N, 2) px.
-    printed_count: how many corners the face has.
     """
 
     ids: Indices
     pixels: Array
-    printed_count: int
     appearance: Appearance = AS_PRINTED
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from bodyscan.arrays import Bytes
 from bodyscan.boards.aprilgrid import find_aprilgrid
+from bodyscan.boards.board_layout import corners_per_face
 from bodyscan.boards.charuco import (
     Markers,
     count_dictionary_markers,
@@ -44,43 +45,31 @@ def find_boards(image: Bytes, boards: Sequence[Board], *, pair: str, shot: str) 
     """
     views = []
     cache: MarkerCache = {}
-    first: dict[str, int] = {}
-    for board in boards:
-        first[board.dictionary] = max(
-            count_dictionary_markers(board), first.get(board.dictionary, 0)
-        )
     for board in boards:
         if board.kind != "checkerboard":
-            found = _find_marked(image, board, cache, first)
+            alike = [one for one in boards if one.dictionary == board.dictionary]
+            found = _find_marked(image, board, cache, max(map(count_dictionary_markers, alike)))
         else:
             found = find_checkerboard(image, board)
-        if found is not None and _determines_plane(found):
-            turnable = board.is_ambiguous
+        if found is not None and _determines_plane(found, board):
+            corners = found.ids, found.pixels
             views.append(
-                BoardView(
-                    pair, shot, board.name, found.ids, found.pixels, turnable, found.appearance
-                )
+                BoardView(pair, shot, board.name, *corners, board.is_ambiguous, found.appearance)
             )
     return views
 
 
 def _find_marked(
-    image: Bytes,
-    board: Board,
-    cache: MarkerCache,
-    first: dict[str, int],
+    image: Bytes, board: Board, cache: MarkerCache, first: int
 ) -> DetectedCorners | None:
-    """Find a board as printed, or else white on black, or mirrored.
-
-    first: number of the markers, by dictionary, that are printed at all.
-    """
+    """Find a board as printed, or else white on black, or mirrored; see `detect_markers`."""
     for appearance in (AS_PRINTED, *OTHER_APPEARANCES):
         picture = appearance.undo(image)
         if board.kind == "aprilgrid":
             found = find_aprilgrid(picture, board, thorough=appearance == AS_PRINTED)
         else:
-            found = _find_charuco(picture, board, appearance, cache, first[board.dictionary])
-        if found is not None and _determines_plane(found):
+            found = _find_charuco(picture, board, appearance, cache, first)
+        if found is not None and _determines_plane(found, board):
             pixels = appearance.original_pixels(found.pixels, image.shape[1])
             combined = replace(
                 found.appearance, inverted=appearance.inverted, mirrored=appearance.mirrored
@@ -109,9 +98,9 @@ def _find_charuco(
     return locate_charuco(picture, board, markers, locate_face(board, markers))
 
 
-def _determines_plane(found: DetectedCorners) -> bool:
+def _determines_plane(found: DetectedCorners, board: Board) -> bool:
     """Whether there are six corners (four on a board that has no more), not all on one line."""
-    if len(found.ids) < min(6, found.printed_count):
+    if len(found.ids) < min(6, corners_per_face(board)):
         return False
     extents = np.linalg.svd(found.pixels - found.pixels.mean(axis=0), compute_uv=False)
     return bool(extents[1] > 2.0)

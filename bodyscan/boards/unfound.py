@@ -8,12 +8,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from itertools import product
 
-import cv2
-import numpy as np
-
 from bodyscan.arrays import Bytes
 from bodyscan.boards.aprilgrid import BORDER_BITS, locate_grid
-from bodyscan.boards.board_layout import marker_corners
 from bodyscan.boards.charuco import Markers, detect_markers, locate_face
 from bodyscan.boards.checkerboard import MIN_SQUARES, find_checkerboard
 from bodyscan.boards.detection import OTHER_APPEARANCES
@@ -43,29 +39,18 @@ def _describe_markers(image: Bytes, board: Board) -> str:
         count += ", white on black"
     if appearance.mirrored:
         count += ", mirrored"
-    side = _estimate_marker_side(board, markers)
-    # Unrefined outlines are too small by up to a tenth.
-    if side is not None and abs(side / (board.marker_mm or 1.0) - 1.0) > 0.2:
-        return (
-            f"{count}, whose sides are about {side / board.square_mm:.2f} of a square's: `marker_mm` "
-            f"is about {side:.2g} if `square_mm` is {board.square_mm:g}, not {board.marker_mm:g}"
-        )
     if _count_agreeing(board, markers):
         return f"{count}, with too few sharp corners next to them"
     better = max(_fit_other_sizes(board, markers), default=None)
     if better is None:
-        return f"{count}, which do not lie as on {board.columns} columns x {board.rows} rows"
-    agreeing, negative_rows, columns = better
-    rows = -negative_rows
-    exchanged = board.model_copy(update={"columns": board.rows, "rows": board.columns})
-    if _count_agreeing(exchanged, markers) >= agreeing:
         return (
-            f"{count}; {agreeing} of them fit with columns and rows exchanged: {board.rows} columns x "
-            f"{board.columns} rows"
+            f"{count}, which do not lie as on {board.columns} columns x {board.rows} rows. Possible "
+            "causes: `columns` and `rows`, or `marker_mm` against `square_mm`, are not the print's"
         )
+    agreeing, negative_rows, columns = better
     return (
-        f"{count}; {agreeing} of them lie as on a board of {columns} columns x {rows} rows, not "
-        f"{board.columns} x {board.rows}"
+        f"{count}; {agreeing} of them lie as on a board of {columns} columns x {-negative_rows} rows, "
+        f"not {board.columns} x {board.rows}"
     )
 
 
@@ -86,26 +71,6 @@ def _count_agreeing(board: Board, markers: Markers) -> int:
         return 0
     position = locate_face(board, markers)
     return position.agreeing if position and position.valid else 0
-
-
-def _estimate_marker_side(board: Board, markers: Markers) -> float | None:
-    """Estimate a marker's side, mm, from the markers' spacing; None if unclear."""
-    layouts = (board, board.model_copy(update={"legacy_layout": not board.legacy_layout}))
-    for described in layouts if board.kind == "charuco" else (board,):
-        ids, printed = marker_corners(described)
-        _, detected, of_board = np.intersect1d(markers.ids, ids, return_indices=True)
-        if len(detected) < 8:
-            continue
-        corners = markers.corners[detected]
-        middles = printed[of_board].mean(axis=1)[:, :2]
-        near = 0.2 * board.square_mm
-        homography, inliers = cv2.findHomography(corners.mean(axis=1), middles, cv2.RANSAC, near)
-        if homography is None or inliers.mean() < 0.8:
-            continue
-        flat = cv2.perspectiveTransform(corners.reshape(-1, 1, 2), homography).reshape(-1, 4, 2)
-        sides = np.linalg.norm(flat - np.roll(flat, 1, axis=1), axis=-1)
-        return float(np.median(sides[inliers.ravel() > 0]))
-    return None
 
 
 def _describe_other_dictionary(image: Bytes, board: Board) -> str:
@@ -137,7 +102,7 @@ def _fit_other_sizes(board: Board, markers: Markers) -> Iterator[tuple[int, int,
 
 def _describe_grids(image: Bytes, board: Board) -> str:
     wanted = f"{board.columns - 1} x {board.rows - 1} inner corners"
-    if _find_grid(255 - image, board):
+    if find_checkerboard(255 - image, board, quick=True):
         return f"a grid of {wanted}, but white on black"
     sizes = [(board.columns, board.rows), (board.columns + 1, board.rows + 1)]
     sizes += [
@@ -149,17 +114,9 @@ def _describe_grids(image: Bytes, board: Board) -> str:
         if min(columns, rows) < MIN_SQUARES or (columns, rows) == (board.columns, board.rows):
             continue
         other = board.model_copy(update={"columns": columns, "rows": rows})
-        if _find_grid(image, other):
+        if find_checkerboard(image, other, quick=True):
             return (
                 f"no grid of {wanted}, but one of {columns - 1} x {rows - 1}: {columns} columns x "
                 f"{rows} rows of squares"
             )
-    found, _, meta = cv2.findChessboardCornersSBWithMeta(image, (3, 3), cv2.CALIB_CB_LARGER)
-    if found and meta is not None and np.size(meta) > 9:
-        rows, columns = np.asarray(meta).shape[:2]
-        return f"no grid of {wanted}; the largest found has {columns} x {rows}"
     return f"no grid of {wanted}, nor of one more or fewer in either direction"
-
-
-def _find_grid(image: Bytes, board: Board) -> bool:
-    return find_checkerboard(image, board, quick=True) is not None

@@ -40,21 +40,11 @@ class BoundaryPoints:
         return _board_errors(self)
 
 
-def points_on_board(
-    camera: Camera, camera_from_board: RigidTransform, pixels: Array, height: Height | None = None
-) -> Array:
-    """Intersect the rays of pixels (N, 2) with a board, camera frame (N, 3) mm (Eq. 18).
-
-    With the board's plane z = 0, or with its surface if `height` is given.
-    """
-    return rays_on_board(camera.rays(pixels), camera_from_board, height)
-
-
 def rays_on_board(
     rays: Array, camera_from_board: RigidTransform, height: Height | None = None
 ) -> Array:
-    """Intersect rays (..., 3), camera frame, with a board: with its plane z = 0, or with its surface
-    if `height` is given; (..., 3) mm.
+    """Intersect rays (..., 3), camera frame, with a board's plane z = 0, or with its surface if
+    `height` is given; (..., 3) mm (Eq. 18).
     """
     normal = camera_from_board.rotation[:, 2]
     flat = rays * (normal @ camera_from_board.translation / (rays @ normal))[..., None]

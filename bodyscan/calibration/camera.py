@@ -4,17 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.calibration.board_views import PlanarView
-from bodyscan.calibration.zhang import (
-    camera_from_plane,
-    homography,
-    matrix_from_homographies,
-)
+from bodyscan.calibration.zhang import camera_from_plane, homography, matrix_from_homographies
 from bodyscan.errors import DegeneratePoses
 from bodyscan.geometry.camera import MATRIX, Camera
 from bodyscan.geometry.least_squares import EXACT, Block, Noise, Solution, minimize
@@ -46,9 +41,8 @@ class LensTrial:
 class CameraCalibration:
     """A calibrated camera.
 
-    camera, covariance: the camera, and the covariance (P, P) of its parameters.
-    camera_from_board: the board's pose in each shot.
-    residuals_px: (N, 2) for each shot.
+    covariance: of the camera's parameters, (P, P).
+    poses: `camera_from_board` of each view that it was fitted to.
     rms_px: RMS distance of corners from their reprojection, robustly weighted.
     lenses: lenses tried on held-out boards; empty if the lens was given.
     rays: how well each pixel's ray is known; None if that was not computed.
@@ -56,59 +50,10 @@ class CameraCalibration:
 
     camera: Camera
     covariance: Array
-    camera_from_board: dict[str, RigidTransform]
-    residuals_px: dict[str, Array]
+    poses: tuple[RigidTransform, ...]
     rms_px: float
     lenses: tuple[LensTrial, ...] = ()
     rays: RayUncertainty | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class CameraFit:
-    """A camera and `camera_from_board` of each view, fitted to them by least squares."""
-
-    solution: Solution[_State]
-
-    @property
-    def camera(self) -> Camera:
-        return self.solution.state.camera
-
-    @property
-    def poses(self) -> tuple[RigidTransform, ...]:
-        return self.solution.state.poses
-
-    @property
-    def residuals(self) -> tuple[Array, ...]:
-        """Reprojection errors of each view, (N, 2) px."""
-        corners = self.solution.blocks[0]
-        return _split_by_view(corners.residuals.reshape(-1, 2), corners)
-
-    @property
-    def weights(self) -> tuple[Array, ...]:
-        """Robust weights of each view's corners, (N,)."""
-        return _split_by_view(self.solution.weights[0][::2], self.solution.blocks[0])
-
-    @cached_property
-    def covariance(self) -> Array:
-        """Covariance of the camera's parameters, (P, P)."""
-        size = len(self.camera.parameters)
-        return self.solution.variance * self.solution.covariance[:size, :size]
-
-    @property
-    def rms_px(self) -> float:
-        """RMS distance of corners from their reprojection, robustly weighted."""
-        return weighted_rms(self.residuals, self.weights)
-
-    def calibration(self, views: Sequence[PlanarView]) -> CameraCalibration:
-        """Convert to a CameraCalibration; views: those it was fitted to."""
-        shots = [view.shot for view in views]
-        return CameraCalibration(
-            self.camera,
-            self.covariance,
-            dict(zip(shots, self.poses, strict=True)),
-            dict(zip(shots, self.residuals, strict=True)),
-            self.rms_px,
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +77,20 @@ def calibrate_camera(
 
     Raises DegeneratePoses for fewer than three poses, or poses that differ only by a translation.
     """
-    return fit_from_scratch(views, width, height, lens).calibration(views)
+    if len(views) < MIN_POSES:
+        raise DegeneratePoses(
+            f"{len(views)} usable board poses, at least {MIN_POSES} are needed",
+            remedy="capture the board in more poses, tilted differently, well inside the image",
+        )
+    homographies = [homography(view.points[:, :2], view.pixels) for view in views]
+    matrix = matrix_from_homographies(homographies, width, height)
+    alpha, gamma, u0, _, beta, v0 = matrix[:2].ravel().tolist()
+    inverse = np.linalg.inv(matrix)
+    poses = [
+        camera_from_plane(inverse @ h, float(view.points[0, 2]))
+        for h, view in zip(homographies, views, strict=True)
+    ]
+    return fit_camera(Camera(alpha, beta, gamma, u0, v0, lens, width, height), poses, views)
 
 
 def calibrate_known_camera(views: Sequence[PlanarView], camera: Camera) -> CameraCalibration:
@@ -146,62 +104,46 @@ def calibrate_known_camera(views: Sequence[PlanarView], camera: Camera) -> Camer
             remedy="show it the board in a shot that others see too",
         )
     poses = [locate_board(camera, view)[0] for view in views]
-    return fit_camera(camera, poses, views).calibration(views)
-
-
-def fit_from_scratch(
-    views: Sequence[PlanarView], width: int, height: int, lens: Lens = CHAPTER_LENS
-) -> CameraFit:
-    """Fit camera and board poses as `calibrate_camera` does."""
-    if len(views) < MIN_POSES:
-        raise DegeneratePoses(
-            f"{len(views)} usable board poses, at least {MIN_POSES} are needed",
-            remedy="capture the board in more poses, tilted differently, well inside the image",
-        )
-    homographies = [homography(view.points[:, :2], view.pixels) for view in views]
-    matrix = matrix_from_homographies(homographies, width, height)
-    camera = _camera(matrix, lens, width, height)
-    inverse = np.linalg.inv(matrix)
-    poses = tuple(
-        camera_from_plane(inverse @ h, float(view.points[0, 2]))
-        for h, view in zip(homographies, views, strict=True)
-    )
     return fit_camera(camera, poses, views)
 
 
 def fit_camera(
+    camera: Camera, poses: Sequence[RigidTransform], views: Sequence[PlanarView]
+) -> CameraCalibration:
+    """Fit camera and `camera_from_board` of each view by least squares, starting from those given."""
+    solution = minimize_camera(camera, poses, views)
+    size, corners = len(camera.parameters), solution.blocks[0]
+    return CameraCalibration(
+        solution.state.camera,
+        solution.variance * solution.covariance[:size, :size],
+        solution.state.poses,
+        weighted_rms(corners.residuals.reshape(-1, 2), solution.weights[0][::2]),
+    )
+
+
+def minimize_camera(
     camera: Camera,
     poses: Sequence[RigidTransform],
     views: Sequence[PlanarView],
     *,
     tolerance: float = 1e-6,
     damping: float = 1e-3,
-) -> CameraFit:
-    """Fit camera and board poses by least squares, starting from those given.
-
-    poses: `camera_from_board` of each view.
-    tolerance, damping: see `minimize`.
-    """
+) -> Solution[_State]:
+    """Minimise the corners' reprojection errors over camera and poses; see `minimize`."""
     size = len(camera.parameters)
-    solution = minimize(
+    return minimize(
         _State(camera, tuple(poses)),
-        lambda state: [
-            _corner_block(state, views),
-            camera_prior(state.camera, np.arange(size)),
-        ],
+        lambda state: [_corner_block(state, views), camera_prior(state.camera, np.arange(size))],
         _State.retract,
         unknowns=size + 6 * len(views),
         tolerance=tolerance,
         damping=damping,
     )
-    return CameraFit(solution)
 
 
-def weighted_rms(residuals: Sequence[Array], weights: Sequence[Array]) -> float:
-    """Compute the weighted RMS length of residuals (N, 2) px, given view by view."""
-    weight = np.concatenate(weights)
-    squared = np.sum(np.concatenate(residuals) ** 2, axis=1)
-    return float(np.sqrt(np.sum(weight * squared) / np.sum(weight)))
+def weighted_rms(residuals: Array, weights: Array) -> float:
+    """Compute the weighted RMS length of residuals (N, 2)."""
+    return float(np.sqrt(np.sum(weights * np.sum(residuals**2, axis=1)) / np.sum(weights)))
 
 
 def camera_prior(camera: Camera, columns: Indices) -> Block:
@@ -255,21 +197,9 @@ def locate_boards(
         steps=30,
         tolerance=tolerance,
     )
-    corners = solution.blocks[0]
-    return solution.state.poses, _split_by_view(corners.residuals.reshape(-1, 2), corners)
-
-
-def _camera(matrix: Array, lens: Lens, width: int, height: int) -> Camera:
-    return Camera(
-        alpha=float(matrix[0, 0]),
-        beta=float(matrix[1, 1]),
-        gamma=float(matrix[0, 1]),
-        u0=float(matrix[0, 2]),
-        v0=float(matrix[1, 2]),
-        lens=lens,
-        width=width,
-        height=height,
-    )
+    ends = np.cumsum([len(view.points) for view in views])[:-1]
+    residuals = solution.blocks[0].residuals.reshape(-1, 2)
+    return solution.state.poses, tuple(np.split(residuals, ends))
 
 
 def _corner_block(state: _State, views: Sequence[PlanarView], *, camera_free: bool = True) -> Block:
@@ -297,9 +227,3 @@ def _corner_block(state: _State, views: Sequence[PlanarView], *, camera_free: bo
         CORNERS,
         runs=np.array([2 * len(view.points) for view in views]),
     )
-
-
-def _split_by_view(values: Array, corners: Block) -> tuple[Array, ...]:
-    """Split values of a block's corners by view."""
-    assert corners.runs is not None
-    return tuple(np.split(values, np.cumsum(corners.runs)[:-1] // 2))

@@ -126,9 +126,8 @@ def _find(known: Known, device: KnownCamera, name: str, folder: Path) -> FoundCa
     if device.nodes and form.read_nodes:
         return form.read_nodes(path, device.nodes)
     cameras = form.read(path)
-    if device.name is None and device.file is not None and len(cameras) == 1:
-        return next(iter(cameras.values()))
-    if device.name is None and len(cameras) == 1 and device is known.camera:
+    only = device.file is not None or device is known.camera
+    if device.name is None and only and len(cameras) == 1:
         return next(iter(cameras.values()))
     return find_camera(cameras, device.name or name, str(path))
 
@@ -174,18 +173,10 @@ def _projector(found: FoundCamera, code: StripeCode) -> Camera:
                 remedy=f"write `stripes: {size}` for {direction} stripes in the rig file, and `origin` "
                 "in pixels",
             )
-        if count < size and size % count and one.has_edges:
+        if count > size or (size % count and one.has_edges):
             raise CalibrationFileError(
                 f"has a projector of {found.size[0]} x {found.size[1]} px, which {count} {direction} "
                 f"stripes do not divide evenly ({size / count:.4g} px each)",
-                where=found.where,
-                remedy="correct `stripes` or `direction` in the rig file, or give the file of this "
-                "projector",
-            )
-        if count > size:
-            raise CalibrationFileError(
-                f"has a projector of {found.size[0]} x {found.size[1]} px, across which there are "
-                f"no {count} {direction} stripes",
                 where=found.where,
                 remedy="correct `stripes` or `direction` in the rig file, or give the file of this "
                 "projector",

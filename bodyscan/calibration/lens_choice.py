@@ -16,11 +16,11 @@ from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.calibration.board_views import PlanarView, match_corners
 from bodyscan.calibration.camera import (
     CameraCalibration,
-    CameraFit,
     LensTrial,
+    calibrate_camera,
     fit_camera,
-    fit_from_scratch,
     locate_boards,
+    minimize_camera,
     weighted_rms,
 )
 from bodyscan.calibration.model_selection import (
@@ -49,10 +49,10 @@ class ChosenLens:
     refused: the fit with the lens tried last, if it was not taken.
     """
 
-    fit: CameraFit
+    fit: CameraCalibration
     trials: tuple[LensTrial, ...]
     rays: RayUncertainty
-    refused: CameraFit | None = None
+    refused: CameraCalibration | None = None
 
 
 def calibrate_with_lenses(
@@ -64,9 +64,9 @@ def calibrate_with_lenses(
 
     Raises DegeneratePoses as `calibrate_camera` does.
     """
-    start = fit_from_scratch(views, width, height, kinds[-1]())
+    start = calibrate_camera(views, width, height, kinds[-1]())
     chosen = choose_lens(kinds, start.camera, start.poses, views)
-    return replace(chosen.fit.calibration(views), lenses=chosen.trials, rays=chosen.rays)
+    return replace(chosen.fit, lenses=chosen.trials, rays=chosen.rays)
 
 
 def choose_lens(
@@ -87,7 +87,7 @@ def choose_lens(
         richest = chosen if len(kinds) == 1 else _fit(kinds[1], camera, poses, views)
         return ChosenLens(chosen, (), ray_uncertainty(chosen.camera, richest, views))
     residuals = _hold_out(chosen, views, cluster)
-    trials: list[tuple[CameraFit, Array, float | None]] = [(chosen, residuals, None)]
+    trials: list[tuple[CameraCalibration, Array, float | None]] = [(chosen, residuals, None)]
     corner_cluster = np.repeat(cluster, [len(view.points) for view in views])
     for kind in kinds[1:]:
         tried = _fit(kind, camera, poses, views)
@@ -97,9 +97,9 @@ def choose_lens(
         if better_by < MIN_GAIN:
             break  # the next has all coefficients of this one, and more
         chosen, residuals = tried, richer
-    weights = [shared_weights([one for _, one, _ in trials])]
+    weights = shared_weights([one for _, one, _ in trials])
     figures = tuple(
-        LensTrial(fit.camera.lens.kind, weighted_rms([one], weights), better_by, fit is chosen)
+        LensTrial(fit.camera.lens.kind, weighted_rms(one, weights), better_by, fit is chosen)
         for fit, one, better_by in trials
     )
     last = trials[-1][0]
@@ -109,7 +109,7 @@ def choose_lens(
 
 def _fit(
     kind: type[Lens], camera: Camera, poses: Sequence[RigidTransform], views: Sequence[PlanarView]
-) -> CameraFit:
+) -> CameraCalibration:
     ideal = np.concatenate(
         [pose.apply(view.points) for pose, view in zip(poses, views, strict=True)]
     )
@@ -141,7 +141,7 @@ def _near(first: PlanarView, second: PlanarView) -> bool:
     return bool(np.median(moved) < 0.05 * np.linalg.norm(np.ptp(first.pixels, axis=0)))
 
 
-def _hold_out(fit: CameraFit, views: Sequence[PlanarView], cluster: Indices) -> Array:
+def _hold_out(fit: CameraCalibration, views: Sequence[PlanarView], cluster: Indices) -> Array:
     """Residuals (N, 2) px of all views, from fits without their cluster, or one of MAX_FOLDS groups
     of clusters, that start from `fit`."""
     residuals: list[Array] = [np.empty(0)] * len(views)
@@ -151,13 +151,13 @@ def _hold_out(fit: CameraFit, views: Sequence[PlanarView], cluster: Indices) -> 
         # A tenth of a standard deviation changes nothing on held-out boards. Fits start close to
         # their minimum, where full steps are right; damped ones creep along directions in which
         # boards hardly determine a lens.
-        others = fit_camera(
+        others = minimize_camera(
             fit.camera,
             [fit.poses[k] for k in rest],
             [views[k] for k in rest],
             tolerance=1e-2,
             damping=1e-9,
-        ).camera
+        ).state.camera
         held_out = np.flatnonzero(fold == number).tolist()
         found = locate_boards(
             others, [views[k] for k in held_out], [fit.poses[k] for k in held_out], tolerance=1e-2
@@ -168,7 +168,7 @@ def _hold_out(fit: CameraFit, views: Sequence[PlanarView], cluster: Indices) -> 
 
 
 def ray_uncertainty(
-    chosen: Camera, richest: CameraFit, views: Sequence[PlanarView]
+    chosen: Camera, richest: CameraCalibration, views: Sequence[PlanarView]
 ) -> RayUncertainty:
     """Estimate the uncertainty of the rays of the camera `chosen`, also where boards did not reach.
 

@@ -43,7 +43,7 @@ def fit_light_planes(
     (Cauchy). A boundary on a single board, or whose points lie on a line, gets no plane.
     """
     count = stripes + 1
-    enough = _count_boards(data, count, min_points) >= 2
+    enough = count_boards(data, stripes, min_points) >= 2
     sigma_mm = np.linalg.norm(data.per_pixel, axis=1) * data.sigma_px
     robust = np.ones(len(data.index))
     for _ in range(4):
@@ -65,11 +65,11 @@ def fit_light_planes(
     return PlaneFit(LightPlanes(planes, covariance, direction), distances, rms)
 
 
-def _count_boards(data: BoundaryPoints, count: int, min_points: int) -> Indices:
-    """Number of boards with enough points of each boundary, (count,)."""
-    boards = int(data.board.max()) + 1 if len(data.board) else 1
-    points = np.bincount(data.index * boards + data.board, minlength=count * boards)
-    return np.sum(points.reshape(count, boards) >= min_points, axis=1)
+def count_boards(data: BoundaryPoints, stripes: int, min_points: int = 1) -> Indices:
+    """Count the boards with at least `min_points` points of each boundary, (S + 1,)."""
+    boards = int(data.board.max(initial=0)) + 1
+    points = np.bincount(data.index * boards + data.board, minlength=(stripes + 1) * boards)
+    return np.count_nonzero(points.reshape(stripes + 1, boards) >= min_points, axis=1)
 
 
 def _weighted_planes(

@@ -8,7 +8,7 @@ import numpy as np
 
 from bodyscan.arrays import Indices
 from bodyscan.calibration.boundary_points import BoundaryPoints, subsample
-from bodyscan.calibration.light_planes import PlaneFit, fit_light_planes
+from bodyscan.calibration.light_planes import PlaneFit, count_boards, fit_light_planes
 from bodyscan.calibration.model_selection import (
     Candidate,
     HeldOutModel,
@@ -74,7 +74,11 @@ def fit_light_sheets(bins: BoundaryPoints, stripes: int, direction: Axis) -> She
     few = subsample(bins, 4000)
     starts = smooth_models(few, stripes, direction)
     candidates = [_smooth_candidate(name, start) for name, start in starts]
-    candidates.append(_planes_candidate(stripes, direction))
+
+    def planes(data: BoundaryPoints) -> LightSheets:
+        return fit_planes(data, stripes, direction, 1.0).planes
+
+    candidates.append(Candidate("free planes", planes, complete=False))
     folds = split(few)
     tried = [hold_out(candidate, few, folds) for candidate in candidates]
     chosen, figures = select_model(candidates, tried, few)
@@ -131,13 +135,6 @@ def _lens_start(plain: LensSheets, data: BoundaryPoints) -> LensSheets:
     return min(fits, key=lambda fit: np.nan_to_num(fit.noise, nan=np.inf)).sheets
 
 
-def count_boards(data: BoundaryPoints, stripes: int) -> Indices:
-    """Count the boards on which each boundary was found, (S + 1,)."""
-    boards = int(data.board.max(initial=0)) + 1
-    points = np.bincount(data.index * boards + data.board, minlength=(stripes + 1) * boards)
-    return np.count_nonzero(points.reshape(stripes + 1, boards), axis=1).astype(np.int64)
-
-
 def fit_planes(
     bins: BoundaryPoints, stripes: int, direction: Axis, board_error_mm: float
 ) -> PlaneFit:
@@ -154,10 +151,3 @@ def _smooth_candidate(name: str, start: SmoothSheets) -> Candidate:
     # with a prior that covers such devices.
     incomplete = name in ("pinhole", "lens k1", "smooth planes")
     return Candidate(name, fit, selectable=not incomplete)
-
-
-def _planes_candidate(stripes: int, direction: Axis) -> Candidate:
-    def fit(data: BoundaryPoints) -> LightSheets:
-        return fit_planes(data, stripes, direction, 1.0).planes
-
-    return Candidate("free planes", fit, complete=False)

@@ -46,19 +46,14 @@ def shared_weights(tried: Sequence[Array]) -> Array:
     return np.asarray(cauchy_weights(scaled, size, 4.0)[::size], np.float64)
 
 
-def gain(*kinds: ResidualPair) -> float:
-    """Compute by how many standard errors the richer model lowers held-out squared residuals.
-
-    Each kind of points is scaled by its own robust sigma.
-    """
-    gained, variance = 0.0, 0.0
-    for pair in kinds:
-        sigma = min(robust_scale(residuals.ravel()) for residuals in (pair.simple, pair.rich))
-        weights = shared_weights([pair.simple, pair.rich]) / sigma**2
-        gained += float(np.sum(weights * np.sum(pair.simple**2 - pair.rich**2, axis=1)))
-        noise = weights * np.sum(2.0 * pair.rich * (pair.simple - pair.rich), axis=1)
-        variance += float(np.sum(np.bincount(pair.cluster, noise) ** 2))
-    return gained / max(float(np.sqrt(variance)), 1e-12)
+def gain(pair: ResidualPair) -> float:
+    """Compute by how many standard errors the richer model lowers held-out squared residuals."""
+    sigma = min(robust_scale(residuals.ravel()) for residuals in (pair.simple, pair.rich))
+    weights = shared_weights([pair.simple, pair.rich]) / sigma**2
+    gained = float(np.sum(weights * np.sum(pair.simple**2 - pair.rich**2, axis=1)))
+    noise = weights * np.sum(2.0 * pair.rich * (pair.simple - pair.rich), axis=1)
+    deviation = float(np.sqrt(np.sum(np.bincount(pair.cluster, noise) ** 2)))
+    return gained / max(deviation, 1e-12)
 
 
 @dataclass(frozen=True)
@@ -121,23 +116,18 @@ class HeldOutErrors:
     distances: Array
     sheets: tuple[LightSheets, ...]
 
-    def unit_variance(self, data: BoundaryPoints, folds: Sequence[Fold]) -> Array:
-        """Variance (N,) mm^2 of the distances if boards were known to 1 mm (see `BoardErrors`)."""
-        errors = data.board_errors
-        variance = np.sum(errors.effects**2, axis=1)
-        for fold, sheets in zip(folds, self.sheets, strict=True):
-            rays, s, _ = _held_out_rays(data, fold)
-            of_depth = sheets.variance_mm2(rays, s, sheets.depth(rays, s))
-            variance[fold.left_out] += of_depth * errors.facing[fold.left_out] ** 2
-        return variance
-
     def board_error_mm(self, data: BoundaryPoints, folds: Sequence[Fold]) -> float:
         """Estimate the error of the boards' poses, mm, that explains distances as large as these.
 
         data: the points that were held out. Their noise, by the differences of neighbours on a
             boundary, is subtracted.
         """
-        unit_variance = self.unit_variance(data, folds)
+        # Variance (N,) mm^2 of the distances if boards were known to 1 mm.
+        unit_variance = np.sum(data.board_errors.effects**2, axis=1)
+        for fold, sheets in zip(folds, self.sheets, strict=True):
+            rays, s, _ = _held_out_rays(data, fold)
+            of_depth = sheets.variance_mm2(rays, s, sheets.depth(rays, s))
+            unit_variance[fold.left_out] += of_depth * data.board_errors.facing[fold.left_out] ** 2
         known = np.isfinite(self.distances) & np.isfinite(unit_variance)
         squared = self.distances[known] ** 2
         if not squared.size:

@@ -14,17 +14,12 @@ from bodyscan.calibration.camera import LensTrial
 from bodyscan.calibration.joint_refinement import JointFit, StripedBoard, refine_jointly
 from bodyscan.calibration.light_sheets import fit_light_sheets
 from bodyscan.calibration.model_selection import HeldOutModel
-from bodyscan.calibration.stripe_agreement import (
-    ProjectorMotion,
-    board_offsets,
-    find_projector_motion,
-)
+from bodyscan.calibration.stripe_agreement import board_offsets, find_projector_motion
 from bodyscan.calibration.striped_view import StripedView, boundaries_on_boards
 from bodyscan.errors import PairFailed
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.light_planes import LightSheets
 from bodyscan.geometry.smooth_sheets import SmoothSheets
-from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import RayUncertainty
 from bodyscan.outcome import Outcome
 from bodyscan.rig.board import Board
@@ -155,9 +150,24 @@ def calibrate_pair(pair: LocatedPair) -> Outcome[PairCalibration]:
         # In a rig of several pairs all cameras together constrain the boards, far better than the
         # stripes of one pair could.
         joint = _refine(pair, fit.sheets, shots, points)
-        calibration = _with_joint_fit(calibration, joint)
+        quality = replace(
+            quality,
+            refinement="joint solve of corners and stripes",
+            corners_rms_px=joint.corners_rms_px,
+            bent_mm={name: warp.out_of_plane_mm for name, warp in joint.warps.items()},
+        )
+        calibration = replace(
+            calibration,
+            camera=joint.camera,
+            camera_covariance=joint.camera_covariance,
+            sheets=joint.sheets,
+            quality=quality,
+        )
         poses = dict(zip((view.key for view in pair.views), joint.camera_from_board, strict=True))
-        shots = tuple(_with_pose(shot, poses[shot.view.key]) for shot in shots)
+        shots = tuple(
+            replace(shot, view=replace(shot.view, camera_from_board=poses[shot.view.key]))
+            for shot in shots
+        )
     crossing = _fit_crossing(calibration, code, shots)
     return replace(crossing, notes=(*notes, *crossing.notes))
 
@@ -171,12 +181,8 @@ def drop_inconsistent(
     """
     points = boundaries_on_boards(name, camera, code, shots)
     split = find_projector_motion(points, code.stripes, code.direction)
-    return Outcome(tuple(shots)) if split is None else _consistent_shots(name, shots, split)
-
-
-def _consistent_shots(
-    name: str, shots: Sequence[StripedView], split: ProjectorMotion
-) -> Outcome[tuple[StripedView, ...]]:
+    if split is None:
+        return Outcome(tuple(shots))
     names = [shot.view.shot for shot in shots]
     misfit = f"{split.joint_px:.1f} px RMS as one group, {split.separate_px:.1f} px as two"
     others = ", ".join(names[k] for k in split.others)
@@ -225,26 +231,6 @@ def _refine(
     }
     poses = [view.camera_from_board for view in pair.views]
     return refine_jointly(pair.camera, poses, sheets, boards, flatness)
-
-
-def _with_joint_fit(pair: PairCalibration, fit: JointFit[SmoothSheets]) -> PairCalibration:
-    quality = replace(
-        pair.quality,
-        refinement="joint solve of corners and stripes",
-        corners_rms_px=fit.corners_rms_px,
-        bent_mm={name: warp.out_of_plane_mm for name, warp in fit.warps.items()},
-    )
-    return replace(
-        pair,
-        camera=fit.camera,
-        camera_covariance=fit.camera_covariance,
-        sheets=fit.sheets,
-        quality=quality,
-    )
-
-
-def _with_pose(shot: StripedView, camera_from_board: RigidTransform) -> StripedView:
-    return replace(shot, view=replace(shot.view, camera_from_board=camera_from_board))
 
 
 def _fit_crossing(

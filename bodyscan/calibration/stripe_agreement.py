@@ -63,10 +63,7 @@ def find_projector_motion(
             best, separate = ProjectorMotion(kept, others, joint, misfit, moved), misfit
         if separate < MAX_MISFIT_PX:
             break
-    if best is not None:
-        return best
-    width = _stripe_width(few)
-    if joint > width:
+    if best is None and joint > (width := _stripe_width(few)):
         raise PairFailed(
             f"no projector explains the stripes on {len(boards)} boards, nor those on most of them: "
             f"the misfit is {joint:.1f} px, a stripe is {width:.1f} px wide. Possible causes: images "
@@ -74,7 +71,7 @@ def find_projector_motion(
             remedy="check that the lit image and the patterns of each shot belong together, and "
             "`stripes` and `direction` in the rig file",
         )
-    return None
+    return best
 
 
 def board_offsets(data: BoundaryPoints, sheets: LightSheets) -> Array:

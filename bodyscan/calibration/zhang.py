@@ -111,16 +111,8 @@ def _central_matrix(homographies: Sequence[Array]) -> Array:
 def _constraint(h: Array, i: int, j: int) -> Array:
     """Coefficients v_ij of h_i^T B h_j in (B11, B12, B22, B13, B23, B33) (Zhang 2000, Eq. 7)."""
     a, b = h[:, i], h[:, j]
-    return np.array(
-        [
-            a[0] * b[0],
-            a[0] * b[1] + a[1] * b[0],
-            a[1] * b[1],
-            a[2] * b[0] + a[0] * b[2],
-            a[2] * b[1] + a[1] * b[2],
-            a[2] * b[2],
-        ]
-    )
+    twice = np.outer(a, b) + np.outer(b, a)
+    return np.array([a[0] * b[0], twice[0, 1], a[1] * b[1], twice[0, 2], twice[1, 2], a[2] * b[2]])
 
 
 def _normalization(points: Array) -> Array:

@@ -24,19 +24,14 @@ from bodyscan.calibration.zhang import homography
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.light_planes import Axis, LightPlanes, LightSheets
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.laboratory.apparatus import BOARD, PROJECTOR
 from bodyscan.laboratory.rival_cameras import (
     TsaiCamera,
     calibrate_tsai,
     projection_matrix,
     split_projection_matrix,
 )
-from bodyscan.laboratory.rival_projectors import (
-    fit_invariable_baseline,
-    fit_remapped_pinhole,
-    fit_variable_baseline,
-)
-from bodyscan.rig.board import Board
-from bodyscan.stripes.stripe_code import StripeCode
+from bodyscan.laboratory.rival_projectors import fit_baseline, fit_remapped_pinhole
 from bodyscan.stripes.stripe_map import StripeMap
 
 
@@ -49,14 +44,6 @@ class StripedShot:
 
 
 @dataclass(frozen=True, eq=False)
-class Target:
-    """What the shots have in common."""
-
-    board: Board
-    projector: StripeCode
-
-
-@dataclass(frozen=True, eq=False)
 class LocatedBoards:
     """A camera, camera_from_board by shot, and the boundaries on the boards, camera frame."""
 
@@ -66,64 +53,61 @@ class LocatedBoards:
 
 
 def calibrate_by_reference_plane(
-    target: Target, shots: Sequence[StripedShot]
+    shots: Sequence[StripedShot],
 ) -> tuple[CameraCalibration, LocatedBoards]:
     """Calibrate by Zhang's method (section 3), which also gives the boards' poses."""
     height, width = shots[0].stripes.s.shape
-    views = [planar_view(shot.view, target.board) for shot in shots]
+    views = [planar_view(shot.view, BOARD) for shot in shots]
     found = calibrate_camera(views, width, height)
-    return found, locate_boundaries(target, shots, found.camera, found.camera_from_board)
+    poses = {view.shot: pose for view, pose in zip(views, found.poses, strict=True)}
+    return found, locate_boundaries(shots, found.camera, poses)
 
 
 def calibrate_by_slide_stage(
-    target: Target, shots: Sequence[StripedShot], readings: Array, *, skewed: bool = False
+    shots: Sequence[StripedShot], readings: Array, *, skewed: bool = False
 ) -> tuple[TsaiCamera, LocatedBoards]:
     """Calibrate Tsai's camera, with a skew if wanted, from a board slid along its normal.
 
     readings: (shots,) mm, of the stage.
     """
     height, width = shots[0].stripes.s.shape
-    points, pixels = stage_points(target.board, shots, readings)
+    points, pixels = stage_points(shots, readings)
     middle = np.array([(width - 1) / 2.0, (height - 1) / 2.0])
     tsai = calibrate_tsai(points, pixels, middle, skewed=skewed)
     poses = {
         shot.view.shot: tsai.camera_from_points @ _stage_pose(float(reading))
         for shot, reading in zip(shots, readings, strict=True)
     }
-    return tsai, locate_boundaries(target, shots, tsai.camera(width, height), poses)
+    return tsai, locate_boundaries(shots, tsai.camera(width, height), poses)
 
 
-def calibrate_by_matrix(
-    target: Target, shots: Sequence[StripedShot], readings: Array
-) -> LocatedBoards:
+def calibrate_by_matrix(shots: Sequence[StripedShot], readings: Array) -> LocatedBoards:
     """Calibrate a 3 x 4 camera without a lens from the stage (Bolles et al. 1981).
 
     The stripes' positions are read off each board by its own homography, which has no lens either.
     """
     height, width = shots[0].stripes.s.shape
-    points, pixels = stage_points(target.board, shots, readings)
+    points, pixels = stage_points(shots, readings)
     matrix = projection_matrix(points, pixels)
     camera, camera_from_stage = split_projection_matrix(matrix, width, height)
     poses, parts = {}, []
     for number, (shot, reading) in enumerate(zip(shots, readings, strict=True)):
         pose = camera_from_stage @ _stage_pose(float(reading))
         poses[shot.view.shot] = pose
-        view = planar_view(shot.view, target.board)
-        parts.append(_locate_by_homography(target, shot, view, camera, pose, number))
+        view = planar_view(shot.view, BOARD)
+        parts.append(_locate_by_homography(shot, view, camera, pose, number))
     return LocatedBoards(camera, poses, concatenate(parts))
 
 
-def locate_boards(target: Target, shots: Sequence[StripedShot], camera: Camera) -> LocatedBoards:
+def locate_boards(shots: Sequence[StripedShot], camera: Camera) -> LocatedBoards:
     """Locate boards held anywhere with a camera that is already known."""
     poses = {
-        shot.view.shot: locate_board(camera, planar_view(shot.view, target.board))[0]
-        for shot in shots
+        shot.view.shot: locate_board(camera, planar_view(shot.view, BOARD))[0] for shot in shots
     }
-    return locate_boundaries(target, shots, camera, poses)
+    return locate_boundaries(shots, camera, poses)
 
 
 def locate_boundaries(
-    target: Target,
     shots: Sequence[StripedShot],
     camera: Camera,
     camera_from_board: dict[str, RigidTransform],
@@ -134,8 +118,8 @@ def locate_boundaries(
     parts = [
         on_board(
             camera,
-            target.projector,
-            target.board,
+            PROJECTOR,
+            BOARD,
             camera_from_board[shot.view.shot],
             boundaries_near(shot.stripes, box_around(shot.view)),
             number,
@@ -146,11 +130,9 @@ def locate_boundaries(
     return LocatedBoards(camera, camera_from_board, concatenate(parts))
 
 
-def stage_points(
-    board: Board, shots: Sequence[StripedShot], readings: Array
-) -> tuple[Array, Array]:
+def stage_points(shots: Sequence[StripedShot], readings: Array) -> tuple[Array, Array]:
     """Stack all corners (N, 3) mm, frame of the board at reading 0, and their pixels (N, 2)."""
-    views = [planar_view(shot.view, board) for shot in shots]
+    views = [planar_view(shot.view, BOARD) for shot in shots]
     points = [
         view.points + [0.0, 0.0, reading] for view, reading in zip(views, readings, strict=True)
     ]
@@ -162,7 +144,6 @@ def _stage_pose(reading: float) -> RigidTransform:
 
 
 def _locate_by_homography(
-    target: Target,
     shot: StripedShot,
     view: PlanarView,
     camera: Camera,
@@ -179,11 +160,9 @@ def _locate_by_homography(
         return camera_from_board.apply(flat)
 
     # The same test of what lies on the checkered area as for every other model.
-    everything = on_board(
-        camera, target.projector, target.board, camera_from_board, near, number, bin_px=1
-    )
+    everything = on_board(camera, PROJECTOR, BOARD, camera_from_board, near, number, bin_px=1)
     pixels = camera.project(everything.points)
-    horizontal = target.projector.direction == "horizontal"
+    horizontal = PROJECTOR.direction == "horizontal"
     across = np.array([0.0, 0.5]) if horizontal else np.array([0.5, 0.0])
     return BoundaryPoints(
         everything.index,
@@ -227,23 +206,22 @@ def remapped_planes(points: BoundaryPoints, stripes: int, direction: Axis) -> Li
 PROJECTORS: dict[str, Model] = {
     "2 x 4 matrix": pinhole_planes,
     "2 x 4 matrix, index re-mapped": remapped_planes,
-    "invariable baseline": partial(fit_invariable_baseline, fit_tilt=False),
-    "invariable baseline, tilted": fit_invariable_baseline,
-    "variable baseline": partial(fit_variable_baseline, fit_tilt=False),
-    "variable baseline, tilted": fit_variable_baseline,
+    "invariable baseline": partial(fit_baseline, variable=False, fit_tilt=False),
+    "invariable baseline, tilted": partial(fit_baseline, variable=False),
+    "variable baseline": partial(fit_baseline, variable=True, fit_tilt=False),
+    "variable baseline, tilted": partial(fit_baseline, variable=True),
     "free planes": free_planes,
 }
 """Every model of the projector that the chapter names. `tilted`: the baseline's direction in the
 image is estimated too, instead of being assumed to be the camera's x axis."""
 
 
-def fit_rivals(target: Target, where: LocatedBoards) -> list[Approach]:
+def fit_rivals(where: LocatedBoards) -> list[Approach]:
     """Fit each model of the projector to the same boundaries."""
-    return [fit_approach(name, where, target, model) for name, model in PROJECTORS.items()]
+    return [fit_approach(name, where, model) for name, model in PROJECTORS.items()]
 
 
-def fit_approach(name: str, where: LocatedBoards, target: Target, model: Model) -> Approach:
+def fit_approach(name: str, where: LocatedBoards, model: Model) -> Approach:
     """Fit one model of the projector to boundaries at known points."""
-    projector = target.projector
-    sheets = model(where.points, projector.stripes, projector.direction)
+    sheets = model(where.points, PROJECTOR.stripes, PROJECTOR.direction)
     return Approach(name, where.camera, sheets)

@@ -10,10 +10,7 @@ from bodyscan.arrays import Array
 from bodyscan.boards.board_layout import corner_points
 from bodyscan.calibration.board_views import PlanarView, planar_view
 from bodyscan.calibration.boundary_points import select, subsample
-from bodyscan.calibration.camera import (
-    CameraCalibration,
-    calibrate_camera,
-)
+from bodyscan.calibration.camera import CameraCalibration, calibrate_camera
 from bodyscan.calibration.joint_refinement import StripedBoard, refine_jointly
 from bodyscan.calibration.light_planes import PlaneFit, fit_light_planes
 from bodyscan.calibration.light_sheets import fit_light_sheets
@@ -35,7 +32,7 @@ from bodyscan.laboratory.approaches import (
     pinhole_planes,
     remapped_planes,
 )
-from bodyscan.laboratory.chapter_captures import TARGET, ChapterCaptures
+from bodyscan.laboratory.chapter_captures import ChapterCaptures
 from bodyscan.simulation.files import describe_camera
 
 
@@ -65,25 +62,25 @@ class Calibrations:
 
 def calibrate_all(captures: ChapterCaptures) -> Calibrations:
     """Calibrate everything that is compared, from the same shots."""
-    reference, reference_boards = calibrate_by_reference_plane(TARGET, captures.boards)
-    _, stage = calibrate_by_slide_stage(TARGET, captures.stage, captures.readings)
-    _, skewed = calibrate_by_slide_stage(TARGET, captures.stage, captures.readings, skewed=True)
-    projector = TARGET.projector
+    reference, reference_boards = calibrate_by_reference_plane(captures.boards)
+    _, stage = calibrate_by_slide_stage(captures.stage, captures.readings)
+    _, skewed = calibrate_by_slide_stage(captures.stage, captures.readings, skewed=True)
+    projector = apparatus.PROJECTOR
     planes = fit_light_planes(reference_boards.points, projector.stripes, projector.direction)
     ours, covariance, model, refinement = calibrate_ours(captures, reference, reference_boards)
-    by_matrix = calibrate_by_matrix(TARGET, captures.stage, captures.readings)
+    by_matrix = calibrate_by_matrix(captures.stage, captures.readings)
     second, with_skew = (
-        locate_boards(TARGET, captures.boards, boards.camera) for boards in (stage, skewed)
+        locate_boards(captures.boards, boards.camera) for boards in (stage, skewed)
     )
     approaches = (
         # 3 x 4 and 2 x 4 matrices from the stage, no lens, the index taken as linear.
-        fit_approach("(i)", by_matrix, TARGET, pinhole_planes),
+        fit_approach("(i)", by_matrix, pinhole_planes),
         # Tsai's camera with its lens, and a re-mapped index.
-        fit_approach("(i) mended", stage, TARGET, remapped_planes),
+        fit_approach("(i) mended", stage, remapped_planes),
         # Tsai's camera from the stage, planes from the reference plane: the chapter's text, not its
         # heading `calibrated by slide stage`.
-        fit_approach("(ii)", second, TARGET, free_planes),
-        fit_approach("(ii) with skew", with_skew, TARGET, free_planes),
+        fit_approach("(ii)", second, free_planes),
+        fit_approach("(ii) with skew", with_skew, free_planes),
         Approach("(iii)", reference_boards.camera, planes.planes),
         ours,
     )
@@ -95,8 +92,8 @@ def calibrate_all(captures: ChapterCaptures) -> Calibrations:
         model,
         refinement,
         approaches,
-        tuple(fit_rivals(TARGET, stage)),
-        tuple(fit_rivals(TARGET, reference_boards)),
+        tuple(fit_rivals(stage)),
+        tuple(fit_rivals(reference_boards)),
     )
 
 
@@ -105,9 +102,9 @@ def calibrate_ours(
 ) -> tuple[Approach, Array, str, str]:
     """Calibrate as `bodyscan calibrate-rig` does for a single pair: the light model that held-out
     boards choose, and a joint solve of corners and stripes."""
-    projector, board = TARGET.projector, TARGET.board
+    projector, board = apparatus.PROJECTOR, apparatus.BOARD
     bins = locate_boundaries(
-        TARGET, captures.boards, boards.camera, boards.camera_from_board, bin_px=BIN_PX
+        captures.boards, boards.camera, boards.camera_from_board, bin_px=BIN_PX
     ).points
     data = subsample(bins, 6000)
     fit = fit_light_sheets(bins, projector.stripes, projector.direction)
@@ -123,9 +120,8 @@ def calibrate_ours(
         )
         for number, shot in enumerate(captures.boards)
     ]
-    poses = [reference.camera_from_board[shot.view.shot] for shot in captures.boards]
     flatness = {board.name: board.flatness_sigma_mm}
-    refined = refine_jointly(boards.camera, poses, fit.sheets, striped, flatness)
+    refined = refine_jointly(boards.camera, reference.poses, fit.sheets, striped, flatness)
     approach = Approach("ours", refined.camera, refined.sheets)
     return approach, refined.camera_covariance, fit.model, "joint solve"
 
@@ -151,7 +147,7 @@ class SigmaTrial:
 
 def run_sigma_trial(seeds: int, seed: int = 0) -> SigmaTrial:
     """Calibrate Table 1's camera from three poses, `seeds` times with corner noise of 0.012 px."""
-    corners = corner_points(TARGET.board)
+    corners = corner_points(apparatus.BOARD)
     poses = apparatus.board_poses()
     images = [apparatus.CAMERA.image(pose.apply(corners)) for pose in poses]
     true, errors = camera_from_fields(describe_camera(apparatus.CAMERA)), []

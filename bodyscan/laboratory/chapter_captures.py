@@ -15,7 +15,7 @@ from bodyscan.errors import BoardNotFound
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.laboratory import apparatus
 from bodyscan.laboratory.apparatus import ChapterSetup
-from bodyscan.laboratory.approaches import StripedShot, Target
+from bodyscan.laboratory.approaches import StripedShot
 from bodyscan.progress import Progress, silent
 from bodyscan.rig.frame_names import FrameNames
 from bodyscan.simulation.lamps import Lamps
@@ -24,14 +24,6 @@ from bodyscan.simulation.scene import Scene, Surface, grid_surface
 from bodyscan.simulation.sensor import expose
 from bodyscan.stripes.decoding import decode_stripes
 from bodyscan.stripes.stripe_map import StripeMap
-
-
-@dataclass(frozen=True, eq=False)
-class Exposure:
-    """What the camera took: the lit image, and the stripes decoded from the whole sequence."""
-
-    lit: Bytes
-    stripes: StripeMap
 
 
 def board_scene(setup: ChapterSetup, camera_from_board: RigidTransform) -> list[Surface]:
@@ -59,8 +51,10 @@ def plate_scene() -> list[Surface]:
 
 def expose_scene(
     setup: ChapterSetup, surfaces: Sequence[Surface], number: int, times: int = 1
-) -> list[Exposure]:
-    """Render the sequence and decode its stripes; `number` selects the shot's noise.
+) -> list[tuple[Bytes, StripeMap]]:
+    """Render the sequence; return the lit image and the decoded stripes of each exposure.
+
+    number: selects the shot's noise.
 
     times: how often the sensor's noise is drawn anew on the same light (jitter and speckle too).
     """
@@ -76,11 +70,10 @@ def expose_scene(
     ]
 
 
-def _read(frames: dict[str, Bytes]) -> Exposure:
+def _read(frames: dict[str, Bytes]) -> tuple[Bytes, StripeMap]:
     code = apparatus.PROJECTOR
     coded = np.stack([frames[name] for name in FrameNames().code_names(code)])
-    stripes = decode_stripes(code, frames["lit"], frames["dark"], coded)
-    return Exposure(frames["lit"], stripes)
+    return frames["lit"], decode_stripes(code, frames["lit"], frames["dark"], coded)
 
 
 def _ground() -> Surface:
@@ -97,15 +90,10 @@ def _wall() -> Surface:
     return grid_surface(corner, across, down, albedo=0.3, encloses=True)
 
 
-TARGET = Target(apparatus.BOARD, apparatus.PROJECTOR)
-
-
 @dataclass(frozen=True, eq=False)
 class SceneCapture:
-    """One scene: the lit image, its stripes, the same light
-    exposed a second time, and the truth."""
+    """One scene: its stripes, those of the same light exposed a second time, and the truth."""
 
-    lit: Bytes
     stripes: StripeMap
     again: StripeMap
     truth: PixelTruth
@@ -167,17 +155,17 @@ def take_captures(
 
 
 def _board_shot(setup: ChapterSetup, pose: RigidTransform, shot: str, number: int) -> StripedShot:
-    (taken,) = expose_scene(setup, board_scene(setup, pose), number)
-    views = find_boards(taken.lit, [apparatus.BOARD], pair="chapter", shot=shot)
+    ((lit, stripes),) = expose_scene(setup, board_scene(setup, pose), number)
+    views = find_boards(lit, [apparatus.BOARD], pair="chapter", shot=shot)
     if not views:
         raise BoardNotFound("the simulated board was not found", where=f"shot {shot}")
-    return StripedShot(views[0], taken.stripes)
+    return StripedShot(views[0], stripes)
 
 
 def _expose(setup: ChapterSetup, surfaces: Sequence[Surface], number: int) -> SceneCapture:
-    first, second = expose_scene(setup, surfaces, number, times=2)
+    (_, first), (_, second) = expose_scene(setup, surfaces, number, times=2)
     truth = compute_pixel_truth(Scene(surfaces), apparatus.CAMERA, setup.projector)
-    return SceneCapture(first.lit, first.stripes, second.stripes, truth)
+    return SceneCapture(first, second, truth)
 
 
 def _label_spheres(setup: ChapterSetup, truth: PixelTruth) -> Indices:

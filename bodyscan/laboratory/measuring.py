@@ -67,17 +67,13 @@ def triangulate_pixels(approach: Approach, s: Stripes, where: Mask | None = None
     return points
 
 
-def round_to_stripes(s: Stripes) -> Stripes:
-    """Round s to the middle of its stripe, as the chapter's instrument gives it."""
-    return np.floor(s) + 0.5
-
-
 def measure_artefacts(
     approach: Approach, captures: ChapterCaptures, *, whole: bool = False
 ) -> ApproachAccuracy:
     """Measure spheres and plate. whole: use only the stripe number of each pixel, no fraction."""
     maps = [captures.spheres.stripes.s, captures.plate.stripes.s]
-    spheres_s, plate_s = (round_to_stripes(s) if whole else s for s in maps)
+    # The chapter's instrument gives the middle of each stripe.
+    spheres_s, plate_s = (np.floor(s) + 0.5 if whole else s for s in maps)
     on_spheres = captures.owner >= 0
     points, owner = triangulate_pixels(approach, spheres_s, on_spheres), captures.owner[on_spheres]
     found, covered = [], []

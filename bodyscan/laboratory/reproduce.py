@@ -22,12 +22,7 @@ from bodyscan.laboratory.measuring import (
     measure_artefacts,
     triangulate_pixels,
 )
-from bodyscan.laboratory.text import (
-    Reproduction,
-    figure_names,
-    reproduction_text,
-    text_name,
-)
+from bodyscan.laboratory.text import Reproduction, figure_names, reproduction_text, text_name
 from bodyscan.progress import Progress, silent
 from bodyscan.reconstruction.triangulation import grid_normals
 
@@ -76,37 +71,35 @@ def _measure_all(
 ) -> Reproduction:
     """Measure the artefacts by every approach, whole-stripe and sub-pixel."""
     compared = [*calibrated.approaches, make_true_approach(captures.setup)]
-    groups: list[tuple[Sequence[Approach], bool]] = [
-        (compared, True),
-        (compared, False),
-        (calibrated.by_stage, False),
-        (calibrated.by_reference, False),
-    ]
-    total = sum(len(approaches) for approaches, _ in groups)
-    results: list[tuple[ApproachAccuracy, ...]] = []
-    for approaches, whole in groups:
-        done = sum(map(len, results))
+    total = 2 * len(compared) + len(calibrated.by_stage) + len(calibrated.by_reference)
+    done = 0
+
+    def measure(
+        approaches: Sequence[Approach], whole: bool = False
+    ) -> tuple[ApproachAccuracy, ...]:
+        nonlocal done
         progress("measuring", done, total)
-        results.append(
-            tuple(measure_artefacts(approach, captures, whole=whole) for approach in approaches)
-        )
-    progress("measuring", total, total)
-    return Reproduction(
+        done += len(approaches)
+        return tuple(measure_artefacts(one, captures, whole=whole) for one in approaches)
+
+    found = Reproduction(
         seed=seed,
         real_light=real_light,
         boards=len(captures.boards),
         calibrated=calibrated,
         trial=run_sigma_trial(5 if quick else 250, seed),
-        whole=results[0],
-        fine=results[1],
-        by_stage=results[2],
-        by_reference=results[3],
+        whole=measure(compared, whole=True),
+        fine=measure(compared),
+        by_stage=measure(calibrated.by_stage),
+        by_reference=measure(calibrated.by_reference),
         noise=estimate_noise_bound(captures),
         # Of the approaches whose sheets know their covariance.
         sigmas=tuple(
             compare_point_sigmas(one, captures) for one in compared if one.name in ("(iii)", "ours")
         ),
     )
+    progress("measuring", total, total)
+    return found
 
 
 def draw(
@@ -124,13 +117,8 @@ def draw(
     ]
     true = PlaneCurve("true", s, apparatus.true_planes(captures.setup))
     distances = calibrated.planes.distances_mm
-    draw_projector(
-        curves,
-        true,
-        distances[np.isfinite(distances)],
-        apparatus.PROJECTOR.direction,
-        out / names[0],
-    )
+    known = distances[np.isfinite(distances)]
+    draw_projector(curves, true, known, apparatus.PROJECTOR.direction, out / names[0])
     wanted = [by_name[name] for name in ("(i)", "(ii)", "(iii)", "ours")]
     draw_range_data([_range_data(approach, captures) for approach in wanted], out / names[1])
 

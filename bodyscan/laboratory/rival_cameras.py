@@ -55,16 +55,10 @@ class TsaiCamera:
         # Weighted by the radius, as more of the image lies there.
         rows = np.stack([ideal**3, ideal**5], axis=1) * np.sqrt(real)[:, None]
         coefficients = np.linalg.lstsq(rows, (real - ideal) * np.sqrt(real), rcond=None)[0]
-        return Camera(
-            alpha=self.focal * self.aspect,
-            beta=self.focal,
-            gamma=self.skew,
-            u0=float(self.centre[0]),
-            v0=float(self.centre[1]),
-            lens=Radial().with_coefficients(coefficients),
-            width=width,
-            height=height,
-        )
+        u0, v0 = self.centre.tolist()
+        lens = Radial().with_coefficients(coefficients)
+        alpha = self.focal * self.aspect
+        return Camera(alpha, self.focal, self.skew, u0, v0, lens, width, height)
 
 
 def calibrate_tsai(
@@ -85,25 +79,13 @@ def calibrate_tsai(
     found = least_squares(misalignment, centre).x
     rotation, across, aspect = _align(points, pixels - found)
     focal, depth = _focal_and_depth(points, pixels - found, rotation, across)
-    start = np.concatenate(
-        [
-            RigidTransform(rotation, np.zeros(3)).rotation_vector,
-            [*across, depth, focal, aspect, *found, 0.0, *[0.0] * skewed],
-        ]
-    )
+    turn = RigidTransform(rotation, np.zeros(3)).rotation_vector
+    start = np.array([*turn, *across, depth, focal, aspect, *found, 0.0, *[0.0] * skewed])
     solved = least_squares(_residuals, start, x_scale="jac", args=(points, pixels))
-    values = solved.x
+    pose = RigidTransform.from_rotation_vector(solved.x[:3], solved.x[3:6])
+    focal, aspect, u0, v0, kappa, *skew = solved.x[6:].tolist()
     rms = float(np.sqrt(2.0 * np.mean(solved.fun**2)))
-    pose = RigidTransform.from_rotation_vector(values[:3], values[3:6])
-    return TsaiCamera(
-        float(values[6]),
-        float(values[7]),
-        values[8:10],
-        float(values[10]),
-        pose,
-        rms,
-        float(values[11]) if skewed else 0.0,
-    )
+    return TsaiCamera(focal, aspect, np.array([u0, v0]), kappa, pose, rms, *skew)
 
 
 def _solve_alignment(points: Array, image: Array) -> tuple[Array, Array]:
@@ -164,12 +146,7 @@ def projection_matrix(points: Array, pixels: Array) -> Array:
     x = homogeneous(points) @ space.T
     u, v = (homogeneous(pixels) @ image.T)[:, :2].T
     zero = np.zeros_like(x)
-    rows = np.concatenate(
-        [
-            np.concatenate([x, zero, -u[:, None] * x], axis=1),
-            np.concatenate([zero, x, -v[:, None] * x], axis=1),
-        ]
-    )
+    rows = np.block([[x, zero, -u[:, None] * x], [zero, x, -v[:, None] * x]])
     _, vectors = np.linalg.eigh(rows.T @ rows)
     matrix = np.linalg.inv(image) @ vectors[:, 0].reshape(3, 4) @ space
     matrix /= np.linalg.norm(matrix[2, :3])
@@ -187,19 +164,10 @@ def split_projection_matrix(
     if np.linalg.det(rotation) < 0.0:
         rotation, translation = -rotation, -translation
     inner = inner / inner[2, 2]
-    camera = Camera(
-        alpha=float(inner[0, 0]),
-        beta=float(inner[1, 1]),
-        gamma=float(inner[0, 1]),
-        u0=float(inner[0, 2]),
-        v0=float(inner[1, 2]),
-        lens=Radial(),
-        width=width,
-        height=height,
-    )
-    return camera, RigidTransform(
-        np.asarray(rotation, np.float64), np.asarray(translation, np.float64)
-    )
+    alpha, gamma, u0, _, beta, v0 = inner[:2].ravel().tolist()
+    camera = Camera(alpha, beta, gamma, u0, v0, Radial(), width, height)
+    pose = RigidTransform(np.asarray(rotation, np.float64), np.asarray(translation, np.float64))
+    return camera, pose
 
 
 def _scaling(points: Array) -> Array:

@@ -19,31 +19,18 @@ from bodyscan.geometry.light_planes import Axis, LightPlanes
 from bodyscan.geometry.robust import cauchy_weights, robust_scale
 
 
-def fit_invariable_baseline(
-    data: BoundaryPoints, stripes: int, direction: Axis, *, fit_tilt: bool = True
+def fit_baseline(
+    data: BoundaryPoints, stripes: int, direction: Axis, *, variable: bool, fit_tilt: bool = True
 ) -> LightPlanes:
-    """Fit one baseline for all stripes and an angle for each, by joint least squares.
+    """Fit an angle for each stripe, and one baseline for all or one for each (`variable`).
 
     fit_tilt: estimate the baseline's direction in the image too; otherwise it is the camera's x
         axis (y for horizontal stripes).
 
     Boundaries observed at fewer than 12 points get no plane.
     """
-    return _fit(data, stripes, direction, variable=False, fit_tilt=fit_tilt)
-
-
-def fit_variable_baseline(
-    data: BoundaryPoints, stripes: int, direction: Axis, *, fit_tilt: bool = True
-) -> LightPlanes:
-    """Fit a baseline and an angle for each stripe, and one tilt for all."""
-    return _fit(data, stripes, direction, variable=True, fit_tilt=fit_tilt)
-
-
-def _fit(
-    data: BoundaryPoints, stripes: int, direction: Axis, *, variable: bool, fit_tilt: bool
-) -> LightPlanes:
-    """Linear least squares for x = tan(tilt) y + tan(angle_i) z - l, weighted by how far an error
-    of one pixel moves x; points that disagree lose their weight (Cauchy)."""
+    # Linear least squares for x = tan(tilt) y + tan(angle_i) z - l, weighted by how far an error of
+    # one pixel moves x; points that disagree lose their weight (Cauchy).
     x, y, z = _axes(data.points, direction)
     across = np.abs(_axes(data.per_pixel, direction)[0])
     one = np.ones_like(z)

@@ -181,13 +181,7 @@ def simulate_readings(
         with TemporaryDirectory(prefix="bodyscan-") as folder:
             out = Path(folder) / f"pose-{number + 1}"
             taken = capture_artefact(
-                world,
-                surfaces,
-                at,
-                out,
-                shots=shots,
-                number=number,
-                progress=progress,
+                world, surfaces, at, out, shots=shots, number=number, progress=progress
             )
             total += read(calibration, open_scan(calibration.rig, taken), name, file, progress)
     return total

@@ -14,7 +14,7 @@ import numpy as np
 
 from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import LocatedView, PlanarView
-from bodyscan.calibration.camera import CameraFit, LensTrial
+from bodyscan.calibration.camera import CameraCalibration, LensTrial
 from bodyscan.calibration.lens_choice import ChosenLens, choose_lens
 from bodyscan.calibration.model_selection import MIN_GAIN
 from bodyscan.geometry.camera import Camera
@@ -155,7 +155,7 @@ def _pool_decentring(
     return found
 
 
-def _decentring(fit: CameraFit | None) -> Array:
+def _decentring(fit: CameraCalibration | None) -> Array:
     """p1 and p2 in their sigmas, (2,), of a fit with a lens that has them."""
     assert fit is not None
     names = fit.camera.parameter_names

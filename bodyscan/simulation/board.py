@@ -113,14 +113,9 @@ def make_board(board: Board, making: BoardMaking, rng: np.random.Generator) -> M
         vertices = _on_sheet(positions.reshape(-1, 2), board, face, error, sheet)
         triangles = grid_triangles(positions.shape[1] - 1, positions.shape[0] - 1)
         printed = make_print(board, face, making)
+        on_print = positions.reshape(-1, 2)
         surfaces.append(
-            Surface(
-                vertices,
-                triangles,
-                printed=printed,
-                print_xy=positions.reshape(-1, 2),
-                open_to_light=True,
-            )
+            Surface(vertices, triangles, printed=printed, print_xy=on_print, open_to_light=True)
         )
         c, r = np.meshgrid(np.arange(1, board.columns), np.arange(1, board.rows))
         inner = np.stack([c.ravel(), r.ravel()], axis=1).astype(float) * board.square_mm
@@ -160,8 +155,6 @@ class _Sheet:
     def height(self, across: Array, down: Array) -> Array:
         """Compute the height towards the front, at positions from -1/2 to 1/2 along each side."""
         bowl = self.bowl * (1.0 - 2.0 * (across**2 + down**2))
-        if not any((self.across, self.down, self.twist)):
-            return bowl
         return bowl + self.across * across**2 + self.down * down**2 + self.twist * across * down
 
 

@@ -59,12 +59,12 @@ class LaserLight:
 
     weight: grey level of the light that it scatters.
     s: stripe coordinate of the projector's light, NaN where none arrives.
-    gloss: grey level of what its skin mirrors; None if nothing is glossy.
+    gloss: grey level of what its skin mirrors.
     """
 
     weight: Floats
     s: Floats
-    gloss: Floats | None
+    gloss: Floats
 
 
 def compute_laser_light(scene: Scene, hits: Hits, projector: Projector, lamps: Lamps) -> LaserLight:
@@ -83,12 +83,10 @@ def compute_laser_light(scene: Scene, hits: Hits, projector: Projector, lamps: L
     weight = np.zeros(len(s), np.float32)
     weight[chosen] = bright * reaches * hits.albedo[chosen]
 
-    covered = np.flatnonzero(hits.skin[chosen] > 0.5)
-    gloss = None
+    covered, gloss = np.flatnonzero(hits.skin[chosen] > 0.5), np.zeros(len(s), np.float32)
     if covered.size and lamps.skin.gloss > 0:
         mirrored = highlight(points[covered], towards[covered], normals[covered], lamps.skin)
         full = np.float32(lamps.laser_grey * lamps.reach_mm**2) / square[covered]
-        gloss = np.zeros(len(s), np.float32)
         gloss[chosen[covered]] = full * mirrored * reaches[covered]
     return LaserLight(weight, s, gloss)
 

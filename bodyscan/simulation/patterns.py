@@ -6,7 +6,6 @@ mistake in that would be repeated here, and cancel out when the images are decod
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -47,20 +46,6 @@ def gray_code_bits(stripes: int, first: int = 0) -> Mask:
     return (code >> positions[:, None] & 1).astype(bool)
 
 
-@dataclass(frozen=True, eq=False)
-class LightTable:
-    """Light as a function of the stripe coordinate, one row for each of several blurs.
-
-    values: (blurs, entries) float32 in 0..1.
-    """
-
-    values: Floats
-
-    def at(self, index: NDArray[np.int32]) -> Floats:
-        """Light at entries from `table_index`."""
-        return self.values.ravel().take(index)
-
-
 def table_index(
     s: NDArray[np.floating], stripes: int, blur: NDArray[np.integer] | None = None
 ) -> NDArray[np.int32]:
@@ -72,12 +57,9 @@ def table_index(
 
 
 def make_light_table(
-    lit: NDArray[Any],
-    blurs: Array,
-    jitter: Array | None = None,
-    parts: int = 1,
-) -> LightTable:
-    """Tabulate one frame's light against s: the lit stripes, blurred by Gaussians.
+    lit: NDArray[Any], blurs: Array, jitter: Array | None = None, parts: int = 1
+) -> Floats:
+    """Tabulate one frame's light, 0 to 1, against s: the lit stripes, (B, entries).
 
     lit: (S,), or (S * parts,) if light changes inside stripes.
     blurs: (B,) standard deviations in stripes.
@@ -93,7 +75,7 @@ def make_light_table(
     energy = np.concatenate([[0.0], np.cumsum(lit * np.diff(boundaries))])
     edges = np.arange((stripes + 2 * PAD) * FINE + 1) / FINE - PAD
     sharp = np.diff(np.interp(edges, boundaries, energy)) * FINE
-    return LightTable(_blur_light(sharp.astype(np.float32), tuple(blurs.tolist())))
+    return _blur_light(sharp.astype(np.float32), tuple(blurs.tolist()))
 
 
 def _blur_light(values: Floats, blurs: tuple[float, ...]) -> Floats:

@@ -45,20 +45,6 @@ class Sight:
     lean: Indices
 
 
-@dataclass(frozen=True, eq=False)
-class Merits:
-    """What poses contribute.
-
-    offered: (poses, merits) bool.
-    worth: (merits,) of each time a merit is gained, up to `needed` times; it fades quickly from there.
-    needed: (merits,).
-    """
-
-    offered: Mask
-    worth: Array
-    needed: Array
-
-
 def count_default_shots(pairs: int) -> int:
     """Count 40 board shots for twelve pairs, at least 8."""
     return max(8, round(40 * pairs / 12))
@@ -78,7 +64,7 @@ def plan_boards(
     names = (name for i in range(10_000) if (name := f"b{i + 1:02d}") not in taken)
     poses = _candidates(board, list(pairs.values()), rng)
     sights = {name: look(pair, poses, board) for name, pair in pairs.items()}
-    for pose in _choose_poses(_merits(sights, pairs, board), shots):
+    for pose in _choose_poses(*_merits(sights, pairs, board), shots):
         stripes, lit = _pairs_of_shot(board, sights, pairs, pose)
         plan.append(BoardShot(next(names), board.name, poses[pose], stripes, lit))
     return plan
@@ -229,23 +215,28 @@ def _rotation(vector: ArrayLike) -> Array:
     return RigidTransform.from_rotation_vector(vector, np.zeros(3)).rotation
 
 
-def _choose_poses(merits: Merits, shots: int) -> list[int]:
-    """Choose greedily the poses that add most to what is not yet covered and linked."""
-    free = np.ones(len(merits.offered), bool)
-    counts = np.zeros(len(merits.worth))
-    offered = merits.offered.astype(np.float32)
+def _choose_poses(offered: Mask, worth: Array, needed: Array, shots: int) -> list[int]:
+    """Choose greedily the poses that add most to what is not yet covered and linked.
+
+    offered: (poses, merits), by which pose.
+    worth: (merits,) of each time a merit is gained, up to `needed` times; it fades quickly from there.
+    """
+    free = np.ones(len(offered), bool)
+    counts, weights = np.zeros(len(worth)), offered.astype(np.float32)
     chosen: list[int] = []
     for _ in range(min(shots, len(free))):
-        spare = np.maximum(counts - merits.needed + 1.0, 0.0)
-        gain = offered @ (merits.worth * 0.35**spare).astype(np.float32)
+        spare = np.maximum(counts - needed + 1.0, 0.0)
+        gain = weights @ (worth * 0.35**spare).astype(np.float32)
         best = int(np.argmax(np.where(free, gain, -1.0)))
         free[best] = False
-        counts += offered[best]
+        counts += weights[best]
         chosen.append(best)
     return chosen
 
 
-def _merits(sights: Mapping[str, Sight], pairs: Mapping[str, TruePair], board: Board) -> Merits:
+def _merits(
+    sights: Mapping[str, Sight], pairs: Mapping[str, TruePair], board: Board
+) -> tuple[Mask, Array, Array]:
     """Every cell of every image three times, near and far; tilts to all sides; six boards per pair;
     two pairs on one face of a board, or on both, three times."""
     parts: list[tuple[Mask, float, float]] = []
@@ -264,7 +255,7 @@ def _merits(sights: Mapping[str, Sight], pairs: Mapping[str, TruePair], board: B
         same = sights[first].back == sights[second].back
         parts += [((both & same)[:, None], 3.0, 3.0), ((both & ~same)[:, None], 2.0, 3.0)]
     sizes = [part.shape[1] for part, _, _ in parts]
-    return Merits(
+    return (
         np.concatenate([part for part, _, _ in parts], axis=1),
         np.repeat([worth for _, worth, _ in parts], sizes),
         np.repeat([needed for _, _, needed in parts], sizes),

@@ -138,11 +138,10 @@ def _light_fields(scene: Scene, hits: Hits, projector: Projector, lamps: Lamps) 
     """Compute fields (F, N) in the order of `RayEnds`."""
     white = replace(hits, albedo=np.ones_like(hits.albedo))
     light = compute_laser_light(scene, white, projector, lamps)
-    gloss = np.zeros_like(light.weight) if light.gloss is None else light.gloss
     return np.stack(
         [
             light.weight,
-            gloss,
+            light.gloss,
             light.s,
             compute_room_light(hits, lamps),
             hits.albedo,

@@ -14,7 +14,7 @@ from bodyscan.arrays import Array, Floats, Mask
 from bodyscan.rig.frame_names import FrameNames
 from bodyscan.simulation.lamps import Lamps, compute_laser_light, spread_light
 from bodyscan.simulation.lens import TrueCamera
-from bodyscan.simulation.patterns import LightTable, make_light_table, make_patterns, table_index
+from bodyscan.simulation.patterns import make_light_table, make_patterns, table_index
 from bodyscan.simulation.projector import Projector
 from bodyscan.simulation.rays import Band, View, mean_light, min_over_samples, trace_band
 from bodyscan.simulation.scene import Scene
@@ -137,7 +137,7 @@ def _render_still(
     scene: Scene,
     view: View,
     source: _Source,
-    lit: Mapping[str, LightTable],
+    lit: Mapping[str, Floats],
     unlit: tuple[str, ...],
     moving_surfaces: int,
 ) -> _LightImages:
@@ -155,7 +155,7 @@ def _render_still(
         ambient[slices], depth[slices] = rays.ambient, rays.depth
         near[slices], skin[slices] = rays.surface < moving_surfaces, rays.skin
         for name in gloss:
-            gloss[name][slices] = rays.gloss_light(lit[name])
+            gloss[name][slices] = rays.light(lit[name], gloss=True)
     return _LightImages(laser, dict.fromkeys(laser, ambient), depth, near, gloss, skin)
 
 
@@ -163,7 +163,7 @@ def _rerender_moving(
     images: _LightImages,
     view: View,
     source: _Source,
-    lit: Mapping[str, LightTable],
+    lit: Mapping[str, Floats],
     moving: Moving,
 ) -> None:
     """Update what moves, and what it covers and uncovers, for the moment of each frame."""
@@ -178,9 +178,8 @@ def _rerender_moving(
             if name in lit:
                 np.copyto(images.laser[name][band.slices], rays.light(lit[name]), where=chosen)
             if name in images.gloss:
-                np.copyto(
-                    images.gloss[name][band.slices], rays.gloss_light(lit[name]), where=chosen
-                )
+                mirrored = rays.light(lit[name], gloss=True)
+                np.copyto(images.gloss[name][band.slices], mirrored, where=chosen)
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,13 +215,9 @@ class _LitRays:
             surface=min_over_samples(ends.surface),
         )
 
-    def light(self, table: LightTable) -> Floats:
-        """Compute the grey level (R, C) of one frame."""
-        return mean_light(self.weight, self.index, table.values.ravel())
-
-    def gloss_light(self, table: LightTable) -> Floats:
-        """Compute the part (R, C) of one frame that glossy skin mirrors."""
-        return mean_light(self.gloss, self.index, table.values.ravel())
+    def light(self, table: Floats, *, gloss: bool = False) -> Floats:
+        """Compute the grey level (R, C) of one frame, scattered or mirrored."""
+        return mean_light(self.gloss if gloss else self.weight, self.index, table.ravel())
 
 
 def _dilate(near: Mask, depth: Floats, reach_mm: float, camera: TrueCamera) -> Mask:
@@ -253,7 +248,7 @@ def _tables(
     rng: np.random.Generator,
     frames: FrameNames,
     sequence: bool,
-) -> dict[str, LightTable]:
+) -> dict[str, Floats]:
     """Tabulate the light of each frame that the laser lights."""
     if projection.jitter_stripes <= 0:
         steady = _steady_tables(code, frames, projection)
@@ -271,7 +266,7 @@ def _tables(
 @lru_cache(maxsize=8)
 def _steady_tables(
     code: StripeCode, frames: FrameNames, projection: Projection
-) -> tuple[tuple[str, LightTable], ...]:
+) -> tuple[tuple[str, Floats], ...]:
     """Tabulate lit and the code's images without jitter."""
     blurs = _blurs(projection)
     return tuple(

@@ -158,7 +158,7 @@ def _corners_px(pair: PairCalibration) -> float:
 
 def _cameras(calibration: RigCalibration) -> Mapping[str, CameraCalibration]:
     return {
-        name: CameraCalibration(pair.camera, pair.camera_covariance, {}, {}, _corners_px(pair))
+        name: CameraCalibration(pair.camera, pair.camera_covariance, (), _corners_px(pair))
         for name, pair in calibration.pairs.items()
     }
 

@@ -85,16 +85,6 @@ def project(points: np.ndarray, distortion: float = 0.0) -> np.ndarray:
     return np.asarray(pixels + distortion * error * np.sum(error**2, axis=1)[:, None])
 
 
-@pytest.mark.parametrize(
-    ("size", "degree", "terms"),
-    [((8, 5), 3, 10), ((13, 3), 2, 6), ((5, 4), 2, 6), ((19, 1), 0, 1)],
-)
-def test_terms_follow_the_number_of_points(size: tuple[int, int], degree: int, terms: int) -> None:
-    found = fit_board_map(printed(*size), project(printed(*size)))
-    assert found.degree == degree
-    assert found.coefficients.shape == (terms, 2), "those of x and y together up to the degree"
-
-
 def test_without_a_lens_it_is_the_homography_and_its_slopes() -> None:
     points = printed(9, 6)
     found = fit_board_map(points, project(points))

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from board_rendering import render, true_corners, view_of
 
-from bodyscan.arrays import Array, Bytes
+from bodyscan.arrays import Array, Bytes, Floats
 from bodyscan.boards import checkerboard
 from bodyscan.boards.board_layout import corner_points
 from bodyscan.boards.board_map import fit_board_map
@@ -34,6 +34,12 @@ def found(image: Bytes, *boards: Board) -> list[BoardView]:
 
 def errors(view: BoardView, true: Array) -> Array:
     return view.pixels - true[view.corner_ids]
+
+
+def offer(monkeypatch: pytest.MonkeyPatch, corners: Floats) -> None:
+    """Let all of OpenCV's detectors find these corners."""
+    for detector in ("findChessboardCorners", "findChessboardCornersSB"):
+        monkeypatch.setattr(cv2, detector, lambda *_, **__: (True, corners))
 
 
 @pytest.mark.parametrize("spin_deg", [0, 75, 180, -100])
@@ -65,7 +71,7 @@ def test_numbering_does_not_depend_on_the_detector_s_order(
     place = view_of(PLAIN, 35, 60, 20, fill=0.55)
     true = true_corners(PLAIN, place)
     counted = true.reshape(6, 9, 2)[order].reshape(-1, 2).astype(np.float32)
-    monkeypatch.setattr(checkerboard, "_classic", lambda image, size: (True, counted))
+    offer(monkeypatch, counted)
     (view,) = found(render([(PLAIN, place)]), PLAIN)
     assert np.abs(errors(view, true)).max() < 0.1
 
@@ -75,8 +81,7 @@ def test_corners_that_form_no_board_are_rejected(monkeypatch: pytest.MonkeyPatch
     # Every one of them is a corner of the right colours, but two rows are exchanged.
     rows = true_corners(PLAIN, place).astype(np.float32).reshape(6, 9, 2)
     wrong = rows[[2, 1, 0, 3, 4, 5]].reshape(-1, 2)
-    for detector in ("_classic", "_adaptive", "_sector_based", "_sector_based_enlarged"):
-        monkeypatch.setattr(checkerboard, detector, lambda image, size: (True, wrong))
+    offer(monkeypatch, wrong)
     assert found(render([(PLAIN, place)]), PLAIN) == []
 
 
@@ -88,9 +93,12 @@ def test_a_detector_s_errors_of_pixels_are_refined_away(
     # 1.05 and 1.8 px were seen in real pictures, and refused.
     rough = true + 2.0 * np.sin(np.arange(108).reshape(54, 2))
     rough[17] += 3.0
-    monkeypatch.setattr(
-        checkerboard, "_classic", lambda image, size: (True, rough.astype(np.float32))
-    )
+    find = cv2.findChessboardCorners
+
+    def detect(image: Bytes, size: tuple[int, int], flags: int) -> tuple[bool, Floats]:
+        return find(image, size, flags=flags) if flags else (True, rough.astype(np.float32))
+
+    monkeypatch.setattr(cv2, "findChessboardCorners", detect)
     (view,) = found(render([(PLAIN, place)]), PLAIN)
     assert len(view.corner_ids) == 54
     assert np.abs(errors(view, true)).max() < 0.1
@@ -117,8 +125,7 @@ def test_one_line_of_squares_too_many_on_any_side_is_seen(
         squares = np.pad(np.kron(print_, np.ones((20, 20), np.uint8)), 60, constant_values=200)
         x, y = np.meshgrid(np.arange(1, 8) + left, np.arange(1, 6) + above)
         corners = 59.5 + 20.0 * np.stack([x, y], axis=-1).reshape(-1, 2).astype(np.float32)
-        monkeypatch.setattr(checkerboard, "_classic", lambda image, size: (True, corners))
-        monkeypatch.setattr(checkerboard, "_adaptive", lambda image, size: (False, None))
+        offer(monkeypatch, corners)
         seen = checkerboard.find_checkerboard(
             cv2.GaussianBlur(squares, (0, 0), 0.9), board, quick=True
         )

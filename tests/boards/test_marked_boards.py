@@ -3,8 +3,6 @@ none is found."""
 
 from __future__ import annotations
 
-import re
-
 import cv2
 import numpy as np
 import pytest
@@ -131,30 +129,12 @@ def test_a_column_too_many_is_refused_and_the_right_number_named(picture: Bytes)
     assert "board of 9 columns x 8 rows, not 10 x 8" in describe_unfound(picture, described)
 
 
-@pytest.mark.slow
-def test_columns_and_rows_that_are_exchanged_are_named(picture: Bytes) -> None:
-    described = MARKED.model_copy(update={"columns": 8, "rows": 9})
-    assert found(picture, described) == []
-    text = describe_unfound(picture, described)
-    assert "columns and rows exchanged: 9 columns x 8 rows" in text
-
-
 def test_rows_that_are_not_there_or_not_described_are_named(picture: Bytes) -> None:
     for rows, text in ((10, "fewer than 10 rows"), (6, "more than 6 rows")):
         described = MARKED.model_copy(update={"rows": rows})
         views = found(picture, described) * 3
         rig = Rig(name="r", boards=(described,), pairs=(CAMERA,))
         assert any(text in note for note in appearance_notes(rig, views)), text
-
-
-def test_markers_of_another_size_are_named(picture: Bytes) -> None:
-    assert MARKED.marker_mm is not None
-    described = MARKED.model_copy(update={"marker_mm": 0.6 * MARKED.marker_mm})
-    text = describe_unfound(picture, described)
-    share = MARKED.marker_mm / MARKED.square_mm
-    match = re.search(r"sides are about (0\.\d+) of a square's", text)
-    assert match, text
-    assert float(match[1]) == pytest.approx(share, rel=0.1)
 
 
 @pytest.mark.slow

@@ -65,27 +65,6 @@ def test_a_large_board_out_of_focus_shows_its_lattice() -> None:
     assert shows_lattice(grey(flat, blur_px=30.0, noise=1.0), SIZE)
 
 
-def checkers(image: np.ndarray, left: int, top: int, columns: int, rows: int, square: int) -> None:
-    even = np.add.outer(np.arange(rows), np.arange(columns)) % 2
-    part = np.kron(even, np.ones((square, square))) * 150 + 40
-    image[flat_board(left, top, columns, rows, square)] = part
-
-
-def test_clusters_are_formed_at_two_distances() -> None:
-    """Squares of 60 px; and of 10 px with something like them 45 px away, at first by itself."""
-    image = np.full((480, 640), 150, np.uint8)
-    checkers(image, 60, 60, 8, 6, 60)
-    (one,) = board_regions(image, 7 * 5)
-    assert one.left < 60 < 540 < one.right
-    assert one.top < 60 < 420 < one.bottom
-    image[:] = 150
-    checkers(image, 100, 100, 12, 9, 10)
-    checkers(image, 265, 100, 5, 9, 10)
-    first, *others = board_regions(image, 11 * 8)
-    assert first.right < 265
-    assert [other.right > 315 for other in others] == [True]
-
-
 def flat_board(left: int, top: int, columns: int, rows: int, square: int) -> tuple[slice, slice]:
     return slice(top, top + rows * square), slice(left, left + columns * square)
 

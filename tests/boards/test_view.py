@@ -70,21 +70,12 @@ def test_too_few_too_many_and_none() -> None:
     assert numbered(np.full((12, 2), np.nan)) is None
 
 
-@pytest.mark.parametrize(
-    ("pixel", "inside"),
-    [
-        ((-0.5, 40.0), True), ((-0.6, 40.0), False), ((50.0, -0.5), True), ((50.0, -0.6), False),
-        ((319.5, 40.0), True), ((319.6, 40.0), False), ((50.0, 239.5), True), ((50.0, 239.6), False),
-    ],
-)  # fmt: skip
-def test_corners_outside_the_image_are_refused(pixel: tuple[float, float], inside: bool) -> None:
+@pytest.mark.parametrize("pixel", [(-0.6, 40.0), (50.0, -0.6), (319.6, 40.0), (50.0, 239.6)])
+def test_corners_outside_the_image_are_refused(pixel: tuple[float, float]) -> None:
     pixels = grid(4, 3)
     pixels[4] = pixel
-    if inside:
-        assert len(numbered(pixels).corner_ids) == 12
-    else:
-        with pytest.raises(CaptureError, match="outside of 320 x 240 px"):
-            numbered(pixels)
+    with pytest.raises(CaptureError, match="outside of 320 x 240 px"):
+        numbered(pixels)
 
 
 @pytest.mark.parametrize("inverted", [False, True])

@@ -71,27 +71,12 @@ def calibrated(*, alone: bool, crossed: int = len(POSES)) -> Outcome[PairCalibra
     camera = own.camera if alone else CAMERA
     if alone:
         shots = [
-            replace(
-                shot,
-                view=replace(shot.view, camera_from_board=own.camera_from_board[shot.view.shot]),
-            )
-            for shot in shots
+            replace(shot, view=replace(shot.view, camera_from_board=pose))
+            for shot, pose in zip(shots, own.poses, strict=True)
         ]
-    return calibrate_pair(
-        LocatedPair(
-            "p",
-            camera,
-            own.covariance,
-            own.rays,
-            own.lenses,
-            0.05,
-            COLUMNS,
-            tuple(shot.view for shot in shots),
-            tuple(shots),
-            (BOARD,),
-            alone,
-        )
-    )
+    located = tuple(shot.view for shot in shots)
+    known = (camera, own.covariance, own.rays, own.lenses, 0.05, COLUMNS, located)
+    return calibrate_pair(LocatedPair("p", *known, tuple(shots), (BOARD,), alone))
 
 
 def depths(pair: PairCalibration) -> tuple[Array, Array, Array]:

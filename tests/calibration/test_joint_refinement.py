@@ -100,7 +100,7 @@ def solved(
         index, pixels = crossings(pose, bow_mm)
         pixels[:, 0] += rng.normal(0.0, STRIPE_PX, len(pixels))
         means = binned(index, pixels, STRIPE_PX, "vertical")
-        located = camera.camera_from_board[f"s{k}"]
+        located = camera.poses[k]
         parts.append(boundary_points(camera.camera, located, *means, board=k, direction="vertical"))
     data = subsample(concatenate(parts), 6000)
     sheets = fit_light_sheets(data, 254, "vertical").sheets
@@ -109,8 +109,7 @@ def solved(
         StripedBoard.from_points("b", view, camera.camera, select(data, data.board == k))
         for k, view in enumerate(views)
     ]
-    poses = [camera.camera_from_board[view.shot] for view in views]
-    joint = refine_jointly(camera.camera, poses, sheets, striped, {"b": FLATNESS_MM})
+    joint = refine_jointly(camera.camera, camera.poses, sheets, striped, {"b": FLATNESS_MM})
     return Solved(camera, sheets, striped, joint)
 
 
@@ -143,9 +142,8 @@ def test_a_plate_measured_with_flat_boards_becomes_flatter() -> None:
     for one in (solved(0.0, 3, seed) for seed in range(2)):
         before.append(plate(one.in_turn.camera, one.sheets)[0])
         after.append(plate(one.joint.camera, one.joint.sheets)[0])
-        poses = [one.in_turn.camera_from_board[board.view.shot] for board in one.boards]
         exact = refine_jointly(
-            one.in_turn.camera, poses, one.sheets, one.boards, {"b": 0.0}, print_mm=0.0
+            one.in_turn.camera, one.in_turn.poses, one.sheets, one.boards, {"b": 0.0}, print_mm=0.0
         )
         assert plate(exact.camera, exact.sheets)[0] < 0.002
     assert np.mean(after) < 0.75 * np.mean(before)
@@ -187,11 +185,15 @@ def test_camera_sigmas_are_consistent_with_errors_of_the_print() -> None:
 
 def test_priors_of_warp_and_print_are_in_the_covariance() -> None:
     one = solved(0.0, 3)
-    poses = [one.in_turn.camera_from_board[board.view.shot] for board in one.boards]
 
     def sigma(flatness_mm: float, print_mm: float) -> float:
         found = refine_jointly(
-            one.in_turn.camera, poses, one.sheets, one.boards, {"b": flatness_mm}, print_mm=print_mm
+            one.in_turn.camera,
+            one.in_turn.poses,
+            one.sheets,
+            one.boards,
+            {"b": flatness_mm},
+            print_mm=print_mm,
         )
         return float(np.sqrt(np.trace(found.camera_covariance[:2, :2])))
 

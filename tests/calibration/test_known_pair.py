@@ -41,8 +41,7 @@ def test_stripes_divide_the_picture_evenly() -> None:
     for way, said in (
         (stripes("vertical", 300), r"1280 x 800 px, which 300 vertical .* evenly \(4.267 px each"),
         (stripes("horizontal", 300), r"which 300 horizontal stripes .* evenly \(2.667 px each"),
-        (stripes("vertical", 1281), "1280 x 800 px, across which there are no 1281 vertical"),
-        (stripes("horizontal", 801), "1280 x 800 px, across which there are no 801 horizontal"),
+        (stripes("vertical", 1281), "1280 x 800 px, which 1281 vertical stripes do not divide"),
         (
             stripes("vertical", 640, origin=2.5),
             "1280 x 800 px, but its waves begin at `origin: 2.5` of",
@@ -57,17 +56,10 @@ def test_without_a_size_a_stripe_is_a_pixel_and_the_axis_in_the_middle() -> None
     assert projector(None, stripes("horizontal", 768)) == (1260, 768)
 
 
-@pytest.mark.parametrize(
-    ("baseline_mm", "believed"), [(4.0, False), (6.0, True), (19_990.0, True), (20_010.0, False)]
-)
-def test_a_projector_stands_millimetres_to_metres_from_its_camera(
-    baseline_mm: float, believed: bool
-) -> None:
-    place = RigidTransform(np.eye(3), np.array([0.6, 0.0, 0.8]) * baseline_mm)
+@pytest.mark.parametrize("baseline_mm", [0.4, 50_000.0])
+def test_a_projector_stands_millimetres_to_metres_from_its_camera(baseline_mm: float) -> None:
+    place = RigidTransform.from_translation([baseline_mm, 0.0, 0.0])
     known: Any = SimpleNamespace(units="m")
-    if believed:
-        _require_baseline(place, "theirs.json", known)
-        return
     with pytest.raises(CalibrationFileError, match="mm from its camera"):
         _require_baseline(place, "theirs.json", known)
 

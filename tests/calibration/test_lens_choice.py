@@ -8,7 +8,6 @@ from picture_boards import HEIGHT, NOISE_PX, WIDTH, seen
 
 from bodyscan.calibration.board_views import PlanarView
 from bodyscan.calibration.lens_choice import calibrate_with_lenses, cluster_poses
-from bodyscan.errors import DegeneratePoses
 from bodyscan.geometry.lenses import FAMILY
 from bodyscan.geometry.lenses.brown import Brown
 from bodyscan.geometry.lenses.lens import Lens
@@ -55,27 +54,3 @@ def test_with_too_few_clusters_no_lens_is_tried() -> None:
     found = calibrate_with_lenses(FAMILY, views, WIDTH, HEIGHT)
     assert found.camera.lens.kind == "radial"
     assert found.lenses == ()
-
-
-def test_two_poses_are_refused() -> None:
-    with pytest.raises(DegeneratePoses):
-        calibrate_with_lenses(FAMILY, seen(Radial(), shots=2), WIDTH, HEIGHT)
-
-
-@pytest.mark.parametrize(("moved_px", "one"), [(24.0, True), (26.0, False)])
-def test_a_board_that_moved_by_a_twentieth_of_its_picture_is_elsewhere(
-    moved_px: float, one: bool
-) -> None:
-    """Of 300 by 400 px; some of its corners may be hidden, and one may be wrong."""
-    points = np.array([[x, y, 0.0] for y in (0.0, 100.0, 200.0) for x in (0.0, 150.0)])
-    pixels = points[:, :2] * 2.0 + [100.0, 50.0]
-    later = pixels + moved_px * np.array([0.6, 0.8])
-    later[5] += 300.0
-    views = [PlanarView("a", points, pixels), PlanarView("b", points[1:], later[1:])]
-    # The diagonal is 500 px: a twentieth of it is 25.
-    assert (len(set(cluster_poses(views).tolist())) == 1) is one
-    assert cluster_poses([views[0], PlanarView("a", points, later + 200.0)]).tolist() == [0, 0], (
-        "one shot"
-    )
-    none_alike = PlanarView("c", points + [0.0, 0.0, 7.0], pixels)
-    assert cluster_poses([views[0], none_alike]).tolist() == [0, 1]

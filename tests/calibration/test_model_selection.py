@@ -203,38 +203,27 @@ def test_the_boards_error_is_estimated_apart_from_the_points_noise(
     assert found.board_error_mm(data, split(data)) == pytest.approx(0.2, rel=0.03)
 
 
-def gains(cluster_size: int, sign: float, kinds: int = 1) -> Array:
-    """Of models that differ by a tenth of a sigma at each of 1,600 points, the nearer one right; errors
-    are equal within a cluster."""
+@pytest.mark.parametrize(
+    ("cluster_size", "sign", "mean"),
+    [
+        # d = 0.1 at 1,600 points: sum d^2 = 16, standard error 2 sqrt(16) = 8.
+        (1, 1.0, 2.0),
+        (1, -1.0, -2.0),
+        # Sixteen share their error: the error is four times as large.
+        (16, 1.0, 0.5),
+    ],
+)
+def test_gains_are_standard_errors(cluster_size: int, sign: float, mean: float) -> None:
+    """Models differ by a tenth of a sigma, the nearer one right; errors are equal in a cluster."""
     found = []
     for seed in range(150):
         rng = np.random.default_rng(seed)
-        compared = []
-        for kind in range(kinds):
-            noise = rng.normal(size=(1600 // cluster_size, 2)).repeat(cluster_size, axis=0)
-            wrong = np.tile([0.1, 0.0], (1600, 1))
-            simple, rich = (noise + wrong, noise) if sign > 0 else (noise, noise + wrong)
-            cluster = np.arange(1600) // cluster_size
-            # In other units nothing changes.
-            compared.append(ResidualPair(10.0**kind * simple, 10.0**kind * rich, cluster))
-        found.append(gain(*compared))
-    return np.array(found)
-
-
-@pytest.mark.parametrize(
-    ("cluster_size", "sign", "kinds", "mean"),
-    [
-        # d = 0.1 at 1,600 points: sum d^2 = 16, standard error 2 sqrt(16) = 8.
-        (1, 1.0, 1, 2.0),
-        (1, -1.0, 1, -2.0),
-        # Two kinds of points: twice the sum, sqrt 2 times the error.
-        (1, 1.0, 2, 2.0 * np.sqrt(2.0)),
-        # Sixteen share their error: the error is four times as large.
-        (16, 1.0, 1, 0.5),
-    ],
-)
-def test_gains_are_standard_errors(cluster_size: int, sign: float, kinds: int, mean: float) -> None:
-    found = gains(cluster_size, sign, kinds)
+        noise = rng.normal(size=(1600 // cluster_size, 2)).repeat(cluster_size, axis=0)
+        wrong = noise + [0.1, 0.0]
+        simple, rich = (wrong, noise) if sign > 0 else (noise, wrong)
+        # In other units nothing changes.
+        pair = ResidualPair(10.0 * simple, 10.0 * rich, np.arange(1600) // cluster_size)
+        found.append(gain(pair))
     # 150 of them: the mean is known to 0.08, their deviation to 6 %.
     assert np.mean(found) == pytest.approx(mean, abs=0.25)
     assert np.std(found) == pytest.approx(1.0, abs=0.15)

@@ -78,8 +78,3 @@ def test_nothing_is_known_of_what_was_imported_without_a_sigma() -> None:
     assert PairQuality(None, 0, imported="theirs.json").unjudged
     assert not PairQuality(None, 0, imported="theirs.json", imported_sigma_px=0.0).unjudged
     assert not PairQuality(0.1, 5).unjudged
-
-
-def test_a_pair_of_which_no_stripes_were_looked_at_has_none() -> None:
-    quality = PairQuality(0.1, 5)
-    assert quality.stripe_shots == quality.stripes_calibrated == quality.stripes_projected == 0

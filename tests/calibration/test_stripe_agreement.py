@@ -1,10 +1,7 @@
 """A projector that moves between the shots of a calibration is noticed, and its shots named."""
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +17,6 @@ from lit_boards import (
     chapter_scene,
 )
 
-from bodyscan.calibration import stripe_agreement
 from bodyscan.calibration.boundary_points import BoundaryPoints, boundary_points, concatenate
 from bodyscan.calibration.light_sheets import fit_light_sheets
 from bodyscan.calibration.stripe_agreement import (
@@ -79,23 +75,27 @@ def test_uneven_stripes_are_no_move() -> None:
     assert find_motion(uneven, CHAPTER_POSES) is None
 
 
-def test_a_move_between_shots_tells_those_before_from_those_after() -> None:
+@pytest.mark.parametrize(
+    ("shots", "others", "moved"),
+    [
+        ((3, 4, 5, 6), [3, 4, 5, 6], True),
+        # Two before: the projector stands where the others saw it.
+        ((2, 3, 4, 5, 6), [0, 1], False),
+        # Shots of their own.
+        ((0,), [0], False),
+        ((2,), [2], False),
+        ((6,), [6], False),
+    ],
+)
+def test_shots_are_split_in_the_simplest_way_that_explains_them(
+    shots: tuple[int, ...], others: list[int], moved: bool
+) -> None:
     scene = body_scene(-0.05)
-    found = find_motion(scene, MORE_POSES, turned(scene, 0.1), shots=(3, 4, 5, 6))
+    found = find_motion(scene, MORE_POSES, turned(scene, 0.1), shots)
     assert found is not None
-    assert found.moved
-    np.testing.assert_array_equal(found.kept, [0, 1, 2])
-    np.testing.assert_array_equal(found.others, [3, 4, 5, 6])
+    assert (found.others.tolist(), found.moved) == (others, moved)
+    assert sorted([*found.kept.tolist(), *others]) == list(range(7))
     assert found.joint_px > 3.0 * found.separate_px
-
-
-@pytest.mark.parametrize("shot", [0, 2, 6])
-def test_a_shot_of_its_own_is_named(shot: int) -> None:
-    scene = body_scene(-0.05)
-    found = find_motion(scene, MORE_POSES, turned(scene, -0.1), shots=(shot,))
-    assert found is not None
-    assert not found.moved
-    assert found.others == [shot]
 
 
 def mixed_up(scene: Scene, poses: Sequence[Pose], *exchanged: tuple[int, int]) -> BoundaryPoints:
@@ -151,52 +151,3 @@ def test_a_board_that_stands_elsewhere_is_measured_there() -> None:
     off = board_offsets(replace(data, points=nearer), fit.sheets)
     assert 0.25 < off[2] < 0.55
     assert np.abs(np.delete(off, 2)).max() < 0.05
-
-
-def split_of(
-    lights: Sequence[int],
-    monkeypatch: pytest.MonkeyPatch,
-    *,
-    usual_px: float = 0.1,
-    other_px: float = 3.0,
-    width_px: float = 5.0,
-) -> ProjectorMotion | None:
-    """Of boards that saw lights of such numbers: in a group those that saw another than most are
-    `other_px` off, and the rest as usual."""
-
-    def misfit(data: Any, groups: Sequence[Any], stripes: int, direction: str) -> float:
-        squares: list[float] = []
-        for group in groups:
-            most = Counter(lights[board] for board in group).most_common(1)[0][0]
-            off = [usual_px if lights[board] == most else other_px for board in group]
-            squares += [each**2 for each in off]
-        return float(np.sqrt(np.mean(squares)))
-
-    monkeypatch.setattr(stripe_agreement, "subsample", lambda data, count: data)
-    monkeypatch.setattr(stripe_agreement, "_misfit", misfit)
-    monkeypatch.setattr(stripe_agreement, "_stripe_width", lambda data: width_px)
-    data: Any = SimpleNamespace(board=np.arange(len(lights)))
-    return find_projector_motion(data, 64, "vertical")
-
-
-@pytest.mark.parametrize(
-    ("lights", "others", "moved"),
-    [
-        ([1, 1, 1, 1, 2], [4], False),
-        ([2, 1, 1, 2, 1, 1, 1], [0, 3], False),
-        # From the third board on, where three before agree, and three after.
-        ([1, 1, 1, 2, 2, 2], [3, 4, 5], True),
-        ([1, 1, 1, 1, 2, 2], [4, 5], True),
-        # Two before: the projector stands where the others saw it.
-        ([1, 1, 2, 2, 2], [0, 1], False),
-    ],
-)
-def test_boards_are_split_in_the_simplest_way_that_explains_them(
-    lights: list[int], others: list[int], moved: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    found = split_of(lights, monkeypatch)
-    assert found is not None
-    assert (found.others.tolist(), found.moved) == (others, moved)
-    assert sorted([*found.kept.tolist(), *others]) == list(range(len(lights)))
-    assert found.separate_px == pytest.approx(0.1)
-    assert found.joint_px > 1.0

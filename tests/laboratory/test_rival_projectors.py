@@ -9,11 +9,7 @@ from mirror_points import STRIPES, mirror_points, systematic_mm
 from bodyscan.arrays import Array
 from bodyscan.geometry.light_planes import LightPlanes, baseline_angle_tilt
 from bodyscan.laboratory.approaches import PROJECTORS
-from bodyscan.laboratory.rival_projectors import (
-    fit_invariable_baseline,
-    fit_remapped_pinhole,
-    fit_variable_baseline,
-)
+from bodyscan.laboratory.rival_projectors import fit_baseline, fit_remapped_pinhole
 
 ANGLES = np.radians(np.linspace(2.0, 38.0, STRIPES + 1))
 BASELINES = np.linspace(165.0, 150.0, STRIPES + 1)
@@ -55,7 +51,7 @@ def worst_offset(found: LightPlanes, true: LightPlanes) -> float:
 def test_an_invariable_baseline_is_found(tilt_deg: float) -> None:
     true = baseline_planes(160.0, tilt_deg)
     points = mirror_points(stripe=stripe_of(true), every_px=32)
-    found = fit_invariable_baseline(points, STRIPES, "vertical")
+    found = fit_baseline(points, STRIPES, "vertical", variable=False)
     # Points come from an iteration that ends at 1e-7 of a stripe.
     assert worst_offset(found, true) < 1e-4
     length, _, tilt = baseline_angle_tilt(found.coefficients, "vertical")
@@ -66,16 +62,16 @@ def test_an_invariable_baseline_is_found(tilt_deg: float) -> None:
 def test_a_variable_baseline_is_found_and_an_invariable_one_misses_it() -> None:
     true = baseline_planes(BASELINES, 1.5)
     points = mirror_points(stripe=stripe_of(true), every_px=32)
-    assert worst_offset(fit_variable_baseline(points, STRIPES, "vertical"), true) < 1e-4
+    assert worst_offset(fit_baseline(points, STRIPES, "vertical", variable=True), true) < 1e-4
     # 15 mm of change in the baseline, half of it within the boards: the best single baseline is
     # off by some 3 of 160 mm at their ends, which angles make up for at one depth only.
-    assert worst_offset(fit_invariable_baseline(points, STRIPES, "vertical"), true) > 0.05
+    assert worst_offset(fit_baseline(points, STRIPES, "vertical", variable=False), true) > 0.05
 
 
 def test_tilted_light_needs_a_tilted_model() -> None:
     true = baseline_planes(160.0, 1.5)
     points = mirror_points(stripe=stripe_of(true), every_px=32)
-    straight = fit_invariable_baseline(points, STRIPES, "vertical", fit_tilt=False)
+    straight = fit_baseline(points, STRIPES, "vertical", variable=False, fit_tilt=False)
     # tan 1.5 degrees over 20 mm (0.05 of 400) is 0.5 mm across, over tan of some 20 degrees.
     assert worst_offset(straight, true) > 0.5
 
@@ -84,7 +80,7 @@ def test_outliers_lose_their_weight() -> None:
     true = baseline_planes(160.0)
     points = mirror_points(stripe=stripe_of(true), every_px=16, noise_px=0.02)
     points.points[::50] += [3.0, 0.0, 0.0]
-    found = fit_invariable_baseline(points, STRIPES, "vertical")
+    found = fit_baseline(points, STRIPES, "vertical", variable=False)
     # Unweighted they would move every angle by 3 / 50 = 0.06 mm across, 0.15 mm in depth.
     assert worst_offset(found, true) < 0.05
 
@@ -98,8 +94,8 @@ def test_horizontal_stripes_are_the_same_turned() -> None:
         points.per_pixel[:, [1, 0, 2]],
         points.sigma_px,
     )
-    upright = fit_variable_baseline(points, STRIPES, "vertical")
-    lying = fit_variable_baseline(turned, STRIPES, "horizontal")
+    upright = fit_baseline(points, STRIPES, "vertical", variable=True)
+    lying = fit_baseline(turned, STRIPES, "horizontal", variable=True)
     known = np.isfinite(upright.coefficients[:, 0])
     assert np.allclose(
         lying.coefficients[known][:, [1, 0, 2, 3]], upright.coefficients[known], atol=1e-9
