@@ -160,25 +160,6 @@ def test_horizontal_stripes_are_told_about_the_other_axis() -> None:
     assert np.allclose(tilt, -np.arctan(0.02 / np.cos(np.radians(20.0 + i))))
 
 
-def test_depth_is_nan_beside_a_missing_plane() -> None:
-    coefficients = true_planes()
-    coefficients[5] = np.nan
-    planes = LightPlanes(coefficients, np.zeros((STRIPES + 1, 4, 4)), "vertical")
-    rays = np.tile([0.02, 0.01, 1.0], (5, 1))
-    depth = planes.depth(rays, np.array([3.5, 4.0, 4.5, 5.5, 6.0]))
-    assert list(np.isfinite(depth)) == [True, True, False, False, True]
-
-
-@pytest.mark.parametrize("last", [1, 2, STRIPES])
-def test_at_the_last_plane_depth_changes_as_before_it(last: int) -> None:
-    coefficients = true_planes()
-    coefficients[last + 1 :] = np.nan
-    planes = LightPlanes(coefficients, np.zeros((STRIPES + 1, 4, 4)), "vertical")
-    ray, s = np.array([[0.02, 0.01, 1.0]]), np.array([float(last)])
-    slope = (planes.depth(ray, s) - planes.depth(ray, s - 1e-4)) / 1e-4
-    assert planes.depth_per_stripe(ray, s) == pytest.approx(slope, rel=1e-3)
-
-
 @given(st.floats(20.0, 600.0), st.floats(20.0, 460.0), st.integers(0, STRIPES))
 def test_equation_13_equals_equation_14(u: float, v: float, i: int) -> None:
     planes = LightPlanes(true_planes(), np.zeros((STRIPES + 1, 4, 4)), "vertical")

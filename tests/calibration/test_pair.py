@@ -71,10 +71,9 @@ def test_light_that_another_program_calibrated_is_called_so_and_other_light_by_i
         PairQuality(None, 0, imported="theirs.json", stripes_projected=63).light_model == "imported"
     )
     # A camera alone, without light of its own.
-    assert PairQuality(None, 0, imported="theirs.json").light_model is None
-
-
-def test_nothing_is_known_of_what_was_imported_without_a_sigma() -> None:
-    assert PairQuality(None, 0, imported="theirs.json").unjudged
+    camera = PairQuality(None, 0, imported="theirs.json")
+    assert camera.light_model is None
+    # Nothing is known of the accuracy of what was imported without a sigma.
+    assert camera.unjudged
     assert not PairQuality(None, 0, imported="theirs.json", imported_sigma_px=0.0).unjudged
     assert not PairQuality(0.1, 5).unjudged

@@ -96,11 +96,8 @@ def test_the_box_of_a_print_holds_it_all_and_little_else() -> None:
     place = SCENE.looking_at(*CHAPTER_POSES[0])
     rim = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
     area = np.array([BOARD.columns, BOARD.rows]) * BOARD.square_mm
-    print_px = SCENE.camera.project(
-        place.apply(
-            np.column_stack([rim * area, np.zeros(4)])
-        )  # straight edges: corners are extreme
-    )
+    # Straight edges: corners are extreme.
+    print_px = SCENE.camera.project(place.apply(np.column_stack([rim * area, np.zeros(4)])))
     corners = SCENE.camera.project(place.apply(FRONT))
     view = LocatedView("p1", "b1", "board", FRONT, corners, place, ())
     low, high = box_of_print(SCENE.camera, BOARD, view)

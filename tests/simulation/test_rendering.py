@@ -40,8 +40,6 @@ def render(
     projection: Projection = CRISP,
     optics: Optics = SHARP,
     light: MirrorProjector | PinholeProjector | None = None,
-    sequence: bool = True,
-    seed: int = 0,
 ) -> dict[str, Floats]:
     return render_pair(
         Scene(surfaces),
@@ -49,8 +47,7 @@ def render(
         light or projector(projection=projection),
         LAMPS,
         projection,
-        np.random.default_rng(seed),
-        sequence=sequence,
+        np.random.default_rng(0),
     )
 
 
@@ -222,10 +219,3 @@ def test_vignetting_darkens_the_corners() -> None:
     cosine = 1 / np.linalg.norm(CAMERA.directions(np.array([0.0, 0.0])))
     assert ratio[0, 0] == pytest.approx(cosine**4, rel=1e-5)
     assert ratio.max() == pytest.approx(1.0, abs=1e-4)
-
-
-def test_lit_alone_is_the_lit_frame_of_the_sequence() -> None:
-    surfaces = [wall(1200.0), ball([0, 0, 900.0], 100.0)]
-    alone = render(surfaces, sequence=False)
-    assert list(alone) == ["lit"]
-    assert (alone["lit"] == render(surfaces)["lit"]).all()

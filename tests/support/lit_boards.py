@@ -195,15 +195,8 @@ class Scene:
             pixels[:, across] += rng.normal(0.0, noise_px, len(pixels))
             placed = self.placed(pose, corner_px, rng) if corner_px else pose
             means = binned(index, pixels, max(noise_px, 0.01), self.direction)
-            parts.append(
-                boundary_points(
-                    self.camera,
-                    placed,
-                    *means,
-                    board=number,
-                    direction=self.direction,
-                )
-            )
+            seen = self.camera, placed, *means
+            parts.append(boundary_points(*seen, board=number, direction=self.direction))
         return concatenate(parts)
 
     def placed(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -11,6 +11,7 @@ import numpy as np
 import open3d as o3d
 import yaml
 from open3d.pybind.t.geometry import RaycastingScene
+from ring import looking_at
 
 from bodyscan.arrays import Array, Mask
 from bodyscan.geometry.camera import Camera
@@ -61,12 +62,7 @@ def scene_of(truth: Truth) -> o3d.t.geometry.RaycastingScene:
 
 def looking(placing: NominalPose) -> RigidTransform:
     """rig_from_camera of a camera that stands upright at a placing."""
-    position = np.array(placing.position_mm)
-    forward = np.array(placing.look_at_mm) - position
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    return RigidTransform(np.stack([right, np.cross(forward, right), forward], axis=-1), position)
+    return looking_at(list(placing.position_mm), list(placing.look_at_mm))
 
 
 def nominal_placings(rig: Rig) -> dict[str, RigidTransform]:
@@ -77,16 +73,8 @@ def nominal_placings(rig: Rig) -> dict[str, RigidTransform]:
 def nominal_camera(width: int, height: int) -> Camera:
     """Sees about 1 m x 0.8 m at 1.3 m, with a little barrel distortion."""
     focal = 1.33 * width
-    return Camera(
-        focal,
-        1.002 * focal,
-        0.4,
-        width / 2 + 3.3,
-        height / 2 - 2.1,
-        Radial(-0.09, 0.06),
-        width,
-        height,
-    )
+    u0, v0 = width / 2 + 3.3, height / 2 - 2.1
+    return Camera(focal, 1.002 * focal, 0.4, u0, v0, Radial(-0.09, 0.06), width, height)
 
 
 def cast_scan(
@@ -179,11 +167,9 @@ def without(
     height = rig_from_camera.apply(image.points.astype(float))[..., 2]
     gone = (height > low_mm) & (height < high_mm)
     nan = np.float32(np.nan)
-    return RangeImage(
-        image.pair,
-        image.camera,
-        np.where(gone[..., None], nan, image.points),
-        np.where(gone[..., None], nan, image.normals),
-        np.where(gone, nan, image.sigma_mm),
-        image.colours,
+    return replace(
+        image,
+        points=np.where(gone[..., None], nan, image.points),
+        normals=np.where(gone[..., None], nan, image.normals),
+        sigma_mm=np.where(gone, nan, image.sigma_mm),
     )

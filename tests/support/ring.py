@@ -148,13 +148,8 @@ def _located(
 def as_found(views: Sequence[LocatedView]) -> list[BoardView]:
     """The same views of CHARUCO as a detector gives them: corners by number, no pose."""
     corners = {tuple(p): k for k, p in enumerate(np.round(corner_points(CHARUCO), 6).tolist())}
+    ids = [[corners[tuple(p)] for p in np.round(view.points, 6).tolist()] for view in views]
     return [
-        BoardView(
-            view.pair,
-            view.shot,
-            view.board,
-            np.array([corners[tuple(p)] for p in np.round(view.points, 6).tolist()]),
-            view.pixels,
-        )
-        for view in views
+        BoardView(view.pair, view.shot, view.board, np.array(own), view.pixels)
+        for view, own in zip(views, ids, strict=True)
     ]

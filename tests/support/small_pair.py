@@ -41,13 +41,6 @@ def stripe_map(depth: Array) -> StripeMap:
     exact = 0.5 * (low + high)
     known = (exact > 0.5) & (exact < STRIPES - 0.5)
     s = np.where(known, exact, np.nan).astype(np.float32)
-    empty = np.empty(0)
-    return StripeMap(
-        s,
-        np.where(np.isfinite(s), 0.01, np.nan).astype(np.float32),
-        np.full(s.shape, 150, np.uint8),
-        empty.astype(np.int64),
-        empty.reshape(0, 2),
-        empty.astype(np.float32),
-        STRIPES,
-    )
+    sigma = np.where(known, 0.01, np.nan).astype(np.float32)
+    nothing = np.empty(0, np.int64), np.empty((0, 2)), np.empty(0, np.float32)
+    return StripeMap(s, sigma, np.full(s.shape, 150, np.uint8), *nothing, STRIPES)
