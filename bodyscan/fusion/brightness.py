@@ -42,42 +42,34 @@ def equalize_brightness(
         for surface, centre in zip(surfaces, centres, strict=True)
     ]
     parts = [slice(start, end) for start, end in pairwise(samples.starts)]
-    of_samples = np.concatenate(
-        [
-            log_irradiance(samples.points[part], samples.normals[part], centre)
-            for part, centre in zip(parts, centres, strict=True)
-        ]
-    )
+    shades = [
+        log_irradiance(samples.points[part], samples.normals[part], centre)
+        for part, centre in zip(parts, centres, strict=True)
+    ]
+    of_samples = np.concatenate(shades)
     overlaps = find_overlaps(samples, surfaces, consistency, of_samples, of_surfaces)
     power = estimate_light_power([(overlap.ratio, overlap.shade) for overlap in overlaps])
     ratios = [(o.a, o.b, float(np.median(o.ratio - power * o.shade)), o.spots) for o in overlaps]
     gain = solve_gains(ratios, len(surfaces))
     typical = float(np.mean(of_samples)) if len(of_samples) else 0.0
 
-    def normalize(colours: Bytes, shades: Floats, factor: float) -> Floats:
-        return colours * (factor * np.exp(np.float32(-power) * (shades - np.float32(typical))))
+    def normalize(colours: list[Bytes], shades: list[Floats]) -> list[Floats]:
+        return [
+            grey * (factor * np.exp(np.float32(-power) * (shade - np.float32(typical))))
+            for grey, shade, factor in zip(colours, shades, gain, strict=True)
+        ]
 
+    of_parts = normalize([samples.colours[part] for part in parts], shades)
     return EqualizedGrey(
-        np.concatenate(
-            [
-                normalize(samples.colours[part], of_samples[part], factor)
-                for part, factor in zip(parts, gain, strict=True)
-            ]
-        ),
-        [
-            normalize(surface.colours, shades, factor)
-            for surface, shades, factor in zip(surfaces, of_surfaces, gain, strict=True)
-        ],
+        np.concatenate(of_parts), normalize([one.colours for one in surfaces], of_surfaces)
     )
 
 
 @dataclass(frozen=True, eq=False)
 class Overlap:
-    """Spots shown by both surfaces a and b.
+    """Spots shown by both surfaces a and b, and how many these stand for.
 
-    ratio: logarithm of b's grey level over a's, (N,).
-    shade: the same for the light that falls there, (N,).
-    spots: number of spots that these stand for.
+    ratio, shade: logarithms (N,) of b's grey level over a's, and of the light that falls there.
     """
 
     a: int
@@ -117,10 +109,8 @@ def find_overlaps(
 def estimate_light_power(overlaps: Sequence[tuple[Floats, Floats]]) -> float:
     """Estimate the power, 0 to 1, of irradiance to which grey levels are proportional.
 
-    overlaps: logarithms (N,) of one camera's grey levels over another's, and of the light's.
-
-    Fitted within each overlap, so that exposures do not matter, by the least sum of absolute
-    errors.
+    overlaps: logarithms (N,) of one camera's grey levels over another's, and of the light's. Fitted
+        within each overlap by the least sum of absolute errors.
     """
     if not overlaps:
         return 0.0
@@ -142,11 +132,10 @@ def _weighted_median(values: Array, weights: Array) -> float:
 
 
 def solve_gains(ratios: Sequence[tuple[int, int, float, int]], count: int) -> Floats:
-    """Solve for the factors (count,) that bring the pairs' grey levels together, with geometric mean 1.
+    """Solve for the factors (count,) that bring the pairs' grey levels together, with geometric
+    mean 1.
 
     ratios: (a, b, log of b's grey level over a's at common spots, number of spots).
-
-    Least squares in logarithms, so that the factors go round the ring without a step.
     """
     # Pairs without overlap keep their brightness.
     normal, right = 1e-3 * np.eye(count), np.zeros(count)
@@ -162,11 +151,9 @@ def solve_gains(ratios: Sequence[tuple[int, int, float, int]], count: int) -> Fl
 
 @compiled
 def log_irradiance(points: Floats, normals: Floats, centre: Array) -> Floats:
-    """Logarithm (N,) of a surface's irradiance from a lamp at a camera's centre, up to a constant.
-
-    That is the cosine of incidence over the squared distance. Below a cosine of 0.1 the room's light
-    prevails.
-    """
+    """Logarithm (N,) of a surface's irradiance from a lamp at a camera's centre, up to a
+    constant: cosine of incidence over squared distance. Below a cosine of 0.1 the room's light
+    prevails."""
     shades = np.empty(len(points), np.float32)
     for n in range(len(points)):
         towards = distance2 = 0.0

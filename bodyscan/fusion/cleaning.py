@@ -33,13 +33,13 @@ def clean(
     smallest_patch_mm2: float = 150.0,
     workers: int = THREADS,
 ) -> list[RangeImage]:
-    """The same range images, with nothing measured where a pixel shows no part of the subject.
+    """Remove from range images whatever shows no part of the subject.
 
     empty: range images of the rig without a subject, of some or all pairs.
     smallest_patch_mm2: smaller disconnected patches are removed.
 
-    Removed are: everything outside the scan volume (floor, walls), what `empty` shows, flying
-    pixels at silhouettes, grazing surfaces, narrow dark gaps (see `find_dark_gaps`), and small patches.
+    Removed are: everything outside the scan volume, what `empty` shows, flying pixels, grazing
+    surfaces, narrow dark gaps (see `find_dark_gaps`), and small patches.
     """
     background = {image.pair: image for image in empty}
 
@@ -93,10 +93,8 @@ def find_inside(image: RangeImage, rig_from_camera: RigidTransform, volume: Volu
 
 
 def find_foreground(image: RangeImage, empty: RangeImage) -> Mask:
-    """(h, w): where a point was measured 4 mm or more in front of the scene without a subject.
-
-    The nearest background among neighbouring pixels counts, because of edges of things in the room.
-    """
+    """(h, w): where a point lies 4 mm or more in front of the nearest background around its
+    pixel."""
     window = np.ones((3, 3), np.uint8)
     far = np.where(empty.open_depth > 0.0, empty.open_depth, np.float32(np.inf))
     with np.errstate(invalid="ignore"):
@@ -104,11 +102,11 @@ def find_foreground(image: RangeImage, empty: RangeImage) -> Mask:
 
 
 def drop_flying_pixels(depth: Floats, step_mm: float, *, supporters: int = 13) -> Floats:
-    """Depth (h, w) of pixels that enough neighbours agree with; NaN elsewhere.
+    """Depth (h, w) of pixels that enough neighbours agree with, within `step_mm` per step; else
+    NaN.
 
-    At a straight rim of a surface a pixel has 14 of its 24 neighbours; a flying pixel hangs between
-    front and back, and has few within `step_mm` per step. A second pass no longer counts what the
-    first removed.
+    At a straight rim a pixel has 14 of its 24 neighbours; a flying one has few. A second pass no
+    longer counts what the first removed.
     """
     distances_px = np.hypot(*np.mgrid[-2:3, -2:3])
     limits = np.where(distances_px > 0, step_mm * distances_px, -1.0).astype(np.float32)
@@ -129,12 +127,8 @@ def drop_speckles(depth: Floats, step_mm: float, smallest_px: float) -> Mask:
 def find_dark_gaps(grey: Bytes) -> Mask:
     """(height, width): pixels in a narrow dark gap of an image (height, width), or at its rim.
 
-    Hardly any light falls into the gap between two toes. What a camera sees there is the blur of
-    the bright skin on both sides, with its stripes: it is measured as a smooth bridge from one side
-    to the other, and other cameras see the same.
-
-    A morphological closing fills what is narrower than its window with brighter surfaces on both
-    sides; dark and wide things (hair, cloth, the background beside a silhouette) stay.
+    Between two toes a camera sees the blur of bright skin on both sides, measured as a bridge. A
+    morphological closing fills what is narrower than its window; dark and wide things stay.
     """
     # 7 pixels: the gap and half of its slopes, several times the blur.
     window = np.ones((7, 7), np.uint8)
@@ -154,8 +148,7 @@ def _inside(
 ) -> None:
     """Set within (H, W): which points (H, W, 3) with a sigma lie in an upright cylinder.
 
-    rig_from_camera: (3, 4).
-    size: radius, bottom and top of the cylinder, mm.
+    rig_from_camera: (3, 4). size: radius, bottom and top of the cylinder, mm.
     """
     m, (radius, bottom, top) = rig_from_camera, size
     for v in range(within.shape[0]):
@@ -171,11 +164,8 @@ def _inside(
 
 @compiled
 def _keep_supported(padded: Floats, limits: Floats, supporters: int, kept: Floats) -> None:
-    """Set kept (h, w): depths that at least `supporters` neighbours agree with, NaN elsewhere.
-
-    padded: depths with two more pixels on all sides, (h + 4, w + 4).
-    limits: how far each neighbour's depth may differ, (5, 5).
-    """
+    """Set kept (h, w): depths, padded by two pixels, that differ from at least `supporters`
+    neighbours' by less than limits (5, 5); NaN elsewhere."""
     height, width = kept.shape
     count = np.empty(width, np.uint8)
     for v in range(height):

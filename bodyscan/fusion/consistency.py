@@ -27,8 +27,7 @@ Counts = NDArray[np.int64]
 class Consistency:
     """What one surface shows of the samples of others, in the samples' order.
 
-    index: numbers of the samples that it agrees with.
-    at: numbers of its points there.
+    index, at: numbers of the samples that it agrees with, and of its points there.
     shift_mm: from the sample along its normal to that surface.
     against_index, against_at: the same where it contradicts the sample.
     """
@@ -44,10 +43,9 @@ class Consistency:
 class Contradictions:
     """How often pairs contradict each other's points.
 
-    pairs: P of them.
-    compared: how often points of the column's pair were compared with the row's surface, (P, P).
-    against: how often that surface contradicted them, (P, P).
-    by_noise: share of contradictions expected for a single surface, by the sigmas of both points.
+    compared, against: how often points of the column's pair were compared with the row's surface,
+        and contradicted by it, (P, P).
+    by_noise: share of contradictions that both points' sigmas predict for a single surface.
     """
 
     pairs: tuple[str, ...]
@@ -93,10 +91,8 @@ class Contradictions:
         return self.share - self.by_noise
 
     def find_outlier(self, groups: Mapping[str, frozenset[str]]) -> str:
-        """The smallest of the groups without which the others agree best.
-
-        Empty unless less than half of the share of contradictions is left without it.
-        """
+        """The smallest of the groups without which the others agree best; "" unless less than
+        half of the share of contradictions is left without it."""
         left = {name: self._share_without(group) for name, group in groups.items()}
         outliers = [
             name
@@ -119,8 +115,8 @@ def compare_with_surface(
 ) -> Consistency:
     """Compare the samples of other pairs with `surface`, which is number `number`.
 
-    It agrees if it lies within `agreement_mm` of them, and contradicts them if it is a double
-    surface within `double_mm`, or was seen through them.
+    It agrees within `agreement_mm`, and contradicts as a double surface within `double_mm`, or if
+    it was seen through the samples.
     """
     count = len(samples.points)
     index, at = np.empty(count, np.int32), np.empty(count, np.int32)
@@ -161,8 +157,7 @@ def _compare(
 ) -> tuple[int, int]:
     """Write `found`; return how many samples are agreed with and how many contradicted.
 
-    samples: points and normals.
-    excluded: range of the samples that come from the surface itself.
+    samples: points and normals; those in the range `excluded` come from the surface itself.
     surface: points, normals and the image of their numbers, which begins at `corner`.
     warped: whether its points do not lie on the rays of their pixels.
     limits_mm: of agreement, and of a double surface.

@@ -22,12 +22,8 @@ CROWN_RADIUS_MM = 100.0
 
 @dataclass(frozen=True, eq=False)
 class PartialSurface:
-    """A closed surface that is partly filled.
-
-    vertices: (V, 3) float32, rig frame.
-    faces: (F, 3).
-    filled: (F,).
-    """
+    """A closed surface, partly filled: vertices (V, 3) float32, rig frame; faces (F, 3); filled
+    (F,)."""
 
     vertices: Floats
     faces: Indices
@@ -41,10 +37,8 @@ def find_free_points(
     rig_from_camera: RigidTransform,
     margin_mm: float = 10.0,
 ) -> Mask:
-    """Find the points (N, 3), rig frame, that one camera saw through by at least `margin_mm`.
-
-    Either something was measured behind them, or they lie in a gap: see `find_gaps`.
-    """
+    """Find the points (N, 3), rig frame, that one camera saw through by at least `margin_mm`:
+    something was measured behind them, or they lie in a gap (see `find_gaps`)."""
     in_camera = _transform_points(points, rig_from_camera.inverse())
     ahead = in_camera[:, 2] > 1.0
     u, v = image.camera.project(np.where(ahead[:, None], in_camera, np.float32(1.0))).T
@@ -77,10 +71,9 @@ def find_gaps(
 ) -> Mask:
     """Find the blocks of stride x stride pixels in a window that look through a gap of the body.
 
-    In such a block nothing was measured, its middle shows only filled faces of the guessed surface,
-    and there is measured surface to the left and to the right: between the legs, between arm and
-    trunk. A filled face in front of or behind measured surface is a part in shadow instead, and a
-    part of the outline that nobody measured (dark hair) has measured surface on one side at most.
+    In such a block nothing was measured, its middle shows only filled faces, and there is measured
+    surface to the left and to the right: between the legs, between arm and trunk. A filled face in
+        front of or behind measured surface is a part in shadow instead.
     """
     rows, columns = (stride * np.arange(some.start, some.stop) + stride // 2 for some in blocks)
     vertices = _project_to_blocks(surface.vertices, image, rig_from_camera, stride, blocks)
@@ -110,10 +103,8 @@ def _project_to_blocks(
     stride: int,
     blocks: tuple[slice, slice],
 ) -> Floats:
-    """(V, 3): column and row of the block that shows each vertex in its middle, and depth.
-
-    NaN for vertices that are not in front of the camera.
-    """
+    """(V, 3): column and row of the block that shows each vertex, and depth; NaN behind the
+    camera."""
     points = _transform_points(vertices, rig_from_camera.inverse())
     points[points[:, 2] < 1.0] = np.nan
     pixels = (image.camera.project(points.astype(float)) - stride // 2) / stride
@@ -138,9 +129,8 @@ def _transform_points(points: Floats, a_from_b: RigidTransform) -> Floats:
 class Crown:
     """Tangent planes below which everything measured around the top of a head lies.
 
-    A crown is convex. If cameras see its top too flat to measure it, and the gap is small or its rim
-    nearly level, these planes bound the head's height to a millimetre; where a head is measured to its
-    hairline they are steep and bound nothing.
+    A crown is convex: where cameras see its top too flat to measure it, these planes bound the
+    head's height to a millimetre; planes around a hairline are steep and bound nothing.
 
     highest: the highest point measured, (3,) mm.
     normals, offsets: of the planes, (P, 3) and (P,) mm.

@@ -39,11 +39,8 @@ def fill_distances(
     *,
     workers: int,
 ) -> Distances:
-    """Signed distances of a closed surface through the cloud, on a grid with room around it.
-
-    finest_mm: no cell is smaller.
-    range_images: as measured, background included.
-    """
+    """Signed distances of a closed surface through the cloud, on a grid with room around it, no
+    cell smaller than `finest_mm`; range_images: as measured, background included."""
     cell_mm = max(CELL_MM, finest_mm)
     bricks = _grid_around(cloud.points, cell_mm)
     some = cloud.subsample(max(1, len(cloud.points) // 250_000))  # nine within a node's reach
@@ -55,11 +52,8 @@ def fill_distances(
     fixed = weights > 0.05  # one point 7 mm away
     values = np.clip(values, -reach, reach)
     for axis in range(3):
-        for side in (0, -1):
-            np.moveaxis(values, axis, 0)[side] = (
-                0.3 * reach
-            )  # small, or missing parts would cave in
-            np.moveaxis(fixed, axis, 0)[side] = True
+        np.moveaxis(values, axis, 0)[[0, -1]] = 0.3 * reach  # small, or missing parts cave in
+        np.moveaxis(fixed, axis, 0)[[0, -1]] = True
     height = (bricks.origin[2] + cell_mm * np.arange(values.shape[2])).astype(np.float32)
     below = int(np.count_nonzero(height < 0.0))
     measured = fixed.copy()
@@ -96,10 +90,8 @@ def _bound_crown(
 
 
 def _mirror(values: Floats | Mask, below: int, where: Mask) -> None:
-    """Mirror nodes from above the floor to below it, where `where` is true.
-
-    What is filled in between then meets the floor upright: soles are not seen, but stand on it.
-    """
+    """Mirror nodes from above the floor to below it where `where` is true: filled surface then
+    meets the floor upright."""
     count = min(below, values.shape[2] - below)
     if count > 0:
         under = np.s_[..., below - count : below]
@@ -151,8 +143,7 @@ def fill_harmonically(values: Floats, fixed: Mask, bound: Floats, certain: float
     certain: nodes that a coarser grid puts farther from 0 keep its value, and so do those far from
         any change of sign and from any active bound, since only the zero set matters.
 
-    Multigrid: solved first on grids two, four and eight times as coarse, since sweeps settle what is
-    near, and coarse levels what is far.
+    Multigrid: solved first on grids two, four and eight times as coarse.
     """
     if min(values.shape) <= 16 or any(size % 2 for size in values.shape):
         found, sweeps = np.where(fixed, values, np.maximum(np.float32(0.0), bound)), 200
@@ -164,7 +155,7 @@ def fill_harmonically(values: Floats, fixed: Mask, bound: Floats, certain: float
         active = ~fixed & (bound > guess)
         if active.any():  # a gap is narrow: of the eight nodes of a coarser one not all have bounds
             # Sweeps carry a bound that the coarser grid lacks by half as many nodes.
-            near |= _dilate(_any_of_eight(active), RELAXATION_SWEEPS // 2)
+            near |= _dilate(_sum_eight(active), RELAXATION_SWEEPS // 2)
         free = ~fixed & _refine(near) & (np.abs(found) < certain)
     found = np.ascontiguousarray(found, np.float32)
     nodes = np.flatnonzero(free).astype(np.int32)
@@ -174,22 +165,17 @@ def fill_harmonically(values: Floats, fixed: Mask, bound: Floats, certain: float
 
 def _coarsen(values: Floats, fixed: Mask, bound: Floats) -> tuple[Floats, Mask, Floats]:
     """One node for eight: the mean of the fixed ones, and of the bounds if all have one."""
-
-    def total(part: Floats) -> Floats:
-        # One axis at a time: numpy's reduction over three axes takes several times as long.
-        part = part[::2] + part[1::2]
-        part = part[:, ::2] + part[:, 1::2]
-        return part[:, :, ::2] + part[:, :, 1::2]
-
-    count = total(fixed.astype(np.float32))
-    known = total(np.where(fixed, values, np.float32(0.0))) / np.maximum(count, np.float32(1.0))
-    return np.asarray(known, np.float32), count > 0, total(0.125 * bound)
+    count = _sum_eight(fixed.astype(np.float32))
+    known = _sum_eight(np.where(fixed, values, np.float32(0.0)))
+    known /= np.maximum(count, np.float32(1.0))
+    return np.asarray(known, np.float32), count > 0, _sum_eight(0.125 * bound)
 
 
-def _any_of_eight(where: Mask) -> Mask:
-    where = where[::2] | where[1::2]
-    where = where[:, ::2] | where[:, 1::2]
-    return where[:, :, ::2] | where[:, :, 1::2]
+def _sum_eight(part: Values) -> Values:
+    """Sums (or, of masks, any) over 2 x 2 x 2 nodes; several times faster axis by axis."""
+    part = part[::2] + part[1::2]
+    part = part[:, ::2] + part[:, 1::2]
+    return part[:, :, ::2] + part[:, :, 1::2]
 
 
 def _near_zero(values: Floats) -> Mask:
@@ -227,7 +213,5 @@ def _relax(
             at = nodes[n if step > 0 else len(nodes) - 1 - n]
             others = values[at - a] + values[at + a] + values[at - b] + values[at + b]
             new = keep * values[at] + share * (others + values[at + step])
-            new += (
-                share * values[at - step]
-            )  # last: it was computed just now and is still in flight
+            new += share * values[at - step]  # last: it was computed just now, still in flight
             values[at] = max(new, bound[at])

@@ -50,9 +50,9 @@ def merge(
 
     poses: how well the pairs' poses are known; None for exactly. See `estimate_sigma_inflation`.
 
-    Surfaces of two pairs within `settings.agreement_mm` along the normal are averaged by weight;
-    between that and `settings.double_mm` they are a double surface, of which the heavier one stays.
-    Raises ScanFailed if the range images show next to nothing.
+    Surfaces of two pairs within `settings.agreement_mm` along the normal are averaged by weight; of
+    a double surface within `settings.double_mm` the heavier one stays. Raises ScanFailed for images
+    that show next to nothing.
     """
     with ThreadPoolExecutor(workers) as pool:
         smoothed = pool.map(
@@ -85,10 +85,7 @@ def average(
     poses: PoseCovariance | None = None,
     workers: int = THREADS,
 ) -> BodyCloud:
-    """Average each sample with the surfaces that agree with it; outvoted samples are dropped.
-
-    poses: how well the pairs' poses are known, None for exactly.
-    """
+    """Average each sample with the surfaces that agree with it; outvoted samples are dropped."""
     block = 1 << 16  # samples whose sums fit into a processor's cache
     inflation = estimate_sigma_inflation(samples, surfaces, consistency, poses) ** 2
 
@@ -154,9 +151,8 @@ def _pose_variance(
 class _Sums(NamedTuple):
     """Sums (N,) over the pairs that show each of N samples, the sample's own pair included.
 
-    weight: of weights; against: of the weights of surfaces that contradict the sample.
-    shift, square, grey: of weights times shift, its square and grey level.
-    normal: of weights times normals, (N, 3).
+    weight, against: of weights, and of those of surfaces that contradict the sample.
+    shift, square, grey, normal: of weights times shift, its square, grey level and normal (N, 3).
     variance: of the squares of weights times sigmas.
     pairs: their number.
     """
@@ -172,7 +168,6 @@ class _Sums(NamedTuple):
 
 
 def _start_sums(normals: Floats, sigma_mm: Floats, weights: Floats, grey: Floats) -> _Sums:
-    """Sums over the samples alone."""
     shift, square, against = np.zeros((3, len(weights)))
     return _Sums(
         weights.astype(np.float64),
@@ -215,8 +210,8 @@ def _average(
 ) -> tuple[Array, Floats, Floats, Bytes, Bytes]:
     """Points, normals, sigmas, colours and number of pairs of the samples that were not outvoted.
 
-    inflation: variance of the pairs' differences over the predicted one. Sigmas are enlarged by it,
-        and by more where pairs differ by more than three of their sigmas.
+    inflation: variance of the pairs' differences over the predicted one. It enlarges sigmas, and
+        differences of more than three sigmas enlarge them more.
     """
     kept = np.flatnonzero(sums.against < sums.weight)
     position, normal = np.empty((len(kept), 3)), np.empty((len(kept), 3), np.float32)

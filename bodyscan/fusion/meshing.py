@@ -36,8 +36,7 @@ def mesh(
 ) -> BodyMesh:
     """One closed manifold surface around a cloud, with faces outward.
 
-    range_images: as measured, background included (not cleaned); with them, gaps that cameras saw
-        through are not webbed over.
+    range_images: as measured, background included; gaps that they see through are not webbed over.
 
     A vertex farther than `settings.reach_mm` from every point counts as not measured. Raises
     ScanFailed if no closed surface comes out.
@@ -82,11 +81,8 @@ def compute_distances(
     *,
     workers: int,
 ) -> tuple[Bricks, Floats]:
-    """Compute signed distances (mm) of a closed surface at the nodes of a sparse grid around it.
-
-    Near the cloud they follow its points, elsewhere `hole_filling`, with a blend in between, so
-    that there is no seam and every node has a side.
-    """
+    """Compute signed distances (mm) of a closed surface at the nodes of a sparse grid around it:
+    from the cloud where it is near, from `hole_filling` elsewhere, blended in between."""
     coarse = fill_distances(cloud, cell_mm, range_images, rig_from_camera, workers=workers)
     extent = coarse.cell_mm * np.array(coarse.values.shape)
     shape = tuple(np.ceil(extent / cell_mm / SIDE).astype(int))
@@ -101,11 +97,8 @@ def compute_distances(
 def attach_attributes(
     vertices: Array, faces: Indices, cloud: BodyCloud, reach_mm: float
 ) -> BodyMesh:
-    """Fit the mesh to the points, with normals, the points' attributes, and what was filled.
-
-    A grid's vertices are only as exact as its cells are small: they move along their normals to the
-    points around, by less the farther away those are.
-    """
+    """Fit the mesh to the points, along its normals, and attach normals, the points' attributes
+    and what was filled."""
     normals = vertex_normals(vertices, faces)
     around = measure_support(vertices, normals, cloud, reach_mm)
     vertices = fit_to_points(vertices, faces, normals, around)

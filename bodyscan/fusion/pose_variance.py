@@ -22,9 +22,8 @@ def add_pose_variance(
 ) -> BodyCloud:
     """Add the variance of the pairs' poses along the normals to a cloud's sigmas.
 
-    A small motion (w, t) of a pair moves a point p along its normal n by (p x n).w + n.t. A point is
-    the mean of `pairs_seen` of the pairs that face it: their independent errors average out, their
-    covariances do not.
+    A small motion (w, t) of a pair moves a point p along its normal n by (p x n).w + n.t. In the
+    mean of `pairs_seen` pairs independent errors average out, covariances do not.
     """
     centres = np.array([pose.translation for pose in rig_from_camera.values()])
     size = len(centres)
@@ -46,8 +45,8 @@ def add_motion_variance(
 ) -> BodyCloud:
     """Add the variance of the person's motion to a cloud's sigmas.
 
-    with_poses: the cloud from `add_pose_variance`. Following leaves out motions of the body as a
-        whole, which its sigmas include: the larger of both counts.
+    Following leaves out motions of the body as a whole, which the sigmas of `with_poses` (from
+    `add_pose_variance`) include: the larger of both counts.
     """
     cell = followed.cells.find_by_groups(cloud.points, cloud.normals.astype(np.float64))
     sigma_mm = np.hypot(cloud.sigma_mm, followed.sigma_mm[cell])
@@ -58,10 +57,10 @@ def add_motion_variance(
 def _pose_sigmas(
     points: Array, normals: Floats, pairs_seen: Bytes, centres: Array, joint: Array, sigma_mm: Array
 ) -> None:
-    """Write standard deviations (N,) mm along the normals due to pose errors.
+    """Write standard deviations (N,) mm along the normals due to errors of pairs at `centres` (P,
+    3).
 
-    Pairs stand at `centres` (P, 3). joint: their covariances (P, P, 21): of each two the upper
-    triangle, with what lies below it added.
+    joint: their covariances (P, P, 21), the upper triangle with what lies below it added.
     """
     lever, products, facing = np.empty(6), np.empty(21), np.zeros(len(centres), np.bool_)
     alone, between = np.zeros(21), np.zeros(21)

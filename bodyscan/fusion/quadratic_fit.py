@@ -39,8 +39,8 @@ def fit_quadratics(
 ) -> tuple[QuadraticFit, Mask]:
     """Fit a quadratic around every measured pixel; return the fits and where they succeed, (h, w).
 
-    inverse: inverse depths (h, w), 0 where nothing was measured.
-    noise: their standard deviation; scaled up if the residuals are larger than it predicts.
+    inverse, noise: inverse depths (h, w), 0 where nothing was measured, and their standard
+        deviation, which is scaled up if the residuals are larger.
     reach: windows have 2 reach + 1 pixels a side, of `pixel_mm` on the surface.
     correlation_px: see `noise_gain`.
     """
@@ -80,10 +80,8 @@ def noise_gain(reach: int, correlation_px: tuple[float, float]) -> float:
 
 
 def fit_full_windows(inverse: Floats, noise: Floats, reach: int) -> tuple[QuadraticFit, Mask]:
-    """Fit all windows by convolution, and find the measured pixels (h, w) whose window is full.
-
-    Holes of a few pixels are closed first. The fits of other windows are worthless.
-    """
+    """Fit all windows by convolution, and find the measured pixels (h, w) whose window is full,
+    holes of a few pixels closed; other fits are worthless."""
     valid = inverse > 0
     closed, known = close_holes(inverse, valid)
     window = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
@@ -109,11 +107,9 @@ def convolve_quadratics(inverse: Floats, noise: Floats, reach: int) -> Quadratic
 
 
 def close_holes(inverse: Floats, valid: Mask) -> tuple[Floats, Mask]:
-    """Fill holes of a few pixels, so that they do not spoil the windows around them.
-
-    Each takes the mean of opposite neighbours up to two pixels away, exact on a plane; at least
-    four of the twelve opposite pairs must be there. Returns the image and where it has values.
-    """
+    """Fill holes of a few pixels by the mean of opposite neighbours up to two pixels away, exact
+    on a plane; four of the twelve pairs must be there. Returns the image and where it has
+    values."""
     known = valid.astype(np.uint8)
     around = cv2.boxFilter(known, -1, (5, 5), normalize=False, borderType=cv2.BORDER_CONSTANT)
     holes = np.flatnonzero(~valid & (around >= 8))
@@ -147,13 +143,12 @@ def fit_trimmed_windows(
     fit: QuadraticFit,
     fitted: Mask,
 ) -> None:
-    """Fit the windows around some measured pixels to the samples on the centre's surface.
+    """Fit the windows around some measured pixels (flat indices) to the samples on the centre's
+    surface.
 
-    pixels: flat indices. Writes `fit` there, and `fitted`: whether the pixel lies on its own fit
-        and enough samples do.
-
-    Trimmed least squares, from the closest neighbours outwards. A prior on the second derivatives,
-    that surfaces rarely curve more tightly than a radius of 6 mm, keeps one-sided windows stable.
+    Writes `fit` there, and `fitted`: whether the pixel lies on its own fit and enough samples do.
+    Trimmed least squares, from the closest neighbours outwards, with a prior on the second
+    derivatives: surfaces rarely curve more tightly than a radius of 6 mm.
     """
     border = (reach, reach, reach, reach)
     padded = cv2.copyMakeBorder(inverse, *border, cv2.BORDER_CONSTANT, value=0.0)
@@ -171,7 +166,6 @@ def _fit_trimmed(
     fits: tuple[Floats, Floats, Floats, Floats],
     fitted: Mask,
 ) -> None:
-    """`fit_trimmed_windows` for inverse depths with a border of `reach` zeros."""
     side, width = 2 * reach + 1, noise.shape[1]
     residual, inlier = np.empty(side * side), np.empty(side * side, np.bool_)
     normal, solution = np.empty((6, 6)), np.empty(6)
@@ -207,7 +201,6 @@ def _fit_trimmed(
 
 @compiled
 def _find_inliers(residual: Array, solution: Array, reach: int, limit: float, inlier: Mask) -> None:
-    """Mark the samples within `limit` of a quadratic."""
     a, b, c, d, e, f = solution
     n = 0
     for v in range(-reach, reach + 1):
@@ -223,7 +216,7 @@ def _solve_window(
 ) -> int:
     """Solve for a window's six coefficients; return the number of inliers.
 
-    ridge: information of the prior on each of the last three coefficients.
+    ridge: information of the prior on each of the last three.
     normal: overwritten; its first element becomes the first coefficient's inverse variance.
     """
     s00 = s10 = s01 = s20 = s11 = s02 = s30 = s21 = s12 = s03 = 0.0
@@ -288,10 +281,8 @@ def _noise_scale(
 def _square_residuals(
     inverse: Floats, noise: Floats, value: Floats, fitted: Mask, squares: Floats, inlier: Bytes
 ) -> None:
-    """Write squared residuals over variances (h, w), 0 where nothing was measured, and `inlier`.
-
-    inlier: 0 for residuals beyond 5 sigmas and pixels without a fit, else 1.
-    """
+    """Write squared residuals over variances (h, w), 0 where nothing was measured, and `inlier`:
+    0 beyond 5 sigmas or without a fit, else 1."""
     for row in range(inverse.shape[0]):
         for column in range(inverse.shape[1]):
             squares[row, column] = 0.0

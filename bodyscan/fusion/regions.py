@@ -37,12 +37,8 @@ ROUGH_MM = 0.2
 
 @dataclass(frozen=True, eq=False)
 class Regions:
-    """Of N points.
-
-    numbers: (N,) uint8, each point's region in `REGION_NAMES`.
-    relief_mm: (N,) float32, standard deviation of strands and locks of hair about the smoothed
-        surface; 0 elsewhere.
-    """
+    """Of N points: each one's region in `REGION_NAMES`, uint8; relief_mm, float32: standard
+    deviation of hair about the smoothed surface, 0 elsewhere."""
 
     numbers: Bytes
     relief_mm: Floats
@@ -73,7 +69,7 @@ class _Grid:
         return self.origin + CELL_MM * (index + 0.5)
 
     def find(self, points: Array) -> Indices:
-        """Number (N,) of the cell of each point (N, 3); the nearest cell for points outside."""
+        """Number (N,) of the cell of each point (N, 3), or of the nearest cell."""
         index = np.floor((points - self.origin) / CELL_MM).astype(np.int64)
         return np.ravel_multi_index(tuple(index.T), self.shape, mode="clip")
 
@@ -83,7 +79,7 @@ class _Grid:
         return np.asarray(label.ravel(), np.int64)
 
     def find_majority(self, mask: Mask, among: Mask) -> Mask:
-        """(count,): cells around which more than half of the `among` cells are in `mask` too."""
+        """(count,): cells around which more than half of the `among` cells are in `mask`."""
         counts = [
             ndimage.uniform_filter(some.reshape(self.shape).astype(float), 3).ravel()
             for some in (mask & among, among)
@@ -93,13 +89,8 @@ class _Grid:
 
 @dataclass(frozen=True, eq=False)
 class _Texture:
-    """Texture of each cell, (count,).
-
-    known: whether enough pixels were examined.
-    rough: whether it is rough beyond noise.
-    smooth: whether it is smooth, noise included.
-    relief_mm: standard deviation about the smooth surface, noise subtracted.
-    """
+    """Texture of each cell, (count,): whether enough pixels are known, and whether it is rough
+    beyond noise or smooth, noise included; relief_mm: standard deviation, noise subtracted."""
 
     known: Mask
     rough: Mask
@@ -113,10 +104,7 @@ def label_regions(
     rig_from_camera: Mapping[str, RigidTransform],
     window_mm: float,
 ) -> Regions:
-    """Label each point of a cloud.
-
-    range_images: those that the cloud was merged from.
-    window_mm: window over which they were smoothed.
+    """Label each point of a cloud merged from range images that were smoothed over `window_mm`.
 
     All points are unsure if the images are too dark, or if more than a tenth is so bright that the
     rest would be dark beside it: it is then open which part is skin.
@@ -205,9 +193,9 @@ def find_in_cells(
     cells: Mask,
     inside: Mask,
 ) -> None:
-    """Write inside (H, W): which points (H, W, 3) with a sigma lie in the cells of a mask (a, b, c).
+    """Write inside (H, W): which points (H, W, 3) with a sigma lie in the cells of a mask (a, b,
+    c).
 
-    rig_from_camera: (3, 4).
     origin: lowest corner of the cells, (3,) mm; points outside count for the nearest cell.
     """
     m, low = rig_from_camera, origin
@@ -255,12 +243,8 @@ def _group_medians(values: Floats, group: Indices, count: int) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Roughness:
-    """Residuals of N pixels that have a full window around them.
-
-    points: (N, 3) mm, rig frame.
-    residual_mm: distance along the ray from the quadratic through the window, (N,).
-    expected_mm: its standard deviation by noise alone, (N,).
-    """
+    """Pixels with a full window around them: points (N, 3) mm, rig frame; distance along the ray
+    from the quadratic through the window, and its standard deviation by noise alone, (N,)."""
 
     points: Array
     residual_mm: Floats

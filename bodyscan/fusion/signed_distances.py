@@ -35,9 +35,9 @@ def splat_planes(
 ) -> tuple[Floats, Floats]:
     """Signed distances (B, SIDE, SIDE, SIDE) mm, negative inside, and their weights.
 
-    Each point contributes its tangent plane to the nodes within `reach` cells, as their distance in
-    front of it, with a weight that falls with their distance from the point and with its sigma. A
-    weight of 1 is one point right at the node; without points both weight and distance are 0.
+    Each point contributes its tangent plane to the nodes within `reach` cells, with a weight that
+    falls
+    with distance and sigma: 1 for one point right at the node, 0 (and distance 0) without points.
     """
     median = float(np.median(cloud.sigma_mm))
     relative = np.clip(cloud.sigma_mm / max(median, 1e-6), 1.0 / 3.0, 3.0)
@@ -51,7 +51,7 @@ def splat_planes(
 
 
 def find_near_bricks(points: Array, origin: Array, cell_mm: float, shape: tuple[int, ...]) -> Mask:
-    """Find the bricks (a, b, c) that hold nodes within a point's reach, or nodes next to such."""
+    """Find the bricks (a, b, c) with nodes within, or next to, a point's reach."""
     near = np.zeros(shape, np.bool_)
     _mark_near((points - origin) / cell_mm, near)
     return near

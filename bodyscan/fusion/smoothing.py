@@ -30,12 +30,10 @@ class SmoothSurface:
 
     corner: (column, row) of the crop's first pixel in the camera's image.
     number: (h, w) int32, of the point that a pixel shows, row by row; -1 where it shows none.
-    points: (n, 3) float32, mm.
-    normals: (n, 3) float32, unit, towards the camera.
-    sigma_mm: (n,) float32, standard deviation of the smoothed point along its normal: what
-        smoothing leaves of the pixels' own noise, and everything that they share.
-    rim: (n,) float32, rises from near 0 at the rim to 1 well inside.
-    weight: (n,) float32, rim/sigma^2.
+    points, normals: (n, 3) float32, mm, and unit vectors towards the camera.
+    sigma_mm: (n,) float32, standard deviation along the normal, of noise that smoothing leaves and
+        of everything that pixels share.
+    rim, weight: (n,) float32, from near 0 at the rim to 1 well inside, and rim / sigma^2.
     colours: (n,) uint8.
     warped: whether points were moved off the rays of their pixels.
     """
@@ -57,10 +55,8 @@ class SmoothSurface:
 def smooth(
     image: RangeImage, rig_from_camera: RigidTransform, window_mm: float
 ) -> SmoothSurface | None:
-    """Fit a quadratic in a square window of about `window_mm` around every pixel.
-
-    None if the range image shows nothing.
-    """
+    """Fit a quadratic in a square window of about `window_mm` around every pixel; None for an
+    image that shows nothing."""
     box = find_crop(image.valid)
     if box is None:
         return None
@@ -141,10 +137,8 @@ def distance_to_rim(depth: Floats, jump: float) -> Floats:
 def inverse_depths(
     points: Floats, sigma_mm: Floats, common_mm: Floats, ends: tuple[int, int, int, int]
 ) -> tuple[Floats, Floats]:
-    """Inverse depth 1/z and its sigma (h, w) within `ends`, without the part common to neighbours.
-
-    0 where nothing was measured.
-    """
+    """Inverse depth 1/z and its sigma (h, w) within `ends`, without the part common to
+    neighbours; 0 where nothing was measured."""
     top, bottom, left, right = ends
     inverse = np.zeros((bottom - top, right - left), np.float32)
     noise = np.zeros_like(inverse)
@@ -178,8 +172,7 @@ def _compute_points(
     """Fill in depth and number (h, w), and points, normals and sigmas; return how many there are.
 
     measured: points (height, width, 3), camera frame, and the shared part of their sigmas.
-    fit: value, slopes and sigma of 1/z.
-    rig_from_camera: rotation and translation.
+    fit: value, slopes and sigma of 1/z. rig_from_camera: rotation and translation.
     """
     value, slope_u, slope_v, fit_sigma = fit
     measured_points, common_mm = measured
@@ -217,8 +210,8 @@ def _normal(
 ) -> tuple[float, float, float]:
     """Unit normal towards the camera, camera frame, from the slopes of 1/z per pixel.
 
-    A plane n.P = d has 1/z = n.(x, y, 1) / d in ideal normalised coordinates; the slopes per pixel
-    are converted to these by the derivative of the projection.
+    A plane n.P = d has 1/z = n.(x, y, 1) / d in ideal normalised coordinates; the derivative of the
+    projection converts the slopes.
     """
     u_by_x, u_by_y, v_by_x, v_by_y = look_up_derivatives(projection, x, y)
     slope_x = by_u * u_by_x + by_v * v_by_x

@@ -22,14 +22,12 @@ MAX_SHIFT = 0.25
 
 @dataclass(frozen=True, eq=False)
 class Support:
-    """Support of V vertices by the points within a reach.
+    """Support of V vertices by the points within a reach, (V,) each.
 
-    nearest: index of the nearest point, (V,).
-    sigma_mm: its standard deviation, (V,).
-    weight: of the nearest points together, (V,): 1 for one at the vertex itself that faces like it,
-        0 if there is none.
-    shift_mm: from the vertex along its normal to the mean of those points' tangent planes, (V,).
-    scatter_mm: RMS of the planes about that mean, (V,).
+    nearest, sigma_mm: index of the nearest point, and its standard deviation.
+    weight: of the nearest points together: 1 for one at the vertex itself that faces like it.
+    shift_mm, scatter_mm: from the vertex along its normal to the mean of those points' tangent
+        planes, and the RMS of the planes about that.
     """
 
     nearest: Indices
@@ -41,12 +39,9 @@ class Support:
 
     @property
     def measured(self) -> Mask:
-        """(V,): whether a vertex lies on its points, and these agree.
-
-        False beyond the rim of what was seen (too little weight), where the grid's cells lift the
-        surface off the points (fingertips), and where points of different surfaces meet (between
-        toes, at the corner of an eye).
-        """
+        """(V,): whether a vertex lies on its points, and these agree: not beyond the rim of what
+        was seen, nor where the grid lifts it off the points (fingertips), nor between surfaces
+        (toes)."""
         lifted = np.abs(self.shift_mm) > np.maximum(MAX_SHIFT * self.reach_mm, 4.0 * self.sigma_mm)
         torn = self.scatter_mm > np.maximum(0.125 * self.reach_mm, 2.0 * self.sigma_mm)
         # One point 3 mm away, or a sixth of the median vertex: a straight rim has a half of that.
@@ -71,9 +66,9 @@ def measure_support(vertices: Array, normals: Floats, cloud: BodyCloud, reach_mm
 
 
 def fit_to_points(vertices: Array, faces: Indices, normals: Floats, around: Support) -> Array:
-    """Move the vertices (V, 3) along their normals to where the points around are.
+    """Move the vertices (V, 3) along their normals to the points around, by less the smaller their
+    weight.
 
-    The smaller their weight, the smaller the move, so that there is no step where the points end.
     Where a face would fold over, its corners move by half of that, then a quarter, then not at all.
     """
     farthest = MAX_SHIFT * around.reach_mm
@@ -106,10 +101,9 @@ def _average_planes(
 ) -> tuple[Array, Array, Array]:
     """Weight, shift and scatter as in `Support`, from the nearest points.
 
-    distance, near: (V, k), sorted by distance, infinite where there are no more points.
-
-    A point's weight falls off as a Gaussian of its distance; a point that faces another direction
-    counts for the scatter but not for the shift.
+    distance, near: (V, k), sorted by distance, infinite where there are no more points. A point's
+        weight falls off as a Gaussian; one that faces another direction counts for the scatter
+        only.
     """
     count, neighbours = near.shape
     weight, shift, scatter = np.zeros(count), np.zeros(count), np.zeros(count)
@@ -140,10 +134,8 @@ def _average_planes(
 
 @dataclass(frozen=True, eq=False)
 class PointColumns:
-    """Points (N, 3) in columns along x, `reach_mm` wide, for searches within that reach.
-
-    All points of a body lie on its skin, and all queries have the same reach of a few millimetres:
-    sorting into columns takes a tenth of the time of building a tree, and a query half.
+    """Points (N, 3) in columns along x, `reach_mm` wide, for searches within that reach: built in a
+    tenth of the time of a tree, and searched in half.
 
     order: indices of the points, column after column, (N,).
     start: where each column begins, by (y, z); columns at the rim are empty.
@@ -158,7 +150,6 @@ class PointColumns:
 
     @staticmethod
     def from_points(points: Array, reach_mm: float) -> PointColumns:
-        """Columns for a cloud and the reach of all queries."""
         low = points[:, 1:].min(axis=0) - reach_mm
         across = ((points[:, 1:] - low) / reach_mm).astype(np.int64)
         shape = across.max(axis=0) + 2
@@ -168,11 +159,8 @@ class PointColumns:
         return PointColumns(points[order], order, start[:-1].reshape(shape), low, reach_mm)
 
     def find_nearest(self, queries: Array, count: int) -> tuple[Array, Indices]:
-        """Find the nearest points to queries (M, 3).
-
-        Distances (M, count) mm, ascending, infinite if fewer points lie within the reach; and their
-        indices (M, count), N for missing ones.
-        """
+        """Find the nearest points to queries (M, 3): distances (M, count) mm, ascending,
+        infinite beyond the reach, and indices (M, count), N for missing ones."""
         distance = np.full((len(queries), count), np.inf)
         near = np.full((len(queries), count), len(self.points))
 

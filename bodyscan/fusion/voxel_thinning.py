@@ -36,10 +36,8 @@ class Samples:
 
 
 def take_samples(surfaces: Sequence[SmoothSurface], points: int) -> Samples:
-    """About `points` evenly spread samples of all surfaces.
-
-    Raises ScanFailed if there are next to no points.
-    """
+    """About `points` evenly spread samples of all surfaces. Raises ScanFailed if these show next
+    to nothing."""
     ends = np.cumsum([0, *(len(surface.points) for surface in surfaces)])
     if ends[-1] < 1000:
         raise ScanFailed(
@@ -73,9 +71,8 @@ def take_samples(surfaces: Sequence[SmoothSurface], points: int) -> Samples:
 def find_voxel_size(points: Floats, wanted: int) -> float:
     """Find the edge (mm) of voxels of which about `wanted` are occupied by points (N, 3) mm.
 
-    The number of voxels that a surface occupies is inversely proportional to the square of their
-    edge, as long as points are closer than that; up to four corrections settle the rest. Of more
-    than 300,000 points one layer of blocks in four is counted.
+    Their number is inversely proportional to the square of their edge; up to four corrections
+    settle the rest. Of more than 300,000 points one layer of blocks in four is counted.
     """
     size = 1.2
     box = _bounds(points)
@@ -90,10 +87,8 @@ def find_voxel_size(points: Floats, wanted: int) -> float:
 
 
 def select_per_voxel(points: Floats, second_rate: Mask, voxel_mm: float) -> NDArray[np.intp]:
-    """Select one point in each occupied voxel, the nearest to its centre; return their indices.
-
-    second_rate: points taken only where a voxel has no other, (N,).
-    """
+    """Select one point in each occupied voxel, the nearest to its centre, second-rate ones (N,)
+    only where there is no other; return their indices."""
     box, scale = _bounds(points), np.float32(1.0 / voxel_mm)
     chosen = np.zeros(len(points), np.bool_)
 
@@ -112,8 +107,7 @@ def select_per_voxel(points: Floats, second_rate: Mask, voxel_mm: float) -> NDAr
 class _Voxels:
     """The voxels that points lie in, numbered by blocks, so that neighbours are close in memory.
 
-    point: index of a point, (M,).
-    number: number of its voxel, (M,).
+    point, number: index of a point and number of its voxel, (M,).
     count: how many numbers there are.
     """
 

@@ -49,9 +49,8 @@ def measure_coverage(
 class _View:
     """One camera's view of N points of the mesh; masks (N,).
 
-    visible: inside its image and facing it by 60 degrees or less, so that it should measure them.
-    valid: at whose pixel it measured something.
-    measured: which it measured themselves.
+    visible: inside its image and facing it by 60 degrees or less.
+    valid, measured: at whose pixel it measured something, and which it measured themselves.
     white: white in its lit image.
     """
 
@@ -142,10 +141,7 @@ def check_gaps(scan: ScanEvidence) -> Iterator[Finding]:
 
 
 def check_crown(scan: ScanEvidence) -> Iterator[Finding]:
-    """A crown that was not measured, and may be higher by the 4 mm that ISO 20685-1 allows.
-
-    Curls that were measured are not convex: no plane bounds them, and none has to.
-    """
+    """A crown that was not measured, and may be higher by the 4 mm that ISO 20685-1 allows."""
     coverage = scan.coverage
     if coverage is None or (scan.mesh and _sees_one_side(scan)):
         return

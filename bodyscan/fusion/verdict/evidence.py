@@ -66,9 +66,9 @@ class Seam:
 
 @dataclass(frozen=True, eq=False)
 class SeamReport:
-    """The seams of a scan.
+    """The seams of a scan, and the groups (poles and single pairs) that may have moved by
+    themselves.
 
-    groups: poles and single pairs, which may have moved by themselves, by name.
     isolated: groups of pairs that share no surface with the largest: their poses are not checked.
     """
 
@@ -101,12 +101,10 @@ class ImageEvidence:
 class Coverage:
     """A sample of N faces of the mesh, and how much of them each pair measured.
 
-    heights_mm: heights of the faces, (N,).
-    areas_mm2: areas that they stand for, (N,).
+    heights_mm, areas_mm2: heights of the faces, and areas that they stand for, (N,).
     filled: whether no pair measured them, (N,).
-    yields: by pair, the share that it measured of the faces that it sees and others measured; pairs
-        that see next to nothing are left out.
-    saturated: by pair, share of those faces that are white in its lit image.
+    yields, saturated: by pair, shares that it measured, and that are white in its lit image, of the
+        faces that it sees and others measured.
     """
 
     heights_mm: Array
@@ -124,7 +122,6 @@ class Coverage:
 class ScanEvidence:
     """Everything that the checks of a scan look at.
 
-    use: how wrong a girth may be.
     together: the result of alignment; None if it took no part.
     person: how a moving body moved.
     mesh, coverage: None while there is no mesh; findings that need it are then left out.

@@ -20,9 +20,8 @@ MAX_MOTION_MM = MAX_RESIDUAL_MM / UNCORRECTED_SHARE
 def check_displaced_poles(scan: ScanEvidence) -> Iterator[Finding]:
     """Poles and pairs that alignment found displaced, and corrected.
 
-    What the correction left shows at the seams. But whether a single pair moved or measures wrongly
-    (another lens, rows lost), which no pose corrects, cannot be determined; and if several moved,
-    the overlaps alone determine the body's size.
+    What the correction left shows at the seams. But a single pair may instead measure wrongly, and
+    if several moved, the overlaps alone determine the body's size.
     """
     steps = scan.together.displaced if scan.together else ()
     for step in steps:
@@ -62,10 +61,7 @@ def check_size(scan: ScanEvidence) -> Iterator[Finding]:
 
 
 def check_displaced_pairs(scan: ScanEvidence) -> Iterator[Finding]:
-    """Pairs displaced by more than sway and their calibration's errors explain.
-
-    A head or arms that move by themselves may have the same effect.
-    """
+    """Pairs displaced by more than sway and their calibration's errors explain."""
     if scan.together is None:
         return
     search = scan.together.search
@@ -84,11 +80,8 @@ def check_displaced_pairs(scan: ScanEvidence) -> Iterator[Finding]:
 
 
 def check_motion(scan: ScanEvidence) -> Iterator[Finding]:
-    """The effect of motion on girths.
-
-    If the person was followed, of what that left; otherwise of how far the pairs were moved, beyond
-    what their own pose errors explain.
-    """
+    """The effect of motion on girths: of what following the person left, or of how far the pairs
+    were moved beyond what their own pose errors explain."""
     alignment = None if scan.poses_corrected else scan.alignment
     usable_mm = scan.use.usable_girth_mm
     for part in scan.person.parts if scan.person else ():
