@@ -38,7 +38,16 @@ def test_a_rig_is_loaded_without_what_fuses() -> None:
 def test_every_name_is_there_and_says_what_it_is(name: str) -> None:
     assert getattr(bodyscan, name) is getattr(api, name)
     assert getattr(bodyscan, name).__doc__
-    assert name in dir(bodyscan)
+
+
+def test_the_list_is_sorted_short_and_all_that_shows() -> None:
+    given: dict[str, object] = {}
+    exec("from bodyscan import *", given)
+    assert set(api.__all__) <= set(given)
+    assert dir(bodyscan) == sorted([*api.__all__, "__version__"])
+    assert api.__all__ == sorted(api.__all__)
+    assert len(api.__all__) < 32
+    assert (Path(bodyscan.__file__).parent / "py.typed").is_file()
 
 
 def test_no_name_is_that_of_a_room() -> None:
@@ -47,25 +56,10 @@ def test_no_name_is_that_of_a_room() -> None:
     assert not rooms & set(api.__all__)
 
 
-def test_the_list_is_sorted_and_short() -> None:
-    assert api.__all__ == sorted(api.__all__)
-    assert len(api.__all__) < 32
-
-
 @pytest.mark.parametrize("word", ["scann", "Path", "silent"])
 def test_a_word_that_is_no_name_is_refused(word: str) -> None:
     with pytest.raises(AttributeError, match=word):
         getattr(bodyscan, word)
-
-
-def test_the_list_is_all_that_shows() -> None:
-    assert dir(bodyscan) == sorted([*api.__all__, "__version__"])
-
-
-def test_star_gives_the_list() -> None:
-    given: dict[str, object] = {}
-    exec("from bodyscan import *", given)
-    assert set(api.__all__) <= set(given)
 
 
 def test_the_examples_run(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -78,7 +72,3 @@ def test_the_examples_run(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_page_names_every_name() -> None:
     page = (PROJECT / "docs" / "api.md").read_text("utf-8")
     assert [name for name in api.__all__ if f"`{name}`" not in page] == []
-
-
-def test_the_package_says_that_it_is_typed() -> None:
-    assert (Path(bodyscan.__file__).parent / "py.typed").is_file()

@@ -7,6 +7,7 @@ import re
 from pathlib import Path
 
 import pytest
+from slow_files import SLOW
 
 PROJECT = Path(__file__).parents[1]
 DOCUMENTS = sorted([*PROJECT.glob("*.md"), *PROJECT.glob("docs/**/*.md")])
@@ -51,3 +52,7 @@ def test_a_room_says_where_each_of_its_files_belongs(room: Path) -> None:
     assert files - named == set()
     assert {name for name in named if "_" in name} - files - folders == set()
     assert files - named == set()
+
+
+def test_every_file_in_the_list_of_slow_tests_is_there() -> None:
+    assert [name for name in SLOW if not (PROJECT / "tests" / name).is_file()] == []

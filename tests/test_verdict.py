@@ -2,28 +2,18 @@
 
 from __future__ import annotations
 
-import pytest
+from typing import get_args
 
-from bodyscan.verdict import Grade, Mark, Verdict
-
-
-@pytest.mark.parametrize(
-    ("grade", "mark"),
-    [
-        ("good", "good"),
-        ("accepted", "good"),
-        ("usable", "usable"),
-        ("not judged", "usable"),
-        ("repeat", "bad"),
-        ("recalibrate", "bad"),
-        ("not accepted", "bad"),
-    ],
-)
-def test_every_grade_is_good_usable_or_bad(grade: Grade, mark: Mark) -> None:
-    assert Verdict(grade).mark == mark
+from bodyscan.verdict import Grade, Verdict
 
 
-def test_reasons_follow_the_grade_line_by_line() -> None:
+def test_every_grade_is_good_usable_or_bad() -> None:
+    marks = {grade: Verdict(grade).mark for grade in get_args(Grade)}
+    assert marks == {
+        **dict.fromkeys(("good", "accepted"), "good"),
+        **dict.fromkeys(("usable", "not judged"), "usable"),
+        **dict.fromkeys(("repeat", "recalibrate", "not accepted"), "bad"),
+    }
     assert str(Verdict("usable", ("dark hair", "a hand on the hip"))) == (
         "verdict: usable\n  dark hair\n  a hand on the hip"
     )

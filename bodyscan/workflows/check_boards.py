@@ -47,13 +47,9 @@ class StripeOffset:
 
 @dataclass(frozen=True, eq=False)
 class BoardCheck:
-    """What shots of a board tell about a calibrated rig.
+    """The drift of cameras and the stripe offsets of projectors, from shots of a board.
 
-    drift: of the cameras.
-    stripes: of the projectors whose stripes were taken on a board.
-    checked: pairs that saw a board.
-    unchecked: calibrated pairs that did not.
-    notes: what was dropped.
+    checked, unchecked: calibrated pairs that saw a board, and that did not.
     """
 
     drift: Drift
@@ -98,7 +94,6 @@ def check_boards(
 def _nothing_to_compare(
     captures: Captures, located: Sequence[LocatedView], notes: Sequence[str]
 ) -> BoardNotFound:
-    """The error for captures that show nothing to compare the rig with, and every note so far."""
     symmetric = sorted({view.board for view in located if view.ambiguous})
     what = (
         f"board {', '.join(symmetric)} looks the same when turned by 180 degrees, so cameras cannot "
@@ -129,12 +124,8 @@ def apply_moves(calibration: RigCalibration, moves: Sequence[Move]) -> RigCalibr
         poses |= {pair: move.motion @ poses[pair] for pair in pairs}
         covariance = covariance.add_common_motion(pairs, move.covariance)
     notes = tuple(f"repaired: {move_line(move)}" for move in moves)
-    return replace(
-        calibration,
-        rig_from_camera=poses,
-        covariance=covariance,
-        notes=(*calibration.notes, *notes),
-    )
+    notes = (*calibration.notes, *notes)
+    return replace(calibration, rig_from_camera=poses, covariance=covariance, notes=notes)
 
 
 def move_line(move: Move) -> str:
@@ -177,11 +168,10 @@ def _stripe_offsets(
     parts: dict[str, list[Array]] = defaultdict(list)
     for key, boundaries in decoded.value.items():
         parts[key[0]].append(_stripe_distances(calibration, known[key], boundaries))
-    offsets = [_offset(pair, np.concatenate(rows)) for pair, rows in sorted(parts.items())]
+    rows = {pair: np.concatenate(found) for pair, found in sorted(parts.items())}
+    offsets = tuple(_offset(pair, found) for pair, found in rows.items() if len(found) >= 100)
     lost = (f"{pair}: {reason}" for pair, reason in decoded.failures.items())
-    return Outcome(
-        tuple(offset for offset in offsets if offset is not None), (*decoded.notes, *lost)
-    )
+    return Outcome(offsets, (*decoded.notes, *lost))
 
 
 def _stripe_distances(
@@ -208,10 +198,8 @@ def _stripe_distances(
     return rows[np.all(np.isfinite(rows), axis=1)]
 
 
-def _offset(pair: str, rows: Array) -> StripeOffset | None:
-    """Medians of such distances over all boards; None for fewer than 100 boundaries."""
-    if len(rows) < 100:
-        return None
+def _offset(pair: str, rows: Array) -> StripeOffset:
+    """Medians of such distances over all boards."""
     away, across, sigma = rows.T
     low, high = across < -0.4, across > 0.4
     tilt = 0.0

@@ -59,16 +59,14 @@ def check_rig(
 ) -> Findings:
     """Check a rig with folders of one kind: shots of the board, or scans of people.
 
-    follow_links: follow links even if the calibration's rig file does not allow it.
-
     Raises CaptureError for folders without captures, BadInput for a mixture of kinds,
     BoardNotFound, and ScanFailed if nobody is in a scan.
     """
     if follow_links:
         described = calibration.rig.model_copy(update={"follow_links": True})
         calibration = replace(calibration, rig=described)
-    captures = [open_check(calibration.rig, folder) for folder in folders]
-    kinds = {kind for kind, _ in captures}
+    opened = [open_check(calibration.rig, folder) for folder in folders]
+    kinds, captures = {kind for kind, _ in opened}, [found for _, found in opened]
     if len(kinds) > 1:
         raise BadInput(
             "shots of boards and scans of people cannot be checked together",
@@ -76,8 +74,8 @@ def check_rig(
             remedy="check one kind at a time",
         )
     if kinds == {"scan"}:
-        return describe_scan_check(check_scans(calibration, [one for _, one in captures], progress))
-    shots = join_captures(tuple(number_shots([one for _, one in captures])))
+        return describe_scan_check(check_scans(calibration, captures, progress))
+    shots = join_captures(tuple(number_shots(captures)))
     return describe_board_check(calibration, check_boards(calibration, shots, progress))
 
 
@@ -99,16 +97,11 @@ def describe_board_check(calibration: RigCalibration, check: BoardCheck) -> Find
     """Put the check by boards into words."""
     drift = check.drift
     shared = bool(drift.rig_from_board)
-    if check.valid:
-        lines = [
-            "valid: all that see the board agree"
-            if shared
-            else "valid: the stripes lie on the board"
-        ]
-    elif drift.moves:
-        lines = ["NOT valid: something moved; --repair writes a corrected calibration"]
-    else:
-        lines = ["NOT valid: the stripes do not lie on the board"]
+    agreed = "all that see the board agree" if shared else "the stripes lie on the board"
+    wrong = "the stripes do not lie on the board"
+    if drift.moves:
+        wrong = "something moved; --repair writes a corrected calibration"
+    lines = [f"valid: {agreed}" if check.valid else f"NOT valid: {wrong}"]
     lines += [move_line(move) for move in drift.moves]
     for offset in filter(lambda offset: offset.moved, check.stripes):
         imported = calibration.pairs[offset.pair].quality.imported
@@ -133,16 +126,14 @@ def describe_board_check(calibration: RigCalibration, check: BoardCheck) -> Find
     if check.unchecked:
         lines.append(f"not checked, because they saw no board: {', '.join(check.unchecked)}")
     if drift.lonely:
-        lines.append(
-            f"not checked, because no other pair saw their board: {', '.join(drift.lonely)}"
-        )
+        lonely = ", ".join(drift.lonely)
+        lines.append(f"not checked, because no other pair saw their board: {lonely}")
     return Findings(check, (*lines, *(f"note: {note}" for note in check.notes)))
 
 
 def describe_scan_check(check: ScanCheck) -> Findings:
     """Put the check by scans into words."""
     step = check.search.found
-    moved = [drift for drift in (*check.poles, *check.pairs) if drift.moved]
     count = len(check.before_mm)
     scans = "1 scan" if count == 1 else f"{count} scans"
     if not check.valid:
@@ -174,8 +165,8 @@ def describe_scan_check(check: ScanCheck) -> Findings:
             f"{step.name} is displaced by {step.shift_mm:.1f} mm and rotated by "
             f"{step.rotation_deg:.2f} degrees"
         )
-    for drift in moved:
-        if step is None or drift.pair not in step.name:
+    for drift in (*check.poles, *check.pairs):
+        if drift.moved and (step is None or drift.pair not in step.name):
             lines.append(f"{drift.pair}: {drift.shift_mm:.2f} mm (sigma {drift.sigma_mm:.2f})")
     before, after = max(check.before_mm), max(check.after_mm)
     if np.isfinite(before):

@@ -79,10 +79,8 @@ def decode_sequence(
             where=where,
         )
 
-    first_direction = (
-        sequence.without_crossing,
-        pair.projector.model_copy(update={"crossing": None}),
-    )
+    one_way = pair.projector.model_copy(update={"crossing": None})
+    first_direction = (sequence.without_crossing, one_way)
     if sequence.lacks_crossing:
         fault = f"images are missing, such as {sequence.missing[0]}"
         return replace(decode(*first_direction), crossing_fault=fault)
@@ -176,9 +174,8 @@ def decode_pairs(
     for name in {s.pair for s in sequences}:
         of_pair = [v for (pair, _), group in wanted.items() if pair == name for v in group]
         step[name] = prints.band_step(rig.pair(name), of_pair) if prints else 1
-    turn = {
-        s: captures.pair_sequences(s.pair).index(s) for s in sequences
-    }  # shots take turns in bands
+    # Shots take turns in bands.
+    turn = {s: captures.pair_sequences(s.pair).index(s) for s in sequences}
 
     def decode(sequence: ImageSequence) -> BoardStripes:
         pair, group = rig.pair(sequence.pair), wanted[sequence.pair, sequence.shot]

@@ -46,7 +46,7 @@ from bodyscan.registration.board_checks import (
     drop_inconsistently_mirrored,
 )
 from bodyscan.registration.soundness import camera_faults
-from bodyscan.rig.pair import AUTO, Known
+from bodyscan.rig.pair import AUTO, Pair
 from bodyscan.rig.rig import Rig
 
 HERE = Path()
@@ -91,17 +91,14 @@ def find_all_boards(rig: Rig, captures: Captures, progress: Progress = silent) -
         for sequence, (found, error) in zip(captures.sequences, results, strict=True)
         if not found and error is None and sequence.board_path not in captures.corners
     ]
-    looked_at = _look_closer(rig, views, without)
+    shown = _look_closer(rig, views, without)
     missing = [
         f"{s.board_path} (pair {s.pair}, shot {s.shot}): no board found"
-        + (f": {looked_at[s]}" if s in looked_at else "")
+        + (f": {shown[s]}" if s in shown else "")
         for s in without
     ]
-    refused = {
-        sequence: error
-        for sequence, (_, error) in zip(captures.sequences, results, strict=True)
-        if error is not None
-    }
+    errors = zip(captures.sequences, (error for _, error in results), strict=True)
+    refused = {sequence: error for sequence, error in errors if error is not None}
     notes = (*map(str, refused.values()), *missing, *odd, *appearance_notes(rig, views))
     return FoundBoards(views, notes, refused=refused)
 
@@ -120,13 +117,9 @@ def _given_view(rig: Rig, captures: Captures, sequence: ImageSequence) -> list[B
     camera = rig.pair(sequence.pair).camera
     pixels = np.array(captures.corners[sequence.board_path]).reshape(-1, 2)
     view = number_corners(
-        pixels,
-        rig.boards[0],
-        (camera.width, camera.height),
-        pair=sequence.pair,
-        shot=sequence.shot,
-        where=str(sequence.board_path),
-    )
+        pixels, rig.boards[0], (camera.width, camera.height),
+        pair=sequence.pair, shot=sequence.shot, where=str(sequence.board_path),
+    )  # fmt: skip
     return [] if view is None else [view]
 
 
@@ -218,17 +211,16 @@ def calibrate_cameras(
         calibrate, names, BodyscanError, stage="calibrating cameras", progress=progress
     )
     notes = [
-        line
-        for name, found in cameras.items()
-        for known in [rig.pair(name).known]
-        if known is not None
-        for line in _known_notes(name, known, found)
+        line for name, found in cameras.items() for line in _known_notes(rig.pair(name), found)
     ]
     failures = {name: str(error) for name, error in errors.items()}
     return Outcome(cameras, tuple(notes), failures)
 
 
-def _known_notes(name: str, known: Known, found: CameraCalibration) -> Iterator[str]:
+def _known_notes(pair: Pair, found: CameraCalibration) -> Iterator[str]:
+    known, name = pair.known, pair.name
+    if known is None:
+        return
     use = "fixed" if known.sigma_px is None else f"a prior of sigma {known.sigma_px:g} px"
     yield f"{name}: camera from {known.file} ({known.format}), {use}"
     if found.rms_px > 1.0:

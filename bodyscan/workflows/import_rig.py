@@ -58,7 +58,13 @@ def import_rig(rig: Rig, folder: Path, sigma_px: float | None = None) -> RigCali
         raise next(iter(failed.values()))
     if sigma_px is not None:
         known = {name: replace(one, sigma_px=sigma_px) for name, one in known.items()}
-    rig_from_camera = _rig_from_camera(rig, known)
+    rig_from_camera = {
+        name: (one.camera_from_world or RigidTransform.identity()).inverse()
+        for name, one in known.items()
+    }
+    rig_frame = rig_from_world(rig, rig_from_camera)
+    if rig_frame is not None:
+        rig_from_camera = {name: rig_frame @ pose for name, pose in rig_from_camera.items()}
     return RigCalibration(
         rig,
         {name: _calibration_of(rig.pair(name), one) for name, one in known.items()},
@@ -66,7 +72,15 @@ def import_rig(rig: Rig, folder: Path, sigma_px: float | None = None) -> RigCali
         _covariance(known, rig_from_camera),
         {},
         {name: make_paths_relative(str(error), folder) for name, error in failed.items()},
-        tuple(_note(name, one) for name, one in known.items()),
+        tuple(
+            f"{name}: imported from {one.source}; "
+            + (
+                "its accuracy is not known: sigmas of scans cover the decoding alone"
+                if one.sigma_px is None
+                else f"taken to be accurate to {one.sigma_px:g} px"
+            )
+            for name, one in known.items()
+        ),
     )
 
 
@@ -106,18 +120,6 @@ def _read(pair: Pair, folder: Path, *, several: bool) -> KnownPair:
     return known
 
 
-def _rig_from_camera(rig: Rig, known: dict[str, KnownPair]) -> dict[str, RigidTransform]:
-    """`rig_from_camera` of each pair."""
-    world_from_camera = {
-        name: (one.camera_from_world or RigidTransform.identity()).inverse()
-        for name, one in known.items()
-    }
-    carried = rig_from_world(rig, world_from_camera)
-    if carried is None:
-        return world_from_camera
-    return {name: carried @ pose for name, pose in world_from_camera.items()}
-
-
 def _calibration_of(pair: Pair, known: KnownPair) -> PairCalibration:
     camera, code = known.camera, pair.projector
     covariance = np.zeros((len(camera.parameters),) * 2)
@@ -149,13 +151,3 @@ def _covariance(
         to_rig: Array = adjoint(rig_from_camera[name])
         matrix[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = to_rig @ np.diag(sigmas**2) @ to_rig.T
     return PoseCovariance(names, matrix)
-
-
-def _note(name: str, known: KnownPair) -> str:
-    """Say where a pair's calibration comes from, and how accurate it is."""
-    exact = (
-        "its accuracy is not known: sigmas of scans cover the decoding alone"
-        if known.sigma_px is None
-        else f"taken to be accurate to {known.sigma_px:g} px"
-    )
-    return f"{name}: imported from {known.source}; {exact}"

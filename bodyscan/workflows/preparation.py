@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 
 from bodyscan.captures.captures_file import FILE_NAME
@@ -22,12 +21,8 @@ from bodyscan.workflows.range_images import Reconstructed, reconstruct_sequence
 Stamp = tuple[int, int]
 
 
-@dataclass(frozen=True, eq=False)
-class _Made:
-    """A range image and the stamps (size, time of change) of the files it was made from."""
-
-    range_image: Reconstructed
-    stamps: tuple[Stamp, ...]
+_Made = tuple[Reconstructed, tuple[Stamp, ...]]
+"""A range image and the stamps (size, time of change) of the files it was made from."""
 
 
 class Preparation:
@@ -57,7 +52,7 @@ class Preparation:
                 made = reconstruct_sequence(self.calibration, captures, sequence, volume_only=True)
             except BodyscanError:
                 return None
-            return _Made(made, stamps)
+            return made, stamps
 
         started = self._made.setdefault(folder, {})
         started |= {sequence: self._pool.submit(make, sequence) for sequence in wanted}
@@ -72,9 +67,9 @@ class Preparation:
             made |= self._made.pop(folder, {})
         found = {sequence: one.result() for sequence, one in made.items()}
         return {
-            sequence: one.range_image
+            sequence: one[0]
             for sequence, one in found.items()
-            if one is not None and _stamps(captures, sequence) == one.stamps
+            if one is not None and _stamps(captures, sequence) == one[1]
         }
 
     def _is_whole(self, sequence: ImageSequence) -> bool:

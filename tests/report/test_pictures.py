@@ -93,11 +93,6 @@ def test_faces_turned_inside_out_are_magenta() -> None:
     assert np.mean(strongly(wrong, 2, 1)[shown]) > 0.9
 
 
-def test_several_views_stand_side_by_side() -> None:
-    one, two = (read(draw_mesh(ball(), ["front"] * n, height_px=300)) for n in (1, 2))
-    assert (two == np.concatenate([one, one], axis=1)).all()
-
-
 def test_the_side_facing_away_is_hidden() -> None:
     picture = read(draw_cloud(dots(), ["front", "back"], height_px=300))
     front, back = np.split(picture, 2, axis=1)
@@ -135,11 +130,6 @@ def test_deviations_are_red_outside_and_blue_inside() -> None:
     middle = (picture.shape[1] - 130) // 2
     assert strongly(picture[80:140, middle], 2, 0).mean() > 0.9
     assert strongly(picture[160:220, middle], 0, 2).mean() > 0.9
-
-
-def test_unknown_colours_are_refused() -> None:
-    with pytest.raises(ValueError, match="pink"):
-        draw_cloud(dots(100), colour="pink")
 
 
 @pytest.mark.parametrize(

@@ -36,15 +36,11 @@ def calibrated(
     return RigCalibration(ring_rig(placings), pairs, placings, covariance, {}, {}, ())
 
 
-def test_independent_shifts_average_out() -> None:
+def test_independent_shifts_average_out_and_shifts_in_common_do_not() -> None:
     placings, cameras = ring_of_cameras(heights=(1000,))
     sigma, seen = sigma_at(MIDDLE, placings, cameras, shifts(placings, 0.3), ())
     assert seen[0] == 3
     assert sigma[0] == pytest.approx(0.3 * np.sqrt(3) / np.sqrt(3))  # three axes, three pairs
-
-
-def test_shifts_in_common_do_not() -> None:
-    placings, cameras = ring_of_cameras(heights=(1000,))
     own = np.diag([0.0, 0.0, 0.0, *[0.3**2] * 3])
     together = PoseCovariance(tuple(placings), np.kron(np.ones((3, 3)), own).astype(float))
     sigma, _ = sigma_at(MIDDLE, placings, cameras, together, ())

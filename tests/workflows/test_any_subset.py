@@ -43,10 +43,6 @@ def calibrated(boards: SeenBoards, views: Views) -> RigCalibration:
     return found
 
 
-def as_they_are(views: Views, _: np.random.Generator) -> Views:
-    return views
-
-
 def mixed_up(views: Views, rng: np.random.Generator) -> Views:
     """The corners of every fifth view in another order."""
     return [
@@ -101,7 +97,7 @@ def test_any_subset_gives_a_calibration_or_a_refusal(
     pairs = set(boards.placings) - without(data, sorted(boards.placings), "pairs")
     kept = set(shots) - without(data, shots, "shots")
     share = data.draw(st.sampled_from([1.0, 0.8, 0.5, 0.3]), "share of the views")
-    spoil: Spoiling = data.draw(st.sampled_from([as_they_are, mixed_up, moved, bent, cut]))
+    spoil: Spoiling | None = data.draw(st.sampled_from([None, mixed_up, moved, bent, cut]))
     by_board = data.draw(st.booleans(), "a board holds the frame")
     rng = np.random.default_rng(data.draw(st.integers(0, 99), "seed"))
     views = [v for v in boards.views if v.pair in pairs and v.shot in kept and rng.random() < share]
@@ -109,7 +105,7 @@ def test_any_subset_gives_a_calibration_or_a_refusal(
         frame = RigFrame(shot=min(kept), board=boards.rig.boards[0].name)
         boards = replace(boards, rig=boards.rig.model_copy(update={"rig_frame": frame}))
     try:
-        found = calibrated(boards, spoil(views, rng))
+        found = calibrated(boards, spoil(views, rng) if spoil else views)
     except BodyscanError:
         return
     assert set(found.pairs) <= pairs
@@ -213,15 +209,6 @@ def test_shots_that_one_camera_saw_tie_nothing_together() -> None:
         v for v in boards.views if int(v.shot[1:]) < 5 or v.pair == names[int(v.shot[1:]) % 4]
     ]
     assert sorted(calibrated(boards, shared).pairs) == names
-    # Three shots of each camera, none of them with another.
-    more = seen(3, shots=9)
-    single = [v for v in more.views if v.pair == f"c{1 + int(v.shot[1:]) % 3}"]
-    with pytest.raises(RigDisconnected, match="no shared board view ties"):
-        calibrated(more, single)
-
-
-def test_halves_of_the_rig_that_share_nothing_are_named() -> None:
-    boards = seen(4, shots=10)
     apart = [v for v in boards.views if (v.pair in ("c1", "c2")) == (int(v.shot[1:]) % 2 == 0)]
     with pytest.raises(RigDisconnected, match="c1, c2 to c3, c4"):
         calibrated(boards, apart)

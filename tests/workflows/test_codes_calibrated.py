@@ -9,20 +9,20 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from small_workspace import PROJECT, run
+from small_workspace import PROJECT, Workspace, run
 
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.storage import load_calibration
 
 
-def workspace(folder: Path, **code: object) -> Path:
+def simulate_pair(folder: Path, *more: object, **code: object) -> Path:
     """rigs/one-pair.yaml with another code, simulated, checked and calibrated by the commands."""
     rig = yaml.safe_load((PROJECT / "rigs" / "one-pair.yaml").read_text("utf-8"))
     rig["pairs"][0]["projector"] |= code
     (folder / "code.yaml").write_text(yaml.safe_dump(rig), "utf-8")
     out, size = folder / "work", ("--scale", 0.3, "--board-shots", 4, "--preset", "ideal")
     for command in (
-        ("simulate", folder / "code.yaml", "--out", out, *size),
+        ("simulate", folder / "code.yaml", "--out", out, *size, *more),
         ("check", out / "rig.yaml"),
         ("calibrate-rig", out / "rig.yaml"),
     ):
@@ -88,8 +88,27 @@ def misfit(points: np.ndarray, model: np.ndarray) -> np.ndarray:
 def test_a_pair_is_calibrated_with_each_code(
     tmp_path: Path, code: dict[str, Any], rms_mm: float
 ) -> None:
-    folder = workspace(tmp_path, **code)
+    folder = simulate_pair(tmp_path, **code)
     calibration = load_calibration(folder / "calibration")
     errors = board_errors(folder, calibration)
     assert len(errors) > 4 * 50
     assert np.sqrt(np.mean(errors**2)) < rms_mm
+
+
+def test_held_out_boards_choose_a_lens_for_a_lens_and_none_for_a_mirror(
+    workspace: Workspace, tmp_path: Path
+) -> None:
+    size = ("--scale", 0.4, "--board-shots", 6)
+    folder = simulate_pair(tmp_path, "--projector", "pinhole", *size)
+    quality = load_calibration(folder / "calibration").pairs["pair"].quality
+    assert quality.light_model in ("lens k1 k2", "lens k1 k2 p1 p2")
+    errors = {tried.model: tried.mean_mm for tried in quality.held_out}
+    planes = min(errors["free planes"], errors["smooth planes"])
+    assert planes > 1.5 * errors[quality.light_model]
+    for pair in load_calibration(workspace.folder / "calibration").pairs.values():
+        quality = pair.quality
+        assert quality.light_model is not None
+        assert "planes" in quality.light_model or "sheets" in quality.light_model
+        errors = {tried.model: tried.mean_mm for tried in quality.held_out}
+        lens = min(mean for model, mean in errors.items() if "lens" in model)
+        assert lens > 3.0 * errors[quality.light_model]

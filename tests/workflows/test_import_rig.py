@@ -70,14 +70,8 @@ def write_storage(path: Path, *, millimetres: float = 1.0) -> None:
 
 
 def nodes(what: str, pair: str) -> dict[str, str]:
-    keys = (
-        ("matrix", "K"),
-        ("distortion", "D"),
-        ("size", "S"),
-        ("rotation", "R"),
-        ("translation", "T"),
-    )
-    return {key: f"{node}_{what}_{pair}" for key, node in keys}
+    keys = ("matrix", "distortion", "size", "rotation", "translation")
+    return {key: f"{node}_{what}_{pair}" for key, node in zip(keys, "KDSRT", strict=True)}
 
 
 def described(*pairs: str, **changed: Any) -> dict[str, Any]:
@@ -131,33 +125,29 @@ def test_what_is_scanned_lies_where_it_is(folder: Path) -> None:
     assert calibration.covariance.names == ("a", "b")
 
 
-def test_a_lens_that_is_not_the_cameras_is_named(folder: Path) -> None:
-    """A camera given a distortion that folds its picture: no ray anywhere, and no numpy warning."""
-    content = described("a")
-    store = cv2.FileStorage(str(folder / "folds.yaml"), cv2.FILE_STORAGE_WRITE)
-    for key, value in (("K", CAMERA), ("D", np.array([-9.0, 0.0, 0.0, 0.0, 0.0]))):
-        store.write(key, value)
-    store.release()
-    content["pairs"][0]["known"]["camera"] = {"matrix": "K", "distortion": "D"}
-    content["pairs"][0]["known"]["file"] = "folds.yaml"
-    content["pairs"][0]["known"]["projector"]["file"] = "foreign.yaml"
-    rig_file = write_rig_file(folder, content)
-    with pytest.raises(CalibrationFileError, match=r"folds.yaml.*folds inside a picture"):
-        import_rig(load_rig(rig_file), folder)
-
-
-def test_an_axis_far_beside_the_picture_is_named_though_the_size_fits(folder: Path) -> None:
-    shifted = CAMERA.copy()
-    shifted[0, 2] = 5000.0
-    store = cv2.FileStorage(str(folder / "far.yaml"), cv2.FILE_STORAGE_WRITE)
-    store.write("K", shifted)
-    store.write("S", np.array(SIZES["camera"]))
+@pytest.mark.parametrize(
+    ("what", "node", "value", "said"),
+    [
+        # No ray anywhere, and no numpy warning.
+        ("distortion", "D", np.array([-9.0, 0, 0, 0, 0]), r"odd.yaml.*folds inside a picture"),
+        ("size", "S", np.array(SIZES["camera"]), "principal point"),
+    ],
+)
+def test_a_lens_or_an_axis_that_is_not_the_cameras_is_named(
+    folder: Path, what: str, node: str, value: Array, said: str
+) -> None:
+    matrix = CAMERA.copy()
+    if what == "size":
+        matrix[0, 2] = 5000.0
+    store = cv2.FileStorage(str(folder / "odd.yaml"), cv2.FILE_STORAGE_WRITE)
+    store.write("K", matrix)
+    store.write(node, value)
     store.release()
     content = described("a")
-    content["pairs"][0]["known"]["camera"] = {"matrix": "K", "size": "S"}
-    content["pairs"][0]["known"]["file"] = "far.yaml"
-    content["pairs"][0]["known"]["projector"]["file"] = "foreign.yaml"
-    with pytest.raises(CalibrationFileError, match="principal point"):
+    known = content["pairs"][0]["known"]
+    known |= {"camera": {"matrix": "K", what: node}, "file": "odd.yaml"}
+    known["projector"]["file"] = "foreign.yaml"
+    with pytest.raises(CalibrationFileError, match=said):
         import_rig(load_rig(write_rig_file(folder, content)), folder)
 
 
@@ -291,10 +281,7 @@ def test_a_mirrored_or_endless_pose_is_named(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (
-            {"format": "opencvv"},
-            r"rig.yaml:\d+:\d+: pairs\[0\].known.format: .*did you mean 'opencv'",
-        ),
+        ({"format": "opencvv"}, r"rig.yaml:\d+:\d+: pairs\[0\].known.format: .*mean 'opencv'"),
         ({"units": "inch"}, r"pairs\[0\].known.units: must be 'mm', 'cm' or 'm'"),
         ({"format": "kalibr"}, r"pairs\[0\].known.camera.matrix: is for format: opencv"),
         ({"sigma_px": 0}, r"pairs\[0\].known.sigma_px: must be greater than 0"),
@@ -302,12 +289,10 @@ def test_a_mirrored_or_endless_pose_is_named(folder: Path) -> None:
         ({"camera": {"matrix": "K", "rotation": "R"}}, r"known.camera.translation: is missing"),
         ({"camera": {"matrix": "K", "name": "a"}}, r"known.camera.name: is for files that name"),
         ({"camera": {"matrix": "K", "width": "w"}}, r"known.camera.height: is missing"),
-        (
-            {"camera": {"matrix": "K", "size": "s", "width": "w", "height": "h"}},
-            r"known.camera.size: is said twice",
-        ),
+        ({"camera": {"matrix": "K", "size": "s", "width": "w", "height": "h"}}, r"is said twice"),
         ({"camera": {"matrx": "K"}}, r"known.camera.matrx: is not a key.*did you mean 'matrix'"),
         ({"projector": {}}, r"known.projector: does not say which"),
+        ({}, r"known.projector: needs a projector"),  # which the pair does not have
     ],
 )
 def test_wrong_keys_are_named_with_their_line(
@@ -315,14 +300,9 @@ def test_wrong_keys_are_named_with_their_line(
 ) -> None:
     content = json.loads(json.dumps(described("a")))
     content["pairs"][0]["known"] |= change
+    if not change:
+        content["pairs"][0]["projector"] = None
     with pytest.raises(RigFileError, match=said):
-        load_rig(write_rig_file(folder, content))
-
-
-def test_a_projector_that_the_pair_does_not_have(folder: Path) -> None:
-    content = described("a")
-    content["pairs"][0] = {**content["pairs"][0], "projector": None}
-    with pytest.raises(RigFileError, match=r"known.projector: needs a projector"):
         load_rig(write_rig_file(folder, content))
 
 

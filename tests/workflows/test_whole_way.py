@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from small_workspace import Workspace
 
+import bodyscan
 from bodyscan.arrays import Array
 from bodyscan.evaluation.surface import deviation, normalized_errors, signed_distances
 from bodyscan.fusion.storage import load_scan
-from bodyscan.geometry.light_sheets import sheets_to_arrays
 from bodyscan.mesh.ply import read_ply_mesh
 from bodyscan.mesh.topology import compute_topology
 from bodyscan.registration.rig_calibration import RigCalibration
-from bodyscan.registration.storage import load_calibration, save_calibration
+from bodyscan.registration.storage import load_calibration
 from bodyscan.workflows.evaluate import compare_rig, evaluate_workspace, load_truth
 
 
@@ -29,8 +29,11 @@ def calibration(workspace: Workspace) -> RigCalibration:
 def test_all_pairs_are_calibrated(workspace: Workspace, calibration: RigCalibration) -> None:
     assert sorted(calibration.pairs) == ["p1-2", "p1-3", "p2-2", "p2-3"]
     assert not calibration.failed
-    for name in calibration.pairs:
-        assert name in workspace.outputs["calibrate-rig"]
+    outputs = workspace.outputs
+    for name in (*calibration.pairs, "calibration.json"):
+        assert name in outputs["calibrate-rig"]
+    for command, made in (("scan", "scan.json"), ("export", "body.glb"), ("evaluate", "mesh.ply")):
+        assert made in outputs[command]
 
 
 def test_cameras_stand_where_they_stand(workspace: Workspace, calibration: RigCalibration) -> None:
@@ -93,34 +96,6 @@ def test_exports_are_there_and_say_what_they_are(workspace: Workspace) -> None:
     assert shape.components == 1
 
 
-def test_calibration_reads_back_to_the_last_bit(
-    calibration: RigCalibration, tmp_path: Path
-) -> None:
-    save_calibration(calibration, tmp_path)
-    again = load_calibration(tmp_path)
-    for name, pair in calibration.pairs.items():
-        assert again.pairs[name].camera == pair.camera
-        assert np.array_equal(
-            again.rig_from_camera[name].matrix, calibration.rig_from_camera[name].matrix
-        )
-        sheets = again.pairs[name].sheets
-        assert sheets is not None
-        assert pair.sheets is not None
-        stored, original = sheets_to_arrays(sheets), sheets_to_arrays(pair.sheets)
-        for key, array in original.items():
-            assert np.array_equal(stored[key], array, equal_nan=True)
-    first = (tmp_path / "calibration.json").read_bytes()
-    save_calibration(again, tmp_path / "again")
-    assert (tmp_path / "again" / "calibration.json").read_bytes() == first
-
-
-def test_every_command_says_where_its_results_are(workspace: Workspace) -> None:
-    assert "calibration.json" in workspace.outputs["calibrate-rig"]
-    assert "scan.json" in workspace.outputs["scan"]
-    assert "body.glb" in workspace.outputs["export"]
-    assert "mesh.ply" in workspace.outputs["evaluate"]
-
-
 def test_a_person_who_moved_is_held_against_the_body_of_that_moment(
     workspace: Workspace, tmp_path: Path
 ) -> None:
@@ -143,3 +118,16 @@ def test_a_person_who_moved_is_held_against_the_body_of_that_moment(
     clouds = [text.partition("cloud,")[2] for text in (grown, as_it_was)]
     rms = [float(text.partition("RMS ")[2].split(",")[0]) for text in clouds]
     assert rms[0] > rms[1] + 1.0
+
+
+def test_the_example_calibrates_scans_and_measures(example: Path) -> None:
+    said = (example / "said.txt").read_text("utf-8")
+    assert "verdict: " in said
+    assert "mm by tape" in said
+    assert (example / "made" / "export" / "body.glb").stat().st_size > 10_000
+    stored = bodyscan.load_scan(example / "made" / "person")
+    assert 1500 < bodyscan.measure(stored).stature_mm < 1800
+    calibration = bodyscan.load_calibration(example / "made" / "calibration")
+    images = bodyscan.triangulate(example / "pole" / "captures" / "person", calibration)
+    assert {image.pair for image in images.value} == set(calibration.pairs)
+    assert not images.failures
