@@ -306,7 +306,7 @@ def minimize_each(
         tried = equations_at(trial)
         better = tried.cost < at.cost
         gained = at.cost - tried.cost
-        # A small predicted gain that is due to damping says nothing.
+        # A small predicted gain that is due to damping is no sign of convergence.
         converged |= (better & (gained < enough)) | (
             (promised < enough) & (strength <= EFFECTIVE_DAMPING)
         )

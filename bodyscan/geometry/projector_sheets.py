@@ -60,8 +60,8 @@ def projector_from_sheets(sheets: LensSheets) -> tuple[Camera, RigidTransform]:
     """The inverse: the projector as a camera with one pixel per stripe, and
     `projector_from_camera`.
 
-    Exact across the stripes. Along them one direction of stripes says nothing, so the image is
-    assumed to be square, with square pixels and its axis in the middle.
+    Exact across the stripes. One direction of stripes carries no information along them, so the
+    image is assumed to be square, with square pixels and its axis in the middle.
     """
     focal, centre = sheets.parameters[:SCALE].tolist()
     terms = sheets.parameters[SCALE:]

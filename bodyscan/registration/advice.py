@@ -15,7 +15,6 @@ from bodyscan.registration.more_shots import (
     MAX_SHOTS,
     BoardCandidate,
     RigInformation,
-    SigmaReduction,
     propose_board_poses,
 )
 from bodyscan.registration.normal_equations import normal_equations
@@ -27,11 +26,9 @@ from bodyscan.rig.rig import Rig
 
 @dataclass(frozen=True)
 class Link:
-    """Two pairs that saw boards at the same moments.
+    """Two pairs that saw boards at the same moments, in so many shots.
 
-    shots: how many.
-    sigma_mm: of the second pair's position relative to the first, by all boards of the rig
-        together.
+    sigma_mm: of the second pair's position relative to the first, by all boards of the rig.
     """
 
     first: str
@@ -62,18 +59,13 @@ class ShotSuggestion:
 class Advice:
     """What ties a rig together, and what would improve it.
 
-    links: all of them, least known first.
-    chain: those that tie all pairs together best.
-    bridges: links without which the rig falls apart.
-    weak: links of the chain far less known than its usual ones; no other link ties their sides
-        better.
-    crucial: shots (with board) without which the rig falls apart.
+    bridges: links without which the rig is disconnected.
+    weak: links far less known than usual, where no other link ties their sides better.
+    crucial: shots (with board) without which the rig is disconnected.
     worst, worst_sigma_mm: the pair least known in the rig frame, and its sigma over all axes.
     more: the most useful further shots; None if none would help.
     """
 
-    links: tuple[Link, ...]
-    chain: tuple[Link, ...]
     bridges: tuple[Link, ...]
     weak: tuple[Link, ...]
     crucial: tuple[Target, ...]
@@ -117,8 +109,6 @@ def advise(rig: Rig, solution: RigSolution) -> Advice:
     worst = max(sorted(sigmas), key=lambda name: sigmas[name])
     # A link is weak at twice the median sigma of the chain.
     return Advice(
-        links,
-        chain,
         tuple(link for link in links if {link.first, link.second} in bridging),
         tuple(link for link in chain if link.sigma_mm > 2.0 * median),
         find_articulation_shots(solution),
@@ -143,10 +133,8 @@ def minimum_spanning_links(links: Sequence[Link]) -> tuple[Link, ...]:
     """The links that tie all pairs together best, a minimum spanning tree by sigma; least known
     first."""
     graph = nx.Graph()
-    graph.add_edges_from(
-        (link.first, link.second, {"link": link, "sigma": link.sigma_mm}) for link in links
-    )
-    tree = nx.minimum_spanning_edges(graph, weight="sigma", data=True)
+    graph.add_edges_from((link.first, link.second, {"link": link, **vars(link)}) for link in links)
+    tree = nx.minimum_spanning_edges(graph, weight="sigma_mm", data=True)
     return tuple(sorted((data["link"] for _, _, data in tree), key=lambda link: -link.sigma_mm))
 
 
@@ -183,7 +171,14 @@ def more_shots(rig: Rig, solution: RigSolution, pair: str) -> ShotSuggestion | N
         (candidate, knowledge.after(knowledge.information(candidate), pair))
         for candidate in candidates
     ]
-    candidate, best = min(tried, key=lambda item: _preference(item[1]))
+    # Fewest shots to halve; if equal or out of reach, the largest gain.
+    candidate, best = min(
+        tried,
+        key=lambda item: (
+            item[1].shots_to_halve or MAX_SHOTS + 1,
+            item[1].after_mm2[(item[1].shots_to_halve or MAX_SHOTS) - 1],
+        ),
+    )
     if best.after_mm2[-1] > 0.98 * best.before_mm2:
         return None
     shots = best.shots_to_halve or MAX_SHOTS
@@ -202,12 +197,6 @@ def more_shots(rig: Rig, solution: RigSolution, pair: str) -> ShotSuggestion | N
     )
 
 
-def _preference(sharpening: SigmaReduction) -> tuple[int, float]:
-    """Sort key: fewest shots to halve; if equal or out of reach, the largest gain."""
-    shots = sharpening.shots_to_halve
-    return shots or MAX_SHOTS + 1, float(sharpening.after_mm2[(shots or MAX_SHOTS) - 1])
-
-
 def _best_two_views(
     knowledge: RigInformation, candidate: BoardCandidate, pair: str, shots: int
 ) -> tuple[str, str]:
@@ -218,21 +207,6 @@ def _best_two_views(
         return float(knowledge.after(information, pair, shots).after_mm2[-1])
 
     return min(combinations(candidate.visible_to, 2), key=remaining_variance)
-
-
-def _facing(degrees: float) -> str:
-    """A direction in words; x is the way the subject faces, y the subject's left."""
-    directions = (
-        "front",
-        "front left",
-        "left",
-        "back left",
-        "back",
-        "back right",
-        "right",
-        "front right",
-    )
-    return f"the subject's {directions[round(degrees / 45.0) % 8]}"
 
 
 def _shots(count: int) -> str:
@@ -251,6 +225,9 @@ def _sentence(more: ShotSuggestion) -> str:
     x, y, z = candidate.centre_mm
     others = [name for name in candidate.visible_to if name not in more.between]
     also = f" (also by {', '.join(others)})" if others else ""
+    # x is the direction that the subject faces, y the subject's left.
+    left, right = ("front", "front left", "left", "back left"), ("back", "back right", "right")
+    facing = (*left, *right, "front right")[round(candidate.facing_deg / 45.0) % 8]
     effect = (
         f"would halve the sigma of {more.pair}"
         if more.halves
@@ -258,8 +235,7 @@ def _sentence(more: ShotSuggestion) -> str:
     )
     return (
         f"{more.shots} more {'shot' if more.shots == 1 else 'shots'} seen by both {a} and {b}{also}, "
-        f"board at {candidate.height} height "
-        f"(middle at {x:.0f}, {y:.0f}, {z:.0f} mm, facing {_facing(candidate.facing_deg)}, tilted in "
-        f"turn in all directions), {effect}: {more.before_mm:.3f} to "
+        f"board at {candidate.height} height (middle at {x:.0f}, {y:.0f}, {z:.0f} mm, facing the "
+        f"subject's {facing}, tilted in turn in all directions), {effect}: {more.before_mm:.3f} to "
         f"{more.after_mm:.3f} mm"
     )

@@ -19,7 +19,7 @@ from bodyscan.calibration.board_views import (
     match_corners,
 )
 from bodyscan.calibration.model_selection import MIN_GAIN, ResidualPair, gain
-from bodyscan.geometry.linear_gaussian import solve_scaled
+from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
 from bodyscan.geometry.robust import rms, rms_length
 from bodyscan.geometry.transforms import fit_rigid_transform
 from bodyscan.registration.bundle_adjustment import refine_solution
@@ -230,15 +230,12 @@ def _corner_steps(
     equal_noise: bool,
 ) -> dict[str, Array]:
     """Gauss-Newton steps (N, 3) mm of single corners, with a prior at the nominal board."""
-    information, gradient, variance = _corner_equations(
-        shaped, numbers, shapes, solution, equal_noise
-    )
+    systems, variance = _corner_systems(shaped, numbers, shapes, solution, equal_noise)
     steps = {}
     for name, shape in shapes.items():
-        prior = variance / (PRIOR * shape.diagonal) ** 2
-        matrix = information[name] + prior * np.eye(3)
-        right = gradient[name] + prior * shape.offsets
-        steps[name] = -solve_scaled(matrix, right)
+        weight = variance / (PRIOR * shape.diagonal) ** 2
+        prior = LinearGaussianSystem(weight * np.eye(3), -weight * shape.offsets)
+        steps[name] = (systems[name] + prior).solve()
     return steps
 
 
@@ -246,23 +243,27 @@ def _gain_per_unknown(views: Sequence[LocatedView], solution: JointSolution) -> 
     """Mean reduction of the squared residuals per coordinate of freed corners, in variances."""
     shapes = _flat(views)
     numbers = [shapes[view.board].numbers(view.points) for view in views]
-    information, gradient, variance = _corner_equations(views, numbers, shapes, solution, True)
-    gain, unknowns = 0.0, 0
-    for name in shapes:
-        inverse = np.linalg.pinv(information[name], rcond=1e-6, hermitian=True)
-        gain += float(np.einsum("ni,nij,nj->", gradient[name], inverse, gradient[name]))
-        unknowns += 3 * len(gradient[name])
-    return gain / (variance * unknowns)
+    systems, variance = _corner_systems(views, numbers, shapes, solution, True)
+    gain = sum(
+        np.einsum(
+            "ni,nij,nj->",
+            system.vector,
+            np.linalg.pinv(system.information, rcond=1e-6, hermitian=True),
+            system.vector,
+        )
+        for system in systems.values()
+    )
+    return float(gain / (variance * sum(system.vector.size for system in systems.values())))
 
 
-def _corner_equations(
+def _corner_systems(
     shaped: Sequence[LocatedView],
     numbers: Sequence[Indices],
     shapes: Mapping[str, BoardShape],
     solution: JointSolution,
     equal_noise: bool,
-) -> tuple[dict[str, Array], dict[str, Array], float]:
-    """J^T W J (N, 3, 3) and J^T W r (N, 3) of each board's corners, and the variance in px2.
+) -> tuple[dict[str, LinearGaussianSystem], float]:
+    """Systems of each board's corners, a stack (N, 3), and the variance in px2.
 
     shaped: views with points where they are thought to lie.
     numbers: indices of these points in their board's shape.
@@ -274,24 +275,20 @@ def _corner_equations(
         of_pair = [k for k, view in enumerate(shaped) if view.pair == pair]
         corners += [first[shaped[k].board] + numbers[k] for k in of_pair]
         parts.append(_by_corner([shaped[k] for k in of_pair], solution))
-    number = np.concatenate(corners)
     every = [residuals for _, of_pair in parts for residuals in of_pair]
     sigmas = np.ones(len(every)) if equal_noise else view_sigmas([one.ravel() for one in every])
-    counts = [len(residuals) for residuals in every]
-    sigma = np.repeat(sigmas, counts)
+    sigma = np.repeat(sigmas, [len(residuals) for residuals in every])
     jacobian = np.concatenate([by_corner for by_corner, _ in parts]) / sigma[:, None, None]
     residuals = np.concatenate(every) / sigma[:, None]
     weights = CORNERS.weights(residuals.ravel() / CORNERS.estimate_scale(residuals.ravel()))
     variance = float(np.sum(weights * residuals.ravel() ** 2) / np.sum(weights))
-    weighted = np.swapaxes(jacobian * weights.reshape(-1, 2, 1), 1, 2)
-    information, gradient = np.zeros((ends[-1], 3, 3)), np.zeros((ends[-1], 3))
-    np.add.at(information, number, weighted @ jacobian)
-    np.add.at(gradient, number, (weighted @ residuals[..., None])[..., 0])
-    return (
-        dict(zip(shapes, np.split(information, ends[:-1]), strict=True)),
-        dict(zip(shapes, np.split(gradient, ends[:-1]), strict=True)),
-        variance,
-    )
+    each = LinearGaussianSystem.from_observations(jacobian, -residuals, weights.reshape(-1, 2))
+    information, vector = np.zeros((ends[-1], 3, 3)), np.zeros((ends[-1], 3))
+    np.add.at(information, np.concatenate(corners), each.information)
+    np.add.at(vector, np.concatenate(corners), each.vector)
+    split = zip(np.split(information, ends[:-1]), np.split(vector, ends[:-1]), strict=True)
+    systems = [LinearGaussianSystem(*arrays) for arrays in split]
+    return dict(zip(shapes, systems, strict=True)), variance
 
 
 def _by_corner(views: Sequence[LocatedView], solution: JointSolution) -> tuple[Array, list[Array]]:
@@ -354,11 +351,11 @@ def _without_extremes(compared: ResidualPair) -> ResidualPair:
     """
     better = np.sum(compared.simple**2 - compared.rich**2, axis=1)
     boards = np.unique(compared.cluster)
-    order = boards[np.argsort([better[compared.cluster == board].mean() for board in boards])]
-    kept = np.isin(compared.cluster, order[1:-1])
+    order = np.argsort([better[compared.cluster == board].mean() for board in boards])
+    kept = np.isin(compared.cluster, boards[order[1:-1]])
     return ResidualPair(compared.simple[kept], compared.rich[kept], compared.cluster[kept])
 
 
 def _median(residuals: Array) -> float:
-    """Median length, px, which a few wrong views do not change."""
+    """Median length, px."""
     return float(np.sqrt(np.median(np.sum(residuals**2, axis=1))))

@@ -44,13 +44,13 @@ def cluster_robust_covariance(
     clusters: the targets of each, every target in one.
     """
     reduced, rest = equations.without_boards(), equations.rest
-    free = np.flatnonzero(~np.isin(rest, equations.held))
+    free = np.flatnonzero(~np.isin(rest, equations.fixed))
     rest, reduced = rest[free], reduced.select(free)
     number = {target: k for k, targets in enumerate(clusters) for target in targets}
     information = np.zeros((len(clusters), len(rest), len(rest)))
     vectors = np.zeros((len(clusters), len(rest)))
     for target, part in zip(equations.targets, equations.parts, strict=True):
-        columns, system = part.without_board(equations.held)
+        columns, system = part.without_board(equations.fixed)
         where, k = np.searchsorted(rest, columns), number[target]
         information[k][np.ix_(where, where)] += system.information
         vectors[k][where] += system.vector

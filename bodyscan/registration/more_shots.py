@@ -1,13 +1,10 @@
-"""Which further shots of a board would add most to what is known of a pair's position.
-
-Computed from the information they would add.
-"""
+"""Which further shots of a board would add most information on a pair's position."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from itertools import combinations
+from dataclasses import dataclass, replace
+from itertools import combinations, product
 
 import numpy as np
 
@@ -18,26 +15,18 @@ from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.camera_tables import is_in_image
 from bodyscan.geometry.linear_gaussian import invert_scaled
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
-from bodyscan.registration.normal_equations import (
-    NormalEquations,
-    normal_equations,
-)
+from bodyscan.registration.normal_equations import NormalEquations, normal_equations
 from bodyscan.rig.board import Board
 from bodyscan.rig.rig import Volume
 
-HEIGHTS_MM = {"knee": 500.0, "waist": 1000.0, "chest": 1350.0}
-# Shots at one place differ a little, as hand-held boards do: about x, y and the board's normal.
-TILTS_DEG = ((20.0, 0.0, 0.0), (-20.0, 0.0, 15.0), (0.0, 20.0, -15.0))
 MAX_SHOTS = 60
-OFFSETS = 0.35  # of the volume's radius: boards are also tried this far off the middle
-STEP_DEG = 15.0
 
 
 @dataclass(frozen=True, eq=False)
 class BoardCandidate:
     """Where a board might be held: a few tilts of it at one place.
 
-    height: name of the height, a key of HEIGHTS_MM.
+    height: `knee`, `waist` or `chest`.
     centre_mm: the board's centre, rig frame, (3,).
     facing_deg: azimuth of the front's normal, rig frame.
     rig_from_board: of each tilt.
@@ -58,9 +47,7 @@ class BoardCandidate:
 
     def restrict_to(self, pairs: Sequence[str]) -> BoardCandidate:
         views = tuple(tuple(v for v in tilt if v.pair in pairs) for tilt in self.views)
-        return BoardCandidate(
-            self.height, self.centre_mm, self.facing_deg, self.rig_from_board, views
-        )
+        return replace(self, views=views)
 
 
 def propose_board_poses(
@@ -73,32 +60,29 @@ def propose_board_poses(
 
     Only those that at least two pairs would see.
     """
+    azimuths = candidate_azimuths(rig_from_camera.values(), board.faces == 2)
+    heights = {"knee": 500.0, "waist": 1000.0, "chest": 1350.0}
     found = []
-    for height, z in HEIGHTS_MM.items():
-        if not volume.bottom_mm < z < volume.top_mm:
-            continue
-        for azimuth in candidate_azimuths(rig_from_camera.values(), board.faces == 2):
+    # In the middle of the volume, and a third of its radius in front of and behind it.
+    for (height, z), azimuth, share in product(heights.items(), azimuths, (-0.35, 0.0, 0.35)):
+        if volume.bottom_mm < z < volume.top_mm:
             ahead = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-            for share in (-OFFSETS, 0.0, OFFSETS):
-                centre = np.array([0.0, 0.0, z]) + share * volume.radius_mm * ahead
-                poses = tuple(_tilted_poses(board, centre, ahead))
-                views = tuple(
-                    tuple(_views(board, pose, cameras, rig_from_camera)) for pose in poses
-                )
-                candidate = BoardCandidate(height, centre, float(np.degrees(azimuth)), poses, views)
-                if len(candidate.visible_to) >= 2:
-                    found.append(candidate)
-    return found
+            centre = np.array([0.0, 0.0, z]) + share * volume.radius_mm * ahead
+            poses = tuple(_tilted_poses(board, centre, ahead))
+            views = tuple(tuple(_views(board, pose, cameras, rig_from_camera)) for pose in poses)
+            found.append(BoardCandidate(height, centre, float(np.degrees(azimuth)), poses, views))
+    return [candidate for candidate in found if len(candidate.visible_to) >= 2]
 
 
 def candidate_azimuths(poses: Iterable[RigidTransform], two_faced: bool) -> list[float]:
-    """Azimuths (radians) halfway between any two cameras, seen from the rig's axis."""
+    """Azimuths (radians) halfway between any two cameras, seen from the rig's axis, in steps of 15
+    degrees."""
     positions = np.array([pose.translation[:2] for pose in poses])
     towards = positions / np.maximum(np.linalg.norm(positions, axis=1, keepdims=True), 1e-9)
     between = np.array([a + b for a, b in combinations(towards, 2)]).reshape(-1, 2)
     between = between[np.linalg.norm(between, axis=1) > 0.2]  # opposite cameras: nothing between
     degrees = np.degrees(np.arctan2(between[:, 1], between[:, 0]))
-    steps = np.rint(degrees / STEP_DEG) * STEP_DEG % (180.0 if two_faced else 360.0)
+    steps = np.rint(degrees / 15.0) * 15.0 % (180.0 if two_faced else 360.0)
     return [float(np.radians(step)) for step in np.unique(steps)]
 
 
@@ -126,16 +110,14 @@ class RigInformation:
         rig_from_camera: Mapping[str, RigidTransform],
     ) -> None:
         self._equations = equations
-        self._cameras, self._placings = cameras, rig_from_camera
+        self._cameras, self._rig_from_camera = cameras, rig_from_camera
         # A board that holds the frame has been eliminated already; a pair that does is removed here.
-        fixed_pair = equations.held[equations.held < equations.first_board]
         reduced = equations.without_boards()
-        self._unknowns = reduced.size
-        self._free = np.setdiff1d(np.arange(self._unknowns), fixed_pair)
+        fixed_pair = equations.fixed[equations.fixed < equations.first_board]
+        self._free = np.setdiff1d(np.arange(reduced.size), fixed_pair)
         information = reduced.select(self._free).information
         self._scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
-        scaled = information * np.outer(self._scale, self._scale)
-        self._inverse = invert_scaled(scaled)
+        self._inverse = invert_scaled(information * np.outer(self._scale, self._scale))
 
     def information(self, candidate: BoardCandidate) -> Array:
         """Information in one shot there, averaged over its tilts; scaled, free unknowns only."""
@@ -146,7 +128,7 @@ class RigInformation:
             shot = normal_equations(
                 views,
                 self._cameras,
-                self._placings,
+                self._rig_from_camera,
                 {views[0].target: pose},
                 fixed_pair=None,
                 fixed_target=None,
@@ -162,10 +144,9 @@ class RigInformation:
         Uses the matrix inversion lemma in the basis in which the added information is diagonal,
         which gives all numbers of shots at once.
         """
-        start = 6 * self._equations.names.index(pair)
-        jacobian = np.zeros((3, self._unknowns))
-        motion = twist_jacobian(self._placings[pair].translation[None])[0]
-        jacobian[:, start : start + 6] = motion
+        columns = 6 * self._equations.names.index(pair) + np.arange(6)
+        jacobian = np.zeros((3, self._equations.system.size))
+        jacobian[:, columns] = twist_jacobian(self._rig_from_camera[pair].translation[None])[0]
         jacobian = jacobian[:, self._free] * self._scale
         values, vectors = np.linalg.eigh(information)
         kept = values > 1e-12 * values[-1]
@@ -184,7 +165,8 @@ def _tilted_poses(board: Board, centre: Array, ahead: Array) -> Iterator[RigidTr
     down = np.array([0.0, 0.0, -1.0])
     upright = np.column_stack([np.cross(down, -ahead), down, -ahead])
     middle = board.square_mm / 2.0 * np.array([board.columns, board.rows, 0.0])
-    for tilt in TILTS_DEG:
+    # Shots at one position differ a little, as hand-held boards do: about x, y and the normal.
+    for tilt in ((20.0, 0.0, 0.0), (-20.0, 0.0, 15.0), (0.0, 20.0, -15.0)):
         turn = RigidTransform.from_rotation_vector(np.radians(tilt), np.zeros(3)).rotation
         yield RigidTransform(upright @ turn, centre - upright @ turn @ middle)
 

@@ -68,15 +68,28 @@ class BoardContribution:
     columns: Indices
     system: LinearGaussianSystem
 
-    def without_board(self, held: Indices) -> tuple[Indices, LinearGaussianSystem]:
+    @staticmethod
+    def from_views(
+        systems: Sequence[tuple[Indices, LinearGaussianSystem]], board: Indices
+    ) -> BoardContribution:
+        """Sum the views' systems, each of its own unknowns; board: columns of its motion."""
+        every = [board, *(columns for columns, _ in systems)]
+        columns = np.append(np.setdiff1d(np.concatenate(every), board), board)
+        rows = {column: k for k, column in enumerate(columns.tolist())}
+        placed = (
+            (np.array([rows[column] for column in own.tolist()]), one) for own, one in systems
+        )
+        return BoardContribution(columns, LinearGaussianSystem.assemble(placed, len(columns)))
+
+    def without_board(self, fixed: Indices) -> tuple[Indices, LinearGaussianSystem]:
         """Eliminate the board's motion, or fix it if the board holds the frame.
 
         Returns the free ones of the other columns, and the system of these.
         """
         others, board = np.split(np.arange(len(self.columns)), [-6])
-        fixed = self.columns[-1] in held
-        reduced = self.system.select(others) if fixed else self.system.marginalize(board)
-        free = np.flatnonzero(~np.isin(self.columns[others], held))
+        is_fixed = self.columns[-1] in fixed
+        reduced = self.system.select(others) if is_fixed else self.system.marginalize(board)
+        free = np.flatnonzero(~np.isin(self.columns[others], fixed))
         return self.columns[free], reduced.select(free)
 
 
@@ -90,7 +103,7 @@ class NormalEquations:
 
     parameters: number of parameters of each camera, 0 if cameras are fixed.
     system: J^T W J, px2 per unit of either unknown, and -J^T W r.
-    held: unknowns fixed by the definition of the rig frame.
+    fixed: unknowns fixed by the definition of the rig frame.
     variance_px2: variance of one coordinate of a corner, in a view of average noise.
     parts: contributions of the targets, in their order; the priors are in none of them.
     """
@@ -99,7 +112,7 @@ class NormalEquations:
     targets: tuple[Target, ...]
     parameters: tuple[int, ...]
     system: LinearGaussianSystem
-    held: Indices
+    fixed: Indices
     variance_px2: float
     parts: tuple[BoardContribution, ...]
 
@@ -122,7 +135,7 @@ class NormalEquations:
 
     @property
     def free(self) -> Indices:
-        return np.setdiff1d(np.arange(self.system.size), self.held)
+        return np.setdiff1d(np.arange(self.system.size), self.fixed)
 
     @property
     def rest(self) -> Indices:
@@ -134,8 +147,8 @@ class NormalEquations:
         """The system of the unknowns `rest`, with the boards' motions eliminated; a board that
         holds the rig frame is fixed instead."""
         boards = np.arange(self.first_board, self.first_camera)
-        fixed = np.intersect1d(boards, self.held)
-        kept = np.setdiff1d(np.arange(self.system.size), fixed)
+        fixed_boards = np.intersect1d(boards, self.fixed)
+        kept = np.setdiff1d(np.arange(self.system.size), fixed_boards)
         free_boards = np.flatnonzero(np.isin(kept, boards))
         return self.system.select(kept).marginalize(free_boards)
 
@@ -152,91 +165,84 @@ def normal_equations(
     camera_prior: bool = True,
     shapes: Mapping[str, FreeShape] | None = None,
 ) -> NormalEquations:
-    """Build the joint solve's normal equations at the given poses, with Cauchy weights per corner
-    and each view's noise.
+    """Build the joint solve's normal equations, with Cauchy weights and each view's noise.
 
     camera_prior: adds the cameras' priors; False where views are to be added to other views.
     shapes: of boards whose corners were unknowns too.
-
-    A corner q in the rig frame is observed at R^T (q - t); a motion of the board and the opposite
-    motion of the camera have the same effect on it, so both share one Jacobian.
     """
     names, targets = tuple(sorted(rig_from_camera)), sorted(rig_from_board)
-    first_board = 6 * len(names)
-    first_camera = first_board + 6 * len(targets)
-    parameters = tuple(len(cameras[n].parameters) if cameras_free else 0 for n in names)
-    camera_columns = _split_range(first_camera, parameters)
     shapes = shapes or {}
-    first_shape = first_camera + sum(parameters)
-    sizes = [3 * len(shape.points) for shape in shapes.values()]
-    shape_columns = dict(zip(shapes, _split_range(first_shape, sizes), strict=bool(sizes)))
-    size = first_shape + sum(len(columns) for columns in shape_columns.values())
-    residuals, linearized = zip(
-        *(
-            reprojection_errors(
-                [view], cameras, rig_from_camera, rig_from_board, cameras_free=cameras_free
-            )
-            for view in views
-        ),
-        strict=True,
+    parameters = tuple(len(cameras[n].parameters) if cameras_free else 0 for n in names)
+    sizes = [6] * (len(names) + len(targets)) + [*parameters]
+    sizes += [3 * len(shape.points) for shape in shapes.values()]
+    columns, size = _split_range(0, sizes), sum(sizes)
+    board_columns = columns[len(names) :]
+    camera_columns = board_columns[len(targets) :]
+    corner_columns = dict(zip(shapes, camera_columns[len(names) :], strict=True))
+    residuals, jacobians = _whitened_errors(
+        views, cameras, rig_from_camera, rig_from_board, cameras_free
     )
-    sigmas = view_sigmas(residuals)
-    residuals = tuple(r / sigma for r, sigma in zip(residuals, sigmas, strict=True))
-    scale = CORNERS.estimate_scale(np.concatenate(residuals))
-
-    def contribution(number: int, target: Target) -> BoardContribution:
-        group = [k for k, view in enumerate(views) if view.target == target]
-        board = first_board + 6 * number + np.arange(6)
-        pairs = [names.index(views[k].pair) for k in group]
-        jacobians = [linearized[k]() / sigmas[k] for k in group]
-        columns = [np.concatenate([6 * n + np.arange(6), board, camera_columns[n]]) for n in pairs]
-        if target[1] in shapes:
-            shape, corners = shapes[target[1]], shape_columns[target[1]].reshape(-1, 3)
-            rotation = rig_from_board[target].rotation
-            jacobians = [np.hstack([one, _corner_jacobian(one, rotation)]) for one in jacobians]
-            columns = [
-                np.append(one, corners[shape.corner_indices(views[k].points)])
-                for one, k in zip(columns, group, strict=True)
-            ]
-        return _sum_views([residuals[k] for k in group], jacobians, columns, board, scale)
-
-    parts = [contribution(number, target) for number, target in enumerate(targets)]
-    system = LinearGaussianSystem.assemble(((part.columns, part.system) for part in parts), size)
     everything = np.concatenate(residuals)
+    scale = CORNERS.estimate_scale(everything)
+
+    def contribution(target: Target, board: Indices) -> BoardContribution:
+        systems = []
+        for k in [k for k, view in enumerate(views) if view.target == target]:
+            pair, jacobian = names.index(views[k].pair), jacobians[k]
+            unknowns = [columns[pair], board, camera_columns[pair]]
+            if target[1] in shapes:
+                corners = shapes[target[1]].corner_indices(views[k].points)
+                unknowns.append(corner_columns[target[1]].reshape(-1, 3)[corners].ravel())
+                jacobian = _append_corners(jacobian, rig_from_board[target].rotation)
+            weights = CORNERS.weights(residuals[k] / scale)
+            system = LinearGaussianSystem.from_observations(jacobian, -residuals[k], weights)
+            systems.append((np.concatenate(unknowns), system))
+        return BoardContribution.from_views(systems, board)
+
+    parts = tuple(map(contribution, targets, board_columns))
     weights = CORNERS.weights(everything / scale)
-    if fixed_target is not None:
-        first_held = first_board + 6 * targets.index(fixed_target)
-    else:
-        first_held = 6 * names.index(fixed_pair or names[0])
     degrees = max(float(np.sum(weights)) - (size - 6), 1.0)
     variance = float(np.sum(weights * everything**2)) / degrees
-    prior = np.zeros((size, size))
+    priors = [(corner_columns[name], shapes[name].prior_information) for name in shapes]
     if cameras_free and camera_prior:
-        columns = np.concatenate(camera_columns)
-        known = np.concatenate([cameras[name].prior_sigmas ** -2 for name in names])
-        prior[columns, columns] = max(variance, 1e-12) * known
-    for name, columns in shape_columns.items():
-        prior[np.ix_(columns, columns)] = max(variance, 1e-12) * shapes[name].prior_information
-    return NormalEquations(
-        names,
-        tuple(targets),
-        parameters,
-        system + LinearGaussianSystem.from_prior(prior),
-        np.arange(first_held, first_held + 6),
-        variance,
-        tuple(parts),
+        known = [np.diag(cameras[name].prior_sigmas ** -2) for name in names]
+        priors += zip(camera_columns, known, strict=False)
+    systems = [(part.columns, part.system) for part in parts]
+    scaled = ((free, max(variance, 1e-12) * known) for free, known in priors)
+    systems += [(free, LinearGaussianSystem.from_prior(known)) for free, known in scaled]
+    system = LinearGaussianSystem.assemble(systems, size)
+    fixed = columns[[*names, *targets].index(fixed_target or fixed_pair or names[0])]
+    return NormalEquations(names, tuple(targets), parameters, system, fixed, variance, parts)
+
+
+def _whitened_errors(
+    views: Sequence[LocatedView],
+    cameras: Mapping[str, Camera],
+    rig_from_camera: Mapping[str, RigidTransform],
+    rig_from_board: Mapping[Target, RigidTransform],
+    cameras_free: bool,
+) -> tuple[list[Array], list[Array]]:
+    """Reprojection errors (2N,) of each view and their Jacobians, over the view's noise."""
+    poses = cameras, rig_from_camera, rig_from_board
+    errors = [reprojection_errors([view], *poses, cameras_free=cameras_free) for view in views]
+    sigmas = view_sigmas([residuals for residuals, _ in errors])
+    return (
+        [residuals / sigma for (residuals, _), sigma in zip(errors, sigmas, strict=True)],
+        [linearize() / sigma for (_, linearize), sigma in zip(errors, sigmas, strict=True)],
     )
 
 
-def _corner_jacobian(jacobian: Array, rotation: Array) -> Array:
-    """Derivatives (2N, 3N) of a view's pixels by its corners' positions on the board, from its
-    Jacobian (2N, C), whose columns 9 to 11 are by the board's translation, and `rig_from_board`'s
-    rotation."""
+def _append_corners(jacobian: Array, rotation: Array) -> Array:
+    """Append derivatives (2N, 3N) by the corners' positions on the board to a view's Jacobian
+    (2N, C), whose columns 9 to 11 are by the board's translation.
+
+    rotation: that of `rig_from_board`.
+    """
     count = len(jacobian) // 2
     by_corner = jacobian[:, 9:12] @ rotation
     blocks = np.zeros((count, 2, count, 3))
     blocks[range(count), :, range(count)] = by_corner.reshape(count, 2, 3)
-    return blocks.reshape(2 * count, 3 * count)
+    return np.hstack([jacobian, blocks.reshape(2 * count, 3 * count)])
 
 
 def view_sigmas(residuals: Sequence[Array]) -> Array:
@@ -257,34 +263,6 @@ def view_sigmas(residuals: Sequence[Array]) -> Array:
     return np.clip(np.sqrt(shrunk / every), 0.25, 4.0)
 
 
-def _sum_views(
-    residuals: Sequence[Array],
-    jacobians: Sequence[Array],
-    columns: Sequence[Indices],
-    board: Indices,
-    scale: float,
-) -> BoardContribution:
-    """Sum views with residuals (2N,), and jacobians (2N, C) by the unknowns `columns` (C,)."""
-    others = np.setdiff1d(np.concatenate([board, *columns]), board)
-    every = np.append(others, board)
-    row = {column: k for k, column in enumerate(every.tolist())}
-    return BoardContribution(
-        every,
-        LinearGaussianSystem.assemble(
-            (
-                (
-                    np.array([row[column] for column in unknowns.tolist()]),
-                    LinearGaussianSystem.from_observations(
-                        jacobian, -residual, CORNERS.weights(residual / scale)
-                    ),
-                )
-                for residual, jacobian, unknowns in zip(residuals, jacobians, columns, strict=True)
-            ),
-            len(every),
-        ),
-    )
-
-
 def _split_range(first: int, sizes: Sequence[int]) -> list[Indices]:
     """Consecutive integers from `first`, in runs of the given sizes."""
     return np.split(np.arange(first, first + sum(sizes)), np.cumsum(sizes)[:-1])
@@ -301,7 +279,8 @@ def reprojection_errors(
     """Reprojection errors (2N,) px of one pair's views, and a function for their Jacobian.
 
     The Jacobian (2N, 12 + P) is by the camera's motion, each board's motion, and the camera's
-    parameters if free.
+    parameters if free. A corner q in the rig frame is observed at R^T (q - t): a motion of the board
+    and the opposite motion of the camera have the same effect on it.
     """
     pair = views[0].pair
     camera = cameras[pair]

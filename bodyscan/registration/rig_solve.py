@@ -152,11 +152,11 @@ def _solve(
     root = max(names, key=lambda name: (graph.degree(name), name))
     to_root = start[root].inverse()
     root_from_camera = {name: to_root @ pose for name, pose in start.items()}
-    resolved, boards, doubtful = locate_boards_jointly(views, root_from_camera)
+    resolved, boards, inconsistent = locate_boards_jointly(views, root_from_camera)
     solution = JointSolution(root_from_camera, boards, cameras)
     # The graph's poses alone are rough: 30 px.
     gross = find_inconsistent_views(
-        [view for view in resolved if view.target in doubtful], solution, 30.0
+        [view for view in resolved if view.target in inconsistent], solution, 30.0
     ).wrong
     kept = [view for view in resolved if view not in gross]
     # A single camera was solved with its skew already, and there is nothing to join.

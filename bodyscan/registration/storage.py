@@ -91,18 +91,13 @@ def save_calibration(calibration: RigCalibration, folder: Path) -> Path:
     arrays: dict[str, Any] = {"placing_covariance": calibration.covariance.matrix}
     for name, pair in calibration.pairs.items():
         arrays[f"{name}/camera_covariance"] = pair.camera_covariance
-        if pair.sheets is not None:
-            for key, array in sheets_to_arrays(pair.sheets).items():
-                arrays[f"{name}/light/{key}"] = array
-        if pair.crossing is not None:
-            for key, array in sheets_to_arrays(pair.crossing).items():
-                arrays[f"{name}/crossing/{key}"] = array
-        if pair.rays is not None:
-            arrays[f"{name}/rays/noise_px"] = pair.rays.noise_px
-            arrays[f"{name}/rays/lens_px"] = pair.rays.lens_px
+        for key, sheets in (("light", pair.sheets), ("crossing", pair.crossing)):
+            parts = sheets_to_arrays(sheets) if sheets is not None else {}
+            arrays |= {f"{name}/{key}/{part}": array for part, array in parts.items()}
+        parts = vars(pair.rays) if pair.rays is not None else {}
+        arrays |= {f"{name}/rays/{part}": array for part, array in parts.items()}
     for name, corners in calibration.observed.items():
-        for part in fields(corners):
-            arrays[f"{name}/seen/{part.name}"] = getattr(corners, part.name)
+        arrays |= {f"{name}/seen/{part}": array for part, array in vars(corners).items()}
     write_npz(folder / ARRAYS_NAME, **arrays)
     content = {
         "schema": SCHEMA,
@@ -198,20 +193,18 @@ def accept_calibration(path: Path) -> Path | None:
 
 def _arrays_of(file: Path, content: dict[str, Any]) -> Path:
     """The arrays beside the JSON, or the kept ones if a replacement was interrupted."""
-    beside, kept = (
-        file.with_name(ARRAYS_NAME),
-        file.parent / HISTORY / file_hash(file) / ARRAYS_NAME,
-    )
-    ours = content.get("arrays_sha256")
-    if kept.exists() and file_hash(beside) != ours and file_hash(kept) == ours:
-        return kept
-    return beside
+    current = file.with_name(ARRAYS_NAME)
+    archived = file.parent / HISTORY / file_hash(file) / ARRAYS_NAME
+    expected = content.get("arrays_sha256")
+    if archived.exists() and file_hash(current) != expected and file_hash(archived) == expected:
+        return archived
+    return current
 
 
 def _refuse_changed(content: dict[str, Any], file: Path, arrays_file: Path) -> None:
     if content["version"] == VERSION:
-        own = {key: value for key, value in content.items() if key != HASH}
-        if content_hash(own) != content[HASH]:
+        unhashed = {key: value for key, value in content.items() if key != HASH}
+        if content_hash(unhashed) != content[HASH]:
             raise CalibrationFileError(
                 "was changed after it was stored", where=str(file), remedy=CHANGED
             )

@@ -25,7 +25,7 @@ Group = dict[str, RigidTransform]
 
 @dataclass(frozen=True, eq=False)
 class RelativePose:
-    """What the boards shared by two groups of pairs say about their relative pose.
+    """The relative pose of two groups of pairs by the boards that they share.
 
     targets: the shared targets.
     agreeing: those that agree with the pose.

@@ -92,7 +92,7 @@ def test_a_board_that_holds_the_frame_is_held_whichever_it_is(number: int) -> No
     found = normal_equations(
         views(), CAMERAS, PLACED, BOARDS, fixed_pair=None, fixed_target=target, cameras_free=False
     )
-    assert found.held.tolist() == found.parts[number].columns[-6:].tolist()
+    assert found.fixed.tolist() == found.parts[number].columns[-6:].tolist()
 
 
 @pytest.mark.parametrize("free", [False, True])
@@ -118,7 +118,7 @@ def test_they_are_those_of_all_errors_by_all_unknowns(free: bool) -> None:
     assert np.linalg.norm((-found.system.vector - by.T @ residuals) / scale) < 0.2 * np.linalg.norm(
         by.T @ residuals / scale
     )
-    assert found.held.tolist() == list(range(6))
+    assert found.fixed.tolist() == list(range(6))
     assert found.first_board == 12
     assert found.first_camera == 30
     assert found.cameras_free == free
