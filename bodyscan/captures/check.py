@@ -116,7 +116,11 @@ def check(rig_path: Path, known_errors: Iterable[str] = ()) -> CheckReport:
     find_bad = partial(_find_bad_images, rig, set(captures.corners if captures else ()))
     found = map_threads(find_bad, sequences, stage="checking", workers=WORKERS)
     good = [sequence for sequence, bad in zip(sequences, found, strict=True) if not bad]
-    counts = tuple(_count_shots(pair, good) for pair in rig.pairs)
+    striped = {p.name: [s.has_stripes for s in good if s.pair == p.name] for p in rig.pairs}
+    counts = tuple(
+        PairCount(pair, sum(striped[pair.name]), striped[pair.name].count(False))
+        for pair in rig.pairs
+    )
     order = {pair.name: index for index, pair in enumerate(rig.pairs)}
     if captures:
         taken = {sequence.shot for sequence in sequences}
@@ -171,11 +175,6 @@ def _find_bad_images(rig: Rig, known: set[Path], sequence: ImageSequence) -> lis
     return [
         BadImage(path, sequence.pair, sequence.shot, what) for path, what in faults.items() if what
     ]
-
-
-def _count_shots(pair: Pair, good: list[ImageSequence]) -> PairCount:
-    taken = [sequence.has_stripes for sequence in good if sequence.pair == pair.name]
-    return PairCount(pair, sum(taken), len(taken) - sum(taken))
 
 
 def _find_warnings(

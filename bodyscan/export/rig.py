@@ -27,19 +27,12 @@ def export_rig(
     and for a camera's lens that a format cannot express.
     """
     chosen = [RIG_FORMATS.find(name.strip().lower()) for name in dict.fromkeys(formats)]
-    cameras = collect_cameras(calibration)
+    poses = calibration.rig_from_camera
+    cameras = {name: (pair.camera, poses[name]) for name, pair in calibration.pairs.items()}
     projectors = fit_projectors(calibration)
     written = [_write(one, cameras, projectors.value, folder) for one in chosen]
     notes = [note for one in written for note in one.notes]
     return Outcome([one.value for one in written], (*projectors.notes, *notes))
-
-
-def collect_cameras(calibration: RigCalibration) -> RigCameras:
-    """Collect camera and `rig_from_camera` of every pair of a calibration."""
-    return {
-        name: (pair.camera, calibration.rig_from_camera[name])
-        for name, pair in calibration.pairs.items()
-    }
 
 
 def fit_projectors(calibration: RigCalibration) -> Outcome[RigCameras]:

@@ -41,7 +41,13 @@ def read_corners(path: Path) -> dict[str, Corners]:
             continue
         where = f"{path}:{number}"
         if words[0].startswith("#"):
-            order = order or _columns(line.lstrip("#").split(), where)
+            names = line.lstrip("#").split()
+            if not order and not {"filename", "x", "y"} <= set(names):
+                raise CaptureError(
+                    f"has the columns {' '.join(names)}", where=where, remedy=_REMEDY
+                )
+            columns = ("filename", "x", "y", "level")
+            order = order or [names.index(c) if c in names else -1 for c in columns]
             continue
         if not order:
             raise CaptureError(
@@ -71,14 +77,6 @@ def write_corners(path: Path, corners: Iterable[tuple[str, Corners]]) -> None:
         for x, y in pixels:
             lines.append(f"{name} {x:.6f} {y:.6f} 0" if x == x else f"{name} 0 0 -")
     write_text(path, "\n".join(lines) + "\n")
-
-
-def _columns(names: list[str], where: str) -> list[int]:
-    """Find the positions of filename, x, y, level in a row; -1 if there is no level."""
-    columns = ("filename", "x", "y", "level")
-    if any(name not in names for name in columns[:3]):
-        raise CaptureError(f"has the columns {' '.join(names)}", where=where, remedy=_REMEDY)
-    return [names.index(name) if name in names else -1 for name in columns]
 
 
 def _corner(

@@ -51,10 +51,8 @@ def find_subject(subject: str, workspace: Path) -> SubjectFiles:
     """Find what `forget_subject` would remove. Raises BadInput if the workspace is not a folder."""
     if not workspace.is_dir():
         raise BadInput("there is no such folder", where=str(workspace), remedy="check --workspace")
-    files: list[Path] = []
-    folders: list[Path] = []
-    tables: list[Path] = []
-    unreadable: list[Path] = []
+    lists: list[list[Path]] = [[], [], [], []]
+    files, folders, tables, unreadable = lists
     for folder, names, owner in _walk(workspace, None, unreadable):
         found = set(names) if owner == subject else _exports(folder, names, subject)
         files += (folder / name for name in found)
@@ -62,7 +60,8 @@ def find_subject(subject: str, workspace: Path) -> SubjectFiles:
             folders.append(folder)
         if BATCH_LOCK in names and owner is None:
             tables.append(folder)
-    files.sort(key=lambda path: (_rank(path.name), path))
+    order = {name: rank for rank, name in enumerate(_MARKERS, start=1)}
+    files.sort(key=lambda path: (order.get(path.name, 0), path))
     rows = [out for out in tables if _without(subject, out / SUMMARY) is not None]
     return SubjectFiles(tuple(files), tuple(folders), tuple(tables), tuple(rows), tuple(unreadable))
 
@@ -134,10 +133,6 @@ def _exports(folder: Path, names: list[str], subject: str) -> set[str]:
                 if _subject(folder / name) == subject:
                     found |= {name, name.removesuffix(".json")}
     return found
-
-
-def _rank(name: str) -> int:
-    return _MARKERS.index(name) + 1 if name in _MARKERS else 0
 
 
 def _without(subject: str, summary: Path) -> str | None:

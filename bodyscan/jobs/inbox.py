@@ -92,18 +92,14 @@ class IncomingScan:
             sequences = ()  # nothing yet, or an error that the scan itself will report
         striped = [sequence for sequence in sequences if sequence.has_stripes]
         whole = {sequence.pair for sequence in striped if self._is_whole(sequence, now_s)}
-        all_there = bool(whole) and self._expected_pairs(striped) <= whole
-        complete = all_there or self._is_marked() or now_s - self._changed_s >= quiet_s
-        return Arrival(tuple(sorted(whole)), complete)
-
-    def _expected_pairs(self, striped: list[ImageSequence]) -> set[str]:
-        """Pairs to expect: those in captures.yaml, or all that have a projector."""
         if (self.folder / CAPTURES).exists():
-            return {sequence.pair for sequence in striped}
-        return {pair.name for pair in self.rig.pairs if pair.projector is not None}
-
-    def _is_marked(self) -> bool:
-        return (self.folder / "done").exists()
+            expected = {sequence.pair for sequence in striped}
+        else:
+            expected = {pair.name for pair in self.rig.pairs if pair.projector is not None}
+        is_marked = (self.folder / "done").exists()
+        complete = is_marked or (bool(whole) and expected <= whole)
+        complete |= now_s - self._changed_s >= quiet_s
+        return Arrival(tuple(sorted(whole)), complete)
 
     def _is_whole(self, sequence: ImageSequence, now_s: float) -> bool:
         if sequence.missing:

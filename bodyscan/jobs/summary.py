@@ -190,16 +190,13 @@ def _motions(job: Job) -> Motions:
     if not alignment or job.calibration is None:
         return {}
     calibrated = read_record(job.calibration / "calibration.json").get("pairs", {})
-    return {
-        pair: _centre_motion(matrix, calibrated[pair]["rig_from_camera"])
-        for pair, matrix in alignment["rig_from_camera"].items()
-        if pair in calibrated and pair not in alignment["refused"]
-    }
-
-
-def _centre_motion(now: Any, calibrated: Any) -> Array:
-    change = np.asarray(now, float) @ np.linalg.inv(np.asarray(calibrated, float))
-    return np.asarray(change[:3, :3] @ BODY_CENTRE_MM + change[:3, 3] - BODY_CENTRE_MM)
+    motions = {}
+    for pair, matrix in alignment["rig_from_camera"].items():
+        if pair in calibrated and pair not in alignment["refused"]:
+            before = np.asarray(calibrated[pair]["rig_from_camera"], float)
+            change = np.asarray(matrix, float) @ np.linalg.inv(before)
+            motions[pair] = change[:3, :3] @ BODY_CENTRE_MM + change[:3, 3] - BODY_CENTRE_MM
+    return motions
 
 
 def _round(value: float | None, digits: int = 4) -> float | None:

@@ -81,9 +81,9 @@ def become_worker() -> Tell:
     keep_freed_memory()
     logging.basicConfig(format="%(message)s")  # on standard error, which is the job's log
     logging.getLogger("bodyscan").setLevel(logging.DEBUG)
-    tell = _take_over_output()
-    _prefer_killing_this()
-    return tell
+    with suppress(OSError):  # if memory runs out: a job is tried again, a batch is not
+        Path("/proc/self/oom_score_adj").write_text("900")
+    return _take_over_output()
 
 
 def work(folder: Path, kinds: Kinds, tell: Tell) -> None:
@@ -99,7 +99,11 @@ def work(folder: Path, kinds: Kinds, tell: Tell) -> None:
                 tell(stage=stage.name, why=why)
                 _perform(job, stage, now, tell)
         for stage in every[len(stages) :]:
-            _drop_if_stale(job, stage, tell)
+            # Remove results that were made from other results than are there now.
+            results = job.folder / stage.name
+            with suppress(BodyscanError, OSError):
+                if results.exists() and reason_to_run(job, origin_of(job, stage)):
+                    _remove_results(_move_aside(results), tell)
         _write_manifest(job, every)
 
 
@@ -124,18 +128,15 @@ def _perform(job: Job, stage: Stage, before: Origin, tell: Tell) -> None:
                 remedy="start the batch again when the folder is complete",
             )
         write_json(made / STAGE, before.record(file_hashes(list_relative_files(made))))
-        _flush_all(made)
+        for path in (*list_files(made), made):  # to the disk, before a name says that it is there
+            flush(path)
     except BaseException:
         shutil.rmtree(made, ignore_errors=True)
         raise
-    _put_in_place(made, job.folder / stage.name, tell)
-
-
-def _put_in_place(made: Path, folder: Path, tell: Tell) -> None:
-    """Rename; a folder cannot replace another in one step, so the old one is moved aside first."""
-    old = _move_aside(folder)
-    made.rename(folder)
-    flush(folder.parent)
+    # A folder cannot replace another in one step, so the old one is moved aside first.
+    old = _move_aside(job.folder / stage.name)
+    made.rename(job.folder / stage.name)
+    flush(job.folder)
     _remove_results(old, tell)
 
 
@@ -169,14 +170,6 @@ def _remove_results(old: Path, tell: Tell) -> None:
         tell(stage=stage, kept=kept.name)
 
 
-def _drop_if_stale(job: Job, stage: Stage, tell: Tell) -> None:
-    """Remove results of a later stage that were made from other results than are there now."""
-    folder = job.folder / stage.name
-    with suppress(BodyscanError, OSError):
-        if folder.exists() and reason_to_run(job, origin_of(job, stage)):
-            _remove_results(_move_aside(folder), tell)
-
-
 def _write_manifest(job: Job, stages: Sequence[Stage]) -> None:
     """Write one file that ties inputs and results together, and contains its own hash.
 
@@ -192,12 +185,8 @@ def _write_manifest(job: Job, stages: Sequence[Stage]) -> None:
             outputs |= {f"{stage.name}/{name}": h for name, h in record["outputs"].items()}
             outputs[f"{stage.name}/{STAGE}"] = file_hash(path)
     inputs = {name: value for name, value in inputs.items() if name not in outputs}
-    content: dict[str, Any] = {
-        "schema": "bodyscan-manifest",
-        "version": 1,
-        "inputs": inputs,
-        "outputs": outputs,
-    }
+    content: dict[str, Any] = {"schema": "bodyscan-manifest", "version": 1}
+    content |= {"inputs": inputs, "outputs": outputs}
     content["own_sha256"] = content_hash(content)
     path = job.folder / MANIFEST
     if not path.exists() or path.read_text("utf-8") != json_text(content):
@@ -210,20 +199,10 @@ def _tidy(folder: Path, tell: Tell) -> None:
         if path.name.startswith(_TAKEN_AWAY):
             _remove_results(path, tell)
         elif path.name.startswith(_BEING_MADE) or path.name.endswith(".tmp.json"):
-            _remove(path)
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)
-
-
-def _flush_all(folder: Path) -> None:
-    """Flush to the disk, before a name says that it is there."""
-    for path in (*list_files(folder), folder):
-        flush(path)
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path)
+            else:
+                path.unlink(missing_ok=True)
 
 
 def _take_over_output() -> Tell:
@@ -248,9 +227,3 @@ def _end_with_parent() -> None:
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
-
-
-def _prefer_killing_this() -> None:
-    """Make Linux kill this process first if memory runs out: a job is tried again, a batch is not."""
-    with suppress(OSError):
-        Path("/proc/self/oom_score_adj").write_text("900")

@@ -60,17 +60,6 @@ class MeshSlicer:
         return tuple(sorted(loops, key=lambda loop: -loop.area_mm2))
 
 
-def slice_mesh(
-    vertices: Array,
-    faces: Indices,
-    height_mm: float,
-    filled: Mask | None = None,
-    regions: Bytes | None = None,
-) -> tuple[Loop, ...]:
-    """Cut a mesh once into loops; see `MeshSlicer`."""
-    return MeshSlicer(vertices, faces, filled, regions).slice(height_mm)
-
-
 @dataclass(frozen=True, eq=False)
 class Loop:
     """One closed curve of a slice, mm.

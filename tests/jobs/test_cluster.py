@@ -7,6 +7,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import cheap_job
@@ -54,8 +55,11 @@ def test_a_lost_worker_loses_nothing_and_nothing_is_done_twice(
 def test_a_scheduler_that_is_not_there_is_named(
     make_scans: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pytest.importorskip("distributed", reason="dask.distributed is not installed")
-    monkeypatch.setattr("bodyscan.jobs.cluster._TIMEOUT_S", 1)
+    distributed = pytest.importorskip("distributed", reason="dask.distributed is not installed")
+    connect = partial(distributed.Client, timeout=1)
+    monkeypatch.setattr(
+        distributed, "Client", lambda address, **_: connect(address, set_as_default=False)
+    )
     run = run_on_cluster("tcp://127.0.0.1:9", 1)
     with pytest.raises(BodyscanError, match="no dask scheduler with a worker answers"):
         run_batch(jobs_of(make_scans(a="nothing"), tmp_path / "out"), tmp_path / "out", run)

@@ -7,7 +7,7 @@ import pytest
 
 from bodyscan.arrays import Array, Mask
 from bodyscan.measurement.outline import Outline, find_outline
-from bodyscan.mesh.slices import Loop, slice_mesh
+from bodyscan.mesh.slices import Loop, MeshSlicer
 
 TRUNK_MM, ARM_MM, ARM_AT_MM = 150.0, 45.0, 230.0
 
@@ -32,7 +32,7 @@ def wall(points: Array, filled: Mask) -> Loop:
             np.stack([here, after + count, here + count], 1),
         ]
     )
-    (loop,) = slice_mesh(vertices, faces, 50.0, np.tile(filled, 2))
+    (loop,) = MeshSlicer(vertices, faces, np.tile(filled, 2)).slice(50.0)
     return loop
 
 

@@ -10,12 +10,12 @@ from hypothesis import strategies as st
 from made_bodies import arrays, cylinder, ellipsoid, together
 from scipy.special import ellipe
 
-from bodyscan.mesh.slices import Loop, hull_perimeter, join_runs, slice_mesh, split_runs
+from bodyscan.mesh.slices import Loop, MeshSlicer, hull_perimeter, join_runs, split_runs
 
 
 @pytest.mark.parametrize("height", [55.0, 100.0, 123.4])  # 100 lies on a ring of vertices
 def test_a_cylinder_is_cut_in_a_circle(height: float) -> None:
-    (loop,) = slice_mesh(*cylinder(80.0, 0.0, 200.0), height)
+    (loop,) = MeshSlicer(*cylinder(80.0, 0.0, 200.0)).slice(height)
     # 400 corners on a circle: shorter by pi^2 / (6 * 400^2), a hundred-thousandth.
     assert loop.girth_mm == pytest.approx(2 * np.pi * 80.0, rel=2e-5)
     assert loop.tape_mm == pytest.approx(2 * np.pi * 80.0, rel=2e-5)
@@ -25,7 +25,7 @@ def test_a_cylinder_is_cut_in_a_circle(height: float) -> None:
 
 @given(share=st.floats(-0.9, 0.9))
 def test_an_ellipsoid_is_cut_in_an_ellipse(share: float) -> None:
-    (loop,) = slice_mesh(*ELLIPSOID, 250.0 * share)
+    (loop,) = MeshSlicer(*ELLIPSOID).slice(250.0 * share)
     long, short = np.array([150.0, 90.0]) * np.sqrt(1.0 - share**2)
     girth = 4.0 * long * ellipe(1.0 - (short / long) ** 2)
     # 400 facets around and 200 from pole to pole: flat where the body is round.
@@ -40,24 +40,24 @@ ELLIPSOID = ellipsoid((150.0, 90.0, 250.0))
 def test_a_hollow_is_followed_by_the_surface_and_spanned_by_the_tape() -> None:
     """A torus that stands upright, cut above its hole's bottom: two circles; the lying one: a ring."""
     vertices, faces = arrays(o3d.geometry.TriangleMesh.create_torus(100.0, 30.0, 200, 100))
-    outer, inner = slice_mesh(vertices, faces, 0.0)
+    outer, inner = MeshSlicer(vertices, faces).slice(0.0)
     assert outer.girth_mm == pytest.approx(2 * np.pi * 130.0, rel=1e-3)
     assert inner.girth_mm == pytest.approx(2 * np.pi * 70.0, rel=1e-3)
     assert outer.area_mm2 + inner.area_mm2 == pytest.approx(np.pi * (130.0**2 - 70.0**2), rel=2e-3)
     upright = vertices[:, [2, 0, 1]]
-    one, other = slice_mesh(upright, faces, 0.0)
+    one, other = MeshSlicer(upright, faces).slice(0.0)
     for loop in (one, other):
         assert loop.girth_mm == pytest.approx(2 * np.pi * 30.0, rel=2e-3)
     assert sorted([one.centre[1], other.centre[1]]) == pytest.approx([-100.0, 100.0], abs=0.1)
     # Just above the hole's edge the two have run together, with a waist between them.
-    (both,) = slice_mesh(upright, faces, 75.0)
+    (both,) = MeshSlicer(upright, faces).slice(75.0)
     assert both.tape_mm < both.girth_mm - 5.0
     assert both.area_mm2 > 0
 
 
 def test_each_leg_is_a_loop() -> None:
     legs = together(cylinder(70.0, 0.0, 700.0, y=90.0), cylinder(60.0, 0.0, 700.0, y=-90.0))
-    left, right = slice_mesh(*legs, 333.0)
+    left, right = MeshSlicer(*legs).slice(333.0)
     assert left.girth_mm == pytest.approx(2 * np.pi * 70.0, rel=2e-5)
     assert right.girth_mm == pytest.approx(2 * np.pi * 60.0, rel=2e-5)
     assert left.centre[1] == pytest.approx(90.0)
@@ -66,13 +66,13 @@ def test_each_leg_is_a_loop() -> None:
 def test_the_measured_share_excludes_filled_faces() -> None:
     vertices, faces = ellipsoid((100.0, 100.0, 100.0))
     filled = vertices[faces].mean(axis=1)[:, 0] > 0
-    (loop,) = slice_mesh(vertices, faces, 10.0, filled)
+    (loop,) = MeshSlicer(vertices, faces, filled).slice(10.0)
     assert loop.measured_share == pytest.approx(0.5, abs=0.01)
 
 
 def test_a_plane_outside_the_body_cuts_nothing() -> None:
-    assert slice_mesh(*ELLIPSOID, 251.0) == ()
-    assert slice_mesh(*ELLIPSOID, -251.0) == ()
+    assert MeshSlicer(*ELLIPSOID).slice(251.0) == ()
+    assert MeshSlicer(*ELLIPSOID).slice(-251.0) == ()
 
 
 def square(*measured: bool, regions: list[int] | None = None) -> Loop:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -85,7 +84,8 @@ def read_colmap(folder: Path) -> dict[str, FoundCamera]:
     found: dict[str, FoundCamera] = {}
     for number, camera in sorted(model.cameras.items()):
         taken = [image for image in images if image.camera_id == number]
-        names = {str(number), *_common_folder([names_of[image.image_id] for image in taken])}
+        folders = {names_of[image.image_id].rpartition("/")[0] for image in taken}
+        names = {str(number), *(folders - {""} if len(folders) == 1 else ())}
         rig_pose = _find_pose_in_rig(model, number)
         for name in names - {image.name for image in taken}:
             found[name] = _read_camera(folder, camera, 0.0, rig_pose)
@@ -116,11 +116,6 @@ def _read_gammas(folder: Path) -> dict[str, float]:
             where=str(file),
             remedy="write it again with `bodyscan export-rig --format colmap`, or remove it",
         ) from error
-
-
-def _common_folder(names: list[str]) -> set[str]:
-    folders = Counter(name.rpartition("/")[0] for name in names)
-    return set(folders) - {""} if len(folders) == 1 else set()
 
 
 def _image_pose(image: Any) -> RigidTransform | None:
