@@ -93,20 +93,6 @@ def test_what_exceeds_its_limit_or_was_not_found_is_not_accepted() -> None:
     assert grade_acceptance(unjudged, Readings()).grade == "not judged"
 
 
-def test_a_limit_is_kept_on_both_sides_of_zero() -> None:
-    for value, exceeded in ((0.3, False), (-0.3, False), (0.31, True), (-0.31, True), (None, True)):
-        assert Figure("size_mm", value, "a", 0.3, "").exceeded is exceeded
-        assert not Figure("size_mm", value, "a", None, "").exceeded
-
-
-def test_readings_of_several_places_are_those_of_all() -> None:
-    total = READ + Readings(spheres=READ.spheres[:1], problems=("one",)) + Readings()
-    assert len(total.spheres) == 4
-    assert total.spacings == READ.spacings
-    assert total.plates == READ.plates
-    assert total.problems == ("one",)
-
-
 def test_the_file_says_what_it_is_and_holds_every_figure_and_reading() -> None:
     class Described(File):
         def model_dump(self, mode: str) -> dict[str, str]:

@@ -155,15 +155,6 @@ def test_shift_and_spread_are_weighted_means_of_the_planes_around() -> None:
     assert found.nearest[0] == 0
 
 
-def test_a_vertex_takes_after_the_point_nearest_to_it() -> None:
-    """The first and the last among them; where none is near, any will do."""
-    points = sheet()
-    cloud = cloud_of(points, UP)
-    found = asked(cloud, [*(points + [0.1, 0.1, 0.2]).tolist(), [500.0, 0.0, 0.0]])
-    np.testing.assert_array_equal(found.nearest[:-1], np.arange(len(points)))
-    assert 0 <= found.nearest[-1] < len(points)
-
-
 def told(**values: list[float]) -> Support:
     """Vertices whose weight is 1, and that lie on points of no noise, but for `values`."""
     count = len(next(iter(values.values())))

@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
-from stripe_rendering import decode_gray
 
 from bodyscan.errors import BadInput
 from bodyscan.geometry.light_planes import Axis
@@ -211,35 +210,6 @@ def test_patterns_are_stripes_that_differ_in_one_bit_from_their_neighbours(
     assert len(np.unique(words, axis=0)) == stripes
     assert frames.shape[across] == (40 if direction == "horizontal" else 41)
     assert not words[0].any(), "stripe 0 is written as 0"
-
-
-@pytest.mark.parametrize("direction", ["horizontal", "vertical"])
-@pytest.mark.parametrize("with_dark", [True, False])
-def test_projected_frames_seen_as_they_are_give_their_stripes(
-    direction: Axis, with_dark: bool
-) -> None:
-    spec = Gray(stripes=40, direction=direction)
-    patterns, inverses = np.split(spec.pattern_images(width=120, height=160) // 2 + 20, 2)
-    lit = np.full((160, 120), 147, np.uint8)
-    dark = np.full_like(lit, 20) if with_dark else None
-    seen = decode_gray(lit, dark, patterns, inverses, stripes=40, direction=direction)
-    pixel = np.arange(160 if direction == "horizontal" else 120)
-    stripe_px = len(pixel) / 40
-    true = (pixel + 0.5) / stripe_px
-    true = np.broadcast_to(true[:, None] if direction == "horizontal" else true, lit.shape)
-    assert np.isfinite(seen.s).mean() > 0.96  # all but a part of the outermost stripes
-    # Unblurred boundaries between two pixels are known to half a pixel, and here exactly there.
-    np.testing.assert_allclose(seen.s[np.isfinite(seen.s)], true[np.isfinite(seen.s)], atol=0.02)
-    axis = 1 if direction == "horizontal" else 0
-    np.testing.assert_allclose(
-        seen.boundary_pixels[:, axis], seen.boundary_index * stripe_px - 0.5, atol=0.02
-    )
-    assert set(seen.boundary_index) == set(range(1, 40))
-    assert seen.stripes == 40
-    assert seen.lit is lit
-    assert seen.s.dtype == seen.sigma.dtype == np.float32
-    assert seen.boundary_index.dtype == np.int64
-    assert seen.boundary_pixels.dtype == np.float64
 
 
 def test_a_stripe_index_image_is_one_of_an_instrument() -> None:

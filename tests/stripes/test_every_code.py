@@ -150,7 +150,7 @@ def test_edges_of_brightness_are_corrected(code: Code, untouched: float, correct
     assert len(error) > 0.97 * np.isfinite(images[3]).sum()
 
 
-@pytest.mark.parametrize("code", ALL, ids=name)
+@pytest.mark.parametrize("code", [{"code": "gray"}, *ALL], ids=name)
 def test_vertical_stripes_are_horizontal_ones_transposed(code: Code) -> None:
     images = captured(code, wavy(3.0), 64, shape=(120, 140))
     seen = read(code, images, 64)
@@ -159,11 +159,15 @@ def test_vertical_stripes_are_horizontal_ones_transposed(code: Code) -> None:
         spec_of(code, 64, "vertical"), *map(np.ascontiguousarray, (lit, dark, coded))
     )
     np.testing.assert_array_equal(turned.s.T, seen.s)
+    np.testing.assert_array_equal(turned.sigma.T, seen.sigma)
     np.testing.assert_array_equal(turned.boundary_pixels[:, ::-1], seen.boundary_pixels)
+    assert turned.correlation_px == seen.correlation_px[::-1]
 
 
 @pytest.mark.parametrize("direction", ["horizontal", "vertical"])
-@pytest.mark.parametrize("code", [each for each in ALL if each is not INDEX], ids=name)
+@pytest.mark.parametrize(
+    "code", [{"code": "gray"}, *(each for each in ALL if each is not INDEX)], ids=name
+)
 def test_projected_patterns_are_decoded_to_their_stripes(code: Code, direction: Axis) -> None:
     spec = spec_of(code, 40, direction)
     coded = spec.pattern_images(120, 160) // 2 + 20

@@ -62,17 +62,3 @@ def test_boundaries_in_bands_are_those_of_the_whole_picture(
     assert set((own % 3).tolist()) == {turn % 3}
     assert len(np.unique(nearest)) == len(nearest)
     assert not some.s.size
-
-
-@pytest.mark.parametrize("turned", [False, True])
-def test_lines_beside_a_band_are_looked_at_on_both_sides(turned: bool) -> None:
-    """Bands of ten, the second of every five, counted from the picture's own first line."""
-    found = LineBands(10, 5, 1, (4, 3)).lines(60, transposed=turned)
-    first = 10 - (3 if turned else 4)
-    band = np.arange(first, first + 10)
-    later = band[band + 50 < 60] + 50
-    np.testing.assert_array_equal(np.flatnonzero(found.inside), np.r_[band, later])
-    beside = np.r_[np.arange(max(first - 8, 0), first + 18), np.arange(later[0] - 8, 60)]
-    np.testing.assert_array_equal(found.number, beside)
-    near = np.r_[np.arange(first - 2, first + 12), np.arange(later[0] - 2, 60)]
-    np.testing.assert_array_equal(found.number[found.wanted], near)

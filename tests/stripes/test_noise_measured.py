@@ -23,12 +23,6 @@ def test_variance_that_rises_with_the_grey_level_is_linear() -> None:
     np.testing.assert_allclose(found, 2.0 + 0.02 * np.arange(256), rtol=1e-5)
 
 
-def test_falling_variance_or_two_bands_give_the_weighted_mean() -> None:
-    found = line(U8, [8.0, 100.0, 200.0], [6.0, 4.0, 3.0], [300, 100, 100])
-    np.testing.assert_allclose(found, 5.0)
-    np.testing.assert_allclose(line(U8, [8.0, 100.0], [2.0, 6.0], [300, 100]), 3.0)
-
-
 def test_variance_is_at_least_that_of_rounding() -> None:
     np.testing.assert_allclose(line(U8, [8.0, 100.0], [0.0, 0.01], [600, 600]), 0.15)
     np.testing.assert_allclose(line(F32, [8.0, 100.0], [0.0, 0.0], [600, 600]), 0.15 / 256)

@@ -93,27 +93,6 @@ def test_sigmas_match_errors_in_dim_light(stripe_px: float, light: float) -> Non
     assert least < robust(boundary_errors(seen, s_at) / seen.boundary_sigma_px) < 1.25
 
 
-def test_vertical_stripes_are_horizontal_ones_transposed() -> None:
-    s_at = wavy(3.0)
-    sequence = render_sequence(s_at, stripes=80, shape=(120, 140))
-    seen = read(sequence, 80)
-    turned = decode_gray(
-        np.ascontiguousarray(sequence.lit.T),
-        np.ascontiguousarray(sequence.dark.T),
-        np.ascontiguousarray(sequence.patterns.transpose(0, 2, 1)),
-        np.ascontiguousarray(sequence.inverses.transpose(0, 2, 1)),
-        stripes=80,
-        direction="vertical",
-    )
-    np.testing.assert_array_equal(turned.s.T, seen.s)
-    np.testing.assert_array_equal(turned.sigma.T, seen.sigma)
-    np.testing.assert_array_equal(turned.boundary_pixels[:, ::-1], seen.boundary_pixels)
-    # Pixels share noise across stripes, along columns if these are horizontal.
-    assert seen.correlation_px[0] == 0.0
-    assert turned.correlation_px == seen.correlation_px[::-1]
-    assert seen.correlation_px[1] > 2.0
-
-
 def test_a_depth_jump_gives_no_values_in_between() -> None:
     near, far = wavy(2.2), wavy(2.2, first=20.6)
 
