@@ -131,7 +131,6 @@ def write_captures_file(folder: Path, captures: CapturesFile) -> None:
 
 
 def _find_unknown_names(captures: CapturesFile, rig: Rig) -> Iterator[Problem]:
-    """Find names that the rig does not have."""
     pairs = {pair.name: pair for pair in rig.pairs}
     for index, shot in enumerate(captures.shots or ()):
         for key in ("stripes", "lit"):
@@ -203,7 +202,6 @@ def _compute_starts(timing: Timing, rig: Rig, counts: Mapping[str, int]) -> dict
 
 
 def _read_times(path: Path, rig: Rig, sequences: Sequences) -> FrameTimes:
-    """Read and check a file of times."""
     try:
         content = read_regular(path, MAX_BYTES)
         if len(content) > MAX_BYTES:

@@ -66,7 +66,6 @@ def _sample(image: Raw) -> NDArray[np.uint16]:
 
 
 def _refuse_eight_bits(values: Sequence[NDArray[np.uint16]], largest: int, used: int) -> None:
-    """Raise ImageError if 16-bit numbers hold only 8 bits."""
     found = ""
     if largest < 256:
         found = f"none of their numbers is above {largest}"

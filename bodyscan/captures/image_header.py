@@ -78,7 +78,6 @@ def read_header(path: Path) -> ImageHeader:
 
 
 def _read_png_header(start: bytes) -> tuple[int, int, int]:
-    """Read width, height and bits from the first 33 bytes of a PNG file."""
     if len(start) < 33:
         raise NotAnImage("is cut short")
     length, kind, width, height, bits = struct.unpack_from(">I4sIIB", start, 8)

@@ -24,7 +24,6 @@ class Provenance:
     """What a body was made from.
 
     subject: its pseudonym, if any.
-
     defaced: the head was replaced by a plain one.
     found: the scan's findings (verdict, sway, pairs left out).
     rig_from_body: the pose of the body frame, if the body is given in that.
@@ -56,9 +55,8 @@ def _find_format(path: Path, body: BodyCloud | BodyMesh) -> BodyFormat:
     name = path.suffix.lower().removeprefix(".")
     able = [known for known in BODY_FORMATS.names() if kind in BODY_FORMATS.find(known).holds]
     if name not in able:
-        raise unknown_format_error(
-            f"a {kind}", name or "a file without suffix", able, where=str(path)
-        )
+        what = name or "a file without suffix"
+        raise unknown_format_error(f"a {kind}", what, able, where=str(path))
     return BODY_FORMATS.find(name)
 
 

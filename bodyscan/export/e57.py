@@ -44,13 +44,8 @@ def write_e57(
                 continue
             x, y, z = image.points[rows, columns].astype(np.float64).T / 1000.0
             grey = image.colours[rows, columns]
-            data = {
-                "cartesianX": x,
-                "cartesianY": y,
-                "cartesianZ": z,
-                "rowIndex": image.corner[0] + rows,
-                "columnIndex": image.corner[1] + columns,
-            }
+            data = {"cartesianX": x, "cartesianY": y, "cartesianZ": z}
+            data |= {"rowIndex": image.corner[0] + rows, "columnIndex": image.corner[1] + columns}
             data |= {f"color{name}": grey for name in ("Red", "Green", "Blue")}
             pose = rig_from_camera[image.pair]
             qx, qy, qz, qw = Rotation.from_matrix(pose.rotation).as_quat()

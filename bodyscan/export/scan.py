@@ -57,12 +57,9 @@ def export_scan(
                 remedy=f"Choose from {', '.join(known)}.",
             )
     pose = rig_from_body(scan.mesh.vertices) if frame == "body" else None
+    facts = scan.facts
     origin = Provenance(
-        scan.facts.get("subject"),
-        scan.facts["calibration_id"],
-        deface,
-        scan_facts(scan.facts),
-        pose,
+        facts.get("subject"), facts["calibration_id"], deface, scan_facts(facts), pose
     )
     neck = find_neck(scan.mesh.vertices, scan.mesh.faces) if deface else None
     written = []

@@ -228,7 +228,6 @@ def _find_path(loc: Where, document: Document) -> Where:
 
 
 def _keys_at(model: type[BaseModel], where: Where) -> list[str]:
-    """The keys that the model knows at a path."""
     here: type[BaseModel] | None = model
     for part in where:
         if isinstance(part, str) and here is not None:

@@ -55,13 +55,13 @@ def run_batch(
                 except (BodyscanError, OSError) as error:
                     outcomes[job.name] = JobResult(job.name, "set aside", reason=str(error))
             for outcome in outcomes.values():
-                _report(outcome, listen)
+                listen({"event": "job", **asdict(outcome)})
             since = time.monotonic()
             waiting = {job.name for job in ready if not (job.folder / job.until / STAGE).exists()}
             for outcome in run(ready):
                 outcomes[outcome.job] = outcome
                 waiting.discard(outcome.job)
-                _report(outcome, listen)
+                listen({"event": "job", **asdict(outcome)})
                 left = seconds_left(list(outcomes.values()), waiting, time.monotonic() - since)
                 ended = {"ended": len(outcomes), "jobs": len(jobs), "seconds_left": left}
                 listen({"event": "progress", **ended})
@@ -109,10 +109,6 @@ def sweep(out: Path) -> None:
     """Remove files that a batch was writing when it was killed."""
     for path in (*out.glob(".summary.*.tmp.csv"), *out.glob(".manifest.*.tmp.json")):
         path.unlink(missing_ok=True)
-
-
-def _report(outcome: JobResult, listen: Listen) -> None:
-    listen({"event": "job", **asdict(outcome)})
 
 
 def finish(jobs: Sequence[Job], outcomes: Sequence[JobResult], out: Path) -> dict[str, object]:

@@ -79,15 +79,9 @@ def run_scan(
     """
     from bodyscan.workflows.scan_person import scan_folder
 
-    settings = job.pipeline.scan
+    folders, settings = (job.source, calibration_of(job), out), job.pipeline.scan
     *_, pictures = scan_folder(
-        job.source,
-        calibration_of(job),
-        out,
-        settings,
-        progress,
-        preparation=preparation,
-        announce=announce,
+        *folders, settings, progress, preparation=preparation, announce=announce
     )
     for note in pictures.notes:
         print(note, flush=True)  # into the job's log

@@ -120,10 +120,10 @@ class _Watching:
         watched = self.watched
         found = []
         for path in sorted(watched.inbox.absolute().iterdir()):
-            hidden = (
-                path.name.startswith(".") or not path.is_dir() or path == watched.out.absolute()
-            )
-            if hidden or path in self.ended or any((path / name).exists() for name in RESULTS):
+            is_folder = path.is_dir() and path != watched.out.absolute()
+            if path.name.startswith(".") or not is_folder or path in self.ended:
+                continue
+            if any((path / name).exists() for name in RESULTS):
                 continue
             if path not in self.scans and (outcome := self._earlier(path)):
                 self.jobs[path] = self._job(path)
@@ -164,10 +164,8 @@ class _Watching:
                 self.listen({"event": "stage", "job": job.name, **message})
             if "ended" in message:
                 self._end(path, attempt, printable(message["failed"]))
-        status, limit_s = (
-            self.process.status(),
-            60.0 * self.watched.pipeline.resources.limit_minutes,
-        )
+        status = self.process.status()
+        limit_s = 60.0 * self.watched.pipeline.resources.limit_minutes
         if status is None and self.running and time.monotonic() - self.started_s > limit_s:
             self.process.kill()
         elif status is not None:

@@ -122,11 +122,8 @@ def _perform(job: Job, stage: Stage, before: Origin, tell: Tell) -> None:
     try:
         stage.run(job, made, progress, announce)
         if file_hashes(stage.inputs(job)) != before.inputs:
-            raise CaptureError(
-                "changed while it was read",
-                where=str(job.source),
-                remedy="start the batch again when the folder is complete",
-            )
+            remedy = "start the batch again when the folder is complete"
+            raise CaptureError("changed while it was read", where=str(job.source), remedy=remedy)
         write_json(made / STAGE, before.record(file_hashes(list_relative_files(made))))
         for path in (*list_files(made), made):  # to the disk, before a name says that it is there
             flush(path)

@@ -87,9 +87,8 @@ class BodyMesh:
         """Region (F,) uint8 of at least two of each face's corners; unsure where filled."""
         if self.regions is None:
             return None
-        return np.where(
-            self.filled, np.uint8(UNSURE), compute_face_regions(self.regions, self.faces)
-        )
+        regions = compute_face_regions(self.regions, self.faces)
+        return np.where(self.filled, np.uint8(UNSURE), regions)
 
     @cached_property
     def filled_share(self) -> float:
@@ -152,13 +151,10 @@ def compute_face_regions(regions: Bytes, faces: Indices) -> Bytes:
 
 
 DIRECTIONS = {
-    "front": (1.0, 0.0, 0.0),
-    "back": (-1.0, 0.0, 0.0),
-    "left": (0.0, 1.0, 0.0),
-    "right": (0.0, -1.0, 0.0),
-    "up": (0.0, 0.0, 1.0),
-    "down": (0.0, 0.0, -1.0),
-}
+    "front": (1.0, 0.0, 0.0), "back": (-1.0, 0.0, 0.0),
+    "left": (0.0, 1.0, 0.0), "right": (0.0, -1.0, 0.0),
+    "up": (0.0, 0.0, 1.0), "down": (0.0, 0.0, -1.0),
+}  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)

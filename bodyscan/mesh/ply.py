@@ -140,7 +140,6 @@ def _vertex_records(element: Element, body: BodyCloud | BodyMesh, positions: Arr
 
 
 def _vertex_arrays(records: Records) -> tuple[Array, Floats, Floats, Bytes]:
-    """Extract positions, normals, sigmas and colours."""
 
     def columns(*names: str) -> NDArray[Any]:
         return np.stack([records[name] for name in names], axis=-1)
@@ -182,5 +181,4 @@ def _read(path: Path, known: Sequence[Sequence[Element]], what: str) -> list[Rec
 
 
 def _strip_comments(header: bytes) -> list[bytes]:
-    """Split a header into lines without its comments."""
     return [line for line in header.splitlines() if not line.startswith(b"comment")]

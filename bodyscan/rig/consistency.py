@@ -46,7 +46,6 @@ def rig_problems(parts: RigParts) -> Iterator[Problem]:
 
 
 def _find_marker_overlaps(boards: Sequence[Board | None]) -> Iterator[Problem]:
-    """Find boards that share markers."""
     taken: list[tuple[Board, range]] = []
     for index, board in enumerate(boards):
         if board is None or board.kind == "checkerboard":
@@ -54,10 +53,8 @@ def _find_marker_overlaps(boards: Sequence[Board | None]) -> Iterator[Problem]:
         ids = range(board.first_marker, board.first_marker + board.marker_count)
         for other, theirs in taken:
             shared = range(max(ids.start, theirs.start), min(ids.stop, theirs.stop))
-            if (
-                dictionary_family(other.dictionary) == dictionary_family(board.dictionary)
-                and shared
-            ):
+            family, its = dictionary_family(other.dictionary), dictionary_family(board.dictionary)
+            if shared and family == its:
                 yield (
                     ("boards", index, "first_marker"),
                     f"gives board {board.name} markers {ids.start} to {ids.stop - 1}, of which"
@@ -88,10 +85,8 @@ def _find_wrong_frames(parts: RigParts) -> Iterator[Problem]:
     if frames.lit is None:
         lacking = next((name for name, one in directions if one.needs_lit), None)
         if lacking:
-            wrong = (
-                f"is needed: the images of pair {lacking} do not show the scene under full light"
-            )
-            yield ("frames", "lit"), wrong
+            wrong = f"the images of pair {lacking} do not show the scene under full light"
+            yield ("frames", "lit"), f"is needed: {wrong}"
         alone = next((pair.name for pair in pairs if not pair.projector), None)
         if alone and frames.board is None and "{frame}" in (parts.files or "{frame}"):
             wrong = f"or board is needed: pair {alone}, a camera alone, takes no other image"

@@ -42,7 +42,6 @@ class CaptureFolder(Model):
 
 
 def _find_name_faults(kind: ImageKind, names: Names) -> Iterator[Problem]:
-    """Find what is wrong with the names of one kind of image."""
     if isinstance(names, str):
         numbering = frame_name_faults(names, kind.number) if kind.number else ()
         for fault in [*numbering, *filter(None, [path_fault(names)])]:

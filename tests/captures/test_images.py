@@ -134,8 +134,6 @@ def test_a_damaged_png_is_refused_and_opencv_prints_nothing(
     data[500] ^= 1
     with pytest.raises(ImageError, match="damaged"):
         read(write(tmp_path / "x.png", bytes(data)))
-    with pytest.raises(ImageError, match="cut short"):
-        read(write(tmp_path / "y.png", encoded(NOISE)[:600]))
     assert capfd.readouterr().err == ""
 
 

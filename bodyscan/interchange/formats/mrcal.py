@@ -100,7 +100,6 @@ def _read_model(path: Path) -> FoundCamera:
 
 
 def _parse_literal(file: ForeignFile) -> dict[Any, Any]:
-    """Parse the Python literal that a cameramodel is."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", SyntaxWarning)
