@@ -51,8 +51,7 @@ class BowedSheets(SmoothSheets):
     """Smooth planes, or sheets with a bow of `bow_terms` terms.
 
     parameters: coefficients of p, q, r (PLANE_DEGREE), then of b2, b3, ... (BOW_DEGREE), lowest
-    degree
-        first; with a bow, x0 (mm) is the last.
+        degree first; with a bow, x0 (mm) is the last.
     bow_terms: number of terms b2, b3, ...; 0 for planes.
     """
 

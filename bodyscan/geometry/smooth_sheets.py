@@ -45,9 +45,8 @@ class Offset:
 class SmoothSheets(ABC):
     """Light sheets that are smooth in s.
 
-    projector_from_camera: a frame roughly at the projector: z the way it shines, x along the
-    stripes,
-        y across them.
+    projector_from_camera: a frame roughly at the projector, z the direction it shines, x along the
+        stripes, y across them.
     middle: (3,) mm, camera frame, the middle of the boards; the search for a depth starts there.
     parameters: (Q,), see the model.
     covariance: (P, P) of the freedoms that `retract` takes.

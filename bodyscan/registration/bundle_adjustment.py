@@ -10,6 +10,7 @@ every parameter free. It also runs again after views are dropped or boards found
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -112,7 +113,7 @@ def _blocks(
             np.concatenate([of_motion, unknowns.of_board[view.target], of_camera]) for view in views
         ]
         if not len(of_motion):
-            linearize = _without_motion(linearize)
+            linearize = partial(_drop_motion, linearize)  # the root camera fixes the frame
         sigma = np.repeat([next(sigmas) for _ in views], lengths)
         yield Block(residuals, linearize, np.array(columns), CORNERS, sigma, runs=lengths)
     if unknowns.refine_cameras:
@@ -132,6 +133,6 @@ def camera_priors(camera: Camera, columns: Indices) -> Iterator[Block]:
     yield camera_prior(camera, columns)
 
 
-def _without_motion(linearize: Callable[[], Array]) -> Callable[[], Array]:
-    """Derivatives without those by the motion of the root camera, which fixes the frame."""
-    return lambda: linearize()[:, 6:]
+def _drop_motion(linearize: Callable[[], Array]) -> Array:
+    """Derivatives without those by the camera's motion."""
+    return linearize()[:, 6:]

@@ -16,6 +16,7 @@ from bodyscan.arrays import Array, Indices
 from bodyscan.boards.board_layout import corner_grid, corner_points
 from bodyscan.boards.view import BoardView
 from bodyscan.errors import FailedWork
+from bodyscan.geometry.robust import rms_length
 from bodyscan.geometry.transforms import fit_rigid_transform
 from bodyscan.outcome import Outcome
 from bodyscan.registration.rig_calibration import MAX_SIZE_ERROR, REFUSED_SIZE_ERROR
@@ -41,12 +42,8 @@ class Size:
         return f"by its references the rig is {self.factor:.3f} times as large as square_mm says"
 
 
-@dataclass(frozen=True)
-class _Reading:
-    """A reference as it was measured in one shot, mm."""
-
-    length_mm: float
-    sigma_mm: float
+Reading = tuple[float, float]
+"""Length of a reference as measured in one shot, and its sigma, mm."""
 
 
 def select_solving_views(rig: Rig, views: Sequence[BoardView]) -> list[BoardView]:
@@ -138,10 +135,10 @@ def _refuse_contradictions(rig: Rig, found: dict[str, Size], size: Size) -> None
             )
 
 
-def _average(readings: Sequence[_Reading]) -> tuple[float, float]:
+def _average(readings: Sequence[Reading]) -> tuple[float, float]:
     """Mean over all shots and its sigma, larger if shots scatter more than their sigmas say."""
-    lengths = np.array([one.length_mm for one in readings])
-    weights = np.array([one.sigma_mm**-2 for one in readings])
+    lengths, sigmas = np.array(readings).T
+    weights = sigmas**-2
     mean = float(weights @ lengths / weights.sum())
     scatter = float(weights @ (lengths - mean) ** 2) / max(len(readings) - 1, 1)
     return mean, float(np.sqrt(max(scatter, 1.0) / weights.sum()))
@@ -149,7 +146,7 @@ def _average(readings: Sequence[_Reading]) -> tuple[float, float]:
 
 def _readings(
     rig: Rig, reference: Reference, solution: RigSolution, views: Sequence[BoardView]
-) -> Iterator[_Reading]:
+) -> Iterator[Reading]:
     """One reading for each shot in which two cameras saw enough of all its boards."""
     for shot in sorted({view.shot for view in views if view.board in reference.boards}):
         boards = []
@@ -163,9 +160,7 @@ def _readings(
         if len(boards) == 1:
             yield _measure_board(*boards[0], solution.variance_inflation)
         else:
-            yield _measure_separation(
-                [_Middle.locate(*one) for one in boards], solution.variance_inflation
-            )
+            yield _measure_separation(boards, solution.variance_inflation)
 
 
 def triangulate_corners(solution: RigSolution, views: Sequence[BoardView]) -> tuple[Indices, Array]:
@@ -194,9 +189,7 @@ def triangulate_corners(solution: RigSolution, views: Sequence[BoardView]) -> tu
     return known[twice].astype(np.int64), found
 
 
-def _measure_board(
-    board: Board, ids: Indices, points: Array, variance_inflation: float
-) -> _Reading:
+def _measure_board(board: Board, ids: Indices, points: Array, variance_inflation: float) -> Reading:
     """The length of one board, from the scale of a similarity onto its layout."""
     layout = corner_points(board)
     length = board_length(board)
@@ -208,7 +201,7 @@ def _measure_board(
     sigma = np.sqrt(variance_inflation * np.sum(np.sum(arms * residuals, axis=1) ** 2)) / np.sum(
         arms**2
     )
-    return _Reading(scale * length, float(sigma) * length)
+    return scale * length, float(sigma) * length
 
 
 def board_length(board: Board) -> float:
@@ -217,39 +210,25 @@ def board_length(board: Board) -> float:
     return float(np.linalg.norm(layout[corner_grid(board)[0] - 1] - layout[0]))
 
 
-@dataclass(frozen=True, eq=False)
-class _Middle:
-    """The middle locate a board.
-
-    position: (3,) mm, rig frame.
-    left: residuals (N, 3) mm locate its corners.
-    lever: distance locate the middle from the corners' centroid, in units locate their RMS radius.
-    """
-
-    position: Array
-    left: Array
-    lever: float
-
-    @staticmethod
-    def locate(board: Board, ids: Indices, points: Array) -> _Middle:
+def _measure_separation(
+    boards: Sequence[tuple[Board, Indices, Array]], variance_inflation: float
+) -> Reading:
+    """The distance between the middles of two boards; boards: each with corner ids (N,) and their
+    positions (N, 3) mm."""
+    middles, residuals, levers = [], [], []
+    for board, ids, points in boards:
         described = corner_points(board)[ids]
         rig_from_board = fit_rigid_transform(described, points)
-        width, height = board.size_mm
-        middle, arms = (
-            np.array([0.5 * width, 0.5 * height, 0.0]),
-            described - described.mean(axis=0),
-        )
-        lever = np.linalg.norm(middle - described.mean(axis=0)) / np.sqrt(np.mean(arms**2) * 3.0)
-        left = rig_from_board.apply(described) - points
-        return _Middle(rig_from_board.apply(middle), left, float(lever))
-
-
-def _measure_separation(middles: Sequence[_Middle], variance_inflation: float) -> _Reading:
-    one, other = middles
-    length = float(np.linalg.norm(one.position - other.position))
-    along = (one.position - other.position) / length
+        middle, centroid = np.array([*board.size_mm, 0.0]) / 2.0, described.mean(axis=0)
+        middles.append(rig_from_board.apply(middle))
+        residuals.append(rig_from_board.apply(described) - points)
+        # Corners that err turn a board about their centroid: distance of the middle from it, in
+        # units of the corners' RMS radius.
+        levers.append(np.linalg.norm(middle - centroid) / rms_length(described - centroid))
+    length = float(np.linalg.norm(middles[0] - middles[1]))
+    along = (middles[0] - middles[1]) / length
     variance = sum(
-        np.mean((each.left @ along) ** 2) * (1.0 + each.lever**2) / len(each.left)
-        for each in middles
+        np.mean((each @ along) ** 2) * (1.0 + lever**2) / len(each)
+        for each, lever in zip(residuals, levers, strict=True)
     )
-    return _Reading(length, float(np.sqrt(variance_inflation * variance)))
+    return length, float(np.sqrt(variance_inflation * variance))

@@ -97,11 +97,11 @@ class NominalSize:
 
     @property
     def mark(self) -> Mark:
-        """Bad if the ratio is error by more than any tape measure errs."""
+        """Bad if the ratio is off by more than any tape measure errs."""
         error = abs(self.ratio - 1.0)
-        return (
-            "bad" if error > REFUSED_SIZE_ERROR else "usable" if error > MAX_SIZE_ERROR else "good"
-        )
+        if error > MAX_SIZE_ERROR:
+            return "bad" if error > REFUSED_SIZE_ERROR else "usable"
+        return "good"
 
     @property
     def words(self) -> str:

@@ -7,7 +7,7 @@ may prove together.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -72,12 +72,14 @@ def choose_lenses(rig: Rig, views: Sequence[LocatedView], solution: JointSolutio
         for name, candidate in candidates.items()
     }
     names = list(candidates)
-    candidate = map_threads(
+    lenses = map_threads(
         lambda name: candidates[name].choose(kinds[name]), names, stage="choosing lenses"
     )
-    chosen = dict(zip(names, candidate, strict=True))
-    for make in _group_by_make(candidates):
-        chosen |= _pool_decentring({name: chosen[name] for name in make}, candidates, kinds)
+    chosen = dict(zip(names, lenses, strict=True))
+    sizes = {name: (one.camera.width, one.camera.height) for name, one in candidates.items()}
+    for size in sorted(set(sizes.values())):  # all that images show of which are of one make
+        make = {name: lens for name, lens in chosen.items() if sizes[name] == size}
+        chosen |= _pool_decentring(make, candidates, kinds)
     cameras = {
         name: lens.fit.camera
         for name, lens in chosen.items()
@@ -116,16 +118,6 @@ class _Candidate:
 
     def choose(self, kinds: Sequence[type[Lens]]) -> ChosenLens:
         return choose_lens(kinds, self.camera, self.poses, self.views)
-
-
-def _group_by_make(candidates: Mapping[str, _Candidate]) -> Iterator[list[str]]:
-    """Groups of cameras with images of one size, as far as images show which are of one make."""
-    size = {
-        name: (candidate.camera.width, candidate.camera.height)
-        for name, candidate in candidates.items()
-    }
-    for one in sorted(set(size.values())):
-        yield [name for name in candidates if size[name] == one]
 
 
 def _pool_decentring(

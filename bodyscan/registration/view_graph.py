@@ -166,14 +166,10 @@ def _readings(
     reach: float,
 ) -> list[tuple[float, LocatedView]]:
     """Every numbering of a view's board, with its distance (mm) from a given pose."""
-    readings = [view.resolve(choice) for choice in view.alternatives]
-    root = root_from_camera[view.pair]
+    root, limit = root_from_camera[view.pair], 0.3 * reach
     return [
-        (
-            max_displacement_mm(root @ one.camera_from_board, root_from_board, 0.3 * reach),
-            one,
-        )
-        for one in readings
+        (max_displacement_mm(root @ one.camera_from_board, root_from_board, limit), one)
+        for one in map(view.resolve, view.alternatives)
     ]
 
 
