@@ -198,12 +198,8 @@ def _share(areas: Array, which: Mask, among: Mask) -> float:
 
 @dataclass(frozen=True)
 class _Contact:
-    """An arm whose hand touches the trunk at heights from low_mm to high_mm.
-
-    y_mm: of the arm's middle just above, body frame.
-
-    Below the height where a hand first touches the body, it may keep touching for 200 mm.
-    """
+    """An arm whose hand touches the trunk at heights from low_mm to high_mm; y_mm: of the arm's
+    middle just above, body frame. Below the first touch, the hand may keep touching for 200 mm."""
 
     side: str
     low_mm: float
@@ -286,11 +282,10 @@ def _girth(part: str, meshed: Loop) -> Girth:
 
 
 def rig_from_body(vertices: Array) -> RigidTransform:
-    """Estimate the pose of a standing body in the rig frame from evenly spread vertices (V, 3) mm.
+    """Estimate the pose of a standing body in the rig frame from evenly spread vertices (V, 3) mm:
+    z = 0 on the floor, origin under the body, x where it faces, y to its left.
 
-    The body's frame has z = 0 on the floor, its origin under the body, x where it faces and y to its
-    left. The upper body is widest from side to side; of the two directions across that, the subject
-    faces the one nearer to the rig's x.
+    The upper body is widest from side to side; it faces the direction nearer to the rig's x.
     """
     # Hips, trunk and arms, which together are wider than deep.
     upper = vertices[vertices[:, 2] > 0.45 * vertices[:, 2].max(), :2]

@@ -49,12 +49,10 @@ UNIFORM_SIGMA = 12.0**-0.5
 
 
 def decode_sweep(lit: Greys, frames: Greys, direction: str) -> StripeMap:
-    """Compute the stripe map of a swept line.
+    """Compute the stripe map of a swept line from images (stripes, H, W), most dark at any one
+    pixel.
 
-    lit: (H, W).
-    frames: (stripes, H, W), most of them dark at any one pixel.
-
-    Raises DecodingFailed if the images are inconsistent.
+    lit: (H, W). Raises DecodingFailed if the images are inconsistent.
     """
     stripes = len(frames)
     lines = ScanLines.from_images(lit, lit, frames, None, direction)
@@ -84,11 +82,9 @@ def decode_sweep(lit: Greys, frames: Greys, direction: str) -> StripeMap:
 class _Sweep:
     """The sweep at each pixel (L, P), grey levels.
 
-    base: without the line.
-    peak: number of the brightest image.
-    window: (2 REACH + 1, L, P) the images around it, above the base.
-    height: of the brightest image.
-    total: of the whole window.
+    base: without the line. peak: number of the brightest image.
+    window: (2 REACH + 1, L, P) the images around it, above the base; height, total: the brightest
+        of them, and all.
     second: the brightest of the other images.
     """
 
@@ -141,10 +137,8 @@ class _Sweep:
         return float(max(np.mean(np.minimum(stray, 8.0)) ** 2 * np.pi / 2.0, 0.15))
 
     def noise_rise(self, lit: Greys, base_noise2: float) -> float:
-        """Measure how much the variance rises with each grey level of light.
-
-        The window adds up to the lit image, except for the noise of both.
-        """
+        """Measure how much the variance rises with each grey level of light: the window adds up
+        to the lit image, except for the noise of both."""
         above = lit - self.base
         bright = (above > 20) & (lit < SATURATED) & (self.total > 20)
         if np.count_nonzero(bright) < 200:
@@ -160,15 +154,11 @@ class _Sweep:
 
 
 def decode_index(lit: Greys, numbers: Greys, direction: str, stripes: int) -> StripeMap:
-    """Compute the stripe map of a stripe-index image.
+    """Compute the stripe map of a stripe-index image; lit: (H, W), numbers: (1, H, W).
 
-    lit: (H, W).
-    numbers: (1, H, W).
-
-    A boundary is only known to lie between two pixels. Along a line of boundaries s is interpolated
-    nevertheless: it is closer to the truth than the middle of the stripe, which is used for pixels
-    that lie between no two boundaries. Raises DecodingFailed if neighbours are not in neighbouring
-    stripes.
+    Boundaries lie somewhere between two pixels. Along a line of them s is interpolated; pixels
+    between no two boundaries get their stripe's middle. Raises DecodingFailed for stripes in
+    disorder.
     """
     black = np.zeros_like(lit)
     images = ScanLines.from_images(lit, black, numbers, None, direction)

@@ -75,11 +75,9 @@ class ScanLines:
 
     def difference(self, bit: Indices, pixels: Indices, variance: Floats) -> tuple[Floats, Floats]:
         """Compute pattern minus inverse of bits (N,) at flat pixels (N, K), and its standard
-        deviation, grey levels; 0 where the pixel is negative.
+        deviation, grey levels; 0 at negative pixels. variance: (256,) of each grey level.
 
         Without inverses: twice the excess of the pattern over the mean of lit and dark.
-
-        variance: (256,) of each grey level.
         """
         patterns, inverses = self.patterns.reshape(-1), self._inverses.reshape(-1)
         return _differences(
@@ -105,12 +103,12 @@ class ScanLines:
 
 @dataclass(frozen=True)
 class LineBands:
-    """One in `every` of the bands of `width` neighbouring lines: a board shows more boundaries than
-    any fit needs.
+    """One in `every` of the bands of `width` neighbouring lines: boards show more boundaries than
+    needed.
 
     turn: which of the `every` bands.
-    corner: row and column of the camera's image at which the images begin. Bands are counted from
-        the camera image's first line, so that they do not depend on the crop.
+    corner: row and column of the camera's image at which the images begin; bands are counted from
+        the camera image's first line.
     """
 
     width: int
@@ -121,8 +119,8 @@ class LineBands:
     def lines(self, count: int, *, transposed: bool) -> BandLines:
         """Select the lines to decode out of `count`.
 
-        The correction at edges of brightness moves boundaries across up to 2 lines, and 8 more are
-        needed to judge pixels: `albedo_edges` looks 3 lines aside, at pixels that depend on 2 more.
+        The correction at edges moves boundaries across up to 2 lines, and judging pixels takes 8
+        more.
         """
         band = (self.corner[transposed] + np.arange(count)) // self.width
         inside = band % self.every == self.turn % self.every

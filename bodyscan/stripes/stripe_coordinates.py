@@ -52,9 +52,7 @@ def interpolate_stripes(
 def correlation_along_lines(boundaries: Boundaries) -> float:
     """Compute the distance along a line, px, within which pixels share noise; 0 without stripes.
 
-    One stripe apart, two pixels between boundaries share a quarter of it, and 0.65 if the boundaries
-    were smoothed; two apart nothing, and 0.14. A correlation that falls linearly to zero at 1.4 and
-    2.4 stripes differs from these by a tenth at most.
+    A linear fall to zero at 1.4 stripes (2.4 if boundaries were smoothed) is right to a tenth.
     """
     width = np.diff(boundaries.position)[boundaries.joined]
     width = width[width >= MIN_STRIPE_PX]
@@ -143,8 +141,8 @@ def _interpolate(pixel: int, code: int, k: int, segments: tuple[Array, ...]) -> 
 
 @compiled
 def _extrapolate(pixel: int, code: int, k: int, segments: tuple[Array, ...]) -> tuple[float, float]:
-    """s and its standard deviation at a pixel before or after segment k, or NaN: its curvature
-    continues, and its contribution counts as an error besides three sigmas of the segment."""
+    """s and its standard deviation at a pixel before or after segment k, or NaN; the continued
+    curvature counts as an error besides three sigmas of the segment."""
     start, width, index, rise, sigma, slope_in, slope_out, bias = segments
     x, base, slope = pixel - start[k], index[k] - bias[k], slope_in[k]
     if x > 0.5 * width[k]:
@@ -169,9 +167,8 @@ def _accept(value: float, error: float, code: int, middle: float) -> tuple[float
 def estimate_end_slopes(secant: Array, width: Array) -> tuple[Array, Array]:
     """Estimate the slopes of s at both ends of every segment from the neighbouring segments.
 
-    Within a run the slope at a boundary is that of the parabola through it and its neighbours; at a
-    run's end the parabola of the one segment is continued; a segment alone has its secant's slope.
-    Segments in which s runs the other way are ignored.
+    Within a run the slope is that of the parabola through a boundary and its neighbours; at its
+    ends the parabola is continued; a segment alone has its secant's slope.
     """
     count = secant.size
     slope_in, slope_out = np.full(count, np.nan), np.full(count, np.nan)
@@ -195,12 +192,11 @@ def _continue_slope(slope: float, other: float, secant: float) -> float:
 
 
 def smooth_runs(boundaries: Boundaries, joined: Mask) -> tuple[Array, Array]:
-    """Smooth positions by a local quadratic fit along each unbroken run; returns them and their
-    sigmas, px.
+    """Smooth positions by a local quadratic fit of position against index along each unbroken run;
+    returns them and their sigmas, px.
 
-    Along a run the index counts evenly, so the fit of position against index is a fixed filter. It
-    reaches no farther than about 6 px and not past the run's ends; a boundary that it would move by
-    more than four sigmas is left in place.
+    The fit reaches no farther than about 6 px; a boundary that it would move by more than four
+    sigmas is left in place.
     """
     position, sigma = boundaries.position.copy(), boundaries.sigma_px.copy()
     for weights in SMOOTHERS:

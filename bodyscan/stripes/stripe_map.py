@@ -38,9 +38,8 @@ class ResponseShare:
 class StripeMap:
     """The stripe coordinate of every lit pixel, and the stripe boundaries between them.
 
-    s: (height, width) float32, in [0, S]; NaN where there is none; (0, 0) if only boundaries were
-        wanted.
-    sigma: (height, width) float32, standard deviation of s, in stripes; NaN likewise.
+    s, sigma: (height, width) float32, in [0, S], and its standard deviation, stripes; NaN where
+        there is none; (0, 0) if only boundaries were wanted.
     lit: (height, width) uint8, the fully lit image (grey).
     boundary_index: (N,) int64: boundary i lies between stripes i - 1 and i, that is s = i.
     boundary_pixels: (N, 2) float64, its position, px, sub-pixel.
@@ -48,12 +47,9 @@ class StripeMap:
     stripes: S, the number of stripes projected.
     beyond: (height, width) bool, lit by a stripe that lies deeper than wanted, where s is NaN (see
         `StripeLimits`); None if all stripes were wanted.
-    crossing: the map of the stripes that run the other way, if such were projected.
-    crossing_fault: why there is none although they were, else "".
-    response: error due to the projector's response, for codes that measure it; None if noise
-        explains it.
-    correlation_px: distance along rows and along columns within which pixels share noise, as they
-        lie between the same boundaries; 0 if their noise is independent.
+    crossing, crossing_fault: the map of the stripes that run the other way, or why there is none.
+    response: error due to the projector's response; None if not measured or noise explains it.
+    correlation_px: distance along rows and along columns within which pixels share noise.
     """
 
     s: Floats
@@ -120,11 +116,10 @@ def assemble_from_pixels(
     """Make the map from s and its standard deviation (L, P) at each pixel, NaN where there is none.
 
     variance: (256,) of each grey level.
-    codes: (L, P) stripes; if given, s interpolated between boundaries replaces a pixel's s where its
-        sigma is smaller.
+    codes: (L, P) stripes; if given, s interpolated between boundaries is used where its sigma is
+        less.
 
-    Edges of the surface's brightness shift s as they shift boundaries (see `albedo_edges`); that is
-    corrected first. Boundaries are where s passes a whole number between two pixels of a line.
+    Shifts by edges of the surface's brightness are corrected first (see `albedo_edges`).
     """
     brightness = Brightness.from_images(images, variance, np.isfinite(s))
     raw = find_whole_numbers(s, sigma, 0.0)

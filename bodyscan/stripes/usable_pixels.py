@@ -29,13 +29,11 @@ def find_usable_pixels(
 ) -> tuple[Mask, Mask]:
     """Find the pixels (L, P) whose stripes `codes` can be relied on, and all that are lit well.
 
-    Excluded from both are low contrast, saturation, codes that were not projected, pixels that the
-    surface's rim covers only in part, and pixels that get more light from other surfaces than from
-    the projector; from the former also pixels next to a jump of the code by more than one (such as a
-    mixed pixel at a depth discontinuity).
+    Excluded from both are low contrast, saturation, codes that were not projected, half-covered
+    pixels at rims, and mostly indirect light; from the former also pixels next to a jump of the
+    code by more than one.
 
-    variance: (256,) of each grey level.
-    fine_bit: see `find_direct_pixels`.
+    variance: (256,) of each grey level. fine_bit: see `find_direct_pixels`.
     """
     contrast = cv2.subtract(images.lit, images.dark)
     needed = np.maximum(min_contrast(contrast.dtype), MIN_CONTRAST_TO_NOISE * np.sqrt(variance))
@@ -64,16 +62,13 @@ def find_half_covered_pixels(contrast: NDArray[Any], lit: Mask) -> Mask:
 def find_direct_pixels(images: ScanLines, usable: Mask, bit: int, variance: Floats) -> Mask:
     """Find the pixels (L, P) that get more light from the projector than from other surfaces.
 
-    usable: (L, P) pixels to examine.
-    bit: the pattern with stripes two wide.
+    usable: (L, P) pixels to examine. bit: the pattern with stripes two wide.
     variance: (256,) of each grey level.
 
-    A pixel's lit minus dark is direct light D plus light I from other surfaces. A fine pattern minus
-    its inverse is about +-D (Nayar et al. 2006), and a bit is certain where D > I (Xu and Aliaga
-    2007). The finest bit decides, or the next coarser one that the projector shows sharply, to 0.8
-    of the contrast in a tenth of the pixels (in procam-board its lens leaves a fifth of the finest).
-    Where a bit flips its difference is small whatever the light; such dips along the lines, up to
-    7 px wide, are filled.
+    A fine pattern minus its inverse is about +- the direct light (Nayar et al. 2006); a bit is
+    certain where that exceeds the rest (Xu and Aliaga 2007). The finest bit decides, or the next
+    coarser one that the projector shows sharply, to 0.8 of the contrast in a tenth of the pixels.
+    Dips where the bit flips, up to 7 px wide, are filled.
     """
     window = np.ones((1, 7), np.uint8)
     for fine in range(bit, max(bit - 3, -1), -1):

@@ -68,14 +68,6 @@ def test_at_a_rim_a_surface_counts_for_less_and_so_it_does_in_the_sigma() -> Non
     assert cloud.sigma_mm[both] == pytest.approx(0.1 * np.sqrt(1 + 1 / 16) / 1.25, rel=1e-3)
 
 
-def test_what_one_pair_alone_saw_is_as_certain_as_it_says() -> None:
-    surface = known_to(wall(WALL_MM, 60, RigidTransform.identity()), 0.1)
-    samples = take_samples([surface], 10**6)
-    alone = [compare_with_surface(samples, surface, 0, 1.5, 6.0)]
-    cloud = average(samples, [surface], alone, as_seen(samples, [surface]), workers=1)
-    assert cloud.sigma_mm == pytest.approx(0.1, rel=1e-5)
-
-
 def test_where_a_surface_ends_there_is_no_step() -> None:
     """Its weight rises from near 0 at its rim to that of its sigma over a window."""
     surfaces = [wall(WALL_MM, 100, RigidTransform.identity()), wall(WALL_MM + 0.5, 100, ASIDE)]

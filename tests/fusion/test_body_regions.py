@@ -10,8 +10,7 @@ import pytest
 from ray_cast_scan import Scan, cast_scan, load_body, load_rig
 
 from bodyscan.arrays import Bytes, Mask
-from bodyscan.fusion.regions import CELL_MM, Regions, find_head, find_in_cells, label_regions
-from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.fusion.regions import Regions, find_head, label_regions
 from bodyscan.mesh.body import DARK_CLOTH, HAIR, SKIN, UNSURE, BodyCloud, compute_cover_shares
 from bodyscan.motion.body_parts import NECK
 from bodyscan.reconstruction.range_image import RangeImage
@@ -231,22 +230,6 @@ def test_of_what_covers_the_skin_is_spoken_where_it_is_more_than_moles() -> None
     regions = np.repeat(np.array([SKIN, HAIR, DARK_CLOTH, UNSURE], np.uint8), [700, 200, 97, 3])
     assert compute_cover_shares(regions) == pytest.approx({"hair": 0.2, "dark cloth": 0.097})
     assert compute_cover_shares(None) == {}
-
-
-def test_pixels_that_are_looked_at_lie_in_the_cells_asked_about() -> None:
-    rng = np.random.default_rng(1)
-    points = rng.uniform(-400.0, 400.0, (40, 50, 3)).astype(np.float32)
-    sigma_mm = np.where(rng.random((40, 50)) < 0.8, 0.1, np.nan).astype(np.float32)
-    at = RigidTransform.from_rotation_vector([0.3, -0.2, 1.0], [50.0, -20.0, 900.0])
-    asked = rng.random((10, 12, 14)) < 0.5
-    low = np.array([-150.0, -180.0, 700.0])
-    wanted = np.zeros(sigma_mm.shape, np.bool_)
-    find_in_cells(points, sigma_mm, at.matrix[:3], low, asked, wanted)
-
-    cell = np.floor((at.apply(points.astype(np.float64)) - low) / CELL_MM).astype(int)
-    nearest = np.clip(cell, 0, np.array(asked.shape) - 1)
-    expected = np.isfinite(sigma_mm) & asked[tuple(np.moveaxis(nearest, -1, 0))]
-    np.testing.assert_array_equal(wanted, expected)
 
 
 def test_a_head_is_above_the_neck_and_near_the_middle_of_the_upper_body() -> None:

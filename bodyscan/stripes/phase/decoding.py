@@ -57,13 +57,11 @@ def decode_wave(
 ) -> StripeMap:
     """Compute the stripe map from one wave and a Gray code of its half periods.
 
-    images: scan lines of the Gray code.
-    lit: (H, W) in the camera's layout.
-    phases: (steps, H, W), the images of the wave.
+    images: scan lines of the Gray code. lit: (H, W); phases: (steps, H, W), images of the wave.
 
-    Near its own boundaries the Gray code's word is off by at most one, so the middle of its half
-    period is never half a period from s, and the period whose phase is nearest to it is the right
-    one. Raises DecodingFailed if the images are inconsistent.
+    Near its own boundaries the Gray code is off by at most one half period, so that the period
+    whose phase is nearest to its middle is the right one. Raises DecodingFailed for inconsistent
+    images.
     """
     variance = measure_noise(images)
     halves = GRAY.stripes(read_words(GRAY, images, half_periods, variance))
@@ -152,11 +150,9 @@ def check_phase(turn: Floats, coarse: Floats, usable: Mask) -> None:
 
 
 def smooth_phase(s: Floats, sigma: Floats) -> tuple[Floats, Floats]:
-    """Smooth s (L, P), NaN where there is none, by a quadratic fitted to 3 x 3 pixels; returns it
-    and its standard deviation.
+    """Smooth s (L, P) by a quadratic fitted to 3 x 3 pixels; return it and its standard deviation.
 
-    The fit preserves whatever changes only along lines or only along columns, however sharply; it
-    removes only what changes from pixel to pixel both ways, which a lens and a pixel blur away on any
+    The fit removes only what changes from pixel to pixel both ways, which a lens blurs away on any
     surface. Where it would change s by more than four sigmas there is an edge: s is kept. Source:
     Savitzky and Golay, Analytical Chemistry 36 (1964), in two dimensions.
     """
@@ -172,11 +168,7 @@ def smooth_phase(s: Floats, sigma: Floats) -> tuple[Floats, Floats]:
 def decode_waves(
     images: Greys, waves: tuple[Wave, ...], lit: Greys, direction: str, stripes: int
 ) -> StripeMap:
-    """Compute the stripe map from waves of several periods: s from their phases, black and white
-    from their means and amplitudes.
-
-    images: (F, H, W), those of each wave in the order of `waves`.
-    lit: (H, W).
+    """Compute the stripe map from images (F, H, W) of waves of several periods; lit: (H, W).
 
     Raises DecodingFailed if the images are inconsistent.
     """
@@ -201,13 +193,10 @@ def decode_waves(
 
 @dataclass(frozen=True, eq=False)
 class WaveReading:
-    """Waves measured along scan lines (L, P).
+    """Waves measured along scan lines (L, P), the finest first, with their errors removed.
 
-    waves: the finest first, with their errors removed.
-    images: of each wave.
-    errors: of each wave.
-    bright: clearly lit.
-    brightest: of all images.
+    images, errors: of each wave.
+    bright: clearly lit. brightest: of all images.
     variance: (256,) of each grey level.
     """
 
@@ -250,11 +239,8 @@ class WaveReading:
 
 
 def check_several_waves(read: WaveReading, stripes: int) -> None:
-    """Raise DecodingFailed if an image is missing, taken twice or exposed differently.
-
-    All waves have the same mean at each pixel (lamps and sensors drift by less than 15 %), and no
-    two images of a wave are the same.
-    """
+    """Raise DecodingFailed if an image is missing, taken twice or exposed differently: all waves
+    have the same mean at each pixel to 15 %, and no two images of a wave are the same."""
     good = read.bright & (read.brightest < SATURATED)
     if not good.any():
         return

@@ -98,7 +98,7 @@ def _average_waves(
     turns: Floats, sigmas: Floats, periods: Array, orders: Indices, residual: Floats
 ) -> tuple[Floats, Floats]:
     """Weighted mean of s from the waves up to twice as long as the finest, and its standard
-    deviation (M,); longer ones would add more of their errors than they remove of its noise."""
+    deviation (M,); longer ones add more errors than they remove noise."""
     weights = 1.0 / np.square(sigmas * periods[:, None].astype(np.float32))
     weights[periods > 2.0 * periods[0]] = 0.0
     moved = np.sum(weights[1:] * residual * periods[1:, None].astype(np.float32), axis=0)

@@ -32,10 +32,8 @@ images."""
 
 @dataclass(frozen=True, eq=False)
 class PhaseError:
-    """The error of a wave's turn, itself a wave of the turn as measured.
-
-    cosines, sines: amplitudes, in turns, at 1, 2, ... times `steps` times its frequency.
-    """
+    """The error of a wave's turn, itself a wave of the turn as measured: amplitudes (turns) of
+    cosines and sines at 1, 2, ... times `steps` times its frequency."""
 
     steps: int
     cosines: Array
@@ -60,8 +58,8 @@ def correct_wave(wave: MeasuredWave, error: PhaseError | None) -> MeasuredWave:
 def compute_response_share(
     error: PhaseError | None, wave: MeasuredWave, sigma: Floats
 ) -> ResponseShare | None:
-    """Compute the error of s (stripes) that was corrected, and that due to noise, over the pixels
-    with a sigma (in any layout)."""
+    """Compute the error of s (stripes) that was corrected, and that due to noise, where sigma is
+    known."""
     known = np.isfinite(sigma)
     if error is None or not known.any():
         return None
@@ -71,11 +69,8 @@ def compute_response_share(
 
 
 def estimate_error(wave: MeasuredWave, usable: Mask, stripes: int) -> PhaseError | None:
-    """Estimate the error of a wave that repeats in the image; None if noise explains it or it does
-    not repeat.
-
-    usable: (L, P); lines cross the wave.
-    """
+    """Estimate the error of a wave at usable pixels (L, P); None if noise explains it, or the
+    wave does not repeat."""
     if wave.wave.period * MIN_PERIODS > stripes:
         return None
     lag = _choose_lag(wave, usable)

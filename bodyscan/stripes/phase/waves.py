@@ -89,8 +89,8 @@ def measure_wave_noise(
 ) -> Floats:
     """Measure the variance (256,) of one image's grey level, for each grey level.
 
-    Several waves, or more than three steps of one, give the surface's mean brightness and the shape
-    of a wave more than once; the differences are noise.
+    Several waves, or more than three steps of one, determine mean and shape more than once; the
+    differences are noise.
 
     waves, images: the waves, and the images (N, L, P) of each.
     usable: (L, P) pixels that the projector lights.
