@@ -160,37 +160,3 @@ def test_exported_files_state_that_they_are_defaced(body: BodyMesh, tmp_path: Pa
         assert not set(map(bytes, mesh.vertices[mesh.vertices[:, 2] > 1430.0])) & set(
             map(bytes, body.vertices)
         )
-
-
-SIDES, STEP_MM = 24, 4.0
-AXIS = np.array([30.0, -20.0])
-TALL_MM, NECK_MM = 1700.0, 1452.0
-PERSON = [(0.0, 150.0), (1344.0, 150.0), (NECK_MM, 55.0), (1500.0, 80.0), (TALL_MM, 80.0)]
-"""(height, radius) mm of a figure of revolution, straight in between."""
-
-
-def revolve(profile: list[tuple[float, float]]) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and faces of the surface, a ring every 4 mm; open at both ends."""
-    height = np.arange(0.0, TALL_MM + 1.0, STEP_MM)
-    radius = np.interp(height, *np.array(profile).T)
-    angle = 2.0 * np.pi * np.arange(SIDES) / SIDES
-    flat = AXIS + radius[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    z = np.broadcast_to(height[:, None, None], (len(height), SIDES, 1))
-    ring, side = np.mgrid[: len(height) - 1, :SIDES]
-    a, b = SIDES * ring + side, SIDES * ring + (side + 1) % SIDES
-    faces = np.stack([[a, b, b + SIDES], [a, b + SIDES, a + SIDES]], axis=-1).reshape(3, -1).T
-    return np.concatenate([flat, z], axis=-1).reshape(-1, 3), faces
-
-
-def test_the_neck_is_the_narrowest_slice_and_its_axis_that_of_the_head() -> None:
-    neck = find_neck(*revolve(PERSON))
-    assert neck.height_mm == pytest.approx(NECK_MM)
-    np.testing.assert_allclose(neck.axis, AXIS, atol=1e-6)  # the middle of rings
-
-
-def test_what_is_farther_from_the_axis_than_a_head_reaches_does_not_count() -> None:
-    """A second trunk 400 mm aside, wider, whose narrowest slice is at another height."""
-    vertices, faces = revolve(PERSON)
-    aside = vertices * [2.0, 2.0, 1.0] + [0.0, 500.0, 0.0]
-    both = np.concatenate([vertices, aside]), np.concatenate([faces, faces + len(vertices)])
-    assert find_neck(*both).height_mm == pytest.approx(NECK_MM)
