@@ -77,31 +77,6 @@ def marker_dictionary(board: Board) -> cv2.aruco.Dictionary:
     return cv2.aruco.getPredefinedDictionary(number)
 
 
-def charuco_face(board: Board, face: int = 0) -> cv2.aruco.CharucoBoard:
-    """Describe one face as OpenCV's CharucoBoard. The back's marker ids follow the front's.
-
-    Raises BadInput if marker_mm is missing or too large, or the dictionary has too few markers.
-    """
-    where = f"board {board.name}"
-    if board.marker_mm is None or not board.marker_mm < board.square_mm:
-        raise BadInput("a charuco board needs marker_mm, smaller than square_mm", where=where)
-    dictionary = marker_dictionary(board)
-    count = markers_per_face(board)
-    first = board.first_marker + face * count
-    if first + count > len(dictionary.bytesList):
-        raise BadInput(
-            f"{board.dictionary} has {len(dictionary.bytesList)} markers, too few for ids "
-            f"{first} to {first + count - 1}",
-            where=where,
-            remedy="choose a larger dictionary or a smaller first_marker",
-        )
-    size = (board.columns, board.rows)
-    ids = np.arange(first, first + count)
-    charuco = cv2.aruco.CharucoBoard(size, board.square_mm, board.marker_mm, dictionary, ids)
-    charuco.setLegacyPattern(board.legacy_layout)
-    return charuco
-
-
 def markers_per_face(board: Board) -> int:
     """Number of markers on one face: one per white square, or all tags of an aprilgrid."""
     return board.marker_count // board.faces
@@ -112,11 +87,32 @@ def marker_corners(board: Board, face: int = 0) -> tuple[Indices, Array]:
 
     Corners run clockwise as printed, from the marker's own top left, as OpenCV's detector gives
     them; for an aprilgrid from the print's top left. Its tags count from the lower left, row by row
-    upwards, as Kalibr prints them.
+    upwards, as Kalibr prints them. The back's ids follow the front's.
+
+    Raises BadInput if marker_mm is missing or too large, or the dictionary has too few markers.
     """
     if board.kind == "aprilgrid":
         return _tag_corners(board, face)
-    charuco = charuco_face(board, face)
+    where = f"board {board.name}"
+    if board.marker_mm is None or not board.marker_mm < board.square_mm:
+        raise BadInput("a charuco board needs marker_mm, smaller than square_mm", where=where)
+    dictionary, count = marker_dictionary(board), markers_per_face(board)
+    first = board.first_marker + face * count
+    if first + count > len(dictionary.bytesList):
+        raise BadInput(
+            f"{board.dictionary} has {len(dictionary.bytesList)} markers, too few for ids "
+            f"{first} to {first + count - 1}",
+            where=where,
+            remedy="choose a larger dictionary or a smaller first_marker",
+        )
+    charuco = cv2.aruco.CharucoBoard(
+        (board.columns, board.rows),
+        board.square_mm,
+        board.marker_mm,
+        dictionary,
+        np.arange(first, first + count),
+    )
+    charuco.setLegacyPattern(board.legacy_layout)
     corners = np.asarray(charuco.getObjPoints(), float).reshape(-1, 4, 3)[..., :2]
     return np.asarray(charuco.getIds(), np.int64).ravel(), corners
 

@@ -159,11 +159,7 @@ def _fit_face(board: Board, face: int, markers: Markers) -> FacePosition | None:
 
 
 def _refine(
-    image: Bytes,
-    board: Board,
-    board_map: BoardMap,
-    corner_ids: Indices,
-    markers: Array,
+    image: Bytes, board: Board, board_map: BoardMap, corner_ids: Indices, markers: Array
 ) -> tuple[Array, Mask]:
     """Refine corners (N,) where the markers predict them; return pixels (N, 2) and which are good.
 

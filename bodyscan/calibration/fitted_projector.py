@@ -248,6 +248,6 @@ def _with_misfit(found: FittedProjector, both: Sequence[_Samples]) -> FittedProj
     if not sigmas < 3.0:
         raise BadInput(
             f"no projector with a lens explains its sheets of light: the best fit has an RMS misfit "
-            f"of {misfit:.2g} of its pixels, the noise of the sheets explains {predicted:.2g}",
+            f"of {misfit:.2g} of its pixels, the noise of the sheets explains {predicted:.2g}"
         )
     return replace(found, misfit_px=misfit, predicted_px=predicted)

@@ -20,7 +20,7 @@ from bodyscan.calibration.board_views import BoardFace, PlanarView, corner_keys,
 from bodyscan.calibration.boundary_points import BoundaryPoints, lift_along_rays, rays_on_board
 from bodyscan.calibration.camera import camera_prior
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.least_squares import EXACT, Block, Noise, Solution, minimize
+from bodyscan.geometry.least_squares import EXACT, Block, Noise, minimize
 from bodyscan.geometry.smooth_sheets import SmoothSheets
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 
@@ -35,7 +35,6 @@ STRIPES = Noise("stripes, in sigmas", cauchy=4.0, min_scale=1e-2)
 class StripedBoard:
     """One observation of a board: its corners, and the stripe boundaries on it, if any.
 
-    board: its name.
     pixels: of boundary points, (N, 2) px.
     index: their boundaries, s = i, (N,).
     sigma_px: (N,).
@@ -163,7 +162,6 @@ class JointFit(Generic[Sheets]):
     camera_from_board: of each board, in the order given.
     camera_covariance: (P, P).
     corners_rms_px: robustly weighted.
-    warps: of the boards, by name.
     """
 
     camera: Camera
@@ -205,7 +203,16 @@ def refine_jointly(
         tolerance=1e-2,  # within a tenth of a sigma in every unknown
         damping=1e-6,
     )
-    return _fit(solution, boards)
+    state, covariance = solution.state, solution.covariance
+    corners = np.concatenate([_corner_residuals(state, k, one) for k, one in enumerate(boards)])
+    return JointFit(
+        state.camera,
+        state.poses,
+        state.sheets.with_covariance(_depth_covariance(state, boards, covariance)),
+        covariance[: state.first_pose, : state.first_pose],
+        float(np.sqrt(CORNERS.mean_square(corners)) * np.sqrt(2.0)),
+        state.warps,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,19 +257,6 @@ class _State(Generic[Sheets]):
             self.sheets.retract(step[self.first_sheet : self.first_warp]),
             {name: warp.retract(step[columns[name]]) for name, warp in self.warps.items()},
         )
-
-
-def _fit(solution: Solution[_State[Sheets]], boards: Sequence[StripedBoard]) -> JointFit[Sheets]:
-    state, covariance = solution.state, solution.covariance
-    corners = np.concatenate([_corner_residuals(state, k, one) for k, one in enumerate(boards)])
-    return JointFit(
-        state.camera,
-        state.poses,
-        state.sheets.with_covariance(_depth_covariance(state, boards, covariance)),
-        covariance[: state.first_pose, : state.first_pose],
-        float(np.sqrt(CORNERS.mean_square(corners)) * np.sqrt(2.0)),
-        state.warps,
-    )
 
 
 def _blocks(state: _State[Sheets], boards: Sequence[StripedBoard]) -> Iterator[Block]:

@@ -76,10 +76,8 @@ class HeldOutModel:
     """How well one model measured held-out boards, as distances from the board, mm.
 
     mean_mm: mean absolute distance, outliers capped, every board weighted the same.
-    median_mm: median absolute distance.
     rms_mm: RMS distance without outliers.
     measured: share of the points that got a depth.
-    chosen: whether this model is used.
     gain: standard errors by which it beat the model chosen among those before it, three being
         required; None for the first that may be chosen, and for models that may not be.
     """

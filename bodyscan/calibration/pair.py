@@ -31,9 +31,7 @@ class PairQuality:
     """Figures of one pair.
 
     corners_rms_px: RMS error of corners, px; None if no board was seen.
-    poses: number of board poses.
     planes_rms_mm: RMS distance of boundary points from their sheets, mm.
-    stripe_shots: number of boards with stripes.
     stripes_calibrated, stripes_projected: boundaries with a sheet, and all that are projected.
     held_out: every model of the light tried on held-out boards, simplest first.
     refinement: for a pair by itself, how camera, boards and light were solved for; "" if in turn.
@@ -80,7 +78,6 @@ class PairCalibration:
     camera_covariance: covariance of the camera's parameters, (P, P).
     sheets: None for a camera without a projector.
     crossing: sheets of the crossing stripes, None if there are none or they are not known.
-    rays: how well each pixel's ray is known; None if that was not computed.
     """
 
     name: str
@@ -99,10 +96,8 @@ class LocatedPair:
     camera, camera_covariance: the camera after the joint solve of the rig's corners, and the
         covariance (P, P) of its parameters.
     rays: how well each pixel's ray is known.
-    lenses: those that were tried.
     views: every board view that the camera contributed, with `camera_from_board` from that solve.
     shots: those with decoded stripes.
-    boards: of the rig.
     alone: whether no other pair constrains the boards.
     """
 
@@ -204,10 +199,7 @@ def drop_inconsistent(
 
 
 def _refine(
-    pair: LocatedPair,
-    sheets: SmoothSheets,
-    shots: Sequence[StripedView],
-    points: BoundaryPoints,
+    pair: LocatedPair, sheets: SmoothSheets, shots: Sequence[StripedView], points: BoundaryPoints
 ) -> JointFit[SmoothSheets]:
     """Refine camera, boards and sheets jointly, from all corners and a subset of the stripes."""
     # 6000 bins determine camera, boards and sheets to a tenth as well as all bins do.

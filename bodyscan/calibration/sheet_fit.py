@@ -95,11 +95,7 @@ class SheetFit(Generic[Sheets]):
 
 
 def fit_sheets(
-    start: Sheets,
-    data: BoundaryPoints,
-    *,
-    board_error_mm: float = 0.0,
-    max_steps: int = 25,
+    start: Sheets, data: BoundaryPoints, *, board_error_mm: float = 0.0, max_steps: int = 25
 ) -> SheetFit[Sheets]:
     """Fit sheets by least squares on offsets of points, with Cauchy loss and the model's prior.
 

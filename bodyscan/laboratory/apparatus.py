@@ -21,13 +21,7 @@ from bodyscan.simulation.layout import build_mirror, sample_view_volume
 from bodyscan.simulation.lens import TrueCamera
 from bodyscan.simulation.projector import MirrorProjector
 from bodyscan.simulation.rays import View
-from bodyscan.simulation.settings import (
-    BoardMaking,
-    Noise,
-    Optics,
-    Projection,
-    SimulationSettings,
-)
+from bodyscan.simulation.settings import BoardMaking, Noise, Optics, Projection, SimulationSettings
 from bodyscan.stripes.codes.gray import Gray
 
 CAMERA = TrueCamera(1061.71, 1064.09, -0.562002, 350.08, 286.547, -0.140279, -0.0916363, 640, 480)
@@ -64,7 +58,6 @@ class ChapterSetup:
     """The simulated set-up, all in the camera's frame.
 
     projector: a mirror whose surface lies off its axis.
-    board: as it was made.
     seed: of all noise.
     """
 

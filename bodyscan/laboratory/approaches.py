@@ -216,11 +216,6 @@ PROJECTORS: dict[str, Model] = {
 image is estimated too, instead of being assumed to be the camera's x axis."""
 
 
-def fit_rivals(where: LocatedBoards) -> list[Approach]:
-    """Fit each model of the projector to the same boundaries."""
-    return [fit_approach(name, where, model) for name, model in PROJECTORS.items()]
-
-
 def fit_approach(name: str, where: LocatedBoards, model: Model) -> Approach:
     """Fit one model of the projector to boundaries at known points."""
     sheets = model(where.points, PROJECTOR.stripes, PROJECTOR.direction)

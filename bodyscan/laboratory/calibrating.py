@@ -19,13 +19,13 @@ from bodyscan.geometry.camera import camera_from_fields
 from bodyscan.geometry.smooth_sheets import SmoothSheets
 from bodyscan.laboratory import apparatus
 from bodyscan.laboratory.approaches import (
+    PROJECTORS,
     Approach,
     LocatedBoards,
     calibrate_by_matrix,
     calibrate_by_reference_plane,
     calibrate_by_slide_stage,
     fit_approach,
-    fit_rivals,
     free_planes,
     locate_boards,
     locate_boundaries,
@@ -43,7 +43,6 @@ class Calibrations:
     reference: Zhang's camera.
     planes: the chapter's fit of its free planes.
     ours: our approach, with the camera of the joint solve.
-    camera_covariance: of our camera.
     model, refinement: what ours chose.
     approaches: (i), (i) mended, (ii), (ii) with skew, (iii), ours.
     by_stage, by_reference: every model of the projector, calibrated either way.
@@ -92,8 +91,8 @@ def calibrate_all(captures: ChapterCaptures) -> Calibrations:
         model,
         refinement,
         approaches,
-        tuple(fit_rivals(stage)),
-        tuple(fit_rivals(reference_boards)),
+        tuple(fit_approach(name, stage, model) for name, model in PROJECTORS.items()),
+        tuple(fit_approach(name, reference_boards, model) for name, model in PROJECTORS.items()),
     )
 
 

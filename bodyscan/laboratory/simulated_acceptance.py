@@ -25,15 +25,9 @@ from bodyscan.simulation.layout import TruePair, build_room
 from bodyscan.simulation.presets import settings_from_dict
 from bodyscan.simulation.rays import View
 from bodyscan.simulation.scene import Surface, grid_surface
+from bodyscan.simulation.sensor import fixed_pattern
 from bodyscan.simulation.settings import SimulationSettings
-from bodyscan.simulation.simulate import (
-    Stream,
-    Task,
-    draw_sensor,
-    draw_true_pairs,
-    random_stream,
-    render_task,
-)
+from bodyscan.simulation.simulate import Stream, Task, draw_true_pairs, random_stream, render_task
 from bodyscan.workflows.accept_rig import read_plates, read_spheres
 
 
@@ -116,7 +110,8 @@ def capture_artefact(
     def work(pair: TruePair) -> None:
         rays = random_stream(simulated.seed, Stream.ARTEFACT_RAYS, order[pair.name])
         view = View.from_camera(pair.camera, settings.optics, rays)
-        fixed = draw_sensor(pair.camera, settings, simulated.seed, order[pair.name])
+        pixels = random_stream(simulated.seed, Stream.PIXELS, order[pair.name])
+        fixed = fixed_pattern(pair.camera, settings.noise, pixels)
         for k, name in enumerate(names):
             purpose = Stream.ARTEFACT_NOISE, order[pair.name], number, k
             task = Task(k, name, out.name, tuple(surfaces), rig_from_artefact, 225.0, True)

@@ -95,7 +95,7 @@ def dress(bare: Surface, skin: Skin, rng: np.random.Generator) -> Surface:
     """Cover a surface as `skin` says. Hair is rough: its surface is the truth as well."""
     vertices, albedo = bare.vertices.copy(), np.array(bare.albedo, float)
     if skin.mottling > 0:
-        albedo *= 1.0 + skin.mottling * _mottle(vertices, rng)
+        albedo *= 1.0 + skin.mottling * sum_waves(vertices, 8.0, 40.0, rng) / 2.0
     for centre in rng.integers(len(vertices), size=skin.moles):
         away = np.linalg.norm(vertices - vertices[centre], axis=1)
         albedo[away < rng.uniform(1.5, 5.0)] *= 0.45  # vertices are 3 mm apart
@@ -122,11 +122,6 @@ def sum_waves(
         phase = vertices @ (direction / np.linalg.norm(direction)) * (2.0 * np.pi / length)
         waves += np.cos(phase + rng.uniform(0.0, 2.0 * np.pi))
     return waves
-
-
-def _mottle(vertices: Array, rng: np.random.Generator) -> Array:
-    """Sum waves 8 to 40 mm long at vertices: (N,), standard deviation 1."""
-    return sum_waves(vertices, 8.0, 40.0, rng) / 2.0
 
 
 def mask_hair(vertices: Array) -> Mask:

@@ -97,8 +97,7 @@ def render_pair(
     blurs = list_blurs(view.optics, defocus(images.depth, lamps.focus_mm))
     return {
         name: blur(
-            (add_speckle(light, projection.speckle, rng) + images.ambient[name]) * shading,
-            blurs,
+            (add_speckle(light, projection.speckle, rng) + images.ambient[name]) * shading, blurs
         )
         for name, light in images.laser.items()
     }
@@ -160,11 +159,7 @@ def _render_still(
 
 
 def _rerender_moving(
-    images: _LightImages,
-    view: View,
-    source: _Source,
-    lit: Mapping[str, Floats],
-    moving: Moving,
+    images: _LightImages, view: View, source: _Source, lit: Mapping[str, Floats], moving: Moving
 ) -> None:
     """Update what moves, and what it covers and uncovers, for the moment of each frame."""
     near = _dilate(images.near, images.depth, moving.reach_mm, view.camera)

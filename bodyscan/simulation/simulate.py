@@ -21,7 +21,6 @@ from bodyscan.simulation.board import make_board
 from bodyscan.simulation.files import Motion, Truth, describe
 from bodyscan.simulation.lamps import Lamps
 from bodyscan.simulation.layout import TruePair, build_pairs, build_room
-from bodyscan.simulation.lens import TrueCamera
 from bodyscan.simulation.living import LivingBody, animate, moves, save_body
 from bodyscan.simulation.patterns import (
     refuse_unknown_code,
@@ -207,7 +206,8 @@ def _render_all(rig: Rig, truth: Truth, out: Path, workers: int, progress: Progr
         number, pair = numbered
         rays = random_stream(truth.seed, Stream.RAYS, number)
         view = View.from_camera(pair.camera, settings.optics, rays)
-        fixed = draw_sensor(pair.camera, settings, truth.seed, number)
+        pixels = random_stream(truth.seed, Stream.PIXELS, number)
+        fixed = fixed_pattern(pair.camera, settings.noise, pixels)
         for task in tasks[pair.name]:
             noise = random_stream(truth.seed, Stream.NOISE, number, task.number)
             render_task(rig, pair, view, room, task, settings, out, noise, fixed)
@@ -216,13 +216,6 @@ def _render_all(rig: Rig, truth: Truth, out: Path, workers: int, progress: Progr
                 progress("simulate", done, total)
 
     map_threads(render, enumerate(truth.pairs.values()), stage="simulate", workers=workers)
-
-
-def draw_sensor(
-    camera: TrueCamera, settings: SimulationSettings, seed: int, number: int
-) -> FixedPattern | None:
-    """Draw the fixed pattern of the camera with that number."""
-    return fixed_pattern(camera, settings.noise, random_stream(seed, Stream.PIXELS, number))
 
 
 def render_task(

@@ -54,13 +54,6 @@ def test_neighbouring_edges_stay_out_of_the_windows_of_a_fine_board() -> None:
     assert np.sqrt(np.mean((fitted - true)[good] ** 2)) < 0.03
 
 
-def test_uneven_light_does_not_move_corners() -> None:
-    image, true, start, along = picture(30, light_falloff=0.7)
-    fitted, good = refine_corners(image, start, along, BRIGHT_DIAGONAL)
-    assert good.all()
-    assert np.sqrt(np.mean((fitted - true) ** 2)) < 0.01
-
-
 def test_other_corners_edges_and_flat_areas_are_refused() -> None:
     image, true, start, along = picture(20)
     _, good = refine_corners(image, start, along, ~BRIGHT_DIAGONAL)

@@ -85,9 +85,7 @@ def test_corners_that_form_no_board_are_rejected(monkeypatch: pytest.MonkeyPatch
     assert found(render([(PLAIN, place)]), PLAIN) == []
 
 
-def test_a_detector_s_errors_of_pixels_are_refined_away(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_detector_s_errors_of_pixels_are_refined_away(monkeypatch: pytest.MonkeyPatch) -> None:
     place = view_of(PLAIN, 35, 60, 20, fill=0.55)
     true = true_corners(PLAIN, place)
     # 1.05 and 1.8 px were seen in real pictures, and refused.

@@ -51,15 +51,8 @@ def test_of_a_bent_board_they_are_carried_onto_its_surface() -> None:
 def test_a_pixel_across_the_stripes_moves_a_point_on_its_board(
     direction: Axis, across: int
 ) -> None:
-    found = boundary_points(
-        CAMERA,
-        BOARD,
-        np.array([4, 5, 9]),
-        PIXELS,
-        np.full(3, 0.1),
-        board=7,
-        direction=direction,
-    )
+    seen = np.array([4, 5, 9]), PIXELS, np.full(3, 0.1)
+    found = boundary_points(CAMERA, BOARD, *seen, board=7, direction=direction)
     half = np.zeros(2)
     half[across] = 0.5
     ahead, behind = (rays_on_board(CAMERA.rays(PIXELS + way * half), BOARD) for way in (1.0, -1.0))

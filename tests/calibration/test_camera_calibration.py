@@ -6,10 +6,7 @@ from table_one import CAMERA, POINTS, TURNS
 
 from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import PlanarView
-from bodyscan.calibration.camera import (
-    calibrate_camera,
-    locate_board,
-)
+from bodyscan.calibration.camera import calibrate_camera, locate_board
 from bodyscan.errors import DegeneratePoses
 from bodyscan.geometry.transforms import RigidTransform
 

@@ -66,11 +66,7 @@ def test_a_homography_is_normalised_before_noise_is_shared_out() -> None:
 
 @pytest.mark.parametrize(
     "true",
-    [
-        USUAL,
-        matrix(900.0, 1200.0, 0.0, 640.0, 512.0),
-        matrix(1200.0, 880.0, -80.0, 360.0, 800.0),
-    ],
+    [USUAL, matrix(900.0, 1200.0, 0.0, 640.0, 512.0), matrix(1200.0, 880.0, -80.0, 360.0, 800.0)],
 )
 def test_the_full_matrix_follows_from_three_planes_or_more(true: np.ndarray) -> None:
     for count in (3, 4):

@@ -58,6 +58,7 @@ class Leaning(Lens):
 
 
 CAMERA = Camera(1061.7, 1064.1, -0.6, 330.0, 250.0, Leaning(0.02), 640, 480)
+Ring = tuple[dict[str, RigidTransform], dict[str, Camera]]
 
 
 @pytest.fixture(autouse=True)
@@ -93,7 +94,7 @@ def test_its_rays_are_tabulated() -> None:
 
 
 @pytest.fixture(scope="module")
-def ring() -> tuple[dict[str, RigidTransform], dict[str, Camera]]:
+def ring() -> Ring:
     placings, cameras = ring_of_cameras(heights=(700, 1200))
     first = next(iter(cameras))
     c = cameras[first]
@@ -102,9 +103,7 @@ def ring() -> tuple[dict[str, RigidTransform], dict[str, Camera]]:
     return placings, cameras | {first: own}
 
 
-def test_its_pair_is_placed_among_others(
-    ring: tuple[dict[str, RigidTransform], dict[str, Camera]],
-) -> None:
+def test_its_pair_is_placed_among_others(ring: Ring) -> None:
     placings, cameras = ring
     views, _ = ring_views(placings, cameras, shots=20)
     placed = solve_rig(ring_rig(placings), views, cameras).value
@@ -117,9 +116,7 @@ def test_its_pair_is_placed_among_others(
     assert lens.t == pytest.approx(0.01, abs=2e-4)
 
 
-def test_its_calibration_is_read_as_it_was_written(
-    ring: tuple[dict[str, RigidTransform], dict[str, Camera]], tmp_path: Path
-) -> None:
+def test_its_calibration_is_read_as_it_was_written(ring: Ring, tmp_path: Path) -> None:
     placings, cameras = ring
     pairs = {
         name: PairCalibration(name, c, np.eye(len(c.parameters)), None, PairQuality(0.1, 9))

@@ -21,6 +21,8 @@ from bodyscan.laboratory.reproduce import draw
 from bodyscan.laboratory.text import Reproduction, figure_names, reproduction_text
 from bodyscan.reconstruction.triangulation import grid_normals
 
+Measured = dict[bool, dict[str, ApproachAccuracy]]
+
 
 @pytest.fixture(scope="module")
 def captures() -> ChapterCaptures:
@@ -34,9 +36,7 @@ def calibrated(captures: ChapterCaptures) -> Calibrations:
 
 
 @pytest.fixture(scope="module")
-def measured(
-    captures: ChapterCaptures, calibrated: Calibrations
-) -> dict[bool, dict[str, ApproachAccuracy]]:
+def measured(captures: ChapterCaptures, calibrated: Calibrations) -> Measured:
     approaches = [*calibrated.approaches, make_true_approach(captures.setup)]
     return {
         whole: {
@@ -88,9 +88,7 @@ def test_a_smile_belongs_to_the_truth() -> None:
     assert np.allclose(0.1 / slope, beyond - s, rtol=0.01)
 
 
-def test_whole_stripes_hide_the_calibration(
-    measured: dict[bool, dict[str, ApproachAccuracy]],
-) -> None:
+def test_whole_stripes_hide_the_calibration(measured: Measured) -> None:
     third = measured[True]["(iii)"]
     for name, one in measured[True].items():
         # The trial: 0.31 to 0.52 with whole stripes, chapter's Table 2: 0.13 to 0.41.
@@ -99,7 +97,7 @@ def test_whole_stripes_hide_the_calibration(
         assert one.mean_e == pytest.approx(third.mean_e, rel=0.1), name
 
 
-def test_sub_pixel_boundaries_do_not(measured: dict[bool, dict[str, ApproachAccuracy]]) -> None:
+def test_sub_pixel_boundaries_do_not(measured: Measured) -> None:
     fine = measured[False]
     assert fine["(iii)"].mean_e < 0.02 * measured[True]["(iii)"].mean_e
     assert fine["(i)"].mean_e > 1.3 * fine["(iii)"].mean_e
@@ -115,9 +113,7 @@ def test_sub_pixel_boundaries_do_not(measured: dict[bool, dict[str, ApproachAccu
         assert min(one.covered) > 0.9
 
 
-def test_the_plate_and_the_centres_tell_calibrations_apart(
-    measured: dict[bool, dict[str, ApproachAccuracy]],
-) -> None:
+def test_the_plate_and_the_centres_tell_calibrations_apart(measured: Measured) -> None:
     fine = measured[False]
     # Corners found to 0.03 px in rendering this coarse: a few um, and 0.2 um for all in one solve.
     assert fine["(iii)"].plate_systematic_mm < 0.02
@@ -157,9 +153,7 @@ def test_the_spheres_are_found_without_knowing_where_they_are(
     assert np.allclose(places, apparatus.CENTRES, atol=0.8)
 
 
-def test_noise_is_less_than_everything(
-    captures: ChapterCaptures, measured: dict[bool, dict[str, ApproachAccuracy]]
-) -> None:
+def test_noise_is_less_than_everything(captures: ChapterCaptures, measured: Measured) -> None:
     noise = estimate_noise_bound(captures)
     assert max(noise.best_share) < 0.001
     for alone, sphere in zip(
@@ -182,10 +176,7 @@ def test_points_are_as_far_off_as_they_say(
 
 
 def test_the_report_says_all_of_it(
-    tmp_path: Path,
-    captures: ChapterCaptures,
-    calibrated: Calibrations,
-    measured: dict[bool, dict[str, ApproachAccuracy]],
+    tmp_path: Path, captures: ChapterCaptures, calibrated: Calibrations, measured: Measured
 ) -> None:
     fine, whole = tuple(measured[False].values()), tuple(measured[True].values())
     found = Reproduction(

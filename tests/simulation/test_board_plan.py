@@ -15,9 +15,10 @@ from bodyscan.simulation.plan import BoardShot, count_default_shots, plan_boards
 from bodyscan.simulation.settings import SimulationSettings
 
 RIGS = Path(__file__).parents[2] / "rigs"
+Plan = tuple[Rig, dict[str, TruePair], list[BoardShot]]
 
 
-def planned(name: str) -> tuple[Rig, dict[str, TruePair], list[BoardShot]]:
+def planned(name: str) -> Plan:
     rig = load_rig(RIGS / name)
     pairs = build_pairs(rig, SimulationSettings(), lambda n: np.random.default_rng([0, n]))
     shots = count_default_shots(len(pairs))
@@ -25,7 +26,7 @@ def planned(name: str) -> tuple[Rig, dict[str, TruePair], list[BoardShot]]:
 
 
 @pytest.fixture(scope="module", params=["three-pole-12.yaml", "four-pole-16.yaml", "one-pair.yaml"])
-def plan(request: pytest.FixtureRequest) -> tuple[Rig, dict[str, TruePair], list[BoardShot]]:
+def plan(request: pytest.FixtureRequest) -> Plan:
     return planned(request.param)
 
 
@@ -46,9 +47,7 @@ def seen(pair: TruePair, shot: BoardShot, rig: Rig) -> tuple[float, float, bool]
     return float(np.degrees(np.arccos(abs(cosine)))), float(np.mean(inside)), bool(cosine < 0)
 
 
-def test_who_takes_what_follows_the_rules(
-    plan: tuple[Rig, dict[str, TruePair], list[BoardShot]],
-) -> None:
+def test_who_takes_what_follows_the_rules(plan: Plan) -> None:
     rig, pairs, shots = plan
     for shot in [shot for shot in shots if shot.name != rig.rig_frame.shot][::4]:
         assert not set(shot.stripes) & set(shot.lit)
@@ -67,9 +66,7 @@ def test_who_takes_what_follows_the_rules(
                 assert angle > 69 or inside < (1.0 if whole else 0.3) or not front
 
 
-def test_every_pair_gets_its_boards_near_and_far_and_tilted(
-    plan: tuple[Rig, dict[str, TruePair], list[BoardShot]],
-) -> None:
+def test_every_pair_gets_its_boards_near_and_far_and_tilted(plan: Plan) -> None:
     rig, pairs, shots = plan
     for name, pair in pairs.items():
         own = [shot for shot in shots if name in shot.stripes]
@@ -84,9 +81,7 @@ def test_every_pair_gets_its_boards_near_and_far_and_tilted(
         assert spread[1] > 0.08  # about two axes, by 5 degrees and more (one sigma)
 
 
-def test_pairs_of_all_poles_are_tied_together(
-    plan: tuple[Rig, dict[str, TruePair], list[BoardShot]],
-) -> None:
+def test_pairs_of_all_poles_are_tied_together(plan: Plan) -> None:
     _, pairs, shots = plan
     groups = {name: {name} for name in pairs}
     for shot in shots:

@@ -13,9 +13,7 @@ from small_view import CRISP, LAMPS, projector, view, wall
 
 from bodyscan.arrays import Array, Floats
 from bodyscan.errors import BadInput
-from bodyscan.evaluation.body import girth_errors
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.mesh.body import BodyMesh
 from bodyscan.simulation import SimulationSettings, settings_for, simulate
 from bodyscan.simulation.body import load_subject
 from bodyscan.simulation.living import LivingBody, animate, draw_signal, load_body, moves
@@ -83,23 +81,6 @@ def test_breath_comes_and_goes_on_chest_and_belly_alone() -> None:
     assert reach[still].max() < 0.05
     back = body.rest.vertices[:, 0] < np.percentile(body.rest.vertices[:, 0], 10)
     assert reach[back & (height > 0.5)].max() < 0.2
-
-
-def test_a_breath_moves_a_torso_girth_by_millimetres() -> None:
-    body = load_moving_body(Person(subdivisions=0, breath_mm=4.0))
-    moments = np.linspace(0.0, 1000.0 * body.breath.period_s, 24, endpoint=False)
-    chest = [body.breath.at(ms)[0] for ms in moments]
-    breathed = [body.vertices(moments[int(k)]) for k in (np.argmax(chest), np.argmin(chest))]
-    faces = body.rest.triangles.astype(np.int64)
-    count = len(breathed[0])
-    mesh = BodyMesh(
-        breathed[0], faces, np.zeros((count, 3), np.float32), np.zeros((count, 3), np.uint8),
-        np.zeros(count, np.float32), np.zeros(len(faces), bool),
-    )  # fmt: skip
-    # A girth grows by the outward part of what moves, over the angle it turns by: 4 cos^2 over the
-    # front half and 1 sin^2 all round make 3 pi mm, more or less as a trunk is no ellipse.
-    worst = girth_errors(mesh, breathed[1], faces).worst_mm
-    assert worst == pytest.approx(3.0 * np.pi, rel=0.2)
 
 
 def test_arms_turn_about_shoulders_and_the_head_about_the_neck() -> None:

@@ -71,9 +71,7 @@ def make_scan(folder: Path, subject: str = "s-17", grown_mm: float = 0.0) -> Mad
         },
         "counts": {},
         "person": {
-            "parts": [
-                {"name": "left arm", "moved_mm": 4.61, "left_mm": 0.17, "seen_once": 0.25},
-            ],
+            "parts": [{"name": "left arm", "moved_mm": 4.61, "left_mm": 0.17, "seen_once": 0.25}],
             "breathed_mm": 2.2,
             "moment_ms": 1041.7,
             "fuller_mm": -1.26,
