@@ -30,9 +30,7 @@ MIN_PLATE_POINTS = 300
 class SphereReading:
     """One sphere, from points (all pairs merged, or one pair's).
 
-    fitted: the best sphere.
-    points: number of points on it.
-    form_mm: range of the radial distances from it, 3 per mille of the points left out.
+    form_mm: range of the radial distances from the fitted one, 3 per mille of the points left out.
     shell_mm: width of the shell that holds 90 % of the points.
     size_mm: its diameter less the calibrated one.
     """
@@ -46,13 +44,8 @@ class SphereReading:
 
 @dataclass(frozen=True, eq=False)
 class PlateReading:
-    """One plate.
-
-    points: number of points on it.
-    flatness_mm: range of the distances from the best plane, 3 per mille left out.
-    rms_mm: RMS of all distances.
-    area_mm2: of the hull of what was measured, before its rim was left out.
-    """
+    """One plate: number of its points, range of their distances from the best plane (3 per mille
+    left out) and RMS of all; area of the hull of what was measured."""
 
     points: int
     flatness_mm: float
@@ -78,10 +71,8 @@ def locate_spheres(
 
 
 def read_sphere(points: Array, normals: Array, near: Sphere, radius_mm: float) -> SphereReading:
-    """Read the sphere near a given one, from those of points (N, 3) that belong to it.
-
-    Raises FailedWork if there are too few.
-    """
+    """Read the sphere near a given one from points (N, 3). Raises FailedWork if too few belong
+    to it."""
     arm = points - near.centre
     length = np.linalg.norm(arm, axis=1)
     inliers = np.abs(length - radius_mm) < 0.15 * radius_mm

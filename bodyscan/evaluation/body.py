@@ -24,11 +24,8 @@ WHOLE = 0.97  # of a girth measured, and not hair: what is filled is a declared 
 
 @dataclass(frozen=True, eq=False)
 class SwayResidual:
-    """What is left of calibration error and sway.
-
-    rig_from_still: where the model has the true body.
-    rms_mm: RMS of what is left, over pairs and the body, along all axes.
-    """
+    """What is left of calibration error and sway: where the model has the true body, and the RMS
+    over pairs and the body, along all axes."""
 
     rig_from_still: RigidTransform
     rms_mm: float
@@ -57,12 +54,9 @@ def sway_residual(
 
 @dataclass(frozen=True)
 class GirthErrors:
-    """Tape girths of the trunk, mesh minus truth, where at least 97 % of the girth was measured.
-
-    heights: number of slices.
-    rms_mm, worst_mm, worst_at_mm: RMS and worst error over them, and the latter's height.
-    stature_mm: error of the stature.
-    """
+    """Tape girths of the trunk, mesh minus truth, in slices (`heights` many) where at least 97 % of
+    the
+    girth was measured: RMS, worst error and its height; and the error of the stature."""
 
     heights: int
     rms_mm: float
@@ -74,10 +68,7 @@ class GirthErrors:
 def girth_errors(
     mesh: BodyMesh, vertices: Array, faces: Indices, *, mean_breath: bool = False
 ) -> GirthErrors:
-    """Errors of a mesh in the truth's frame.
-
-    vertices, faces: the truth, at mean breath or at the mesh's moment.
-    """
+    """Errors of a mesh in the frame of the truth, at mean breath or at the mesh's moment."""
     return compare_girths(mesh, true_girths(vertices, faces), mean_breath=mean_breath)
 
 

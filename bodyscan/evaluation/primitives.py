@@ -33,13 +33,8 @@ class Sphere:
 
 @dataclass(frozen=True, eq=False)
 class SphereAccuracy:
-    """One measured sphere of known radius.
-
-    points: number of points.
-    given: the fit with its radius held.
-    fitted: the fit with its radius free.
-    e_given, e_fitted: Eq. 19 for each, mm^2.
-    """
+    """One measured sphere of known radius: the fits with its radius held and free, and Eq. 19
+    for each, mm^2."""
 
     points: int
     given: Sphere
@@ -58,9 +53,8 @@ SURFACE = Noise("distance from the surface", cauchy=4.0)
 
 
 def fit_sphere(points: Array, radius: float | None = None) -> Sphere:
-    """Fit a sphere to points (N, 3): least distances from the surface, Cauchy loss.
-
-    radius: held if given.
+    """Fit a sphere to points (N, 3): least distances from the surface, Cauchy loss; radius: held if
+    given.
 
     Raises FailedWork for fewer than 50 points.
     """
@@ -130,10 +124,8 @@ def _fit_algebraically(points: Array) -> Sphere:
 class Flatness:
     """Flatness of points measured on a plane.
 
-    points: number of points.
-    normal, offset_mm: the best plane, normal . p = offset; normal: (3,).
-    rms_mm: RMS of the points' distances from it.
-    systematic_rms_mm: RMS of the smooth part of the distances.
+    normal, offset_mm: the best plane, normal . p = offset.
+    rms_mm, systematic_rms_mm: RMS of the points' distances from it, and of their smooth part.
     """
 
     points: int
