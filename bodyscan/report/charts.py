@@ -81,16 +81,9 @@ def matrix(names: Sequence[str], values: Array, label: str, form: str = ".2f") -
         top = float(known.max()) if known.size else 1.0
         shown = axis.imshow(values, cmap="YlGnBu", vmin=0.0, vmax=top or 1.0)
         for row, column in zip(*np.nonzero(np.isfinite(values)), strict=True):
-            dark = values[row, column] > 0.55 * top
-            axis.text(
-                column,
-                row,
-                format(values[row, column], form),
-                ha="center",
-                va="center",
-                fontsize=7.5,
-                color="white" if dark else INK,
-            )
+            text = axis.text(column, row, format(values[row, column], form), fontsize=7.5)
+            colour = "white" if values[row, column] > 0.55 * top else INK
+            text.set(ha="center", va="center", color=colour)
         axis.set_xticks(range(len(names)), names, rotation=45, ha="right")
         axis.set_yticks(range(len(names)), names)
         axis.tick_params(length=0)
@@ -102,13 +95,8 @@ def matrix(names: Sequence[str], values: Array, label: str, form: str = ".2f") -
 def grid_of(count: int, columns: int, cell: tuple[float, float]) -> tuple[Figure, list[Axes]]:
     """`count` axes in rows of `columns`, each `cell` inches in size; surplus ones are hidden."""
     rows = -(-count // columns)
-    figure, axes = plt.subplots(
-        rows,
-        columns,
-        figsize=(cell[0] * columns, cell[1] * rows),
-        constrained_layout=True,
-        squeeze=False,
-    )
+    size = (cell[0] * columns, cell[1] * rows)
+    figure, axes = plt.subplots(rows, columns, figsize=size, constrained_layout=True, squeeze=False)
     flat = list(axes.ravel())
     for axis in flat[count:]:
         axis.set_visible(False)

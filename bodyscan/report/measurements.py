@@ -34,17 +34,8 @@ def tables(measured: Measurements) -> Iterator[Table]:
     yield body
     breath = ", at mean breath" if measured.at_mean_breath else ""
     slices = Table(title=f"horizontal slices{breath}, mm")
-    headings = (
-        "height",
-        "part",
-        "tape (hull)",
-        "along surface",
-        "width",
-        "depth",
-        "measured",
-        "over",
-    )
-    for heading in headings:
+    numbers = ("tape (hull)", "along surface", "width", "depth", "measured")
+    for heading in ("height", "part", *numbers, "over"):
         slices.add_column(heading, justify="left" if heading in ("part", "over") else "right")
     for level in sorted(measured.slices, key=lambda level: -level.height_mm):
         for girth in level.girths:
@@ -64,11 +55,10 @@ def tables(measured: Measurements) -> Iterator[Table]:
 
 def _name_covered(regions: Mapping[str, float] | None) -> str:
     """Name what a girth crosses that is not skin, from 5 % on."""
-    parts = (
-        (name, (regions or {}).get(name, 0.0))
-        for name in (REGION_NAMES[HAIR], REGION_NAMES[DARK_CLOTH])
-    )
-    return ", ".join(f"{name} {100.0 * part:.0f} %" for name, part in parts if part > 0.05)
+    shares = {
+        REGION_NAMES[k]: (regions or {}).get(REGION_NAMES[k], 0.0) for k in (HAIR, DARK_CLOTH)
+    }
+    return ", ".join(f"{name} {100.0 * s:.0f} %" for name, s in shares.items() if s > 0.05)
 
 
 def _format_girth(value: float, between: Range) -> str:

@@ -42,31 +42,23 @@ class Strokes:
     colours: Bytes
 
 
-@dataclass(frozen=True)
-class Standpoint:
-    """Where the viewer stands at first: degrees from x towards y, and upwards."""
-
-    azimuth_deg: float = 25.0
-    elevation_deg: float = 6.0
-
-
 def pack(
     shape: Shape | None,
     layers: Sequence[Layer] = (),
     *,
     strokes: Strokes | None = None,
     labels: Sequence[tuple[str, Array]] = (),
-    standpoint: Standpoint = Standpoint(),
+    view_deg: tuple[float, float] = (25.0, 6.0),
 ) -> dict[str, Any]:
     """Pack a model for `viewer.js`.
+
+    view_deg: where the viewer stands at first: azimuth from x towards y, and elevation.
 
     A coordinate is `low + step * integer`, in steps of 1/65,535 of the longest side. Raises
     ValueError for a mesh of more than 65,536 vertices.
     """
     if shape is not None and len(shape.vertices) > 65_536:
-        raise ValueError(
-            f"{len(shape.vertices)} vertices; the viewer's 16-bit indices address 65,536"
-        )
+        raise ValueError(f"{len(shape.vertices)} vertices; 16-bit indices address 65,536")
     coordinates = [shape.vertices] if shape is not None else []
     coordinates += [strokes.ends.reshape(-1, 3)] if strokes is not None else []
     everything = np.concatenate(coordinates)
@@ -84,8 +76,8 @@ def pack(
         "faces": None,
         "labels": [[text, *map(float, np.round(at, 1))] for text, at in labels],
         "view": {
-            "azimuth": float(np.radians(standpoint.azimuth_deg)),
-            "elevation": float(np.radians(standpoint.elevation_deg)),
+            "azimuth": float(np.radians(view_deg[0])),
+            "elevation": float(np.radians(view_deg[1])),
             "target": (0.5 * (low + high)).tolist(),
             "size": float(np.linalg.norm(high - low)),
         },

@@ -9,7 +9,7 @@ from bodyscan.geometry.uncertainty import point_covariance
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.report.calibration_charts import line_styles
 from bodyscan.report.charts import round_down
-from bodyscan.report.model import Layer, Shape, Standpoint, Strokes, pack
+from bodyscan.report.model import Layer, Shape, Strokes, pack
 
 
 def rig_model(calibration: RigCalibration) -> tuple[dict[str, object], float]:
@@ -28,20 +28,9 @@ def rig_model(calibration: RigCalibration) -> tuple[dict[str, object], float]:
     colours, _ = line_styles(calibration)
     shape, tint = _join(shapes, {name: _rgb(colours[name]) for name in shapes})
     labels = [(name, t.translation) for name, t in calibration.rig_from_camera.items()]
-    return (
-        pack(
-            shape,
-            [Layer("ellipsoids", tint)],
-            strokes=_strokes(calibration),
-            labels=[
-                *labels,
-                ("x", np.array([340.0, 0.0, 0.0])),
-                ("y", np.array([0.0, 340.0, 0.0])),
-            ],
-            standpoint=Standpoint(20.0, 22.0),
-        ),
-        times,
-    )
+    labels += [("x", np.array([340.0, 0.0, 0.0])), ("y", np.array([0.0, 340.0, 0.0]))]
+    layer, strokes = Layer("ellipsoids", tint), _strokes(calibration)
+    return pack(shape, [layer], strokes=strokes, labels=labels, view_deg=(20.0, 22.0)), times
 
 
 def _ellipsoid(middle: Array, covariance: Array) -> Shape:

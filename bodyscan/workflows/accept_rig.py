@@ -102,7 +102,6 @@ def judge_readings(
     """Write figures and verdict to acceptance.json and acceptance.html in `out`, and return them.
 
     stored: path of the calibration.
-    synthetic: whether the artefacts were simulated.
     """
     found = figures(readings, file)
     origin = calibration_id(stored)
@@ -114,13 +113,9 @@ def judge_readings(
     with optional("report", notes.append):
         page = acceptance_page(found, readings, calibration, origin, synthetic)
         write_text(page_path, render(page))
-    return Acceptance(
-        tuple(found),
-        grade_acceptance(found, readings),
-        file_path,
-        page_path if page_path.exists() else None,
-        tuple(notes),
-    )
+    verdict = grade_acceptance(found, readings)
+    made = page_path if page_path.exists() else None
+    return Acceptance(tuple(found), verdict, file_path, made, tuple(notes))
 
 
 MIN_POINTS = 400
@@ -223,14 +218,10 @@ def _clouds(
     found = [_Cloud(ALL, cloud.points, cloud.normals.astype(np.float64))]
     for image in measured:
         valid = image.valid & np.isfinite(image.normals).all(axis=-1)
-        rig_from_camera = calibration.rig_from_camera[image.pair]
-        found.append(
-            _Cloud(
-                image.pair,
-                rig_from_camera.apply(image.points[valid].astype(np.float64)),
-                rig_from_camera.rotate(image.normals[valid].astype(np.float64)),
-            )
-        )
+        pose = calibration.rig_from_camera[image.pair]
+        points = pose.apply(image.points[valid].astype(np.float64))
+        normals = pose.rotate(image.normals[valid].astype(np.float64))
+        found.append(_Cloud(image.pair, points, normals))
     return found
 
 

@@ -215,7 +215,11 @@ def test_a_pair_that_cannot_be_read_costs_that_pair(folder: Path) -> None:
     ("where", "value", "said"),
     [
         (("camera", "width"), 640, r"1280 x 1024 px, the rig file says 640 x 1024"),
-        (("projector", "stripes"), 1100, r"1024 x 768 px, across which there are no 1100 vertical"),
+        (
+            ("projector", "stripes"),
+            1100,
+            r"1024 x 768 px, which 1100 vertical stripes do not divide",
+        ),
         (("projector", "stripes"), 500, r"which 500 vertical stripes do not divide evenly"),
         (
             ("projector",),
