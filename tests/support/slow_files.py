@@ -33,7 +33,7 @@ SLOW = (
     "registration/test_halves.py",
     "jobs/test_cluster.py",
     "registration/test_drift.py",
-    "calibration/test_crossing_stripes.py",
+    "calibration/test_crossing_sheets.py",
     "workflows/test_whole_way.py",
     "stripes/test_gray_jpeg.py",
     "examples/test_examples.py",
