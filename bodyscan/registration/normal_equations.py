@@ -76,10 +76,11 @@ class BoardContribution:
         every = [board, *(columns for columns, _ in systems)]
         columns = np.append(np.setdiff1d(np.concatenate(every), board), board)
         rows = {column: k for k, column in enumerate(columns.tolist())}
-        placed = (
-            (np.array([rows[column] for column in own.tolist()]), one) for own, one in systems
-        )
-        return BoardContribution(columns, LinearGaussianSystem.assemble(placed, len(columns)))
+        indexed = [
+            (np.array([rows[column] for column in unknowns.tolist()]), system)
+            for unknowns, system in systems
+        ]
+        return BoardContribution(columns, LinearGaussianSystem.assemble(indexed, len(columns)))
 
     def without_board(self, fixed: Indices) -> tuple[Indices, LinearGaussianSystem]:
         """Eliminate the board's motion, or fix it if the board holds the frame.

@@ -138,17 +138,20 @@ def _light_faults(pair: PairCalibration, described: Pair) -> Iterator[Fault]:
         )
         return
     crossing = code.crossing if code else None
-    for what, light, shown in (("light", pair.sheets, code), ("crossing", pair.crossing, crossing)):
+    for what, light, expected in (
+        ("light", pair.sheets, code),
+        ("crossing", pair.crossing, crossing),
+    ):
         where = f"pairs.{pair.name}.{what}"
         if light is None:
             continue
-        if shown is None:
+        if expected is None:
             yield where, "is of stripes that the rig's projector does not show"
-        elif (light.direction, light.stripes) != (shown.direction, shown.stripes):
+        elif (light.direction, light.stripes) != (expected.direction, expected.stripes):
             yield (
                 where,
                 f"is of {light.stripes} {light.direction} stripes, but the rig's projector shows "
-                f"{shown.stripes} {shown.direction}",
+                f"{expected.stripes} {expected.direction}",
             )
         elif isinstance(light, LightPlanes):
             yield from _plane_faults(light, where)

@@ -125,13 +125,6 @@ def test_outliers_lose_their_weight_and_do_not_move_the_fit() -> None:
     assert np.median(weights) > 0.8
 
 
-def test_neighbouring_residuals_of_a_group_share_one_weight() -> None:
-    residuals = np.array([0.1, 5.0, 0.1, -0.1])
-    weights = Noise("corners", group=2, cauchy=2.0).weights(residuals)
-    assert weights[0] == weights[1] < 0.2
-    assert weights[2] == weights[3] > 0.9
-
-
 def test_kinds_of_residuals_are_each_weighed_by_their_own_spread() -> None:
     """One coarse and one fine instrument for one number: the mean goes by the fine one."""
     rng = np.random.default_rng(4)
