@@ -127,6 +127,13 @@ def test_images_in_a_renamed_folder_are_reported(rig_path: Path, folder: str, re
     assert str(captures / renamed) in warning
 
 
+def test_images_of_a_shot_with_another_suffix_are_reported(rig_path: Path) -> None:
+    for path in [*(rig_path.parent / "captures" / "b2").rglob("*.png")]:
+        path.rename(path.with_suffix(".bmp"))
+    (warning,) = lines_with(rig_path, "check the spelling")
+    assert f"{2 * len(FRAMES) + 1} images belong to no pair" in warning
+
+
 def test_images_of_unwanted_shots_are_ignored(rig_path: Path) -> None:
     folder = rig_path.parent / "captures"
     shutil.copytree(folder / "b2", rig_path.parent / "captures" / "elsewhere" / "b9")
