@@ -108,6 +108,7 @@ def test_a_scan_without_a_pair_or_a_frame_goes_on_and_names_it(
     shutil.rmtree(copy / "captures" / "person" / "s01" / "p2-3")
     arguments = (copy / "captures" / "person", "--calibration", workspace.folder / "calibration")
     result = run("scan", *arguments, "--out", copy / "scan", *COARSER)
+    assert result.exit_code == 0, result.output
     said = " ".join(result.output.split())
     for part in ("left out: p1-3", "bit04-inverse.png", "left out: p2-3"):
         assert part in said
