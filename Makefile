@@ -3,7 +3,7 @@
 # make test-quick   those that answer within seconds, for the loop of everyday work
 # make coverage     all tests again, with the lines of the package that they run
 # make wheel        build the wheel, install it into an empty environment, scan something small there
-# make check        format, lint, types and the directions of imports
+# make check        format, lint, types, the directions of imports, words and the size of the house
 # make lock         the versions that CI installs, data/constraints.txt, made anew from the newest that fit
 # make bench        speed and accuracy at full size, written to docs/results.md, old sections marked
 
@@ -48,6 +48,7 @@ check: setup
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python tests/support/check_words.py
 
 # The site, in build/site: a dead link or a reference to what is not there fails it.
 .PHONY: docs

@@ -156,19 +156,19 @@ None if not known."""
 
 
 def find_displaced_pole(
-    scans: Sequence[Scan], poles: Mapping[str, str], freed: Collection[str] = ()
+    scans: Sequence[Scan], poles: Mapping[str, str], displaced: Collection[str] = ()
 ) -> DisplacementSearch:
     """Find the pole or pair that is displaced in one scan, or in several since the calibration.
 
     poles: as in `group_by_pole`.
-    freed: pairs already known to be displaced; another one is searched for.
+    displaced: pairs already known to be displaced; another one is searched for.
 
     A person sways differently in each scan, while a displacement is the same in all. In a single
     scan nothing is known of pairs without a time. If every pole is displaced, the one that is
     farthest off is returned.
     """
     several = len(scans) >= MIN_SCANS
-    seen = _PoseMotions.from_scans(scans, poles, freed, timed=not several)
+    seen = _PoseMotions.from_scans(scans, poles, displaced, timed=not several)
     if len(set(seen.names)) < MIN_PAIRS:
         return DisplacementSearch(None, np.inf)
     nothing = np.zeros_like(seen.sway)
@@ -176,10 +176,10 @@ def find_displaced_pole(
         seen, SWAYS_MM, nothing, np.zeros(1)
     )
     candidates: list[tuple[float, DisplacedPole]] = []
-    detectable, ambiguous = MIN_STEP_MM, bool(freed)
+    detectable, ambiguous = MIN_STEP_MM, bool(displaced)
     for name, pairs in group_by_pole(sorted(set(seen.names)), poles).items():
         members = np.array([pair in pairs for pair in seen.names])
-        if not pairs.isdisjoint(freed) or not set(seen.names) - pairs - set(freed):
+        if not pairs.isdisjoint(displaced) or not set(seen.names) - pairs - set(displaced):
             continue
         # Correlation 0.8 s apart: if a pole fires at no other pole's time, the person may have
         # moved meanwhile.
@@ -198,7 +198,7 @@ def find_displaced_pole(
         sways = SWAYS_MM if any_sway else SWAYS_MM[SWAYS_MM < STILL_MM]
         stepped = np.outer(members, members)
         gain = _maximize_likelihood(seen, sways, stepped, STEPS_MM)[0] - null
-        motions = [{n: m[n] for n in m if n in seen.names and n not in freed} for m, _ in scans]
+        motions = [{n: m[n] for n in m if n in seen.names and n not in displaced} for m, _ in scans]
         candidates.append((gain, DisplacedPole.from_motions(name, pairs, _mean_motions(motions))))
     if not candidates:
         return DisplacementSearch(None, np.inf)
@@ -208,8 +208,8 @@ def find_displaced_pole(
         candidates = _with_all_moved(candidates, each)
     gain, best = max(candidates, key=lambda one: one[0])
     lever = np.radians(best.rotation_deg) * LEVER_MM
-    displaced = gain > MIN_LOG_RATIO and np.hypot(best.shift_mm, lever) > MIN_STEP_MM
-    return DisplacementSearch(best if displaced else None, detectable, sway_mm, offset_mm)
+    significant = gain > MIN_LOG_RATIO and np.hypot(best.shift_mm, lever) > MIN_STEP_MM
+    return DisplacementSearch(best if significant else None, detectable, sway_mm, offset_mm)
 
 
 def _with_all_moved(
@@ -240,7 +240,7 @@ class _PoseMotions:
     motions: of the body's centre and of a point at the lever arm, (N, 6) mm.
     sway: correlations of the person's sway, (N, N).
     sides: 1 for pairs of one pole in one scan, (N, N).
-    nuisance: prior variances of each scan's common motion, and of freed poles, (N, N) mm^2.
+    nuisance: prior variances of each scan's common motion, and of displaced poles, (N, N) mm^2.
     """
 
     names: tuple[str, ...]
@@ -251,7 +251,7 @@ class _PoseMotions:
 
     @staticmethod
     def from_scans(
-        scans: Sequence[Scan], poles: Mapping[str, str], freed: Collection[str], *, timed: bool
+        scans: Sequence[Scan], poles: Mapping[str, str], displaced: Collection[str], *, timed: bool
     ) -> _PoseMotions:
         """timed: leave out pairs without a time."""
         names: list[str] = []
@@ -263,9 +263,9 @@ class _PoseMotions:
             sways.append(_stance_correlations([moments_ms[name] for name in used]))
             sides.append(_same_pole(used, poles))
             names += used
-        is_freed = np.array([name in freed for name in names], float)
+        is_displaced = np.array([name in displaced for name in names], float)
         nuisance = block_diag(*(np.ones_like(sway) for sway in sways))
-        nuisance += np.outer(is_freed, is_freed)
+        nuisance += np.outer(is_displaced, is_displaced)
         return _PoseMotions(
             tuple(names),
             np.concatenate(motions),

@@ -79,7 +79,7 @@ def detect_displacement(
     evidence: PoseEvidence,
     rig_from_camera: Mapping[str, RigidTransform],
     poles: Mapping[str, str],
-    freed: Collection[str] = (),
+    displaced: Collection[str] = (),
 ) -> DisplacedPole | ScaleError | None:
     """Find the displacement that explains a scan better than any motion of the subject.
 
@@ -88,19 +88,19 @@ def detect_displacement(
 
     rig_from_camera: as calibrated.
     poles: the pole of each pair that is mounted on one.
-    freed: pairs already known to be displaced.
+    displaced: pairs already known to be displaced.
     """
     sides = [poles.get(name, name) for name in evidence.names]
-    if len(set(sides)) < 2 or not set(evidence.names) - set(freed):
+    if len(set(sides)) < 2 or not set(evidence.names) - set(displaced):
         return None
     candidates: list[tuple[float, DisplacedPole | ScaleError]] = []
     for name, pairs in group_by_pole(evidence.names, poles).items():
         # Among few pairs, any single one could be displaced.
         identifiable = len(pairs) > 1 or len(evidence.names) >= MIN_PAIRS
-        if identifiable and pairs.isdisjoint(freed):
+        if identifiable and pairs.isdisjoint(displaced):
             fit = evidence.fit(_rigid_basis(np.isin(evidence.names, list(pairs))))
             candidates.append((fit.log_ratio, _displaced_pole(name, pairs, fit.steps)))
-    if not freed:
+    if not displaced:
         bases = {side: _rigid_basis(np.equal(sides, side)) for side in dict.fromkeys(sides)}
         each = evidence.fit(np.hstack(list(bases.values())))
         relative = each.steps.reshape(-1, 6) - each.steps.reshape(-1, 6).mean(axis=0)

@@ -47,8 +47,10 @@ def find_boards(image: Bytes, boards: Sequence[Board], *, pair: str, shot: str) 
     cache: MarkerCache = {}
     for board in boards:
         if board.kind != "checkerboard":
-            alike = [one for one in boards if one.dictionary == board.dictionary]
-            found = _find_marked(image, board, cache, max(map(count_dictionary_markers, alike)))
+            same_dictionary = [one for one in boards if one.dictionary == board.dictionary]
+            found = _find_marked(
+                image, board, cache, max(map(count_dictionary_markers, same_dictionary))
+            )
         else:
             found = find_checkerboard(image, board)
         if found is not None and _determines_plane(found, board):

@@ -159,7 +159,7 @@ class Output:
             "error": error and {"what": error.what, "where": error.where, "remedy": error.remedy},
         }
 
-    def tell_events(self) -> None:
+    def stream_events(self) -> None:
         """The command writes JSON of its own to standard output, event by event."""
         self._give_back()
         self._events = True

@@ -294,7 +294,7 @@ def _run(
     from bodyscan.jobs.cluster import run_on_cluster
     from bodyscan.jobs.supervision import supervise_job
 
-    output.tell_events()
+    output.stream_events()
     resources = jobs[0].pipeline.resources
     shares = batches.allocate(
         resources, len(jobs), workers, batches.cores(), batches.free_memory_mb()
@@ -318,12 +318,12 @@ def _run(
 
 @contextmanager
 def _listening(
-    output: Output, usual: Callable[[], AbstractContextManager[Listen]]
+    output: Output, default: Callable[[], AbstractContextManager[Listen]]
 ) -> Iterator[Listen]:
     """Show how jobs go; the process ends at once when it is interrupted."""
     from bodyscan.jobs import display
 
-    show = display.json_lines if output.json else display.silence if output.quiet else usual
+    show = display.json_lines if output.json else display.silence if output.quiet else default
     try:
         with show() as listen:
             yield listen
@@ -367,7 +367,7 @@ def watch(
     from bodyscan.jobs.watching import watch as watch_inbox
 
     require_writable(out)
-    output.tell_events()
+    output.stream_events()
     settings = (
         load_pipeline(pipeline, changes or ())
         if pipeline

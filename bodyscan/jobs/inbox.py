@@ -22,7 +22,7 @@ from bodyscan.files.hashing import list_files
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.templates import ANYTHING, fill
 
-SETTLED_S = 0.5
+STABLE_S = 0.5
 """An image without an end mark is whole when it has not grown for this long: camera drivers write a
 file in one go, in hundredths of a second."""
 
@@ -105,7 +105,7 @@ class IncomingScan:
         if sequence.missing:
             return False
         there = [self._files[path] for path in sequence.paths if path in self._files]
-        whole = [one.whole or now_s - one.since_s >= SETTLED_S for one in there]
+        whole = [one.whole or now_s - one.since_s >= STABLE_S for one in there]
         return len(there) == len(sequence.paths) and all(whole)
 
     def _look_for_changes(self, now_s: float) -> bool:

@@ -30,17 +30,17 @@ from bodyscan.workflows.preparation import Preparation
 
 def main() -> int:
     """Answer requests until there is no one left to ask; 2 if the calibration cannot be used."""
-    tell = become_worker()
+    emit = become_worker()
     requests = _requests()
     try:
         preparation = Preparation(Path(sys.argv[2]))
     except BodyscanError as error:
-        tell(unusable=str(error))
+        emit(unusable=str(error))
         return error.exit_code
     kinds = _kinds(preparation)
     # Now, not while someone waits for the first verdict.
     import_module("bodyscan.workflows.scan_person")
-    tell(ready=True)
+    emit(ready=True)
     while True:
         request = requests.get()
         folder = Path(request["folder"])
@@ -48,8 +48,8 @@ def main() -> int:
             preparation.prepare(folder, request["pairs"])
             continue
         with _log_of(folder):
-            failure = attempt(folder, kinds, tell)
-        tell(ended=request["folder"], failed=failure.reason if failure else "")
+            failure = attempt(folder, kinds, emit)
+        emit(ended=request["folder"], failed=failure.reason if failure else "")
 
 
 def _kinds(preparation: Preparation) -> Kinds:

@@ -37,18 +37,18 @@ from bodyscan.jobs.stages import KINDS, Kinds, Stage, stages_until
 from bodyscan.memory import keep_freed_memory
 from bodyscan.verdict import Verdict
 
-Tell = Callable[..., None]
+Emit = Callable[..., None]
 
 _BEING_MADE, _TAKEN_AWAY = ".making-", ".old-"
 
 
 def main(kinds: Kinds = KINDS) -> int:
     """Do the job in the folder on the command line; 0: done, 2: bad input, 1: failed."""
-    tell = become_worker()
+    emit = become_worker()
     _end_with_parent()
-    failure = attempt(Path(sys.argv[1]), kinds, tell)
+    failure = attempt(Path(sys.argv[1]), kinds, emit)
     if failure is not None:
-        tell(failed=failure.reason)
+        emit(failed=failure.reason)
     return failure.exit_code if failure else 0
 
 
@@ -60,11 +60,11 @@ class Failure:
     exit_code: int
 
 
-def attempt(folder: Path, kinds: Kinds, tell: Tell) -> Failure | None:
+def attempt(folder: Path, kinds: Kinds, emit: Emit) -> Failure | None:
     """Do `work`; None if all went well."""
     try:
         with restrict_to_owner():
-            work(folder, kinds, tell)
+            work(folder, kinds, emit)
     except BodyscanError as error:
         return Failure(str(error), error.exit_code)
     except Exception as error:
@@ -76,7 +76,7 @@ def attempt(folder: Path, kinds: Kinds, tell: Tell) -> Failure | None:
     return None
 
 
-def become_worker() -> Tell:
+def become_worker() -> Emit:
     """Set up a process of jobs; returns the function that reports to its parent."""
     keep_freed_memory()
     logging.basicConfig(format="%(message)s")  # on standard error, which is the job's log
@@ -86,38 +86,38 @@ def become_worker() -> Tell:
     return _take_over_output()
 
 
-def work(folder: Path, kinds: Kinds, tell: Tell) -> None:
+def work(folder: Path, kinds: Kinds, emit: Emit) -> None:
     """Bring a job's results up to date, waiting for anyone else at work on it."""
     with lock_file(folder / LOCK, wait=True):
-        _tidy(folder, tell)
+        _tidy(folder, emit)
         job = read_job(folder)
         every = kinds[job.pipeline.kind]
         stages = stages_until(every, job.until)
         for stage in stages:
             now = origin_of(job, stage)
             if why := reason_to_run(job, now):
-                tell(stage=stage.name, why=why)
-                _perform(job, stage, now, tell)
+                emit(stage=stage.name, why=why)
+                _perform(job, stage, now, emit)
         for stage in every[len(stages) :]:
             # Remove results that were made from other results than are there now.
             results = job.folder / stage.name
             with suppress(BodyscanError, OSError):
                 if results.exists() and reason_to_run(job, origin_of(job, stage)):
-                    _remove_results(_move_aside(results), tell)
+                    _remove_results(_move_aside(results), emit)
         _write_manifest(job, every)
 
 
-def _perform(job: Job, stage: Stage, before: Origin, tell: Tell) -> None:
+def _perform(job: Job, stage: Stage, before: Origin, emit: Emit) -> None:
     """Run a stage and put its results in place, provided that its inputs did not change
     meanwhile."""
     made = job.folder / f"{_BEING_MADE}{stage.name}-{secrets.token_hex(4)}"
     made.mkdir()
 
     def progress(part: str, done: int, total: int) -> None:
-        tell(stage=stage.name, part=part, done=done, total=total)
+        emit(stage=stage.name, part=part, done=done, total=total)
 
     def announce(verdict: Verdict, *, final: bool) -> None:
-        tell(grade=verdict.grade, reasons=verdict.reasons, final=final)
+        emit(grade=verdict.grade, reasons=verdict.reasons, final=final)
 
     try:
         stage.run(job, made, progress, announce)
@@ -134,7 +134,7 @@ def _perform(job: Job, stage: Stage, before: Origin, tell: Tell) -> None:
     old = _move_aside(job.folder / stage.name)
     made.rename(job.folder / stage.name)
     flush(job.folder)
-    _remove_results(old, tell)
+    _remove_results(old, emit)
 
 
 def _move_aside(folder: Path) -> Path:
@@ -144,7 +144,7 @@ def _move_aside(folder: Path) -> Path:
     return old
 
 
-def _remove_results(old: Path, tell: Tell) -> None:
+def _remove_results(old: Path, emit: Emit) -> None:
     """Remove what a stage wrote, and its record last, so that this can be cut short at any moment.
 
     Anything else is a person's, made from the former result: it stays in a folder of its own.
@@ -164,7 +164,7 @@ def _remove_results(old: Path, tell: Tell) -> None:
     if os.path.lexists(old):
         kept = old.rename(old.with_name(f"{KEPT}{token}"))
         print(f"files that were added to {stage} are now in {kept.name}", flush=True)  # the log
-        tell(stage=stage, kept=kept.name)
+        emit(stage=stage, kept=kept.name)
 
 
 def _write_manifest(job: Job, stages: Sequence[Stage]) -> None:
@@ -190,11 +190,11 @@ def _write_manifest(job: Job, stages: Sequence[Stage]) -> None:
         write_json(path, content)
 
 
-def _tidy(folder: Path, tell: Tell) -> None:
+def _tidy(folder: Path, emit: Emit) -> None:
     """Remove what an earlier process was making, or taking away, when it was killed."""
     for path in [*folder.iterdir()]:
         if path.name.startswith(_TAKEN_AWAY):
-            _remove_results(path, tell)
+            _remove_results(path, emit)
         elif path.name.startswith(_BEING_MADE) or path.name.endswith(".tmp.json"):
             if path.is_dir() and not path.is_symlink():
                 shutil.rmtree(path)
@@ -202,17 +202,17 @@ def _tidy(folder: Path, tell: Tell) -> None:
                 path.unlink(missing_ok=True)
 
 
-def _take_over_output() -> Tell:
+def _take_over_output() -> Emit:
     """Reserve standard output for the parent; what libraries print there goes into the log."""
     stream = os.fdopen(os.dup(1), "w", encoding="utf-8", buffering=1)
     os.dup2(2, 1)
     lock = threading.Lock()
 
-    def tell(**what: Any) -> None:
+    def emit(**what: Any) -> None:
         with lock:
             stream.write(json.dumps(what) + "\n")
 
-    return tell
+    return emit
 
 
 def _end_with_parent() -> None:

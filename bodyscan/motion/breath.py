@@ -52,8 +52,8 @@ def _local_functions(centres: Array, shape: Array) -> Array:
     eigenvalues, eigenvectors = np.linalg.eigh(covariance[landmarks])
     kept = eigenvalues > 1e-3 * eigenvalues[-1]
     functions = covariance @ (eigenvectors[:, kept] / np.sqrt(eigenvalues[kept])) * shape
-    variances, directions = np.linalg.eigh(functions.T @ functions)
-    return np.asarray(functions @ directions[:, variances > 0.02 * variances[-1]])
+    eigenvalues, eigenvectors = np.linalg.eigh(functions.T @ functions)
+    return np.asarray(functions @ eigenvectors[:, eigenvalues > 0.02 * eigenvalues[-1]])
 
 
 def estimate_breath_covariance(

@@ -93,8 +93,8 @@ def _require_still(
     if motion is None:
         return
     parts = PersonMotion.from_motion(motion).parts
-    most = max(parts, key=lambda part: part.moved_mm, default=None)
-    by = f" by up to {most.moved_mm:.1f} mm ({most.name})" if most else ""
+    largest = max(parts, key=lambda part: part.moved_mm, default=None)
+    by = f" by up to {largest.moved_mm:.1f} mm ({largest.name})" if largest else ""
     raise FailedWork(
         f"the object moved{by} during the scan: poses fitted to it would be wrong",
         remedy="scan a mannequin or another rigid object that stands still. If it did, a pair has "

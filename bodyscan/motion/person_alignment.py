@@ -29,8 +29,8 @@ class PersonAlignment:
     """A person's aligned range images.
 
     motion: of a person who moved.
-    displaced: poles, or pairs, that were displaced and freed.
-    scale_error: the common displacement outwards, if all poles were freed.
+    displaced: poles, or pairs, that were displaced and moved back.
+    scale_error: the common displacement outwards, if all poles were displaced.
     search: for further displaced poles.
     """
 
@@ -56,7 +56,7 @@ def align_person(
     poles: the pole of each pair that is mounted on one.
 
     Motion and displaced poles can explain each other. So the motion is estimated first as if no pole
-    were displaced; what only a displaced pole explains then is freed, and all is repeated.
+    were displaced; what only a displaced pole explains is then freed, and all is repeated.
     """
     displaced: list[DisplacedPole] = []
     scale_error: ScaleError | None = None
@@ -108,12 +108,15 @@ def _search(
     known: Sequence[DisplacedPole],
 ) -> DisplacementSearch:
     """Search for another displaced pole, as long as a second one remains as reference."""
-    freed = _pairs_of(known)
-    if len({poles.get(image.pair, image.pair) for image in images if image.pair not in freed}) < 2:
+    displaced = _pairs_of(known)
+    if (
+        len({poles.get(image.pair, image.pair) for image in images if image.pair not in displaced})
+        < 2
+    ):
         return DisplacementSearch(None, np.inf)
     moments = {image.pair: image.time_ms for image in images}
     return find_displaced_pole(
-        [(_connected_motions(rig_from_camera, aligned), moments)], poles, freed
+        [(_connected_motions(rig_from_camera, aligned), moments)], poles, displaced
     )
 
 

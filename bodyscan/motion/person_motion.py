@@ -129,11 +129,11 @@ def measure_breath(motion: EstimatedMotion) -> float | None:
         np.array(list(motion.warps.values()))[:, trunk, :3],
         motion.cells.normals[trunk],
     )
-    course, singular_values, mode = np.linalg.svd(
+    temporal, singular_values, mode = np.linalg.svd(
         outward - outward.mean(axis=0), full_matrices=False
     )
     largest = np.percentile(np.abs(mode[0]), 95.0)
-    range_mm = float(np.ptp(course[:, 0]) * singular_values[0] * largest)
+    range_mm = float(np.ptp(temporal[:, 0]) * singular_values[0] * largest)
     same_direction = abs(np.mean(mode[0])) > 0.6 * np.mean(np.abs(mode[0]))
     significant = range_mm > 4.0 * float(np.median(motion.sigma_mm[trunk]))
     return range_mm if same_direction and significant else None
@@ -149,5 +149,5 @@ def measure_fullness(motion: EstimatedMotion) -> tuple[float, float] | None:
         return None
     normals = motion.cells.normals[breathes]
     offset = np.sum(motion.breath.field[breathes, :3] * normals, axis=1)
-    # The uncertainty is that of the breath's course, which all of the front shares.
+    # The uncertainty is that of the breath's temporal, which all of the front shares.
     return -float(np.mean(offset)), rms(motion.breath.sigma_mm[breathes])

@@ -79,8 +79,8 @@ def decode_sequence(
             where=where,
         )
 
-    one_way = pair.projector.model_copy(update={"crossing": None})
-    first_direction = (sequence.without_crossing, one_way)
+    single_direction = pair.projector.model_copy(update={"crossing": None})
+    first_direction = (sequence.without_crossing, single_direction)
     if sequence.lacks_crossing:
         fault = f"images are missing, such as {sequence.missing[0]}"
         return replace(decode(*first_direction), crossing_fault=fault)

@@ -91,10 +91,10 @@ def find_all_boards(rig: Rig, captures: Captures, progress: Progress = silent) -
         for sequence, (found, error) in zip(captures.sequences, results, strict=True)
         if not found and error is None and sequence.board_path not in captures.corners
     ]
-    shown = _look_closer(rig, views, without)
+    described = _look_closer(rig, views, without)
     missing = [
         f"{s.board_path} (pair {s.pair}, shot {s.shot}): no board found"
-        + (f": {shown[s]}" if s in shown else "")
+        + (f": {described[s]}" if s in described else "")
         for s in without
     ]
     errors = zip(captures.sequences, (error for _, error in results), strict=True)

@@ -32,8 +32,8 @@ SEQUENCE_MS = 22 * 1000.0 / 120.0
 SEEDS = range(20)
 
 
-def in_one(scan: Scan, freed: Collection[str] = ()) -> DisplacedPole | None:
-    return find_displaced_pole([scan], POLES, freed).found
+def in_one(scan: Scan, displaced: Collection[str] = ()) -> DisplacedPole | None:
+    return find_displaced_pole([scan], POLES, displaced).found
 
 
 def found(

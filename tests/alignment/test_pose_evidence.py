@@ -42,9 +42,9 @@ def evidence(shifts: Array, seed: int = 0, noise: float = 1.0) -> PoseEvidence:
 
 
 def off(
-    shifts: Array, seed: int = 0, freed: tuple[str, ...] = ()
+    shifts: Array, seed: int = 0, displaced: tuple[str, ...] = ()
 ) -> DisplacedPole | ScaleError | None:
-    return detect_displacement(evidence(shifts, seed), PLACED, POLES, freed)
+    return detect_displacement(evidence(shifts, seed), PLACED, POLES, displaced)
 
 
 def of_pole(pole: str, shift: list[float]) -> Array:
@@ -89,7 +89,7 @@ def test_one_pair_that_moved_is_named_and_not_its_pole(pair: str) -> None:
 
 def test_another_pair_than_those_that_are_free() -> None:
     shifts = of_pair("p1-1", [5.0, 0.0, 0.0]) + of_pair("p3-2", [0.0, 4.0, 0.0])
-    found = off(shifts, freed=("p1-1",))
+    found = off(shifts, displaced=("p1-1",))
     assert isinstance(found, DisplacedPole)
     assert found.name == "pair p3-2"
 
@@ -117,12 +117,12 @@ def test_less_than_does_harm_is_not_said() -> None:
 
 
 def test_of_poles_that_are_free_nothing_is_asked() -> None:
-    freed = tuple(name for name in NAMES if POLES[name] == "p2")
-    other = off(of_pole("p3", [0.0, 5.0, 0.0]), freed=freed)
+    displaced = tuple(name for name in NAMES if POLES[name] == "p2")
+    other = off(of_pole("p3", [0.0, 5.0, 0.0]), displaced=displaced)
     assert isinstance(other, DisplacedPole)
     assert other.name == "pole p3"
-    assert not isinstance(off(3.0 * OUT, freed=freed), ScaleError)
-    assert off(of_pole("p2", [0.0, 5.0, 0.0]), freed=NAMES) is None
+    assert not isinstance(off(3.0 * OUT, displaced=displaced), ScaleError)
+    assert off(of_pole("p2", [0.0, 5.0, 0.0]), displaced=NAMES) is None
 
 
 def test_of_three_pairs_two_that_stand_on_one_pole_and_moved_are_named() -> None:

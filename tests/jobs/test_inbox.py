@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bodyscan.errors import BadInput
-from bodyscan.jobs.inbox import SETTLED_S, IncomingScan, put_image
+from bodyscan.jobs.inbox import STABLE_S, IncomingScan, put_image
 from bodyscan.rig.rig import Rig
 
 QUIET_S = 30.0
@@ -66,10 +66,10 @@ def test_half_an_image_is_waited_for(rig: Rig, tmp_path: Path) -> None:
     path.write_bytes(content[:-20])
     assert scan.look(0.0, QUIET_S).whole == ()
     path.write_bytes(content[:-10])
-    assert scan.look(SETTLED_S + 0.1, QUIET_S).whole == ()
-    assert scan.look(2 * SETTLED_S + 0.2, QUIET_S).whole == ("a",)
+    assert scan.look(STABLE_S + 0.1, QUIET_S).whole == ()
+    assert scan.look(2 * STABLE_S + 0.2, QUIET_S).whole == ("a",)
     path.write_bytes(content)
-    assert scan.look(2 * SETTLED_S + 0.3, QUIET_S).whole == ("a",)
+    assert scan.look(2 * STABLE_S + 0.3, QUIET_S).whole == ("a",)
 
 
 def test_a_scan_with_images_missing_is_taken_when_marked_or_quiet(rig: Rig, tmp_path: Path) -> None:

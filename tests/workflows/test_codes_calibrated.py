@@ -19,6 +19,8 @@ def simulate_pair(folder: Path, *more: object, **code: object) -> Path:
     """rigs/one-pair.yaml with another code, simulated, checked and calibrated by the commands."""
     rig = yaml.safe_load((PROJECT / "rigs" / "one-pair.yaml").read_text("utf-8"))
     rig["pairs"][0]["projector"] |= code
+    for board in rig["boards"]:
+        board["flatness_mm"] = 0  # as the preset `ideal` has it
     (folder / "code.yaml").write_text(yaml.safe_dump(rig), "utf-8")
     out, size = folder / "work", ("--scale", 0.3, "--board-shots", 4, "--preset", "ideal")
     for command in (
@@ -72,16 +74,17 @@ def misfit(points: np.ndarray, model: np.ndarray) -> np.ndarray:
     return np.linalg.norm(a - b @ turn, axis=1)
 
 
-# About 1.6 times what was measured (0.018, 0.021, 0.103, 0.020, 0.013 mm) in images of 192 x 144 px,
-# where a pixel is 1.5 mm wide on the board, 300 to 400 mm away.
+# 1.2 to 1.4 times what was measured (0.021, 0.035, 0.124, 0.025, 0.023 mm) in images of 192 x 144 px,
+# where a pixel is 1.5 mm wide on the board, 300 to 400 mm away. The solve allows corners to be printed
+# 0.05 mm off, which these are not; without that it was 0.013 to 0.021 mm, and worse on a real pair.
 @pytest.mark.parametrize(
     ("code", "rms_mm"),
     [
         ({"inverses": False}, 0.03),
-        ({"code": "light-section"}, 0.035),
+        ({"code": "light-section"}, 0.045),
         ({"code": "stripe-index"}, 0.17),
         ({"code": "phase-shift", "steps": 4, "period": 8}, 0.03),
-        ({"code": "phase-shift", "steps": [3, 4], "periods": [16, 1], "shift": "backward"}, 0.022),
+        ({"code": "phase-shift", "steps": [3, 4], "periods": [16, 1], "shift": "backward"}, 0.03),
     ],
     ids=lambda value: value.get("code", "gray") if isinstance(value, dict) else "",
 )
