@@ -163,7 +163,8 @@ def image_error(what: str, path: Path, where: str, *, remedy: str = "") -> Image
     remedy = remedy or (
         "Possible causes: it was not taken, or is damaged (copy it again, take the shot again, or "
         "leave it out of captures.yaml); the rig file has another name for it (`files`, `frames`; "
-        "capitals count) or another size (`camera`); the software saves other kinds of files."
+        "capitals count) or another size (the camera's width and height); the software saves "
+        "other kinds of files."
     )
     return ImageError(what, where=f"{path} ({where})" if where else str(path), remedy=remedy)
 
