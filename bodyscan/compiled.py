@@ -43,7 +43,7 @@ def _look_at_imports(kept: Any, function: Any) -> None:
     Numba checks the date and size of the function's own file alone, and would keep using stale
     versions of the functions it calls.
     """
-    own = function.__code__.co_filename
+    source_file = function.__code__.co_filename
     called = {
         value.py_func.__code__.co_filename
         for value in function.__globals__.values()
@@ -51,6 +51,7 @@ def _look_at_imports(kept: Any, function: Any) -> None:
     }
     files = kept._cache._cache_file
     stamps = [
-        (file, os.stat(file).st_mtime, os.stat(file).st_size) for file in sorted(called - {own})
+        (file, os.stat(file).st_mtime, os.stat(file).st_size)
+        for file in sorted(called - {source_file})
     ]
     files._source_stamp = (*files._source_stamp, *stamps)

@@ -122,7 +122,7 @@ class Coverage:
 class ScanEvidence:
     """Everything that the checks of a scan look at.
 
-    together: the result of alignment; None if it took no part.
+    person_alignment: the result of alignment; None if it took no part.
     person: how a moving body moved.
     mesh, coverage: None while there is no mesh; findings that need it are then left out.
     """
@@ -131,19 +131,22 @@ class ScanEvidence:
     rig: RigEvidence
     images: ImageEvidence
     use: UseLimits
-    together: PersonAlignment | None = None
+    person_alignment: PersonAlignment | None = None
     person: PersonMotion | None = None
     mesh: BodyMesh | None = None
     coverage: Coverage | None = None
 
     @property
     def alignment(self) -> Alignment | None:
-        return self.together.alignment if self.together else None
+        return self.person_alignment.alignment if self.person_alignment else None
 
     @property
     def poses_corrected(self) -> bool:
         """Whether alignment found displaced poles, or all poles farther out, and corrected them."""
-        return bool(self.together and (self.together.displaced or self.together.scale_error))
+        return bool(
+            self.person_alignment
+            and (self.person_alignment.displaced or self.person_alignment.scale_error)
+        )
 
     @property
     def shape(self) -> BodyMesh | None:

@@ -23,7 +23,7 @@ def check_displaced_poles(scan: ScanEvidence) -> Iterator[Finding]:
     What the correction left shows at the seams. But a single pair may instead measure wrongly, and
     if several moved, the overlaps alone determine the body's size.
     """
-    steps = scan.together.displaced if scan.together else ()
+    steps = scan.person_alignment.displaced if scan.person_alignment else ()
     for step in steps:
         # A bumped pole turns about its foot and carries its view of the body along, by the turn
         # times its distance, at least a metre. If the body's middle stays within a quarter of
@@ -47,7 +47,7 @@ def check_displaced_poles(scan: ScanEvidence) -> Iterator[Finding]:
 
 def check_size(scan: ScanEvidence) -> Iterator[Finding]:
     """A common step of all poles outwards or inwards, corrected too."""
-    size = scan.together.scale_error if scan.together else None
+    size = scan.person_alignment.scale_error if scan.person_alignment else None
     if size is None:
         return
     girth_mm = abs(size.outward_mm) * GIRTH_PER_MM
@@ -62,9 +62,9 @@ def check_size(scan: ScanEvidence) -> Iterator[Finding]:
 
 def check_displaced_pairs(scan: ScanEvidence) -> Iterator[Finding]:
     """Pairs displaced by more than sway and their calibration's errors explain."""
-    if scan.together is None:
+    if scan.person_alignment is None:
         return
-    search = scan.together.search
+    search = scan.person_alignment.search
     boards_mm = np.array(list(scan.rig.boards_mm.values()) or [0.0])
     expected_mm = float(np.sqrt(np.mean(boards_mm**2) / 3.0))  # along one axis
     girth_mm = float(np.sqrt(max(search.offset_mm**2 - expected_mm**2, 0.0))) * GIRTH_PER_MM

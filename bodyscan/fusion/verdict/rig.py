@@ -122,7 +122,7 @@ def check_floor(scan: ScanEvidence) -> Iterator[Finding]:
     if floor_mm is None or abs(floor_mm) <= 4.0:
         return
     yield (
-        "repeat" if scan.together and scan.together.displaced else "usable",
+        "repeat" if scan.person_alignment and scan.person_alignment.displaced else "usable",
         f"the floor is at {floor_mm:.0f} mm, not at 0: the stature is wrong by as much, and girths are "
         f"taken {abs(floor_mm):.0f} mm too {'low' if floor_mm > 0.0 else 'high'}. Possible causes: "
         "poles were lifted or lowered since the calibration; `rig_frame` is that of another floor; the "
