@@ -22,7 +22,7 @@ from benchmarks.free_triangulation import (
 from benchmarks.rivals import RIVALS, run_rival, with_lens, without_skew
 from bodyscan.boards.view import BoardView
 from bodyscan.calibration.board_views import max_displacement_mm
-from bodyscan.geometry.lenses.brown import Brown
+from bodyscan.geometry.lenses.opencv import Brown
 from bodyscan.registration.rig_solve import RigSolution, solve_rig
 from bodyscan.rig.rig import Rig
 from bodyscan.workflows.find_boards import find_all_boards

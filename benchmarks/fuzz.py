@@ -29,7 +29,7 @@ from bodyscan.evaluation.acceptance import load_acceptance
 from bodyscan.files.corners_vnl import read_corners
 from bodyscan.fusion.storage import load_scan
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.interchange.rig_format import RIG_FORMATS
 from bodyscan.jobs.pipeline import load_pipeline

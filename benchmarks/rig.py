@@ -13,7 +13,7 @@ from benchmarks.board_images import SeenRig, see_boards
 from benchmarks.rivals import RIVALS, run_rival, with_lens
 from bodyscan.arrays import Array, Mask
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.transforms import RigidTransform, fit_rigid_transform
 from bodyscan.geometry.uncertainty import position_sigma
 from bodyscan.registration.rig_solve import RigSolution, solve_rig

@@ -18,8 +18,7 @@ from bodyscan.errors import BadInput
 from bodyscan.geometry.camera import MATRIX, Camera
 from bodyscan.geometry.least_squares import EXACT, Block, minimize
 from bodyscan.geometry.lens_sheets import LensSheets
-from bodyscan.geometry.lenses.brown import Brown
-from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.geometry.lenses.opencv import Brown, Radial
 from bodyscan.geometry.light_planes import LightPlanes, LightSheets
 from bodyscan.geometry.projector_sheets import projector_from_sheets
 from bodyscan.geometry.robust import rms
@@ -76,7 +75,7 @@ def fit_projector(
     both = [first, _samples(camera, crossing)]
     terms = [len(one.parameters) for one in (light, crossing) if isinstance(one, LensSheets)]
     projector = _with_crossing_axis(projector, from_camera, both[1], crossing.stripes)
-    if isinstance(projector.lens, Radial):
+    if type(projector.lens) is Radial:
         projector = replace(projector, lens=Brown.from_opencv(projector.lens.opencv()) or Brown())
     refined = _refine(projector, from_camera, both, every_term=max(terms, default=0) > 6)
     return _with_misfit(refined, both)

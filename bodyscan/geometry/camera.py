@@ -12,7 +12,7 @@ import numpy as np
 from bodyscan.arrays import Array
 from bodyscan.geometry.lenses import LENSES
 from bodyscan.geometry.lenses.lens import Lens
-from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.geometry.lenses.opencv import Radial
 
 MATRIX = ("alpha", "beta", "gamma", "u0", "v0")
 MATRIX_PRIOR_PX = (50.0, 50.0, 5.0, 50.0, 50.0)

@@ -19,7 +19,7 @@ from scipy.optimize import least_squares
 from bodyscan.arrays import Array
 from bodyscan.calibration.zhang import homogeneous
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.transforms import RigidTransform
 
 

@@ -19,8 +19,8 @@ from bodyscan.calibration.lens_choice import ChosenLens, choose_lens
 from bodyscan.calibration.model_selection import MIN_GAIN
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses import family_up_to
-from bodyscan.geometry.lenses.brown import Brown
 from bodyscan.geometry.lenses.lens import Lens
+from bodyscan.geometry.lenses.opencv import Brown
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import RayUncertainty
 from bodyscan.progress import map_threads

@@ -12,7 +12,7 @@ from bodyscan.alignment.matching import Matches
 from bodyscan.alignment.overlaps import linearize
 from bodyscan.errors import FailedWork
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.motion.object_refinement import refine_on_object

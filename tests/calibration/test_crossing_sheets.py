@@ -14,7 +14,7 @@ from bodyscan.calibration.camera import calibrate_camera
 from bodyscan.calibration.pair import LocatedPair, PairCalibration, calibrate_pair
 from bodyscan.calibration.striped_view import BoardBoundaries, StripedView
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.light_sheets import intersect_rays
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.outcome import Outcome

@@ -11,7 +11,7 @@ import pytest
 from bodyscan.calibration.known_pair import _projector, _require_baseline, parameter_sigmas
 from bodyscan.errors import CalibrationFileError
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.transforms import RigidTransform
 
 SIZE = (1280, 800)

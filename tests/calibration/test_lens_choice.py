@@ -9,10 +9,8 @@ from picture_boards import HEIGHT, NOISE_PX, WIDTH, seen
 from bodyscan.calibration.board_views import PlanarView
 from bodyscan.calibration.lens_choice import calibrate_with_lenses, cluster_poses
 from bodyscan.geometry.lenses import FAMILY
-from bodyscan.geometry.lenses.brown import Brown
 from bodyscan.geometry.lenses.lens import Lens
-from bodyscan.geometry.lenses.radial import Radial
-from bodyscan.geometry.lenses.rational import Rational
+from bodyscan.geometry.lenses.opencv import Brown, Radial, Rational
 
 CASES = [
     (Radial(-0.3, 0.1), "radial"),

@@ -15,8 +15,7 @@ from bodyscan.calibration.lens_choice import calibrate_with_lenses, ray_uncertai
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses import FAMILY
 from bodyscan.geometry.lenses.lens import Lens
-from bodyscan.geometry.lenses.radial import Radial
-from bodyscan.geometry.lenses.rational import Rational
+from bodyscan.geometry.lenses.opencv import Radial, Rational
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 from bodyscan.geometry.uncertainty import RayUncertainty, node_pixels
 

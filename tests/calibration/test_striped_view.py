@@ -21,7 +21,7 @@ from bodyscan.calibration.striped_view import (
     max_band_step,
     on_board,
 )
-from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.registration.board_shape import BoardShape
 from bodyscan.rig.board import Board
 from bodyscan.rig.pair import CameraSpec

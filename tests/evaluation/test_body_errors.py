@@ -12,7 +12,7 @@ from made_bodies import mesh_of
 
 from bodyscan.evaluation.body import girth_errors, measure_visible_coverage, sway_residual
 from bodyscan.geometry.camera import Camera, camera_to_fields
-from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyMesh, BreathAt
 from bodyscan.mesh.topology import vertex_normals

@@ -14,7 +14,7 @@ from bodyscan.arrays import Array, Mask
 from bodyscan.fusion.filling_bounds import Crown, PartialSurface, find_free_points, find_gaps
 from bodyscan.fusion.meshing import mesh
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud
 from bodyscan.reconstruction.range_image import RangeImage

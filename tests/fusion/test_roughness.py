@@ -10,7 +10,7 @@ import pytest
 from bodyscan.arrays import Array
 from bodyscan.fusion.regions import measure_roughness
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from bodyscan.fusion.smoothing import SmoothSurface, smooth
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.settings import FusionSettings

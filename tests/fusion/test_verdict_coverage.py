@@ -12,7 +12,7 @@ from bodyscan.arrays import Array, Indices
 from bodyscan.fusion.verdict.coverage import measure_coverage
 from bodyscan.fusion.verdict.evidence import Coverage
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.transforms import RigidTransform
 
 CAMERA = Camera(500.0, 500.0, 0.0, 60.0, 40.0, Radial(), 121, 81)

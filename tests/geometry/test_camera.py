@@ -6,7 +6,7 @@ from any_camera import cameras, pixels_of
 from hypothesis import given
 
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.geometry.lenses.opencv import Radial
 
 
 @given(cameras)

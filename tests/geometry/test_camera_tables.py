@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.camera_tables import look_up_rays, projection_table, ray_table
-from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.quadratic_table import Table, look_up, look_up_derivatives
 
 MOST_PX = 1e-3

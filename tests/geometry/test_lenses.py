@@ -12,10 +12,8 @@ from hypothesis import strategies as st
 from bodyscan.errors import BadInput
 from bodyscan.geometry.camera import Camera, camera_from_fields, camera_to_fields
 from bodyscan.geometry.lenses import LENSES, lens_from_opencv
-from bodyscan.geometry.lenses.brown import Brown
 from bodyscan.geometry.lenses.lens import Lens
-from bodyscan.geometry.lenses.radial import Radial
-from bodyscan.geometry.lenses.rational import Rational
+from bodyscan.geometry.lenses.opencv import Brown, Radial, Rational
 
 
 @given(cameras)

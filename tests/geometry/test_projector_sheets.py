@@ -9,7 +9,7 @@ import pytest
 from bodyscan.arrays import Array
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.lens import Lens
-from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.light_planes import Axis
 from bodyscan.geometry.projector_sheets import intersect_central_rays, sheets_from_projector
 from bodyscan.geometry.transforms import RigidTransform

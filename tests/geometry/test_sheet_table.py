@@ -9,7 +9,7 @@ from sheet_models import MIDDLE, STRIPES, models
 from bodyscan.arrays import Array
 from bodyscan.geometry.bowed_sheets import BowedSheets, SheetTable
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.light_sheets import MAX_RELATIVE_SIGMA, intersect_rays, triangulate_image
 
 

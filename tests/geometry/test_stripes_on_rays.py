@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.light_planes import LightPlanes
 from bodyscan.geometry.light_sheets import (
     intersect_rays,

@@ -8,7 +8,7 @@ import pytest
 from bodyscan.arrays import crop_bounds, find_crop, pad_crop
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.camera_tables import is_in_image
-from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.uncertainty import (
     COLUMNS,
     ROWS,

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from table_one import CAMERA
 
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.laboratory.rival_cameras import (
     calibrate_tsai,

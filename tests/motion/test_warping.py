@@ -14,7 +14,7 @@ from bodyscan.alignment.matching import match_projected, sample_points
 from bodyscan.arrays import WHOLE, find_crop, pad_crop
 from bodyscan.fusion.smoothing import smooth
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.motion.body_cells import BodyCells, modulate_fields, rigid_fields
 from bodyscan.motion.warping import warp_image

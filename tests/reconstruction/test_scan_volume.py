@@ -14,7 +14,7 @@ from small_pair import CAMERA, STRIPES, pair, planes, stripe_map
 from bodyscan.arrays import Floats
 from bodyscan.calibration.pair import PairCalibration
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.light_sheets import triangulate_image
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.scan_volume import (

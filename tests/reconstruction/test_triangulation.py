@@ -7,7 +7,7 @@ from small_pair import CAMERA, pair, stripe_map
 
 from bodyscan.errors import BadInput
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.uncertainty import COLUMNS, ROWS, RayUncertainty
 from bodyscan.reconstruction.triangulation import grid_normals, reconstruct_range_image
 from bodyscan.stripes.stripe_map import StripeMap

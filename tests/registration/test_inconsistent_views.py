@@ -6,7 +6,7 @@ import numpy as np
 
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.joint_solve import JointSolution
 from bodyscan.registration.view_consistency import (

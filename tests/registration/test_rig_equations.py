@@ -10,7 +10,7 @@ import pytest
 from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 from bodyscan.registration.normal_equations import (
     FreeShape,

@@ -9,7 +9,7 @@ import pytest
 from ring import as_found, ring_of_cameras, ring_rig, ring_views
 
 from bodyscan.boards.view import BoardView
-from bodyscan.geometry.lenses.brown import Brown
+from bodyscan.geometry.lenses.opencv import Brown
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import position_sigma
 from bodyscan.registration.rig_solve import RigSolution, solve_rig

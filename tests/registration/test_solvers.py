@@ -11,9 +11,8 @@ from ring import ring_of_cameras, ring_views
 from bodyscan.calibration.board_views import LocatedView, PlanarView
 from bodyscan.calibration.camera import locate_board
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lenses.brown import Brown
 from bodyscan.geometry.lenses.lens import Lens
-from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.geometry.lenses.opencv import Brown, Radial
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.bundle_adjustment import refine_solution
 from bodyscan.registration.joint_solve import (

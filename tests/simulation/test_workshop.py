@@ -10,7 +10,7 @@ from small_view import CAMERA, CRISP, LAMPS, projector, view, wall
 
 from bodyscan.errors import BadInput
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lenses.brown import Brown
+from bodyscan.geometry.lenses.opencv import Brown
 from bodyscan.rig.board import Board
 from bodyscan.simulation import SimulationSettings, settings_for
 from bodyscan.simulation.board import make_board

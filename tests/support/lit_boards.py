@@ -17,7 +17,7 @@ from bodyscan.calibration.boundary_points import BoundaryPoints, boundary_points
 from bodyscan.calibration.camera import locate_board
 from bodyscan.calibration.striped_view import BoardBoundaries, bin_boundaries
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.light_planes import Axis
 from bodyscan.geometry.transforms import RigidTransform
 

@@ -15,7 +15,7 @@ from ring import looking_at
 
 from bodyscan.arrays import Array, Mask
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.rig.pair import NominalPose, Pair

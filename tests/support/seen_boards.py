@@ -13,7 +13,7 @@ from bodyscan.boards.board_layout import corner_points, corners_per_face
 from bodyscan.boards.view import BoardView
 from bodyscan.captures.folder import Captures, ImageSequence
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.rig.rig import Rig
 from bodyscan.workflows.find_boards import FoundBoards

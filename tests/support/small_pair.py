@@ -7,7 +7,7 @@ import numpy as np
 from bodyscan.arrays import Array
 from bodyscan.calibration.pair import PairCalibration, PairQuality
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.light_planes import LightPlanes
 from bodyscan.stripes.stripe_map import StripeMap
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.geometry.lenses.opencv import Radial
 
 # Table 1 of the chapter, and its 48 calibration points at 20 mm.
 CAMERA = Camera(

@@ -10,7 +10,7 @@ import pytest
 
 from bodyscan.errors import BadInput
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.rig.frame_names import FrameNames
 from bodyscan.stripes.codes.gray import Gray

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from bodyscan.arrays import Array
-from bodyscan.geometry.lenses.brown import Brown
 from bodyscan.geometry.lenses.lens import Lens
-from bodyscan.geometry.lenses.radial import Radial
-from bodyscan.geometry.lenses.rational import Rational
+from bodyscan.geometry.lenses.opencv import Brown, Radial, Rational
 
 LENSES: dict[str, type[Lens]] = {lens.kind: lens for lens in (Radial, Brown, Rational)}
 """By name in files, the simplest first: the first that has all of the given OpenCV coefficients is

@@ -16,7 +16,6 @@ import numpy as np
 
 from bodyscan.arrays import Array
 from bodyscan.errors import BadInput
-from bodyscan.geometry.lenses.polynomials import split_coordinates, squared_radius
 
 NEWTON_STEPS = 20
 """Five or six reach rounding; close to where a lens folds it takes more."""
@@ -101,7 +100,7 @@ class Lens(ABC):
         Accurate to rounding within `fold_radius`; NaN where no ideal point within it maps to the
         real one.
         """
-        real = split_coordinates(real)
+        real = np.asarray(real, float)
         with np.errstate(all="ignore"):
             ideal = _at_most(real, 0.9 * self.fold_radius)
             for _ in range(NEWTON_STEPS):
@@ -110,19 +109,13 @@ class Lens(ABC):
                 x, y, scale = residual[..., 0], residual[..., 1], a * d - b * c
                 step = np.empty_like(ideal)
                 step[..., 0], step[..., 1] = (d * x - b * y) / scale, (a * y - c * x) / scale
-                ideal = _at_most(
-                    ideal - step, 0.5 * (self.fold_radius + np.sqrt(squared_radius(ideal)))
-                )
-                if has_converged(step):
+                ideal = _at_most(ideal - step, 0.5 * (self.fold_radius + _radius(ideal)))
+                # Diverged steps do not count.
+                if np.max(np.abs(step), initial=0.0, where=np.isfinite(step)) < TOLERANCE:
                     break
-            return self.before_fold(ideal, real)
-
-    def before_fold(self, ideal: Array, real: Array) -> Array:
-        """Ideal points (..., 2), NaN where they lie beyond `fold_radius` or do not map to
-        `real`."""
-        reached = squared_radius(self.distort(ideal) - real) < NOT_FOUND**2
-        reached &= np.sqrt(squared_radius(ideal)) < self.fold_radius
-        return np.where(reached[..., None], ideal, np.nan)
+            reached = _radius(self.distort(ideal) - real) < NOT_FOUND
+            reached &= _radius(ideal) < self.fold_radius
+            return np.where(reached[..., None], ideal, np.nan)
 
     def opencv(self) -> Array:
         """OpenCV's distortion coefficients k1, k2, p1, p2, k3, ... (5,) or more.
@@ -140,18 +133,19 @@ class Lens(ABC):
         return None
 
 
+def _radius(points: Array) -> Array:
+    """Distances (...) of points (..., 2) from the axis."""
+    x, y = points[..., 0], points[..., 1]
+    return np.asarray(np.sqrt(x * x + y * y), float)
+
+
 def _at_most(points: Array, radius: Array | float) -> Array:
     """Points (..., 2), with those farther than `radius` (...) from the axis moved in to it."""
-    radii = np.sqrt(squared_radius(points))
+    radii = _radius(points)
     beyond = radii > radius
     if not beyond.any():
         return points
     return points * np.where(beyond, radius / radii, 1.0)[..., None]
-
-
-def has_converged(step: Array) -> bool:
-    """Whether no Newton step moves anything any more; diverged (not finite) ones do not count."""
-    return bool(np.max(np.abs(step), initial=0.0, where=np.isfinite(step)) < TOLERANCE)
 
 
 @lru_cache(256)
