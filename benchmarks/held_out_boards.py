@@ -16,11 +16,10 @@ from bodyscan.calibration.board_views import LocatedView, planar_view
 from bodyscan.calibration.boundary_points import BoundaryPoints, concatenate
 from bodyscan.calibration.camera import CameraCalibration, locate_board
 from bodyscan.calibration.light_sheets import fit_light_sheets, fit_planes
-from bodyscan.calibration.sheet_fit import fit_pinhole, fit_sheets
+from bodyscan.calibration.sheet_fit import fit_pinhole
 from bodyscan.calibration.striped_view import BoardBoundaries, StripedView, on_board
 from bodyscan.captures.folder import Captures
 from bodyscan.errors import PairFailed
-from bodyscan.geometry.bowed_sheets import BowedSheets
 from bodyscan.geometry.light_planes import LightSheets
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.rig.rig import Rig
@@ -84,9 +83,7 @@ def _models(
         [c[2] for c in corners],
         pinhole,
     )
-    plain = pinhole.sheets(points.points, stripes, direction)
     return {
-        "smooth planes": fit_sheets(BowedSheets.from_pinhole(plain, 0), points).sheets,
         "free planes": fit_planes(points, stripes, direction, 0.0).planes,
         "chosen by held-out boards": fit_light_sheets(points, stripes, direction).sheets,
         "pinhole (2 x 4, stripes)": pinhole.planes(stripes, direction),
@@ -144,7 +141,7 @@ def _corners_with_stripe(rig: Rig, shot: _Shot) -> tuple[Array, Array, Array]:
 
 def _measure(model: str, sheets: LightSheets, held: _Shot) -> HeldOutBoard:
     rays = held.points.points / held.points.points[:, 2:]
-    depth = sheets.depth(rays, held.points.index.astype(float))
+    depth = sheets.measure(rays, held.points.index.astype(float)).depth
     known = np.isfinite(depth)
     measured = rays[known] * depth[known, None]
     centre = held.points.points.mean(axis=0)

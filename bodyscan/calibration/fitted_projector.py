@@ -136,7 +136,7 @@ def _distance(camera: Camera, sheets: LightSheets) -> float:
     if isinstance(sheets, SmoothSheets):
         return float(sheets.middle[2])
     ray = camera.rays(np.array([[0.5 * camera.width, 0.5 * camera.height]]))
-    return float(sheets.depth(ray, np.array([0.5 * sheets.stripes]))[0])
+    return float(sheets.measure(ray, np.array([0.5 * sheets.stripes])).depth[0])
 
 
 def _fit_lens(light: LightSheets, samples: _Samples) -> LensSheets:

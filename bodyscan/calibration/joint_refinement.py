@@ -405,7 +405,7 @@ def _depth_covariance(
     index = np.concatenate([board.index for board in boards])
     rays = state.camera.rays(np.concatenate([board.pixels for board in boards]))
     with np.errstate(all="ignore"):
-        depth = state.sheets.depth(rays, index)[:, None]
+        depth = state.sheets.measure(rays, index).depth[:, None]
         offset = state.sheets.offset(rays * depth, state.sheets.at(index), parameters=True)
         assert offset.by_parameter is not None
         along_ray = np.sum(offset.by_point * rays, axis=1)[:, None]

@@ -62,13 +62,11 @@ class Candidate:
 
     fit: sheets from points, with the covariance for boards displaced by 1 mm.
     complete: gives sheets for every s, so that a ray it cannot measure counts against it.
-    selectable: has all terms that such devices have; others are tried for information.
     """
 
     name: str
     fit: Callable[[BoundaryPoints], LightSheets]
     complete: bool = True
-    selectable: bool = True
 
 
 @dataclass(frozen=True)
@@ -79,7 +77,7 @@ class HeldOutModel:
     rms_mm: RMS distance without outliers.
     measured: share of the points that got a depth.
     gain: standard errors by which it beat the model chosen among those before it, three being
-        required; None for the first that may be chosen, and for models that may not be.
+        required; None for the first.
     """
 
     model: str
@@ -92,41 +90,23 @@ class HeldOutModel:
 
 
 @dataclass(frozen=True, eq=False)
-class Fold:
-    """One split of the points.
-
-    left_out: the points to be measured, (N,).
-    rest: the others, to which models are fitted.
-    """
-
-    left_out: Mask
-    rest: BoundaryPoints
-
-
-@dataclass(frozen=True, eq=False)
 class HeldOutErrors:
     """Distances of held-out points from their boards, as measured by sheets fitted without them.
 
     distances: (N,) mm, NaN where not measured.
-    sheets: those fitted without each fold.
+    unit_variance: (N,) mm^2 of the distances if boards were known to 1 mm.
     """
 
     distances: Array
-    sheets: tuple[LightSheets, ...]
+    unit_variance: Array
 
-    def board_error_mm(self, data: BoundaryPoints, folds: Sequence[Fold]) -> float:
+    def board_error_mm(self, data: BoundaryPoints) -> float:
         """Estimate the error of the boards' poses, mm, that explains distances as large as these.
 
         data: the points that were held out. Their noise, by the differences of neighbours on a
             boundary, is subtracted.
         """
-        # Variance (N,) mm^2 of the distances if boards were known to 1 mm.
-        unit_variance = np.sum(data.board_errors.effects**2, axis=1)
-        for fold, sheets in zip(folds, self.sheets, strict=True):
-            rays, s, _ = _held_out_rays(data, fold)
-            of_depth = sheets.variance_mm2(rays, s, sheets.depth(rays, s))
-            unit_variance[fold.left_out] += of_depth * data.board_errors.facing[fold.left_out] ** 2
-        known = np.isfinite(self.distances) & np.isfinite(unit_variance)
+        known = np.isfinite(self.distances) & np.isfinite(self.unit_variance)
         squared = self.distances[known] ** 2
         if not squared.size:
             return 0.0
@@ -138,11 +118,11 @@ class HeldOutErrors:
         noise = 0.5 * robust_scale(steps) ** 2 if steps.size else 0.0
         # Boards are never assumed to account for less than a hundredth.
         left = max(total - noise, 0.01 * total)
-        return float(np.sqrt(left / unit_variance[known].mean()))
+        return float(np.sqrt(left / self.unit_variance[known].mean()))
 
 
-def split(data: BoundaryPoints) -> list[Fold]:
-    """Split the points so that each is left out once.
+def split(data: BoundaryPoints) -> list[Mask]:
+    """Split the points so that each is left out once; (N,) for each fold, true for those left out.
 
     They are left out by boards, in MAX_FOLDS groups at most; with only two boards, by halves of
     one.
@@ -152,25 +132,20 @@ def split(data: BoundaryPoints) -> list[Fold]:
         group = number % MAX_FOLDS
     else:
         group = 2 * number + (data.board_errors.effects[:, 2] > 0.0)
-    return [Fold(group == k, select(data, group != k)) for k in np.unique(group)]
+    return [group == k for k in np.unique(group)]
 
 
-def hold_out(candidate: Candidate, data: BoundaryPoints, folds: Sequence[Fold]) -> HeldOutErrors:
+def hold_out(candidate: Candidate, data: BoundaryPoints, folds: Sequence[Mask]) -> HeldOutErrors:
     """Fit without each fold in turn, and measure what was left out."""
-    distances, fitted = np.full(len(data.index), np.nan), []
-    for fold in folds:
-        sheets = candidate.fit(fold.rest)
-        rays, s, depth = _held_out_rays(data, fold)
-        facing = data.board_errors.facing[fold.left_out]
-        distances[fold.left_out] = (sheets.depth(rays, s) - depth) * facing
-        fitted.append(sheets)
-    return HeldOutErrors(distances, tuple(fitted))
-
-
-def _held_out_rays(data: BoundaryPoints, fold: Fold) -> tuple[Array, Array, Array]:
-    """Rays (n, 3) with z = 1, s (n,) and true depths (n,) mm of the points left out."""
-    points, s = data.points[fold.left_out], data.index[fold.left_out].astype(float)
-    return points / points[:, 2:], s, points[:, 2]
+    errors, distances = data.board_errors, np.full(len(data.index), np.nan)
+    unit_variance = np.sum(errors.effects**2, axis=1)
+    for left_out in folds:
+        points, facing = data.points[left_out], errors.facing[left_out]
+        sheets = candidate.fit(select(data, ~left_out))
+        found = sheets.measure(points / points[:, 2:], data.index[left_out].astype(float))
+        distances[left_out] = (found.depth - points[:, 2]) * facing
+        unit_variance[left_out] += found.variance_mm2 * facing**2
+    return HeldOutErrors(distances, unit_variance)
 
 
 def select_model(
@@ -191,11 +166,11 @@ def select_model(
         np.isfinite(errors.distances) | candidate.complete
         for candidate, errors in zip(candidates, tried, strict=True)
     ]
-    chosen = next(i for i, candidate in enumerate(candidates) if candidate.selectable)
+    chosen = 0
     gains: list[float | None] = [None] * len(candidates)
-    for i in range(chosen + 1, len(candidates)):
+    for i in range(1, len(candidates)):
         known = counted[i]
-        if not (candidates[i].selectable and np.isfinite(medians[i])):
+        if not np.isfinite(medians[i]):
             continue
         rich, simple = (
             _without_motion(_clip(tried[k].distances[known], cap), effects[known], board[known])

@@ -1,4 +1,4 @@
-"""Sheets that vary smoothly with s and may bow across their width; without bow, smooth planes.
+"""Sheets that vary smoothly with s and bow across their width.
 
 In a frame roughly at the projector let y' = Y/Z across the stripes, x' = (X + x0)/Z along them and
 w = D/Z - 1. The sheet at s is
@@ -9,16 +9,16 @@ Without the b terms this can represent any plane; p, q, r, b are Chebyshev polyn
 The projector's centre is not assumed to be known: r(s) moves each sheet independently. Only the
 bow, which is small, is extended radially from the frame's origin, shifted along the stripes by x0.
 
-`SheetTable` tabulates the coefficients, their derivatives by s and their covariance, which are
-smooth in s: interpolated linearly between nodes an eighth of a stripe apart they are good to less
-than a micrometre. Along a ray the equation times Z is linear but for the bow, so Newton's method
-needs a step or two.
+To measure, the coefficients, their derivatives by s and their covariance, which are smooth in s, are
+tabulated: interpolated linearly between nodes an eighth of a stripe apart they are good to less than
+a micrometre. Along a ray the equation times Z is linear but for the bow, so Newton's method needs a
+step or two.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -48,19 +48,16 @@ class SheetsAtStripe:
 
 @dataclass(frozen=True, eq=False)
 class BowedSheets(SmoothSheets):
-    """Smooth planes, or sheets with a bow of `bow_terms` terms.
+    """Smooth planes with a bow.
 
     parameters: coefficients of p, q, r (PLANE_DEGREE), then of b2, b3, ... (BOW_DEGREE), lowest
-        degree first; with a bow, x0 (mm) is the last.
-    bow_terms: number of terms b2, b3, ...; 0 for planes.
+        degree first, and x0 (mm).
     """
-
-    bow_terms: int
 
     @staticmethod
     def from_pinhole(pinhole: LensSheets, bow_terms: int) -> BowedSheets:
         """The planes of a projector without a lens, y' = (s - c) / f: the start of a fit."""
-        size = 3 * (PLANE_DEGREE + 1) + bow_terms * (BOW_DEGREE + 1) + (bow_terms > 0)
+        size = 3 * (PLANE_DEGREE + 1) + bow_terms * (BOW_DEGREE + 1) + 1
         parameters, half = np.zeros(size), pinhole.stripes / 2.0
         focal, centre = pinhole.parameters[:2]
         parameters[:2] = (half - centre) / focal, half / focal
@@ -71,12 +68,16 @@ class BowedSheets(SmoothSheets):
             pinhole.direction,
             parameters,
             np.full((size, size), np.nan),
-            bow_terms,
         )
 
     @property
     def kind(self) -> str:
-        return "bowed" if self.bow_terms else "smooth-planes"
+        return "bowed"
+
+    @property
+    def bow_terms(self) -> int:
+        """Number of terms b2, b3, ..."""
+        return (len(self.parameters) - 3 * (PLANE_DEGREE + 1) - 1) // (BOW_DEGREE + 1)
 
     def prior(self) -> tuple[Array, Array]:
         fall = FALL ** np.arange(PLANE_DEGREE + 1)
@@ -84,13 +85,10 @@ class BowedSheets(SmoothSheets):
         late = FALL ** np.maximum(np.arange(BOW_DEGREE + 1) - 1, 0)
         sigmas = [size * fall for size in PLANE_SIGMAS]
         sigmas += [size * late for size in BOW_SIGMAS[: self.bow_terms]]
-        deviation = self.parameters
-        if self.bow_terms:
-            # The boards' middle along the stripes is known to 30 % of its distance.
-            sigmas.append(np.array([0.3 * self.distance_mm]))
-            middle = self.projector_from_camera.apply(self.middle)[0]
-            deviation = np.append(deviation[:-1], middle + deviation[-1])
-        size = np.concatenate(sigmas)
+        # The boards' middle along the stripes is known to 30 % of its distance.
+        size = np.append(np.concatenate(sigmas), 0.3 * self.distance_mm)
+        deviation = self.parameters.copy()
+        deviation[-1] += self.projector_from_camera.apply(self.middle)[0]
         return deviation / size, np.diag(1.0 / size)
 
     def retract(self, step: Array) -> BowedSheets:
@@ -106,12 +104,8 @@ class BowedSheets(SmoothSheets):
     def offset(self, points: Array, sheet: SheetsAtStripe, *, parameters: bool = False) -> Offset:
         in_projector = self.projector_from_camera.apply(points)
         reach = in_projector[..., 2]
-        shift = self.parameters[-1] if self.bow_terms else 0.0
-        x, y, w = (
-            (in_projector[..., 0] + shift) / reach,
-            in_projector[..., 1] / reach,
-            self.distance_mm / reach,
-        )
+        x, y = (in_projector[..., 0] + self.parameters[-1]) / reach, in_projector[..., 1] / reach
+        w = self.distance_mm / reach
         powers = [np.ones_like(x), x]
         for _ in range(self.bow_terms):
             powers.append(powers[-1] * x)
@@ -130,83 +124,60 @@ class BowedSheets(SmoothSheets):
         )
 
     def _by_parameter(self, basis: Array, terms: Array, by_point: Array) -> Array:
-        columns = [-terms[..., k, None] * basis for k in range(3)]
-        low = basis[..., : BOW_DEGREE + 1]
-        columns += [-terms[..., 3 + k, None] * low for k in range(self.bow_terms)]
-        columns += [by_point[..., :1]] if self.bow_terms else []
-        return np.concatenate(columns, axis=-1)
+        sizes = self._sizes[:-1]
+        columns = [-terms[..., k, None] * basis[..., :size] for k, size in enumerate(sizes)]
+        return np.concatenate([*columns, by_point[..., :1]], axis=-1)
+
+    @property
+    def _sizes(self) -> list[int]:
+        """Number of parameters of p, q, r, b2, ..., and of x0."""
+        return [PLANE_DEGREE + 1] * 3 + [BOW_DEGREE + 1] * self.bow_terms + [1]
 
     def _polynomials(self) -> Array:
         """Coefficients (3 + bow_terms, PLANE_DEGREE + 1), one row per polynomial."""
-        planes = 3 * (PLANE_DEGREE + 1)
         rows = np.zeros((3 + self.bow_terms, PLANE_DEGREE + 1))
-        rows[:3] = self.parameters[:planes].reshape(3, -1)
-        if self.bow_terms:
-            rows[3:, : BOW_DEGREE + 1] = self.parameters[planes:-1].reshape(self.bow_terms, -1)
+        for row, part in zip(
+            rows, np.split(self.parameters, np.cumsum(self._sizes))[:-2], strict=True
+        ):
+            row[: len(part)] = part
         return rows
+
+    @cached_property
+    def _table(self) -> Array:
+        """Rows (K, 2 T + U) at s = 0, 1/8, 2/8, ...: the T coefficients p, q, r, b2, ..., their
+        derivatives by s, and row by row the upper triangle of the covariance of them and x0."""
+        at = self.at(np.arange(NODES_PER_STRIPE * self.stripes + 1.0) / NODES_PER_STRIPE)
+        sizes = self._sizes
+        parts = [slice(end - size, end) for size, end in zip(sizes, np.cumsum(sizes), strict=True)]
+        # Chebyshev polynomials begin with 1, which is also what x0 is multiplied by.
+        covariances = [
+            np.sum(
+                (at.basis[:, : sizes[k]] @ self.covariance[parts[k], parts[m]])
+                * at.basis[:, : sizes[m]],
+                axis=1,
+            )
+            for k, m in zip(*np.triu_indices(len(sizes)), strict=True)
+        ]
+        return np.column_stack([at.value, at.slope, *covariances])
+
+    def _measure(self, rays: Array, s: Array, found: Array) -> None:
+        frame = self.projector_from_camera.matrix[:3].ravel()
+        frame = np.append(frame, [self.parameters[-1], self.distance_mm])
+        _measure(frame, self._table, 3 + self.bow_terms, rays, s, found)
 
 
 NODES_PER_STRIPE = 8
 EXACT, CONVERGED = 1e-7, 1e-6  # relative: the next step would be about the square of the last
 
 
-@dataclass(frozen=True, eq=False)
-class SheetTable:
-    """The tabulated sheets.
-
-    rows: (K, 2 T + U) at s = 0, 1/8, 2/8, ...: the T coefficients p, q, r, b2, ..., their
-        derivatives by s, and row by row the upper triangle of the covariance of the coefficients
-        and, with a bow, x0.
-    terms: T.
-    frame: (14,) the three rows of projector_from_camera, then x0 and D.
-    """
-
-    rows: Array
-    terms: int
-    frame: Array
-
-    @staticmethod
-    @lru_cache(maxsize=64)
-    def from_sheets(sheets: BowedSheets) -> SheetTable:
-        at = sheets.at(np.arange(NODES_PER_STRIPE * sheets.stripes + 1.0) / NODES_PER_STRIPE)
-        terms, aside = 3 + sheets.bow_terms, sheets.bow_terms > 0
-        by_parameter = _by_parameter(at, terms, len(sheets.parameters))
-        # A small matrix per node: two large products do all nodes.
-        variances = (by_parameter.reshape(-1, len(sheets.covariance)) @ sheets.covariance).reshape(
-            by_parameter.shape
-        ) @ by_parameter.transpose(0, 2, 1)
-        above = np.triu_indices(terms + aside)
-        rows = np.concatenate([at.value, at.slope, variances[:, above[0], above[1]]], axis=1)
-        shift = float(sheets.parameters[-1]) if aside else 0.0
-        frame = sheets.projector_from_camera.matrix[:3].ravel()
-        return SheetTable(rows, terms, np.append(frame, [shift, sheets.distance_mm]))
-
-    def measure(self, rays: Array, s: Array) -> tuple[Array, Array, Array]:
-        """Depth z (N,) mm, dz/ds and the variance of z, for rays (N, 3) at s (N,); NaN where
-        none."""
-        found = np.empty((3, len(s)))
-        _measure(self.frame, self.rows, self.terms, np.ascontiguousarray(rays), s, found)
-        return found[0], found[1], found[2]
-
-
-def _by_parameter(at: SheetsAtStripe, terms: int, parameters: int) -> Array:
-    """Derivatives (K, T, P) of the coefficients by the parameters at the nodes; with a bow, x0 is
-    one more coefficient."""
-    aside = terms > 3
-    found = np.zeros((len(at.basis), terms + aside, parameters))
-    first = 0
-    for k in range(terms):
-        size = (PLANE_DEGREE if k < 3 else BOW_DEGREE) + 1
-        found[:, k, first : first + size] = at.basis[:, :size]
-        first += size
-    if aside:
-        found[:, -1, -1] = 1.0
-    return found
-
-
 @compiled
 def _measure(frame: Array, rows: Array, terms: int, rays: Array, s: Array, found: Array) -> None:
-    """Fill `found` (3, N) with depth, dz/ds and variance of rays (N, 3) at s (N,)."""
+    """Fill `found` (3, N) with depth, dz/ds and variance of rays (N, 3) at s (N,).
+
+    frame: (14,) the three rows of projector_from_camera, then x0 and D.
+    rows: see `BowedSheets._table`.
+    terms: T.
+    """
     last, row, by = len(rows) - 1, np.empty(rows.shape[1]), np.empty(terms + 1)
     for n in range(len(s)):
         found[0, n] = found[1, n] = found[2, n] = np.nan
@@ -248,8 +219,6 @@ def _depth(frame: Array, row: Array, terms: int, x: float, y: float) -> tuple[fl
     rise = (row[0] - row[2]) * forward + row[1] * along - across
     start = (row[0] - row[2]) * behind + row[1] * aside - frame[7] + row[2] * frame[13]
     depth = -start / rise
-    if terms == 3:
-        return depth, rise
     step = slope = np.nan
     for _ in range(5):
         shift = depth * along + aside
@@ -280,10 +249,8 @@ def _at(frame: Array, axis: int, x: float, y: float, depth: float) -> float:
 
 @compiled
 def _variance(upper: Array, by: Array) -> float:
-    """by^T C by, given the upper triangle of C row by row, as far as `by` reaches."""
+    """by^T C by, given the upper triangle of C row by row."""
     total, first, size = 0.0, 0, len(by)
-    if len(upper) < size * (size + 1) // 2:
-        size -= 1
     for i in range(size):
         row = 0.5 * upper[first] * by[i]
         for j in range(i + 1, size):

@@ -126,14 +126,10 @@ class LensSheets(SmoothSheets):
             by_freedom.reshape(*shape, size) if parameters else None,
         )
 
-    def measure(self, rays: Array, s: Array) -> tuple[Array, Array, Array]:
-        """`depth`, `depth_per_stripe` and `variance_mm2` (N,) of rays (N, 3) at s (N,) in one
-        pass."""
-        found = np.empty((3, len(s)))
-        flat, covariance = np.ascontiguousarray(rays), np.ascontiguousarray(self.covariance)
+    def _measure(self, rays: Array, s: Array, found: Array) -> None:
+        covariance = np.ascontiguousarray(self.covariance)
         frame, lens = self._frame_and_lens()
-        measure_rays(frame, lens, covariance, self.distance_mm, self.stripes, flat, s, found)
-        return found[0], found[1], found[2]
+        measure_rays(frame, lens, covariance, self.distance_mm, self.stripes, rays, s, found)
 
     def _frame_and_lens(self) -> tuple[Array, Array]:
         """projector_from_camera (3, 4), and f, c, k1, ..., k6 (10,) with 0 for missing

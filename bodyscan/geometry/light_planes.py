@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 
@@ -12,15 +12,24 @@ from bodyscan.arrays import Array, Indices, Mask
 Axis = Literal["horizontal", "vertical"]
 
 
+class RayDepths(NamedTuple):
+    """Depths along rays; NaN where a ray meets no sheet, or no depth can be trusted.
+
+    depth: z (...) mm.
+    per_stripe: dz/ds (...), mm per stripe.
+    variance_mm2: (...) of the depth, due to the uncertainty of the sheets alone.
+    """
+
+    depth: Array
+    per_stripe: Array
+    variance_mm2: Array
+
+
 class LightSheets(Protocol):
     """What triangulation needs from a projector, whatever its model.
 
-    In all methods rays (..., 3), camera frame, have z = 1, s (...) is real, and `depth`, where it
-    is already known, is z (...) mm. Results are NaN where a ray meets no sheet.
     direction: which way the stripes run in the image.
     """
-
-    def __hash__(self) -> int: ...
 
     @property
     def direction(self) -> Axis: ...
@@ -30,19 +39,11 @@ class LightSheets(Protocol):
 
     @property
     def kind(self) -> str:
-        """`planes`, `smooth-planes`, `bowed` or `lens`: see `light_sheets.sheets_from_arrays`."""
+        """`planes`, `bowed` or `lens`: see `light_sheets.sheets_from_arrays`."""
         ...
 
-    def depth(self, rays: Array, s: Array) -> Array:
-        """z (...) mm where rays meet the sheets at s."""
-        ...
-
-    def depth_per_stripe(self, rays: Array, s: Array, depth: Array | None = None) -> Array:
-        """dz/ds (...), mm per stripe."""
-        ...
-
-    def variance_mm2(self, rays: Array, s: Array, depth: Array | None = None) -> Array:
-        """Variance (...) mm^2 of z due to the uncertainty of the sheets themselves."""
+    def measure(self, rays: Array, s: Array) -> RayDepths:
+        """Intersect rays (..., 3) with z = 1, camera frame, with the sheets at real s (...)."""
         ...
 
     def tangent_planes(self, s: Array) -> Array:
@@ -102,36 +103,30 @@ class LightPlanes:
         """The planes themselves."""
         return self.at(s)
 
-    def depth(self, rays: Array, s: Array) -> Array:
-        """z (...) by Eq. 13: z = -d / (a x/z + b y/z + c)."""
+    def measure(self, rays: Array, s: Array) -> RayDepths:
+        """z by Eq. 13, -d / (a x/z + b y/z + c), and dz/ds from the two planes around s; at the last
+        plane, from the two before it.
+
+        Neighbouring planes come from the same boards, so their errors are treated as one.
+        """
+        below, share = self._locate(s)
         planes = self.at(s)
         facing = np.sum(planes[..., :3] * rays, axis=-1)
         depth = -planes[..., 3] / np.where(facing == 0.0, np.nan, facing)
-        return np.where(depth > 0.0, depth, np.nan)
-
-    def depth_per_stripe(self, rays: Array, s: Array, depth: Array | None = None) -> Array:
-        """dz/ds (...) from the two planes around s; at the last plane, from the two before it."""
-        depth = self.depth(rays, s) if depth is None else depth
-        below, share = self._locate(s)
+        depth = np.where(depth > 0.0, depth, np.nan)
         step = self.coefficients[below + 1] - self.coefficients[below]
         before = self.coefficients[below] - self.coefficients[np.maximum(below - 1, 0)]
         alone = np.isnan(step[..., :1]) & (share[..., None] == 0.0) & (below[..., None] > 0)
         step = np.where(alone, before, step)
-        facing = np.sum(self.at(s)[..., :3] * rays, axis=-1)
-        return -(depth * np.sum(step[..., :3] * rays, axis=-1) + step[..., 3]) / facing
-
-    def variance_mm2(self, rays: Array, s: Array, depth: Array | None = None) -> Array:
-        """Neighbouring planes come from the same boards, so their errors are treated as one."""
-        depth = self.depth(rays, s) if depth is None else depth
-        below, share = self._locate(s)
-        facing = np.sum(self.at(s)[..., :3] * rays, axis=-1)
+        per_stripe = -(depth * np.sum(step[..., :3] * rays, axis=-1) + step[..., 3]) / facing
         point = np.concatenate([rays * depth[..., None], np.ones_like(depth)[..., None]], axis=-1)
         lower, upper = (
             np.sqrt(np.einsum("...i,...ij,...j->...", point, self.covariance[row], point))
             for row in (below, below + 1)
         )
         lower, upper = np.where(share < 1.0, lower, 0.0), np.where(share > 0.0, upper, 0.0)
-        return (((1.0 - share) * lower + share * upper) / facing) ** 2
+        variance = (((1.0 - share) * lower + share * upper) / facing) ** 2
+        return RayDepths(depth, per_stripe, variance)
 
     def _locate(self, s: Array) -> tuple[Indices, Array]:
         """Index of the plane below s, and the fraction of the interval from it to s."""

@@ -1,8 +1,7 @@
 """Light sheets that change smoothly with s: what bowed sheets and a projector's lens share.
 
-A model says how far a point lies off the sheet at s, as a smooth function of both. Everything else
-follows from that function's derivatives: the depth along a ray (by Newton's method), its change
-with s, its variance, and the fit itself.
+A model says how far a point lies off the sheet at s, as a smooth function of both, with its
+derivatives: what a fit needs. Depths along rays are found by compiled functions of each model.
 """
 
 from __future__ import annotations
@@ -14,13 +13,10 @@ from typing import Any, TypeVar
 import numpy as np
 
 from bodyscan.arrays import Array
-from bodyscan.geometry.light_planes import Axis, towards_camera
+from bodyscan.geometry.light_planes import Axis, RayDepths, towards_camera
 from bodyscan.geometry.transforms import RigidTransform
 
 Sheets = TypeVar("Sheets", bound="SmoothSheets")
-
-NEWTON_STEPS = 5
-CHUNK = 1 << 17
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,38 +81,17 @@ class SmoothSheets(ABC):
     def offset(self, points: Array, sheet: Any, *, parameters: bool = False) -> Offset:
         """How far points (..., 3), camera frame, lie off the sheets `at(s)`."""
 
-    def depth(self, rays: Array, s: Array) -> Array:
-        """z (...) mm where rays (..., 3) with z = 1 meet the sheets at s (...); else NaN.
+    def measure(self, rays: Array, s: Array) -> RayDepths:
+        """Intersect rays (..., 3) with z = 1, camera frame, with the sheets at s (...)."""
+        shape = rays.shape[:-1]
+        found = np.empty((3, int(np.prod(shape))))
+        flat = np.ascontiguousarray(rays.reshape(-1, 3)), np.broadcast_to(s, shape).ravel()
+        self._measure(*flat, found)
+        return RayDepths(*found.reshape(3, *shape))
 
-        Newton's method on the offset times the reach, which for planes is linear along a ray.
-        """
-        flat_rays, flat_s = rays.reshape(-1, 3), np.broadcast_to(s, rays.shape[:-1]).ravel()
-        depth = np.empty(len(flat_s))
-        for start in range(0, len(flat_s), CHUNK):
-            part = slice(start, start + CHUNK)
-            depth[part] = self._depth(flat_rays[part], flat_s[part])
-        return depth.reshape(rays.shape[:-1])
-
-    def depth_per_stripe(self, rays: Array, s: Array, depth: Array | None = None) -> Array:
-        """dz/ds (...), mm per stripe."""
-        depth = self.depth(rays, s) if depth is None else depth
-        offset = self.offset(rays * depth[..., None], self.at(s))
-        return -offset.by_stripe / np.sum(offset.by_point * rays, axis=-1)
-
-    def variance_mm2(self, rays: Array, s: Array, depth: Array | None = None) -> Array:
-        """Variance of z (...), mm^2, from the covariance of the fit."""
-        depth = self.depth(rays, s) if depth is None else depth
-        shape, rays = depth.shape, rays.reshape(-1, 3)
-        points, s = rays * depth.reshape(-1, 1), np.broadcast_to(s, shape).ravel()
-        variance = np.empty(len(points))
-        for start in range(0, len(points), CHUNK):
-            part = slice(start, start + CHUNK)
-            offset = self.offset(points[part], self.at(s[part]), parameters=True)
-            jacobian = offset.by_parameter
-            assert jacobian is not None
-            sheet_variance = np.sum((jacobian @ self.covariance) * jacobian, axis=-1)
-            variance[part] = sheet_variance / np.sum(offset.by_point * rays[part], axis=-1) ** 2
-        return variance.reshape(shape)
+    @abstractmethod
+    def _measure(self, rays: Array, s: Array, found: Array) -> None:
+        """Fill `found` (3, N) with depth, dz/ds and variance of rays (N, 3) at s (N,)."""
 
     def tangent_planes(self, s: Array) -> Array:
         """Planes (..., 4) of Eq. 6 that touch the sheets at s (...) in the middle of the
@@ -127,7 +102,7 @@ class SmoothSheets(ABC):
         position[..., 2] = self.distance_mm
         across = camera_from_projector.rotation[:, 1]
         sheet = self.at(s)
-        for _ in range(NEWTON_STEPS):
+        for _ in range(5):
             offset = self.offset(camera_from_projector.apply(position), sheet)
             position[..., 1] -= offset.value / (offset.by_point @ across)
         points = camera_from_projector.apply(position)
@@ -139,18 +114,3 @@ class SmoothSheets(ABC):
     def with_covariance(self: Sheets, covariance: Array) -> Sheets:
         """The same sheets with another covariance (P, P)."""
         return replace(self, covariance=covariance)
-
-    def _depth(self, rays: Array, s: Array) -> Array:
-        forward = rays @ self.projector_from_camera.rotation[2]
-        depth = (self.distance_mm - self.projector_from_camera.translation[2]) / forward
-        sheet = self.at(s)
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            for _ in range(NEWTON_STEPS):
-                offset = self.offset(rays * depth[:, None], sheet)
-                slope = np.sum(offset.by_point * rays, axis=-1) * offset.reach
-                step = offset.value * offset.reach / (slope + offset.value * forward)
-                depth = depth - step
-                if not np.any(np.abs(step) > 1e-11 * np.abs(depth)):
-                    break
-            good = (np.abs(step) < 1e-6 * depth) & (offset.reach > 0.0)
-            return np.where(good & (s >= 0.0) & (s <= self.stripes), depth, np.nan)

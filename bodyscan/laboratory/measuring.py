@@ -18,7 +18,7 @@ from bodyscan.evaluation.primitives import (
     measure_sphere,
 )
 from bodyscan.geometry.camera import camera_from_fields
-from bodyscan.geometry.light_planes import Axis, towards_camera
+from bodyscan.geometry.light_planes import Axis, RayDepths, towards_camera
 from bodyscan.geometry.light_sheets import intersect_rays
 from bodyscan.geometry.robust import rms
 from bodyscan.laboratory import apparatus
@@ -62,7 +62,7 @@ def triangulate_pixels(approach: Approach, s: Stripes, where: Mask | None = None
     wanted = s[rows, columns].astype(float)
     known = np.isfinite(wanted)
     points = np.full(rays.shape, np.nan)
-    depth = approach.sheets.depth(rays[known], wanted[known])
+    depth = approach.sheets.measure(rays[known], wanted[known]).depth
     points[known] = rays[known] * depth[:, None]
     return points
 
@@ -113,7 +113,13 @@ class TrueSheets:
     def kind(self) -> str:
         return "true"
 
-    def depth(self, rays: Array, s: Array) -> Array:
+    def measure(self, rays: Array, s: Array) -> RayDepths:
+        """Intersect rays with the light; it is known exactly."""
+        depth = self._depth(rays, s)
+        per_stripe = (self._depth(rays, s + 1e-3) - depth) / 1e-3
+        return RayDepths(depth, per_stripe, np.zeros(rays.shape[:-1]))
+
+    def _depth(self, rays: Array, s: Array) -> Array:
         """Compute depths by the secant method, started at the planes without smile."""
         planes = self.setup.projector.plane(s)
         first = -planes[..., 3] / np.sum(planes[..., :3] * rays, axis=-1)
@@ -127,13 +133,6 @@ class TrueSheets:
                 step = np.where(change == 0.0, 0.0, next_residual * (further - first) / change)
                 first, further, residual = further, further - step, next_residual
         return further
-
-    def depth_per_stripe(self, rays: Array, s: Array, depth: Array | None = None) -> Array:
-        here = self.depth(rays, s) if depth is None else depth
-        return (self.depth(rays, s + 1e-3) - here) / 1e-3
-
-    def variance_mm2(self, rays: Array, s: Array, depth: Array | None = None) -> Array:
-        return np.zeros(rays.shape[:-1])
 
     def tangent_planes(self, s: Array) -> Array:
         """Compute planes that touch in the middle of the fan, where there is no smile."""

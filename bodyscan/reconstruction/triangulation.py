@@ -137,7 +137,7 @@ def _count_intersections(
     for sheets, direction in ((pair.sheets, stripes), (pair.crossing, stripes.crossing)):
         s = direction.s[decoded].astype(np.float64)
         exist &= np.isfinite(sheets.tangent_planes(s)[:, 3])
-        meet &= np.isfinite(sheets.depth(rays, s))
+        meet &= np.isfinite(sheets.measure(rays, s).depth)
     return int(np.count_nonzero(exist)), int(np.count_nonzero(exist & meet))
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from sheet_models import MATRIX, MIDDLE, PINHOLE, STRIPES, models, moved
+from sheet_models import MATRIX, MIDDLE, PINHOLE, STRIPES, by_offset, models, moved
 
 from bodyscan.arrays import Array
 from bodyscan.geometry.bowed_sheets import BowedSheets
@@ -79,10 +79,14 @@ def test_depth_and_its_slope(seed: int) -> None:
     for model in models(seed):
         s = sliced(model, rays, depth)
         inside = (s > 1.0) & (s < STRIPES - 1.0)
-        # Bisection leaves 1e-14 stripes, a stripe is worth some 10 mm.
-        assert np.allclose(model.depth(rays, s)[inside], depth[inside], atol=1e-6)
-        slope = (model.depth(rays, s + 1e-3) - model.depth(rays, s - 1e-3)) / 2e-3
-        assert np.allclose(model.depth_per_stripe(rays, s)[inside], slope[inside], rtol=1e-5)
+        found = model.measure(rays, s)
+        # Bisection leaves 1e-14 stripes, a stripe is worth some 10 mm; tables 3e-9 of 1/z.
+        atol = 1e-6 if isinstance(model, LensSheets) else 5e-3
+        assert np.allclose(found.depth[inside], depth[inside], rtol=0.0, atol=atol)
+        slope = (model.measure(rays, s + 1e-3).depth - model.measure(rays, s - 1e-3).depth) / 2e-3
+        assert np.allclose(
+            found.per_stripe[inside], slope[inside], rtol=1e-5 if atol < 1e-3 else 1e-3
+        )
 
 
 @pytest.mark.slow
@@ -96,17 +100,19 @@ def test_variance_is_that_of_sheets_drawn_from_the_covariance(seed: int) -> None
         s = sliced(model, rays, depth)
         factor = np.linalg.cholesky(model.covariance + 1e-30 * np.eye(len(model.covariance)))
         draws = [
-            model.retract(factor @ rng.standard_normal(len(factor))).depth(rays, s)
+            model.retract(factor @ rng.standard_normal(len(factor))).measure(rays, s).depth
             for _ in range(200)
         ]
         # 200 draws give a standard deviation to 5 percent; five times that.
-        ratio = np.std(draws, axis=0) / np.sqrt(model.variance_mm2(rays, s))
+        ratio = np.std(draws, axis=0) / np.sqrt(model.measure(rays, s).variance_mm2)
         inside = (s > 5.0) & (s < STRIPES - 5.0)
         assert np.all(np.abs(ratio[inside] - 1.0) < 0.25)
 
 
-def test_smooth_planes_are_planes() -> None:
-    model = next(m for m in models(4) if m.kind == "smooth-planes")
+def test_smooth_planes_of_earlier_versions_are_planes() -> None:
+    arrays = sheets_to_arrays(models(4)[4])
+    old = {"parameters": arrays["parameters"][:24], "covariance": arrays["covariance"][:24, :24]}
+    model = sheets_from_arrays("smooth-planes", arrays | old, "horizontal")
     index = np.arange(STRIPES + 1.0)
     planes = model.tangent_planes(index)
     chapter = LightPlanes(planes, np.zeros((STRIPES + 1, 4, 4)), "horizontal")
@@ -114,10 +120,10 @@ def test_smooth_planes_are_planes() -> None:
     rays = np.column_stack([rng.uniform(-0.3, 0.3, (300, 2)), np.ones(300)])
     s = rng.integers(1, STRIPES, 300).astype(float)
     # Far away rays and planes are nearly parallel: compare where a scanner measures.
-    depth = chapter.depth(rays, s)
+    depth = chapter.measure(rays, s).depth
     near = np.isfinite(depth) & (depth > 500.0) & (depth < 3000.0)
     assert near.sum() > 50
-    assert np.allclose(model.depth(rays, s)[near], depth[near], rtol=1e-9)
+    assert np.allclose(model.measure(rays, s).depth[near], depth[near], rtol=1e-8)
 
 
 def test_a_lens_without_distortion_is_the_two_by_four_matrix() -> None:
@@ -141,10 +147,10 @@ def test_turning_a_projector_moves_its_axis_and_little_else() -> None:
 def test_no_depth_outside_the_stripes_or_behind() -> None:
     rays = np.tile([0.0, 0.0, 1.0], (3, 1))
     for model in models(3):
-        assert np.isnan(model.depth(rays, np.array([-0.5, STRIPES + 0.5, np.nan]))).all()
+        assert np.isnan(model.measure(rays, np.array([-0.5, STRIPES + 0.5, np.nan])).depth).all()
     # Below the projector, a ray that falls steeply never meets the light that falls least.
     steep = np.array([[0.0, 3.0, 1.0]])
-    assert np.isnan(PINHOLE.depth(steep, np.array([10.0]))).all()
+    assert np.isnan(PINHOLE.measure(steep, np.array([10.0])).depth).all()
 
 
 def test_arrays_hold_everything() -> None:
@@ -162,11 +168,13 @@ def test_arrays_hold_everything() -> None:
             sheets_to_arrays(sheets).values(), sheets_to_arrays(again).values(), strict=True
         ):
             assert np.array_equal(left, right)
-        assert np.array_equal(again.depth(rays, s), sheets.depth(rays, s), equal_nan=True)
+        assert np.array_equal(
+            again.measure(rays, s).depth, sheets.measure(rays, s).depth, equal_nan=True
+        )
 
 
 def test_arrays_of_another_kind_are_refused() -> None:
-    bowed = models(0)[6]
+    bowed = models(0)[5]
     with pytest.raises(ValueError, match="smooth-planes"):
         sheets_from_arrays("smooth-planes", sheets_to_arrays(bowed), "horizontal")
     with pytest.raises(ValueError, match="cones"):
@@ -182,15 +190,15 @@ def test_planes_have_slope_and_variance_between_two_and_at_the_last() -> None:
     ray = np.array([[0.02, 0.01, 1.0]])
     for place in (100.5, 149.0, 151.0, 99.0):
         s = np.array([place])
-        depth = chapter.depth(ray, s)
+        depth = chapter.measure(ray, s).depth
         side = -1.0 if place == 149.0 else 1.0
-        nearby = chapter.depth(ray, s + side * 1e-6)
+        nearby = chapter.measure(ray, s + side * 1e-6).depth
         slope = (nearby - depth) / (side * 1e-6)
-        assert np.allclose(chapter.depth_per_stripe(ray, s), slope, rtol=1e-4)
+        assert np.allclose(chapter.measure(ray, s).per_stripe, slope, rtol=1e-4)
         facing = chapter.at(s)[0, :3] @ ray[0]
         # A plane's offset, 0.1 mm uncertain, moves the depth by that over n . ray.
-        assert np.allclose(chapter.variance_mm2(ray, s), 0.01 / facing**2)
-    assert np.isnan(chapter.variance_mm2(ray, np.array([149.5]))).all()
+        assert np.allclose(chapter.measure(ray, s).variance_mm2, 0.01 / facing**2)
+    assert np.isnan(chapter.measure(ray, np.array([149.5])).variance_mm2).all()
 
 
 def test_planes_of_any_length_and_sign_measure_and_do_not_say_how_well() -> None:
@@ -203,16 +211,16 @@ def test_planes_of_any_length_and_sign_measure_and_do_not_say_how_well() -> None
     assert (exact.coefficients[:, 3] > 0.0).all()
     assert exact.stripes == STRIPES
     ray, s = np.array([[0.02, 0.01, 1.0]]), np.array([100.5])
-    assert np.isfinite(exact.depth(ray, s)).all()
-    assert np.isnan(exact.variance_mm2(ray, s)).all()
+    assert np.isfinite(exact.measure(ray, s).depth).all()
+    assert np.isnan(exact.measure(ray, s).variance_mm2).all()
     again = sheets_from_arrays("planes", sheets_to_arrays(exact), "horizontal")
-    assert np.isnan(again.variance_mm2(ray, s)).all()
+    assert np.isnan(again.measure(ray, s).variance_mm2).all()
 
 
 def test_a_plane_behind_the_camera_measures_nothing() -> None:
     ahead, behind = [0.0, 0.0, -1.0, 500.0], [0.0, 0.0, 1.0, 500.0]
     planes = LightPlanes.from_planes(np.array([ahead, ahead, behind, behind]), "vertical")
-    depth = planes.depth(np.tile([0.1, 0.0, 1.0], (2, 1)), np.array([0.5, 2.5]))
+    depth = planes.measure(np.tile([0.1, 0.0, 1.0], (2, 1)), np.array([0.5, 2.5])).depth
     np.testing.assert_allclose(depth, [500.0, np.nan])
 
 
@@ -226,10 +234,13 @@ def test_what_is_too_uncertain_is_not_measured() -> None:
     rays = points / points[:, 2:]
     s = model.stripe(points)
     inside = (s > 0) & (s < STRIPES)
-    depth = model.depth(rays[inside], s[inside])
-    share = np.sqrt(model.variance_mm2(rays[inside], s[inside], depth)) / depth
+    depth = model.measure(rays[inside], s[inside]).depth
+    share = np.sqrt(model.measure(rays[inside], s[inside]).variance_mm2) / depth
     amid_boards = model.stripe(MIDDLE[None])
-    amid = float(np.sqrt(model.variance_mm2(MIDDLE[None] / MIDDLE[2], amid_boards)[0])) / MIDDLE[2]
+    amid = (
+        float(np.sqrt(model.measure(MIDDLE[None] / MIDDLE[2], amid_boards).variance_mm2[0]))
+        / MIDDLE[2]
+    )
     for at_the_boards, most in ((1e-4, 1e-3), (1e-3, 3e-3), (1e-2, 3e-2)):
         scaled = share * at_the_boards / amid
         worse = model.with_covariance(model.covariance * (at_the_boards / amid) ** 2)
@@ -242,22 +253,19 @@ def test_what_is_too_uncertain_is_not_measured() -> None:
 
 @pytest.mark.parametrize("terms", [0, 1, 4, 5, 8])
 def test_a_lens_measures_rays_as_newtons_method_on_its_offset_does(terms: int) -> None:
-    """Depth, its change and its variance in one go, against the ways all smooth sheets share."""
     model = moved(PINHOLE.with_lens(terms), np.random.default_rng(terms))
     rng = np.random.default_rng(13)
     points = MIDDLE + rng.uniform(-400.0, 400.0, (3000, 3))
     rays, s = points / points[:, 2:], rng.uniform(-20.0, STRIPES + 20.0, 3000)
     s[::50] = np.nan
-    depth = model.depth(rays, s)
-    known = np.isfinite(depth)
-    assert 0.2 < known.mean() < 0.95
     found = model.measure(rays, s)
-    for values in found:
-        np.testing.assert_array_equal(np.isfinite(values), known)
+    known = np.isfinite(found.depth)
+    assert 0.2 < known.mean() < 0.95
+    expected = by_offset(model, rays[known], s[known], found.depth[known])
     # Newton's steps end at 1e-7 of the depth, where the next one is the square of that.
-    np.testing.assert_allclose(found[0], depth, rtol=1e-11)
-    np.testing.assert_allclose(found[1], model.depth_per_stripe(rays, s, depth), rtol=1e-8)
-    np.testing.assert_allclose(found[2], model.variance_mm2(rays, s, depth), rtol=1e-8)
+    for value, wanted, rtol in zip(found, expected, (1e-11, 1e-8, 1e-8), strict=True):
+        np.testing.assert_array_equal(np.isfinite(value), known)
+        np.testing.assert_allclose(value[known], wanted, rtol=rtol)
 
 
 @pytest.mark.parametrize("terms", [0, 4])
@@ -266,18 +274,17 @@ def test_the_first_and_the_last_boundary_are_measured_as_well(terms: int) -> Non
     s = np.array([0.0, float(STRIPES)])
     first, last = (MIDDLE + [0.0, y, 0.0] for y in (-284.0, 598.0))
     rays = np.stack([first, last]) / [[first[2]], [last[2]]]
-    for depth in (model.depth(rays, s), model.measure(rays, s)[0]):
-        assert np.isfinite(depth).all()
-        np.testing.assert_allclose(model.stripe(rays * depth[:, None]), s, atol=1e-6)
+    depth = model.measure(rays, s).depth
+    np.testing.assert_allclose(model.stripe(rays * depth[:, None]), s, atol=1e-6)
     beyond = np.array([-1e-9, STRIPES + 1e-9])
-    assert np.isnan(model.measure(rays, beyond)[0]).all()
+    assert np.isnan(model.measure(rays, beyond).depth).all()
 
 
 @pytest.mark.parametrize(
     "model",
     [
         *(PINHOLE.with_lens(terms) for terms in (0, 1, 4, 8)),
-        *(BowedSheets.from_pinhole(PINHOLE, terms) for terms in (0, 1, 3)),
+        *(BowedSheets.from_pinhole(PINHOLE, terms) for terms in (1, 3)),
     ],
     ids=lambda model: f"{model.kind}-{len(model.parameters)}",
 )

@@ -6,6 +6,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from bodyscan.arrays import Array
 from bodyscan.geometry.bowed_sheets import BowedSheets
 from bodyscan.geometry.lens_sheets import LensSheets
 from bodyscan.geometry.smooth_sheets import SmoothSheets
@@ -24,9 +25,20 @@ def models(seed: int) -> list[SmoothSheets]:
     """Each kind, moved a little away from a pinhole at random, with some covariance."""
     rng = np.random.default_rng(seed)
     made: list[SmoothSheets] = [PINHOLE.with_lens(terms) for terms in (0, 1, 2, 4)]
-    made += [BowedSheets.from_pinhole(PINHOLE, terms) for terms in (0, 1, 3)]
+    made += [BowedSheets.from_pinhole(PINHOLE, terms) for terms in (1, 3)]
     made += [PINHOLE.with_lens(terms) for terms in (5, 8)]
     return [moved(model, rng) for model in made]
+
+
+def by_offset(
+    model: SmoothSheets, rays: Array, s: Array, depth: Array
+) -> tuple[Array, Array, Array]:
+    """Depths (N,) after one more step of Newton's method, dz/ds and variance, all from the offset."""
+    offset = model.offset(rays * depth[:, None], model.at(s), parameters=True)
+    along, jacobian = np.sum(offset.by_point * rays, axis=-1), offset.by_parameter
+    assert jacobian is not None
+    variance = np.sum((jacobian @ model.covariance) * jacobian, axis=-1)
+    return depth - offset.value / along, -offset.by_stripe / along, variance / along**2
 
 
 Sheets = TypeVar("Sheets", bound=SmoothSheets)
