@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations
 
 import networkx as nx
 import numpy as np
 
+from bodyscan.geometry.transforms import twist_jacobian
 from bodyscan.geometry.uncertainty import point_covariance, position_sigma
-from bodyscan.registration.more_shots import (
-    MAX_SHOTS,
-    BoardCandidate,
-    RigInformation,
-    propose_board_poses,
-)
-from bodyscan.registration.normal_equations import normal_equations
+from bodyscan.registration.cluster_covariance import normal_equations
 from bodyscan.registration.rig_frame import frame_target
 from bodyscan.registration.rig_solve import RigSolution
-from bodyscan.registration.view_graph import Target, view_graph
+from bodyscan.registration.view_graph import Target, by_target, view_graph
 from bodyscan.rig.rig import Rig
+
+MAX_SHOTS = 10
+"""More are not suggested: nobody takes them."""
 
 
 @dataclass(frozen=True)
@@ -37,36 +33,33 @@ class Link:
     sigma_mm: float
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class ShotSuggestion:
-    """How far `shots` more of the board at `candidate` reduce the sigma of `pair`.
+    """How far `shots` more of the board near where it was in a shot reduce the sigma of `pair`.
 
-    between: the two pairs whose common view of it matters most.
+    target: that shot and board.
+    visible_to: pairs that saw it there.
     before_mm, after_mm: the sigma without and with them.
-    halves: whether they halve it.
     """
 
     pair: str
     shots: int
-    between: tuple[str, str]
-    candidate: BoardCandidate
+    target: Target
+    visible_to: tuple[str, ...]
     before_mm: float
     after_mm: float
-    halves: bool
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Advice:
     """What ties a rig together, and what would improve it.
 
-    bridges: links without which the rig is disconnected.
     weak: links far less known than usual, where no other link ties their sides better.
     crucial: shots (with board) without which the rig is disconnected.
     worst, worst_sigma_mm: the pair least known in the rig frame, and its sigma over all axes.
-    more: the most useful further shots; None if none would help.
+    more: the most useful further shots; None if no two pairs share a shot.
     """
 
-    bridges: tuple[Link, ...]
     weak: tuple[Link, ...]
     crucial: tuple[Target, ...]
     worst: str
@@ -76,11 +69,7 @@ class Advice:
     @property
     def lines(self) -> list[str]:
         """The advice, for the builder of the rig."""
-        lines = [
-            f"{link.first} and {link.second}, with {_shots(link.shots)} in common, are the only link "
-            "between two parts of the rig"
-            for link in self.bridges
-        ]
+        lines = []
         if self.crucial:
             names = ", ".join(f"{shot} ({board})" for shot, board in self.crucial)
             lines.append(f"without any one of these shots the rig is disconnected: {names}")
@@ -96,26 +85,25 @@ class Advice:
 
 
 def advise(rig: Rig, solution: RigSolution) -> Advice:
-    """Links, weak spots and the most useful further shots of a solved rig."""
-    links = find_links(solution)
-    graph = view_graph(solution.views, sorted(solution.rig_from_camera))
-    bridging = {frozenset(edge) for edge in nx.bridges(graph)}
-    chain = minimum_spanning_links(links)
+    """Weak spots and the most useful further shots of a solved rig."""
+    chain = minimum_spanning_links(find_links(solution))
     median = float(np.median([link.sigma_mm for link in chain])) if chain else 0.0
-    sigmas = {
-        name: float(np.linalg.norm(position_sigma(solution.covariance, name, t.translation)))
-        for name, t in solution.rig_from_camera.items()
-    }
+    sigmas = {name: _sigma(solution, name) for name in solution.rig_from_camera}
     worst = max(sorted(sigmas), key=lambda name: sigmas[name])
     # A link is weak at twice the median sigma of the chain.
     return Advice(
-        tuple(link for link in links if {link.first, link.second} in bridging),
         tuple(link for link in chain if link.sigma_mm > 2.0 * median),
         find_articulation_shots(solution),
         worst,
         sigmas[worst],
-        more_shots(rig, solution, worst),
+        suggest_shots(rig, solution, worst),
     )
+
+
+def _sigma(solution: RigSolution, name: str) -> float:
+    """Sigma of a camera's position over all axes, mm."""
+    position = solution.rig_from_camera[name].translation
+    return float(np.linalg.norm(position_sigma(solution.covariance, name, position)))
 
 
 def find_links(solution: RigSolution) -> tuple[Link, ...]:
@@ -146,17 +134,11 @@ def find_articulation_shots(solution: RigSolution) -> tuple[Target, ...]:
     return tuple(sorted(what for kind, what in nx.articulation_points(graph) if kind == "shot"))
 
 
-def more_shots(rig: Rig, solution: RigSolution, pair: str) -> ShotSuggestion | None:
-    """Find the board candidate at which the fewest further shots halve the sigma of `pair`'s position.
+def suggest_shots(rig: Rig, solution: RigSolution, pair: str) -> ShotSuggestion | None:
+    """Find the shot that, repeated, reduces the sigma of `pair`'s position most.
 
-    None if no candidate in the scan volume is seen by two pairs, or no shot would add information.
+    As many repetitions as halve it, or MAX_SHOTS. None if no two pairs share a shot.
     """
-    board, _ = Counter(view.board for view in solution.views).most_common(1)[0]
-    candidates = propose_board_poses(
-        rig.board(board), rig.volume, solution.cameras, solution.rig_from_camera
-    )
-    if not candidates:
-        return None
     equations = normal_equations(
         solution.views,
         solution.cameras,
@@ -166,47 +148,33 @@ def more_shots(rig: Rig, solution: RigSolution, pair: str) -> ShotSuggestion | N
         fixed_target=frame_target(rig),
         cameras_free=True,
     )
-    knowledge = RigInformation(equations, solution.cameras, solution.rig_from_camera)
-    tried = [
-        (candidate, knowledge.after(knowledge.information(candidate), pair))
-        for candidate in candidates
-    ]
-    # Fewest shots to halve; if equal or out of reach, the largest gain.
-    candidate, best = min(
-        tried,
-        key=lambda item: (
-            item[1].shots_to_halve or MAX_SHOTS + 1,
-            item[1].after_mm2[(item[1].shots_to_halve or MAX_SHOTS) - 1],
-        ),
-    )
-    if best.after_mm2[-1] > 0.98 * best.before_mm2:
+    visible_to = {
+        target: tuple(sorted({view.pair for view in views}))
+        for target, views in by_target(solution.views).items()
+    }
+    # A board that holds the frame is no unknown: its part is not that of another shot there.
+    candidates = [t for t, pairs in visible_to.items() if len(pairs) > 1 and t != frame_target(rig)]
+    if not candidates:
         return None
-    shots = best.shots_to_halve or MAX_SHOTS
+    system, first = equations.system, 6 * equations.names.index(pair)
+    jacobian = np.zeros((3, equations.prior.size))
+    position = solution.rig_from_camera[pair].translation
+    jacobian[:, first : first + 6] = twist_jacobian(position[None])[0]
+    jacobian = jacobian[:, equations.free]
+
+    def variance(target: Target, shots: int) -> float:
+        """Of the pair's position with so many more, px2 of corners that err independently."""
+        more = system + equations.sum_parts([target]) * float(shots)
+        return float(np.trace(jacobian @ more.covariance() @ jacobian.T))
+
+    best = min(candidates, key=lambda target: variance(target, MAX_SHOTS))
+    before = variance(best, 0)
+    after = [variance(best, shots) for shots in range(1, MAX_SHOTS + 1)]
+    shots = next((k for k, one in enumerate(after, start=1) if one <= before / 4.0), MAX_SHOTS)
     # The sigma as boards have shown it; the gain as if corners erred independently.
-    here = solution.rig_from_camera[pair].translation
-    before = float(np.linalg.norm(position_sigma(solution.covariance, pair, here)))
-    gained = float(np.sqrt(best.after_mm2[shots - 1] / best.before_mm2))
-    return ShotSuggestion(
-        pair,
-        shots,
-        _best_two_views(knowledge, candidate, pair, shots),
-        candidate,
-        before,
-        gained * before,
-        best.shots_to_halve is not None,
-    )
-
-
-def _best_two_views(
-    knowledge: RigInformation, candidate: BoardCandidate, pair: str, shots: int
-) -> tuple[str, str]:
-    """The two pairs whose views of that board alone would add most."""
-
-    def remaining_variance(two: tuple[str, str]) -> float:
-        information = knowledge.information(candidate.restrict_to(two))
-        return float(knowledge.after(information, pair, shots).after_mm2[-1])
-
-    return min(combinations(candidate.visible_to, 2), key=remaining_variance)
+    sigma = _sigma(solution, pair)
+    gained = float(np.sqrt(after[shots - 1] / before))
+    return ShotSuggestion(pair, shots, best, visible_to[best], sigma, gained * sigma)
 
 
 def _shots(count: int) -> str:
@@ -214,28 +182,17 @@ def _shots(count: int) -> str:
 
 
 def _sentence(more: ShotSuggestion) -> str:
+    shot, board = more.target
+    effect = f"{more.before_mm:.3f} to {more.after_mm:.3f} mm"
     # Not worth taking: they leave more than 80 % of the sigma.
     if more.after_mm > 0.8 * more.before_mm:
         return (
-            f"further shots of this board would improve {more.pair} little: {more.shots} more reduce "
-            f"its sigma from {more.before_mm:.3f} to {more.after_mm:.3f} mm"
+            f"further shots of these boards would improve {more.pair} little: of all shots, "
+            f"{more.shots} more like {shot} help most, from {effect}"
         )
-    a, b = more.between
-    candidate = more.candidate
-    x, y, z = candidate.centre_mm
-    others = [name for name in candidate.visible_to if name not in more.between]
-    also = f" (also by {', '.join(others)})" if others else ""
-    # x is the direction that the subject faces, y the subject's left.
-    left, right = ("front", "front left", "left", "back left"), ("back", "back right", "right")
-    facing = (*left, *right, "front right")[round(candidate.facing_deg / 45.0) % 8]
-    effect = (
-        f"would halve the sigma of {more.pair}"
-        if more.halves
-        else f"would improve {more.pair}, though not by half"
-    )
+    halves = more.after_mm <= 0.5 * more.before_mm
     return (
-        f"{more.shots} more {'shot' if more.shots == 1 else 'shots'} seen by both {a} and {b}{also}, "
-        f"board at {candidate.height} height (middle at {x:.0f}, {y:.0f}, {z:.0f} mm, facing the "
-        f"subject's {facing}, tilted in turn in all directions), {effect}: {more.before_mm:.3f} to "
-        f"{more.after_mm:.3f} mm"
+        f"{more.shots} more {'shot' if more.shots == 1 else 'shots'} like {shot} (board {board} about "
+        f"there, tilted differently each time, seen by {', '.join(more.visible_to)}) would "
+        f"{'halve' if halves else 'improve'} the sigma of {more.pair}: {effect}"
     )

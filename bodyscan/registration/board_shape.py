@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.calibration.board_views import (
@@ -21,10 +22,9 @@ from bodyscan.calibration.board_views import (
 from bodyscan.calibration.model_selection import MIN_GAIN, ResidualPair, gain
 from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
 from bodyscan.geometry.robust import rms, rms_length
-from bodyscan.geometry.transforms import fit_rigid_transform
-from bodyscan.registration.bundle_adjustment import refine_solution
+from bodyscan.geometry.transforms import fit_rigid_transform, twist_jacobian
+from bodyscan.registration.bundle_adjustment import CORNERS, refine_solution, view_sigmas
 from bodyscan.registration.joint_solve import JointSolution
-from bodyscan.registration.normal_equations import CORNERS, FreeShape, view_sigmas
 from bodyscan.registration.view_consistency import fit_board
 
 PRIOR = 4e-3
@@ -68,11 +68,6 @@ class BoardShape:
         return x, y
 
     @property
-    def free(self) -> FreeShape:
-        """What the covariance of a solve that found this shape needs of it."""
-        return FreeShape(self.points + self.offsets, PRIOR * self.diagonal, self.size_sigma)
-
-    @property
     def size_sigma(self) -> float:
         """Standard deviation of the size as a whole, relative, which images cannot tell.
 
@@ -86,6 +81,24 @@ class BoardShape:
             (xx, xy), (yx, yy) = np.linalg.lstsq(arms, self.offsets[face, :2], rcond=None)[0]
             strains += [0.5 * (xx - yy), 0.5 * (xy + yx)]
         return rms(np.array(strains))
+
+    @property
+    def prior_information(self) -> Array:
+        """Information (3N, 3N) per mm2 on the corners before any view: the prior on each coordinate,
+        the gauge constraint that the shape has no motion (the board has it), and the prior on its
+        size."""
+        points, sigma_mm = self.points + self.offsets, PRIOR * self.diagonal
+        arms = points - points.mean(axis=0)
+        motions, _ = np.linalg.qr(twist_jacobian(arms).reshape(-1, 6))
+        gauge_mm = 1e-4 * sigma_mm  # a thousandth of what views determine
+        size = arms.ravel() / np.linalg.norm(arms)
+        size_mm = max(self.size_sigma * float(np.linalg.norm(arms)), gauge_mm)
+        prior = np.eye(arms.size) / sigma_mm**2
+        return prior + motions @ motions.T / gauge_mm**2 + np.outer(size, size) / size_mm**2
+
+    def nearest(self, points: Array) -> Indices:
+        """Indices (M,) of the corners nearest to the true points (M, 3) mm of a view."""
+        return np.asarray(KDTree(self.points + self.offsets).query(points)[1], np.int64)
 
     def face(self, points: Array) -> BoardFace:
         """The face on which a view saw corners (M, 3), through every corner of it in any view."""

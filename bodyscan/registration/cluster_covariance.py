@@ -1,4 +1,4 @@
-"""Cluster-robust covariance of the joint solve: board poses are the clusters.
+"""The joint solve's normal equations and the cluster-robust covariance that follows from them.
 
 Corners do not err independently: what lens, light and detector do to one they do to its neighbours,
 and to the same board in the same pose again. So all views of a board in one pose are one cluster.
@@ -8,18 +8,140 @@ variance inflation (a sandwich estimator; Liang and Zeger, Biometrika 73, 1986).
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from bodyscan.arrays import Array
+from bodyscan.arrays import Array, Indices
 from bodyscan.calibration.board_views import LocatedView, max_displacement_mm
+from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance
-from bodyscan.registration.normal_equations import NormalEquations
+from bodyscan.registration.board_shape import BoardShape
+from bodyscan.registration.bundle_adjustment import CORNERS, reprojection_errors, view_sigmas
 from bodyscan.registration.view_graph import Target
+
+
+@dataclass(frozen=True, eq=False)
+class NormalEquations:
+    """Normal equations of the joint solve, the boards' motions eliminated.
+
+    The unknowns are motions of the pairs `names` (6 each), the parameters of each pair's camera,
+    then the corners of boards whose shape was estimated (3 each, board frame, mm).
+
+    cameras: indices of each camera's parameters; empty if cameras are fixed.
+    free: indices of the unknowns that the definition of the rig frame does not fix.
+    prior: the priors on cameras and corners, px2 per unit of either unknown.
+    parts: by target, indices (C,) of the unknowns that its views involve, and the system of these:
+        J^T W J, px2 per unit of either unknown, and -J^T W r.
+    variance_px2: variance of one coordinate of a corner, in a view of average noise.
+    """
+
+    names: tuple[str, ...]
+    cameras: dict[str, Indices]
+    free: Indices
+    prior: LinearGaussianSystem
+    parts: dict[Target, tuple[Indices, LinearGaussianSystem]]
+    variance_px2: float
+
+    def sum_parts(self, targets: Sequence[Target]) -> LinearGaussianSystem:
+        """The system of the free unknowns by these targets alone."""
+        parts = [self.parts[target] for target in targets]
+        return LinearGaussianSystem.assemble(parts, self.prior.size).select(self.free)
+
+    @property
+    def system(self) -> LinearGaussianSystem:
+        """The system of the free unknowns by all targets and priors."""
+        return self.sum_parts(list(self.parts)) + self.prior.select(self.free)
+
+
+def normal_equations(
+    views: Sequence[LocatedView],
+    cameras: Mapping[str, Camera],
+    rig_from_camera: Mapping[str, RigidTransform],
+    rig_from_board: Mapping[Target, RigidTransform],
+    *,
+    fixed_pair: str | None,
+    fixed_target: Target | None,
+    cameras_free: bool,
+    shapes: Mapping[str, BoardShape] | None = None,
+) -> NormalEquations:
+    """Build the joint solve's normal equations, with Cauchy weights and each view's noise.
+
+    fixed_pair, fixed_target: what fixes the rig frame: a pair, or a board, which then has no motion.
+    shapes: of boards whose corners were unknowns too.
+    """
+    names, shapes = sorted(rig_from_camera), shapes or {}
+    sizes = [6] * len(names)
+    sizes += [len(cameras[name].parameters) if cameras_free else 0 for name in names]
+    sizes += [3 * len(shape.points) for shape in shapes.values()]
+    size, columns = sum(sizes), np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
+    of_motion, of_camera, of_shape = (
+        dict(zip(keys, columns[first:], strict=False))
+        for keys, first in ((names, 0), (names, len(names)), (shapes, 2 * len(names)))
+    )
+    poses = cameras, rig_from_camera, rig_from_board
+    errors = [reprojection_errors([view], *poses, cameras_free=cameras_free) for view in views]
+    sigmas = view_sigmas([residuals for residuals, _ in errors])
+    whitened = [residuals / sigma for (residuals, _), sigma in zip(errors, sigmas, strict=True)]
+    scale = CORNERS.estimate_scale(np.concatenate(whitened))
+    weights = [CORNERS.weights(residuals / scale) for residuals in whitened]
+    board = np.arange(size, size + 6)
+    systems: dict[Target, list[tuple[Indices, LinearGaussianSystem]]] = defaultdict(list)
+    for k, view in enumerate(views):
+        jacobian = errors[k][1]() / sigmas[k]
+        unknowns = [of_motion[view.pair], board, of_camera[view.pair]]
+        if view.board in shapes:
+            corners = shapes[view.board].nearest(view.points)
+            unknowns.append(of_shape[view.board].reshape(-1, 3)[corners].ravel())
+            jacobian = _append_corners(jacobian, rig_from_board[view.target].rotation)
+        system = LinearGaussianSystem.from_observations(jacobian, -whitened[k], weights[k])
+        systems[view.target].append((np.concatenate(unknowns), system))
+    parts = {
+        target: _eliminate_board(of_target, board, target == fixed_target)
+        for target, of_target in sorted(systems.items())
+    }
+    everything, weight = np.concatenate(whitened), np.concatenate(weights)
+    degrees = max(float(np.sum(weight)) - (size + 6 * len(parts) - 6), 1.0)
+    variance = max(float(np.sum(weight * everything**2)) / degrees, 1e-12)
+    known = [(of_shape[name], shape.prior_information) for name, shape in shapes.items()]
+    if cameras_free:
+        known += [(of_camera[name], np.diag(cameras[name].prior_sigmas ** -2)) for name in names]
+    priors = [(own, LinearGaussianSystem.from_prior(variance * each)) for own, each in known]
+    prior = LinearGaussianSystem.assemble(priors, size)
+    free = np.arange(size)
+    if fixed_target is None:
+        free = np.setdiff1d(free, of_motion[fixed_pair or names[0]])
+    return NormalEquations(tuple(names), of_camera, free, prior, parts, variance)
+
+
+def _eliminate_board(
+    systems: Sequence[tuple[Indices, LinearGaussianSystem]], board: Indices, is_fixed: bool
+) -> tuple[Indices, LinearGaussianSystem]:
+    """Sum the systems of one target's views and eliminate its motion, the last of all columns, or
+    fix it; returns the columns that remain, and their system."""
+    whole = LinearGaussianSystem.assemble(systems, board[-1] + 1)
+    involved = np.unique(np.concatenate([columns for columns, _ in systems]))
+    others = involved[:-6]
+    if is_fixed:
+        return others, whole.select(others)
+    return others, whole.select(involved).marginalize(np.arange(len(others), len(involved)))
+
+
+def _append_corners(jacobian: Array, rotation: Array) -> Array:
+    """Append derivatives (2N, 3N) by the corners' positions on the board to a view's Jacobian
+    (2N, C), whose columns 9 to 11 are by the board's translation.
+
+    rotation: that of `rig_from_board`.
+    """
+    count = len(jacobian) // 2
+    by_corner = jacobian[:, 9:12] @ rotation
+    blocks = np.zeros((count, 2, count, 3))
+    blocks[range(count), :, range(count)] = by_corner.reshape(count, 2, 3)
+    return np.hstack([jacobian, blocks.reshape(2 * count, 3 * count)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,30 +165,20 @@ def cluster_robust_covariance(
 
     clusters: the targets of each, every target in one.
     """
-    reduced, rest = equations.without_boards(), equations.rest
-    free = np.flatnonzero(~np.isin(rest, equations.fixed))
-    rest, reduced = rest[free], reduced.select(free)
-    number = {target: k for k, targets in enumerate(clusters) for target in targets}
-    information = np.zeros((len(clusters), len(rest), len(rest)))
-    vectors = np.zeros((len(clusters), len(rest)))
-    for target, part in zip(equations.targets, equations.parts, strict=True):
-        columns, system = part.without_board(equations.fixed)
-        where, k = np.searchsorted(rest, columns), number[target]
-        information[k][np.ix_(where, where)] += system.information
-        vectors[k][where] += system.vector
-    inverse, variance = reduced.covariance(), equations.variance_px2
-    inflation, pooled = variance_inflations(
-        LinearGaussianSystem(information, vectors), inverse, variance
-    )
-    prior = reduced.information - information.sum(axis=0)  # exact: not inflated
-    middle = np.tensordot(inflation, information, axes=1) + prior
+    free, variance = equations.free, equations.variance_px2
+    inverse = equations.system.covariance()
+    systems = [equations.sum_parts(cluster) for cluster in clusters]
+    inflation, pooled = variance_inflations(systems, inverse, variance)
+    middle = equations.prior.select(free).information  # exact: not inflated
+    for factor, system in zip(inflation, systems, strict=True):
+        middle = middle + factor * system.information
     covariance = variance * inverse @ middle @ inverse
-    full = np.zeros(equations.system.information.shape)
-    full[np.ix_(rest, rest)] = 0.5 * (covariance + covariance.T)
-    pairs = slice(0, equations.first_board)
+    full = np.zeros(equations.prior.information.shape)
+    full[np.ix_(free, free)] = 0.5 * (covariance + covariance.T)
+    pairs = slice(0, 6 * len(equations.names))
     cameras = {
         name: full[np.ix_(columns, columns)]
-        for name, columns in zip(equations.names, equations.camera_columns, strict=True)
+        for name, columns in equations.cameras.items()
         if len(columns)
     }
     return ClusterRobustCovariance(
@@ -102,11 +214,11 @@ def cluster_board_poses(
 
 
 def variance_inflations(
-    clusters: LinearGaussianSystem, covariance: Array, variance: float
+    clusters: Sequence[LinearGaussianSystem], covariance: Array, variance: float
 ) -> tuple[Array, float]:
     """Estimate the variance inflation of each cluster, (K,), and over all clusters.
 
-    clusters: the systems of K clusters at the solution, (K, P, P) and (K, P).
+    clusters: their K systems at the solution.
     covariance: V (P, P) of independent corners of unit variance.
     variance: of a corner's coordinate, px2.
 
@@ -114,15 +226,14 @@ def variance_inflations(
     cluster's share of all information: less than tr S because the solve followed the cluster. A
     cluster's own ratio counts for half at 10 degrees of freedom, the rest being that of all.
     """
-    # One by one: with the corners of boards as unknowns all at once would take gigabytes.
     traces = []
-    for information in clusters.information:
-        share = information @ covariance
+    for system in clusters:
+        share = system.information @ covariance
         kept = share - share @ share
         traces.append((np.trace(kept), np.sum(kept * kept.T)))
     expected, squared = np.array(traces).T
     freedoms = expected**2 / np.maximum(squared, 1e-300)
-    vectors = clusters.vector
+    vectors = np.array([system.vector for system in clusters])
     found = np.einsum("ki,ij,kj->k", vectors, covariance, vectors) / variance
     if not expected.sum() > 1.0:  # a single cluster: its errors cannot be judged
         return np.ones(len(vectors)), 1.0

@@ -29,9 +29,13 @@ from bodyscan.registration.board_shape import (
     estimate_board_shapes,
     reestimate_board_shapes,
 )
-from bodyscan.registration.cluster_covariance import cluster_board_poses, cluster_robust_covariance
+from bodyscan.registration.bundle_adjustment import CORNERS
+from bodyscan.registration.cluster_covariance import (
+    cluster_board_poses,
+    cluster_robust_covariance,
+    normal_equations,
+)
 from bodyscan.registration.joint_solve import JointSolution, solve_jointly
-from bodyscan.registration.normal_equations import CORNERS, normal_equations
 from bodyscan.registration.rig_calibration import ObservedCorners
 from bodyscan.registration.rig_frame import frame_board_turn, frame_target, rig_from_root
 from bodyscan.registration.rig_lenses import ChosenLenses, choose_lenses, lens_notes
@@ -218,7 +222,7 @@ def _transfer_to_rig_frame(rig: Rig, solved: _Solved, refine: bool) -> RigSoluti
         fixed_pair=rig.frame_pair.name if rig.frame_pair else None,
         fixed_target=frame_target(rig),
         cameras_free=refine,
-        shapes={name: shape.free for name, shape in shaped.shapes.items()},
+        shapes=shaped.shapes,
     )
     covariance = cluster_robust_covariance(equations, cluster_board_poses(kept, rig_from_board))
     rms = {

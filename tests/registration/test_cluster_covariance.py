@@ -10,10 +10,10 @@ from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.cluster_covariance import (
     ClusterRobustCovariance,
+    NormalEquations,
     cluster_board_poses,
     cluster_robust_covariance,
 )
-from bodyscan.registration.normal_equations import BoardContribution, NormalEquations
 from bodyscan.registration.view_graph import Target
 
 ROWS = 30
@@ -40,23 +40,14 @@ def solved(
     free = np.arange(6, size)
     found = np.zeros(size)
     found[free] = np.linalg.solve(matrix[np.ix_(free, free)], right[free])
-    parts = tuple(
-        BoardContribution(
-            own,
-            LinearGaussianSystem(jacobian.T @ jacobian, jacobian.T @ (off - jacobian @ found[own])),
-        )
-        for own, jacobian, off in zip(columns, jacobians, noise, strict=True)
-    )
-    held = np.arange(6)
-    equations = NormalEquations(
-        ("a", "b"),
-        tuple(names),
-        (0, 0),
-        LinearGaussianSystem(matrix, np.zeros(size)),
-        held,
-        1.0,
-        parts,
-    )
+    parts = {}
+    for name, own, jacobian, off in zip(names, columns, jacobians, noise, strict=True):
+        vector = jacobian.T @ (off - jacobian @ found[own])
+        part = LinearGaussianSystem(jacobian.T @ jacobian, vector)
+        parts[name] = np.arange(6, 12), part.marginalize(np.arange(6, 12))
+    known = LinearGaussianSystem.from_prior(np.diag([0.0] * 6 + [prior] * 6))
+    cameras = dict.fromkeys("ab", np.zeros(0, np.int64))
+    equations = NormalEquations(("a", "b"), cameras, np.arange(6, 12), known, parts, 1.0)
     return equations, names, found[6:12]
 
 
@@ -79,7 +70,7 @@ def test_noise_as_large_as_thought_has_no_excess() -> None:
     found = cluster_robust_covariance(equations, each(names))
     # Of 54 x 6 degrees of freedom: known to 8 %, and never less than 1.
     assert 1.0 <= found.variance_inflation < 1.25
-    independent = np.linalg.inv(equations.without_boards().information[6:, 6:])
+    independent = np.linalg.inv(equations.system.information)
     np.testing.assert_allclose(
         np.diag(of_b(found)), np.diag(independent) * found.variance_inflation, rtol=0.35
     )
@@ -120,7 +111,7 @@ def test_one_place_alone_says_nothing_of_how_it_errs() -> None:
     equations, names, _ = solved(5, draw(5, 7.0, 0))
     found = cluster_robust_covariance(equations, [names])
     assert found.variance_inflation == 1.0
-    independent = np.linalg.inv(equations.without_boards().information[6:, 6:])
+    independent = np.linalg.inv(equations.system.information)
     np.testing.assert_allclose(of_b(found), independent, rtol=1e-6, atol=1e-12)
 
 

@@ -15,12 +15,12 @@ from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.lenses.opencv import Brown, Radial
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.bundle_adjustment import refine_solution
+from bodyscan.registration.cluster_covariance import normal_equations
 from bodyscan.registration.joint_solve import (
     JointSolution,
     colmap_camera,
     colmap_pixels,
 )
-from bodyscan.registration.normal_equations import normal_equations
 
 PLACINGS, CAMERAS = ring_of_cameras(poles=2, heights=(700, 1100))
 ROOT = "p1-1"
