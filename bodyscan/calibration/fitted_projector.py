@@ -1,28 +1,26 @@
-"""Fit a projector with a lens, as other programs describe it, to the light sheets of a pair.
+"""The projector of a pair as a camera with a lens, as other programs describe it.
 
-Sheets of a projector with a lens need no fit. Those of any other model are sampled over the
-camera's image and around the boards' distance, each point weighted by its sheet's sigma, and a
-projector is fitted to them; both directions of stripes belong to one projector.
+Light sheets of one direction that held-out boards found to be a projector with a lens are one as they
+are. Both directions of stripes belong to one projector: it is fitted to samples of both.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from bodyscan.arrays import Array, Indices
-from bodyscan.calibration.sheet_fit import fit_pinhole
 from bodyscan.errors import BadInput
 from bodyscan.geometry.camera import MATRIX, Camera
 from bodyscan.geometry.least_squares import EXACT, Block, minimize
 from bodyscan.geometry.lens_sheets import LensSheets
-from bodyscan.geometry.lenses.opencv import Brown, Radial
-from bodyscan.geometry.light_planes import LightPlanes, LightSheets
+from bodyscan.geometry.lenses.opencv import Brown
+from bodyscan.geometry.light_planes import LightSheets
 from bodyscan.geometry.projector_sheets import projector_from_sheets
 from bodyscan.geometry.robust import rms
-from bodyscan.geometry.smooth_sheets import SmoothSheets
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 
 POSE = 6  # unknowns of the projector's pose, before those of its camera model
@@ -60,106 +58,51 @@ class _Samples:
 def fit_projector(
     camera: Camera, light: LightSheets, crossing: LightSheets | None = None
 ) -> FittedProjector:
-    """Fit a projector with a lens (k1, k2, p1, p2; more if the sheets have more) to light sheets.
+    """The projector of light sheets; of both directions, fitted with k1, k2, p1, p2, or more if the
+    sheets have more.
 
     With a single direction of stripes its pixels are square and its position along the stripes is
-    unknown: see `projector_from_sheets`. Raises BadInput if no such projector explains the sheets
-    within their noise, or only one whose image is mirrored.
+    unknown: see `projector_from_sheets`. Raises BadInput for sheets of another model, if no projector
+    explains both within their noise, or only one whose image is mirrored.
     """
-    first = _samples(camera, light)
-    start = light if isinstance(light, LensSheets) else _fit_lens(light, first)
-    projector, from_camera = projector_from_sheets(start)
-    if crossing is None:
-        found = FittedProjector(projector, from_camera)
-        return found if start is light else _with_misfit(found, [first])
-    both = [first, _samples(camera, crossing)]
-    terms = [len(one.parameters) for one in (light, crossing) if isinstance(one, LensSheets)]
+    for sheets in (light, crossing or light):
+        if not isinstance(sheets, LensSheets):
+            raise BadInput(
+                f"its light sheets ({sheets.kind}) are not those of a projector with a lens, which "
+                "held-out boards refused"
+            )
+    assert isinstance(light, LensSheets)
+    projector, from_camera = projector_from_sheets(light)
+    if not isinstance(crossing, LensSheets):
+        return FittedProjector(projector, from_camera)
+    both = [_sample(camera, light), _sample(camera, crossing)]
     projector = _with_crossing_axis(projector, from_camera, both[1], crossing.stripes)
-    if type(projector.lens) is Radial:
+    if len(projector.lens.names) < 5:
         projector = replace(projector, lens=Brown.from_opencv(projector.lens.opencv()) or Brown())
-    refined = _refine(projector, from_camera, both, every_term=max(terms, default=0) > 6)
-    return _with_misfit(refined, both)
+    terms = max(len(light.parameters), len(crossing.parameters)) - 2
+    return _refine(projector, from_camera, both, max(terms, 4))
 
 
-def _samples(camera: Camera, sheets: LightSheets) -> _Samples:
+def _sample(camera: Camera, sheets: LensSheets) -> _Samples:
     """Sample sheets over the camera's image, at 0.7 to 1.4 times the distance of the boards."""
     u, v = np.linspace(0.0, camera.width - 1.0, 14), np.linspace(0, camera.height - 1.0, 11)
     rays = camera.rays(np.stack(np.meshgrid(u, v), axis=-1)).reshape(-1, 1, 3)
-    depths = _distance(camera, sheets) * np.linspace(0.7, 1.4, 5)[:, None]
-    points = (rays * depths).reshape(-1, 3)
+    points = (rays * (sheets.middle[2] * np.linspace(0.7, 1.4, 5)[:, None])).reshape(-1, 3)
     points = points[np.isfinite(points).all(axis=1)]
-    locate = _between_planes if isinstance(sheets, LightPlanes) else _on_smooth_sheets
-    s, sigma = locate(sheets, points)  # type: ignore[arg-type]  # there are no other models
-    known = np.isfinite(sigma)
+    offset = sheets.offset(points, np.zeros(len(points)), parameters=True)
+    s, jacobian = offset.value, offset.by_parameter
+    assert jacobian is not None
+    sigma = np.sqrt(np.sum((jacobian @ sheets.covariance) * jacobian, axis=1))
+    known = (offset.reach > 0.0) & (s > 0.0) & (s < sheets.stripes) & np.isfinite(sigma)
     if known.sum() < 50:
         raise BadInput(
-            f"its sheets of light ({sheets.kind}) are known at {known.sum()} of {len(points)} points "
-            "in its camera's view, too few for a projector with a lens",
+            f"its light sheets are known at {known.sum()} of {len(points)} points in its camera's "
+            "view, too few for a projector with a lens",
             remedy="calibrate the pair with boards over more of its picture",
         )
     axis = 0 if sheets.direction == "vertical" else 1
     # The floor is a fifth of what the best codes leave uncertain in a pixel of the camera.
     return _Samples(points[known], s[known], np.hypot(sigma[known], 0.02), axis)
-
-
-def _on_smooth_sheets(sheets: SmoothSheets, points: Array) -> tuple[Array, Array]:
-    """Solve for s (N,) of points (N, 3), with its standard deviation; NaN where they are not lit."""
-    s, step = np.full(len(points), 0.5 * sheets.stripes), np.full(len(points), np.inf)
-    with np.errstate(all="ignore"):
-        for _ in range(8):
-            offset = sheets.offset(points, sheets.at(s))
-            step = offset.value / offset.by_stripe
-            s = np.clip(s - step, 0.0, sheets.stripes)
-        offset = sheets.offset(points, sheets.at(s), parameters=True)
-        assert offset.by_parameter is not None
-        variance = np.sum((offset.by_parameter @ sheets.covariance) * offset.by_parameter, axis=1)
-        lit = (offset.reach > 0.0) & (s > 0.0) & (s < sheets.stripes) & (np.abs(step) < 1e-6)
-        return s, np.where(lit, np.sqrt(variance) / np.abs(offset.by_stripe), np.nan)
-
-
-def _between_planes(sheets: LightPlanes, points: Array) -> tuple[Array, Array]:
-    """Interpolate s (N,), with its standard deviation, between the planes next to each point."""
-    homogeneous = np.column_stack([points, np.ones(len(points))])
-    distance = homogeneous @ sheets.coefficients.T
-    between = distance[:, :-1] * distance[:, 1:] <= 0.0
-    first, every = np.argmax(between, axis=1), np.arange(len(points))
-    step = distance[every, first] - distance[every, first + 1]
-    variance = np.einsum("ni,nij,nj->n", homogeneous, sheets.covariance[first], homogeneous)
-    with np.errstate(all="ignore"):
-        sigma = np.sqrt(variance) / np.abs(step)
-        return first + distance[every, first] / step, np.where(between.any(axis=1), sigma, np.nan)
-
-
-def _distance(camera: Camera, sheets: LightSheets) -> float:
-    """Distance of the boards along the camera's axis, mm; if unknown, the distance at which the
-    projector's middle lights the middle of the image."""
-    if isinstance(sheets, SmoothSheets):
-        return float(sheets.middle[2])
-    ray = camera.rays(np.array([[0.5 * camera.width, 0.5 * camera.height]]))
-    return float(sheets.measure(ray, np.array([0.5 * sheets.stripes])).depth[0])
-
-
-def _fit_lens(light: LightSheets, samples: _Samples) -> LensSheets:
-    """Fit sheets of a projector with a lens to samples of one direction of stripes."""
-    pinhole = fit_pinhole(samples.points, samples.s)
-    start = pinhole.sheets(samples.points, light.stripes, light.direction)
-
-    def blocks(sheets: LensSheets) -> tuple[Block, Block]:
-        offset = sheets.offset(samples.points, samples.s, parameters=True)
-        by_freedom = offset.by_parameter
-        assert by_freedom is not None
-        known, jacobian = sheets.prior()
-        every = slice(0, by_freedom.shape[1])
-        value = np.where(offset.reach > 0.0, offset.value, np.nan)
-        return (
-            Block(value, lambda: by_freedom, every, EXACT, samples.sigma),
-            Block(known, lambda: jacobian, every, EXACT),
-        )
-
-    start = start.with_lens(4)
-    return minimize(
-        start, blocks, lambda sheets, step: sheets.retract(step), unknowns=len(start.covariance)
-    ).state
 
 
 def _with_crossing_axis(
@@ -181,36 +124,31 @@ def _with_crossing_axis(
 
 
 def _refine(
-    projector: Camera, from_camera: RigidTransform, both: Sequence[_Samples], *, every_term: bool
+    projector: Camera, from_camera: RigidTransform, both: Sequence[_Samples], terms: int
 ) -> FittedProjector:
-    """Fit pose, focal lengths, centre and lens jointly, without skew.
+    """Fit pose, focal lengths, centre and the first `terms` of the lens jointly, without skew.
 
-    every_term: whether lens terms from k3 on are fitted too.
+    Raises BadInput if the misfit is beyond three sigmas, RMS.
     """
-    size = POSE + len(projector.parameters)
-    last = size if every_term else POSE + len(MATRIX) + 4
-    free: Indices = np.setdiff1d(np.arange(last), [POSE + MATRIX.index("gamma")])
-    lens = free[free >= POSE + len(MATRIX)] - POSE - len(MATRIX)
-    start, sigmas = projector.lens.coefficients[lens], projector.lens.prior_sigmas[lens]
-    by_lens = np.zeros((len(lens), len(free)))
-    by_lens[:, len(free) - len(lens) :] = np.diag(1.0 / sigmas)
-    columns = slice(0, len(free))
+    size, first_term = POSE + len(projector.parameters), POSE + len(MATRIX)
+    free = np.setdiff1d(np.arange(first_term + terms), [POSE + MATRIX.index("gamma")])
+    start, sigmas = projector.lens.coefficients[:terms], projector.lens.prior_sigmas[:terms]
+    lens = slice(len(free) - terms, len(free))
     State = tuple[Camera, RigidTransform]
 
     def blocks(state: State) -> list[Block]:
-        light, pose = state
         stripes = [
             Block(
-                _residuals(light, pose, samples),
-                lambda samples=samples: _jacobian(light, pose, samples)[:, free],  # type: ignore[misc]
-                columns,
+                _residuals(*state, samples),
+                partial(_jacobian, *state, samples, free),
+                slice(0, len(free)),
                 EXACT,
                 samples.sigma,
             )
             for samples in both
         ]
-        known = (light.lens.coefficients[lens] - start) / sigmas
-        return [*stripes, Block(known, lambda: by_lens, columns, EXACT)]
+        known = (state[0].lens.coefficients[:terms] - start) / sigmas
+        return [*stripes, Block(known, lambda: np.diag(1.0 / sigmas), lens, EXACT)]
 
     def retract(state: State, step: Array) -> State:
         whole = np.zeros(size)
@@ -218,7 +156,16 @@ def _refine(
         return state[0].retract(whole[POSE:]), state[1].retract(whole[:POSE])
 
     solution = minimize((projector, from_camera), blocks, retract, unknowns=len(free))
-    return FittedProjector(*solution.state)
+    sigma = np.concatenate([samples.sigma for samples in both])
+    sigmas_off = rms(np.concatenate([block.residuals for block in solution.blocks[:2]]) / sigma)
+    predicted = float(np.sqrt(len(sigma) / np.sum(sigma**-2.0)))
+    if not sigmas_off < 3.0:
+        raise BadInput(
+            f"no projector with a lens explains its light sheets: the best fit has an RMS misfit of "
+            f"{predicted * sigmas_off:.2g} of its pixels, the noise of the sheets explains "
+            f"{predicted:.2g}"
+        )
+    return FittedProjector(*solution.state, predicted * sigmas_off, predicted)
 
 
 def _residuals(light: Camera, from_camera: RigidTransform, samples: _Samples) -> Array:
@@ -228,25 +175,12 @@ def _residuals(light: Camera, from_camera: RigidTransform, samples: _Samples) ->
     return np.where(points[:, 2] > 0.0, error, np.nan)
 
 
-def _jacobian(light: Camera, from_camera: RigidTransform, samples: _Samples) -> Array:
-    """Derivatives of `_residuals` by the projector's pose and its parameters, (N, 6 + P)."""
+def _jacobian(
+    light: Camera, from_camera: RigidTransform, samples: _Samples, free: Indices
+) -> Array:
+    """Derivatives (N, F) of `_residuals` by those of the pose's and the projector's parameters that
+    are free."""
     points = from_camera.apply(samples.points)
     by_parameter, by_point = light.jacobians(points)
     by_pose = by_point[:, samples.axis, None, :] @ twist_jacobian(points)
-    return np.concatenate([by_pose[:, 0], by_parameter[:, samples.axis]], axis=1)
-
-
-def _with_misfit(found: FittedProjector, both: Sequence[_Samples]) -> FittedProjector:
-    """Compute the projector's misfit. Raises BadInput if it is beyond three sigmas, RMS."""
-    pose = found.projector_from_camera
-    residuals = np.concatenate([_residuals(found.camera, pose, samples) for samples in both])
-    sigma = np.concatenate([samples.sigma for samples in both])
-    sigmas = rms(residuals / sigma)
-    predicted = float(np.sqrt(len(sigma) / np.sum(sigma**-2.0)))
-    misfit = predicted * sigmas
-    if not sigmas < 3.0:
-        raise BadInput(
-            f"no projector with a lens explains its sheets of light: the best fit has an RMS misfit "
-            f"of {misfit:.2g} of its pixels, the noise of the sheets explains {predicted:.2g}"
-        )
-    return replace(found, misfit_px=misfit, predicted_px=predicted)
+    return np.concatenate([by_pose[:, 0], by_parameter[:, samples.axis]], axis=1)[:, free]

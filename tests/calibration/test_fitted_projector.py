@@ -9,9 +9,8 @@ import pytest
 
 from bodyscan.arrays import Array
 from bodyscan.calibration.fitted_projector import fit_projector
-from bodyscan.calibration.sheet_fit import PinholeProjector
 from bodyscan.errors import BadInput
-from bodyscan.geometry.bowed_sheets import PLANE_DEGREE, BowedSheets
+from bodyscan.geometry.bowed_sheets import BowedSheets
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lens_sheets import LensSheets
 from bodyscan.geometry.lenses import lens_from_opencv
@@ -69,38 +68,28 @@ def test_one_direction_is_exact_across_the_stripes(lens: str, direction: Axis) -
     assert found.misfit_px == found.predicted_px == 0.0
 
 
-def test_free_planes_of_a_pinhole_are_one() -> None:
-    """The chapter's planes have a covariance each; a row that was never seen does no harm."""
-    light = projector("none")
-    rows = (light.matrix @ PLACE.matrix[:3])[[0, 2]]
-    rows[0] += 0.5 * rows[1]  # columns begin half a pixel before their middle
-    planes = PinholeProjector(rows).planes(1280, "vertical").coefficients
-    planes[100] = np.nan
-    variances = np.tile(np.diag([1e-6, 1e-6, 1e-6, 1e-2]) ** 2, (1281, 1, 1))
-    found = fit_projector(CAMERA, LightPlanes(planes, variances, "vertical"))
-    columns = found.camera.project(found.projector_from_camera.apply(somewhere()))[:, 0]
-    truth = light.project(PLACE.apply(somewhere()))[:, 0]
-    np.testing.assert_allclose(columns, truth, rtol=0, atol=1e-3)  # a twentieth of FLOOR_PX
+def test_light_that_held_out_boards_found_to_be_no_projector_with_a_lens_is_refused() -> None:
+    columns = sheets(projector("none"), "vertical")
+    planes = LightPlanes.from_planes(columns.tangent_planes(np.arange(1281.0)), "vertical")
+    for light, crossing in ((planes, None), (columns, BowedSheets.from_pinhole(columns, 1))):
+        with pytest.raises(BadInput, match="not those of a projector with a lens"):
+            fit_projector(CAMERA, light, crossing)
 
 
-def bowed(sigma: float) -> BowedSheets:
-    pinhole = sheets(projector("none"), "vertical")
-    own = BowedSheets.from_pinhole(pinhole, 0)
-    return replace(own, covariance=np.eye(len(own.parameters)) * sigma**2)
-
-
-def test_sheets_off_a_projector_by_their_noise_are_taken_and_by_more_refused() -> None:
-    """A tenth of a thousandth of the picture's width is a fifth of a stripe."""
-    sigma, known = 1e-4, bowed(1e-4)
-    draw = np.random.default_rng(8).normal(0.0, sigma, len(known.parameters))
-    noisy = replace(known, parameters=known.parameters + draw)
-    found = fit_projector(CAMERA, noisy)
-    assert 0.01 < found.misfit_px < 2.0 * found.predicted_px
-    # a mirror that scans: where the sheets meet wanders by 3 % of the distance, there and back
-    wandering = bowed(1e-4).parameters.copy()
-    wandering[2 * (PLANE_DEGREE + 1) + 2] += 0.03
-    with pytest.raises(BadInput, match="no projector with a lens explains its sheets"):
-        fit_projector(CAMERA, replace(known, parameters=wandering))
+def test_directions_off_by_their_noise_are_taken_and_by_more_refused() -> None:
+    columns, rows = (sheets(projector("Brown"), one) for one in ("vertical", "horizontal"))
+    for shift, refused in ((0.05, False), (5.0, True)):
+        # A shift of 0.05 mm at 900 mm is 0.1 of the projector's pixels, five times the floor.
+        aside = RigidTransform.from_translation([shift, 0.0, 0.0])
+        other = replace(rows, projector_from_camera=aside @ rows.projector_from_camera)
+        if refused:
+            with pytest.raises(
+                BadInput, match="no projector with a lens explains its light sheets"
+            ):
+                fit_projector(CAMERA, columns, other)
+        else:
+            found = fit_projector(CAMERA, columns, other)
+            assert 0.0 < found.misfit_px < 3.0 * found.predicted_px
 
 
 def test_a_mirrored_picture_is_named() -> None:
@@ -113,7 +102,7 @@ def test_a_mirrored_picture_is_named() -> None:
 
 
 def test_sheets_that_nobody_knows_are_no_projector() -> None:
-    own = bowed(1e-4)
+    own, rows = (sheets(projector("none"), one) for one in ("vertical", "horizontal"))
     unknown = replace(own, covariance=np.full_like(own.covariance, np.nan))
     with pytest.raises(BadInput, match="known at 0 of"):
-        fit_projector(CAMERA, unknown)
+        fit_projector(CAMERA, unknown, rows)
