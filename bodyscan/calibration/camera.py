@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.calibration.board_views import PlanarView
-from bodyscan.calibration.zhang import camera_from_plane, homography, matrix_from_homographies
 from bodyscan.errors import DegeneratePoses
 from bodyscan.geometry.camera import MATRIX, Camera
 from bodyscan.geometry.least_squares import EXACT, Block, Noise, Solution, minimize
@@ -73,24 +73,46 @@ class _State:
 def calibrate_camera(
     views: Sequence[PlanarView], width: int, height: int, lens: Lens = CHAPTER_LENS
 ) -> CameraCalibration:
-    """Calibrate a camera by Zhang's method, with skew and a lens of the kind of `lens`, the start.
+    """Calibrate a camera from planes, with skew and a lens of the kind of `lens`, the start.
 
-    Raises DegeneratePoses for fewer than three poses, or poses that differ only by a translation.
+    Started by OpenCV with focal lengths alone (Zhang's closed form, the axis in the middle). Raises
+    DegeneratePoses for fewer than three poses, or poses that differ only by a translation.
     """
     if len(views) < MIN_POSES:
         raise DegeneratePoses(
             f"{len(views)} usable board poses, at least {MIN_POSES} are needed",
             remedy="capture the board in more poses, tilted differently, well inside the image",
         )
-    homographies = [homography(view.points[:, :2], view.pixels) for view in views]
-    matrix = matrix_from_homographies(homographies, width, height)
-    alpha, gamma, u0, _, beta, v0 = matrix[:2].ravel().tolist()
-    inverse = np.linalg.inv(matrix)
-    poses = [
-        camera_from_plane(inverse @ h, float(view.points[0, 2]))
-        for h, view in zip(homographies, views, strict=True)
-    ]
-    return fit_camera(Camera(alpha, beta, gamma, u0, v0, lens, width, height), poses, views)
+    refuse_parallel(views, width, height)
+    matrix = cv2.initCameraMatrix2D(
+        [(view.points * [1.0, 1.0, 0.0]).astype(np.float32) for view in views],
+        [view.pixels.astype(np.float32) for view in views],
+        (width, height),
+        0,
+    )
+    focal = np.diag(matrix)[:2] if np.isfinite(matrix).all() else np.full(2, 1.2 * width)
+    alpha, beta = focal.tolist()
+    start = Camera(alpha, beta, 0.0, width / 2, height / 2, type(lens)(), width, height)
+    poses = [estimate_pose(start, view) for view in views]
+    return fit_camera(replace(start, lens=lens), poses, views)
+
+
+def refuse_parallel(views: Sequence[PlanarView], width: int, height: int) -> None:
+    """Raise DegeneratePoses if all boards have one orientation (pure translation, Zhang 1998).
+
+    Parallel planes share their vanishing line, which a rough camera turns into a plane normal.
+    """
+    rough = np.array([[1.2 * width, 0, width / 2], [0, 1.2 * width, height / 2], [0, 0, 1.0]])
+    homographies = [cv2.findHomography(view.points[:, :2], view.pixels, 0)[0] for view in views]
+    normals = np.stack([np.linalg.inv(h).T[:, 2] for h in homographies]) @ rough
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    angles = np.degrees(np.arccos(np.clip(np.abs(normals @ normals.T), 0.0, 1.0)))
+    if np.max(angles) < 3.0:
+        raise DegeneratePoses(
+            f"the {len(views)} board poses differ by a translation only "
+            f"(their orientations agree within {np.max(angles):.1f} degrees)",
+            remedy="tilt the board by 15 to 35 degrees about different axes between the shots",
+        )
 
 
 def calibrate_known_camera(views: Sequence[PlanarView], camera: Camera) -> CameraCalibration:
@@ -165,17 +187,22 @@ def locate_board(
     camera: Camera, view: PlanarView, start: RigidTransform | None = None
 ) -> tuple[RigidTransform, Array]:
     """Fit `camera_from_board` of one view with a known camera; also return residuals (N, 2) px."""
-    start = pose_from_homography(camera, view) if start is None else start
+    start = estimate_pose(camera, view) if start is None else start
     (pose,), (residuals,) = locate_boards(camera, [view], [start])
     return pose, residuals
 
 
-def pose_from_homography(camera: Camera, view: PlanarView) -> RigidTransform:
-    """Estimate `camera_from_board` of one view linearly: a start for `locate_boards`."""
+def estimate_pose(camera: Camera, view: PlanarView) -> RigidTransform:
+    """Estimate `camera_from_board` of one view in closed form: a start for `locate_boards`.
+
+    Source: Collins and Bartoli, Infinitesimal Plane-Based Pose Estimation, 2014 (OpenCV's).
+    """
     # Where the lens folds there is no ray: use the pixel with the lens ignored.
     rays = camera.rays(view.pixels)[:, :2]
     normalized = np.where(np.isfinite(rays), rays, camera.normalized_from_pixels(view.pixels))
-    return camera_from_plane(homography(view.points[:, :2], normalized), float(view.points[0, 2]))
+    flags = cv2.SOLVEPNP_IPPE
+    _, turn, shift = cv2.solvePnP(view.points, normalized, np.eye(3), None, flags=flags)
+    return RigidTransform.from_rotation_vector(turn, shift.ravel())
 
 
 def locate_boards(

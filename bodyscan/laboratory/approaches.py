@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
+import cv2
 import numpy as np
 
 from bodyscan.arrays import Array
@@ -20,7 +21,6 @@ from bodyscan.calibration.camera import CameraCalibration, calibrate_camera, loc
 from bodyscan.calibration.light_planes import fit_light_planes
 from bodyscan.calibration.sheet_fit import fit_pinhole
 from bodyscan.calibration.striped_view import boundaries_near, box_around, on_board
-from bodyscan.calibration.zhang import homography
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.light_planes import Axis, LightPlanes, LightSheets
 from bodyscan.geometry.transforms import RigidTransform
@@ -152,7 +152,7 @@ def _locate_by_homography(
 ) -> BoundaryPoints:
     """Locate a board's boundaries on it by the homography of its corners alone."""
     near = boundaries_near(shot.stripes, box_around(shot.view))
-    onto_board = np.linalg.inv(homography(view.points[:, :2], view.pixels))
+    onto_board = np.linalg.inv(cv2.findHomography(view.points[:, :2], view.pixels, 0)[0])
 
     def onto_plane(pixels: Array) -> Array:
         image = np.column_stack([pixels, np.ones(len(pixels))]) @ onto_board.T

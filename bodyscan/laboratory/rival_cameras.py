@@ -17,7 +17,6 @@ from scipy.linalg import rq
 from scipy.optimize import least_squares
 
 from bodyscan.arrays import Array
-from bodyscan.calibration.zhang import homogeneous
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.transforms import RigidTransform
@@ -143,8 +142,8 @@ def projection_matrix(points: Array, pixels: Array) -> Array:
     Direct linear transformation (Abdel-Aziz and Karara 1971) with Hartley's scaling.
     """
     space, image = _scaling(points), _scaling(pixels)
-    x = homogeneous(points) @ space.T
-    u, v = (homogeneous(pixels) @ image.T)[:, :2].T
+    x = _homogeneous(points) @ space.T
+    u, v = (_homogeneous(pixels) @ image.T)[:, :2].T
     zero = np.zeros_like(x)
     rows = np.block([[x, zero, -u[:, None] * x], [zero, x, -v[:, None] * x]])
     _, vectors = np.linalg.eigh(rows.T @ rows)
@@ -179,3 +178,8 @@ def _scaling(points: Array) -> Array:
     matrix[:size] *= scale
     matrix[:size, size] = -scale * mean
     return matrix
+
+
+def _homogeneous(points: Array) -> Array:
+    """Append ones to points (N, D)."""
+    return np.column_stack([points, np.ones(len(points))])

@@ -26,8 +26,8 @@ from bodyscan.calibration.camera import (
     CameraCalibration,
     calibrate_camera,
     calibrate_known_camera,
+    estimate_pose,
     locate_boards,
-    pose_from_homography,
 )
 from bodyscan.calibration.known_pair import read_known_camera
 from bodyscan.calibration.lens_choice import calibrate_with_lenses
@@ -289,7 +289,7 @@ def locate_views(
         # All at once: solving for one board's pose takes as many calls as for thirty.
         of_camera = [view for view in usable if view.pair == name]
         planar = [planar_view(view, rig.board(view.board)) for view in of_camera]
-        starts = [pose_from_homography(found.camera, view) for view in planar]
+        starts = [estimate_pose(found.camera, view) for view in planar]
         poses = zip(*locate_boards(found.camera, planar, starts), strict=True) if planar else ()
         fitted |= zip((view.key for view in of_camera), poses, strict=True)
     located, notes = [], []

@@ -10,7 +10,7 @@ from bodyscan.arrays import Array
 from bodyscan.boards.board_layout import corner_points
 from bodyscan.boards.view import BoardView
 from bodyscan.calibration.board_views import LocatedView, PlanarView, board_symmetries
-from bodyscan.calibration.camera import locate_boards, pose_from_homography
+from bodyscan.calibration.camera import estimate_pose, locate_boards
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.transforms import RigidTransform
@@ -138,7 +138,7 @@ def _located(
     poses: dict[int, RigidTransform] = {}
     for name, camera in cameras.items():
         own = {number: view for number, (of, view) in enumerate(views) if of == name}
-        starts = [pose_from_homography(camera, view) for view in own.values()]
+        starts = [estimate_pose(camera, view) for view in own.values()]
         if own:
             found, _ = locate_boards(camera, list(own.values()), starts)
             poses |= dict(zip(own, found, strict=True))
