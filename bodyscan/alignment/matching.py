@@ -14,8 +14,7 @@ import numpy as np
 
 from bodyscan.arrays import Array, Floats, Indices, Mask
 from bodyscan.compiled import compiled
-from bodyscan.geometry.camera_tables import projection_table
-from bodyscan.geometry.quadratic_table import Table, look_up
+from bodyscan.geometry.camera_tables import Table, look_up, projection_table
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
 

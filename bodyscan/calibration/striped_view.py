@@ -20,9 +20,8 @@ from bodyscan.calibration.light_sheets import FIT_BINS
 from bodyscan.compiled import compiled
 from bodyscan.errors import PairFailed
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.camera_tables import ray_table
+from bodyscan.geometry.camera_tables import Table, look_up, ray_table
 from bodyscan.geometry.light_planes import Axis
-from bodyscan.geometry.quadratic_table import Table, look_up
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.rig.board import Board
 from bodyscan.rig.pair import CameraSpec

@@ -17,8 +17,7 @@ from bodyscan.arrays import Array, Floats
 from bodyscan.compiled import compiled
 from bodyscan.fusion.smoothing import Numbers, SmoothSurface
 from bodyscan.fusion.voxel_thinning import Samples
-from bodyscan.geometry.camera_tables import projection_table
-from bodyscan.geometry.quadratic_table import Table, look_up
+from bodyscan.geometry.camera_tables import Table, look_up, projection_table
 
 Counts = NDArray[np.int64]
 

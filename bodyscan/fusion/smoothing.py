@@ -16,8 +16,7 @@ from bodyscan.arrays import Array, Bytes, Floats, Mask, crop_bounds, find_crop
 from bodyscan.compiled import compiled
 from bodyscan.fusion.quadratic_fit import QuadraticFit, fit_quadratics
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.camera_tables import projection_table
-from bodyscan.geometry.quadratic_table import Table, look_up_derivatives
+from bodyscan.geometry.camera_tables import Table, look_up_derivatives, projection_table
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
 

@@ -1,9 +1,14 @@
 """A camera as two lookup tables, independent of its lens, for compiled loops; rays of many pixels;
-which points lie in the image."""
+which points lie in the image.
+
+A table holds a smooth map from the plane to the plane, pixels to rays or rays to pixels, as one
+quadratic per cell.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -11,7 +16,108 @@ import numpy as np
 from bodyscan.arrays import Array, Mask
 from bodyscan.compiled import compiled
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.quadratic_table import QuadraticTable, Table
+
+Table = tuple[Array, Array]
+"""Coefficients and frame of a `QuadraticTable`, for compiled functions."""
+
+POWERS = ((0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (2, 0))
+"""Powers of x and y that belong to a cell's six coefficients."""
+NODES = 0.5 + 0.5 * np.cos(np.pi * (np.arange(3) + 0.5) / 3.0)
+"""Chebyshev nodes across a cell of width 1: a fit there has about the same error everywhere."""
+
+
+@dataclass(frozen=True, eq=False)
+class QuadraticTable:
+    """A tabulated map with two values.
+
+    coefficients: (rows, columns, 2, 6) of x^i y^j, both from 0 to 1 across a cell. The outermost
+        cells form a ring around the tabulated rectangle that means "outside".
+    frame: (4,) the ring's least x and y, then cells per unit of x and of y.
+    error: the largest deviation of a quadratic from a fitted value, in the values' unit.
+    """
+
+    coefficients: Array
+    frame: Array
+    error: float
+
+    @property
+    def table(self) -> Table:
+        return self.coefficients, self.frame
+
+    @staticmethod
+    def fit(
+        function: Callable[[Array], Array],
+        low: Array,
+        high: Array,
+        cells: tuple[int, int],
+        outside: float,
+    ) -> QuadraticTable:
+        """Tabulate a function by least squares at 3 x 3 nodes of each cell.
+
+        function: takes places (..., 2) to values (..., 2).
+        low, high: (2,) limits of the tabulated rectangle.
+        cells: number of columns and rows.
+        outside: both values elsewhere, and in cells where the function is NaN at some node.
+        """
+        size = (high - low) / cells
+        x, y = (grid.ravel() for grid in np.meshgrid(NODES, NODES))
+        corner = np.stack(np.meshgrid(np.arange(cells[0]), np.arange(cells[1])), axis=-1)
+        values = function(low + size * (corner[:, :, None] + np.stack([x, y], axis=-1)))
+        monomials = np.stack([x**i * y**j for i, j in POWERS], axis=-1)
+        coefficients = np.swapaxes(np.linalg.pinv(monomials) @ values, -1, -2)
+        error = np.abs(coefficients @ monomials.T - np.swapaxes(values, -1, -2))
+        ringed = np.zeros((cells[1] + 2, cells[0] + 2, 2, len(POWERS)))
+        ringed[..., 0] = outside
+        known = np.isfinite(coefficients).all(axis=(2, 3))
+        ringed[1:-1, 1:-1][known] = coefficients[known]
+        worst = float(error[known].max(initial=0.0))
+        return QuadraticTable(ringed, np.concatenate([low - size, 1.0 / size]), worst)
+
+
+@compiled
+def look_up(table: Table, x: float, y: float) -> tuple[float, float]:
+    """The two values at (x, y).
+
+    Without a branch: with one, Numba counts references to the arrays, which takes longer than all
+    the rest.
+    """
+    cells, frame = table
+    across, down = (x - frame[0]) * frame[2], (y - frame[1]) * frame[3]
+    column = min(max(int(across), 0), cells.shape[1] - 1)
+    row = min(max(int(down), 0), cells.shape[0] - 1)
+    x, y = across - column, down - row
+    return _quadratic(cells, row, column, 0, x, y), _quadratic(cells, row, column, 1, x, y)
+
+
+@compiled
+def look_up_derivatives(table: Table, x: float, y: float) -> tuple[float, float, float, float]:
+    """Derivatives of the first value by x and y, then of the second, at (x, y)."""
+    cells, frame = table
+    across, down = (x - frame[0]) * frame[2], (y - frame[1]) * frame[3]
+    column = min(max(int(across), 0), cells.shape[1] - 1)
+    row = min(max(int(down), 0), cells.shape[0] - 1)
+    x, y = across - column, down - row
+    a, b = _derivatives(cells, row, column, 0, x, y)
+    c, d = _derivatives(cells, row, column, 1, x, y)
+    return a * frame[2], b * frame[3], c * frame[2], d * frame[3]
+
+
+@compiled
+def _quadratic(c: Array, i: int, j: int, k: int, x: float, y: float) -> float:
+    return (
+        c[i, j, k, 0]
+        + y * (c[i, j, k, 1] + y * c[i, j, k, 2])
+        + x * (c[i, j, k, 3] + y * c[i, j, k, 4] + x * c[i, j, k, 5])
+    )
+
+
+@compiled
+def _derivatives(c: Array, i: int, j: int, k: int, x: float, y: float) -> tuple[float, float]:
+    return (
+        c[i, j, k, 3] + y * c[i, j, k, 4] + 2.0 * x * c[i, j, k, 5],
+        c[i, j, k, 1] + x * c[i, j, k, 4] + 2.0 * y * c[i, j, k, 2],
+    )
+
 
 CELLS_PX = (32, 16, 8)
 """Cell widths; the widest that keeps the tolerance is used. The first is enough for a scanner's
@@ -85,54 +191,26 @@ def look_up_rays(rays: Table, wanted: Mask, first_row: int = 0) -> Array:
 
 @compiled
 def _look_up_rays(table: Table, first_row: int, wanted: Mask, rays: Array) -> None:
-    """Fill rays (N, 3) of the N pixels `wanted` (rows, width).
-
-    As `look_up`, but within a row each cell's quadratics are reduced to one variable once.
-    """
-    c, frame = table
+    """Fill rays (N, 3) of the N pixels `wanted` (rows, width)."""
     n = 0
     for v in range(wanted.shape[0]):
-        down = (first_row + v - frame[1]) * frame[3]
-        i, column = int(down), -1
-        y = down - i
-        x_0 = x_1 = x_2 = y_0 = y_1 = y_2 = 0.0
         for u in range(wanted.shape[1]):
             if wanted[v, u]:
-                across = (u - frame[0]) * frame[2]
-                j = int(across)
-                if j != column:
-                    column, x_2, y_2 = j, c[i, j, 0, 5], c[i, j, 1, 5]
-                    x_0 = c[i, j, 0, 0] + y * (c[i, j, 0, 1] + y * c[i, j, 0, 2])
-                    y_0 = c[i, j, 1, 0] + y * (c[i, j, 1, 1] + y * c[i, j, 1, 2])
-                    x_1, y_1 = c[i, j, 0, 3] + y * c[i, j, 0, 4], c[i, j, 1, 3] + y * c[i, j, 1, 4]
-                x = across - j
-                rays[n, 0], rays[n, 1] = x_0 + x * (x_1 + x * x_2), y_0 + x * (y_1 + x * y_2)
+                rays[n, 0], rays[n, 1] = look_up(table, float(u), float(first_row + v))
                 rays[n, 2] = 1.0
                 n += 1
 
 
-def is_in_image(camera: Camera, points: Array, margin_px: float = 0.0) -> Mask:
+def is_in_image(camera: Camera, points: Array) -> Mask:
     """Whether points (..., 3), camera frame, lie ahead of the camera and inside its image, (...).
 
-    Far outside its image a lens model may fold back, so that points which the camera cannot see
-    project inside. They are excluded by the lens's fold radius and by the rays of the image's own
-    rim.
+    Far outside its image a lens may fold back, so that points which the camera cannot see project
+    inside: the rays of those pixels lead elsewhere.
     """
-    low, high = _reach(camera)
     ahead = points[..., 2] > 0.0
     safe = np.where(ahead[..., None], points, [0.0, 0.0, 1.0])
-    ideal = safe[..., :2] / safe[..., 2:3]
-    one_to_one = np.linalg.norm(ideal, axis=-1) < camera.lens.fold_radius
     pixels = camera.project(safe)
-    last = np.array([camera.width - 1.0, camera.height - 1.0]) - margin_px
-    inside = np.all((pixels >= margin_px) & (pixels <= last), axis=-1)
-    return ahead & inside & one_to_one & np.all((ideal > low) & (ideal < high), axis=-1)
-
-
-@lru_cache(CAMERAS)
-def _reach(camera: Camera) -> tuple[Array, Array]:
-    """Least and greatest ideal (x, y) within the image, with a small margin."""
-    u, v = np.linspace(0.0, camera.width - 1.0, 9), np.linspace(0.0, camera.height - 1.0, 9)
-    grid = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
-    rim = camera.rays(grid)[:, :2]
-    return np.nanmin(rim, axis=0) - 0.01, np.nanmax(rim, axis=0) + 0.01
+    last = np.array([camera.width - 1.0, camera.height - 1.0])
+    inside = ahead & np.all((pixels >= 0.0) & (pixels <= last), axis=-1)
+    rays = camera.rays(np.where(inside[..., None], pixels, 0.0))
+    return inside & np.all(np.abs(rays - safe / safe[..., 2:3]) < 1e-6, axis=-1)

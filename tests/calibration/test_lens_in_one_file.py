@@ -16,11 +16,10 @@ from bodyscan.calibration.pair import PairCalibration, PairQuality
 from bodyscan.errors import BadInput
 from bodyscan.export.rig import export_rig
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.camera_tables import look_up_rays, projection_table, ray_table
+from bodyscan.geometry.camera_tables import look_up, look_up_rays, projection_table, ray_table
 from bodyscan.geometry.lenses import LENSES
 from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.lenses.opencv import Radial
-from bodyscan.geometry.quadratic_table import look_up
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.registration.rig_calibration import RigCalibration

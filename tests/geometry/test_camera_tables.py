@@ -5,9 +5,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.camera_tables import look_up_rays, projection_table, ray_table
+from bodyscan.geometry.camera_tables import (
+    Table,
+    look_up,
+    look_up_derivatives,
+    look_up_rays,
+    projection_table,
+    ray_table,
+)
 from bodyscan.geometry.lenses.opencv import Radial
-from bodyscan.geometry.quadratic_table import Table, look_up, look_up_derivatives
 
 MOST_PX = 1e-3
 SCANNER = Camera(1510.0, 1512.0, -0.5, 645.0, 508.0, Radial(-0.1, 0.05), 1280, 1024)

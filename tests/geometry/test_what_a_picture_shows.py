@@ -48,14 +48,6 @@ def test_what_is_seen_lies_ahead_between_the_first_pixel_and_the_last() -> None:
     assert is_in_image(PLAIN, just_in.reshape(2, 2, 3)).shape == (2, 2)
 
 
-def test_a_margin_is_kept_on_all_four_sides() -> None:
-    kept = at(PLAIN, (10.001, 10.001), (308.999, 228.999))
-    left_out = at(PLAIN, (9.999, 120), (160, 9.999), (309.001, 120), (160, 229.001))
-    assert is_in_image(PLAIN, kept, 10.0).all()
-    assert not is_in_image(PLAIN, left_out, 10.0).any()
-    assert is_in_image(PLAIN, left_out, 9.99).all()
-
-
 def test_where_a_lens_folds_back_into_the_picture_nothing_is_seen() -> None:
     fold = BARREL.lens.fold_radius
     beyond = np.array([[1.6 * fold, 0.0, 1.0], [0.0, 1.65 * fold, 1.0], [-1.6 * fold, 0.1, 1.0]])
