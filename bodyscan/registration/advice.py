@@ -9,7 +9,7 @@ import networkx as nx
 import numpy as np
 
 from bodyscan.geometry.transforms import twist_jacobian
-from bodyscan.geometry.uncertainty import point_covariance, position_sigma
+from bodyscan.geometry.uncertainty import position_sigma
 from bodyscan.registration.cluster_covariance import normal_equations
 from bodyscan.registration.rig_frame import frame_target
 from bodyscan.registration.rig_solve import RigSolution
@@ -108,12 +108,11 @@ def _sigma(solution: RigSolution, name: str) -> float:
 
 def find_links(solution: RigSolution) -> tuple[Link, ...]:
     """Every two pairs that share a shot, least known first."""
-    found = []
     graph = view_graph(solution.views, sorted(solution.rig_from_camera))
-    for first, second, targets in graph.edges(data="targets"):
-        motion = solution.covariance.relative(first, second)
-        covariance = point_covariance(motion, solution.rig_from_camera[second].translation)
-        found.append(Link(first, second, len(targets), float(np.sqrt(np.trace(covariance)))))
+    found = [
+        Link(first, second, len(targets), solution.relative_sigma_mm(first, second))
+        for first, second, targets in graph.edges(data="targets")
+    ]
     return tuple(sorted(found, key=lambda link: (-link.sigma_mm, link.first, link.second)))
 
 

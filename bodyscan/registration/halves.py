@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import combinations
 
 import networkx as nx
 import numpy as np
@@ -12,8 +13,7 @@ import numpy as np
 from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.errors import BadInput, FailedWork
-from bodyscan.geometry.robust import rms_length
-from bodyscan.geometry.transforms import RigidTransform, adjoint, twist_jacobian
+from bodyscan.geometry.robust import rms
 from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.registration.rig_solve import RigSolution, solve_rig
 from bodyscan.registration.view_graph import view_graph
@@ -26,20 +26,23 @@ MIN_BOARDS = 3
 
 @dataclass(frozen=True, eq=False)
 class HalvesComparison:
-    """Differences between two solutions of the rig, second minus first, common motion removed.
+    """Differences between two solutions of the rig.
 
     names: the pairs compared.
     excluded: pairs not compared, which saw too few boards in a half or could not be solved from it.
-    shifts_mm: of the camera centres, (P, 3), rig frame.
-    sigmas_mm: expected sigmas of the shifts, (P, 3).
-    over_expected: RMS of all differences in units of what the covariances predict; 1 if consistent.
+    shifts_mm: how far the second's position relative to the first moves, for every two pairs, (K,).
+    sigmas_mm: what the covariances predict of each shift, over all axes, (K,).
     """
 
     names: tuple[str, ...]
     excluded: tuple[str, ...]
     shifts_mm: Array
     sigmas_mm: Array
-    over_expected: float
+
+    @property
+    def over_expected(self) -> float:
+        """RMS of all shifts in units of what the covariances predict; 1 if consistent."""
+        return rms(self.shifts_mm / self.sigmas_mm)
 
     @property
     def summary(self) -> str:
@@ -48,43 +51,35 @@ class HalvesComparison:
             f" (without {', '.join(self.excluded)}, not known from a half)" if self.excluded else ""
         )
         return (
-            f"solved from either half of the shots, cameras{without} differ by "
-            f"{rms_length(self.shifts_mm):.3f} mm RMS ({rms_length(self.sigmas_mm):.3f} expected); "
-            f"all differences are {self.over_expected:.2f} times what is expected"
+            f"solved from either half of the shots, cameras{without} differ, relative to each other, "
+            f"by {rms(self.shifts_mm):.3f} mm RMS ({rms(self.sigmas_mm):.3f} expected); all "
+            f"differences are {self.over_expected:.2f} times what is expected"
         )
 
 
 def compare_halves(rig: Rig, solution: RigSolution, *, seed: int = 0) -> HalvesComparison:
-    """Solve the rig from either half of its shots and compare, pair by pair.
+    """Solve the rig from either half of its shots and compare, for every two pairs.
 
-    Each half's frame is fixed by one pair and carried to where `solution` has that pair; the
-    remaining common motion is the frame's own and is removed. Raises FailedWork if there are fewer
-    than two pairs, if no halves tie two of them together with enough boards for their cameras, or
-    if halves determine the rig so much worse than all shots that nothing follows; RigDisconnected
-    as `solve_rig`.
+    Raises FailedWork if there are fewer than two pairs, if no halves tie two of them together with
+    enough boards for their cameras, or if halves determine the rig so much worse than all shots that
+    nothing follows; RigDisconnected as `solve_rig`.
     """
     everyone = tuple(sorted(solution.rig_from_camera))
     if len(everyone) < 2:
         raise FailedWork("one pair alone has no pose to compare", where=f"rig {rig.name}")
-    connected, *halves = split_shots(solution.views, everyone, seed=seed)
-    frame_pair = rig.frame_pair.name if rig.frame_pair else ""
-    holder = frame_pair if frame_pair in connected else connected[0]
-    (first, first_covariance), (second, second_covariance) = (
-        _solve_half(rig, solution, connected, shots, holder) for shots in halves
-    )
-    names = tuple(name for name in connected if name in first and name in second)
-    if len(names) < 2:
+    connected, *shots = split_shots(solution.views, everyone, seed=seed)
+    halves = [_solve_half(rig, solution, connected, half) for half in shots]
+    names = tuple(n for n in connected if all(n in half.rig_from_camera for half in halves))
+    links = list(combinations(names, 2))
+    if not links:
         raise _cannot_halve(len({view.shot for view in solution.views}))
-    # (6P,): twists about the rig's origin that carry each first pose to the second.
-    twists = np.concatenate([(second[name] @ first[name].inverse()).twist for name in names])
-    poses = [solution.rig_from_camera[name] for name in names]
-    centres = np.array([pose.translation for pose in poses])
-    keep = _common_motion_projector(centres, np.array([pose.rotation[:, 2] for pose in poses]))
-    differences = keep @ twists
-    covariance = keep @ (first_covariance.select(names) + second_covariance.select(names)) @ keep.T
-    sigmas = _centre_sigmas(covariance, centres)
-    prior = keep @ solution.covariance.select(names) @ keep.T
-    expected, whole = rms_length(sigmas), rms_length(_centre_sigmas(prior, centres))
+    first, second = halves
+    shifts = [second.relative_position(*two) - first.relative_position(*two) for two in links]
+    sigmas = np.array(
+        [np.hypot(first.relative_sigma_mm(*two), second.relative_sigma_mm(*two)) for two in links]
+    )
+    expected = rms(sigmas)
+    whole = rms(np.array([solution.relative_sigma_mm(*two) for two in links]))
     # Halves should differ by twice the sigma of the whole, since each has half of the information
     # and both err. Far beyond that a half lacks a connection of the rig, not only shots.
     if expected > 5.0 * whole:
@@ -96,9 +91,8 @@ def compare_halves(rig: Rig, solution: RigSolution, *, seed: int = 0) -> HalvesC
     return HalvesComparison(
         names,
         tuple(name for name in everyone if name not in names),
-        np.einsum("pij,pj->pi", twist_jacobian(centres), differences.reshape(-1, 6)),
+        np.linalg.norm(shifts, axis=1),
         sigmas,
-        _normalized_rms(differences, covariance),
     )
 
 
@@ -154,13 +148,15 @@ def _largest_connected(
 
 
 def _solve_half(
-    rig: Rig, solution: RigSolution, names: Sequence[str], shots: Sequence[str], holder: str
-) -> tuple[dict[str, RigidTransform], PoseCovariance]:
-    """`rig_from_camera` of these pairs from these shots alone, and its covariance.
+    rig: Rig, solution: RigSolution, names: Sequence[str], shots: Sequence[str]
+) -> RigSolution:
+    """The solution of these pairs from these shots alone, in the frame of one of them.
 
-    In the frame of `solution`, without pairs that disagree with the others there. Raises FailedWork
-    if the holder does.
+    Pairs that disagree with the others there are left out. Raises FailedWork if the one that fixes
+    the frame does.
     """
+    frame_pair = rig.frame_pair.name if rig.frame_pair else ""
+    holder = frame_pair if frame_pair in names else names[0]
     rig_with_fixed_pair = rig.model_copy(update={"rig_frame": RigFrame(pair=holder)})
     views = [view for view in solution.views if view.shot in shots and view.pair in names]
     cameras = {name: solution.cameras[name] for name in names}
@@ -168,41 +164,7 @@ def _solve_half(
         half = solve_rig(rig_with_fixed_pair, views, cameras, choose=False).value
     except BadInput as error:
         raise FailedWork(f"{holder} does not fit the others in a half of the shots") from error
-    to_rig = solution.rig_from_camera[holder] @ half.rig_from_camera[holder].inverse()
-    carry = np.kron(np.eye(len(half.covariance.names)), adjoint(to_rig))
     # The inflation over independent corners is better determined by all boards.
     more_inflation = max(solution.variance_inflation / half.variance_inflation, 1.0)
-    matrix = more_inflation * carry @ half.covariance.matrix @ carry.T
-    return (
-        {name: to_rig @ pose for name, pose in half.rig_from_camera.items()},
-        PoseCovariance(half.covariance.names, matrix),
-    )
-
-
-def _centre_sigmas(covariance: Array, centres: Array) -> Array:
-    """Sigmas (P, 3) mm of camera centres (P, 3), from the covariance (6P, 6P) of their motions."""
-    count, jacobian = len(centres), twist_jacobian(centres)
-    blocks = covariance.reshape(count, 6, count, 6)[range(count), :, range(count)]
-    variance = np.einsum("pii->pi", jacobian @ blocks @ jacobian.transpose(0, 2, 1))
-    return np.sqrt(np.maximum(variance, 0.0))
-
-
-def _common_motion_projector(centres: Array, ahead: Array) -> Array:
-    """(6P, 6P): removes from the pairs' motions the part common to all, by least squares over each
-    camera's centre and the position it looks at."""
-    # 1300 mm ahead of a camera is about where the subject stands.
-    points = np.concatenate([centres, centres + 1300.0 * ahead])
-    jacobians = twist_jacobian(points).reshape(2, len(centres), 3, 6)
-    weights = np.einsum("kpij,kpil->pjl", jacobians, jacobians)  # (P, 6, 6)
-    common = np.linalg.solve(weights.sum(axis=0), np.concatenate(list(weights), axis=1))
-    return np.eye(6 * len(centres)) - np.tile(common, (len(centres), 1))
-
-
-def _normalized_rms(differences: Array, covariance: Array) -> float:
-    """RMS of the differences in their standard deviations, with correlations."""
-    scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
-    # Smaller eigenvalues are those of the common motion, which was removed.
-    known = values > 1e-9 * values[-1]
-    parts = vectors[:, known].T @ (differences / scale)
-    return float(np.sqrt(np.mean(parts**2 / values[known])))
+    matrix = more_inflation * half.covariance.matrix
+    return replace(half, covariance=PoseCovariance(half.covariance.names, matrix))

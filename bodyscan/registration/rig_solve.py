@@ -20,7 +20,7 @@ from bodyscan.calibration.camera import LensTrial
 from bodyscan.errors import RigDisconnected
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.geometry.uncertainty import PoseCovariance, RayUncertainty
+from bodyscan.geometry.uncertainty import PoseCovariance, RayUncertainty, point_covariance
 from bodyscan.outcome import Outcome
 from bodyscan.registration.board_shape import (
     BoardShape,
@@ -87,6 +87,16 @@ class RigSolution:
     camera_covariances: dict[str, Array] = field(default_factory=dict)
     variance_inflation: float = 1.0
     rays: dict[str, RayUncertainty] = field(default_factory=dict)
+
+    def relative_position(self, first: str, second: str) -> Array:
+        """Position (3,) mm of the second camera in the frame of the first."""
+        return (self.rig_from_camera[first].inverse() @ self.rig_from_camera[second]).translation
+
+    def relative_sigma_mm(self, first: str, second: str) -> float:
+        """Sigma of that position, over all axes."""
+        motion = self.covariance.relative(first, second)
+        position = self.rig_from_camera[second].translation
+        return float(np.sqrt(np.trace(point_covariance(motion, position))))
 
 
 @dataclass(frozen=True, eq=False)

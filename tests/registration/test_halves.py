@@ -32,10 +32,8 @@ def placed_ring(
 def test_honest_halves_differ_by_what_they_promise() -> None:
     found = [compare_halves(*placed_ring(seed), seed=seed) for seed in range(3)]
     ratios = [comparison.over_expected for comparison in found]
-    # 3 x 30 independent normalised differences: 1 +- 0.08, and covariances good to 15 % or so.
-    assert 0.8 < np.sqrt(np.mean(np.square(ratios))) < 1.25
-    shifts = np.concatenate([c.shifts_mm / c.sigmas_mm for c in found])
-    assert 0.7 < np.sqrt(np.mean(shifts**2)) < 1.35  # components of one pair go together: wider
+    # 3 x 15 links that share five pairs each, so that 1 +- 0.15; covariances good to 15 % or so.
+    assert 0.7 < np.sqrt(np.mean(np.square(ratios))) < 1.35
 
 
 def test_the_frame_itself_is_taken_out() -> None:
@@ -44,8 +42,7 @@ def test_the_frame_itself_is_taken_out() -> None:
     comparison = compare_halves(rig, placed, seed=1)
     other = rig.model_copy(update={"rig_frame": rig.rig_frame.model_copy(update={"pair": "p2-2"})})
     again = compare_halves(other, placed, seed=1)
-    holder = comparison.names.index("p1-1")
-    assert np.linalg.norm(comparison.shifts_mm[holder]) > 0.01
+    assert comparison.shifts_mm.min() > 0.001
     # Second-order in motions of 1e-4 radians, and the solver's own tolerance.
     np.testing.assert_allclose(comparison.shifts_mm, again.shifts_mm, atol=5e-3)
     np.testing.assert_allclose(comparison.sigmas_mm, again.sigmas_mm, rtol=0.02)
