@@ -6,8 +6,7 @@ import os
 from pathlib import Path
 
 from bodyscan.captures.folder import Captures, open_captures
-from bodyscan.rig.rig import Rig
-from bodyscan.rig.rig_file import load_rig
+from bodyscan.rig.rig import Rig, load_rig
 
 PROJECT = Path(__file__).parents[1]
 

@@ -18,8 +18,7 @@ from bodyscan.arrays import Array, Indices
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.registration.rig_calibration import RigCalibration
-from bodyscan.rig.rig import Rig
-from bodyscan.rig.rig_file import load_rig
+from bodyscan.rig.rig import Rig, load_rig
 from bodyscan.simulation.body import load_subject
 from bodyscan.simulation.files import compute_person_times, describe_camera, scale_rig
 from bodyscan.simulation.lamps import Lamps, compute_laser_light

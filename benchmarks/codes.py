@@ -9,7 +9,7 @@ import numpy as np
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.rig.board import Board
 from bodyscan.rig.frame_names import FrameNames
-from bodyscan.rig.rig_file import load_rig
+from bodyscan.rig.rig import load_rig
 from bodyscan.simulation.board import make_board
 from bodyscan.simulation.files import scale_rig
 from bodyscan.simulation.lamps import Lamps

@@ -77,7 +77,7 @@ def make_pair(folder: Path, megapixels: float, figure: float = 1.0) -> Path:
 
     figure: its size factor.
     """
-    from bodyscan.rig.rig_file import load_rig, write_rig
+    from bodyscan.rig.rig import load_rig, write_rig
     from bodyscan.rig.rig_frame import RigFrame
     from bodyscan.simulation import settings_for, simulate
     from bodyscan.workflows.calibrate_rig import calibrate_folder

@@ -35,7 +35,7 @@ from bodyscan.interchange.rig_format import RIG_FORMATS
 from bodyscan.jobs.pipeline import load_pipeline
 from bodyscan.mesh.ply import read_ply_cloud, read_ply_mesh
 from bodyscan.registration.storage import load_calibration
-from bodyscan.rig.rig_file import load_rig
+from bodyscan.rig.rig import load_rig
 
 PROJECT = Path(__file__).parents[1]
 STORED = PROJECT / "tests" / "data" / "stored-0.1.0"

@@ -18,8 +18,7 @@ from bodyscan.calibration.pair import PairCalibration
 from bodyscan.captures.folder import open_captures, open_scan
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.storage import load_calibration
-from bodyscan.rig.rig import Rig
-from bodyscan.rig.rig_file import load_rig
+from bodyscan.rig.rig import Rig, load_rig
 from bodyscan.simulation import SimulationSettings, simulate
 from bodyscan.simulation.lens import TrueCamera
 from bodyscan.simulation.projector import PinholeProjector

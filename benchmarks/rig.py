@@ -18,8 +18,7 @@ from bodyscan.geometry.transforms import RigidTransform, fit_rigid_transform
 from bodyscan.geometry.uncertainty import position_sigma
 from bodyscan.registration.rig_solve import RigSolution, solve_rig
 from bodyscan.rig.board import Board
-from bodyscan.rig.rig import Rig
-from bodyscan.rig.rig_file import load_rig
+from bodyscan.rig.rig import Rig, load_rig
 from bodyscan.simulation.layout import TruePair
 from bodyscan.workflows.find_boards import calibrate_cameras, locate_views
 

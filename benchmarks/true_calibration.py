@@ -19,8 +19,7 @@ from bodyscan.geometry.transforms import RigidTransform, adjoint
 from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.rig.pair import Pair
-from bodyscan.rig.rig import Rig
-from bodyscan.rig.rig_file import load_rig
+from bodyscan.rig.rig import Rig, load_rig
 from bodyscan.workflows.evaluate import load_truth
 
 MIDDLE = RigidTransform(np.eye(3), np.array([0.0, 0.0, 900.0]))

@@ -111,7 +111,7 @@ def load_rig(path: AnyPath) -> Rig:
     >>> len(rig.pairs), rig.pairs[0].name, rig.volume.radius_mm
     (12, 'p1-1', 700.0)
     """
-    from bodyscan.rig.rig_file import load_rig as load
+    from bodyscan.rig.rig import load_rig as load
 
     return load(Path(path))
 

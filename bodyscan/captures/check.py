@@ -27,8 +27,7 @@ from bodyscan.errors import BadInput, CaptureError
 from bodyscan.progress import map_threads
 from bodyscan.rig.board import Board
 from bodyscan.rig.pair import Pair
-from bodyscan.rig.rig import Rig, find_unusual_lengths
-from bodyscan.rig.rig_file import load_rig
+from bodyscan.rig.rig import Rig, find_unusual_lengths, load_rig
 
 WORKERS = 8  # threads, which wait for a disk or a server, not for a processor
 

@@ -46,7 +46,7 @@ def check(output: Output, rig_file: RigFile) -> None:
     """Check a rig file and its capture folders, and list what is missing or wrong."""
     from bodyscan.captures.check import check as look_over
     from bodyscan.captures.check import format_report
-    from bodyscan.rig.rig_file import load_rig
+    from bodyscan.rig.rig import load_rig
 
     known_errors: list[str] = []
     if any(pair.known for pair in load_rig(rig_file).pairs):
@@ -72,7 +72,7 @@ def patterns(
 ) -> None:
     """Write the images that a rig's projectors must show, as PNG, with their order."""
     from bodyscan.captures.pattern_files import find_uneven_stripes, write_patterns
-    from bodyscan.rig.rig_file import load_rig
+    from bodyscan.rig.rig import load_rig
 
     require_writable(out)
     rig = load_rig(rig_file)

@@ -95,7 +95,7 @@ def describe_first_error(refused: ValidationError) -> str:
     return f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
 
 
-def find_duplicates(names: list[str | None] | tuple[str | None, ...]) -> Iterator[tuple[int, str]]:
+def find_duplicates(names: Iterable[str | None]) -> Iterator[tuple[int, str]]:
     """Index and name of each name that occurred earlier in the list (None never counts)."""
     seen: set[str] = set()
     for index, name in enumerate(names):

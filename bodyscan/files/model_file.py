@@ -51,12 +51,10 @@ def load_model(
     *,
     remedy: str,
     also: Callable[[M], Iterable[Problem]] = lambda _: (),
-    salvage: Callable[[Any], Iterable[Problem]] = lambda _: (),
 ) -> M:
     """Read `path` as `model`; raise `error` with every problem of the file, one per line.
 
     also: checks of a valid model against something outside the file.
-    salvage: checks of the plain data of an invalid file, so that everything is reported at once.
     """
     try:
         document = read_yaml(path)
@@ -70,11 +68,9 @@ def load_model(
     problems = list(document.problems)
     try:
         loaded = model.model_validate_json(json.dumps(document.data), strict=True)
-        found: Iterable[Problem] = also(loaded)
+        problems += [_locate(problem, document) for problem in also(loaded)]
     except ValidationError as refused:
         problems += _translate(refused, document, model)
-        found = salvage(document.data)
-    problems += [_locate(problem, document) for problem in found]
     if problems:
         raise combine_problems(path, problems, error, remedy)
     return loaded
@@ -146,14 +142,6 @@ def combine_problems(
     if len(lines) > 30:
         shown.append(f"... and {len(lines) - 30} more")
     return error("\n".join(shown), where=lines[0][0], remedy=remedy)
-
-
-def validate(model: type[M], data: Any) -> M | None:
-    """`data` as a model if it is valid, else None."""
-    try:
-        return model.model_validate_json(json.dumps(data), strict=True)
-    except ValidationError:
-        return None
 
 
 def _locate(problem: Problem, document: Document) -> YamlProblem:

@@ -13,8 +13,7 @@ from bodyscan.captures.folder import Captures, open_captures, open_scan
 from bodyscan.errors import BadInput, CalibrationFileError, CaptureError
 from bodyscan.jobs.job import CALIBRATION, RIG_FILE, Job, results_in
 from bodyscan.progress import Progress, step
-from bodyscan.rig.rig import Rig
-from bodyscan.rig.rig_file import load_rig
+from bodyscan.rig.rig import Rig, load_rig
 from bodyscan.verdict import Announce
 
 if TYPE_CHECKING:

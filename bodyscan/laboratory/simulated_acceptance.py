@@ -18,8 +18,7 @@ from bodyscan.evaluation.acceptance import AcceptanceFile, Readings
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.progress import Progress, map_threads, silent
 from bodyscan.registration.rig_calibration import RigCalibration
-from bodyscan.rig.rig import Rig, Volume
-from bodyscan.rig.rig_file import load_rig
+from bodyscan.rig.rig import Rig, Volume, load_rig
 from bodyscan.simulation import files
 from bodyscan.simulation.layout import TruePair, build_room
 from bodyscan.simulation.presets import settings_from_dict

@@ -1,19 +1,26 @@
-"""The whole rig file: boards, poles, pairs, where captures lie and how files are named."""
+"""The rig file: boards, poles, pairs, where captures lie and how files are named; docs/formats.md."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import Field, PositiveFloat
 
-from bodyscan.files.model import Model, Name, Problem
-from bodyscan.rig.board import Board
-from bodyscan.rig.consistency import RigParts, rig_problems
-from bodyscan.rig.frame_names import CaptureFolder, FrameNames
+from bodyscan.errors import RigFileError
+from bodyscan.files.atomic import write_text
+from bodyscan.files.model import Model, Name, Problem, did_you_mean, find_duplicates
+from bodyscan.files.model_file import load_model
+from bodyscan.files.yaml_file import dump_yaml
+from bodyscan.rig.board import Board, dictionary_family
+from bodyscan.rig.frame_names import CaptureFolder, FrameNames, ImageNames
 from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig_frame import Reference, RigFrame
+from bodyscan.rig.templates import template_faults
+from bodyscan.stripes.codes import image_kinds
+from bodyscan.stripes.stripe_code import StripeCode
 
 
 class Volume(Model):
@@ -91,20 +98,31 @@ class Rig(Model):
         return self.board(self.rig_frame.board) if self.rig_frame.board else self.boards[0]
 
     def problems(self) -> Iterator[Problem]:
-        return rig_problems(
-            RigParts(
-                board_names=tuple(board.name for board in self.boards),
-                boards=self.boards,
-                pair_names=tuple(pair.name for pair in self.pairs),
-                pairs=self.pairs,
-                folders=self.calibration,
-                references=self.references,
-                files=self.files,
-                exposures=self.exposures,
-                frames=self.frames,
-                rig_frame=self.rig_frame,
-            )
-        )
+        """What does not fit together in a rig whose parts are valid by themselves."""
+        yield from _find_repeated_names(self)
+        if self.calibration and not self.boards:
+            yield ("boards",), "is missing: calibration captures show a board"
+        yield from _find_marker_overlaps(self.boards)
+        yield from _find_wrong_frames(self)
+        yield from _find_template_problems(self)
+        yield from _find_unknown_references(self)
+        yield from _find_wrong_references(self)
+
+
+def load_rig(path: Path) -> Rig:
+    """Read and check a rig file.
+
+    Raises RigFileError, which lists every problem of its parts by line; once these are valid, every
+    way in which they do not fit together.
+    """
+    remedy = "Correct the rig file; docs/formats.md explains every key."
+    return load_model(Path(path), Rig, RigFileError, remedy=remedy)
+
+
+def write_rig(path: Path, rig: Rig) -> None:
+    """Write a rig file that `load_rig` reads back as the same rig (comments are not kept)."""
+    data = rig.model_dump(mode="json", exclude_defaults=True)
+    write_text(path, dump_yaml({"version": rig.version, **data}))
 
 
 def find_unusual_lengths(rig: Rig) -> Iterator[str]:
@@ -125,3 +143,132 @@ def find_unusual_lengths(rig: Rig) -> Iterator[str]:
                 f"{what} is {value:g} mm, but {low:g} to {high:g} mm is usual: check that it is in "
                 "mm, as all lengths of a rig file are"
             )
+
+
+def _find_repeated_names(rig: Rig) -> Iterator[Problem]:
+    for key, parts in (
+        ("boards", rig.boards),
+        ("pairs", rig.pairs),
+        ("references", rig.references),
+    ):
+        for index, name in find_duplicates([part.name for part in parts]):
+            yield (key, index, "name"), f"is given to two {key}: every name once (got {name!r})"
+    for index, name in find_duplicates(rig.exposures):
+        yield ("exposures", index), f"is named twice (got {name!r})"
+    folders = [folder.folder.rstrip("/") for folder in rig.calibration]
+    for index, path in find_duplicates(folders):
+        yield ("calibration", index, "folder"), f"is listed twice (got {path!r})"
+
+
+def _find_marker_overlaps(boards: Sequence[Board]) -> Iterator[Problem]:
+    taken: list[tuple[Board, range]] = []
+    for index, board in enumerate(boards):
+        ids = range(board.first_marker, board.first_marker + board.marker_count)
+        for other, theirs in taken:
+            shared = range(max(ids.start, theirs.start), min(ids.stop, theirs.stop))
+            family, its = dictionary_family(other.dictionary), dictionary_family(board.dictionary)
+            if shared and family == its:
+                yield (
+                    ("boards", index, "first_marker"),
+                    f"gives board {board.name} markers {ids.start} to {ids.stop - 1}, of which"
+                    f" board {other.name} has {shared.start} to {shared.stop - 1} as well:"
+                    f" print it with first_marker {theirs.stop} or more",
+                )
+        taken.append((board, ids))
+
+
+def _find_wrong_frames(rig: Rig) -> Iterator[Problem]:
+    """Find names of images that the pairs' codes do not fit, or that are missing."""
+    frames = rig.frames
+    codes = [(pair.name, pair.projector) for pair in rig.pairs if pair.projector]
+    yield from _find_wrong_counts(frames, ("frames",), codes)
+    across = [(name, code.crossing) for name, code in codes if code.crossing]
+    yield from _find_wrong_counts(frames.crossing, ("frames", "crossing"), across)
+    if frames.crossing.model_extra and not across:
+        yield ("frames", "crossing"), "is for a projector with `crossing`: no pair has one"
+    directions = [(name, one) for name, code in codes for one in code.directions]
+    if frames.dark is None:
+        for lacking in [name for name, one in directions if one.needs_dark][:1]:
+            wrong = f"is needed: pair {lacking} takes no inverses, so only it shows what black is"
+            yield ("frames", "dark"), wrong
+    if frames.lit is None:
+        for lacking in [name for name, one in directions if one.needs_lit][:1]:
+            wrong = f"the images of pair {lacking} do not show the scene under full light"
+            yield ("frames", "lit"), f"is needed: {wrong}"
+        alone = [pair.name for pair in rig.pairs if not pair.projector]
+        if alone and frames.board is None and "{frame}" in rig.files:
+            wrong = f"or board is needed: pair {alone[0]}, a camera alone, takes no other image"
+            yield ("frames", "lit"), wrong
+
+
+def _find_wrong_counts(
+    names: ImageNames, where: tuple[str, ...], codes: Sequence[tuple[str, StripeCode]]
+) -> Iterator[Problem]:
+    """Find lists of names that are longer or shorter than a pair's code requires."""
+    for kind in image_kinds():
+        given = names.templates(kind)
+        for pair, code in codes if not isinstance(given, str) else ():
+            count = code.image_counts.get(kind, len(given))
+            if count != len(given):
+                first = getattr(code, "first_code", 0)
+                since = f" from {first}" if first else ""
+                yield (
+                    (*where, kind.name),
+                    f"has {len(given)} names, but the {code.stripes} stripes of pair"
+                    f" {pair}{since} take {count} {kind.number}s",
+                )
+                break
+
+
+def _find_template_problems(rig: Rig) -> Iterator[Problem]:
+    """Find file-name templates that do not fit the pairs and exposures."""
+    many, stripes = len(rig.pairs) > 1, any(pair.projector for pair in rig.pairs)
+    if len(rig.exposures) == 1:
+        yield ("exposures",), "names one exposure: name two or more, the shortest first, or none"
+    templates: list[tuple[tuple[str | int, ...], str, bool]] = [(("files",), rig.files, stripes)]
+    for index, folder in enumerate(rig.calibration):
+        templates += (
+            [(("calibration", index, "files"), folder.files, False)] if folder.files else []
+        )
+    for where, template, needs_frame in templates:
+        faults = template_faults(
+            template, many_pairs=many, needs_frame=needs_frame, exposures=bool(rig.exposures)
+        )
+        yield from ((where, fault) for fault in faults)
+
+
+def _find_unknown_references(rig: Rig) -> Iterator[Problem]:
+    """Find names in `rig_frame` that the file does not have."""
+    frame = rig.rig_frame
+    for key, parts in (("pair", rig.pairs), ("board", rig.boards)):
+        wanted, names = getattr(frame, key), [part.name for part in parts]
+        if wanted is not None and wanted not in names:
+            hint = did_you_mean(wanted, names)
+            yield ("rig_frame", key), f"names no {key} of this file{hint} (got {wanted!r})"
+    if frame.shot is not None and frame.board is None and len(rig.boards) > 1:
+        yield ("rig_frame", "board"), "is missing: say which of the boards fixes the rig frame"
+
+
+def _find_wrong_references(rig: Rig) -> Iterator[Problem]:
+    """Find references to boards that cannot give a length."""
+    boards = {board.name: board for board in rig.boards}
+    for index, reference in enumerate(rig.references):
+        where = ("references", index, "boards")
+        if len(set(reference.boards)) < len(reference.boards):
+            yield where, f"names a board twice (got {reference.boards[0]!r})"
+        for k, name in enumerate(reference.boards):
+            if name not in boards:
+                hint = did_you_mean(name, boards)
+                yield (*where, k), f"names no board of this file{hint} (got {name!r})"
+            elif boards[name].kind == "checkerboard":
+                yield (
+                    (*where, k),
+                    f"must have markers, which tell its corners apart from every side: board {name} "
+                    "is a plain checkerboard",
+                )
+            elif name == rig.rig_frame.board and len(rig.boards) > len(reference.boards):
+                yield (
+                    (*where, k),
+                    f"must not fix the rig frame as well: board {name} of a reference takes no part "
+                    "in placing the rig",
+                )

@@ -13,8 +13,7 @@ import numpy as np
 from bodyscan.files.atomic import write_json
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.progress import THREADS, Progress, map_threads, silent
-from bodyscan.rig.rig import Rig
-from bodyscan.rig.rig_file import load_rig, write_rig
+from bodyscan.rig.rig import Rig, load_rig, write_rig
 from bodyscan.rig.templates import fill
 from bodyscan.simulation import body, files
 from bodyscan.simulation.board import make_board

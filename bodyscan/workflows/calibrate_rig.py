@@ -26,8 +26,7 @@ from bodyscan.registration.rig_solve import RigSolution, collect_corners, solve_
 from bodyscan.registration.solved_pairs import solved_pair, update_poses
 from bodyscan.registration.soundness import find_faults
 from bodyscan.registration.storage import CORNERS_NAME, archive_previous, save_calibration
-from bodyscan.rig.rig import Rig
-from bodyscan.rig.rig_file import load_rig
+from bodyscan.rig.rig import Rig, load_rig
 from bodyscan.workflows.decode import PairStripes, PrintAreas, collect_stripes, decode_pairs
 from bodyscan.workflows.find_boards import (
     HERE,

@@ -18,8 +18,7 @@ from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.rig_frame import rig_from_world
 from bodyscan.registration.storage import archive_previous, save_calibration
 from bodyscan.rig.pair import Pair
-from bodyscan.rig.rig import Rig
-from bodyscan.rig.rig_file import load_rig
+from bodyscan.rig.rig import Rig, load_rig
 
 
 def import_folder(

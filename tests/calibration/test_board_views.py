@@ -23,7 +23,7 @@ from bodyscan.calibration.board_views import (
 )
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.rig.board import Board
-from bodyscan.rig.rig_file import load_rig
+from bodyscan.rig.rig import load_rig
 
 BOARD = Board(name="b", kind="checkerboard", columns=9, rows=8, square_mm=30)
 WIDE = 8  # corners in a row

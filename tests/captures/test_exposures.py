@@ -17,7 +17,7 @@ from bodyscan.captures.grey_levels import merge_exposures
 from bodyscan.captures.images import read_sequence
 from bodyscan.errors import ImageError, RigFileError
 from bodyscan.geometry.robust import robust_scale
-from bodyscan.rig.rig_file import load_rig
+from bodyscan.rig.rig import load_rig
 from bodyscan.stripes.codes import parse_stripe_code
 from bodyscan.stripes.decoding import decode_stripes
 from bodyscan.stripes.stripe_map import StripeMap

@@ -20,7 +20,7 @@ from bodyscan.captures.captures_file import (
 from bodyscan.captures.check import check
 from bodyscan.captures.folder import Captures, open_captures, open_scan
 from bodyscan.errors import CaptureError
-from bodyscan.rig.rig_file import load_rig
+from bodyscan.rig.rig import load_rig
 
 
 def opened(rig_path: Path) -> Captures:

@@ -22,7 +22,7 @@ from bodyscan.captures.check import check, format_report
 from bodyscan.captures.folder import open_captures
 from bodyscan.captures.images import read_sequence
 from bodyscan.errors import BodyscanError
-from bodyscan.rig.rig_file import load_rig
+from bodyscan.rig.rig import load_rig
 
 CAPTURES = b"version: 1\nkind: calibration\nwhen: 2026-11-22T10:00:00\nshots:\n- name: b1\n"
 TRIES = int(os.environ.get("BODYSCAN_FUZZ", "25"))

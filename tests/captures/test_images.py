@@ -23,7 +23,7 @@ from bodyscan.captures.image_header import NotAnImage, read_header
 from bodyscan.captures.images import read_board_image, read_image, read_sequence
 from bodyscan.errors import BadInput, ImageError
 from bodyscan.rig.pair import CameraSpec
-from bodyscan.rig.rig_file import load_rig
+from bodyscan.rig.rig import load_rig
 
 CAMERA = CameraSpec(width=WIDTH, height=HEIGHT)
 NOISE = np.random.default_rng(5).integers(0, 256, (HEIGHT, WIDTH), dtype=np.uint8)

@@ -12,7 +12,7 @@ from bodyscan.arrays import Array
 from bodyscan.boards.detection import find_boards
 from bodyscan.captures.folder import open_captures
 from bodyscan.captures.images import read_board_image, read_sequence
-from bodyscan.rig.rig_file import load_rig
+from bodyscan.rig.rig import load_rig
 from bodyscan.stripes.decoding import decode_stripes
 from bodyscan.stripes.stripe_map import StripeMap
 

@@ -9,7 +9,7 @@ from small_captures import FRAMES, RIG, write, write_small_captures
 
 from bodyscan.captures.folder import Captures, open_captures, open_scan
 from bodyscan.errors import CaptureError
-from bodyscan.rig.rig_file import load_rig
+from bodyscan.rig.rig import load_rig
 
 CODE = [f"bit0{bit}{end}" for end in ("", "-inverse") for bit in range(4)]
 DEFAULT = ["lit", "dark", *CODE]

@@ -25,8 +25,7 @@ from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.interchange.rig_format import RIG_FORMATS
 from bodyscan.registration.rig_calibration import RigCalibration
-from bodyscan.rig.rig import Rig
-from bodyscan.rig.rig_file import load_rig
+from bodyscan.rig.rig import Rig, load_rig
 from bodyscan.workflows.import_rig import import_rig
 
 PROJECTOR_FROM_CAMERA = RigidTransform.from_rotation_vector([0.02, 0.2, 0.01], [-210.0, 5.0, -20.0])

@@ -16,8 +16,7 @@ from bodyscan.errors import RigFileError
 from bodyscan.files.yaml_file import dump_yaml, read_yaml
 from bodyscan.rig.board import MARKERS_IN, Board
 from bodyscan.rig.frame_names import FrameNames
-from bodyscan.rig.rig import Rig, find_unusual_lengths
-from bodyscan.rig.rig_file import load_rig, write_rig
+from bodyscan.rig.rig import Rig, find_unusual_lengths, load_rig, write_rig
 from bodyscan.stripes.codes import parse_stripe_code
 from bodyscan.stripes.codes.gray import INVERSE, PATTERN, Gray
 
@@ -203,18 +202,22 @@ def test_markers_of_two_boards_must_differ(tmp_path: Path) -> None:
 
 def test_all_mistakes_are_reported_at_once_in_order(tmp_path: Path) -> None:
     text = changed("square_mm: 30", "square_mm: 0, colour: red").replace("name: p2", "name: p1")
-    text = text.replace("height: 30", 'height: "30"') + "rig_frame: {pair: p7}\nfiles: nothing\n"
+    text = text.replace("height: 30", 'height: "30"').replace("name: cam", "name: a b")
     lines = refused(tmp_path, text)
     numbers = [int(line.split(":")[1]) for line in lines]
     assert numbers == sorted(numbers)
     joined = "\n".join(lines)
-    for part in ("square_mm: must be", "colour: is no", "height: must", "given to two pairs",
-                 "names no pair", "needs {pair}", "must end in"):  # fmt: skip
+    for part in ("square_mm: must be", "colour: is no", "height: must", "name: must be a name"):
         assert part in joined
     # p2's and cam's camera are aliases of p1's: one mistake, reported once, where it is written.
     (height,) = (line for line in lines if "camera.height" in line)
     assert height.startswith("rig.yaml:7:")
     assert height.endswith("(and so in 2 more places by alias)")
+    # Then all that does not fit together.
+    text = changed("name: p2", "name: p1") + "rig_frame: {pair: p7}\nfiles: nothing\n"
+    joined = "\n".join(refused(tmp_path, text))
+    for part in ("given to two pairs", "names no pair", "needs {pair}", "must end in"):
+        assert part in joined
 
 
 @pytest.mark.parametrize(

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from bodyscan.errors import BadInput
-from bodyscan.rig.rig import Rig
-from bodyscan.rig.rig_file import load_rig
+from bodyscan.rig.rig import Rig, load_rig
 from bodyscan.simulation.layout import TruePair, build_pairs
 from bodyscan.simulation.plan import BoardShot, count_default_shots, plan_boards
 from bodyscan.simulation.settings import SimulationSettings

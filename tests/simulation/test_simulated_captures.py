@@ -15,7 +15,7 @@ import yaml
 
 from bodyscan.captures.folder import open_scan
 from bodyscan.errors import BadInput
-from bodyscan.rig.rig_file import load_rig
+from bodyscan.rig.rig import load_rig
 from bodyscan.simulation import SimulationSettings, simulate
 from bodyscan.simulation.body import draw_sways, load_subject
 from bodyscan.simulation.settings import Person

@@ -19,8 +19,7 @@ from bodyscan.arrays import Bytes, Floats
 from bodyscan.captures.folder import open_scan
 from bodyscan.captures.images import read_sequence
 from bodyscan.errors import CaptureError, DecodingFailed
-from bodyscan.rig.rig import Rig
-from bodyscan.rig.rig_file import load_rig
+from bodyscan.rig.rig import Rig, load_rig
 from bodyscan.stripes.decoding import decode_stripes
 from bodyscan.stripes.gray.bit_words import stripe_from_gray
 from bodyscan.stripes.stripe_code import StripeCode

@@ -19,7 +19,7 @@ from bodyscan.captures.check import check
 from bodyscan.captures.folder import open_captures
 from bodyscan.captures.pattern_files import write_patterns
 from bodyscan.errors import BadInput, RigFileError
-from bodyscan.rig.rig_file import load_rig, write_rig
+from bodyscan.rig.rig import load_rig, write_rig
 from bodyscan.simulation import simulate
 from bodyscan.stripes import codes
 from bodyscan.stripes.codes.gray import PATTERN

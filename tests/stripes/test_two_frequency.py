@@ -11,7 +11,7 @@ from real_captures import real_rig_file
 
 from bodyscan.captures.folder import Captures, open_captures
 from bodyscan.captures.images import read_sequence
-from bodyscan.rig.rig_file import load_rig
+from bodyscan.rig.rig import load_rig
 from bodyscan.stripes.stripe_map import StripeMap
 from bodyscan.workflows.decode import decode_sequence
 from bodyscan.workflows.find_boards import find_all_boards

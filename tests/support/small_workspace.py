@@ -14,8 +14,7 @@ from bodyscan.boards.view import BoardView, ViewKey
 from bodyscan.calibration.striped_view import BoardBoundaries
 from bodyscan.captures.folder import Captures, open_captures
 from bodyscan.cli.main import app
-from bodyscan.rig.rig import Rig
-from bodyscan.rig.rig_file import load_rig
+from bodyscan.rig.rig import Rig, load_rig
 from bodyscan.simulation import settings_for, simulate
 from bodyscan.workflows.decode import decode_on_boards
 from bodyscan.workflows.find_boards import find_all_boards

@@ -15,8 +15,7 @@ from bodyscan.boards.view import BoardView
 from bodyscan.calibration.striped_view import boundaries_near, box_around, crop_around
 from bodyscan.captures.folder import ImageSequence, open_scan
 from bodyscan.errors import DecodingFailed, ImageError
-from bodyscan.rig.rig import Rig
-from bodyscan.rig.rig_file import load_rig
+from bodyscan.rig.rig import Rig, load_rig
 from bodyscan.workflows import decode
 from bodyscan.workflows.decode import (
     crossing_notes,

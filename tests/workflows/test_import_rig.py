@@ -29,7 +29,7 @@ from bodyscan.geometry.light_sheets import triangulate_image
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.storage import load_calibration
 from bodyscan.report.calibration_verdict import grade_calibration
-from bodyscan.rig.rig_file import load_rig
+from bodyscan.rig.rig import load_rig
 from bodyscan.workflows.check_boards import BoardCheck
 from bodyscan.workflows.check_rig import check_rig
 from bodyscan.workflows.import_rig import import_folder, import_rig

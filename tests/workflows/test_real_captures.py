@@ -21,8 +21,7 @@ from benchmarks.held_out_boards import hold_out_boards
 from bodyscan.boards.view import BoardView
 from bodyscan.captures.folder import Captures, open_captures
 from bodyscan.registration.halves import compare_halves
-from bodyscan.rig.rig import Rig
-from bodyscan.rig.rig_file import load_rig
+from bodyscan.rig.rig import Rig, load_rig
 from bodyscan.workflows.calibrate_rig import calibrate_rig
 from bodyscan.workflows.find_boards import find_all_boards
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from bodyscan.captures.folder import open_captures
 from bodyscan.errors import FailedWork
-from bodyscan.rig.rig_file import load_rig
+from bodyscan.rig.rig import load_rig
 from bodyscan.workflows.calibrate_rig import calibrate_rig
 
 RIG = """
