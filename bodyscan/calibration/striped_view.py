@@ -112,7 +112,7 @@ def box_of_print(camera: Camera, board: Board, view: LocatedView) -> Box:
     if np.any(points[:, 2] <= 0.0) or np.hypot(*ideal.T).max() >= camera.lens.fold_radius:
         return low, high
     pixels = camera.project(points)
-    # Decoding a boundary uses pixels up to 7 px from it (`indirect_light`, `albedo_edges`) and
+    # Decoding a boundary uses pixels up to 7 px from it (`usable_pixels`, `albedo_edges`) and
     # boundaries of its run up to 6 px away, which in turn use pixels as far from them.
     margin = 16.0
     return (

@@ -75,7 +75,7 @@ class ScanLines:
 
     def difference(self, bit: Indices, pixels: Indices, variance: Floats) -> tuple[Floats, Floats]:
         """Compute pattern minus inverse of bits (N,) at flat pixels (N, K), and its standard
-        deviation, grey levels; 0 at negative pixels. variance: (256,) of each grey level.
+        deviation, grey levels. variance: (256,) of each grey level.
 
         Without inverses: twice the excess of the pattern over the mean of lit and dark.
         """
@@ -198,13 +198,11 @@ def _differences(
     pixels: Indices,
     variance: Floats,
 ) -> tuple[Floats, Floats]:
-    difference, noise = np.zeros(pixels.shape, np.float32), np.zeros(pixels.shape, np.float32)
+    difference, noise = np.empty(pixels.shape, np.float32), np.empty(pixels.shape, np.float32)
     inverted = inverses.size > 0
     for k in range(pixels.shape[0]):
         for n in range(pixels.shape[1]):
             pixel = pixels[k, n]
-            if pixel < 0:
-                continue
             index = bit[k] * lit.size + pixel
             inverse = inverses[index] if inverted else patterns[index]
             difference[k, n], noise[k, n] = _difference(

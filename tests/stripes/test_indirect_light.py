@@ -1,4 +1,4 @@
-"""Stripes where other surfaces throw light too: dropped where it is most, put right where not."""
+"""Stripes where other surfaces throw light too: dropped where that is most of the light."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from stripe_rendering import Sequence, decode_gray, gray_bits, render_sequence
 
 from bodyscan.arrays import Floats
 from bodyscan.stripes import usable_pixels
-from bodyscan.stripes.boundaries import measure_imbalance
 from bodyscan.stripes.scan_lines import ScanLines
 from bodyscan.stripes.stripe_map import StripeMap
 from bodyscan.stripes.usable_pixels import find_direct_pixels
@@ -47,28 +46,6 @@ def with_indirect(sequence: Sequence, grey: float) -> Sequence:
 def read(sequence: Sequence) -> StripeMap:
     frames = (sequence.lit, sequence.dark, sequence.patterns, sequence.inverses)
     return decode_gray(*frames, stripes=STRIPES, direction="vertical")
-
-
-def rms(found: StripeMap, s: np.ndarray) -> float:
-    known = np.isfinite(found.s) & np.isfinite(s)
-    assert known.sum() > 0.9 * np.isfinite(s).sum()
-    return float(np.sqrt(np.mean((found.s - s)[known] ** 2)))
-
-
-def test_boundaries_are_corrected_for_indirect_light() -> None:
-    """A fifth of the light comes by another way. Where the coarsest bits flip, their differences
-    are J, up to a fifth of D, in the middle: taken for 0, their boundaries would be off by a quarter
-    of the blur and more, up to 0.1 stripes."""
-    plain = render_sequence(slanted, stripes=STRIPES, light=DIRECT, noise=0.7)
-    mixed = read(with_indirect(plain, 50.0))
-    # 0.0020 without the other surface's light, 0.0047 with it, 0.020 if J is taken for 0. The finest
-    # bit's boundaries are left as they are: its J is a nineteenth of I, which moves them by 0.004.
-    assert rms(mixed, plain.s) < 0.006
-    u, v = mixed.boundary_pixels.T
-    off = slanted(u, v) - mixed.boundary_index
-    # Each is seen on 200 lines, to 0.003 stripes; taken for 0, J would move the worst by 0.10.
-    for index in range(6, 46):
-        assert abs(np.median(off[mixed.boundary_index == index])) < 0.006, index
 
 
 def test_a_shadow_lit_by_another_surface_has_no_s() -> None:
@@ -149,49 +126,3 @@ def test_dips_where_a_bit_flips_are_filled_and_wider_ones_are_shadows() -> None:
     found = find_direct_pixels(lit_by(direct), EVERY, 4, QUIET)
     assert found[:, :40].all()
     assert not found[:, 40:47].any()
-
-
-def at_boundary(
-    indirect: float, unshared: float, *, noise: float = 1e-6, reach: int = 8, second: int = 60
-) -> tuple[float, float]:
-    """J and its doubt of a boundary between pixels 29 and 30 at stripe 15; a pixel gets D + I, its
-    pattern less its inverse +-D + J.  second: where the bit flips again."""
-    total = 100.0
-    u = np.arange(SHAPE[1])
-    sign = np.where((u >= 30) & (u < second), 1.0, -1.0)
-    difference = np.tile(total * ((1.0 - indirect) * sign + unshared), (SHAPE[0], 1))
-    dark: Floats = np.full(SHAPE, 20.0, np.float32)
-    patterns = (80.0 + difference / 2.0).astype(np.float32)[None]
-    inverses = (80.0 - difference / 2.0).astype(np.float32)[None]
-    images = ScanLines(dark + np.float32(total), dark, patterns, inverses, False)
-    codes = np.tile(u // 2, (SHAPE[0], 1)).astype(np.int32)
-    one = np.array([0])
-    levels = np.full(256, noise, np.float32)
-    mean, doubt = measure_imbalance(
-        images,
-        codes,
-        EVERY,
-        levels,
-        one,
-        np.array([15]),
-        np.array([5 * 60 + 29]),
-        np.array([reach]),
-    )
-    return float(mean[0]), float(doubt[0])
-
-
-@pytest.mark.parametrize("unshared", [0.1, -0.2])
-def test_imbalance_is_the_mean_difference_of_both_sides(unshared: float) -> None:
-    mean, doubt = at_boundary(0.3, unshared)
-    assert mean == pytest.approx(unshared, rel=1e-3)
-    assert doubt == pytest.approx(0.3 * abs(unshared), rel=1e-2)
-
-
-def test_the_finest_bit_has_no_room_and_noise_explains_a_little() -> None:
-    assert at_boundary(0.3, 0.1, reach=1) == (0.0, 0.0)
-    assert at_boundary(0.3, 0.1, reach=2)[0] == pytest.approx(0.1, rel=0.01)
-    # Of eight pixels with sigmas of sqrt(2 v) / 100 each: 0.1 is 4 sigmas, half is believed.
-    noise = (0.1 / 4.0 * 100.0) ** 2 * 8.0 / 2.0
-    mean, doubt = at_boundary(0.3, 0.1, noise=noise)
-    assert mean == pytest.approx(0.05, rel=0.01)
-    assert doubt == pytest.approx(np.hypot(0.025, 0.3 * 0.05), rel=0.01)

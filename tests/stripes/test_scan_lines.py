@@ -57,16 +57,13 @@ def test_differences_have_the_noise_of_the_frames_they_are_made_of(
 ) -> None:
     images = frames(inverses, of)
     bit = np.array([2, 0])
-    at = np.array([[3, 34, -1], [17, -1, 0]])
+    at = np.array([[3, 34, 1], [17, 2, 0]])
     value, noise = images.difference(bit, at, LEVELS)
     lit, dark = images.lit.ravel().astype(int), images.dark.ravel().astype(int)
     for k in range(2):
         pattern = images.patterns[bit[k]].ravel().astype(int)
         for n in range(3):
             here = at[k, n]
-            if here < 0:
-                assert (value[k, n], noise[k, n]) == (0.0, 0.0)
-                continue
             if images.inverses is not None:
                 inverse = images.inverses[bit[k]].ravel().astype(int)[here]
                 expected = pattern[here] - inverse

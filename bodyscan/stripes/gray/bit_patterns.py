@@ -46,9 +46,7 @@ def decode_bits(
     brightness = Brightness.from_images(images, variance, usable)
     if images.bands is not None:
         usable = usable & images.bands.wanted[:, None]
-    boundaries = find_boundaries(
-        images, brightness, codes, usable, variance, code.finest_run, code.first
-    )
+    boundaries = find_boundaries(images, brightness, codes, usable, variance, code.first)
     sigma_px = np.hypot(boundaries.sigma_px, code.blur_sigma_px)
     boundaries = replace(boundaries, sigma_px=sigma_px)
     boundaries = replace(boundaries, sigma_px=estimate_scatter(boundaries) * sigma_px)

@@ -51,11 +51,6 @@ class WordCode:
         shift = np.arange(count)[::-1, None]
         return np.asarray(self.encode(stripes + self.first) >> shift & 1, float)
 
-    @property
-    def finest_run(self) -> int:
-        """Width of the finest pattern's stripes, in stripes."""
-        return 2 if self.single else 1
-
     def bit_two_wide(self, bits: int) -> int:
         """The bit whose stripes are two wide: Gray code's finest, the plain code's next to finest."""
         return bits - 1 if self.single else max(bits - 2, 0)
