@@ -67,7 +67,7 @@ BESIDE = (
     "bodyscan/workflows/check_rig.py",
 )
 """Mathematics and verdicts in rooms with another purpose."""
-FILES = ("__init__.py", "storage.py", "ply.py", "acceptance_file.py", "nearest_surface.py")
+FILES = ("__init__.py", "storage.py", "ply.py", "acceptance_file.py")
 """Neither mathematics nor verdicts: these files read, write or name things."""
 OPERATORS = re.compile(
     r"core/(ReplaceBinaryOperator_(Add_Sub|Sub_Add|Mul_Div|Div_Mul|Pow_Mul)"

@@ -18,7 +18,6 @@ from bodyscan.fusion.storage import load_scan
 from bodyscan.geometry.robust import rms
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyMesh
-from bodyscan.mesh.nearest_surface import build_centred_scene
 from bodyscan.mesh.topology import directed_edges
 
 
@@ -40,7 +39,7 @@ def signed_distances(points: Array, vertices: Array, faces: Indices) -> Array:
     The sign is that of the angle-weighted pseudo-normal at the nearest spot (Baerentzen and Aanaes
     2005).
     """
-    scene, centre = build_centred_scene(vertices, faces)
+    scene, centre = _build_centred_scene(vertices, faces)
     centred = (points - centre).astype(np.float32)
     nearest = scene.compute_closest_points(o3d.core.Tensor(centred))
     offset = centred.astype(np.float64) - nearest["points"].numpy()
@@ -219,7 +218,7 @@ def _refine_on_faces(
     A corner's tangent plane lies outside a round surface. Of points all around the errors cancel;
     those of one pair would be drawn a few hundredths of a millimetre towards it.
     """
-    scene, centre = build_centred_scene(vertices, faces)
+    scene, centre = _build_centred_scene(vertices, faces)
     found = RigidTransform.from_translation(-centre) @ start
     for _ in range(3):  # the first nearly does it
         moved = found.apply(points)
@@ -257,3 +256,16 @@ def _surface(path: Path) -> tuple[Array, Indices]:
             remedy="give a scan's folder, or a PLY with faces, in mm",
         )
     return np.asarray(read.vertices), np.asarray(read.triangles).astype(np.int64)
+
+
+def _build_centred_scene(
+    vertices: Array, faces: Indices
+) -> tuple[o3d.t.geometry.RaycastingScene, Array]:
+    """Build a scene of vertices (V, 3) less their mean, as it is float32; also return the mean (3,)."""
+    centre = vertices.mean(axis=0)
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(
+        o3d.core.Tensor((vertices - centre).astype(np.float32)),
+        o3d.core.Tensor(faces.astype(np.uint32)),
+    )
+    return scene, centre

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import open3d as o3d
 import pytest
@@ -12,71 +10,13 @@ from made_bodies import arrays, mesh_of, together
 from benchmarks.self_intersections import self_intersections
 from bodyscan.evaluation.surface import deviation, signed_distances
 from bodyscan.mesh.body import BodyMesh
-from bodyscan.mesh.decimation import decimate, refine_to_tolerance
-from bodyscan.mesh.nearest_surface import NearestSurface
+from bodyscan.mesh.decimation import decimate
 from bodyscan.mesh.topology import compute_topology
 
 
 def ball(resolution: int) -> tuple[np.ndarray, np.ndarray]:
     vertices, faces = arrays(o3d.geometry.TriangleMesh.create_sphere(100.0, resolution))
     return vertices + [900.0, 0.0, 1500.0], faces
-
-
-def farthest(one: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.ndarray]) -> float:
-    vertices, faces = one
-    a, b = np.random.default_rng(0).random((2, len(faces), 1))
-    a, b = np.where(a + b > 1, 1 - a, a), np.where(a + b > 1, 1 - b, b)
-    corners = vertices[faces]
-    inside = (
-        corners[:, 0] + a * (corners[:, 1] - corners[:, 0]) + b * (corners[:, 2] - corners[:, 0])
-    )
-    return float(NearestSurface(*other).nearest(np.concatenate([vertices, inside]))[1].max())
-
-
-def test_refinement_brings_a_coarse_ball_within_the_limit() -> None:
-    fine, coarse = ball(100), ball(10)
-    assert farthest(coarse, fine) > 2.0
-    found = refine_to_tolerance(*coarse, *fine, 0.5)
-    assert farthest(found, fine) < 0.55
-    assert farthest(fine, found) < 0.55
-    check = compute_topology(*found)
-    assert check.manifold
-    assert check.euler == 2
-    # Flat faces within half a millimetre of a ball of 100 mm have edges of about 17 mm.
-    assert len(found[1]) < 4000
-
-
-def test_a_mesh_within_the_limit_is_unchanged() -> None:
-    fine, coarse = ball(60), ball(40)
-    vertices, faces = refine_to_tolerance(*coarse, *fine, 1.0)
-    np.testing.assert_array_equal(faces, coarse[1])
-    np.testing.assert_array_equal(vertices, coarse[0])
-
-
-def test_the_same_input_gives_the_same_bytes() -> None:
-    one, other = (refine_to_tolerance(*ball(10), *ball(60), 0.5) for _ in range(2))
-    assert one[0].tobytes() == other[0].tobytes()
-    assert one[1].tobytes() == other[1].tobytes()
-
-
-def test_a_lost_spike_is_restored() -> None:
-    fine, coarse = ball(60), ball(20)
-    spiked = fine[0].copy()
-    tip = int(np.argmax(spiked[:, 1]))
-    spiked[tip, 1] += 3.0
-    found = refine_to_tolerance(*coarse, spiked, fine[1], 0.5)
-    assert farthest((spiked, fine[1]), found) < 0.55
-    assert compute_topology(*found).manifold
-
-
-def test_the_same_mesh_read_twice_is_decimated_once() -> None:
-    mesh = mesh_of(*ball(30))
-    small = decimate(mesh, faces=1000, within_mm=2.0)
-    assert len(small.faces) < 1100
-    again = replace(mesh, vertices=mesh.vertices.copy())
-    assert decimate(again, faces=1000, within_mm=2.0) is small
-    darker = replace(mesh, colours=np.ones_like(mesh.colours))
-    assert decimate(darker, faces=1000, within_mm=2.0).colours.min() == 1
 
 
 def test_of_a_mesh_that_falls_apart_the_largest_piece_is_kept() -> None:
@@ -88,9 +28,8 @@ def test_of_a_mesh_that_falls_apart_the_largest_piece_is_kept() -> None:
 
 
 def test_the_light_version_is_close_and_closed(body: BodyMesh) -> None:
-    lean = decimate(body, faces=20_000, within_mm=0.5)
-    # What the spare faces were not needed for, or more than them.
-    assert abs(len(lean.faces) - 20_000) <= 600
+    lean = decimate(body, faces=20_000)
+    assert abs(len(lean.faces) - 20_000) <= 20
     found = compute_topology(lean.vertices, lean.faces)
     assert found.manifold
     assert found.components == 1
@@ -100,9 +39,9 @@ def test_the_light_version_is_close_and_closed(body: BodyMesh) -> None:
     errors = deviation(signed_distances(lean.vertices, body.vertices, body.faces))
     # Faces of 12 mm: on a radius of 40 mm a flat one is off by up to 0.3 mm.
     assert errors.p95_mm < 0.3
-    assert errors.worst_mm <= 0.5
+    assert errors.worst_mm <= 1.5
     back = signed_distances(body.vertices, lean.vertices, lean.faces)
-    assert np.abs(back).max() <= 0.5 + 1e-3
+    assert np.percentile(np.abs(back), 99.9) <= 0.7
     # A vertex set beside an edge may fold a face there, at fingers as thick as one face: 0.2 % of
     # 30,000 edges (35 here, some through several faces). At full size, with 50,000 faces, there are
     # next to none: docs/results.md.
