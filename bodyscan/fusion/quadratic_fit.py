@@ -153,11 +153,12 @@ def fit_trimmed_windows(
     border = (reach, reach, reach, reach)
     padded = cv2.copyMakeBorder(inverse, *border, cv2.BORDER_CONSTANT, value=0.0)
     fits = (fit.value, fit.slope_u, fit.slope_v, fit.sigma)
-    _fit_trimmed(padded, noise, pixels, reach, pixel_mm, fits, fitted)
+    _fit_trimmed(window_basis(reach), padded, noise, pixels, reach, pixel_mm, fits, fitted)
 
 
 @compiled
 def _fit_trimmed(
+    basis: Array,
     padded: Floats,
     noise: Floats,
     pixels: NDArray[np.intp],
@@ -166,31 +167,28 @@ def _fit_trimmed(
     fits: tuple[Floats, Floats, Floats, Floats],
     fitted: Mask,
 ) -> None:
-    side, width = 2 * reach + 1, noise.shape[1]
-    residual, inlier = np.empty(side * side), np.empty(side * side, np.bool_)
+    width = noise.shape[1]
+    residual, inlier = np.empty(len(basis)), np.empty(len(basis), np.bool_)
     normal, solution = np.empty((6, 6)), np.empty(6)
     for pixel in pixels:
         row, column = pixel // width, pixel % width
         centre, unit = float(padded[row + reach, column + reach]), float(noise[row, column])
         # Change of 1/z, in sigmas, per pixel on a surface at 45 degrees.
         step = pixel_mm * centre * centre / unit
-        n = 0
-        for dv in range(-reach, reach + 1):
-            for du in range(-reach, reach + 1):
-                sample = padded[row + reach + dv, column + reach + du]
-                distance = np.sqrt(du * du + dv * dv)
-                residual[n] = (float(sample) - centre) / unit
-                # Four sigmas, plus as much as the steepest useful surface rises.
-                near = sample > 0.0 and abs(residual[n]) < 4.0 + 4.0 * step * distance
-                if not near:
-                    residual[n] = np.inf
-                inlier[n] = near and distance < 2.5
-                n += 1
+        for n in range(len(basis)):
+            du, dv = int(basis[n, 1]), int(basis[n, 2])
+            sample, distance = padded[row + reach + dv, column + reach + du], np.hypot(du, dv)
+            residual[n] = (float(sample) - centre) / unit
+            # Four sigmas, plus as much as the steepest useful surface rises.
+            near = sample > 0.0 and abs(residual[n]) < 4.0 + 4.0 * step * distance
+            if not near:
+                residual[n] = np.inf
+            inlier[n] = near and distance < 2.5
         ridge = (step * pixel_mm / (2.0 * 6.0)) ** -2.0
         for limit in (8.0, 3.0):
-            _solve_window(residual, inlier, reach, ridge, normal, solution)
-            _find_inliers(residual, solution, reach, limit, inlier)
-        count = _solve_window(residual, inlier, reach, ridge, normal, solution)
+            _solve_window(basis, residual, inlier, ridge, normal, solution)
+            _find_inliers(basis, residual, solution, limit, inlier)
+        count = _solve_window(basis, residual, inlier, ridge, normal, solution)
         variance = 1.0 / normal[0, 0]
         fits[0][row, column] = centre + solution[0] * unit
         fits[1][row, column] = solution[1] * unit
@@ -200,54 +198,39 @@ def _fit_trimmed(
 
 
 @compiled
-def _find_inliers(residual: Array, solution: Array, reach: int, limit: float, inlier: Mask) -> None:
-    a, b, c, d, e, f = solution
-    n = 0
-    for v in range(-reach, reach + 1):
-        for u in range(-reach, reach + 1):
-            model = a + v * (c + v * f) + u * (b + v * e + u * d)
-            inlier[n] = abs(residual[n] - model) < limit
-            n += 1
+def _find_inliers(
+    basis: Array, residual: Array, solution: Array, limit: float, inlier: Mask
+) -> None:
+    for n in range(len(basis)):
+        model = 0.0
+        for i in range(6):
+            model += basis[n, i] * solution[i]
+        inlier[n] = abs(residual[n] - model) < limit
 
 
 @compiled
 def _solve_window(
-    residual: Array, inlier: Mask, reach: int, ridge: float, normal: Array, solution: Array
+    basis: Array, residual: Array, inlier: Mask, ridge: float, normal: Array, solution: Array
 ) -> int:
     """Solve for a window's six coefficients; return the number of inliers.
 
+    basis: (samples, 6), see `window_basis`.
     ridge: information of the prior on each of the last three.
     normal: overwritten; its first element becomes the first coefficient's inverse variance.
     """
-    s00 = s10 = s01 = s20 = s11 = s02 = s30 = s21 = s12 = s03 = 0.0
-    s40 = s31 = s22 = s13 = s04 = r00 = r10 = r01 = r20 = r11 = r02 = 0.0
-    n = 0
-    for dv in range(-reach, reach + 1):
-        for du in range(-reach, reach + 1):
-            if inlier[n]:
-                u, v, r = float(du), float(dv), residual[n]
-                uu, uv, vv = u * u, u * v, v * v
-                s00, s10, s01 = s00 + 1.0, s10 + u, s01 + v
-                s20, s11, s02 = s20 + uu, s11 + uv, s02 + vv
-                s30, s21, s12, s03 = s30 + uu * u, s21 + uu * v, s12 + u * vv, s03 + vv * v
-                s40, s31, s22 = s40 + uu * uu, s31 + uu * uv, s22 + uu * vv
-                s13, s04 = s13 + uv * vv, s04 + vv * vv
-                r00, r10, r01 = r00 + r, r10 + r * u, r01 + r * v
-                r20, r11, r02 = r20 + r * uu, r11 + r * uv, r02 + r * vv
-            n += 1
-    tiny = 1e-6
-    upper = (
-        (s00 + tiny, s10, s01, s20, s11, s02),
-        (s10, s20 + tiny, s11, s30, s21, s12),
-        (s01, s11, s02 + tiny, s21, s12, s03),
-        (s20, s30, s21, s40 + ridge, s31, s22),
-        (s11, s21, s12, s31, s22 + ridge, s13),
-        (s02, s12, s03, s22, s13, s04 + ridge),
-    )
+    count = 0
     for i in range(6):
-        solution[i] = (r00, r10, r01, r20, r11, r02)[i]
+        solution[i] = 0.0
         for j in range(i, 6):
-            normal[i, j] = upper[i][j]
+            normal[i, j] = 0.0
+        normal[i, i] = ridge if i > 2 else 1e-6
+    for n in range(len(basis)):
+        if inlier[n]:
+            count += 1
+            for i in range(6):
+                solution[i] += basis[n, i] * residual[n]
+                for j in range(i, 6):
+                    normal[i, j] += basis[n, i] * basis[n, j]
     # Gaussian elimination from the last unknown to the second: the first one's pivot is then its
     # inverse variance. The matrix is positive definite, so no pivoting is needed.
     for k in range(5, 0, -1):
@@ -260,7 +243,7 @@ def _solve_window(
         for k in range(i):
             solution[i] -= normal[k, i] * solution[k]
         solution[i] /= normal[i, i]
-    return int(s00)
+    return count
 
 
 def _noise_scale(

@@ -51,7 +51,7 @@ def test_one_from_each_voxel_and_the_best(count: int, size: float, seed: int) ->
 
 
 def test_small_voxels_in_a_large_box() -> None:
-    """More blocks of voxels than a table holds: they become larger, and the choice stays."""
+    """Many more voxels than points: only occupied ones take memory."""
     points = np.concatenate([sphere(2000), sphere(2000, seed=1) + np.float32(3000.0)])
     chosen = select_per_voxel(points, np.zeros(len(points), bool), 1.0)
     assert len(chosen) == len(np.unique(cells(points, 1.0), axis=0))
