@@ -12,7 +12,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from bodyscan.arrays import Array, Bytes, Floats, Mask, find_crop, pad_crop
+from bodyscan.arrays import Bytes, Floats, Mask, find_crop, pad_crop
 from bodyscan.compiled import compiled
 from bodyscan.errors import ScanFailed
 from bodyscan.geometry.transforms import RigidTransform
@@ -86,10 +86,9 @@ def cut_to_volume(image: RangeImage, rig_from_camera: RigidTransform, volume: Vo
 
 def find_inside(image: RangeImage, rig_from_camera: RigidTransform, volume: Volume) -> Mask:
     """(h, w): where a point was measured inside the upright cylinder of the scan volume."""
-    within = np.empty(image.sigma_mm.shape, np.bool_)
-    size = (volume.radius_mm, volume.bottom_mm, volume.top_mm)
-    _inside(image.points, image.sigma_mm, rig_from_camera.matrix[:3], size, within)
-    return within
+    x, y, z = cv2.split(cv2.transform(image.points, rig_from_camera.matrix[:3]))
+    around = x * x + y * y < volume.radius_mm**2
+    return around & (z > volume.bottom_mm) & (z < volume.top_mm) & np.isfinite(image.sigma_mm)
 
 
 def find_foreground(image: RangeImage, empty: RangeImage) -> Mask:
@@ -136,30 +135,6 @@ def find_dark_gaps(grey: Bytes) -> Mask:
     # Less than 30 grey levels may be noise on a dark surface.
     dark = (around > 2.0 * grey) & (around >= grey + np.float32(30))
     return cv2.dilate(dark.view(np.uint8), np.ones((3, 3), np.uint8)).view(bool)
-
-
-@compiled
-def _inside(
-    points: Floats,
-    sigma_mm: Floats,
-    rig_from_camera: Array,
-    size: tuple[float, float, float],
-    within: Mask,
-) -> None:
-    """Set within (H, W): which points (H, W, 3) with a sigma lie in an upright cylinder.
-
-    rig_from_camera: (3, 4). size: radius, bottom and top of the cylinder, mm.
-    """
-    m, (radius, bottom, top) = rig_from_camera, size
-    for v in range(within.shape[0]):
-        for u in range(within.shape[1]):
-            x, y, z = points[v, u, 0], points[v, u, 1], points[v, u, 2]
-            rig_x = m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]
-            rig_y = m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]
-            rig_z = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
-            around = rig_x * rig_x + rig_y * rig_y < radius * radius
-            measured = sigma_mm[v, u] < np.inf
-            within[v, u] = around & (rig_z > bottom) & (rig_z < top) & measured
 
 
 @compiled

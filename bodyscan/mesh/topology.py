@@ -233,25 +233,15 @@ def find_handles(vertices: Array, faces: Indices, *, min_height_mm: float = 80.0
     height = np.zeros(count)
     height[component] = layer_mm * (layer + 0.5)
     y = np.bincount(component, vertices[:, 1], count) / np.bincount(component, minlength=count)
-    links = prune_branches(np.unique(component[edges[~within]], axis=0))
-    if not len(links):
-        return []
+    links = np.unique(np.sort(component[edges[~within]], axis=1), axis=0)
+    if len(links) == count - connect(links, count)[0]:
+        return []  # a forest
     import networkx as nx  # takes a fifth of a second to load; few bodies have a handle
 
     handles = []
-    for cycle in nx.minimum_cycle_basis(nx.Graph(links.tolist())):
+    for cycle in nx.minimum_cycle_basis(nx.k_core(nx.Graph(links.tolist()), 2)):
         heights = height[cycle]
         if np.ptp(heights) >= min_height_mm:
             low, high = float(heights.min()), float(heights.max())
             handles.append(Handle(low, high, float(y[cycle].mean())))
     return sorted(handles, key=lambda handle: (handle.low_mm, handle.y_mm))
-
-
-def prune_branches(links: Indices) -> Indices:
-    """Reduce links (N, 2) to the graph's 2-core, without those to nodes that have no other link."""
-    links = np.unique(np.sort(links, axis=1), axis=0)
-    while True:
-        inside = (np.bincount(links.ravel())[links] > 1).all(axis=1)
-        if inside.all():
-            return links
-        links = links[inside]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import networkx as nx
 import numpy as np
 import open3d as o3d
 import pytest
@@ -21,7 +20,6 @@ from bodyscan.mesh.topology import (
     find_twins,
     label_components,
     label_corner_fans,
-    prune_branches,
     signed_volume,
     vertex_normals,
 )
@@ -158,13 +156,3 @@ def test_handles_are_sorted_by_height_then_from_right_to_left() -> None:
     found = find_handles(*together(*(upright_ring(80.0, centre) for centre in centres)))
     assert [round(handle.y_mm, -2) for handle in found] == [0.0, -200.0, 200.0, 0.0]
     assert np.diff([handle.low_mm for handle in found]).tolist() == [500.0, 0.0, 400.0]
-
-
-def test_pruning_branches_leaves_the_graphs_core() -> None:
-    rng = np.random.default_rng(5)
-    for count in range(1, 60):
-        links = rng.integers(2 + count // 3, size=(count, 2))
-        links = links[links[:, 0] != links[:, 1]]
-        core = nx.k_core(nx.Graph(links.tolist()), 2)
-        found = {frozenset(link) for link in prune_branches(links).tolist()}
-        assert found == {frozenset(edge) for edge in core.edges}
