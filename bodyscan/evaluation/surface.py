@@ -13,8 +13,7 @@ from scipy.spatial import cKDTree
 
 from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.errors import BadInput
-from bodyscan.fusion.scan_facts import FILE_NAME
-from bodyscan.fusion.storage import load_scan
+from bodyscan.fusion.storage import FILE_NAME, load_scan
 from bodyscan.geometry.robust import rms
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyMesh

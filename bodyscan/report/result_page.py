@@ -6,7 +6,7 @@ from pathlib import Path
 
 from bodyscan.errors import BadInput
 from bodyscan.files.atomic import write_json, write_text
-from bodyscan.fusion import scan_facts as scans
+from bodyscan.fusion import storage as scans
 from bodyscan.registration import storage as calibrations
 from bodyscan.report.page import Page, render
 from bodyscan.verdict import Verdict

@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 
 from bodyscan.evaluation.surface import Comparison, compare_surfaces
-from bodyscan.fusion.scan_facts import read_facts, stored_verdict
-from bodyscan.fusion.storage import StoredScan, load_scan
+from bodyscan.fusion.storage import StoredScan, load_scan, read_facts, stored_verdict
 from bodyscan.fusion.verdict.coverage import MAX_FILLED
 from bodyscan.fusion.verdict.motion import MAX_MOTION_MM, MAX_RESIDUAL_MM
 from bodyscan.fusion.verdict.overlaps import MAX_DISAGREEMENT_MM

@@ -15,8 +15,7 @@ from hypothesis import strategies as st
 
 from bodyscan.errors import BodyscanError, ResultError
 from bodyscan.export.scan import export_scan
-from bodyscan.fusion.scan_facts import read_facts
-from bodyscan.fusion.storage import load_scan
+from bodyscan.fusion.storage import load_scan, read_facts
 
 STORED = Path(__file__).parents[1] / "data" / "stored-0.1.0" / "scan"
 
