@@ -11,10 +11,8 @@ from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.report.page import (
     Column,
     Lines,
-    Number,
     Numbers,
     Page,
-    Paragraph,
     Section,
     Table,
     format_value,
@@ -48,6 +46,15 @@ def acceptance_page(
     calibration_id: str,
     synthetic: bool,
 ) -> Page:
+    numbers = Numbers(
+        tuple(
+            (
+                Column(one.title, "mm", f"{one.meaning}; the largest: {one.where}", one.limit_mm),
+                None if one.value_mm is None else abs(one.value_mm),
+            )
+            for one in found
+        )
+    )
     return Page(
         f"Acceptance of rig {calibration.rig.name}",
         grade_acceptance(found, readings),
@@ -55,26 +62,11 @@ def acceptance_page(
         (("calibration", calibration_id[:12]),),
         calibration.axes,
         [
-            Section("Figures", [Paragraph(NO_STANDARD), _numbers(found)]),
+            Section("Figures", [NO_STANDARD, numbers]),
             Section("Spheres, all pairs merged", [_spheres(readings), _spacings(readings)]),
             Section("Plate", [_plates(readings)]),
             Section("Problems", [Lines(readings.problems or ("None.",))]),
         ],
-    )
-
-
-def _numbers(found: Sequence[Figure]) -> Numbers:
-    return Numbers(
-        tuple(
-            Number(
-                one.title,
-                None if one.value_mm is None else abs(one.value_mm),
-                "mm",
-                f"{one.meaning}; the largest: {one.where}",
-                one.limit_mm,
-            )
-            for one in found
-        )
     )
 
 

@@ -20,7 +20,6 @@ from bodyscan.report.page import (
     Block,
     Lines,
     Page,
-    Paragraph,
     Picture,
     Table,
     Viewer,
@@ -136,7 +135,7 @@ def _boards(calibration: RigCalibration) -> list[Block]:
             else "This calibration was stored without its corners: calibrate again to see where the "
             "boards lay in each picture, and their residuals."
         )
-        return [Lines((why,))]
+        return [why]
     residuals, times = draw.residual_chart(calibration)
     return [
         Picture(
@@ -157,10 +156,10 @@ def _boards(calibration: RigCalibration) -> list[Block]:
 
 def _planes(calibration: RigCalibration) -> list[Block]:
     if all(pair.sheets is None for pair in calibration.pairs.values()):
-        return [Lines(("No pair has a projector.",))]
-    tried = Paragraph("No model of the light was tried on held-out boards: it was given.")
+        return ["No pair has a projector."]
+    tried = "No model of the light was tried on held-out boards: it was given."
     if any(pair.quality.held_out for pair in calibration.pairs.values()):
-        tried = Paragraph(
+        tried = (
             "Each model was fitted without a board and tried on it; mean distance from that board "
             "(mm, outliers capped). In use: the simplest that none after it beats by three standard "
             "errors at the same points."
@@ -179,7 +178,7 @@ def _planes(calibration: RigCalibration) -> list[Block]:
 
 def _shared_boards(calibration: RigCalibration) -> list[Block]:
     if len(calibration.observed) < 2:
-        return [Lines(("There is nothing to share.",))]
+        return ["There is nothing to share."]
     shared = draw.shared_boards(calibration)
     counts = np.where(shared > 0, shared, np.nan)
     return [
@@ -194,7 +193,7 @@ def _shared_boards(calibration: RigCalibration) -> list[Block]:
 def _sigma(calibration: RigCalibration) -> list[Block]:
     why = why_no_sigma(calibration)
     if why is not None:
-        return [Lines((f"There is no map: {why[0]}; {why[1]}.",))]
+        return [f"There is no map: {why[0]}; {why[1]}."]
     return [
         Picture(
             "Sigma over the scan volume",

@@ -64,7 +64,7 @@ class PairFigures:
         """Yield each limit that is exceeded: by what factor, and in words."""
         limited = (column for column in PAIR_COLUMNS if column.limit is not None)
         for column, reason, value in zip(limited, REASONS, astuple(self)[1:], strict=True):
-            if column.cell(value).within_limit is False:
+            if column.keeps_limit(value) is False:
                 limit = float(column.limit or 0.0)
                 times = limit / max(value, 1e-9) if column.at_least else value / limit
                 side = "at least" if column.at_least else "at most"

@@ -17,45 +17,12 @@ from bodyscan.optional import optional
 from bodyscan.verdict import Verdict
 from bodyscan.version import __version__
 
-
-@dataclass(frozen=True)
-class Number:
-    """One figure that explains itself: what it is, its unit, and its limit."""
-
-    name: str
-    value: float | str | None
-    unit: str
-    meaning: str
-    limit: float | None = None
-    at_least: bool = False
-    digits: int = 3
-
-    @property
-    def within_limit(self) -> bool | None:
-        """Whether the limit is kept; None without a limit or a value."""
-        if self.limit is None or not isinstance(self.value, float | int):
-            return None
-        return self.value >= self.limit if self.at_least else self.value <= self.limit
-
-    @property
-    def mark(self) -> str:
-        return {None: "", True: "good", False: "bad"}[self.within_limit]
-
-    @property
-    def text(self) -> str:
-        return format_value(self.value, self.digits)
-
-    @property
-    def limit_text(self) -> str:
-        if self.limit is None:
-            return "–"
-        side = "at least" if self.at_least else "at most"
-        return f"{side} {format_value(self.limit, self.digits)}"
+Value = float | str | None
 
 
 @dataclass(frozen=True)
 class Column:
-    """A table's column: its heading, unit, and what it holds."""
+    """A figure, or a table's column of them: its name, unit, what it holds, and its limit."""
 
     name: str
     unit: str = ""
@@ -64,39 +31,38 @@ class Column:
     at_least: bool = False
     digits: int = 3
 
-    def cell(self, value: float | str | None) -> Number:
-        return Number(self.name, value, self.unit, "", self.limit, self.at_least, self.digits)
+    def keeps_limit(self, value: Value) -> bool | None:
+        """Whether a value keeps the limit; None without a limit or a value."""
+        if self.limit is None or not isinstance(value, float | int):
+            return None
+        return value >= self.limit if self.at_least else value <= self.limit
+
+    def mark(self, value: Value) -> str:
+        return {None: "", True: "good", False: "bad"}[self.keeps_limit(value)]
+
+    def text(self, value: Value) -> str:
+        return format_value(value, self.digits)
 
     @property
     def limit_text(self) -> str:
-        return self.cell(None).limit_text
+        if self.limit is None:
+            return "–"
+        return f"{'at least' if self.at_least else 'at most'} {self.text(self.limit)}"
 
 
 @dataclass(frozen=True)
 class Numbers:
-    items: tuple[Number, ...]
+    """A list of figures that explain themselves."""
+
+    items: tuple[tuple[Column, Value], ...]
     kind: Literal["numbers"] = "numbers"
 
 
 @dataclass(frozen=True)
 class Table:
     columns: tuple[Column, ...]
-    rows: tuple[tuple[float | str | None, ...], ...]
+    rows: tuple[tuple[Value, ...], ...]
     kind: Literal["table"] = "table"
-
-    @property
-    def cells(self) -> list[list[Number]]:
-        return [[c.cell(v) for c, v in zip(self.columns, row, strict=True)] for row in self.rows]
-
-    @property
-    def definitions(self) -> list[Column]:
-        return [column for column in self.columns if column.meaning]
-
-
-@dataclass(frozen=True)
-class Paragraph:
-    text: str
-    kind: Literal["paragraph"] = "paragraph"
 
 
 @dataclass(frozen=True)
@@ -138,7 +104,8 @@ class Viewer:
         return Markup(text.replace("<", "\\u003c"))
 
 
-Block = Paragraph | Numbers | Table | Lines | Picture | Viewer
+Block = str | Numbers | Table | Lines | Picture | Viewer
+"""A paragraph, or something else that a section holds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,7 +166,7 @@ def render(page: Page) -> str:
     )
 
 
-def format_value(value: float | str | None, digits: int = 3) -> str:
+def format_value(value: Value, digits: int = 3) -> str:
     """A value as people read it."""
     if value is None:
         return "–"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import calendar
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import astuple
 from datetime import datetime
 from functools import partial
@@ -28,13 +28,12 @@ from bodyscan.report.page import (
     Block,
     Column,
     Lines,
-    Number,
     Numbers,
     Page,
-    Paragraph,
     Picture,
     Section,
     Table,
+    Value,
     Viewer,
     is_synthetic,
     make_sections,
@@ -95,14 +94,10 @@ def _sections(scan: StoredScan, found: list[Comparison]) -> list[Section]:
         parts["The person"] = lambda: _person(scan.facts["person"])
     if shown:
         parts[f"Compared with {shown.name}"] = lambda: _comparison(scan.mesh, found, shown, limit)
-    return make_sections(
-        parts
-        | {
-            "Pictures": lambda: _pictures(scan),
-            "Pairs and their overlaps": lambda: _pairs(scan.facts),
-            "Holes": lambda: _holes(scan),
-        }
-    )
+    parts["Pictures"] = lambda: _pictures(scan)
+    parts["Pairs and their overlaps"] = lambda: _pairs(scan.facts)
+    parts["Holes"] = lambda: _holes(scan)
+    return make_sections(parts)
 
 
 def _body(scan: StoredScan, shown: Comparison | None, limit: float) -> list[Block]:
@@ -120,84 +115,48 @@ def _body(scan: StoredScan, shown: Comparison | None, limit: float) -> list[Bloc
 
 
 def _numbers(scan: StoredScan) -> Numbers:
-    facts, mesh = scan.facts, scan.mesh
-    made_up = 100.0 * mesh.filled_share
+    mesh, sigma_mm = scan.mesh, scan.cloud.sigma_mm
     largest = next((hole.area_mm2 / 100.0 for hole in find_filled_patches(mesh)), 0.0)
     shape = compute_topology(mesh.vertices, mesh.faces)
-    items = [
-        Number("points", len(scan.cloud.points), "", "in the cloud, after pairs were merged"),
-        Number("faces", len(mesh.faces), "", "triangles of the closed mesh"),
-        Number(
-            "sigma, median",
-            float(np.nanmedian(scan.cloud.sigma_mm)),
-            "mm",
-            "standard deviation of a point along its normal: half of the points have less. From the "
-            "contrast of the stripes, the angles of view and light, and the calibration",
-        ),
-        Number(
-            "sigma, 95 %",
-            float(np.nanpercentile(scan.cloud.sigma_mm, 95)),
-            "mm",
-            "95 of 100 points have less",
-        ),
-        Number(
-            "filled",
-            made_up,
-            "% of area",
-            "of the mesh's surface, filled to close it where nothing was measured",
-            100.0 * MAX_FILLED,
-            digits=1,
-        ),
-        Number("largest hole", largest, "cm²", "area of the largest filled patch", digits=1),
-        Number(
-            "mesh",
-            "closed" if shape.closed and shape.manifold else "open",
-            "",
-            f"{shape.components} piece(s); closed: every edge belongs to two faces",
-        ),
-        *(
-            Number(
-                name, 100.0 * share, "% of points", "by brightness, roughness and place", digits=1
-            )
-            for name, share in compute_cover_shares(scan.cloud.regions).items()
-        ),
-        Number("volume", shape.volume_mm3 / 1e6, "l", "inside the mesh", digits=2),
-    ]
-    return Numbers((*items, *_alignment_numbers(facts)))
+    return Numbers((
+        (Column("points", "", "in the cloud, after pairs were merged"), len(sigma_mm)),
+        (Column("faces", "", "triangles of the closed mesh"), len(mesh.faces)),
+        (Column("sigma, median", "mm", "standard deviation of a point along its normal: half of the "
+                "points have less. From the contrast of the stripes, the angles of view and light, "
+                "and the calibration"), float(np.nanmedian(sigma_mm))),
+        (Column("sigma, 95 %", "mm", "95 of 100 points have less"),
+         float(np.nanpercentile(sigma_mm, 95))),
+        (Column("filled", "% of area", "of the mesh's surface, filled to close it where nothing was "
+                "measured", 100.0 * MAX_FILLED, digits=1), 100.0 * mesh.filled_share),
+        (Column("largest hole", "cm²", "area of the largest filled patch", digits=1), largest),
+        (Column("mesh", "", f"{shape.components} piece(s); closed: every edge belongs to two faces"),
+         "closed" if shape.closed and shape.manifold else "open"),
+        *((Column(name, "% of points", "by brightness, roughness and place", digits=1), 100.0 * share)
+          for name, share in compute_cover_shares(scan.cloud.regions).items()),
+        (Column("volume", "l", "inside the mesh", digits=2), shape.volume_mm3 / 1e6),
+        *_alignment_numbers(scan.facts.get("alignment")),
+    ))  # fmt: skip
 
 
-def _alignment_numbers(facts: Mapping[str, Any]) -> list[Number]:
-    alignment = facts.get("alignment")
+def _alignment_numbers(alignment: Mapping[str, Any] | None) -> Iterator[tuple[Column, Value]]:
     if alignment is None:
-        return [Number("overlaps", "not aligned", "", "pairs are at their calibrated poses")]
-    motions = sorted(alignment["motion_mm"].items(), key=lambda item: -item[1])
-    return [
-        Number(
-            "overlap residual",
-            alignment["rms_after_mm"],
-            "mm RMS",
-            "distance between what two pairs measured of the same place, after alignment",
-            MAX_DISAGREEMENT_MM,
-        ),
-        Number(
-            "overlap residual before",
-            alignment["rms_before_mm"],
-            "mm RMS",
-            "the same with the poses of the calibration alone",
-        ),
-        *(
-            Number(
-                "sway",
-                motion,
-                "mm",
-                "the largest motion of the subject between pairs, by alignment: pair "
-                f"{farthest}, at the body's middle",
-                MAX_MOTION_MM,
-                digits=2,
-            )
-            for farthest, motion in motions[:1]
-        ),
-    ]
+        yield Column("overlaps", "", "pairs are at their calibrated poses"), "not aligned"
+        return
+    after = "distance between what two pairs measured of the same place, after alignment"
+    yield (
+        Column("overlap residual", "mm RMS", after, MAX_DISAGREEMENT_MM),
+        alignment["rms_after_mm"],
+    )
+    before = "the same with the poses of the calibration alone"
+    yield Column("overlap residual before", "mm RMS", before), alignment["rms_before_mm"]
+    motions = alignment["motion_mm"]
+    if motions:
+        farthest = max(motions, key=motions.__getitem__)
+        sway = (
+            f"the largest motion of the subject between pairs, by alignment: pair {farthest}, at the "
+            "body's middle"
+        )
+        yield Column("sway", "mm", sway, MAX_MOTION_MM, digits=2), motions[farthest]
 
 
 def _person(person: Mapping[str, Any]) -> list[Block]:
@@ -205,15 +164,10 @@ def _person(person: Mapping[str, Any]) -> list[Block]:
     columns = (
         Column("part"),
         Column("moved", "mm", "most of it at most, against where it was in the middle.", digits=1),
-        Column(
-            "known to",
-            "mm",
-            "standard deviation of what remains of that, along the surface's normals.",
-            MAX_RESIDUAL_MM,
-            digits=2,
-        ),
+        Column("known to", "mm", "standard deviation of what remains of that, along the surface's "
+               "normals.", MAX_RESIDUAL_MM, digits=2),
         Column("seen once", "%", "by a single pair: no other could measure its motion.", digits=0),
-    )
+    )  # fmt: skip
     keys = ("name", "moved_mm", "left_mm", "seen_once")
     parts = [PartMotion(*(part[key] for key in keys)) for part in person["parts"]]
     rows = tuple((one.name, one.moved_mm, one.left_mm, 100.0 * one.seen_once) for one in parts)
@@ -224,7 +178,7 @@ def _person(person: Mapping[str, Any]) -> list[Block]:
         when = f"{motion.moment_ms / 1000.0:.2f} s after the scan began"
     what = motion.summary or "moved while being scanned"
     intro = f"The person {what}. Cloud and mesh show the body as of {when}."
-    return [Paragraph(intro), Table(columns, rows), Lines(motion.breath_lines)]
+    return [intro, Table(columns, rows), Lines(motion.breath_lines)]
 
 
 def _comparison(
@@ -245,19 +199,13 @@ def _comparison(
     fit = found[-1].other_from_scan
     moved = float(np.linalg.norm(fit.apply(points.mean(axis=0)) - points.mean(axis=0)))
     deviation_map = draw_deviation(
-        points,
-        mesh.normals[shown.vertices],
-        shown.signed_mm,
-        limit_mm=limit,
-        height_px=charts.PICTURE_PX,
-        caption="deviation, mm",
-    )
+        points, mesh.normals[shown.vertices], shown.signed_mm, limit_mm=limit,
+        height_px=charts.PICTURE_PX, caption="deviation, mm",
+    )  # fmt: skip
     return [
-        Paragraph(
-            f"Distances of the {len(points):,} measured vertices of this scan's mesh from the "
-            f"surface of {shown.name}; what was filled is left out. To fit it, the scan was moved "
-            f"by {moved:.2f} mm and turned by {np.degrees(fit.angle):.3f} degrees as a whole."
-        ),
+        f"Distances of the {len(points):,} measured vertices of this scan's mesh from the surface of "
+        f"{shown.name}; what was filled is left out. To fit it, the scan was moved by {moved:.2f} mm "
+        f"and turned by {np.degrees(fit.angle):.3f} degrees as a whole.",
         Table(columns, rows),
         Picture(
             "Deviation map",
@@ -277,78 +225,55 @@ def _pictures(scan: StoredScan) -> list[Block]:
     views = "From the front, from the subject's left side, from the back."
     draw = partial(draw_cloud, scan.cloud, height_px=charts.PICTURE_PX)
     mesh = partial(draw_mesh, scan.mesh, height_px=charts.PICTURE_PX)
-    return [
-        Picture(title, f"{views} {caption}", drawn())
-        for title, caption, drawn in (
-            ("Measured points, as photographed", "White: nothing was measured there.", draw),
-            ("Mesh", "Orange: filled to close the mesh.", mesh),
-            (
-                "Sigma of the points",
-                "Standard deviation of each point along its normal, mm.",
-                partial(draw, colour="sigma"),
-            ),
-            ("Pairs", "How many pairs measured each place.", partial(draw, colour="pairs_seen")),
-        )
-    ]
+    by_sigma, by_pairs = partial(draw, colour="sigma"), partial(draw, colour="pairs_seen")
+    table = (
+        ("Measured points, as photographed", "White: nothing was measured there.", draw),
+        ("Mesh", "Orange: filled to close the mesh.", mesh),
+        ("Sigma of the points", "Standard deviation of each along its normal, mm.", by_sigma),
+        ("Pairs", "How many pairs measured each place.", by_pairs),
+    )
+    return [Picture(title, f"{views} {caption}", drawn()) for title, caption, drawn in table]
 
 
 def _pairs(facts: Mapping[str, Any]) -> list[Block]:
     alignment = facts.get("alignment") or {"motion_mm": {}, "overlaps": [], "refused": {}}
-    motion, overlaps = alignment["motion_mm"], alignment["overlaps"]
+    overlaps = [o for o in alignment["overlaps"] if o["rms_after_mm"] is not None]
+
+    def residual(name: str) -> float | None:
+        known = [(o["points"], o["rms_after_mm"]) for o in overlaps if o["source"] == name]
+        points = sum(count for count, _ in known)
+        return np.sqrt(sum(n * rms**2 for n, rms in known) / points).item() if points else None
+
     rows = tuple(
-        (name, points, motion.get(name), _pair_residual(overlaps, name))
+        (name, points, alignment["motion_mm"].get(name), residual(name))
         for name, points in sorted(facts["measured"].items())
     )
     columns = (
         Column("pair"),
         Column("points", "", "measured on the subject after cleaning."),
-        Column(
-            "moved",
-            "mm",
-            "by the alignment, at the body's middle: sway of the subject and error of the pair's "
-            "pose together.",
-            MAX_MOTION_MM,
-        ),
-        Column(
-            "residual",
-            "mm RMS",
-            "from the other pairs' surfaces where they overlap, after alignment.",
-            MAX_DISAGREEMENT_MM,
-        ),
-    )
+        Column("moved", "mm", "by the alignment, at the body's middle: sway of the subject and error "
+               "of the pair's pose together.", MAX_MOTION_MM),
+        Column("residual", "mm RMS", "from the other pairs' surfaces where they overlap, after "
+               "alignment.", MAX_DISAGREEMENT_MM),
+    )  # fmt: skip
     lost = [f"{name} gave nothing: {reason}" for name, reason in facts["failed"].items()]
     lost += [
         f"{name} was left at its calibrated pose: alignment would have moved it by {sigmas:.1f} sigmas"
         for name, sigmas in alignment["refused"].items()
     ]
-    blocks: list[Block] = [Table(columns, rows)]
-    if lost:
-        blocks.append(Lines(tuple(lost)))
-    if overlaps:
-        blocks.append(_overlap_picture(overlaps))
-    return blocks
-
-
-def _pair_residual(overlaps: list[dict[str, Any]], name: str) -> float | None:
-    known = [o for o in overlaps if o["source"] == name and o["rms_after_mm"] is not None]
-    points = sum(o["points"] for o in known)
-    if not points:
-        return None
-    return float(np.sqrt(sum(o["points"] * o["rms_after_mm"] ** 2 for o in known) / points))
-
-
-def _overlap_picture(overlaps: list[dict[str, Any]]) -> Picture:
-    names = sorted({o[end] for o in overlaps for end in ("source", "target")})
-    values = np.full((len(names), len(names)), np.nan)
-    for o in overlaps:
-        if o["rms_after_mm"] is not None:
+    blocks: list[Block] = [Table(columns, rows), *([Lines(tuple(lost))] if lost else [])]
+    if alignment["overlaps"]:
+        names = sorted({o[end] for o in alignment["overlaps"] for end in ("source", "target")})
+        values = np.full((len(names), len(names)), np.nan)
+        for o in overlaps:
             values[names.index(o["source"]), names.index(o["target"])] = o["rms_after_mm"]
-    return Picture(
-        "Residuals of the overlaps",
-        "RMS distance (mm) of the points of the pair at the left from the surface of the pair below, "
-        "after alignment. Empty: the two share too little of the subject.",
-        charts.matrix(names, values, "mm RMS"),
-    )
+        caption = (
+            "RMS distance (mm) of the points of the pair at the left from the surface of the pair "
+            "below, after alignment. Empty: the two share too little of the subject."
+        )
+        chart = charts.matrix(names, values, "mm RMS")
+        blocks.append(Picture("Residuals of the overlaps", caption, chart))
+    return blocks
 
 
 def _holes(scan: StoredScan) -> list[Block]:
@@ -363,7 +288,7 @@ def _holes(scan: StoredScan) -> list[Block]:
         *(Column(name, "mm", digits=0) for name in ("height", "x", "y")),
         Column("faces"),
     )
-    intro = Paragraph(
+    intro = (
         f"Patches of at least 1 cm² that nothing measured and that were filled: {len(found)}"
         + (", of which the 8 largest are listed" if len(found) > 8 else "")
         + ". Height and place are of the patch's middle."

@@ -26,7 +26,7 @@ from bodyscan.jobs.forgetting import find_subject
 from bodyscan.mesh.body import HAIR, SKIN, BodyCloud, find_filled_patches
 from bodyscan.report.body_model import colour_layers
 from bodyscan.report.model import Layer, Shape, pack
-from bodyscan.report.page import Number, render
+from bodyscan.report.page import Column, render
 from bodyscan.report.result_page import build_page
 
 
@@ -213,11 +213,11 @@ def test_a_slip_of_the_pen_is_not_taken_for_the_folder_above(scan: MadeScan) -> 
 
 
 def test_limits_are_kept_or_not() -> None:
-    assert Number("n", 0.4, "mm", "", 0.4).within_limit
-    assert not Number("n", 0.41, "mm", "", 0.4).within_limit
-    assert Number("n", 7, "", "", 6, at_least=True).within_limit
-    assert Number("n", None, "", "", 6).within_limit is None
-    assert Number("n", 0.4, "mm", "").limit_text == "–"
+    assert Column("n", "mm", "", 0.4).keeps_limit(0.4)
+    assert not Column("n", "mm", "", 0.4).keeps_limit(0.41)
+    assert Column("n", "", "", 6, at_least=True).keeps_limit(7)
+    assert Column("n", "", "", 6).keeps_limit(None) is None
+    assert Column("n", "mm", "").limit_text == "–"
 
 
 @pytest.fixture(scope="module")
