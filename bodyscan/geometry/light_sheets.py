@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from bodyscan.arrays import Array, Floats, Mask
+from bodyscan.arrays import Array, Floats
 from bodyscan.geometry.bowed_sheets import BOW_DEGREE, PLANE_DEGREE, BowedSheets
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.camera_tables import look_up_rays, ray_table
@@ -77,7 +77,10 @@ def intersect_rays(sheets: LightSheets, rays: Array, s: Array) -> RayDepths:
 def stripes_per_pixel(sheets: LightSheets, camera: Camera, s: Floats) -> float:
     """Change of s, at constant depth, from one pixel to the next across the stripes: median over a
     sample of the pixels that have an s (height, width); 0 if none has."""
-    pixels, sampled = _sample_pixels(s, np.isfinite(s))
+    rows, columns = np.nonzero(np.isfinite(s))
+    some = slice(None, None, max(len(rows) // 400, 1))
+    pixels = np.column_stack([columns[some], rows[some]]).astype(float)
+    sampled = s[rows[some], columns[some]].astype(float)
     here = intersect_rays(sheets, camera.rays(pixels), sampled)
     neighbours = [intersect_rays(sheets, camera.rays(pixels + step), sampled) for step in np.eye(2)]
     # Along its sheet a neighbouring ray meets another depth: as if s had changed by this much
@@ -86,27 +89,6 @@ def stripes_per_pixel(sheets: LightSheets, camera: Camera, s: Floats) -> float:
     found = np.hypot(*changes)
     found = found[np.isfinite(found)]
     return float(np.median(found)) if found.size else 0.0
-
-
-def measure_stripe_residual(
-    sheets: LightSheets, camera: Camera, s: Floats, points: Floats
-) -> float:
-    """Distance in stripes between s (height, width) and the sheets through points (height, width,
-    3): median over a sample of the pixels that have both; NaN if none has."""
-    pixels, sampled = _sample_pixels(s, np.isfinite(s) & np.isfinite(points[..., 2]))
-    columns, rows = pixels.astype(np.int64).T
-    found = intersect_rays(sheets, camera.rays(pixels), sampled)
-    residuals = np.abs((points[rows, columns, 2] - found.depth) / found.per_stripe)
-    residuals = residuals[np.isfinite(residuals)]
-    return float(np.median(residuals)) if residuals.size else np.nan
-
-
-def _sample_pixels(s: Floats, wanted: Mask) -> tuple[Array, Array]:
-    """Some of the pixels wanted, (N, 2), and their s (N,)."""
-    every = np.flatnonzero(wanted)
-    some = every[:: max(len(every) // 400, 1)]
-    rows, columns = np.unravel_index(some, s.shape)
-    return np.column_stack([columns, rows]).astype(float), s.ravel()[some].astype(float)
 
 
 def triangulate_image(

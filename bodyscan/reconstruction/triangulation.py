@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import cv2
@@ -9,11 +10,9 @@ import numpy as np
 
 from bodyscan.arrays import Floats, Mask, find_crop
 from bodyscan.calibration.pair import PairCalibration
-from bodyscan.compiled import compiled
 from bodyscan.errors import BadInput
 from bodyscan.geometry.light_planes import LightSheets
 from bodyscan.geometry.light_sheets import (
-    measure_stripe_residual,
     stripes_per_pixel,
     triangulate_image,
 )
@@ -41,21 +40,22 @@ def reconstruct_range_image(pair: PairCalibration, stripes: StripeMap) -> RangeI
             where=f"pair {pair.name}",
             remedy="scan with the camera settings of the calibration, or calibrate again",
         )
-    points, sigma_mm, common_mm = _triangulate(pair, pair.sheets, stripes.s, stripes.sigma)
-    agreement, correlation_px = None, stripes.correlation_px
+    one = _triangulate(pair, pair.sheets, stripes.s, stripes.sigma)
+    (points, sigma_mm, common_mm), agreement = one, None
+    correlation_px = stripes.correlation_px
     if pair.crossing is not None and stripes.crossing is not None:
         crossing = stripes.crossing
-        *others, crossing_common = _triangulate(pair, pair.crossing, crossing.s, crossing.sigma)
+        other = _triangulate(pair, pair.crossing, crossing.s, crossing.sigma)
         # Crossing stripes are decoded everywhere, not only in the scan volume.
         alone = np.full(sigma_mm.shape, stripes.beyond is None)
-        offset, count = _measure_offset(pair, stripes, (points, sigma_mm), (others[0], others[1]))
-        shares = common_mm / sigma_mm, crossing_common / others[1]
-        points, sigma_mm, agreement = combine_directions(points, sigma_mm, *others, alone=alone)
+        points, sigma_mm, agreement = combine_directions(*one[:2], *other[:2], alone=alone)
         # The merged point gets the larger share of the two calibrations.
-        common_mm = sigma_mm * np.fmax(*shares)
+        common_mm = sigma_mm * np.fmax(one[2] / one[1], other[2] / other[1])
         if agreement is not None:
             # Noise is correlated along another direction in each: in their mean it hardly is.
             correlation_px = (0.0, 0.0)
+            offset, is_other = _measure_offset(one, other, (stripes.sigma, crossing.sigma))
+            count = (pair.sheets, pair.crossing)[is_other].stripes
             agreement = replace(agreement, offset_stripes=offset, stripes=count)
         _require_fit(pair, stripes, agreement)
     return RangeImage(
@@ -73,25 +73,24 @@ def reconstruct_range_image(pair: PairCalibration, stripes: StripeMap) -> RangeI
 
 
 def _measure_offset(
-    pair: PairCalibration,
-    stripes: StripeMap,
-    one: tuple[Floats, Floats],
-    other: tuple[Floats, Floats],
-) -> tuple[float, int]:
-    """Robust sigma, in stripes, of the less depth-sensitive direction relative to the other's points.
+    one: tuple[Floats, Floats, Floats],
+    other: tuple[Floats, Floats, Floats],
+    sigmas: Sequence[Floats],
+) -> tuple[float, bool]:
+    """Robust sigma of the directions' difference, in stripes of the less depth-sensitive one, and
+    whether that is the other.
 
-    one, other: points and sigmas of both directions. Also returns that direction's stripe count.
+    one, other: points, sigma_mm and common_mm of both directions.
+    sigmas: of their stripe coordinates.
     """
-    assert pair.sheets is not None
-    assert pair.crossing is not None
-    assert stripes.crossing is not None
     both = np.isfinite(one[1]) & np.isfinite(other[1])
-    better = not both.any() or np.median(one[1][both]) <= np.median(other[1][both])
-    sheets, s = (pair.crossing, stripes.crossing.s) if better else (pair.sheets, stripes.s)
-    points = np.where(both[..., None], one[0] if better else other[0], np.float32(np.nan))
-    return SIGMAS_PER_MEDIAN * measure_stripe_residual(
-        sheets, pair.camera, s, points
-    ), sheets.stripes
+    if not both.any():
+        return np.nan, True
+    is_other = bool(np.median(one[1][both]) <= np.median(other[1][both]))
+    _, sigma_mm, common_mm = (part[both] for part in (other if is_other else one))
+    per_mm = sigmas[is_other][both] / np.sqrt(sigma_mm**2 - common_mm**2)
+    difference = np.linalg.norm(one[0][both] - other[0][both], axis=1)
+    return SIGMAS_PER_MEDIAN * float(np.median(difference * per_mm)), is_other
 
 
 def _require_fit(pair: PairCalibration, stripes: StripeMap, agreement: Agreement | None) -> None:
@@ -170,48 +169,21 @@ def grid_normals(points: Floats, measured: Mask | None = None) -> Floats:
     box = find_crop(measured)
     if box is None:
         return normals
-    planes = np.empty((3, *measured[box].shape), np.float32)  # x/z, y/z and 1000/z
-    _divide_by_depth(points[box], planes)
-    ramp, total = np.arange(-2.0, 3.0), np.ones(5)
-    slopes_u = np.stack([cv2.sepFilter2D(plane, -1, ramp, total) for plane in planes])
-    slopes_v = np.stack([cv2.sepFilter2D(plane, -1, total, ramp) for plane in planes])
-    window, border = (
-        np.ones((5, 5), np.uint8),
-        {"borderType": cv2.BORDER_CONSTANT, "borderValue": 0},
-    )
-    inner = cv2.erode(measured[box].view(np.uint8), window, **border) > 0
-    _set_normals(planes, slopes_u, slopes_v, inner, normals[box])
+    x, y, z = np.moveaxis(points[box], -1, 0)
+    with np.errstate(all="ignore"):
+        planes = np.stack([x / z, y / z, np.float32(1000.0) / z])  # all about as large
+        ramp, total = np.arange(-2.0, 3.0), np.ones(5)
+        x_u, y_u, inverse_u = (cv2.sepFilter2D(plane, -1, ramp, total) for plane in planes)
+        x_v, y_v, inverse_v = (cv2.sepFilter2D(plane, -1, total, ramp) for plane in planes)
+        # Cramer's rule converts slopes by column and row to slopes by x/z and y/z.
+        determinant = x_u * y_v - x_v * y_u
+        p, q = inverse_u * y_v - inverse_v * y_u, inverse_v * x_u - inverse_u * x_v
+        r = determinant * planes[2] - p * planes[0] - q * planes[1]
+        length = np.sqrt(p * p + q * q + r * r)
+        found = (
+            np.stack([p, q, r], axis=-1) / np.where(determinant > 0.0, -length, length)[..., None]
+        )
+    border = {"borderType": cv2.BORDER_CONSTANT, "borderValue": 0}
+    inner = cv2.erode(measured[box].view(np.uint8), np.ones((5, 5), np.uint8), **border) > 0
+    normals[box][inner] = found[inner]
     return normals
-
-
-@compiled
-def _divide_by_depth(points: Floats, planes: Floats) -> None:
-    """Set x/z, y/z and 1000/z, which is as large, (3, h, w), of points (h, w, 3)."""
-    for v in range(planes.shape[1]):
-        for u in range(planes.shape[2]):
-            inverse = np.float32(1.0) / points[v, u, 2]
-            planes[0, v, u], planes[1, v, u] = points[v, u, 0] * inverse, points[v, u, 1] * inverse
-            planes[2, v, u] = np.float32(1000.0) * inverse
-
-
-@compiled
-def _set_normals(
-    planes: Floats, slopes_u: Floats, slopes_v: Floats, inner: Mask, normals: Floats
-) -> None:
-    """Set the normals (h, w, 3) of inner pixels; slopes of the planes by column and row, (3, h, w).
-
-    Converts slopes by column and row to slopes by x/z and y/z by Cramer's rule.
-    """
-    for v in range(planes.shape[1]):
-        for u in range(planes.shape[2]):
-            if not inner[v, u]:
-                continue
-            x_u, y_u, inverse_u = slopes_u[0, v, u], slopes_u[1, v, u], slopes_u[2, v, u]
-            x_v, y_v, inverse_v = slopes_v[0, v, u], slopes_v[1, v, u], slopes_v[2, v, u]
-            determinant = x_u * y_v - x_v * y_u
-            p = inverse_u * y_v - inverse_v * y_u
-            q = inverse_v * x_u - inverse_u * x_v
-            r = determinant * planes[2, v, u] - p * planes[0, v, u] - q * planes[1, v, u]
-            length = np.sqrt(p * p + q * q + r * r)
-            scale = np.float32(1.0) / (-length if determinant > np.float32(0.0) else length)
-            normals[v, u, 0], normals[v, u, 1], normals[v, u, 2] = p * scale, q * scale, r * scale

@@ -10,7 +10,6 @@ from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.light_planes import LightPlanes
 from bodyscan.geometry.light_sheets import (
     intersect_rays,
-    measure_stripe_residual,
     stripes_per_pixel,
 )
 from bodyscan.reconstruction.range_image import RangeImage
@@ -43,16 +42,6 @@ def test_at_one_depth_s_changes_from_pixel_to_pixel_by_their_angle_over_the_shee
     # depth changes by 8 mm of 800 to the next pixel: that is no longer linear by a hundredth.
     assert stripes_per_pixel(sheets(), CAMERA, s) == pytest.approx(0.25, rel=0.02)
     assert stripes_per_pixel(sheets(), CAMERA, np.full_like(s, np.nan)) == 0.0
-
-
-def test_how_far_points_lie_beside_their_sheets_is_told_in_stripes() -> None:
-    s, points = flat_wall()
-    assert measure_stripe_residual(sheets(), CAMERA, s, points) == pytest.approx(0.0, abs=1e-3)
-    for off in (0.3, -0.3):
-        assert measure_stripe_residual(
-            sheets(), CAMERA, s + np.float32(off), points
-        ) == pytest.approx(0.3, rel=0.02)
-    assert np.isnan(measure_stripe_residual(sheets(), CAMERA, s, np.full_like(points, np.nan)))
 
 
 def test_rays_meet_their_sheets_and_depth_changes_with_s() -> None:
