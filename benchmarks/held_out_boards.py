@@ -20,7 +20,7 @@ from bodyscan.calibration.sheet_fit import fit_pinhole
 from bodyscan.calibration.striped_view import BoardBoundaries, StripedView, on_board
 from bodyscan.captures.folder import Captures
 from bodyscan.errors import PairFailed
-from bodyscan.geometry.light_planes import LightSheets
+from bodyscan.geometry.light_planes import Axis, LightPlanes, LightSheets
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.rig.rig import Rig
 from bodyscan.stripes.stripe_map import StripeMap
@@ -86,9 +86,15 @@ def _models(
     return {
         "free planes": fit_planes(points, stripes, direction, 0.0).planes,
         "chosen by held-out boards": fit_light_sheets(points, stripes, direction).sheets,
-        "pinhole (2 x 4, stripes)": pinhole.planes(stripes, direction),
-        "pinhole (OpenCV, corners)": opencv.planes(stripes, direction),
+        "pinhole (2 x 4, stripes)": _planes(pinhole, stripes, direction),
+        "pinhole (OpenCV, corners)": _planes(opencv, stripes, direction),
     }
+
+
+def _planes(pinhole: Array, stripes: int, direction: Axis) -> LightPlanes:
+    """The planes of a projector without a lens, (2, 4)."""
+    s = np.arange(stripes + 1.0)[:, None]
+    return LightPlanes.from_planes(pinhole[0] - s * pinhole[1], direction)
 
 
 def _shots(rig: Rig, captures: Captures, pair: str) -> tuple[CameraCalibration, list[_Shot]]:

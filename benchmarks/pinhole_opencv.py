@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 
 from bodyscan.arrays import Array
-from bodyscan.calibration.sheet_fit import PinholeProjector
 from bodyscan.geometry.camera import Camera
 
 
@@ -17,10 +16,10 @@ def fit_pinhole_opencv(
     boards: Sequence[Array],
     pixels: Sequence[Array],
     rows: Sequence[Array],
-    start: PinholeProjector,
+    start: Array,
     *,
     rounds: int = 5,
-) -> PinholeProjector:
+) -> Array:
     """`cv2.stereoCalibrate` of camera and projector on board corners.
 
     boards: (N, 3) corners of each board, mm.
@@ -72,18 +71,18 @@ def fit_pinhole_opencv(
         )
         rotation, translation = solved[5], solved[6]
     whole = matrix @ np.column_stack([rotation, translation])
-    return PinholeProjector(whole[1:] / np.linalg.norm(whole[2, :3]))
+    return np.asarray(whole[1:] / np.linalg.norm(whole[2, :3]))
 
 
-def _as_camera(model: PinholeProjector) -> tuple[Array, Array, Array]:
+def _as_camera(model: Array) -> tuple[Array, Array, Array]:
     """A full pinhole whose rows are the model: equal focal lengths, centred columns."""
-    axis = model.matrix[1, :3]
-    centre = float(model.matrix[0, :3] @ axis)
-    down = model.matrix[0, :3] - centre * axis
+    axis = model[1, :3]
+    centre = float(model[0, :3] @ axis)
+    down = model[0, :3] - centre * axis
     focal = float(np.linalg.norm(down))
     down /= focal
     rotation = np.stack([np.cross(down, axis), down, axis])
-    depth = model.matrix[1, 3]
-    translation = np.array([0.0, (model.matrix[0, 3] - centre * depth) / focal, depth])
+    depth = model[1, 3]
+    translation = np.array([0.0, (model[0, 3] - centre * depth) / focal, depth])
     matrix = np.array([[focal, 0.0, 500.0], [0.0, focal, centre], [0.0, 0.0, 1.0]])
     return matrix, rotation, translation[:, None]

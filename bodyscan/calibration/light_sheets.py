@@ -115,7 +115,7 @@ def smooth_models(
     """
     few = subsample(data, 1000)
     pinhole = fit_pinhole(few.points, few.index.astype(float))
-    plain = pinhole.sheets(data.points, stripes, direction)
+    plain = LensSheets.from_matrix(pinhole, data.points.mean(axis=0), stripes, direction)
     lens = _lens_start(plain, few)
     models: list[tuple[str, SmoothSheets]] = [
         ("lens k1 k2", lens),

@@ -10,8 +10,6 @@ import numpy as np
 from bodyscan.arrays import Array
 from bodyscan.calibration.boundary_points import BoundaryPoints
 from bodyscan.geometry.least_squares import EXACT, Block, Noise, Solution, minimize
-from bodyscan.geometry.lens_sheets import LensSheets
-from bodyscan.geometry.light_planes import Axis, LightPlanes
 from bodyscan.geometry.robust import robust_scale
 from bodyscan.geometry.smooth_sheets import SmoothSheets
 
@@ -20,35 +18,15 @@ Sheets = TypeVar("Sheets", bound=SmoothSheets)
 POINTS = Noise("points on boards", cauchy=3.0, min_scale=1e-3)
 
 
-@dataclass(frozen=True, eq=False)
-class PinholeProjector:
-    """A projector without a lens as a 2 x 4 matrix (Bolles 1981).
+def fit_pinhole(points: Array, s: Array) -> Array:
+    """Fit a projector without a lens robustly, as a 2 x 4 matrix (Bolles 1981).
 
-    matrix: (2, 4), s = (row 0 . X) / (row 1 . X), X homogeneous in the camera frame, mm, scaled so
-        that the first three numbers of row 1 are a unit vector, the projector's axis.
-    """
+    points: (N, 3) on boards, camera frame.
+    s: their stripe coordinates (N,).
 
-    matrix: Array
-
-    def stripe(self, points: Array) -> Array:
-        """Stripe coordinates s (...,) of points (..., 3)."""
-        above, below = np.moveaxis(points @ self.matrix[:, :3].T + self.matrix[:, 3], -1, 0)
-        return above / below
-
-    def sheets(self, points: Array, stripes: int, direction: Axis) -> LensSheets:
-        """Convert to sheets, given points (N, 3) mm on boards."""
-        return LensSheets.from_matrix(self.matrix, points.mean(axis=0), stripes, direction)
-
-    def planes(self, stripes: int, direction: Axis) -> LightPlanes:
-        """Convert to light planes, which share one line, through the projector's centre."""
-        s = np.arange(stripes + 1.0)[:, None]
-        return LightPlanes.from_planes(self.matrix[0] - s * self.matrix[1], direction)
-
-
-def fit_pinhole(points: Array, s: Array) -> PinholeProjector:
-    """Fit robustly to points (N, 3) on boards, camera frame, and their stripe coordinates (N,).
-
-    A linear start is followed by least squares on s with a Cauchy loss, on at most 20000 points.
+    Returns (2, 4): s = (row 0 . X) / (row 1 . X), X homogeneous in the camera frame, mm, scaled so
+    that the first three numbers of row 1 are a unit vector, the projector's axis. A linear start is
+    followed by least squares on s with a Cauchy loss, on at most 20000 points.
     """
     every = -(-len(points) // 20000)
     points, s = points[::every], s[::every]
@@ -71,7 +49,7 @@ def fit_pinhole(points: Array, s: Array) -> PinholeProjector:
     solved[:, :3] /= size
     solved[:, 3] -= solved[:, :3] @ centre
     solved /= np.linalg.norm(solved[1, :3])
-    return PinholeProjector(solved * np.sign(np.sum(points[0] * solved[1, :3]) + solved[1, 3]))
+    return np.asarray(solved * np.sign(np.sum(points[0] * solved[1, :3]) + solved[1, 3]))
 
 
 @dataclass(frozen=True, eq=False)

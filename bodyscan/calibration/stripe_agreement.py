@@ -12,6 +12,7 @@ from bodyscan.calibration.boundary_points import BoundaryPoints, select, subsamp
 from bodyscan.calibration.sheet_fit import fit_pinhole, fit_sheets
 from bodyscan.errors import PairFailed
 from bodyscan.geometry.bowed_sheets import BowedSheets
+from bodyscan.geometry.lens_sheets import LensSheets
 from bodyscan.geometry.light_planes import Axis, LightSheets
 from bodyscan.geometry.light_sheets import intersect_rays
 
@@ -150,8 +151,11 @@ def _misfit(
     medians = []
     for group in groups:
         points = select(data, np.isin(data.board, group))
-        pinhole = fit_pinhole(points.points, points.index.astype(float))
-        plain = pinhole.sheets(points.points, stripes, direction)
+        pinhole, middle = (
+            fit_pinhole(points.points, points.index.astype(float)),
+            points.points.mean(0),
+        )
+        plain = LensSheets.from_matrix(pinhole, middle, stripes, direction)
         fit = fit_sheets(BowedSheets.from_pinhole(plain, 1), points, max_steps=12)
         distance = np.abs(fit.distances_mm) / np.linalg.norm(points.per_pixel, axis=1)
         medians += [float(np.median(distance[points.board == board])) for board in group]

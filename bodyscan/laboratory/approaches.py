@@ -193,8 +193,8 @@ def free_planes(points: BoundaryPoints, stripes: int, direction: Axis) -> LightP
 def pinhole_planes(points: BoundaryPoints, stripes: int, direction: Axis) -> LightPlanes:
     """Fit the 2 x 4 matrix of Bolles et al. 1981."""
     few = subsample(points, 20_000)
-    fitted = fit_pinhole(few.points, few.index.astype(float))
-    return fitted.planes(stripes, direction)
+    above, below = fit_pinhole(few.points, few.index.astype(float))
+    return LightPlanes.from_planes(above - np.arange(stripes + 1.0)[:, None] * below, direction)
 
 
 def remapped_planes(points: BoundaryPoints, stripes: int, direction: Axis) -> LightPlanes:

@@ -95,7 +95,7 @@ def fit_remapped_pinhole(points: Array, s: Array, stripes: int, direction: Axis)
 
     Robust (Cauchy), started from the matrix alone.
     """
-    start = fit_pinhole(points, s).matrix
+    start = fit_pinhole(points, s)
     middle, size = points.mean(axis=0), float(points.std())
     # In units of the point cloud's size and of half the stripes, all unknowns are about 1.
     scale = np.diag([size, size, size, 1.0])

@@ -1,4 +1,4 @@
 """Triangulation: from a pair's stripe map to a range image.
 
-triangulation within scan_volume gives a range_image; crossing_stripes combines two directions.
+triangulation within scan_volume gives a range_image.
 """

@@ -8,7 +8,62 @@ import numpy as np
 
 from bodyscan.arrays import Bytes, Crop, Floats, Mask
 from bodyscan.geometry.camera import Camera
-from bodyscan.reconstruction.crossing_stripes import Agreement
+
+MAX_RATIO = 2.0
+"""Sigmas by which the directions may typically differ. Beyond, sigmas lack most of the error (an
+imported calibration's lack all of its own) and cannot weight the directions."""
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How well the two directions agree.
+
+    pixels: number of pixels that have both depths.
+    offset_mm: robust sigma of their difference along the rays, mm.
+    offset_sigmas: the same in units of the sigmas of both depths.
+    dropped: pixels that disagree and get no point.
+    offset_stripes: the same in stripes of the less depth-sensitive direction.
+    stripes: number of stripes of that direction.
+    """
+
+    pixels: int
+    offset_mm: float
+    offset_sigmas: float
+    dropped: int
+    offset_stripes: float = np.nan
+    stripes: int = 0
+
+    @property
+    def moderate(self) -> bool:
+        """Whether the calibration, not noise, is off by more than usual.
+
+        By 0.002 of the projector's image: calibrations reproject to half a pixel or one of some 1000.
+        """
+        return self._exceeds(2e-3)
+
+    @property
+    def impossible(self) -> bool:
+        """Whether no right calibration is off by so much.
+
+        By 0.02 of the projector's image, half a degree: a wrong pose, sign or number of stripes.
+        """
+        return self._exceeds(2e-2)
+
+    @property
+    def description(self) -> str:
+        return (
+            f"{self.offset_stripes:.1f} of {self.stripes} stripes of the less depth-sensitive "
+            f"direction ({self.offset_sigmas:.1f} sigmas)"
+        )
+
+    def _exceeds(self, share: float) -> bool:
+        return self.offset_sigmas > MAX_RATIO and self.offset_stripes > share * self.stripes
+
+    def __str__(self) -> str:
+        return (
+            f"stripes of both directions agree to {self.description} at {self.pixels} pixels; "
+            f"{self.dropped} that disagree were dropped"
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,8 @@
-"""Triangulate a stripe map (2.3): intersect each pixel's ray with the light sheet of its stripe."""
+"""Triangulate a stripe map (2.3): intersect each pixel's ray with the light sheet of its stripe.
+
+With stripes of two directions a ray intersects a sheet of each. Both depths lie on the same ray, so
+they differ only by errors of decoding and calibration: a check that needs no board.
+"""
 
 from __future__ import annotations
 
@@ -17,8 +21,7 @@ from bodyscan.geometry.light_sheets import (
     triangulate_image,
 )
 from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
-from bodyscan.reconstruction.crossing_stripes import Agreement, combine_directions
-from bodyscan.reconstruction.range_image import RangeImage
+from bodyscan.reconstruction.range_image import MAX_RATIO, Agreement, RangeImage
 from bodyscan.stripes.stripe_map import StripeMap
 
 
@@ -70,6 +73,42 @@ def reconstruct_range_image(pair: PairCalibration, stripes: StripeMap) -> RangeI
         common_mm=common_mm,
         correlation_px=correlation_px,
     )
+
+
+def combine_directions(
+    points: Floats, sigma_mm: Floats, crossing: Floats, crossing_mm: Floats, *, alone: Mask
+) -> tuple[Floats, Floats, Agreement | None]:
+    """Combine points (H, W, 3) and sigmas (H, W) along their rays from both directions.
+
+    alone: where the crossing stripes may give a point by themselves, (H, W).
+
+    NaN where there are none; the agreement is None if fewer than 100 pixels have both. Depths are
+    weighted by their variances. If the sigmas are too small (an imported calibration may have none),
+    all pixels disagree equally: then only those far beyond the others are dropped, and the better
+    direction alone gives the depth, the other being a check.
+    """
+    points, sigma_mm = points.copy(), sigma_mm.copy()
+    both = np.isfinite(sigma_mm) & np.isfinite(crossing_mm)
+    alone = alone & ~np.isfinite(sigma_mm) & np.isfinite(crossing_mm)
+    points[alone], sigma_mm[alone] = crossing[alone], crossing_mm[alone]
+    pixels = int(np.count_nonzero(both))
+    if pixels < 100:
+        return points, sigma_mm, None
+    one, other = points[both], crossing[both]
+    variance, crossing_variance = sigma_mm[both] ** 2, crossing_mm[both] ** 2
+    difference = np.linalg.norm(one, axis=1) - np.linalg.norm(other, axis=1)
+    normalized = difference / np.sqrt(variance + crossing_variance)
+    sigmas = SIGMAS_PER_MEDIAN * float(np.median(np.abs(normalized)))
+    # Noise alone does not reach five sigmas; a wrong code does, or a pixel that saw two surfaces.
+    wrong = np.abs(normalized) > 5.0 * max(sigmas, 1.0)
+    share = variance / (variance + crossing_variance)  # of the crossing direction
+    if sigmas > MAX_RATIO:
+        share = np.full_like(share, float(np.median(share) > 0.5))
+    points[both] = one + share[:, None] * (other - one)
+    merged = np.sqrt((1.0 - share) ** 2 * variance + share**2 * crossing_variance)
+    sigma_mm[both] = np.where(wrong, np.float32(np.nan), merged)
+    offset = SIGMAS_PER_MEDIAN * float(np.median(np.abs(difference)))
+    return points, sigma_mm, Agreement(pixels, offset, sigmas, int(np.count_nonzero(wrong)))
 
 
 def _measure_offset(

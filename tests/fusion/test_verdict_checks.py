@@ -22,7 +22,7 @@ from bodyscan.fusion.verdict.evidence import Coverage, Seam, SeamReport
 from bodyscan.fusion.verdict.rig import find_silent_poles
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.motion.person_motion import PartMotion, PersonMotion
-from bodyscan.reconstruction.crossing_stripes import Agreement
+from bodyscan.reconstruction.range_image import Agreement
 from bodyscan.registration.rig_calibration import NominalSize
 from bodyscan.rig.rig import Volume
 from bodyscan.settings import UseLimits

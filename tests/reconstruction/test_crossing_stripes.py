@@ -15,9 +15,8 @@ from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.light_planes import Axis, LightPlanes
 from bodyscan.geometry.projector_sheets import sheets_from_projector
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.reconstruction.crossing_stripes import combine_directions
 from bodyscan.reconstruction.range_image import RangeImage
-from bodyscan.reconstruction.triangulation import reconstruct_range_image
+from bodyscan.reconstruction.triangulation import combine_directions, reconstruct_range_image
 from bodyscan.stripes.stripe_map import StripeMap
 
 WIDTH, HEIGHT = 160, 120

@@ -14,7 +14,7 @@ from bodyscan.fusion.consistency import Contradictions
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.motion.person_alignment import PersonAlignment
 from bodyscan.motion.person_motion import PersonMotion
-from bodyscan.reconstruction.crossing_stripes import Agreement
+from bodyscan.reconstruction.range_image import Agreement
 from bodyscan.registration.rig_calibration import NominalSize, RigCalibration, nominal_size
 from bodyscan.rig.rig import Volume
 from bodyscan.settings import UseLimits
