@@ -2,5 +2,5 @@
 
 Start with pair. The camera: camera, lens_choice, from board_views. Its light: striped_view,
 stripe_agreement, boundary_points, light_sheets (light_planes, sheet_fit, model_selection). Both at
-once: joint_refinement. known_pair: calibrated elsewhere. fitted_projector: for other programs.
+once: joint_refinement. known_pair: calibrated elsewhere. projector_camera: for other programs.
 """

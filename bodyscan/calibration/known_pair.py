@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from bodyscan.arrays import Array
+from bodyscan.calibration.projector_camera import intersect_central_rays, sheets_from_projector
 from bodyscan.errors import CalibrationFileError
 from bodyscan.geometry.camera import Camera, CameraPrior
 from bodyscan.geometry.light_planes import LightSheets
-from bodyscan.geometry.projector_sheets import intersect_central_rays, sheets_from_projector
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.interchange.found_camera import FoundCamera, find_camera
 from bodyscan.interchange.rig_format import MILLIMETRES, RIG_FORMATS

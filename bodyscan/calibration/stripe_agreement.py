@@ -57,11 +57,11 @@ def find_projector_motion(
     if joint < MAX_MISFIT_PX:
         return None
     best, separate = None, joint
-    for kept, others, misfit, moved in _candidate_splits(
-        boards, lambda groups: _misfit(few, groups, stripes, direction)
+    for split in _candidate_splits(
+        boards, joint, lambda groups: _misfit(few, groups, stripes, direction)
     ):
-        if 3.0 * misfit < separate:
-            best, separate = ProjectorMotion(kept, others, joint, misfit, moved), misfit
+        if 3.0 * split.separate_px < separate:
+            best, separate = split, split.separate_px
         if separate < MAX_MISFIT_PX:
             break
     if best is None and joint > (width := _stripe_width(few)):
@@ -89,44 +89,36 @@ def board_offsets(data: BoundaryPoints, sheets: LightSheets) -> Array:
 
 
 Misfit = Callable[[Sequence[Indices]], float]
-Split = tuple[Indices, Indices, float, bool]
-"""Boards kept, the others, misfit in px, and whether the projector moved."""
 
 
-def _candidate_splits(boards: Indices, misfit: Misfit) -> Iterator[Split]:
-    """Yield possible splits, simplest first."""
-    drops = _drop_boards(boards, misfit)
-    yield next(drops)
-    yield from _split_in_time(boards, misfit)
-    yield from drops
+def _candidate_splits(boards: Indices, joint: float, misfit: Misfit) -> Iterator[ProjectorMotion]:
+    """Yield possible splits, simplest first: without one board, in time, without several.
 
-
-def _drop_boards(boards: Indices, misfit: Misfit) -> Iterator[Split]:
-    """Drop one board after another, each time the one without which the others agree best.
-
-    Stops while most boards are left and their agreement still means something.
+    Boards are dropped one after another, each time the one without which the others agree best, while
+    most boards are left and their agreement still means something.
     """
     kept, min_kept = boards, max(MIN_GROUP, len(boards) // 2 + 1)
     while len(kept) > min_kept or kept is boards:
         separate, dropped = min((misfit([kept[kept != board]]), board) for board in kept)
+        first = kept is boards
         kept = kept[kept != dropped]
-        yield kept, np.setdiff1d(boards, kept), separate, False
+        yield ProjectorMotion(kept, np.setdiff1d(boards, kept), joint, separate)
+        if first and len(boards) > 3:
+            yield _split_in_time(boards, joint, misfit)
 
 
-def _split_in_time(boards: Indices, misfit: Misfit) -> Iterator[Split]:
+def _split_in_time(boards: Indices, joint: float, misfit: Misfit) -> ProjectorMotion:
     """Split all boards before a shot from all after it, where the groups agree best.
 
     If only two boards come first, their agreement means nothing: they are dropped, and the others
     determine the projector.
     """
     cuts = range(2, len(boards) - 1)
-    if cuts:
-        separate, first = min((misfit([boards[:cut], boards[cut:]]), cut) for cut in cuts)
-        before, after = boards[:first], boards[first:]
-        if first < MIN_GROUP <= len(after):
-            yield after, before, separate, False
-        else:
-            yield before, after, separate, True
+    separate, first = min((misfit([boards[:cut], boards[cut:]]), cut) for cut in cuts)
+    before, after = boards[:first], boards[first:]
+    if first < MIN_GROUP <= len(after):
+        return ProjectorMotion(after, before, joint, separate)
+    return ProjectorMotion(before, after, joint, separate, moved=True)
 
 
 def _stripe_width(data: BoundaryPoints) -> float:

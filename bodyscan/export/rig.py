@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from bodyscan.calibration.fitted_projector import FittedProjector, fit_projector
 from bodyscan.calibration.pair import PairCalibration
+from bodyscan.calibration.projector_camera import FittedProjector, fit_projector
 from bodyscan.errors import BadInput
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform

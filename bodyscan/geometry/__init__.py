@@ -2,6 +2,6 @@
 
 transforms: poses. camera with its lenses, and both as a table: camera_tables.
 Light sheets: light_planes (one plane per stripe, Eq. 6), smooth_sheets with its models bowed_sheets
-and lens_sheets, projector_sheets (a projector described as a camera), light_sheets (any of them).
+and lens_sheets, light_sheets (any of them).
 least_squares, linear_gaussian, robust: estimation. uncertainty: of a calibration.
 """

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bodyscan.arrays import Array
-from bodyscan.calibration.fitted_projector import fit_projector
+from bodyscan.calibration.projector_camera import fit_projector, sheets_from_projector
 from bodyscan.errors import BadInput
 from bodyscan.geometry.bowed_sheets import BowedSheets
 from bodyscan.geometry.camera import Camera
@@ -16,7 +16,6 @@ from bodyscan.geometry.lens_sheets import LensSheets
 from bodyscan.geometry.lenses import lens_from_opencv
 from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.light_planes import Axis, LightPlanes
-from bodyscan.geometry.projector_sheets import sheets_from_projector
 from bodyscan.geometry.transforms import RigidTransform
 
 CAMERA = Camera(1400.0, 1410.0, 0.3, 640.0, 500.0, Radial(-0.1, 0.05), 1280, 1024)

@@ -14,13 +14,13 @@ from real_captures import real_rig_file
 
 from bodyscan.arrays import Array
 from bodyscan.calibration.pair import PairCalibration, PairQuality
+from bodyscan.calibration.projector_camera import sheets_from_projector
 from bodyscan.export.rig import export_rig, fit_projectors
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lens_sheets import LensSheets
 from bodyscan.geometry.lenses import lens_from_opencv
 from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.light_planes import LightSheets
-from bodyscan.geometry.projector_sheets import sheets_from_projector
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.interchange.rig_format import RIG_FORMATS

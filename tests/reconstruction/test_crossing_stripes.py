@@ -9,11 +9,11 @@ import pytest
 
 from bodyscan.arrays import Array
 from bodyscan.calibration.pair import PairCalibration, PairQuality
+from bodyscan.calibration.projector_camera import sheets_from_projector
 from bodyscan.errors import BadInput
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.light_planes import Axis, LightPlanes
-from bodyscan.geometry.projector_sheets import sheets_from_projector
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.reconstruction.triangulation import combine_directions, reconstruct_range_image

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from bodyscan.arrays import Array
+from bodyscan.calibration.projector_camera import intersect_central_rays, sheets_from_projector
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.light_planes import Axis
-from bodyscan.geometry.projector_sheets import intersect_central_rays, sheets_from_projector
 from bodyscan.geometry.transforms import RigidTransform
 
 CAMERA = Camera(2800.0, 2790.0, 0.0, 1300.0, 970.0, Radial(-0.1, 0.05), 2592, 1944)
