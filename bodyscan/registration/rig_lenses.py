@@ -14,8 +14,7 @@ import numpy as np
 
 from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import LocatedView, PlanarView
-from bodyscan.calibration.camera import CameraCalibration, LensTrial
-from bodyscan.calibration.lens_choice import ChosenLens, choose_lens
+from bodyscan.calibration.camera import CameraCalibration, ChosenLens, LensTrial, choose_lens
 from bodyscan.calibration.model_selection import MIN_GAIN
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses import family_up_to

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bodyscan.calibration.lens_choice import MIN_CLUSTERS
+from bodyscan.calibration.camera import MIN_CLUSTERS
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.storage import FILE_NAME, calibration_id, load_calibration
 from bodyscan.report import calibration_charts as draw

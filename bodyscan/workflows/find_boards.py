@@ -26,11 +26,11 @@ from bodyscan.calibration.camera import (
     CameraCalibration,
     calibrate_camera,
     calibrate_known_camera,
+    calibrate_with_lenses,
     estimate_pose,
     locate_boards,
 )
 from bodyscan.calibration.known_pair import read_known_camera
-from bodyscan.calibration.lens_choice import calibrate_with_lenses
 from bodyscan.captures.folder import Captures, ImageSequence
 from bodyscan.captures.images import read_board_image
 from bodyscan.errors import BadInput, BodyscanError, DegeneratePoses, FailedWork, format_list

@@ -7,7 +7,7 @@ import pytest
 from picture_boards import HEIGHT, NOISE_PX, WIDTH, seen
 
 from bodyscan.calibration.board_views import PlanarView
-from bodyscan.calibration.lens_choice import calibrate_with_lenses, cluster_poses
+from bodyscan.calibration.camera import calibrate_with_lenses, cluster_poses
 from bodyscan.geometry.lenses import FAMILY
 from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.lenses.opencv import Brown, Radial, Rational

@@ -10,8 +10,7 @@ import pytest
 from picture_boards import HEIGHT, MIDDLE, NOISE_PX, POINTS, WIDTH
 
 from bodyscan.calibration.board_views import PlanarView
-from bodyscan.calibration.camera import CameraCalibration
-from bodyscan.calibration.lens_choice import calibrate_with_lenses, ray_uncertainty
+from bodyscan.calibration.camera import CameraCalibration, calibrate_with_lenses, ray_uncertainty
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses import FAMILY
 from bodyscan.geometry.lenses.lens import Lens
