@@ -207,12 +207,13 @@ def locate_board(
 def estimate_pose(camera: Camera, view: PlanarView) -> RigidTransform:
     """Estimate `camera_from_board` of one view in closed form: a start for `locate_boards`.
 
-    Source: Collins and Bartoli, Infinitesimal Plane-Based Pose Estimation, 2014 (OpenCV's).
+    Source: Terzakis and Lourakis, A Consistently Fast and Globally Optimal Solution to the
+    Perspective-n-Point Problem, ECCV 2020 (OpenCV's).
     """
     # Where the lens folds there is no ray: use the pixel with the lens ignored.
     rays = camera.rays(view.pixels)[:, :2]
     normalized = np.where(np.isfinite(rays), rays, camera.normalized_from_pixels(view.pixels))
-    flags = cv2.SOLVEPNP_IPPE
+    flags = cv2.SOLVEPNP_SQPNP
     _, turn, shift = cv2.solvePnP(view.points, normalized, np.eye(3), None, flags=flags)
     return RigidTransform.from_rotation_vector(turn, shift.ravel())
 
