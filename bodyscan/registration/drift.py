@@ -7,16 +7,15 @@ freed one after another, each time the one that explains most, until the rest fi
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
 from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.least_squares import EXACT, Block, Solution, minimize
+from bodyscan.geometry.linear_gaussian import LinearGaussianSystem, invert_scaled
 from bodyscan.geometry.transforms import RigidTransform, adjoint, twist_jacobian
 from bodyscan.geometry.uncertainty import PoseCovariance, point_covariance
 from bodyscan.registration.view_graph import Target
@@ -104,27 +103,28 @@ def find_drift(
     shared = [pose for pose in poses if len({p.pair for p in poses if p.target == pose.target}) > 1]
     pairs = tuple(sorted({pose.pair for pose in shared}))
     lonely = tuple(sorted({pose.pair for pose in poses} - set(pairs)))
-    problem = _Problem(shared, pairs, rig_from_camera, _whiten_prior(prior, pairs))
+    poses_of_pairs = {name: rig_from_camera[name] for name in pairs}
+    # The pair that fixes the rig frame has zero covariance: give it a micron.
+    micron = np.diag(np.tile([1e-6**2] * 3 + [1e-3**2] * 3, len(pairs)))
+    known = LinearGaussianSystem.from_prior(invert_scaled(prior.select(pairs) + micron))
     candidates = _groups(pairs, poles)
-    fit = before = problem.solve([])
-    moved: list[Group] = []
+    fit = before = _fit(shared, poses_of_pairs, known, [])
     while candidates:
-        tried = [(problem.solve([*moved, group]), group) for group in candidates]
-        best, group = min(tried, key=lambda one: one[0].report.cost_after)
+        fits = [_fit(shared, poses_of_pairs, known, [*fit.groups, one]) for one in candidates]
+        best = min(fits, key=lambda one: one.cost)
         # Chi-squared with six degrees of freedom exceeds 45 once in twenty million by chance.
-        if fit.report.cost_after - best.report.cost_after < 45.0:
+        if fit.cost - best.cost < 45.0:
             break
-        moved.append(group)
-        fit = best
-        candidates = [other for other in candidates if not set(other[1]) & set(group[1])]
-    moves = (problem.move(group, fit, number) for number, group in enumerate(moved))
-    freedoms = max(6 * (len(shared) - len(fit.state.boards)), 1)
+        fit, (_, moved) = best, best.groups[-1]
+        candidates = [other for other in candidates if not set(other[1]) & set(moved)]
+    moves = (fit.move(number, poses_of_pairs) for number in range(len(fit.groups)))
+    freedoms = max(6 * (len(shared) - len(fit.boards)), 1)
     return Drift(
         # Moves below 0.1 mm and 0.005 degrees, however significant, harm no scan.
         tuple(move for move in moves if move.shift_mm > 0.1 or move.turn_deg > 0.005),
-        fit.state.boards,
-        float(np.sqrt(before.report.cost_after / freedoms)),
-        float(np.sqrt(fit.report.cost_after / freedoms)),
+        fit.boards,
+        float(np.sqrt(before.cost / freedoms)),
+        float(np.sqrt(fit.cost / freedoms)),
         lonely,
     )
 
@@ -139,106 +139,65 @@ def _groups(pairs: Sequence[str], poles: Mapping[str, str]) -> list[Group]:
     return groups
 
 
-def _whiten_prior(prior: PoseCovariance, pairs: Sequence[str]) -> Array:
-    """The matrix (6P, 6P) from the pairs' twists to independent standard deviations."""
-    if not pairs:
-        return np.zeros((0, 0))
-    # The pair that fixes the rig frame has zero covariance: give it a micron.
-    micron = np.diag(np.tile([1e-6**2] * 3 + [1e-3**2] * 3, len(pairs)))
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(prior.select(pairs) + micron)), np.float64)
-
-
 @dataclass(frozen=True, eq=False)
-class _Unknowns:
-    """Twists (P, 6) of the pairs within the calibration's covariance, motions of the groups, poses
-    of the boards; all in the rig frame."""
+class _Fit:
+    """Groups that may have moved, their motions with the covariance (6, 6) of each, poses of the
+    boards, and chi-squared."""
 
-    twists: Array
+    groups: list[Group]
     motions: list[RigidTransform]
+    covariances: list[Array]
     boards: dict[Target, RigidTransform]
+    cost: float
 
-    def retract(self, step: Array) -> _Unknowns:
-        twists, count = step.reshape(-1, 6), len(self.twists)
-        of_groups, of_boards = np.split(twists[count:], [len(self.motions)])
-        boards = zip(self.boards.items(), of_boards, strict=True)
-        return _Unknowns(
-            self.twists + twists[:count],
-            [motion.retract(twist) for motion, twist in zip(self.motions, of_groups, strict=True)],
-            {target: board.retract(twist) for (target, board), twist in boards},
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class _Problem:
-    """Poses of boards that several pairs see; prior: `_whiten_prior`."""
-
-    poses: Sequence[ObservedPose]
-    pairs: tuple[str, ...]
-    rig_from_camera: Mapping[str, RigidTransform]
-    prior: Array
-
-    def solve(self, groups: Sequence[Group]) -> Solution[_Unknowns]:
-        """Fit all unknowns, with free motions of these groups."""
-        boards = {target: self._majority_pose(target) for target in {p.target for p in self.poses}}
-        start = _Unknowns(
-            np.zeros((len(self.pairs), 6)),
-            [RigidTransform.identity()] * len(groups),
-            dict(sorted(boards.items())),
-        )
-        return minimize(
-            start,
-            lambda state: self._blocks(groups, state),
-            _Unknowns.retract,
-            unknowns=6 * (len(self.pairs) + len(groups) + len(boards)),
-            steps=10,
-            tolerance=1e-3,  # of chi-squared
-            damping=1e-9,
-        )
-
-    def _blocks(self, groups: Sequence[Group], state: _Unknowns) -> Iterator[Block]:
-        """The prior on the pairs, then for each view the offset of its board."""
-        twists, targets = state.twists.ravel(), list(state.boards)
-        yield Block(self.prior @ twists, lambda: self.prior, slice(0, twists.size), EXACT)
-        group_of = {name: g for g, (_, members) in enumerate(groups) for name in members}
-        for pose in self.poses:
-            pair, group = self.pairs.index(pose.pair), group_of.get(pose.pair)
-            camera = self.rig_from_camera[pose.pair].retract(state.twists[pair])
-            touched = [pair, len(self.pairs) + len(groups) + targets.index(pose.target)]
-            if group is not None:
-                camera = state.motions[group] @ camera
-                touched.append(len(self.pairs) + group)
-            residuals, root = _offset(pose, camera, state.boards[pose.target])
-            jacobian = np.concatenate([root, -root, root][: len(touched)], axis=1)
-            columns = (6 * np.array(touched)[:, None] + np.arange(6)).ravel()
-            yield Block(residuals, partial(np.asarray, jacobian), columns, EXACT)
-
-    def _majority_pose(self, target: Target) -> RigidTransform:
-        """`rig_from_board` by the view from which the median of all views differs least."""
-        poses = [pose for pose in self.poses if pose.target == target]
-
-        def median_distance(board: RigidTransform) -> float:
-            offsets = [_offset(p, self.rig_from_camera[p.pair], board)[0] for p in poses]
-            return float(np.median(np.sum(np.square(offsets), axis=1)))
-
-        boards = (self.rig_from_camera[pose.pair] @ pose.camera_from_board for pose in poses)
-        return min(boards, key=median_distance)
-
-    def move(self, group: Group, fit: Solution[_Unknowns], number: int) -> Move:
-        """The motion of the group that was freed as that number."""
-        name, pairs = group
-        motion, first = fit.state.motions[number], 6 * (len(self.pairs) + number)
-        covariance = fit.covariance[first : first + 6, first : first + 6]
-        middle = np.mean([self.rig_from_camera[pair].translation for pair in pairs], axis=0)
+    def move(self, number: int, rig_from_camera: Mapping[str, RigidTransform]) -> Move:
+        (name, pairs), motion = self.groups[number], self.motions[number]
+        middle = np.mean([rig_from_camera[pair].translation for pair in pairs], axis=0)
         shift_mm = float(np.linalg.norm(motion.apply(middle) - middle))
+        covariance = self.covariances[number]
         sigma_mm = float(np.sqrt(np.trace(point_covariance(covariance, middle))))
         return Move(name, pairs, motion, covariance, shift_mm, sigma_mm)
 
 
-def _offset(
-    pose: ObservedPose, rig_from_camera: RigidTransform, rig_from_board: RigidTransform
-) -> tuple[Array, Array]:
-    """Offset of a view's board from a pose (6,), in standard deviations, and the matrix (6, 6) that
-    brings twists in the rig frame to standard deviations."""
-    offset = rig_from_camera @ pose.camera_from_board @ rig_from_board.inverse()
-    root = pose.whitener @ adjoint(rig_from_camera.inverse())
-    return root @ offset.twist, root
+def _fit(
+    poses: Sequence[ObservedPose],
+    rig_from_camera: Mapping[str, RigidTransform],
+    prior: LinearGaussianSystem,
+    groups: list[Group],
+) -> _Fit:
+    """Fit motions of groups, poses of boards, and twists of the pairs within the prior on these.
+
+    prior: on the twists of all pairs.
+    """
+    pairs, motions = list(rig_from_camera), [RigidTransform.identity()] * len(groups)
+    boards = {p.target: rig_from_camera[p.pair] @ p.camera_from_board for p in reversed(poses)}
+    rows = {key: k for k, key in enumerate([*pairs, *boards])}
+    # From twists of pairs and boards, then of groups, to those of each camera and board.
+    members = [[float(key in pairs_of) for _, pairs_of in groups] for key in rows]
+    basis = np.kron(np.hstack([np.eye(len(rows)), np.reshape(members, (len(rows), -1))]), np.eye(6))
+    size = basis.shape[1]
+    padded = LinearGaussianSystem.assemble([(np.arange(prior.size), prior)], size)
+    for _ in range(5):  # nearly linear
+        placed = dict(rig_from_camera)
+        for motion, (_, moved) in zip(motions, groups, strict=True):
+            placed |= {pair: motion @ rig_from_camera[pair] for pair in moved}
+        views, squares = [], 0.0
+        for pose in poses:
+            offset = placed[pose.pair] @ pose.camera_from_board @ boards[pose.target].inverse()
+            root = pose.whitener @ adjoint(placed[pose.pair].inverse())
+            residual = root @ offset.twist
+            squares += float(residual @ residual)
+            columns = 6 * np.array([[rows[pose.pair]], [rows[pose.target]]]) + np.arange(6)
+            jacobian = np.hstack([root, -root])
+            view = LinearGaussianSystem.from_observations(jacobian, -residual, np.ones(6))
+            views.append((columns.ravel(), view))
+        system = LinearGaussianSystem.assemble(views, 6 * len(rows)).project(basis) + padded
+        step = system.solve()
+        twists = step.reshape(-1, 6)
+        cost = squares - float(system.vector @ step)
+        boards = {target: pose.retract(twists[rows[target]]) for target, pose in boards.items()}
+        motions = [m.retract(t) for m, t in zip(motions, twists[len(rows) :], strict=True)]
+    first = 6 * len(rows)
+    covariance = system.covariance()[first:, first:]
+    each = [covariance[k : k + 6, k : k + 6] for k in range(0, size - first, 6)]
+    return _Fit(groups, motions, each, dict(sorted(boards.items())), max(cost, 0.0))
