@@ -103,6 +103,8 @@ def find_drift(
     shared = [pose for pose in poses if len({p.pair for p in poses if p.target == pose.target}) > 1]
     pairs = tuple(sorted({pose.pair for pose in shared}))
     lonely = tuple(sorted({pose.pair for pose in poses} - set(pairs)))
+    if not shared:
+        return Drift((), {}, 0.0, 0.0, lonely)
     poses_of_pairs = {name: rig_from_camera[name] for name in pairs}
     # The pair that fixes the rig frame has zero covariance: give it a micron.
     micron = np.diag(np.tile([1e-6**2] * 3 + [1e-3**2] * 3, len(pairs)))
@@ -177,7 +179,7 @@ def _fit(
     basis = np.kron(np.hstack([np.eye(len(rows)), np.reshape(members, (len(rows), -1))]), np.eye(6))
     size = basis.shape[1]
     padded = LinearGaussianSystem.assemble([(np.arange(prior.size), prior)], size)
-    for _ in range(5):  # nearly linear
+    for _ in range(5):  # the problem is nearly linear
         placed = dict(rig_from_camera)
         for motion, (_, moved) in zip(motions, groups, strict=True):
             placed |= {pair: motion @ rig_from_camera[pair] for pair in moved}
