@@ -13,6 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal, TypeAlias
 
+import numpy as np
 from pydantic import Field
 
 from bodyscan.errors import CaptureError
@@ -35,8 +36,9 @@ FrameTimes: TypeAlias = Mapping[tuple[str, str], Mapping[str, float]]
 
 # Milliseconds since 1970 are 2e12, and are accepted.
 Milliseconds = Annotated[float, Field(ge=0.0, le=1e13)]
-# At least a tenth of the fastest projectors', so that seconds are not mistaken for ms.
-FrameMilliseconds = Annotated[float, Field(ge=0.01, le=6e5)]
+STEP_MS = (0.2, 2000.0)
+"""From one frame to the next: half of the fastest projectors', and twice as slow as anyone stands."""
+UNITS_MS = {"nanoseconds": 1e-6, "microseconds": 1e-3, "seconds": 1e3}
 Start = Literal["one-after-another", "together", "poles"] | dict[Name, Milliseconds]
 
 MAX_BYTES = 50_000_000  # of a file of times: a million frames
@@ -52,7 +54,7 @@ class Timing(Model):
     times: a CSV file, relative to the capture folder.
     """
 
-    frame_ms: FrameMilliseconds | None = None
+    frame_ms: Annotated[float, Field(gt=0.0, le=1e13)] | None = None
     order: tuple[str, ...] | None = None
     start: Start | None = None
     times: str | None = None
@@ -60,6 +62,9 @@ class Timing(Model):
     def problems(self) -> Iterator[Problem]:
         if self.times is None and self.frame_ms is None:
             yield ("frame_ms",), "is missing (or `times`, a file that has the time of each frame)"
+        fault = _step_fault(self.frame_ms) if self.frame_ms else ""
+        if fault:
+            yield ("frame_ms",), fault
         steady = {"frame_ms": self.frame_ms, "order": self.order, "start": self.start}
         for key in [key for key, value in steady.items() if value is not None and self.times]:
             yield (key,), "is said twice: `times` has the time of each frame"
@@ -187,6 +192,19 @@ def compute_frame_times(timing: Timing, rig: Rig, sequences: Sequences, folder: 
     return times
 
 
+def _step_fault(step_ms: float) -> str:
+    """What is wrong with a time from frame to frame, naming the unit that would fit; "" if nothing."""
+    low, high = STEP_MS
+    if low <= step_ms <= high:
+        return ""
+    unit = next((u for u, ms in UNITS_MS.items() if 1.0 <= ms * step_ms <= 1000.0), "")
+    fits = f": are these {unit} ({UNITS_MS[unit] * step_ms:.4g} ms)? If not," if unit else ":"
+    return (
+        f"{step_ms:.6g} ms from frame to frame is not between {low:g} and {high:g}, which cameras and"
+        f" people who stand can do{fits} leave `timing` out"
+    )
+
+
 def _compute_starts(timing: Timing, rig: Rig, counts: Mapping[str, int]) -> dict[str, float]:
     """Compute when each pair began, ms, from the number of frames that each took."""
     if isinstance(timing.start, dict):
@@ -218,6 +236,10 @@ def _read_times(path: Path, rig: Rig, sequences: Sequences) -> FrameTimes:
         if absent:
             text = f"has no time of {', '.join(absent)} (pair {pair}, shot {shot})"
             problems.append(YamlProblem(Place(len(lines), 1), "", text))
+    steps = [np.diff(list(times.values())) for times in found.values()]
+    fault = _step_fault(float(np.median(np.concatenate(steps)))) if any(map(len, steps)) else ""
+    if fault:
+        problems.append(YamlProblem(Place(1, 1), "", f"ms: {fault}"))
     if problems:
         raise combine_problems(path, problems, CaptureError, _TIMES_REMEDY)
     return found

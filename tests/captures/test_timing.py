@@ -101,6 +101,9 @@ def test_a_file_of_times(tmp_path: Path) -> None:
         ({"lit": "b1,p1,lit,-1"}, "2:1: ms must be a number, 0 or more"),
         ({"bit00": "b1,p1,6"}, "4:1: has 3 columns, not 4"),
         ({"bit00": ""}, "has no time of bit00 (pair p1, shot b1)"),
+        ({name: f"b1,p1,{name},{3e6 * k}" for k, name in enumerate(DEFAULT)},
+         "ms: 3e+06 ms from frame to frame is not between 0.2 and 2000, which cameras and people who"
+         " stand can do: are these nanoseconds (3 ms)?"),
     ],
 )  # fmt: skip
 def test_mistakes_in_a_file_of_times(tmp_path: Path, change: dict[str, str], message: str) -> None:
@@ -112,8 +115,11 @@ def test_mistakes_in_a_file_of_times(tmp_path: Path, change: dict[str, str], mes
 @pytest.mark.parametrize(
     ("timing", "message"),
     [
-        ("  frame_ms: 0\n  start: together", "4:13: timing.frame_ms: must be 0.01 or more (got 0)"),
-        ("  frame_ms: 1.0e+300\n  start: together", "timing.frame_ms: must be 600000 or less"),
+        ("  frame_ms: 0\n  start: together", "4:13: timing.frame_ms: must be greater than 0 (got 0)"),
+        ("  frame_ms: 0.0083\n  start: together", "timing.frame_ms: 0.0083 ms from frame to frame"),
+        ("  frame_ms: 0.0083\n  start: together", "are these seconds (8.3 ms)?"),
+        ("  frame_ms: 8300000\n  start: together", "are these nanoseconds (8.3 ms)?"),
+        ("  frame_ms: 5000\n  start: together", "are these microseconds (5 ms)? If not, leave"),
         ("  frame_ms: 10\n  start: {p1: 0, p2: 1.0e+308, cam: 3}", "timing.start.p2: must be"),
         ("  start: together", "timing.frame_ms: is missing (or `times`"),
         ("  frame_ms: 10", "timing.start: is missing: one-after-another, together, poles, or"),
