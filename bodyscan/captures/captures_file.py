@@ -62,9 +62,9 @@ class Timing(Model):
     def problems(self) -> Iterator[Problem]:
         if self.times is None and self.frame_ms is None:
             yield ("frame_ms",), "is missing (or `times`, a file that has the time of each frame)"
-        fault = _step_fault(self.frame_ms) if self.frame_ms else ""
-        if fault:
-            yield ("frame_ms",), fault
+        impossible = _step_fault(self.frame_ms) if self.frame_ms else ""
+        if impossible:
+            yield ("frame_ms",), impossible
         steady = {"frame_ms": self.frame_ms, "order": self.order, "start": self.start}
         for key in [key for key, value in steady.items() if value is not None and self.times]:
             yield (key,), "is said twice: `times` has the time of each frame"
