@@ -259,7 +259,7 @@ def versions(full: Any) -> Figures:
     """
     from benchmarks.self_intersections import self_intersections
     from bodyscan.evaluation.surface import sample_surface, signed_distances
-    from bodyscan.mesh.decimation import decimate
+    from bodyscan.mesh.repair import decimate
 
     lean = decimate(full)
     spots = sample_surface(lean.vertices, lean.faces, 500_000)[0]

@@ -19,7 +19,7 @@ from bodyscan.fusion.storage import StoredScan
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.measurement.measurements import rig_from_body
 from bodyscan.mesh.body import BodyMesh
-from bodyscan.mesh.decimation import decimate
+from bodyscan.mesh.repair import decimate
 from bodyscan.settings import ExportSettings
 
 VERSIONS: dict[str, tuple[str, Callable[[BodyMesh], BodyMesh]]] = {

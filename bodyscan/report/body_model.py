@@ -10,7 +10,7 @@ from bodyscan.arrays import Bytes, Mask
 from bodyscan.errors import ScanFailed
 from bodyscan.evaluation.surface import Comparison
 from bodyscan.mesh.body import REGION_NAMES, BodyCloud, BodyMesh, compute_cover_shares
-from bodyscan.mesh.decimation import decimate
+from bodyscan.mesh.repair import decimate
 from bodyscan.progress import THREADS
 from bodyscan.report.model import Layer, css, ramp_legend
 from bodyscan.report.pictures import FILLED_TINT, blue_white_red, turbo

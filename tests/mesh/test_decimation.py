@@ -10,7 +10,7 @@ from made_bodies import arrays, mesh_of, together
 from benchmarks.self_intersections import self_intersections
 from bodyscan.evaluation.surface import deviation, signed_distances
 from bodyscan.mesh.body import BodyMesh
-from bodyscan.mesh.decimation import decimate
+from bodyscan.mesh.repair import decimate
 from bodyscan.mesh.topology import compute_topology
 
 
