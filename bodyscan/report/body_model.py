@@ -51,7 +51,7 @@ def colour_layers(
     covered, and by deviation if compared."""
     made_up = np.zeros(len(small.vertices), bool)
     made_up[small.faces[small.filled]] = True
-    top = _round_up(float(np.nanpercentile(cloud.sigma_mm, 98)))
+    top = float(f"{max(np.nanpercentile(cloud.sigma_mm, 98), 1e-6):.2g}")
     sigma = _ramp(np.nan_to_num(small.sigma_mm / top), turbo()[:, ::-1])
     nearest = np.asarray(cKDTree(cloud.points).query(small.vertices, workers=THREADS)[1])
     pairs = np.array(PAIRS, np.uint8)[np.clip(cloud.pairs_seen[nearest], 1, len(PAIRS)) - 1]
@@ -110,9 +110,3 @@ def _ramp(share: NDArray[np.floating], table: Bytes) -> Bytes:
 
 def _without(colours: Bytes, unknown: Mask) -> Bytes:
     return np.where(unknown[:, None], UNKNOWN, colours).astype(np.uint8)
-
-
-def _round_up(value: float) -> float:
-    """Round up to two digits."""
-    power = 10.0 ** (np.floor(np.log10(max(value, 1e-6))) - 1)
-    return float(np.ceil(value / power) * power)

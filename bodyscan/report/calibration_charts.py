@@ -12,7 +12,7 @@ from bodyscan.arrays import Array
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.light_planes import baseline_angle_tilt
 from bodyscan.registration.rig_calibration import ObservedCorners, RigCalibration
-from bodyscan.report.charts import BLUE, GREY, INK, RED, grid_of, round_down, style, svg
+from bodyscan.report.charts import BLUE, GREY, INK, RED, grid_of, style, svg
 
 POLES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#999999")
 """Okabe and Ito's colours, which the colour-blind can tell apart too."""
@@ -46,8 +46,8 @@ def residual_chart(calibration: RigCalibration) -> tuple[bytes, float]:
     lengths = _finite([np.linalg.norm(mean, axis=-1) for _, mean, _ in maps.values()])
     top = float(np.percentile(rms_known, 98))
     widest = max(calibration.pairs[name].camera.width for name in maps)
-    # The longest arrow is 8 % of the image's width.
-    times = round_down(0.08 * widest / max(float(np.percentile(lengths, 98)), 1e-6), 1)
+    # The longest arrow is about 8 % of the image's width.
+    times = float(f"{0.08 * widest / max(float(np.percentile(lengths, 98)), 1e-6):.1g}")
     with style():
         figure, axes = grid_of(len(maps), 4, (2.6, 2.3))
         for axis, (name, (rms, mean, middles)) in zip(axes, maps.items(), strict=True):
@@ -123,24 +123,18 @@ def line_styles(calibration: RigCalibration) -> tuple[dict[str, str], dict[str, 
 def _residual_map(seen: ObservedCorners, camera: Camera) -> tuple[Array, Array, Array]:
     """RMS (rows, columns) and mean (rows, columns, 2) of residuals, px, in 8 rows of 10 cells, and the
     cells' middles; NaN for fewer than three corners."""
-    columns, rows = 10, 8
-    size = np.array([camera.width, camera.height])
-    cell = np.clip(
-        ((seen.pixels + 0.5) / size * [columns, rows]).astype(int), 0, [columns - 1, rows - 1]
-    )
-    number = cell[:, 1] * columns + cell[:, 0]
-    count = np.bincount(number, minlength=columns * rows).astype(float)
+    rows, columns = np.linspace(0, camera.height, 9) - 0.5, np.linspace(0, camera.width, 11) - 0.5
+
+    def total(values: Array | None = None) -> Array:
+        x, y = seen.pixels.T
+        return np.histogram2d(y, x, (rows, columns), weights=values)[0]
+
+    count, residuals = total(), seen.residuals_px.astype(float)
     enough = np.where(count >= 3, count, np.nan)
-    residuals = seen.residuals_px.astype(float)
-    square = np.bincount(number, np.sum(residuals**2, axis=1), columns * rows) / enough
-    mean = [np.bincount(number, residuals[:, k], columns * rows) / enough for k in (0, 1)]
-    x, y = np.meshgrid(np.arange(columns) + 0.5, np.arange(rows) + 0.5)
-    middles = np.stack([x / columns, y / rows], axis=-1) * size - 0.5
-    return (
-        np.sqrt(square).reshape(rows, columns),
-        np.stack(mean, axis=-1).reshape(rows, columns, 2),
-        middles,
-    )
+    rms = np.sqrt(total(np.sum(residuals**2, axis=1)) / enough)
+    mean = np.stack([total(values) / enough for values in residuals.T], axis=-1)
+    middles = np.meshgrid(columns[:-1] + columns[1:], rows[:-1] + rows[1:])
+    return rms, mean, 0.5 * np.stack(middles, axis=-1)
 
 
 def _picture_frame(axis: Axes, camera: Camera) -> None:

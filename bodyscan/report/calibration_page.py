@@ -60,21 +60,11 @@ def calibration_page(folder: Path) -> Page:
 
 
 def _rig(calibration: RigCalibration) -> list[Block]:
-    model, times = rig_model(calibration)
-    source = "the joint solve knows it"
-    if calibration.is_import:
-        source = "the import says (that of 1 px where it says nothing)"
-    ellipsoids = (
-        f"Ellipsoids: one sigma of each camera's position in the rig frame as {source}, enlarged "
-        f"{times:,.0f} times. "
-        if len(calibration.pairs) > 1
-        else ""
-    )
     caption = (
-        f"Pyramids: cameras and what they see. {ellipsoids}Grey: boards, and the scan volume. Red, "
-        "green and blue: the rig's axes x, y and z."
+        "Pyramids: cameras and what they see. Grey: boards, and the scan volume. Red, green and blue: "
+        "the rig's axes x, y and z."
     )
-    return [Viewer("Cameras in the rig frame", caption, model)]
+    return [Viewer("Cameras in the rig frame", caption, rig_model(calibration))]
 
 
 def _pairs(calibration: RigCalibration) -> list[Block]:

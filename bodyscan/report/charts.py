@@ -103,12 +103,6 @@ def grid_of(count: int, columns: int, cell: tuple[float, float]) -> tuple[Figure
     return figure, flat[:count]
 
 
-def round_down(value: float, digits: int) -> float:
-    """Round a positive number down to so many digits."""
-    power = 10.0 ** (np.floor(np.log10(value)) - digits + 1)
-    return float(np.floor(value / power) * power)
-
-
 def round_up(value: float) -> float:
     """Round a positive number up to 1, 2 or 5 times a power of ten."""
     power = 10.0 ** np.floor(np.log10(value))

@@ -1,77 +1,17 @@
-"""A calibrated rig as a rotatable model: cameras, the covariance of their positions, boards, volume."""
+"""A calibrated rig as a rotatable model: cameras, boards, scan volume."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from bodyscan.arrays import Array, Bytes
-from bodyscan.geometry.uncertainty import point_covariance
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.report.calibration_charts import line_styles
-from bodyscan.report.charts import round_down
-from bodyscan.report.model import Layer, Shape, Strokes, pack
+from bodyscan.report.model import Strokes, pack
 
 
-def rig_model(calibration: RigCalibration) -> tuple[dict[str, object], float]:
-    """Build the model for the viewer; also return by what factor one-sigma ellipsoids are enlarged."""
-    covariances = {
-        name: point_covariance(calibration.covariance.marginal(name), pose.translation)
-        for name, pose in calibration.rig_from_camera.items()
-    }
-    longest = max(float(np.sqrt(np.linalg.eigvalsh(one)[-1])) for one in covariances.values())
-    # The largest is drawn with a half axis of 140 mm; the pose of a single pair has no error.
-    times = round_down(140.0 / max(longest, 1e-3), 2)
-    shapes = {
-        name: _ellipsoid(pose.translation, times**2 * covariances[name])
-        for name, pose in calibration.rig_from_camera.items()
-    }
-    colours, _ = line_styles(calibration)
-    shape, tint = _join(shapes, {name: _rgb(colours[name]) for name in shapes})
-    labels = [(name, t.translation) for name, t in calibration.rig_from_camera.items()]
-    labels += [("x", np.array([340.0, 0.0, 0.0])), ("y", np.array([0.0, 340.0, 0.0]))]
-    layer, strokes = Layer("ellipsoids", tint), _strokes(calibration)
-    return pack(shape, [layer], strokes=strokes, labels=labels, view_deg=(20.0, 22.0)), times
-
-
-def _ellipsoid(middle: Array, covariance: Array) -> Shape:
-    """A one-sigma ellipsoid: the unit sphere mapped by the covariance's square root."""
-    rings, sectors = 16, 24
-    down = np.linspace(0.0, np.pi, rings + 1)[:, None]
-    round_ = 2.0 * np.pi * np.arange(sectors) / sectors
-    sphere = np.stack(
-        np.broadcast_arrays(
-            np.sin(down) * np.cos(round_), np.sin(down) * np.sin(round_), np.cos(down)
-        ),
-        axis=-1,
-    ).reshape(-1, 3)
-    values, vectors = np.linalg.eigh(covariance)
-    axes = np.sqrt(np.maximum(values, 1e-9))
-    normals = (sphere / axes) @ vectors.T
-    row, column = np.meshgrid(np.arange(rings), np.arange(sectors), indexing="ij")
-    after = (column + 1) % sectors
-    a, b = row * sectors + column, row * sectors + after
-    faces = np.stack([a, a + sectors, b, b, a + sectors, b + sectors], axis=-1).reshape(-1, 3)
-    return Shape(
-        middle + (sphere * axes) @ vectors.T,
-        faces,
-        normals / np.linalg.norm(normals, axis=1, keepdims=True),
-    )
-
-
-def _join(shapes: dict[str, Shape], tints: dict[str, Bytes]) -> tuple[Shape, Bytes]:
-    counts = [len(shape.vertices) for shape in shapes.values()]
-    starts = np.cumsum([0, *counts[:-1]])
-    every = list(shapes.values())
-    shape = Shape(
-        np.concatenate([one.vertices for one in every]),
-        np.concatenate([one.faces + start for one, start in zip(every, starts, strict=True)]),
-        np.concatenate([one.normals for one in every]),
-    )
-    return shape, np.repeat([tints[name] for name in shapes], counts, axis=0).astype(np.uint8)
-
-
-def _strokes(calibration: RigCalibration) -> Strokes:
-    """Cameras' fields of view, boards' outlines, the scan volume, and the rig's axes."""
+def rig_model(calibration: RigCalibration) -> dict[str, object]:
+    """Build the model for the viewer: cameras' fields of view, boards' outlines, volume and axes."""
     grey, dark = np.array([190, 197, 207], np.uint8), np.array([120, 130, 145], np.uint8)
     colours, _ = line_styles(calibration)
     parts: list[tuple[Array, Bytes]] = []
@@ -98,7 +38,10 @@ def _strokes(calibration: RigCalibration) -> Strokes:
         parts.append((300.0 * np.stack([np.zeros(3), axis])[None], np.array(colour, np.uint8)))
     ends = np.concatenate([part for part, _ in parts])
     tint = np.repeat([colour for _, colour in parts], [len(part) for part, _ in parts], axis=0)
-    return Strokes(ends, tint.astype(np.uint8))
+    labels = [(name, t.translation) for name, t in calibration.rig_from_camera.items()]
+    labels += [("x", np.array([340.0, 0.0, 0.0])), ("y", np.array([0.0, 340.0, 0.0]))]
+    strokes = Strokes(ends, tint.astype(np.uint8))
+    return pack(None, strokes=strokes, labels=labels, view_deg=(20.0, 22.0))
 
 
 def _close(corners: Array) -> Array:
