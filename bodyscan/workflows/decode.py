@@ -6,7 +6,7 @@ import re
 from collections import defaultdict
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import groupby, islice
+from itertools import groupby
 
 from bodyscan.arrays import WHOLE, Crop
 from bodyscan.boards.view import BoardView, ViewKey
@@ -263,18 +263,25 @@ def _without_stripes(
 
 def crossing_notes(faults: Mapping[ImageSequence, str]) -> Iterator[str]:
     """One line for each pair and each reason why its crossing stripes are not used."""
-    shots: dict[tuple[str, str], list[tuple[str, str]]] = defaultdict(list)
-    for sequence, fault in faults.items():
-        if fault:
-            # Shares of pixels and file names differ between shots: they are quoted from the first.
-            kind = NUMBER.sub("", fault.partition("such as")[0])
-            shots[sequence.pair, kind].append((sequence.shot, fault))
-    for (pair, _), group in sorted(shots.items()):
-        names, fault = ", ".join(shot for shot, _ in group), group[0][1]
+    found = ((sequence, fault) for sequence, fault in faults.items() if fault)
+    for (pair, fault), group in sorted(_group_faults(found).items()):
+        names = ", ".join(sequence.shot for sequence in group)
         yield (
             f"{pair}: stripes of the first direction alone are used in "
             f"shot{'s' if len(group) > 1 else ''} {names}, not those of `crossing`: {fault}"
         )
+
+
+def _group_faults(
+    faults: Iterable[tuple[ImageSequence, str]],
+) -> dict[tuple[str, str], list[ImageSequence]]:
+    """Sequences by pair and reason. Reasons that differ in figures or file names alone are one; the
+    first is quoted."""
+    groups: dict[tuple[str, str], tuple[str, list[ImageSequence]]] = {}
+    for sequence, fault in faults:
+        kind = NUMBER.sub("", fault.partition("such as")[0])
+        groups.setdefault((sequence.pair, kind), (fault, []))[1].append(sequence)
+    return {(pair, fault): group for (pair, _), (fault, group) in groups.items()}
 
 
 def responses_in(stripes: StripeMap) -> list[ResponseShare]:
@@ -292,28 +299,22 @@ def response_notes(responses: Mapping[str, Sequence[ResponseShare]]) -> Iterator
 
 def failed_pairs(failures: Sequence[Failure], good: set[str]) -> dict[str, str]:
     """Pairs that failed in every shot, with the reason, or the first few of several reasons."""
-    reasons: dict[str, dict[str, str]] = defaultdict(dict)
-    for sequence, error in failures:
-        reason = format_error(error)
-        # One fault gives a different share of pixels in each shot.
-        reasons[sequence.pair].setdefault(NUMBER.sub("", reason), reason)
+    reasons: dict[str, list[str]] = defaultdict(list)
+    for pair, reason in _group_faults((s, format_error(error)) for s, error in failures):
+        if pair not in good:
+            reasons[pair].append(reason)
+    several = "no stripe sequence can be decoded: "
     return {
-        pair: next(iter(found.values()))
-        if len(found) == 1
-        else "no stripe sequence can be decoded: " + "\n  or: ".join(islice(found.values(), 3))
+        pair: found[0] if len(found) == 1 else several + "\n  or: ".join(found[:3])
         for pair, found in reasons.items()
-        if pair not in good
     }
 
 
 def failure_notes(failures: Sequence[Failure]) -> Iterator[str]:
-    """One line a shot, or one for three or more shots of a pair that failed for one reason."""
-    same: dict[tuple[str, str], list[Failure]] = defaultdict(list)
-    for failure in failures:
-        same[failure[0].pair, format_error(failure[1])].append(failure)
-    for (pair, reason), group in same.items():
-        if len(group) < 3:
-            yield from (str(error) for _, error in group)
-        else:
-            shots = ", ".join(sequence.shot for sequence, _ in group)
-            yield f"{pair}: {reason}\n  in {len(group)} shots: {shots}"
+    """One line for each pair and each reason."""
+    errors = dict(failures)
+    groups = _group_faults((sequence, format_error(error)) for sequence, error in failures)
+    for (pair, reason), group in groups.items():
+        shots = ", ".join(sequence.shot for sequence in group)
+        several = f"{pair}: {reason}\n  in {len(group)} shots: {shots}"
+        yield several if len(group) > 1 else str(errors[group[0]])
