@@ -206,7 +206,7 @@ def _day(rig: Path) -> tuple[float, float, float, float]:
 def main(rig: Path, scans: int = DAY) -> None:
     """Run a day in the resident process that `watch` keeps; prints seconds and MiB of each scan."""
     from bodyscan.settings import ScanSettings
-    from bodyscan.workflows.preparation import Preparation
+    from bodyscan.workflows.range_images import Preparation
     from bodyscan.workflows.scan_person import scan_folder
 
     preparation = Preparation(rig / "calibration")

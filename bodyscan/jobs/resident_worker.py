@@ -25,7 +25,7 @@ from bodyscan.jobs.job import LOG
 from bodyscan.jobs.stages import KINDS, Kinds, run_scan
 from bodyscan.jobs.supervision import open_log
 from bodyscan.jobs.worker import attempt, become_worker
-from bodyscan.workflows.preparation import Preparation
+from bodyscan.workflows.range_images import Preparation
 
 
 def main() -> int:

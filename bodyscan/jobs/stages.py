@@ -17,7 +17,7 @@ from bodyscan.rig.rig import Rig, load_rig
 from bodyscan.verdict import Announce
 
 if TYPE_CHECKING:
-    from bodyscan.workflows.preparation import Preparation
+    from bodyscan.workflows.range_images import Preparation
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,6 @@
 
 page holds what a report is made of, and result_page finds what a folder holds. scan_page,
 calibration_page (with calibration_verdict and calibration_charts) and acceptance_page make their
-reports. pictures shades bodies; charts and sigma_map use Matplotlib; body_model and rig_model are
-models to rotate, packed by model. measurements: a table on screen.
+reports. pictures shades bodies; charts and sigma_map use Matplotlib; body_model is a model
+to rotate, packed by model. measurements: a table on screen.
 """

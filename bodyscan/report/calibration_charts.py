@@ -1,4 +1,4 @@
-"""Charts of a calibration: coverage, residuals, the light planes."""
+"""Charts of a calibration: coverage, residuals, the light planes; the rig as a rotatable model."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 
-from bodyscan.arrays import Array
+from bodyscan.arrays import Array, Bytes
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.light_planes import baseline_angle_tilt
 from bodyscan.registration.rig_calibration import ObservedCorners, RigCalibration
 from bodyscan.report.charts import BLUE, GREY, INK, RED, grid_of, style, svg
+from bodyscan.report.model import Strokes, pack
 
 POLES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#999999")
 """Okabe and Ito's colours, which the colour-blind can tell apart too."""
@@ -148,3 +149,46 @@ def _finite(arrays: list[Array]) -> Array:
     """All known values in some arrays; a single 1 if there are none."""
     known = np.concatenate([array[np.isfinite(array)] for array in arrays])
     return known if known.size else np.ones(1)
+
+
+def rig_model(calibration: RigCalibration) -> dict[str, object]:
+    """Build the model for the viewer: cameras' fields of view, boards' outlines, volume and axes."""
+    grey, dark = np.array([190, 197, 207], np.uint8), np.array([120, 130, 145], np.uint8)
+    colours, _ = line_styles(calibration)
+    parts: list[tuple[Array, Bytes]] = []
+    for name, pose in calibration.rig_from_camera.items():
+        camera = calibration.pairs[name].camera
+        right, bottom = camera.width - 0.5, camera.height - 0.5
+        corners = np.array([[-0.5, -0.5], [right, -0.5], [right, bottom], [-0.5, bottom]])
+        far = pose.apply(220.0 * np.nan_to_num(camera.rays(corners)))
+        sides = np.stack([np.broadcast_to(pose.translation, far.shape), far], axis=1)
+        parts.append((np.concatenate([sides, _close(far)]), _rgb(colours[name])))
+    for (_, board_name), rig_from_board in calibration.rig_from_board.items():
+        board = calibration.rig.board(board_name)
+        x, y = board.size_mm
+        outline = np.array([[0.0, 0, 0], [x, 0, 0], [x, y, 0], [0, y, 0]])
+        parts.append((_close(rig_from_board.apply(outline)), grey))
+    volume = calibration.rig.volume
+    turn = 2.0 * np.pi * np.arange(48) / 48
+    circle = volume.radius_mm * np.stack([np.cos(turn), np.sin(turn), np.zeros(48)], axis=1)
+    for height in (volume.bottom_mm, volume.top_mm):
+        parts.append((_close(circle + [0.0, 0.0, height]), dark))
+    upright = circle[::6, None] + np.array([[0.0, 0, volume.bottom_mm], [0.0, 0, volume.top_mm]])
+    parts.append((upright, dark))
+    for axis, colour in zip(np.eye(3), ((200, 40, 40), (30, 140, 60), (40, 80, 200)), strict=True):
+        parts.append((300.0 * np.stack([np.zeros(3), axis])[None], np.array(colour, np.uint8)))
+    ends = np.concatenate([part for part, _ in parts])
+    tint = np.repeat([colour for _, colour in parts], [len(part) for part, _ in parts], axis=0)
+    labels = [(name, t.translation) for name, t in calibration.rig_from_camera.items()]
+    labels += [("x", np.array([340.0, 0.0, 0.0])), ("y", np.array([0.0, 340.0, 0.0]))]
+    strokes = Strokes(ends, tint.astype(np.uint8))
+    return pack(None, strokes=strokes, labels=labels, view_deg=(20.0, 22.0))
+
+
+def _close(corners: Array) -> Array:
+    """Sides (N, 2, 3) of a polygon (N, 3)."""
+    return np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
+
+
+def _rgb(colour: str) -> Bytes:
+    return np.array([int(colour[k : k + 2], 16) for k in (1, 3, 5)], np.uint8)

@@ -15,6 +15,7 @@ from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.storage import FILE_NAME, calibration_id, load_calibration
 from bodyscan.report import calibration_charts as draw
 from bodyscan.report import charts
+from bodyscan.report.calibration_charts import rig_model
 from bodyscan.report.calibration_verdict import PAIR_COLUMNS, figures_of, grade_calibration
 from bodyscan.report.page import (
     Block,
@@ -26,7 +27,6 @@ from bodyscan.report.page import (
     is_synthetic,
     make_sections,
 )
-from bodyscan.report.rig_model import rig_model
 from bodyscan.report.sigma_map import draw_sigma_map, why_no_sigma
 
 

@@ -19,8 +19,7 @@ from bodyscan.report.pictures import Pictures, draw_pictures, write_pictures
 from bodyscan.settings import ScanSettings
 from bodyscan.verdict import Announce, say_nothing
 from bodyscan.workflows.fuse_range_images import fuse
-from bodyscan.workflows.preparation import Preparation
-from bodyscan.workflows.range_images import Reconstructed, reconstruct_range_images
+from bodyscan.workflows.range_images import Preparation, Reconstructed, reconstruct_range_images
 
 
 def scan_person(

@@ -11,7 +11,7 @@ import pytest
 from ray_cast_scan import looking, nominal_camera
 
 from bodyscan.arrays import Array, Mask
-from bodyscan.fusion.filling_bounds import Crown, PartialSurface, find_free_points, find_gaps
+from bodyscan.fusion.hole_filling import Crown, PartialSurface, find_free_points, find_gaps
 from bodyscan.fusion.meshing import mesh
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.opencv import Radial

@@ -25,10 +25,9 @@ from bodyscan.registration.storage import load_calibration, save_calibration
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_frame import RigFrame
 from bodyscan.workflows import calibrate_rig, find_boards
-from bodyscan.workflows.calibrate_rig import solve_boards
+from bodyscan.workflows.calibrate_rig import add_remarks, solve_boards
 from bodyscan.workflows.decode import BoardStripes, PairStripes, PrintAreas
 from bodyscan.workflows.find_boards import FoundBoards
-from bodyscan.workflows.rig_remarks import add_remarks
 
 Views = Sequence[BoardView]
 Spoiling = Callable[[Views, np.random.Generator], Views]

@@ -13,8 +13,7 @@ from bodyscan.alignment.icp import Alignment, Overlap
 from bodyscan.errors import BoardNotFound
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.storage import load_calibration, save_calibration
-from bodyscan.workflows.check_rig import describe_scan_check
-from bodyscan.workflows.check_scans import judge_scans
+from bodyscan.workflows.check_rig import describe_scan_check, judge_scans
 
 
 @pytest.fixture

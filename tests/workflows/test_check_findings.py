@@ -13,9 +13,9 @@ from bodyscan.errors import FailedWork
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.registration.drift import Move
-from bodyscan.workflows.check_boards import apply_moves
 from bodyscan.workflows.check_rig import (
     Findings,
+    apply_moves,
     describe_board_check,
     describe_scan_check,
     number_shots,

@@ -30,8 +30,7 @@ from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.storage import load_calibration
 from bodyscan.report.calibration_verdict import grade_calibration
 from bodyscan.rig.rig import load_rig
-from bodyscan.workflows.check_boards import BoardCheck
-from bodyscan.workflows.check_rig import check_rig
+from bodyscan.workflows.check_rig import BoardCheck, check_rig
 from bodyscan.workflows.import_rig import import_folder, import_rig
 
 CAMERA = np.array([[1400.0, 0.0, 630.0], [0.0, 1410.0, 500.0], [0.0, 0.0, 1.0]])

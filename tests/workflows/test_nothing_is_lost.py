@@ -16,7 +16,7 @@ from bodyscan.registration.storage import load_calibration
 from bodyscan.report import calibration_page, pictures
 from bodyscan.report.page import render
 from bodyscan.report.result_page import write_report
-from bodyscan.workflows import calibrate_rig, rig_remarks
+from bodyscan.workflows import calibrate_rig
 
 
 def broken(*_: object, **__: object) -> NoReturn:
@@ -44,7 +44,7 @@ def calibrated(ring: SeenBoards, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         *("coverage_notes", "boards_not_found"),
         *("advise", "compare_halves", "stripe_board_notes"),
     ):
-        monkeypatch.setattr(rig_remarks, name, broken_later)
+        monkeypatch.setattr(calibrate_rig, name, broken_later)
     calibrate_rig.calibrate_folder(tmp_path / "rig.yaml", folder)
     return folder
 

@@ -17,7 +17,7 @@ from small_workspace import run
 from bodyscan.captures.folder import ImageSequence, open_scan
 from bodyscan.errors import ImageError
 from bodyscan.files.hashing import file_hash, list_files
-from bodyscan.workflows.preparation import Preparation
+from bodyscan.workflows.range_images import Preparation
 
 SMALL = ("--set", "fusion.points=20000", "--set", "mesh.depth=6", "--set", "export.formats=glb")
 STORED = Path(__file__).parents[1] / "data" / "stored-0.1.0" / "calibration"
@@ -112,7 +112,7 @@ def test_pairs_that_come_one_by_one_are_decoded_side_by_side(
         met.append(sequence.pair)
         raise ImageError("is left to the scan")
 
-    monkeypatch.setattr("bodyscan.workflows.preparation.reconstruct_sequence", decode)
+    monkeypatch.setattr("bodyscan.workflows.range_images.reconstruct_sequence", decode)
     pairs = sorted({sequence.pair for sequence in captures.sequences})[:2]
     for pair in pairs:
         preparation.prepare(person, [pair])

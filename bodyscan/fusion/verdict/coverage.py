@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodyscan.arrays import Array, Mask
-from bodyscan.fusion.filling_bounds import Crown
+from bodyscan.fusion.hole_filling import Crown
 from bodyscan.fusion.verdict.evidence import Coverage, Finding, ScanEvidence
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyMesh
