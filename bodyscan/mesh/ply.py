@@ -20,14 +20,17 @@ from bodyscan.mesh.body import REGION_NAMES, BodyCloud, BodyMesh, BreathAt
 Records = NDArray[np.void]
 
 END = b"end_header\n"
-_TRIANGLE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
-_XYZ, _NORMAL, _COLOUR = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue")
-_BREATH = ("breath_mm", "breath_sigma_mm")
+_COLUMNS = {
+    "positions": ("x", "y", "z"),
+    "normals": ("nx", "ny", "nz"),
+    "colours": ("red", "green", "blue"),
+    "breath": ("breath_mm", "breath_sigma_mm"),
+}
 _TYPES: dict[str, tuple[Any, str]] = {
-    **dict.fromkeys(_XYZ, ("<f8", "double")),
-    **dict.fromkeys((*_NORMAL, "sigma_mm", *_BREATH), ("<f4", "float")),
-    **dict.fromkeys((*_COLOUR, "pairs_seen", "region", "filled"), ("u1", "uchar")),
-    "vertex_indices": (_TRIANGLE, "list uchar int"),
+    **dict.fromkeys(_COLUMNS["positions"], ("<f8", "double")),
+    **dict.fromkeys((*_COLUMNS["normals"], "sigma_mm", *_COLUMNS["breath"]), ("<f4", "float")),
+    **dict.fromkeys((*_COLUMNS["colours"], "pairs_seen", "region", "filled"), ("u1", "uchar")),
+    "vertex_indices": (np.dtype([("count", "u1"), ("corners", "<i4", 3)]), "list uchar int"),
 }
 """Types of the properties: numpy's and PLY's."""
 
@@ -38,10 +41,10 @@ Layout = dict[str, tuple[str, ...]]
 def _layout(what: str, *, breath: bool = False, regions: bool = False) -> Layout:
     """The layout of a cloud or a mesh, with or without displacements to mean breath and regions."""
     known = ("region",) if regions else ()
-    vertex = (*_XYZ, *_NORMAL, *_COLOUR, "sigma_mm")
+    vertex = (*_COLUMNS["positions"], *_COLUMNS["normals"], *_COLUMNS["colours"], "sigma_mm")
     if what == "cloud":
         return {"vertex": (*vertex, "pairs_seen", *known)}
-    extra = (*_BREATH, *known) if breath else known
+    extra = (*_COLUMNS["breath"], *known) if breath else known
     return {"vertex": (*vertex, *extra), "face": ("vertex_indices", "filled", *known)}
 
 
@@ -51,21 +54,25 @@ def write_ply(path: Path, body: BodyCloud | BodyMesh) -> None:
     A mesh's faces have a uchar `filled` (0 or 1); points, vertices and faces have a uchar `region`
     (index into `REGION_NAMES`) if it is known.
     """
-    vertices: dict[str, Any] = {"sigma_mm": body.sigma_mm, "region": body.regions}
-    vertices |= zip((*_NORMAL, *_COLOUR), (*body.normals.T, *body.colours.T), strict=True)
+    parts: dict[str, NDArray[Any]] = {"normals": body.normals.T, "colours": body.colours.T}
     if isinstance(body, BodyCloud):
         layout = _layout("cloud", regions=body.regions is not None)
-        vertices |= zip((*_XYZ, "pairs_seen"), (*body.points.T, body.pairs_seen), strict=True)
-        columns = [vertices]
+        vertices: dict[str, Any] = {"pairs_seen": body.pairs_seen}
+        parts["positions"] = body.points.T
     else:
         layout = _layout("mesh", breath=body.breath is not None, regions=body.regions is not None)
-        vertices |= zip(_XYZ, body.vertices.T, strict=True)
+        vertices, parts["positions"] = {}, body.vertices.T
         if body.breath is not None:
-            vertices |= zip(_BREATH, (body.breath.mm, body.breath.sigma_mm), strict=True)
-        corners = np.empty(len(body.faces), _TRIANGLE)
+            parts["breath"] = np.stack([body.breath.mm, body.breath.sigma_mm])
+    vertices |= {"sigma_mm": body.sigma_mm, "region": body.regions}
+    for part, arrays in parts.items():
+        vertices |= dict(zip(_COLUMNS[part], arrays, strict=True))
+    columns = [vertices]
+    if isinstance(body, BodyMesh):
+        corners = np.empty(len(body.faces), _TYPES["vertex_indices"][0])
         corners["count"], corners["corners"] = 3, body.faces
         faces = {"vertex_indices": corners, "filled": body.filled, "region": body.face_regions}
-        columns = [vertices, faces]
+        columns.append(faces)
     records = []
     for names, values in zip(layout.values(), columns, strict=True):
         records.append(np.empty(len(values[names[0]]), _fields(names)))
@@ -109,10 +116,11 @@ def _regions(vertices: Records, path: Path) -> Bytes | None:
 
 
 def _vertex_arrays(records: Records) -> tuple[Array, Floats, Floats, Bytes]:
-    def columns(names: Sequence[str]) -> NDArray[Any]:
-        return np.stack([records[name] for name in names], axis=-1)
+    def columns(part: str) -> NDArray[Any]:
+        return np.stack([records[name] for name in _COLUMNS[part]], axis=-1)
 
-    return columns(_XYZ), columns(_NORMAL), records["sigma_mm"].copy(), columns(_COLOUR)
+    sigma_mm = records["sigma_mm"].copy()
+    return columns("positions"), columns("normals"), sigma_mm, columns("colours")
 
 
 def _fields(names: Sequence[str]) -> np.dtype[Any]:

@@ -32,6 +32,7 @@ from bodyscan.files.atomic import write_bytes
 from bodyscan.fusion.storage import StoredScan, load_scan
 from bodyscan.geometry.robust import rms, rms_length
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.uncertainty import position_sigma
 from bodyscan.mesh.body import BodyMesh
 from bodyscan.mesh.topology import compute_topology
 from bodyscan.optional import optional
@@ -103,8 +104,6 @@ def load_truth(folder: Path) -> Truth:
 
 def compare_rig(calibration: RigCalibration, truth: Truth) -> RigDeviation:
     """Compare camera poses with the truth. Raises BadInput for a rig the truth does not know."""
-    from bodyscan.geometry.uncertainty import position_sigma
-
     names = tuple(sorted(calibration.rig_from_camera))
     unknown = [name for name in names if name not in truth.facts["pairs"]]
     if unknown:
@@ -148,15 +147,8 @@ def evaluate_workspace(workspace: Path, body_at: BodyAt | None = None) -> str:
     if body_at is not None and moment_ms is not None:
         truth = replace(truth, vertices=body_at(moment_ms))
     lines += _scan_lines(stored, folder, calibration, truth)
-    lines += [
-        "results:",
-        f"  calibration {workspace / 'calibration' / 'calibration.json'}",
-        f"  cloud       {folder / 'cloud.ply'}",
-        f"  mesh        {folder / 'mesh.ply'}",
-        *(f"  exports     {path}" for path in workspace.glob("export")),
-        f"  pictures    {', '.join(str(path) for path in sorted(folder.glob('*.png')))}",
-    ]
-    return "\n".join(lines)
+    pictures = ", ".join(str(path) for path in sorted(folder.glob("*.png")))
+    return "\n".join([*lines, f"  pictures: {pictures}"])
 
 
 def _scan_lines(
