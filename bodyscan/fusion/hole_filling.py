@@ -15,6 +15,7 @@ from typing import ClassVar, TypeVar
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import linprog
 
 from bodyscan.arrays import Array, Floats, Indices, Mask
 from bodyscan.compiled import compiled
@@ -373,22 +374,14 @@ class Crown:
 
     @property
     def unknown_mm(self) -> float:
-        """By how much the head may end higher than was measured; inf if nothing bounds it.
-
-        The planes' lower envelope is concave: ever finer grids around its best node find its top.
-        """
+        """By how much the head may end higher than was measured; inf if nothing bounds it: the
+        highest point below all planes, a linear program."""
         if not len(self.offsets):
             return np.inf
-        slopes = self.normals[:, :2] / self.normals[:, 2:]
-        above = (self.offsets - self.normals @ self.highest) / self.normals[:, 2]
-        centre, half_width, top = np.zeros(2), CROWN_RADIUS_MM, 0.0
-        grid = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 21)] * 2), axis=-1).reshape(-1, 2)
-        for _ in range(10):  # from 10 mm between nodes to a thousandth of one
-            nodes = centre + half_width * grid
-            heights = np.min(above - nodes @ slopes.T, axis=1)
-            centre, top = nodes[np.argmax(heights)], float(heights.max())
-            half_width *= 0.3
-        return max(0.0, top)
+        room = [(-CROWN_RADIUS_MM, CROWN_RADIUS_MM)] * 2 + [(0.0, None)]
+        above = self.offsets - self.normals @ self.highest
+        found = linprog([0.0, 0.0, -1.0], A_ub=self.normals, b_ub=above, bounds=room)
+        return 0.0 if found.x is None else float(found.x[2])
 
     def compute_heights_above(self, points: Array) -> Array:
         """Height (N,) mm, at least 0, of points (N, 3) at the top of the head above its planes."""

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.arrays import Array, Bytes, Floats, Mask
+from bodyscan.arrays import Array, Floats, Mask
 from bodyscan.compiled import compiled
 
 NORMAL_MEDIAN = 0.6745
@@ -52,12 +52,13 @@ def fit_quadratics(
 
     cut = np.flatnonzero(valid & ~fitted)
     fit_trimmed_windows(inverse, noise, cut, reach, pixel_mm, fit, fitted)
-    squares, inlier = np.empty_like(inverse), np.empty(inverse.shape, np.uint8)
-    _square_residuals(inverse, noise, fit.value, fitted, squares, inlier)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        residual = np.where(valid, (inverse - fit.value) / noise, np.float32(0.0))
+    inlier = ~valid | ((np.abs(residual) < 5.0) & fitted)
     window = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
-    mean_square = cv2.boxFilter(squares, -1, (5, 5), borderType=cv2.BORDER_CONSTANT)
+    mean_square = cv2.boxFilter(residual * residual, -1, (5, 5), borderType=cv2.BORDER_CONSTANT)
     # A mean square of 4 variances over 5 x 5 pixels is a jump in depth, not noise.
-    smooth = (mean_square < 4.0) & (cv2.erode(inlier, window, borderValue=1) > 0)
+    smooth = (mean_square < 4.0) & (cv2.erode(inlier.view(np.uint8), window, borderValue=1) > 0)
     smooth.ravel()[cut] = True  # already fitted by trimmed least squares
     jumps = np.flatnonzero(valid & ~smooth)
     fit_trimmed_windows(inverse, noise, jumps, reach, pixel_mm, fit, fitted)
@@ -258,19 +259,3 @@ def _noise_scale(
     absorbed = np.square(fit.sigma[::every][there][0] / noise[::every][there][0])
     typical = np.median(np.abs(residual)) / np.sqrt(1.0 - absorbed)
     return np.float32(max(1.0, typical / NORMAL_MEDIAN))
-
-
-@compiled
-def _square_residuals(
-    inverse: Floats, noise: Floats, value: Floats, fitted: Mask, squares: Floats, inlier: Bytes
-) -> None:
-    """Write squared residuals over variances (h, w), 0 where nothing was measured, and `inlier`:
-    0 beyond 5 sigmas or without a fit, else 1."""
-    for row in range(inverse.shape[0]):
-        for column in range(inverse.shape[1]):
-            squares[row, column] = 0.0
-            inlier[row, column] = 1
-            if inverse[row, column] > 0:
-                residual = (inverse[row, column] - value[row, column]) / noise[row, column]
-                squares[row, column] = residual * residual
-                inlier[row, column] = abs(residual) < 5.0 and fitted[row, column]

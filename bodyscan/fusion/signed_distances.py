@@ -103,9 +103,17 @@ def _add_planes(
 
 def find_crossed_bricks(distances: Distances, cell_mm: float, shape: tuple[int, ...]) -> Mask:
     """Find the bricks (a, b, c) of a finer grid with the same origin that the surface crosses."""
-    crossed = np.zeros(shape, np.bool_)
-    _mark_crossed(distances.values, cell_mm / distances.cell_mm, crossed)
-    return crossed
+    low = high = np.pad(distances.values, ((0, 1),) * 3, mode="edge")
+    ratio = cell_mm / distances.cell_mm
+    for axis, (count, size) in enumerate(zip(shape, distances.values.shape, strict=True)):
+        # From the coarse node at or before the cell that precedes a brick to the one at or behind
+        # the cell that follows it.
+        first = SIDE * np.arange(count)
+        ends = [(first - 2) * ratio, (first + SIDE + 1) * ratio + 2.0]
+        ranges = np.clip(np.stack(ends, axis=1).astype(int), 0, size).ravel()
+        low = np.minimum.reduceat(low, ranges, axis).take(2 * np.arange(count), axis)
+        high = np.maximum.reduceat(high, ranges, axis).take(2 * np.arange(count), axis)
+    return (low < 0.0) & (high >= 0.0)
 
 
 def interpolate_distances(distances: Distances, bricks: Bricks) -> Floats:
@@ -113,32 +121,6 @@ def interpolate_distances(distances: Distances, bricks: Bricks) -> Floats:
     found = np.empty(bricks.shape, np.float32)
     _interpolate(distances.values, bricks.cell_mm / distances.cell_mm, bricks.indices, found)
     return found
-
-
-@compiled
-def _mark_crossed(values: Floats, ratio: float, crossed: Mask) -> None:
-    for a in range(crossed.shape[0]):
-        for b in range(crossed.shape[1]):
-            for c in range(crossed.shape[2]):
-                inside, outside = False, False
-                for i in range(_first_node(a, ratio), _end_node(a, ratio, values.shape[0])):
-                    for j in range(_first_node(b, ratio), _end_node(b, ratio, values.shape[1])):
-                        for k in range(_first_node(c, ratio), _end_node(c, ratio, values.shape[2])):
-                            inside |= values[i, j, k] < 0.0
-                            outside |= values[i, j, k] >= 0.0
-                crossed[a, b, c] = inside and outside
-
-
-@compiled
-def _first_node(brick: int, ratio: float) -> int:
-    """The coarse node at or before the cell that precedes a brick."""
-    return max(int((SIDE * brick - 2) * ratio), 0)
-
-
-@compiled
-def _end_node(brick: int, ratio: float, size: int) -> int:
-    """One past the coarse node at or behind the cell that follows a brick."""
-    return min(int((SIDE * brick + SIDE + 1) * ratio) + 2, size)
 
 
 @compiled

@@ -7,10 +7,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bodyscan.arrays import Bytes, Mask
-from bodyscan.errors import ScanFailed
 from bodyscan.evaluation.surface import Comparison
 from bodyscan.mesh.body import REGION_NAMES, BodyCloud, BodyMesh, compute_cover_shares
-from bodyscan.mesh.repair import decimate
 from bodyscan.progress import THREADS
 from bodyscan.report.model import Layer, css, ramp_legend
 from bodyscan.report.pictures import FILLED_TINT, blue_white_red, turbo
@@ -28,16 +26,6 @@ PAIRS = (
     (250, 210, 50),
 )
 """For one pair, two, ... and six or more."""
-
-
-def simplify_mesh(mesh: BodyMesh) -> BodyMesh | None:
-    """Reduce the mesh to about 50,000 faces; None if it does not stay closed for any number tried."""
-    for faces in (50_000, 44_000, 38_000):  # it may fold with one number, but not with another
-        try:
-            return decimate(mesh, faces=faces)
-        except ScanFailed:
-            continue
-    return None
 
 
 def colour_layers(

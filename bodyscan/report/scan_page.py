@@ -18,11 +18,12 @@ from bodyscan.fusion.verdict.coverage import MAX_FILLED
 from bodyscan.fusion.verdict.motion import MAX_MOTION_MM, MAX_RESIDUAL_MM
 from bodyscan.fusion.verdict.overlaps import MAX_DISAGREEMENT_MM
 from bodyscan.mesh.body import BodyMesh, compute_cover_shares, find_filled_patches
+from bodyscan.mesh.repair import decimate
 from bodyscan.mesh.topology import compute_topology
 from bodyscan.motion.person_motion import PartMotion, PersonMotion
 from bodyscan.registration.rig_calibration import FLOOR_AXES
 from bodyscan.report import charts
-from bodyscan.report.body_model import colour_layers, simplify_mesh
+from bodyscan.report.body_model import colour_layers
 from bodyscan.report.model import Shape, pack
 from bodyscan.report.page import (
     Block,
@@ -101,9 +102,7 @@ def _sections(scan: StoredScan, found: list[Comparison]) -> list[Section]:
 
 
 def _body(scan: StoredScan, shown: Comparison | None, limit: float) -> list[Block]:
-    small = simplify_mesh(scan.mesh)
-    if small is None:
-        return [Lines(("The mesh cannot be reduced without folds: there is no model to rotate.",))]
+    small = decimate(scan.mesh)
     caption = (
         f"The mesh reduced to {len(small.faces):,} faces, a few tenths of a millimetre from the full "
         f"one ({len(scan.mesh.faces):,}), which the figures are of. Colours are those of the measured "
