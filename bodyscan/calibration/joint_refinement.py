@@ -133,8 +133,7 @@ class BoardWarp:
 
     def height(self, xy: Array) -> Array:
         """Heights (...) mm above the described surface at (..., 2) mm of the board."""
-        powers, plane = self._powers(xy)
-        return np.asarray(powers @ self.heights - plane @ (self._best_planes @ self.heights))
+        return np.asarray(self.basis(xy) @ self.heights)
 
     def apply(self, points: Array) -> Array:
         """Displace described corners (M, 3) mm to where they lie."""

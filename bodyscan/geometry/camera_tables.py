@@ -8,7 +8,6 @@ quadratic per cell.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -18,7 +17,9 @@ from bodyscan.compiled import compiled
 from bodyscan.geometry.camera import Camera
 
 Table = tuple[Array, Array]
-"""Coefficients and frame of a `QuadraticTable`, for compiled functions."""
+"""Coefficients (rows, columns, 2, 6) of x^i y^j, both from 0 to 1 across a cell, whose outermost cells
+form a ring around the tabulated rectangle that means "outside"; and (4,) the ring's least x and y,
+then cells per unit of x and of y."""
 
 POWERS = ((0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (2, 0))
 """Powers of x and y that belong to a cell's six coefficients."""
@@ -26,52 +27,35 @@ NODES = 0.5 + 0.5 * np.cos(np.pi * (np.arange(3) + 0.5) / 3.0)
 """Chebyshev nodes across a cell of width 1: a fit there has about the same error everywhere."""
 
 
-@dataclass(frozen=True, eq=False)
-class QuadraticTable:
-    """A tabulated map with two values.
+def fit_table(
+    function: Callable[[Array], Array],
+    low: Array,
+    high: Array,
+    cells: tuple[int, int],
+    outside: float,
+) -> tuple[Table, float]:
+    """Tabulate a function by least squares at 3 x 3 nodes of each cell.
 
-    coefficients: (rows, columns, 2, 6) of x^i y^j, both from 0 to 1 across a cell. The outermost
-        cells form a ring around the tabulated rectangle that means "outside".
-    frame: (4,) the ring's least x and y, then cells per unit of x and of y.
-    error: the largest deviation of a quadratic from a fitted value, in the values' unit.
+    function: takes places (..., 2) to values (..., 2).
+    low, high: (2,) limits of the tabulated rectangle.
+    cells: number of columns and rows.
+    outside: both values elsewhere, and in cells where the function is NaN at some node.
+
+    Also returns the largest deviation of a quadratic from a fitted value, in the values' unit.
     """
-
-    coefficients: Array
-    frame: Array
-    error: float
-
-    @property
-    def table(self) -> Table:
-        return self.coefficients, self.frame
-
-    @staticmethod
-    def fit(
-        function: Callable[[Array], Array],
-        low: Array,
-        high: Array,
-        cells: tuple[int, int],
-        outside: float,
-    ) -> QuadraticTable:
-        """Tabulate a function by least squares at 3 x 3 nodes of each cell.
-
-        function: takes places (..., 2) to values (..., 2).
-        low, high: (2,) limits of the tabulated rectangle.
-        cells: number of columns and rows.
-        outside: both values elsewhere, and in cells where the function is NaN at some node.
-        """
-        size = (high - low) / cells
-        x, y = (grid.ravel() for grid in np.meshgrid(NODES, NODES))
-        corner = np.stack(np.meshgrid(np.arange(cells[0]), np.arange(cells[1])), axis=-1)
-        values = function(low + size * (corner[:, :, None] + np.stack([x, y], axis=-1)))
-        monomials = np.stack([x**i * y**j for i, j in POWERS], axis=-1)
-        coefficients = np.swapaxes(np.linalg.pinv(monomials) @ values, -1, -2)
-        error = np.abs(coefficients @ monomials.T - np.swapaxes(values, -1, -2))
-        ringed = np.zeros((cells[1] + 2, cells[0] + 2, 2, len(POWERS)))
-        ringed[..., 0] = outside
-        known = np.isfinite(coefficients).all(axis=(2, 3))
-        ringed[1:-1, 1:-1][known] = coefficients[known]
-        worst = float(error[known].max(initial=0.0))
-        return QuadraticTable(ringed, np.concatenate([low - size, 1.0 / size]), worst)
+    size = (high - low) / cells
+    x, y = (grid.ravel() for grid in np.meshgrid(NODES, NODES))
+    corner = np.stack(np.meshgrid(np.arange(cells[0]), np.arange(cells[1])), axis=-1)
+    values = function(low + size * (corner[:, :, None] + np.stack([x, y], axis=-1)))
+    monomials = np.stack([x**i * y**j for i, j in POWERS], axis=-1)
+    coefficients = np.swapaxes(np.linalg.pinv(monomials) @ values, -1, -2)
+    error = np.abs(coefficients @ monomials.T - np.swapaxes(values, -1, -2))
+    ringed = np.zeros((cells[1] + 2, cells[0] + 2, 2, len(POWERS)))
+    ringed[..., 0] = outside
+    known = np.isfinite(coefficients).all(axis=(2, 3))
+    ringed[1:-1, 1:-1][known] = coefficients[known]
+    frame = np.concatenate([low - size, 1.0 / size])
+    return (ringed, frame), float(error[known].max(initial=0.0))
 
 
 @compiled
@@ -171,11 +155,11 @@ def _within_tolerance(
 ) -> Table:
     for cell in CELLS_PX:
         cells = -(-camera.width // cell), -(-camera.height // cell)
-        found = QuadraticTable.fit(function, low, high, cells, outside)
+        table, error = fit_table(function, low, high, cells, outside)
         # A five-hundredth of the precision to which corners and boundaries are found.
-        if found.error * px_per_unit < 1e-4:
+        if error * px_per_unit < 1e-4:
             break
-    return found.table
+    return table
 
 
 def look_up_rays(rays: Table, wanted: Mask, first_row: int = 0) -> Array:

@@ -21,9 +21,10 @@ import numpy as np
 
 from bodyscan.arrays import Array
 from bodyscan.compiled import compiled
+from bodyscan.geometry.lenses.opencv import Rational
 from bodyscan.geometry.light_planes import Axis
 from bodyscan.geometry.smooth_sheets import Offset, SmoothSheets
-from bodyscan.geometry.transforms import RigidTransform, cross_matrix
+from bodyscan.geometry.transforms import RigidTransform, cross_matrix, twist_jacobian
 
 FRAME, SCALE = 6, 2
 CENTRE = FRAME + 1
@@ -113,17 +114,26 @@ class LensSheets(SmoothSheets):
         return self.offset(points, np.zeros(points.shape[:-1])).value
 
     def offset(self, points: Array, sheet: Array, *, parameters: bool = False) -> Offset:
-        shape, size = points.shape[:-1], len(self.covariance) if parameters else 0
-        flat = np.ascontiguousarray(points.reshape(-1, 3))
-        stripe, reach = np.empty(len(flat)), np.empty(len(flat))
-        by_point, by_freedom = np.empty((len(flat), 3)), np.empty((len(flat), size))
-        stripes_of_points(*self._frame_and_lens(), flat, stripe, by_point, reach, by_freedom)
+        in_projector = self.projector_from_camera.apply(points)
+        reach = in_projector[..., 2]
+        ideal = in_projector[..., :2] / reach[..., None]
+        (focal, centre), terms = self.parameters[:SCALE], self.parameters[SCALE:]
+        lens = Rational().with_coefficients(np.pad(terms, (0, len(LENS_SIGMAS) - len(terms))))
+        across, by_ideal = lens.distort(ideal)[..., 1], focal * lens.by_point(ideal)[..., 1, :]
+        by_z = -np.sum(by_ideal * ideal, axis=-1, keepdims=True)
+        by_point = np.concatenate([by_ideal, by_z], axis=-1) / reach[..., None]
+        by_parameter = None
+        if parameters:
+            by_motion = by_point[..., None, :] @ twist_jacobian(in_projector)
+            scale = np.stack([across, np.ones_like(across)], axis=-1)
+            by_lens = focal * lens.by_coefficients(ideal)[..., 1, : len(terms)]
+            by_parameter = np.concatenate([by_motion[..., 0, :], scale, by_lens], axis=-1)
         return Offset(
-            stripe.reshape(shape) - sheet,
-            by_point.reshape(*shape, 3),
-            np.full(shape, -1.0),
-            reach.reshape(shape),
-            by_freedom.reshape(*shape, size) if parameters else None,
+            focal * across + centre - sheet,
+            by_point @ self.projector_from_camera.rotation,
+            np.full(across.shape, -1.0),
+            reach,
+            by_parameter,
         )
 
     def _measure(self, rays: Array, s: Array, found: Array) -> None:
@@ -156,35 +166,6 @@ def _frame_and_scale(above: Array, below: Array, x: float) -> tuple[RigidTransfo
 Vector = tuple[float, float, float]
 
 EXACT, CONVERGED = 1e-7, 1e-6  # relative: the next step would be about the square of the last
-
-
-@compiled
-def stripes_of_points(
-    frame: Array,
-    lens: Array,
-    points: Array,
-    stripe: Array,
-    by_point: Array,
-    reach: Array,
-    by_freedom: Array,
-) -> None:
-    """Fill stripe coordinates and their derivatives at points (N, 3), camera frame.
-
-    stripe: (N,).
-    by_point: (N, 3), derivatives of the stripe coordinate by the point.
-    reach: (N,) mm, distance along the projector's axis.
-    by_freedom: (N, P), derivatives by the freedoms of a fit; skipped if it has no columns.
-    """
-    for n in range(len(points)):
-        point = _to_projector(frame, points[n, 0], points[n, 1], points[n, 2])
-        image = _distort(lens, point[0], point[1])
-        by_z = -(image[1] * point[0] + image[2] * point[1])
-        for k in range(3):
-            derivative = image[1] * frame[0, k] + image[2] * frame[1, k] + by_z * frame[2, k]
-            by_point[n, k] = derivative / point[2]
-        stripe[n], reach[n] = lens[0] * image[0] + lens[1], point[2]
-        if by_freedom.shape[1]:
-            _by_freedom(lens, point, image, by_freedom[n])
 
 
 @compiled

@@ -116,14 +116,9 @@ def adjoint(a_from_b: RigidTransform) -> Array:
 
 
 def twist_jacobian(points: Array) -> Array:
-    """d(point)/d(twist) (N, 3, 6) when a small motion acts on points (N, 3) in their own frame."""
-    jacobian = np.zeros((len(points), 3, 6))
-    x, y, z = points.T
-    jacobian[:, 0, 1], jacobian[:, 0, 2] = z, -y
-    jacobian[:, 1, 0], jacobian[:, 1, 2] = -z, x
-    jacobian[:, 2, 0], jacobian[:, 2, 1] = y, -x
-    jacobian[:, [0, 1, 2], [3, 4, 5]] = 1.0
-    return jacobian
+    """d(point)/d(twist) (..., 3, 6) when a small motion acts on points (..., 3) in their own frame."""
+    unit = np.broadcast_to(np.eye(3), (*points.shape, 3))
+    return np.concatenate([-cross_matrix(points), unit], axis=-1)
 
 
 def fit_rigid_transform(source: Array, target: Array) -> RigidTransform:

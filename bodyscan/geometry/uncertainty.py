@@ -24,8 +24,7 @@ class PoseCovariance:
 
     def marginal(self, name: str) -> Array:
         """Covariance (6, 6) of one pair's motion."""
-        k = 6 * self.names.index(name)
-        return self.matrix[k : k + 6, k : k + 6]
+        return self.select([name])
 
     def select(self, names: Sequence[str]) -> Array:
         """Covariance (6N, 6N) of these pairs' motions, in their order."""
@@ -40,11 +39,8 @@ class PoseCovariance:
 
     def relative(self, a: str, b: str) -> Array:
         """Covariance (6, 6) of the motion of b relative to a."""
-        i, j = 6 * self.names.index(a), 6 * self.names.index(b)
-        m = self.matrix
-        rows_i, rows_j = slice(i, i + 6), slice(j, j + 6)
-        cross = m[rows_i, rows_j]
-        return m[rows_i, rows_i] + m[rows_j, rows_j] - cross - cross.T
+        difference = np.concatenate([-np.eye(6), np.eye(6)], axis=1)
+        return difference @ self.select([a, b]) @ difference.T
 
     def add_common_motion(self, names: Collection[str], covariance: Array) -> PoseCovariance:
         """After these pairs, such as those of a pole, made one motion of covariance (6, 6).

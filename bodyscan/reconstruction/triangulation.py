@@ -133,22 +133,30 @@ def _measure_offset(
 
 
 def _require_fit(pair: PairCalibration, stripes: StripeMap, agreement: Agreement | None) -> None:
-    """Raise BadInput if the directions contradict each other as no right calibration lets them."""
-    assert stripes.crossing is not None
-    if agreement is not None and agreement.impossible:
+    """Raise BadInput if the directions contradict each other as no right calibration lets them.
+
+    With a right calibration nearly all rays meet both sheets; wrong codes do not. An imported
+    calibration has a sheet for every stripe. Ours has none where no board showed the stripe; far from
+    the boards it has one, though the depth there is only a guess.
+    """
+    if agreement is not None:
+        if not agreement.impossible:
+            return
         why = f"the directions differ by {agreement.description}"
     else:
+        assert stripes.crossing is not None
         decoded = np.isfinite(stripes.s) & np.isfinite(stripes.crossing.s)
-        measured = agreement.pixels if agreement else 0
-        # With a right calibration, nearly all rays meet both sheets; wrong codes do not.
-        if measured >= 0.01 * np.count_nonzero(decoded):
+        rays = pair.camera.rays(np.argwhere(decoded)[:, ::-1].astype(float))
+        exist, meet = np.isfinite(rays[:, 0]), np.isfinite(rays[:, 0])
+        for sheets, direction in ((pair.sheets, stripes), (pair.crossing, stripes.crossing)):
+            assert sheets is not None
+            s = direction.s[decoded].astype(np.float64)
+            exist = exist & np.isfinite(sheets.tangent_planes(s)[:, 3])
+            meet = meet & exist & np.isfinite(sheets.measure(rays, s).depth)
+        count, met = np.count_nonzero(exist), np.count_nonzero(exist & meet)
+        if count < 1000 or met >= 0.01 * count:
             return
-        with_sheets, met = _count_intersections(pair, stripes, decoded)
-        if with_sheets < 1000 or met >= 0.01 * with_sheets:
-            return
-        why = (
-            f"of {with_sheets} pixels with stripes of both directions, {met} meet both light sheets"
-        )
+        why = f"of {count} pixels with stripes of both directions, {met} meet both light sheets"
     raise BadInput(
         f"its calibration does not fit these stripes: {why}",
         where=f"pair {pair.name}",
@@ -157,26 +165,6 @@ def _require_fit(pair: PairCalibration, stripes: StripeMap, agreement: Agreement
         if pair.quality.imported
         else "calibrate again: camera or projector were moved, or `stripes` was changed",
     )
-
-
-def _count_intersections(
-    pair: PairCalibration, stripes: StripeMap, decoded: Mask
-) -> tuple[int, int]:
-    """Count the decoded pixels (H, W) with a sheet in both directions, and those that meet both.
-
-    An imported calibration has a sheet for every stripe. Ours has none where no board showed the
-    stripe; far from the boards it has one, though the depth there is only a guess.
-    """
-    assert pair.sheets is not None
-    assert pair.crossing is not None
-    assert stripes.crossing is not None
-    rays = pair.camera.rays(np.argwhere(decoded)[:, ::-1].astype(float))
-    exist, meet = np.isfinite(rays[:, 0]), np.ones(len(rays), bool)
-    for sheets, direction in ((pair.sheets, stripes), (pair.crossing, stripes.crossing)):
-        s = direction.s[decoded].astype(np.float64)
-        exist &= np.isfinite(sheets.tangent_planes(s)[:, 3])
-        meet &= np.isfinite(sheets.measure(rays, s).depth)
-    return int(np.count_nonzero(exist)), int(np.count_nonzero(exist & meet))
 
 
 def _triangulate(

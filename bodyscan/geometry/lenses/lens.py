@@ -152,20 +152,9 @@ def _at_most(points: Array, radius: Array | float) -> Array:
 def _fold_radius(lens: Lens) -> float:
     turns = 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
     around = np.stack([np.cos(turns), np.sin(turns)], axis=-1)
-
-    def first_fold(radii: Array) -> int:
-        """Index of the first radius at which some direction is no longer one to one; N if there is
-        none."""
-        with np.errstate(all="ignore"):
-            (a, b), (c, d) = np.moveaxis(
-                lens.by_point(radii[:, None, None] * around), (-2, -1), (0, 1)
-            )
-            folded = ~np.all((a * d - b * c > 0.0) & (a + d > 0.0), axis=1)
-        return int(np.argmax(folded)) if folded.any() else len(radii)
-
-    coarse = np.append(0.0, np.geomspace(0.02, FARTHEST, 160))
-    first = first_fold(coarse)
-    if first == len(coarse):
-        return np.inf
-    fine = np.linspace(coarse[max(first - 1, 0)], coarse[first], 65)
-    return float(fine[max(first_fold(fine) - 1, 0)])
+    radii = np.append(0.0, np.geomspace(0.02, FARTHEST, 1000))
+    with np.errstate(all="ignore"):
+        by_point = lens.by_point(radii[:, None, None] * around)
+        (a, b), (c, d) = np.moveaxis(by_point, (-2, -1), (0, 1))
+        folded = ~np.all((a * d - b * c > 0.0) & (a + d > 0.0), axis=1)
+    return float(radii[max(int(np.argmax(folded)) - 1, 0)]) if folded.any() else np.inf
