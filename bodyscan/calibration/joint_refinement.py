@@ -21,7 +21,7 @@ from bodyscan.calibration.boundary_points import BoundaryPoints, lift_along_rays
 from bodyscan.calibration.camera import camera_prior
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.least_squares import EXACT, Block, Noise, minimize
-from bodyscan.geometry.smooth_sheets import SmoothSheets
+from bodyscan.geometry.light_planes import SmoothSheets
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 
 Sheets = TypeVar("Sheets", bound=SmoothSheets)

@@ -9,7 +9,6 @@ import numpy as np
 
 from bodyscan.arrays import Indices
 from bodyscan.calibration.boundary_points import BoundaryPoints, subsample
-from bodyscan.calibration.light_planes import PlaneFit, count_boards, fit_light_planes
 from bodyscan.calibration.model_selection import (
     Candidate,
     HeldOutModel,
@@ -17,12 +16,18 @@ from bodyscan.calibration.model_selection import (
     select_model,
     split,
 )
-from bodyscan.calibration.sheet_fit import SheetFit, fit_pinhole, fit_sheets
+from bodyscan.calibration.sheet_fit import (
+    PlaneFit,
+    SheetFit,
+    count_boards,
+    fit_light_planes,
+    fit_pinhole,
+    fit_sheets,
+)
 from bodyscan.errors import PairFailed
 from bodyscan.geometry.bowed_sheets import BowedSheets
 from bodyscan.geometry.lens_sheets import LensSheets
-from bodyscan.geometry.light_planes import Axis, LightPlanes, LightSheets
-from bodyscan.geometry.smooth_sheets import SmoothSheets
+from bodyscan.geometry.light_planes import Axis, LightPlanes, LightSheets, SmoothSheets
 
 FIT_BINS = 25000
 """Points to which the chosen model is fitted; more do not change it by a tenth of its sigma."""

@@ -18,8 +18,7 @@ from bodyscan.calibration.stripe_agreement import board_offsets, find_projector_
 from bodyscan.calibration.striped_view import StripedView, boundaries_on_boards
 from bodyscan.errors import PairFailed
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.light_planes import LightSheets
-from bodyscan.geometry.smooth_sheets import SmoothSheets
+from bodyscan.geometry.light_planes import LightSheets, SmoothSheets
 from bodyscan.geometry.uncertainty import RayUncertainty
 from bodyscan.outcome import Outcome
 from bodyscan.rig.board import Board

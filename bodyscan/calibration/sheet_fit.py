@@ -1,4 +1,5 @@
-"""Fit smooth light sheets, or a pinhole projector as their start, to stripe boundaries on boards."""
+"""Fit light sheets to stripe boundaries on boards of known pose (3.2, Eq. 15-18): one free plane each,
+sheets that are smooth in s, or a projector without a lens as their start."""
 
 from __future__ import annotations
 
@@ -7,11 +8,12 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from bodyscan.arrays import Array
+from bodyscan.arrays import Array, Indices
 from bodyscan.calibration.boundary_points import BoundaryPoints
 from bodyscan.geometry.least_squares import EXACT, Block, Noise, Solution, minimize
-from bodyscan.geometry.robust import robust_scale
-from bodyscan.geometry.smooth_sheets import SmoothSheets
+from bodyscan.geometry.light_planes import Axis, LightPlanes, SmoothSheets
+from bodyscan.geometry.linear_gaussian import invert_scaled
+from bodyscan.geometry.robust import cauchy_weights, robust_scale
 
 Sheets = TypeVar("Sheets", bound=SmoothSheets)
 
@@ -138,3 +140,125 @@ def _board_covariance(
         change = board_error_mm * noise @ (points.jacobian[rows].T @ effects[rows])
         total += change @ change.T
     return total
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneFit:
+    """Light planes and how well they fit.
+
+    distances_mm: distance of every boundary point from its plane, (N,), NaN without a plane.
+    rms_mm: robustly weighted RMS of the distances.
+    """
+
+    planes: LightPlanes
+    distances_mm: Array
+    rms_mm: float
+
+
+def fit_light_planes(
+    data: BoundaryPoints,
+    stripes: int,
+    direction: Axis,
+    *,
+    board_error_mm: float = 0.0,
+    min_points: int = 12,
+) -> PlaneFit:
+    """Fit one plane to each boundary on at least two boards, by weighted least squares.
+
+    board_error_mm: how well the boards' poses are known, for the covariance (see `board_errors`).
+    min_points: number of points from which a board counts.
+
+    A point is weighted by how far one pixel of error moves it off the plane; outliers lose weight
+    (Cauchy). A boundary on a single board, or whose points lie on a line, gets no plane.
+    """
+    count = stripes + 1
+    enough = count_boards(data, stripes, min_points) >= 2
+    sigma_mm = np.linalg.norm(data.per_pixel, axis=1) * data.sigma_px
+    robust = np.ones(len(data.index))
+    for _ in range(4):
+        planes, opening, scatter = _weighted_planes(data, robust / sigma_mm**2, count)
+        distances = np.sum(data.points * planes[data.index, :3], axis=1) + planes[data.index, 3]
+        leverage = np.abs(np.sum(data.per_pixel * planes[data.index, :3], axis=1))
+        sigma_mm = np.maximum(leverage, 1e-6) * data.sigma_px
+        normalized = distances / sigma_mm
+        scale = robust_scale(normalized[np.isfinite(normalized)], 1e-9)
+        robust = np.nan_to_num(cauchy_weights(normalized, 1, 3.0 * scale))
+    bad = ~enough | (opening < 1e-4)  # on a line, for all their noise
+    planes = np.where(bad[:, None], np.nan, planes)
+    distances = np.where(bad[data.index], np.nan, distances)
+    used = np.isfinite(distances)
+    total = float(np.sum(robust[used]))
+    rms = float(np.sqrt(np.sum((robust * distances**2)[used]) / total)) if total else np.nan
+    weights = robust / (sigma_mm * scale) ** 2
+    covariance = _covariance(planes, scatter / scale**2, data, weights, board_error_mm)
+    return PlaneFit(LightPlanes(planes, covariance, direction), distances, rms)
+
+
+def count_boards(data: BoundaryPoints, stripes: int, min_points: int = 1) -> Indices:
+    """Count the boards with at least `min_points` points of each boundary, (S + 1,)."""
+    boards = int(data.board.max(initial=0)) + 1
+    points = np.bincount(data.index * boards + data.board, minlength=(stripes + 1) * boards)
+    return np.count_nonzero(points.reshape(stripes + 1, boards) >= min_points, axis=1)
+
+
+def _weighted_planes(
+    data: BoundaryPoints, weights: Array, count: int
+) -> tuple[Array, Array, Array]:
+    """Fit planes (count, 4); also return the ratio of the two variances of the points within each
+    (0 on a line), and the moments (count, 4, 4)."""
+    homogeneous = np.column_stack([data.points, np.ones(len(data.points))])
+    moments = np.empty((count, 4, 4))
+    for i in range(4):
+        for j in range(i, 4):
+            products = weights * homogeneous[:, i] * homogeneous[:, j]
+            moments[:, i, j] = moments[:, j, i] = np.bincount(data.index, products, count)
+    total = np.maximum(moments[:, 3, 3], 1e-300)
+    mean = moments[:, :3, 3] / total[:, None]
+    scatter = moments[:, :3, :3] / total[:, None, None] - mean[:, :, None] * mean[:, None, :]
+    values, vectors = np.linalg.eigh(scatter)
+    normals = vectors[:, :, 0]
+    offsets = -np.sum(normals * mean, axis=1)
+    sign = np.where(offsets < 0.0, -1.0, 1.0)
+    planes = np.column_stack([normals, offsets]) * sign[:, None]
+    opening = values[:, 1] / np.maximum(values[:, 2], 1e-300)
+    return planes, opening, moments
+
+
+def _covariance(
+    planes: Array, moments: Array, data: BoundaryPoints, weights: Array, board_error_mm: float
+) -> Array:
+    """Covariance (S + 1, 4, 4): the inverse of the weighted normal equations in the planes' three
+    degrees of freedom, plus what board errors of board_error_mm add."""
+    known = np.isfinite(planes[:, 0])
+    covariance = np.full((len(planes), 4, 4), np.nan)
+    normals = planes[known, :3]
+    # A plane's degrees of freedom: two directions perpendicular to the normal, and the offset.
+    helper = np.where(np.abs(normals[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+    first = np.cross(normals, helper)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    basis = np.zeros((len(normals), 4, 3))
+    basis[:, :3, 0], basis[:, :3, 1] = first, np.cross(normals, first)
+    basis[:, 3, 2] = 1.0
+    transposed = basis.transpose(0, 2, 1)
+    inverse = basis @ invert_scaled(transposed @ moments[known] @ basis)
+    inverse = inverse @ transposed
+    covariance[known] = inverse
+    if board_error_mm > 0.0:
+        change = inverse[:, None] @ _board_gradients(planes, data, weights)[known]
+        covariance[known] += board_error_mm**2 * np.einsum("nbik,nbjk->nij", change, change)
+    return covariance
+
+
+def _board_gradients(planes: Array, data: BoundaryPoints, weights: Array) -> Array:
+    """Change of each plane's right-hand side per mm of each board error, (S + 1, boards, 4, 3)."""
+    errors = data.board_errors
+    residual = np.sum(planes[data.index, :3] * errors.along_ray, axis=1)
+    effects = np.nan_to_num(residual * weights)[:, None] * errors.effects
+    homogeneous = np.column_stack([data.points, np.ones(len(data.points))])
+    boards = int(data.board.max()) + 1
+    cell, cells = data.index * boards + data.board, len(planes) * boards
+    gradient = np.empty((cells, 4, 3))
+    for i in range(4):
+        for j in range(3):
+            gradient[:, i, j] = np.bincount(cell, homogeneous[:, i] * effects[:, j], cells)
+    return gradient.reshape(len(planes), boards, 4, 3)

@@ -26,7 +26,7 @@ from numpy.polynomial import chebyshev
 from bodyscan.arrays import Array
 from bodyscan.compiled import compiled
 from bodyscan.geometry.lens_sheets import LensSheets
-from bodyscan.geometry.smooth_sheets import Offset, SmoothSheets
+from bodyscan.geometry.light_planes import Offset, SmoothSheets
 
 PLANE_DEGREE, BOW_DEGREE = 7, 3
 FALL = 0.3

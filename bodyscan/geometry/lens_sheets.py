@@ -22,8 +22,7 @@ import numpy as np
 from bodyscan.arrays import Array
 from bodyscan.compiled import compiled
 from bodyscan.geometry.lenses.opencv import Rational
-from bodyscan.geometry.light_planes import Axis
-from bodyscan.geometry.smooth_sheets import Offset, SmoothSheets
+from bodyscan.geometry.light_planes import Axis, Offset, SmoothSheets
 from bodyscan.geometry.transforms import RigidTransform, cross_matrix, twist_jacobian
 
 FRAME, SCALE = 6, 2

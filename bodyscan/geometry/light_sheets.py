@@ -12,8 +12,7 @@ from bodyscan.geometry.bowed_sheets import BOW_DEGREE, PLANE_DEGREE, BowedSheets
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.camera_tables import look_up_rays, ray_table
 from bodyscan.geometry.lens_sheets import LensSheets
-from bodyscan.geometry.light_planes import Axis, LightPlanes, LightSheets, RayDepths
-from bodyscan.geometry.smooth_sheets import SmoothSheets
+from bodyscan.geometry.light_planes import Axis, LightPlanes, LightSheets, RayDepths, SmoothSheets
 from bodyscan.geometry.transforms import RigidTransform
 
 

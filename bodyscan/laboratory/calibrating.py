@@ -12,11 +12,11 @@ from bodyscan.calibration.board_views import PlanarView, planar_view
 from bodyscan.calibration.boundary_points import select, subsample
 from bodyscan.calibration.camera import CameraCalibration, calibrate_camera
 from bodyscan.calibration.joint_refinement import StripedBoard, refine_jointly
-from bodyscan.calibration.light_planes import PlaneFit, fit_light_planes
 from bodyscan.calibration.light_sheets import fit_light_sheets
+from bodyscan.calibration.sheet_fit import PlaneFit, fit_light_planes
 from bodyscan.calibration.striped_view import BIN_PX
 from bodyscan.geometry.camera import camera_from_fields
-from bodyscan.geometry.smooth_sheets import SmoothSheets
+from bodyscan.geometry.light_planes import SmoothSheets
 from bodyscan.laboratory import apparatus
 from bodyscan.laboratory.approaches import (
     PROJECTORS,

@@ -14,8 +14,7 @@ from bodyscan.arrays import Array, Floats
 from bodyscan.calibration.pair import PairCalibration
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lens_sheets import FRAME, LENS_SIGMAS, SCALE, LensSheets
-from bodyscan.geometry.light_planes import LightPlanes
-from bodyscan.geometry.smooth_sheets import SmoothSheets
+from bodyscan.geometry.light_planes import LightPlanes, SmoothSheets
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.rig_calibration import ObservedCorners, RigCalibration
 from bodyscan.rig.pair import Pair

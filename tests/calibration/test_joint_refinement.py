@@ -29,7 +29,7 @@ from bodyscan.calibration.joint_refinement import (
 )
 from bodyscan.calibration.light_sheets import fit_light_sheets
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.smooth_sheets import SmoothSheets
+from bodyscan.geometry.light_planes import SmoothSheets
 from bodyscan.geometry.transforms import RigidTransform
 
 MIRROR = Mirror(

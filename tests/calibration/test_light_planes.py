@@ -12,7 +12,7 @@ from bodyscan.calibration.boundary_points import (
     concatenate,
     select,
 )
-from bodyscan.calibration.light_planes import fit_light_planes
+from bodyscan.calibration.sheet_fit import fit_light_planes
 from bodyscan.geometry.light_planes import LightPlanes, baseline_angle_tilt
 from bodyscan.geometry.transforms import RigidTransform
 

@@ -20,13 +20,12 @@ from sheet_models import PINHOLE
 
 from bodyscan.arrays import Array
 from bodyscan.calibration.boundary_points import BoundaryPoints, concatenate, select
-from bodyscan.calibration.light_planes import count_boards
 from bodyscan.calibration.light_sheets import SheetsFit, fit_light_sheets
+from bodyscan.calibration.sheet_fit import count_boards
 from bodyscan.errors import PairFailed
 from bodyscan.geometry.lens_sheets import LensSheets
-from bodyscan.geometry.light_planes import LightPlanes
+from bodyscan.geometry.light_planes import LightPlanes, SmoothSheets
 from bodyscan.geometry.light_sheets import intersect_rays
-from bodyscan.geometry.smooth_sheets import SmoothSheets
 
 
 def boards(

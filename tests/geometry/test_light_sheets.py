@@ -11,9 +11,8 @@ from sheet_models import MATRIX, MIDDLE, PINHOLE, STRIPES, by_offset, models, mo
 from bodyscan.arrays import Array
 from bodyscan.geometry.bowed_sheets import BowedSheets
 from bodyscan.geometry.lens_sheets import LensSheets
-from bodyscan.geometry.light_planes import LightPlanes, LightSheets
+from bodyscan.geometry.light_planes import LightPlanes, LightSheets, SmoothSheets
 from bodyscan.geometry.light_sheets import intersect_rays, sheets_from_arrays, sheets_to_arrays
-from bodyscan.geometry.smooth_sheets import SmoothSheets
 
 
 def some_points(rng: np.random.Generator, count: int = 50) -> tuple[np.ndarray, np.ndarray]:

@@ -9,7 +9,7 @@ import numpy as np
 from bodyscan.arrays import Array
 from bodyscan.geometry.bowed_sheets import BowedSheets
 from bodyscan.geometry.lens_sheets import LensSheets
-from bodyscan.geometry.smooth_sheets import SmoothSheets
+from bodyscan.geometry.light_planes import SmoothSheets
 
 STRIPES = 200
 MIDDLE = np.array([20.0, -30.0, 1300.0])
