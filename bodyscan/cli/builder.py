@@ -197,7 +197,7 @@ def refine_rig(
     """Refine the poses of the pairs on a rigid object, within what the boards allow."""
     from bodyscan.captures.folder import open_scan
     from bodyscan.registration.storage import archive_previous, load_calibration, save_calibration
-    from bodyscan.workflows.refine_rig import refine_rig as refine
+    from bodyscan.workflows.check_rig import refine_rig as refine
 
     _require_writable(out, overwrite)
     rig = load_calibration(calibration)

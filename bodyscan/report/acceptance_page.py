@@ -55,27 +55,9 @@ def acceptance_page(
             for one in found
         )
     )
-    return Page(
-        f"Acceptance of rig {calibration.rig.name}",
-        grade_acceptance(found, readings),
-        synthetic,
-        (("calibration", calibration_id[:12]),),
-        calibration.axes,
-        [
-            Section("Figures", [NO_STANDARD, numbers]),
-            Section("Spheres, all pairs merged", [_spheres(readings), _spacings(readings)]),
-            Section("Plate", [_plates(readings)]),
-            Section("Problems", [Lines(readings.problems or ("None.",))]),
-        ],
-    )
-
-
-def _spheres(readings: Readings) -> Table:
-    return Table(
+    spheres = Table(
         (
-            Column("place, shot, sphere"),
-            Column("by"),
-            Column("points"),
+            *(Column(name) for name in ("place, shot, sphere", "by", "points")),
             Column("form", "mm", "probing form."),
             Column("shell", "mm", "width of the shell that holds 90 % of the points."),
             Column("size", "mm", "probing size."),
@@ -86,21 +68,13 @@ def _spheres(readings: Readings) -> Table:
             if r.view == ALL
         ),
     )
-
-
-def _spacings(readings: Readings) -> Table:
-    return Table(
+    spacings = Table(
         (Column("place, shot"), Column("spheres"), Column("spacing error", "mm")),
         tuple((f"{r.place}, {r.shot}", r.between, r.error_mm) for r in readings.spacings),
     )
-
-
-def _plates(readings: Readings) -> Table:
-    return Table(
+    plates = Table(
         (
-            Column("place, shot"),
-            Column("by"),
-            Column("points"),
+            *(Column(name) for name in ("place, shot", "by", "points")),
             Column("flatness", "mm", "range of the distances from the best plane."),
             Column("RMS", "mm", "of the distances from the best plane."),
             Column("measured", "%", "of the plate's area.", digits=0),
@@ -109,4 +83,17 @@ def _plates(readings: Readings) -> Table:
             (f"{r.place}, {r.shot}", r.view, r.points, r.flatness_mm, r.rms_mm, r.measured_percent)
             for r in readings.plates
         ),
+    )
+    return Page(
+        f"Acceptance of rig {calibration.rig.name}",
+        grade_acceptance(found, readings),
+        synthetic,
+        (("calibration", calibration_id[:12]),),
+        calibration.axes,
+        [
+            Section("Figures", [NO_STANDARD, numbers]),
+            Section("Spheres, all pairs merged", [spheres, spacings]),
+            Section("Plate", [plates]),
+            Section("Problems", [Lines(readings.problems or ("None.",))]),
+        ],
     )

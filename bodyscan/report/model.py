@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.arrays import Array, Bytes, Indices
+from bodyscan.arrays import Array, Bytes
+from bodyscan.mesh.body import BodyMesh
 
 Legend = dict[str, Any]
 
@@ -26,15 +27,6 @@ class Layer:
 
 
 @dataclass(frozen=True, eq=False)
-class Shape:
-    """vertices (V, 3) mm, faces (F, 3), normals (V, 3)."""
-
-    vertices: Array
-    faces: Indices
-    normals: NDArray[np.floating[Any]]
-
-
-@dataclass(frozen=True, eq=False)
 class Strokes:
     """Straight lines: ends (L, 2, 3) mm, colours (L, 3) red, green, blue."""
 
@@ -43,7 +35,7 @@ class Strokes:
 
 
 def pack(
-    shape: Shape | None,
+    shape: BodyMesh | None,
     layers: Sequence[Layer] = (),
     *,
     strokes: Strokes | None = None,

@@ -24,7 +24,7 @@ from bodyscan.motion.person_motion import PartMotion, PersonMotion
 from bodyscan.registration.rig_calibration import FLOOR_AXES
 from bodyscan.report import charts
 from bodyscan.report.body_model import colour_layers
-from bodyscan.report.model import Shape, pack
+from bodyscan.report.model import pack
 from bodyscan.report.page import (
     Block,
     Column,
@@ -108,9 +108,8 @@ def _body(scan: StoredScan, shown: Comparison | None, limit: float) -> list[Bloc
         f"one ({len(scan.mesh.faces):,}), which the figures are of. Colours are those of the measured "
         "points: photo, number of pairs, sigma; grey or orange is what nothing measured."
     )
-    shape = Shape(small.vertices, small.faces, small.normals)
     layers = colour_layers(small, scan.mesh, scan.cloud, shown, limit)
-    return [Viewer("Body model", caption, pack(shape, layers))]
+    return [Viewer("Body model", caption, pack(small, layers))]
 
 
 def _numbers(scan: StoredScan) -> Numbers:

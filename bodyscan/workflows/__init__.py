@@ -1,6 +1,6 @@
 """The commands' workflows, stage by stage: each reads as a table of contents.
 
 Calibrating a rig: find_boards (boards, cameras, board poses), decode, calibrate_rig,
-import_rig, refine_rig. Checking it: check_rig, accept_rig, evaluate. Scanning: range_images,
+import_rig. Checking it: check_rig, accept_rig, evaluate. Scanning: range_images,
 fuse_range_images, scan_person.
 """

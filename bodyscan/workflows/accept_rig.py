@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, product
 from pathlib import Path
 
 import numpy as np
@@ -122,11 +122,8 @@ MIN_POINTS = 400
 """Points from which a single pair's sphere or plate is judged."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Cloud:
-    view: str
-    points: Array
-    normals: Array
+_Cloud = tuple[str, Array, Array]
+"""The points of all pairs, or of one: its name, points and normals (N, 3), rig frame."""
 
 
 def read_spheres(
@@ -139,16 +136,21 @@ def read_spheres(
     """Read every shot of a folder of the spheres at one place."""
     centres, radius = np.array(file.spheres.centres_mm), file.spheres.radius_mm
 
+    def row(shot: str, view: str, k: int, one: artefacts.SphereReading) -> SphereRow:
+        return SphereRow(site, shot, view, k, one.points, one.form_mm, one.shell_mm, one.size_mm)
+
     def read(shot: str, clouds: Sequence[_Cloud]) -> Readings:
-        merged, *single = clouds
-        near = artefacts.locate_spheres(merged.points, merged.normals, radius, centres)
-        read = [artefacts.read_sphere(merged.points, merged.normals, s, radius) for s in near]
-        artefacts.require_spheres(read, radius, centres)
-        rows = [_row(site, shot, ALL, k, one) for k, one in enumerate(read, start=1)]
-        for cloud in single:
-            rows += _read_single_pair(cloud, site, shot, read, radius)
+        (_, points, normals), *single = clouds
+        near = artefacts.locate_spheres(points, normals, radius, centres)
+        spheres = [artefacts.read_sphere(points, normals, each, radius) for each in near]
+        artefacts.require_spheres(spheres, radius, centres)
+        rows = [row(shot, ALL, k, one) for k, one in enumerate(spheres, start=1)]
+        for (view, points, normals), (k, sphere) in product(single, enumerate(spheres, start=1)):
+            with suppress(BodyscanError):  # this pair does not see it
+                one = artefacts.read_sphere(points, normals, sphere.fitted, radius)
+                rows += [row(shot, view, k, one)] if one.points >= MIN_POINTS else []
         pairs = combinations(range(1, len(centres) + 1), 2)
-        errors = artefacts.spacing_errors(read, centres)
+        errors = artefacts.spacing_errors(spheres, centres)
         spacings = tuple(
             SpacingRow(site, shot, f"{a}-{b}", float(error))
             for (a, b), error in zip(pairs, errors, strict=True)
@@ -169,14 +171,15 @@ def read_plates(
     width, height = file.plate.size_mm
 
     def row(shot: str, cloud: _Cloud) -> PlateRow:
-        one = artefacts.read_plate(cloud.points, cloud.normals)
+        view, points, normals = cloud
+        one = artefacts.read_plate(points, normals)
         share = 100.0 * one.area_mm2 / (width * height)
-        return PlateRow(site, shot, cloud.view, one.points, one.flatness_mm, one.rms_mm, share)
+        return PlateRow(site, shot, view, one.points, one.flatness_mm, one.rms_mm, share)
 
     def read(shot: str, clouds: Sequence[_Cloud]) -> Readings:
         rows = [row(shot, clouds[0])]
         for cloud in clouds[1:]:
-            if len(cloud.points) >= MIN_POINTS:
+            if len(cloud[1]) >= MIN_POINTS:
                 with suppress(BodyscanError):  # this pair sees only an edge of it
                     rows.append(row(shot, cloud))
         return Readings(plates=tuple(rows))
@@ -215,32 +218,11 @@ def _clouds(
     measured = [image for image in cleaned if image.valid.any()]
     # About 3,000 of the points lie on a sphere of 60 mm.
     cloud = merge(measured, calibration.rig_from_camera, FusionSettings(points=200_000)).cloud
-    found = [_Cloud(ALL, cloud.points, cloud.normals.astype(np.float64))]
+    found = [(ALL, cloud.points, cloud.normals.astype(np.float64))]
     for image in measured:
         valid = image.valid & np.isfinite(image.normals).all(axis=-1)
         pose = calibration.rig_from_camera[image.pair]
         points = pose.apply(image.points[valid].astype(np.float64))
         normals = pose.rotate(image.normals[valid].astype(np.float64))
-        found.append(_Cloud(image.pair, points, normals))
+        found.append((image.pair, points, normals))
     return found
-
-
-def _read_single_pair(
-    cloud: _Cloud,
-    site: str,
-    shot: str,
-    merged: Sequence[artefacts.SphereReading],
-    radius_mm: float,
-) -> Iterator[SphereRow]:
-    """Read by one pair alone the spheres that all pairs together found."""
-    for k, sphere in enumerate(merged, start=1):
-        try:
-            one = artefacts.read_sphere(cloud.points, cloud.normals, sphere.fitted, radius_mm)
-        except BodyscanError:
-            continue  # this pair does not see it
-        if one.points >= MIN_POINTS:
-            yield _row(site, shot, cloud.view, k, one)
-
-
-def _row(site: str, shot: str, view: str, sphere: int, one: artefacts.SphereReading) -> SphereRow:
-    return SphereRow(site, shot, view, sphere, one.points, one.form_mm, one.shell_mm, one.size_mm)

@@ -1,4 +1,4 @@
-"""Check a calibrated rig, by shots of a board or by scans of people, and repair what boards show."""
+"""Check a calibrated rig, by shots of a board or by scans of people; repair or refine it."""
 
 from __future__ import annotations
 
@@ -32,8 +32,9 @@ from bodyscan.errors import BadInput, BoardNotFound, FailedWork
 from bodyscan.fusion.cleaning import clean, require_subject
 from bodyscan.geometry.light_sheets import intersect_rays
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.motion.object_refinement import refine_on_object
 from bodyscan.outcome import Outcome
-from bodyscan.progress import Progress, silent
+from bodyscan.progress import Progress, silent, step
 from bodyscan.registration.drift import Drift, Move, find_drift, observe_pose
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.settings import AlignmentSettings
@@ -498,3 +499,31 @@ def _separate_groups(alignments: Sequence[Alignment]) -> tuple[tuple[str, ...], 
         graph.add_edges_from((overlap.source, overlap.target) for overlap in found.overlaps)
     groups = sorted((tuple(sorted(group)) for group in nx.connected_components(graph)), key=len)
     return tuple(groups[::-1]) if len(groups) > 1 else ()
+
+
+def refine_rig(
+    calibration: RigCalibration, captures: Captures, name: str, progress: Progress = silent
+) -> Outcome[RigCalibration]:
+    """Refine the poses of the pairs by ICP on a rigid object, within the covariance of the boards.
+
+    captures: a scan of an object that stood still.
+    name: what the calibration's notes call it.
+
+    Raises FailedWork if the overlaps do not come closer or the object moved, ScanFailed if nothing
+    was scanned.
+    """
+    measured = reconstruct_range_images(calibration, captures, progress)
+    with step(progress, "aligning"):
+        cleaned = clean(measured.value, calibration.rig_from_camera, calibration.rig.volume)
+        found = refine_on_object(
+            require_subject(cleaned),
+            calibration.rig_from_camera,
+            calibration.covariance,
+            calibration.rig.poles,
+        )
+    if not found.better:
+        what = "the overlaps do not come closer, or hardly: the calibration stays as it is"
+        raise FailedWork("\n  ".join([what, *found.lines]))
+    notes = (*calibration.notes, *(f"refined on {name}: {line}" for line in found.lines))
+    refined = replace(calibration, rig_from_camera=found.rig_from_camera, notes=notes)
+    return Outcome(refined, tuple(found.lines), measured.failures)

@@ -25,7 +25,7 @@ from bodyscan.fusion.storage import Origin
 from bodyscan.jobs.forgetting import find_subject
 from bodyscan.mesh.body import HAIR, SKIN, BodyCloud, find_filled_patches
 from bodyscan.report.body_model import colour_layers
-from bodyscan.report.model import Layer, Shape, pack
+from bodyscan.report.model import Layer, pack
 from bodyscan.report.page import Column, render
 from bodyscan.report.result_page import build_page
 
@@ -127,7 +127,7 @@ def test_what_covers_the_skin_is_a_layer_of_its_own() -> None:
 def test_a_mesh_too_large_for_its_indices_is_refused() -> None:
     many = np.zeros((65_537, 3))
     with pytest.raises(ValueError, match="65537"):
-        pack(Shape(many, np.zeros((1, 3), np.int64), many), [Layer("", many.astype(np.uint8))])
+        pack(replace(egg(20), vertices=many), [Layer("", many.astype(np.uint8))])
 
 
 def test_holes_are_found_where_nothing_was_measured() -> None:
