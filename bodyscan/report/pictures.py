@@ -98,10 +98,9 @@ def draw_deviation(
     *,
     limit_mm: float = 1.0,
     height_px: int = 900,
-    caption: str = "from truth, mm",
 ) -> bytes:
     """Points coloured by signed distance to a known surface: blue inside, red outside."""
-    scale = Scale(-limit_mm, limit_mm, caption, blue_white_red())
+    scale = Scale(-limit_mm, limit_mm, "deviation, mm", blue_white_red())
     return _draw_points(points, normals, scale.colours(signed_mm), views, height_px, scale)
 
 

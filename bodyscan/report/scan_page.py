@@ -198,7 +198,7 @@ def _comparison(
     moved = float(np.linalg.norm(fit.apply(points.mean(axis=0)) - points.mean(axis=0)))
     deviation_map = draw_deviation(
         points, mesh.normals[shown.vertices], shown.signed_mm, limit_mm=limit,
-        height_px=charts.PICTURE_PX, caption="deviation, mm",
+        height_px=charts.PICTURE_PX,
     )  # fmt: skip
     return [
         f"Distances of the {len(points):,} measured vertices of this scan's mesh from the surface of "

@@ -28,7 +28,6 @@ from bodyscan.evaluation.surface import (
     signed_distances,
 )
 from bodyscan.export.scan import transform_mesh
-from bodyscan.files.atomic import write_bytes
 from bodyscan.fusion.storage import StoredScan, load_scan
 from bodyscan.geometry.robust import rms, rms_length
 from bodyscan.geometry.transforms import RigidTransform
@@ -38,7 +37,6 @@ from bodyscan.mesh.topology import compute_topology
 from bodyscan.optional import optional
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.storage import load_calibration
-from bodyscan.report.pictures import draw_deviation
 
 BodyAt = Callable[[float], Array]
 
@@ -123,13 +121,13 @@ def compare_rig(calibration: RigCalibration, truth: Truth) -> RigDeviation:
 
 
 def evaluate_workspace(workspace: Path, body_at: BodyAt | None = None) -> str:
-    """Compare a workspace with its truth; return a text of all figures, and draw pictures.
+    """Compare a workspace with its truth; return a text of all figures.
 
     body_at: vertices of a moving subject's true surface at a moment, ms since the scan began; a
         scan that lacks some pairs stands for another moment than mid-scan.
 
-    Pictures of the deviations are written beside the scan. Raises BadInput without a truth,
-    CalibrationFileError, ResultError; a figure that cannot be computed is a line that says so.
+    Raises BadInput without a truth, CalibrationFileError, ResultError; a figure that cannot be
+    computed is a line that says so.
     """
     truth = load_truth(workspace / "truth")
     calibration = load_calibration(workspace / "calibration")
@@ -146,15 +144,12 @@ def evaluate_workspace(workspace: Path, body_at: BodyAt | None = None) -> str:
     moment_ms = (stored.facts.get("person") or {}).get("moment_ms")
     if body_at is not None and moment_ms is not None:
         truth = replace(truth, vertices=body_at(moment_ms))
-    lines += _scan_lines(stored, folder, calibration, truth)
-    pictures = ", ".join(str(path) for path in sorted(folder.glob("*.png")))
-    return "\n".join([*lines, f"  pictures: {pictures}"])
+    lines += _scan_lines(stored, calibration, truth)
+    return "\n".join(lines)
 
 
-def _scan_lines(
-    stored: StoredScan, folder: Path, calibration: RigCalibration, truth: Truth
-) -> list[str]:
-    """Lines with the figures of a scan; its pictures are written into its folder."""
+def _scan_lines(stored: StoredScan, calibration: RigCalibration, truth: Truth) -> list[str]:
+    """Lines with the figures of a scan."""
     assert truth.vertices is not None
     assert truth.faces is not None
     surface, pairs = (truth.vertices, truth.faces), truth.facts["pairs"]
@@ -193,11 +188,6 @@ def _scan_lines(
     lines.append(
         f"  pairs to each other     {sway.rms_mm:.3f} mm RMS over the body, along and across"
     )
-    of_cloud = stored.cloud.points, stored.cloud.normals, cloud
-    of_mesh = in_rig.vertices[measured], in_rig.normals[measured], mesh
-    for name, points_drawn in (("cloud", of_cloud), ("mesh", of_mesh)):
-        with part(f"{name}-deviation.png"):
-            write_bytes(folder / f"{name}-deviation.png", draw_deviation(*points_drawn))
     return lines
 
 
