@@ -3,15 +3,13 @@
 Also how far boundaries scatter about smooth runs, compared with their sigmas. Grey noise is measured
 where two images show the same thing. But JPEG errs with the content of an image, exposures vary from
 a pattern to its inverse, and pixels of projector and camera beat: each shifts a boundary relative to
-its neighbours, and all of it shows here. So does relief finer than the stripes (hair), where noise
-is low enough.
+its neighbours, and all of it shows here.
 """
 
 from __future__ import annotations
 
 import math
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -32,11 +30,9 @@ MIN_SCATTER = 1.2
 
 
 def interpolate_stripes(
-    boundaries: Boundaries, codes: NDArray[np.int32], usable: Mask, rough: Mask | None = None
+    boundaries: Boundaries, codes: NDArray[np.int32], usable: Mask
 ) -> tuple[Floats, Floats]:
     """Interpolate s and its standard deviation, (L, P) each, NaN where there is none.
-
-    rough: (N,) boundaries on relief that a smooth run would flatten: they are left in place.
 
     Between two boundaries s is a cubic with slopes from the boundaries around them (Hermite). Past
     the last boundary of a run it is extrapolated a little with the slope there.
@@ -44,7 +40,7 @@ def interpolate_stripes(
     s = np.full(codes.shape, np.nan, np.float32)
     sigma = s.copy()
     if boundaries.joined.any():
-        segments = _fit_segments(boundaries, rough)
+        segments = _fit_segments(boundaries)
         _fill(s, sigma, codes, usable, boundaries.line, boundaries.before, segments)
     return s, sigma
 
@@ -63,7 +59,7 @@ def correlation_along_lines(boundaries: Boundaries) -> float:
     return (2.4 if smoothed else 1.4) * median
 
 
-def _fit_segments(boundaries: Boundaries, rough: Mask | None = None) -> tuple[Array, ...]:
+def _fit_segments(boundaries: Boundaries) -> tuple[Array, ...]:
     """Fit s on scan lines between boundaries j and j + 1; NaN if they are not joined.
 
     Returns, (N - 1,) each:
@@ -75,10 +71,7 @@ def _fit_segments(boundaries: Boundaries, rough: Mask | None = None) -> tuple[Ar
     slope_in, slope_out: ds per px at both ends.
     blur_bias: what blur adds to s on a curved surface, blur^2 / 2 times its second derivative.
     """
-    smooth = boundaries.joined
-    if rough is not None:
-        smooth = smooth & ~(rough[1:] | rough[:-1])
-    position, sigma_px = smooth_runs(boundaries, smooth)
+    position, sigma_px = smooth_runs(boundaries)
     width = np.where(boundaries.joined, np.diff(position), np.nan)
     width[width < MIN_STRIPE_PX] = np.nan
     rise = np.diff(boundaries.index).astype(float)
@@ -191,7 +184,7 @@ def _continue_slope(slope: float, other: float, secant: float) -> float:
     return secant if math.isnan(other) else 2.0 * secant - other
 
 
-def smooth_runs(boundaries: Boundaries, joined: Mask) -> tuple[Array, Array]:
+def smooth_runs(boundaries: Boundaries) -> tuple[Array, Array]:
     """Smooth positions by a local quadratic fit of position against index along each unbroken run;
     returns them and their sigmas, px.
 
@@ -200,7 +193,8 @@ def smooth_runs(boundaries: Boundaries, joined: Mask) -> tuple[Array, Array]:
     """
     position, sigma = boundaries.position.copy(), boundaries.sigma_px.copy()
     for weights in SMOOTHERS:
-        _smooth(boundaries.position, boundaries.sigma_px, joined, weights, position, sigma)
+        measured = boundaries.position, boundaries.sigma_px, boundaries.joined
+        _smooth(*measured, weights, position, sigma)
     return position, sigma
 
 
@@ -226,50 +220,20 @@ def _smooth(
 def estimate_scatter(boundaries: Boundaries) -> float:
     """Estimate the ratio of observed to predicted distances from a parabola through five boundaries
     of a run, robustly; 1 if it is not clearly more, or there are too few."""
-    starts = len(boundaries.joined) - len(SMOOTHERS[0]) + 2
-    residual = _measure_residuals(boundaries, max(1, starts // 20_000))[1]
-    if len(residual) < 1000:
-        return 1.0
-    ratio = SIGMAS_PER_MEDIAN * float(np.median(np.abs(residual)))
-    return ratio if ratio > MIN_SCATTER else 1.0
-
-
-def estimate_local_scatter(boundaries: Boundaries) -> Array:
-    """Estimate the same ratio, at most 3, in windows of 31 px around each boundary, (N,), that hold
-    some 400 others; 1 where it is not clearly more."""
-    middle, residual = _measure_residuals(boundaries, 1)
-    if not len(middle):
-        return np.ones(len(boundaries.line))
-    width = int(boundaries.before.max()) + 1
-    pixels = boundaries.line * width + boundaries.before
-    size = (int(boundaries.line.max()) + 1) * width
-
-    def sum_around(values: Array | None) -> Floats:
-        total = np.bincount(pixels[middle], values, size).reshape(-1, width).astype(np.float32)
-        summed = cv2.boxFilter(total, -1, (31, 31), normalize=False, borderType=cv2.BORDER_CONSTANT)
-        return np.asarray(summed.ravel()[pixels])
-
-    count = np.maximum(sum_around(None), 1.0)
-    # One that strays farther strays alone.
-    mean = sum_around(np.minimum(np.square(residual), 3.0**2)) / count
-    # The mean of n squares of normal deviates is known to sqrt(2 / n).
-    significant = mean > MIN_SCATTER**2 + 3.0 * np.sqrt(2.0 / count)
-    return np.sqrt(np.where(significant, mean, 1.0))
-
-
-def _measure_residuals(boundaries: Boundaries, step: int) -> tuple[Indices, Array]:
-    """Every `step`th boundary in the middle of five of a run (M,), and its distance from a parabola
-    through the five, in predicted sigmas (M,)."""
     weights = SMOOTHERS[0]
     middle, span = len(weights) // 2, len(weights) - 1
-    first = np.arange(0, max(len(boundaries.joined) - span + 1, 0), step)
+    starts = len(boundaries.joined) - span + 1
+    first = np.arange(0, max(starts, 0), max(1, (starts + 1) // 20_000))
     run = boundaries.position[first + span] - boundaries.position[first] < 2.0 * REACH_PX
     for k in range(span):
         run &= boundaries.joined[first + k]
     first = first[run]
+    if len(first) < 1000:
+        return 1.0
     residual, variance = np.zeros(len(first)), np.zeros(len(first))
     for k, weight in enumerate(weights):
         gain = weight - (k == middle)
         residual += gain * boundaries.position[first + k]
         variance += (gain * boundaries.sigma_px[first + k]) ** 2
-    return first + middle, residual / np.sqrt(variance)
+    ratio = SIGMAS_PER_MEDIAN * float(np.median(np.abs(residual / np.sqrt(variance))))
+    return ratio if ratio > MIN_SCATTER else 1.0

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from bodyscan.stripes.boundaries import Boundaries
-from bodyscan.stripes.stripe_coordinates import estimate_local_scatter, estimate_scatter
+from bodyscan.stripes.stripe_coordinates import estimate_scatter
 
 
 def boundaries(
@@ -47,32 +45,3 @@ def test_a_thousand_runs_of_five_are_needed() -> None:
     # Of lines of twelve, eight starts each.
     assert estimate_scatter(boundaries(12 * 125, claimed=0.02, line=12)) > 2.0
     assert estimate_scatter(boundaries(12 * 125 - 1, claimed=0.02, line=12)) == 1.0
-
-
-def patch(rough: float) -> Boundaries:
-    """A hundred lines of fifty boundaries; those of lines 50 and on lie farther off than claimed."""
-    even = boundaries(5000, claimed=0.05, line=50)
-    position = even.position.copy()
-    straight = 30.0 + 2.0 * (even.index - 1)
-    position[2500:] += (rough - 1.0) * (position - straight)[2500:]
-    return replace(even, position=position)
-
-
-def test_local_scatter() -> None:
-    found = estimate_local_scatter(patch(2.0)).reshape(100, 50)
-    # Windows of 31 lines: those of the first 35 and the last 35 lines see one kind alone.
-    assert np.all(found[:35] == 1.0)
-    # Squares of twice a normal deviate, no more than 9, have a mean of 3.114; a window's 230 to 450
-    # overlapping fives know its root to 6 %.
-    assert np.median(found[65:]) == pytest.approx(np.sqrt(3.114), rel=0.06)
-    assert np.all(np.abs(found[65:] / np.sqrt(3.114) - 1.0) < 0.2)
-    # One that lies far off alone is none of it.
-    stray = boundaries(5000, claimed=0.05, line=50)
-    stray.position[2525] += 5.0
-    assert np.all(estimate_local_scatter(stray) == 1.0)
-
-
-def test_insignificant_local_scatter_is_ignored() -> None:
-    assert np.all(estimate_local_scatter(patch(1.1)) == 1.0)
-    for count in (0, 4, 5):
-        assert np.all(estimate_local_scatter(boundaries(count, claimed=0.02)) == 1.0)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d
@@ -121,7 +123,7 @@ def test_narrow_stripes_are_smoothed_along_their_run() -> None:
     count, noise = 4000, 0.05
     true = 1.5 * np.arange(count) + 0.3 * np.sin(np.arange(count) / 40.0)
     seen = true + noise * rng.normal(size=count)
-    position, sigma = smooth_runs(run(seen, np.arange(count), noise), np.ones(count - 1, bool))
+    position, sigma = smooth_runs(run(seen, np.arange(count), noise))
     # Seven points: 0.577 of the noise is left; at a run's ends five: 0.697, and one alone: all.
     share = np.sqrt(147.0) / 21.0
     assert np.std((position - true)[3:-3]) == pytest.approx(share * noise, rel=0.03)
@@ -137,17 +139,17 @@ def test_smoothing_stops_at_the_ends_of_runs_and_at_outliers() -> None:
     joined = np.ones(39, bool)
     joined[19] = False
     step = place + np.where(np.arange(40) > 19, 0.9, 0.0)
-    position, sigma = smooth_runs(run(step, np.arange(40), 0.02), joined)
+    position, sigma = smooth_runs(replace(run(step, np.arange(40), 0.02), joined=joined))
     np.testing.assert_allclose(position, step, atol=1e-12)
     np.testing.assert_allclose(sigma[[18, 19, 20, 21]], 0.02)
     stray = place.copy()
     stray[10] += 0.3  # the fit would move it by 0.2, ten sigmas
-    position, sigma = smooth_runs(run(stray, np.arange(40), 0.02), np.ones(39, bool))
+    position, sigma = smooth_runs(run(stray, np.arange(40), 0.02))
     assert position[10] == stray[10]
     assert sigma[10] == 0.02
     # Five boundaries over 12 px and more are not smoothed at all.
     wide = 3.0 * np.arange(40)
-    assert np.all(smooth_runs(run(wide, np.arange(40)), np.ones(39, bool))[1] == 0.02)
+    assert np.all(smooth_runs(run(wide, np.arange(40)))[1] == 0.02)
 
 
 def test_gradient_is_that_of_the_plane_through_usable_pixels() -> None:
@@ -271,26 +273,6 @@ def test_boundaries_are_shifted_to_the_centroid_of_the_light(down: float, right:
     np.testing.assert_allclose((found.line_position - found.line)[inner], 0.45 * down, atol=1e-3)
     moved = found.position - (20.0 * found.index - 0.5)
     np.testing.assert_allclose(moved[inner], 0.45 * right, atol=1e-3)
-
-
-def test_boundaries_on_relief_are_not_smoothed() -> None:
-    position = 2.0 * np.arange(1, 41) + 0.05 * np.random.default_rng(0).normal(size=40)
-    codes = np.tile(np.searchsorted(position, X).astype(np.int32), (2, 1))
-    rough = np.arange(40) >= 20
-    some = run(position, np.arange(1, 41), 0.05)
-    usable = np.ones(codes.shape, bool)
-    smooth, even = (
-        interpolate_stripes(some, codes, usable)[1],
-        interpolate_stripes(some, codes, usable, rough)[1],
-    )
-    # Between two boundaries of 2 px: 0.05 / 2, and seven that are smoothed leave 0.577 of it.
-    np.testing.assert_allclose(
-        even[1, 50:76], 0.05 / np.diff(position)[23:-1][(X[50:76] - 48) // 2], rtol=0.2
-    )
-    np.testing.assert_allclose(even[1, 10:30], smooth[1, 10:30])
-    assert np.all(smooth[1, 50:70] < 0.8 * even[1, 50:70])
-    # A run ends where relief begins: its last two boundaries, 18 and 19, are left in place too.
-    assert even[1, 39] == pytest.approx(0.05 / np.diff(position)[18], rel=0.01)
 
 
 @pytest.mark.parametrize("width", [2.2, 5.0])

@@ -19,7 +19,6 @@ from bodyscan.stripes.grey_noise import measure_noise
 from bodyscan.stripes.scan_lines import LineBands, ScanLines
 from bodyscan.stripes.stripe_coordinates import (
     correlation_along_lines,
-    estimate_local_scatter,
     estimate_scatter,
     interpolate_stripes,
 )
@@ -52,12 +51,7 @@ def decode_bits(
     boundaries = replace(boundaries, sigma_px=estimate_scatter(boundaries) * sigma_px)
     if images.bands is not None:
         return assemble_boundaries(images, lit, boundaries, stripes)
-    rough = None
-    if images.lit.dtype != np.uint8:  # noise in whole levels hides relief, and is known less well
-        ratio = estimate_local_scatter(boundaries)
-        boundaries = replace(boundaries, sigma_px=ratio * boundaries.sigma_px)
-        rough = ratio > 1.0
-    s, sigma = interpolate_stripes(boundaries, codes, usable, rough)
+    s, sigma = interpolate_stripes(boundaries, codes, usable)
     if code.single:  # in other codes words at boundaries may be wrong by any number
         fill_from_codes(s, sigma, codes, coded)
     s, sigma = correct_across_lines(s, sigma, brightness, boundaries.blur2)
