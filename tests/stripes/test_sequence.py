@@ -57,12 +57,9 @@ def test_reversed_bits_and_exchanged_lists_are_refused(good: Sequence) -> None:
 def test_a_frame_taken_twice_or_missing_is_named(good: Sequence, bit: int) -> None:
     with pytest.raises(DecodingFailed, match=f"bit {bit} look alike"):
         read(with_frame(good, "inverses", bit, good.patterns[bit]))
-    unlike = (
-        "finest pattern is darker than its inverse" if bit == 6 else f"differ clearly: bit {bit} "
-    )
-    with pytest.raises(DecodingFailed, match=unlike):
-        read(with_frame(good, "patterns", bit, good.dark))
     if bit < BITS - 1:  # of the finest, no finer one tells; a stripe's half is at stake there
+        with pytest.raises(DecodingFailed, match=f"bit {bit} is faint where finer ones are clear"):
+            read(with_frame(good, "patterns", bit, good.dark))
         with pytest.raises(DecodingFailed):
             read(with_frame(good, "inverses", bit, good.patterns[bit + 1]))
 

@@ -171,18 +171,18 @@ def check_pairs(patterns: np.ndarray, inverses: np.ndarray) -> None:
 def test_a_pattern_with_the_inverse_of_another_bit_is_refused() -> None:
     patterns, inverses = frame_pairs()
     check_pairs(patterns, inverses)
-    with pytest.raises(DecodingFailed, match=r"differ clearly: bit 1 \(\d\d% of the pixels\)"):
+    with pytest.raises(
+        DecodingFailed, match=r"bit 1 is faint where finer ones are clear, in \d\d%"
+    ):
         check_pairs(patterns, inverses[[0, 2, 1, 3, 4, 5]])
-    with pytest.raises(DecodingFailed, match="differ clearly: bit 0"):  # moved up by one
+    with pytest.raises(DecodingFailed, match="bit 0 is faint"):  # moved up by one
         check_pairs(patterns[1:], np.vstack([inverses[:1], inverses[2:]]))
 
 
-def test_a_bit_that_shows_nowhere_is_named() -> None:
+def test_a_pattern_that_is_its_own_inverse_is_refused() -> None:
     patterns, inverses = frame_pairs()
-    noise = np.random.default_rng(0).normal(0.0, 0.3, UP.shape).astype(np.float32)
-    for copy in (patterns[5:], patterns[5:] + noise):
-        with pytest.raises(DecodingFailed, match="bit 5 look alike"):
-            check_pairs(patterns, np.vstack([inverses[:5], copy]))
+    with pytest.raises(DecodingFailed, match="bit 5 look alike"):
+        check_pairs(patterns, np.vstack([inverses[:5], patterns[5:]]))
 
 
 def test_the_finest_bits_may_be_blurred_to_an_even_grey() -> None:
@@ -194,11 +194,9 @@ def test_the_finest_bits_may_be_blurred_to_an_even_grey() -> None:
         check_pairs(patterns, inverses)
 
 
-@pytest.mark.parametrize(("level", "which"), [(120.0, "brighter"), (20.0, "darker")])
-def test_a_finest_pattern_brighter_or_darker_than_its_inverse_everywhere_is_named(
-    level: float, which: str
-) -> None:
+@pytest.mark.parametrize("level", [120.0, 20.0])
+def test_a_finest_pattern_that_never_changes_is_refused(level: float) -> None:
     patterns, inverses = frame_pairs()
     patterns[5], inverses[5] = level, 140.0 - level
-    with pytest.raises(DecodingFailed, match=f"finest pattern is {which} than its inverse nearly"):
+    with pytest.raises(DecodingFailed, match="only 0% of neighbouring pixels"):
         check_pairs(patterns, inverses)

@@ -66,6 +66,20 @@ def check_words(
     Where a code word changes from one pixel to the next, the stripes must be neighbours. An exchange
     of the coarsest pattern and its inverse shows only in codes beyond the last stripe.
     """
+    fault = _find_fault(images, words, code, stripes, variance)
+    if fault:
+        raise DecodingFailed(
+            f"the patterns do not make a stripe code: frames are exchanged, lost or moved ({fault})",
+            remedy="check that frames are in their order, that none is missing or taken twice, that "
+            "pattern and inverse lists are not exchanged, and that `stripes` and `first_code` are "
+            "right; if the stripes are finer than camera or projector can show, project half as many",
+        )
+
+
+def _find_fault(
+    images: ScanLines, words: Codes, code: WordCode, stripes: int, variance: Floats
+) -> str:
+    """Describe how the frames disagree, "" if they do not; raises WrongDirection."""
     bits, step = len(images.patterns), max(1, round(math.sqrt(images.lit.size / 50_000)))
     contrast = cv2.subtract(images.lit, images.dark)
     sample = contrast[::step, ::step]
@@ -74,8 +88,10 @@ def check_words(
     some = (slice(None, None, 2 * step), slice(None, None, 2 * step))
     used = words[some][good[some]]
     if images.inverses is not None:
-        patterns, inverses = images.patterns[:, *some], images.inverses[:, *some]
-        used = used[_check_pairs(patterns[:, good[some]], inverses[:, good[some]], variance)]
+        frames = [stack[:, *some][:, good[some]] for stack in (images.patterns, images.inverses)]
+        if alike := _compare_pairs(*frames, variance):
+            return alike
+        used = used[_find_clear(*frames, variance)[: max(bits - FINE_BITS, 1)].all(axis=0)]
     # Noise flips the finest bits both along and across lines.
     coarse = words >> max(min(FINE_BITS, bits - FINE_BITS), 0)
     check_direction(coarse, good, images.transposed)
@@ -84,97 +100,53 @@ def check_words(
     # bit's changes out of step, even where they are clear of noise.
     min_share = 0.75 if images.inverses is None else 0.5 if code.single else 0.6
     worst = min(shares, key=lambda bit: shares[bit], default=0)
-    numbers, fault = code.stripes(used), ""
-    beyond = float(np.mean((numbers < 0) | (numbers >= stripes))) if numbers.size else 0.0
     if shares and shares[worst] < min_share:
-        fault = f"where bit {worst} changes, only {shares[worst]:.0%} of neighbouring pixels"
-        fault += " are in neighbouring stripes"
-    elif beyond > 0.05:
-        fault = f"{beyond:.0%} of the codes lie beyond the last stripe"
-    else:
-        opposite = _measure_folds(code.stripes(words[:: 2 * step]), good[:: 2 * step])
-        if opposite > 0.15:
-            fault = f"{opposite:.0%} of the pixels count stripes the other way, as without bit 0"
-    if fault:
-        raise DecodingFailed(
-            f"the patterns do not make a stripe code: frames are exchanged, lost or moved ({fault})",
-            remedy="check that frames are in their order, that none is missing or taken twice, that "
-            "pattern and inverse lists are not exchanged, and that `stripes` and `first_code` are "
-            "right",
+        return (
+            f"where bit {worst} changes, only {shares[worst]:.0%} of neighbouring pixels are in "
+            "neighbouring stripes"
         )
+    numbers = code.stripes(used)
+    beyond = float(np.mean((numbers < 0) | (numbers >= stripes))) if numbers.size else 0.0
+    if beyond > 0.05:
+        return f"{beyond:.0%} of the codes lie beyond the last stripe"
+    opposite = _measure_folds(code.stripes(words[:: 2 * step]), good[:: 2 * step])
+    if opposite > 0.15:
+        return f"{opposite:.0%} of the pixels count stripes the other way, as without bit 0"
+    return ""
 
 
-def _check_pairs(patterns: Greys, inverses: Greys, variance: Floats) -> Mask:
-    """Raise DecodingFailed if a pattern (bits, N) and its inverse are not of one bit, or not visible.
+def _find_clear(patterns: Greys, inverses: Greys, variance: Floats) -> Mask:
+    """Where noise alone cannot have decided a bit, for patterns and inverses of any equal shape."""
+    noise2 = sum(variance[level.astype(np.uint8, copy=False)] for level in (patterns, inverses))
+    difference = patterns.astype(np.float32) - inverses
+    return np.asarray(np.square(difference) >= CLEAR_SIGMAS**2 * noise2)
+
+
+def _compare_pairs(patterns: Greys, inverses: Greys, variance: Floats) -> str:
+    """Describe the coarsest pattern (bits, N) that looks like its inverse; "" if none does.
 
     Blur, indirect light and noise weaken fine patterns more than coarse ones: where a fine bit is
     clear, so is every coarser one, except at its boundaries. A pattern paired with another bit's
     inverse is as bright as that over half of the image.
-
-    Returns where noise decided none but the finest bits, (N,).
     """
-    bits = len(patterns)
-    contrast = np.abs(patterns.astype(np.float32) - inverses)
-    levels = (each.astype(np.uint8, copy=False) for each in (patterns, inverses))
-    sigma = np.sqrt(sum(variance[level] for level in levels))
-    clear = contrast >= CLEAR_SIGMAS * sigma
-    shares = clear.mean(axis=1) if contrast.shape[1] >= 200 else ()
-    for bit, share in enumerate(shares):
-        blurred = bit >= bits - FINE_BITS and _is_even_grey(patterns, inverses, bit)
-        if share < 0.02 and not blurred:
-            raise DecodingFailed(
-                f"pattern and inverse of bit {bit} look alike: they differ in {share:.1%} of the lit "
-                "pixels",
-                remedy="check whether one of the two is missing or was taken twice; if the stripes "
-                "are finer than camera or projector can show, leave the finest bit out (half the "
-                "stripes)",
-            )
-    if contrast.shape[1] >= 200:
-        _check_finest(patterns, inverses, contrast)
-    finer, strong, wrong = contrast[-1], contrast[-1] >= 8.0 * sigma[-1], ""
-    for bit in range(bits - 2, -1, -1):
+    bits, contrast = len(patterns), np.abs(patterns.astype(np.float32) - inverses)
+    if contrast.shape[1] < 200:
+        return ""
+    clear, strong = (_find_clear(patterns, inverses, k * variance) for k in (1.0, 4.0))
+    for bit in range(bits):
+        if np.mean(contrast[bit] == 0.0) > 0.9 or (
+            bit < bits - FINE_BITS and np.mean(clear[bit]) < 0.02
+        ):
+            return f"pattern and inverse of bit {bit} look alike"
         # Blurred stripes of the finest bit are a quarter as strong or less in a seventh of their
         # width (2 asin(1/4) / pi), next to their boundaries; coarser ones in half as much.
-        weak = contrast[bit][strong] < 0.25 * finer[strong]
-        max_share = 0.35 if bit >= bits - FINE_BITS else 0.15
-        if weak.size >= 200 and np.mean(weak) > max_share:
-            wrong = f"bit {bit} ({np.mean(weak):.0%} of the pixels)"
-        finer = np.maximum(finer, contrast[bit])
-        strong = strong | (contrast[bit] >= 8.0 * sigma[bit])
-    if wrong:  # the coarsest: frames behind it may have moved up
-        raise DecodingFailed(
-            f"pattern and inverse look alike where finer ones differ clearly: {wrong}",
-            remedy="check whether a frame is missing, so that those behind it moved up, or stands in "
-            "another's place",
-        )
-    return np.asarray(clear[: max(bits - FINE_BITS, 1)].all(axis=0))
-
-
-def _check_finest(patterns: Greys, inverses: Greys, contrast: Floats) -> None:
-    """Raise DecodingFailed if the finest pattern is brighter or darker than its inverse nearly
-    everywhere, and a coarser one is not."""
-    coarse = max(len(patterns) - 1 - FINE_BITS, 0)
-    bright, coarse_bright = (np.mean(patterns[bit] > inverses[bit]) for bit in (-1, coarse))
-    distinct = np.median(contrast[-1]) > 0.25 * np.median(contrast.max(axis=0))
-    if distinct and abs(coarse_bright - 0.5) < 0.35 <= abs(bright - 0.5):
-        raise DecodingFailed(
-            f"the finest pattern is {'brighter' if bright > 0.5 else 'darker'} than its inverse "
-            "nearly everywhere",
-            remedy="check whether one of the two is missing, or another image stands in for it",
-        )
-
-
-def _is_even_grey(patterns: Greys, inverses: Greys, bit: int) -> bool:
-    """Whether a pattern is an even grey between the darkest and the brightest that each pixel
-    sees: too fine for projector or lens. A pattern used as its own inverse is not, or exactly
-    equal to it."""
-    if np.mean(patterns[bit] == inverses[bit]) > 0.9:
-        return False
-    low = np.minimum(patterns, inverses).min(axis=0).astype(np.float32)
-    high = np.maximum(patterns, inverses).max(axis=0)
-    level = (patterns[bit] - low) / np.maximum(high - low, 1.0)
-    first, middle, third = np.percentile(level, [25, 50, 75])
-    return bool(third - first < 0.3 < middle < 1.0)
+        finer = contrast[bit + 1 :].max(axis=0, initial=0.0)[strong[bit + 1 :].any(axis=0)]
+        weak = contrast[bit][strong[bit + 1 :].any(axis=0)] < 0.25 * finer
+        if weak.size >= 200 and np.mean(weak) > (0.35 if bit >= bits - FINE_BITS else 0.15):
+            return (
+                f"bit {bit} is faint where finer ones are clear, in {np.mean(weak):.0%} of pixels"
+            )
+    return ""
 
 
 def _share_in_step(
@@ -183,9 +155,10 @@ def _share_in_step(
     """Compute for each bit the share of its changes along lines that lead to a neighbouring stripe.
 
     A change belongs to the coarsest bit that differs; bits with fewer than 50 changes are left out.
-    In Gray code with inverses only changes that are clear of noise count.
+    In Gray code with inverses only changes count off rims, where the coarser bits and the next finer
+    one are clear of noise. Finer bits are 0 next to a change, and are taken for it where noise decides.
     """
-    bits = len(images.patterns)
+    bits, contrast = len(images.patterns), images.contrast
     some = slice(None, None, 1 + words.size // 600_000)
     difference = words[some, 1:] ^ words[some, :-1]
     change = (difference != 0) & good[some, 1:] & good[some, :-1]
@@ -193,68 +166,27 @@ def _share_in_step(
         change &= difference & (difference - 1) == 0
     line, x = np.nonzero(change)
     bit = bits - np.frexp(difference[line, x].astype(np.float64))[1]
-    line *= some.step
     shares = {}
     for k in range(bits):
         changes = np.flatnonzero(bit == k)
         changes = changes[:: 1 + len(changes) // 1000]
-        here, masks = (line[changes], x[changes]), np.zeros(len(changes), np.uint16)
+        pixels = line[changes] * some.step, x[changes] + np.array([[0], [1]])
+        beside, masks = words[pixels], np.zeros(len(changes), np.uint16)
         if code.single and images.inverses is not None:
-            clear, masks = _find_clear_changes(images, words, *here, k, variance)
-            here, masks = (here[0][clear], here[1][clear]), masks[clear]
+            frames = (stack[:, *pixels] for stack in (images.patterns, images.inverses))
+            clear = _find_clear(*frames, variance).all(axis=1)
+            clear[k] = k < bits - 1  # any two words that differ in the finest bit are neighbours
+            # Where the brightness doubles, the change may be a rim.
+            sides = x[changes] + np.array([[-4], [5]])
+            light = contrast[pixels[0], np.clip(sides, 0, words.shape[1] - 1)]
+            known = clear[: k + 2].all(axis=0) & (light.max(axis=0) <= 2.0 * light.min(axis=0))
+            finer = np.cumprod(clear[k + 1 :], axis=0).sum(axis=0)
+            masks = ((1 << (bits - 1 - k - finer)) - 1).astype(np.uint16)
+            beside, masks = beside[:, known], masks[known]
         if len(masks) >= MIN_CHANGES:
-            first, second = words[here] & ~masks, words[here[0], here[1] + 1] & ~masks
-            steps = np.abs(code.stripes(first) - code.stripes(second))
-            shares[k] = float(np.mean(steps == 1))
+            first, second = code.stripes(beside & ~masks)
+            shares[k] = float(np.mean(np.abs(first - second) == 1))
     return shares
-
-
-def _find_clear_changes(
-    images: ScanLines,
-    words: Codes,
-    line: NDArray[np.intp],
-    x: NDArray[np.intp],
-    bit: int,
-    variance: Floats,
-) -> tuple[Mask, Codes]:
-    """Find changes of a bit between pixels (N,) and the next ones that are clear of noise and rims.
-
-    Every coarser bit and the next finer one must be clear in both pixels; a coarse bit also clear
-    and unchanged 4 px to either side. Where the brightness doubles, the change may be a rim. Also
-    returns masks (N,) of the finer bits that noise may have flipped.
-    """
-    patterns, inverses = images.patterns, images.inverses
-    assert inverses is not None
-    bits, last = len(patterns), words.shape[1] - 1
-
-    def is_clear(k: int, at: NDArray[np.intp]) -> Mask:
-        pattern, inverse = patterns[k][line, at], inverses[k][line, at]
-        noise = variance[pattern.astype(np.uint8)] + variance[inverse.astype(np.uint8)]
-        step = pattern.astype(np.float32) - inverse.astype(np.float32)
-        return np.asarray(np.square(step) >= CLEAR_SIGMAS**2 * noise)
-
-    left, right = np.maximum(x - 4, 0), np.minimum(x + 5, last)
-    sides = [
-        np.maximum(images.lit[line, k].astype(np.float32) - images.dark[line, k], 0.0)
-        for k in (left, right)
-    ]
-    clear = np.maximum(*sides) <= 2.0 * np.minimum(*sides)
-    masks = np.zeros(len(line), np.uint16)
-    for k in range(bits):
-        if k != bit:
-            unclear = ~(is_clear(k, x) & is_clear(k, x + 1))
-            if k <= bit + 1:
-                clear &= ~unclear
-            else:
-                masks = np.where(unclear & (masks == 0), np.uint16((1 << (bits - k)) - 1), masks)
-    if bit == bits - 1:
-        clear[:] = False  # any two words that differ in the finest bit are neighbours
-    elif bit < bits - FINE_BITS:
-        mask = np.uint16(1 << (bits - 1 - bit))
-        clear &= (x >= 4) & (x + 5 <= last) & is_clear(bit, left) & is_clear(bit, right)
-        for near, far in ((x, left), (x + 1, right)):
-            clear &= (words[line, near] ^ words[line, far]) & mask == 0
-    return clear, masks
 
 
 def _measure_folds(stripes: NDArray[np.int32], good: Mask) -> float:
