@@ -88,10 +88,11 @@ def _find_fault(
     some = (slice(None, None, 2 * step), slice(None, None, 2 * step))
     used = words[some][good[some]]
     if images.inverses is not None:
-        frames = [stack[:, *some][:, good[some]] for stack in (images.patterns, images.inverses)]
-        if alike := _compare_pairs(*frames, variance):
+        pattern = images.patterns[:, *some][:, good[some]]
+        inverse = images.inverses[:, *some][:, good[some]]
+        if alike := _compare_pairs(pattern, inverse, variance):
             return alike
-        used = used[_find_clear(*frames, variance)[: max(bits - FINE_BITS, 1)].all(axis=0)]
+        used = used[_find_clear(pattern, inverse, variance)[: max(bits - FINE_BITS, 1)].all(axis=0)]
     # Noise flips the finest bits both along and across lines.
     coarse = words >> max(min(FINE_BITS, bits - FINE_BITS), 0)
     check_direction(coarse, good, images.transposed)
@@ -173,8 +174,8 @@ def _share_in_step(
         pixels = line[changes] * some.step, x[changes] + np.array([[0], [1]])
         beside, masks = words[pixels], np.zeros(len(changes), np.uint16)
         if code.single and images.inverses is not None:
-            frames = (stack[:, *pixels] for stack in (images.patterns, images.inverses))
-            clear = _find_clear(*frames, variance).all(axis=1)
+            pattern, inverse = images.patterns[:, *pixels], images.inverses[:, *pixels]
+            clear = np.asarray(_find_clear(pattern, inverse, variance).all(axis=1))
             clear[k] = k < bits - 1  # any two words that differ in the finest bit are neighbours
             # Where the brightness doubles, the change may be a rim.
             sides = x[changes] + np.array([[-4], [5]])
