@@ -90,8 +90,8 @@ def _find_fault(
     if images.inverses is not None:
         pattern = images.patterns[:, *some][:, good[some]]
         inverse = images.inverses[:, *some][:, good[some]]
-        if alike := _compare_pairs(pattern, inverse, variance):
-            return alike
+        if fault := _compare_pairs(pattern, inverse, variance):
+            return fault
         used = used[_find_clear(pattern, inverse, variance)[: max(bits - FINE_BITS, 1)].all(axis=0)]
     # Noise flips the finest bits both along and across lines.
     coarse = words >> max(min(FINE_BITS, bits - FINE_BITS), 0)
@@ -157,7 +157,7 @@ def _share_in_step(
 
     A change belongs to the coarsest bit that differs; bits with fewer than 50 changes are left out.
     In Gray code with inverses only changes count off rims, where the coarser bits and the next finer
-    one are clear of noise. Finer bits are 0 next to a change, and are taken for it where noise decides.
+    one are clear of noise. Finer bits are 0 next to a change and are taken for it where noise decides.
     """
     bits, contrast = len(images.patterns), images.contrast
     some = slice(None, None, 1 + words.size // 600_000)
@@ -172,7 +172,7 @@ def _share_in_step(
         changes = np.flatnonzero(bit == k)
         changes = changes[:: 1 + len(changes) // 1000]
         pixels = line[changes] * some.step, x[changes] + np.array([[0], [1]])
-        beside, masks = words[pixels], np.zeros(len(changes), np.uint16)
+        neighbours, masks = words[pixels], np.zeros(len(changes), np.uint16)
         if code.single and images.inverses is not None:
             pattern, inverse = images.patterns[:, *pixels], images.inverses[:, *pixels]
             clear = np.asarray(_find_clear(pattern, inverse, variance).all(axis=1))
@@ -183,9 +183,9 @@ def _share_in_step(
             known = clear[: k + 2].all(axis=0) & (light.max(axis=0) <= 2.0 * light.min(axis=0))
             finer = np.cumprod(clear[k + 1 :], axis=0).sum(axis=0)
             masks = ((1 << (bits - 1 - k - finer)) - 1).astype(np.uint16)
-            beside, masks = beside[:, known], masks[known]
+            neighbours, masks = neighbours[:, known], masks[known]
         if len(masks) >= MIN_CHANGES:
-            first, second = code.stripes(beside & ~masks)
+            first, second = code.stripes(neighbours & ~masks)
             shares[k] = float(np.mean(np.abs(first - second) == 1))
     return shares
 
