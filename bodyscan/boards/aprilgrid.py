@@ -17,7 +17,7 @@ import numpy as np
 from bodyscan.arrays import Array, Bytes, Mask
 from bodyscan.boards import board_layout
 from bodyscan.boards.board_map import BoardMap, fit_board_map
-from bodyscan.boards.charuco import Markers, count_dictionary_markers, detect_markers, fit_markers
+from bodyscan.boards.charuco import Markers, detect_markers, fit_markers
 from bodyscan.boards.corners import WINDOW_SQUARES, DetectedCorners, refine_corners
 from bodyscan.rig.board import Board
 
@@ -61,7 +61,7 @@ def _candidate_positions(image: Bytes, board: Board, thorough: bool) -> Iterator
         if grown > 1:
             picture = cv2.dilate(picture, np.ones((grown, grown), np.uint8))
         for border_bits in BORDER_BITS:
-            first = count_dictionary_markers(board)
+            first = board.first_marker + board.marker_count
             tags = detect_markers(picture, board, border_bits=border_bits, first=first)
             corners = (tags.corners + 0.5) / scale - 0.5
             position = locate_grid(board, Markers(tags.ids, corners), border_bits)

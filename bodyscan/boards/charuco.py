@@ -12,7 +12,6 @@ from bodyscan.boards import board_layout
 from bodyscan.boards.board_map import BoardMap, fit_board_map
 from bodyscan.boards.corners import DetectedCorners, refine_corners
 from bodyscan.boards.view import Appearance
-from bodyscan.errors import BadInput
 from bodyscan.rig.board import Board
 
 
@@ -56,18 +55,6 @@ def detect_markers(
     return Markers(np.asarray(ids, np.int64).ravel(), corners)
 
 
-def count_dictionary_markers(board: Board) -> int:
-    """Count the markers to look for, from the dictionary's first on: the board's, and those of two
-    more rows, which show that the print is larger than described.
-
-    The back of a board with two faces has the next markers, so nothing more is looked for.
-    """
-    if board.faces == 2:
-        return board.first_marker + board.marker_count
-    longer = board.model_copy(update={"rows": board.rows + 2})
-    return board.first_marker + longer.marker_count + board.columns
-
-
 @dataclass(frozen=True, eq=False)
 class FacePosition:
     """Where one face of a board appears in an image, by the markers that agree on it.
@@ -101,7 +88,7 @@ class FacePosition:
 
 
 def locate_charuco(
-    image: Bytes, board: Board, markers: Markers, position: FacePosition | None
+    image: Bytes, board: Board, position: FacePosition | None
 ) -> DetectedCorners | None:
     """Find the board's corners next to the detected markers.
 
@@ -114,27 +101,8 @@ def locate_charuco(
         return None
     pixels, good = _refine(image, board, position.board_map, nearby, position.printed)
     ids = nearby[good] + position.face * board_layout.corners_per_face(board)
-    appearance = Appearance(
-        other_layout=position.board.legacy_layout != board.legacy_layout,
-        more_rows=_has_more_rows(position, markers),
-    )
+    appearance = Appearance(other_layout=position.board.legacy_layout != board.legacy_layout)
     return DetectedCorners(ids, pixels[good], appearance)
-
-
-def _has_more_rows(position: FacePosition, markers: Markers) -> bool:
-    """Whether markers lie where a board of more rows would have its next ones."""
-    board = position.board
-    if board.faces == 2:
-        return False  # the back's markers have the next numbers
-    longer = board.model_copy(update={"rows": board.rows + 2})
-    end = board.first_marker + board_layout.markers_per_face(board)
-    if not np.any((markers.ids >= end) & (markers.ids < end + board.columns)):
-        return False
-    try:
-        more = locate_face(longer, markers)
-    except BadInput:  # the dictionary has no more
-        return False
-    return more is not None and more.agreeing > position.agreeing
 
 
 def locate_face(board: Board, markers: Markers) -> FacePosition | None:

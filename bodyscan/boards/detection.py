@@ -12,7 +12,6 @@ from bodyscan.boards.aprilgrid import find_aprilgrid
 from bodyscan.boards.board_layout import corners_per_face
 from bodyscan.boards.charuco import (
     Markers,
-    count_dictionary_markers,
     detect_markers,
     locate_charuco,
     locate_face,
@@ -48,9 +47,8 @@ def find_boards(image: Bytes, boards: Sequence[Board], *, pair: str, shot: str) 
     for board in boards:
         if board.kind != "checkerboard":
             same_dictionary = [one for one in boards if one.dictionary == board.dictionary]
-            found = _find_marked(
-                image, board, cache, max(map(count_dictionary_markers, same_dictionary))
-            )
+            first = max(one.first_marker + one.marker_count for one in same_dictionary)
+            found = _find_marked(image, board, cache, first)
         else:
             found = find_checkerboard(image, board)
         if found is not None and _determines_plane(found, board):
@@ -95,9 +93,9 @@ def _find_charuco(
         markers = detect(quick=True)
         position = locate_face(board, markers)
         if position is not None and position.valid and position.complete(picture.shape):
-            return locate_charuco(picture, board, markers, position)
+            return locate_charuco(picture, board, position)
     markers = detect(quick=False)
-    return locate_charuco(picture, board, markers, locate_face(board, markers))
+    return locate_charuco(picture, board, locate_face(board, markers))
 
 
 def _determines_plane(found: DetectedCorners, board: Board) -> bool:

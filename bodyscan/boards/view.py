@@ -22,13 +22,11 @@ class Appearance:
     inverted: white where the print as described is black.
     mirrored: seen in a mirror, or through the glass it is printed on.
     other_layout: its markers follow OpenCV's other historic layout, not the one in the rig file.
-    more_rows: more markers follow beyond its last row.
     """
 
     inverted: bool = False
     mirrored: bool = False
     other_layout: bool = False
-    more_rows: bool = False
 
     def undo(self, image: Bytes) -> Bytes:
         """The image (H, W) with inversion and mirroring undone."""

@@ -96,7 +96,6 @@ def _notes_of_board(board: Board, views: Sequence[BoardView]) -> Iterator[str]:
     inverted = [view for view in views if view.appearance.inverted]
     mirrored = [view for view in views if view.appearance.mirrored]
     other = [view for view in views if view.appearance.other_layout]
-    beyond = [view for view in views if view.appearance.more_rows]
     if inverted:
         yield f"board {board.name} is white on black in {where(inverted)}; used so"
     if mirrored:
@@ -116,9 +115,4 @@ def _notes_of_board(board: Board, views: Sequence[BoardView]) -> Iterator[str]:
         yield (
             f"board {board.name} has the other of OpenCV's two layouts (legacy_layout: {layout}) in "
             f"{where(other)}; used so"
-        )
-    if beyond:
-        yield (
-            f"board {board.name} has markers below its last row in {where(beyond)}: it seems to have "
-            f"more than {board.rows} rows of squares"
         )

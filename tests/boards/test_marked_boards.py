@@ -129,13 +129,6 @@ def test_a_column_too_many_is_refused_and_the_right_number_named(picture: Bytes)
     assert "board of 9 columns x 8 rows, not 10 x 8" in describe_unfound(picture, described)
 
 
-def test_rows_that_are_not_described_are_named(picture: Bytes) -> None:
-    described = MARKED.model_copy(update={"rows": 6})
-    views = found(picture, described) * 3
-    rig = Rig(name="r", boards=(described,), pairs=(CAMERA,))
-    assert any("more than 6 rows" in note for note in appearance_notes(rig, views))
-
-
 @pytest.mark.slow
 def test_another_dictionary_is_named(picture: Bytes) -> None:
     described = MARKED.model_copy(update={"dictionary": "DICT_5X5_1000"})

@@ -45,7 +45,6 @@ def test_every_other_look_is_told_with_how_many_views_had_it() -> None:
         "white on black in 2 views (p)": Appearance(inverted=True),
         "mirrored in 2 views (p)": Appearance(mirrored=True),
         "legacy_layout: true) in 2 views (p)": Appearance(other_layout=True),
-        "markers below its last row in 2 views (p)": Appearance(more_rows=True),
     }
     for words, look in looks.items():
         plain, other = view(COLUMNS, ROWS), view(COLUMNS, ROWS, look)
