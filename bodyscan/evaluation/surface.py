@@ -185,46 +185,18 @@ def compare_surfaces(mesh: BodyMesh, other: Path) -> list[Comparison]:
 def fit_to_surface(points: Array, vertices: Array, faces: Indices) -> RigidTransform:
     """Fit points (N, 3) to a mesh by a rigid motion, `other_from_scan`.
 
-    Point to plane (Chen and Medioni 1992) with Tukey's weights, in Open3D; then onto the faces.
-    """
-    middle = vertices.mean(axis=0)
-    target = o3d.geometry.TriangleMesh(
-        o3d.utility.Vector3dVector(vertices - middle),
-        o3d.utility.Vector3iVector(faces.astype(np.int32)),
-    )
-    target.compute_vertex_normals()
-    known = o3d.geometry.PointCloud(target.vertices)
-    known.normals = target.vertex_normals
-    some = points[:: max(1, len(points) // 30_000)] - middle
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(some))
-    icp = o3d.pipelines.registration
-    motion = np.eye(4)
-    for reach in (40.0, 10.0, 3.0):  # mm
-        loss = icp.TransformationEstimationPointToPlane(icp.TukeyLoss(0.5 * reach))
-        motion = icp.registration_icp(cloud, known, reach, motion, loss).transformation
-    rough = RigidTransform.from_matrix(motion)
-    found = _refine_on_faces(rough, some, vertices - middle, faces)
-    return (
-        RigidTransform.from_translation(middle) @ found @ RigidTransform.from_translation(-middle)
-    )
-
-
-def _refine_on_faces(
-    start: RigidTransform, points: Array, vertices: Array, faces: Indices
-) -> RigidTransform:
-    """`other_from_scan` that starts as `start`, improved by the nearest points of the faces.
-
-    A corner's tangent plane lies outside a round surface. Of points all around the errors cancel;
-    those of one pair would be drawn a few hundredths of a millimetre towards it.
+    Point to plane (Chen and Medioni 1992) with Tukey's weights, onto the nearest points of the faces:
+    a corner's tangent plane lies outside a round surface.
     """
     scene, centre = _build_centred_scene(vertices, faces)
-    found = RigidTransform.from_translation(-centre) @ start
-    for _ in range(3):  # the first nearly does it
-        moved = found.apply(points)
+    some = points[:: max(1, len(points) // 30_000)]
+    found = RigidTransform.from_translation(-centre)
+    for reach in [40.0] * 10 + [10.0] * 4 + [3.0] * 4:  # mm
+        moved = found.apply(some)
         nearest = scene.compute_closest_points(o3d.core.Tensor(moved.astype(np.float32)))
         normals = nearest["primitive_normals"].numpy().astype(np.float64)
         residual = np.sum((moved - nearest["points"].numpy()) * normals, axis=1)
-        weight = np.maximum(1.0 - (residual / (0.5 * 3.0)) ** 2, 0.0)  # the root of Tukey's
+        weight = np.maximum(1.0 - (residual / (0.5 * reach)) ** 2, 0.0)  # the root of Tukey's
         jacobian = np.hstack([np.cross(moved, normals), normals]) * weight[:, None]
         found = found.retract(np.linalg.lstsq(jacobian, -weight * residual, rcond=None)[0])
     return RigidTransform.from_translation(centre) @ found

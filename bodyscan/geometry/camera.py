@@ -140,10 +140,6 @@ class Camera:
         x = (pixels[..., 0] - self.u0 - self.gamma * y) / self.alpha
         return np.stack([x, y], axis=-1)
 
-    def without_lens(self, pixels: Array) -> Array:
-        """Ideal px (..., 2) of real ones: where the same camera without its lens would see them."""
-        return self.pixels_from_normalized(self.rays(pixels)[..., :2])
-
     def without_skew(self, pixels: Array) -> Array:
         """Shear px (..., 2) by -gamma/beta to what a camera without skew would see."""
         sheared = pixels.copy()

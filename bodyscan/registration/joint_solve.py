@@ -1,28 +1,24 @@
-"""The rig in one solve (pycolmap): cameras are sensors of one rig, shots are frames, corners known.
+"""All poses of a rig in one solve (pycolmap): cameras are sensors of one rig, shots are frames.
 
 Ceres, behind pycolmap, does what it does best: thousands of corners, sparse, from a start that may
-be centimetres off. It knows neither skew nor non-square pixels, so `bundle_adjustment` follows it.
+be centimetres off. Corners are known points, and cameras ideal: lens and skew are taken out of the
+pixels. `bundle_adjustment` follows, with the cameras' own parameters.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pycolmap
 
-from bodyscan.arrays import Array
-from bodyscan.boards.view import ViewKey
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.errors import FailedWork
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.interchange.formats.colmap import PIXEL_CENTRE as COLMAP_PIXEL_CENTRE
 from bodyscan.registration.view_graph import Target
-
-WITHOUT_LENS = "SIMPLE_PINHOLE"
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,37 +31,35 @@ class JointSolution:
 
 
 def solve_jointly(
-    views: Sequence[LocatedView],
-    start: JointSolution,
-    *,
-    root: str,
-    refine_cameras: bool,
-    loss_px: float,
+    views: Sequence[LocatedView], start: JointSolution, *, root: str, loss_px: float
 ) -> JointSolution:
-    """Bundle adjustment with the boards' corners as constant points and a Cauchy loss.
+    """Bundle adjustment of all poses, with the boards' corners as constant points and a Cauchy loss.
 
     COLMAP's world is one board, and each (shot, board) is a frame, so `rig_from_world` is
     `root_from_board`. Raises FailedWork if the solver does not converge.
     """
-    cameras = start.cameras
-    names = [root, *sorted(set(cameras) - {root})]
+    names = [root, *sorted(set(start.cameras) - {root})]
     ids = {name: number for number, name in enumerate(names, start=1)}
     targets = sorted({view.target for view in views})
     model = pycolmap.Reconstruction()
-    for name in names:
-        model.add_camera(colmap_camera(cameras[name], ids[name]))
+    for name, camera in start.cameras.items():
+        model.add_camera(
+            pycolmap.Camera(
+                model="SIMPLE_PINHOLE",
+                width=camera.width,
+                height=camera.height,
+                params=[camera.alpha, 0.0, 0.0],
+                camera_id=ids[name],
+            )
+        )
     model.add_rig(_colmap_rig(names, start.root_from_camera))
     points = _add_points(model, views)
     if not points:  # a single view of a known camera; `bundle_adjustment` needs no start
         return start
-    pixels = _colmap_pixels_by_view(views, cameras)
     for number, target in enumerate(targets, start=1):
         group = [view for view in views if view.target == target]
-        _add_frame(model, number, group, ids, pixels, points, start.root_from_board[target])
-    # Ceres is not told of cameras' priors, so hold those cameras here; `bundle_adjustment` uses the
-    # priors.
-    known = [ids[name] for name in names if cameras[name].prior is not None]
-    _adjust(model, refine_cameras, loss_px, known)
+        _add_frame(model, number, group, ids, start.cameras, points, start.root_from_board[target])
+    _adjust(model, loss_px)
     rig = model.rig(1)
     root_from_camera = {root: RigidTransform.identity()}
     for name in names[1:]:
@@ -75,67 +69,7 @@ def solve_jointly(
         target: RigidTransform.from_matrix(model.frame(number).rig_from_world.matrix())
         for number, target in enumerate(targets, start=1)
     }
-    solved = {name: _camera_from_colmap(cameras[name], model.camera(ids[name])) for name in names}
-    return JointSolution(root_from_camera, boards, solved)
-
-
-def colmap_camera(camera: Camera, camera_id: int) -> pycolmap.Camera:
-    """COLMAP's model of a camera, without skew and with square pixels; see `colmap_pixels`.
-
-    A lens that COLMAP does not have is removed from the pixels instead and stays unchanged.
-    """
-    lens = camera.lens
-    return pycolmap.Camera(
-        model=lens.colmap_model or WITHOUT_LENS,
-        width=camera.width,
-        height=camera.height,
-        params=[
-            camera.alpha,
-            camera.u0 + COLMAP_PIXEL_CENTRE,
-            camera.v0 + COLMAP_PIXEL_CENTRE,
-            *(lens.coefficients if lens.colmap_model else ()),
-        ],
-        camera_id=camera_id,
-    )
-
-
-def colmap_pixels(camera: Camera, pixels: Array) -> Array:
-    """OpenCV px (N, 2) to COLMAP px (N, 2) of `colmap_camera`: no skew, beta equal to alpha."""
-    square = camera.without_skew(
-        pixels if camera.lens.colmap_model else camera.without_lens(pixels)
-    )
-    square[..., 1] = camera.v0 + (square[..., 1] - camera.v0) * camera.alpha / camera.beta
-    return square + COLMAP_PIXEL_CENTRE
-
-
-def _colmap_pixels_by_view(
-    views: Sequence[LocatedView], cameras: Mapping[str, Camera]
-) -> dict[ViewKey, Array]:
-    """`colmap_pixels` of each view, computed camera by camera."""
-    by_view: dict[ViewKey, Array] = {}
-    for pair in sorted({view.pair for view in views}):
-        of_pair = [view for view in views if view.pair == pair]
-        pixels = colmap_pixels(cameras[pair], np.concatenate([view.pixels for view in of_pair]))
-        cuts = np.cumsum([len(view.pixels) for view in of_pair])[:-1]
-        by_view |= zip((view.key for view in of_pair), np.split(pixels, cuts), strict=True)
-    return by_view
-
-
-def _camera_from_colmap(camera: Camera, solved: pycolmap.Camera) -> Camera:
-    focal, u0, v0, *coefficients = (float(value) for value in solved.params)
-    lens = camera.lens.with_coefficients(np.array(coefficients)) if coefficients else camera.lens
-    aspect, shear = camera.beta / camera.alpha, camera.gamma / camera.beta
-    v0_moved = (v0 - COLMAP_PIXEL_CENTRE - camera.v0) * aspect
-    return replace(
-        camera,
-        alpha=focal,
-        beta=focal * aspect,
-        gamma=shear * focal * aspect,
-        # The shear was undone about the old principal point.
-        u0=u0 - COLMAP_PIXEL_CENTRE + shear * v0_moved,
-        v0=camera.v0 + v0_moved,
-        lens=lens,
-    )
+    return JointSolution(root_from_camera, boards, start.cameras)
 
 
 def _sensor(camera_id: int) -> pycolmap.sensor_t:
@@ -181,7 +115,7 @@ def _add_frame(
     number: int,
     group: Sequence[LocatedView],
     ids: dict[str, int],
-    colmap_pixels_of_view: Mapping[ViewKey, Array],
+    cameras: Mapping[str, Camera],
     points: dict[tuple[str, tuple[float, ...]], int],
     root_from_board: RigidTransform,
 ) -> None:
@@ -193,7 +127,8 @@ def _add_frame(
     frame.rig_from_world = _rigid3d(root_from_board)
     model.add_frame(frame)
     for image_id, view in enumerate(group, start=first_image):
-        pixels = colmap_pixels_of_view[view.key]
+        camera = cameras[view.pair]
+        pixels = camera.alpha * camera.rays(view.pixels)[:, :2]  # as a pinhole with alpha sees them
         image = pycolmap.Image(
             name=f"{view.shot}/{view.board}/{view.pair}",
             keypoints=pixels,
@@ -208,14 +143,12 @@ def _add_frame(
     model.register_frame(number)
 
 
-def _adjust(
-    model: pycolmap.Reconstruction, refine_cameras: bool, loss_px: float, known: Sequence[int]
-) -> None:
+def _adjust(model: pycolmap.Reconstruction, loss_px: float) -> None:
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_points3D = False
-    options.refine_focal_length = refine_cameras
-    options.refine_principal_point = refine_cameras
-    options.refine_extra_params = refine_cameras
+    options.refine_focal_length = False
+    options.refine_principal_point = False
+    options.refine_extra_params = False
     options.print_summary = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = loss_px
@@ -227,8 +160,6 @@ def _adjust(
         config.add_image(image_id)
     for point_id in model.points3D:
         config.add_constant_point(point_id)
-    for camera_id in known:
-        config.set_constant_cam_intrinsics(camera_id)
     adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
     summary = adjuster.solve()
     if not summary.is_solution_usable():

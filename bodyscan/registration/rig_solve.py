@@ -15,8 +15,11 @@ from functools import partial
 import numpy as np
 
 from bodyscan.arrays import Array
-from bodyscan.calibration.board_views import LocatedView
-from bodyscan.calibration.camera import LensTrial
+from bodyscan.boards.view import ViewKey
+from bodyscan.calibration.board_views import LocatedView, PlanarView
+from bodyscan.calibration.camera import CameraCalibration, LensTrial, locate_board
+from bodyscan.calibration.pair import LocatedPair, PairCalibration
+from bodyscan.calibration.striped_view import BoardBoundaries, StripedView
 from bodyscan.errors import RigDisconnected
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform
@@ -176,7 +179,7 @@ def _solve(
     # A single camera was solved with its skew already, and there is nothing to join.
     several = len(names) > 1
     for loss_px in LOSSES_PX:
-        solution = solve_jointly(kept, solution, root=root, refine_cameras=several, loss_px=loss_px)
+        solution = solve_jointly(kept, solution, root=root, loss_px=loss_px)
     solve = partial(
         solve_consistently,
         root=root,
@@ -317,3 +320,74 @@ def collect_corners(solution: RigSolution, names: Iterable[str]) -> dict[str, Ob
             ),
         )
     return corners
+
+
+def _with_pose(solution: RigSolution, view: LocatedView) -> LocatedView:
+    camera_from_rig = solution.rig_from_camera[view.pair].inverse()
+    return replace(view, camera_from_board=camera_from_rig @ solution.rig_from_board[view.target])
+
+
+def solved_pair(
+    rig: Rig,
+    solution: RigSolution,
+    name: str,
+    single: CameraCalibration,
+    boundaries: Mapping[ViewKey, BoardBoundaries],
+) -> LocatedPair:
+    """A pair with the camera, and the poses and shapes of its boards, of the joint solve.
+
+    single: its camera as calibrated by itself.
+    boundaries: of stripes on the boards, by view; views without any take part with their corners.
+    """
+    views = [view for view in solution.views if view.pair == name]
+    shapes = solution.board_shapes
+    return LocatedPair(
+        name,
+        solution.cameras[name],
+        solution.camera_covariances.get(name, single.covariance),
+        solution.rays.get(name, single.rays),
+        solution.lenses.get(name, single.lenses),
+        solution.rms_px[name],
+        rig.pair(name).projector,
+        tuple(_with_pose(solution, view) for view in views),
+        tuple(
+            StripedView(
+                _with_pose(solution, view),
+                rig.board(view.board),
+                boundaries[view.key],
+                shapes[view.board].face(view.points) if view.board in shapes else None,
+            )
+            for view in views
+            if view.key in boundaries
+        ),
+        rig.boards,
+        alone=len(solution.cameras) == 1,
+    )
+
+
+def update_poses(rig: Rig, solution: RigSolution, pair: PairCalibration) -> RigSolution:
+    """Locate the boards again by a pair's camera, where its stripes refined that.
+
+    The board that fixes the rig frame stays where it is, or else the camera. Only a pair by itself is
+    refined by its stripes.
+    """
+    if pair.camera == solution.cameras[pair.name]:
+        return solution
+    camera_from_board = {
+        view.target: locate_board(pair.camera, PlanarView(view.shot, view.points, view.pixels))[0]
+        for view in solution.views
+    }
+    frame = frame_target(rig)
+    rig_from_camera = (
+        solution.rig_from_board[frame] @ camera_from_board[frame].inverse()
+        if frame in camera_from_board
+        else solution.rig_from_camera[pair.name]
+    )
+    return replace(
+        solution,
+        cameras={pair.name: pair.camera},
+        rig_from_camera={pair.name: rig_from_camera},
+        rig_from_board={
+            target: rig_from_camera @ pose for target, pose in camera_from_board.items()
+        },
+    )

@@ -25,8 +25,13 @@ from bodyscan.registration.halves import compare_halves
 from bodyscan.registration.references import find_rig_size, rescale_boards, select_solving_views
 from bodyscan.registration.rig_calibration import RigCalibration, check_nominal_size
 from bodyscan.registration.rig_frame import refuse_without_frame_shot
-from bodyscan.registration.rig_solve import RigSolution, collect_corners, solve_rig
-from bodyscan.registration.solved_pairs import solved_pair, update_poses
+from bodyscan.registration.rig_solve import (
+    RigSolution,
+    collect_corners,
+    solve_rig,
+    solved_pair,
+    update_poses,
+)
 from bodyscan.registration.soundness import find_faults
 from bodyscan.registration.storage import CORNERS_NAME, archive_previous, save_calibration
 from bodyscan.rig.rig import Rig, load_rig

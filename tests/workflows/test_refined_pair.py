@@ -9,8 +9,7 @@ from ring import ring_of_cameras, ring_rig, ring_views
 
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.calibration.pair import PairCalibration, PairQuality
-from bodyscan.registration.rig_solve import RigSolution, solve_rig
-from bodyscan.registration.solved_pairs import update_poses
+from bodyscan.registration.rig_solve import RigSolution, solve_rig, update_poses
 
 
 def misfit_px(placed: RigSolution, views: Sequence[LocatedView]) -> float:

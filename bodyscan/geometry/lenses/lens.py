@@ -30,12 +30,9 @@ class Lens(ABC):
     """A frozen value whose fields are its coefficients, all 0 for a lens that bends nothing.
 
     kind: its name in files.
-    colmap_model: COLMAP's model with one focal length and exactly these coefficients in this order,
-        if there is one.
     """
 
     kind: ClassVar[str]
-    colmap_model: ClassVar[str | None] = None
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -105,7 +105,6 @@ class Radial(OpenCVLens):
     k2: float = 0.0
 
     kind: ClassVar[str] = "radial"
-    colmap_model: ClassVar[str | None] = "RADIAL"
 
 
 @dataclass(frozen=True)
@@ -120,7 +119,6 @@ class Brown(Radial):
     k3: float = 0.0
 
     kind: ClassVar[str] = "brown"
-    colmap_model: ClassVar[str | None] = None
 
 
 @dataclass(frozen=True)
