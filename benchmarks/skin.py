@@ -173,8 +173,10 @@ def _errors(case: Case) -> Array:
 def _laid(case: Case) -> Array:
     """The cloud's points moved to where the truth stands."""
     vertices, _ = _surface(case.truth)
-    found = sway_residual(case.scan.rig_from_camera, case.truth.facts["pairs"], vertices)
-    return found.rig_from_still.inverse().apply(case.scan.cloud.points)
+    rig_from_still, _ = sway_residual(
+        case.scan.rig_from_camera, case.truth.facts["pairs"], vertices
+    )
+    return rig_from_still.inverse().apply(case.scan.cloud.points)
 
 
 def _seen_by_two(vertices: Array, faces: Indices, pairs: Mapping[str, Any]) -> Mask:

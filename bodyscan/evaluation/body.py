@@ -22,19 +22,11 @@ TORSO = (0.46, 0.86)  # of the stature: crotch to shoulders
 WHOLE = 0.97  # of a girth measured, and not hair: what is filled is a declared guess
 
 
-@dataclass(frozen=True, eq=False)
-class SwayResidual:
-    """What is left of calibration error and sway: where the model has the true body, and the RMS
-    over pairs and the body, along all axes."""
-
-    rig_from_still: RigidTransform
-    rms_mm: float
-
-
 def sway_residual(
     found: Mapping[str, RigidTransform], true_pairs: Mapping[str, Any], vertices: Array
-) -> SwayResidual:
-    """Compare poses with the truth.
+) -> tuple[RigidTransform, float]:
+    """What is left of calibration error and sway: `rig_from_still`, where the model has the true
+    body, and the RMS over pairs and the body, along all axes, mm.
 
     found: rig_from_camera as the scan used it.
     true_pairs: `pairs` of truth.json.
@@ -49,7 +41,7 @@ def sway_residual(
         moved.append((pose @ camera.inverse() @ swayed).apply(body))
     mean = np.mean(moved, axis=0)
     rms_mm = float(np.sqrt(np.mean(np.sum((np.array(moved) - mean) ** 2, axis=-1))))
-    return SwayResidual(fit_rigid_transform(body, mean), rms_mm)
+    return fit_rigid_transform(body, mean), rms_mm
 
 
 @dataclass(frozen=True)
@@ -65,13 +57,6 @@ class GirthErrors:
     stature_mm: float
 
 
-def girth_errors(
-    mesh: BodyMesh, vertices: Array, faces: Indices, *, mean_breath: bool = False
-) -> GirthErrors:
-    """Errors of a mesh in the frame of the truth, at mean breath or at the mesh's moment."""
-    return compare_girths(mesh, true_girths(vertices, faces), mean_breath=mean_breath)
-
-
 def true_girths(vertices: Array, faces: Indices) -> Measurements:
     """Girths of the true trunk, every `STEP_MM`."""
     stature = float(vertices[:, 2].max())
@@ -79,8 +64,11 @@ def true_girths(vertices: Array, faces: Indices) -> Measurements:
     return measure(_as_measured(vertices, faces), levels)
 
 
-def compare_girths(mesh: BodyMesh, true: Measurements, *, mean_breath: bool = False) -> GirthErrors:
-    """Errors of a mesh in the truth's frame; true: see `true_girths`."""
+def girth_errors(mesh: BodyMesh, true: Measurements, *, mean_breath: bool = False) -> GirthErrors:
+    """Errors of a mesh in the frame of the truth, at mean breath or at the mesh's moment.
+
+    true: see `true_girths`.
+    """
     ours = measure(mesh, [one.height_mm for one in true.slices], mean_breath=mean_breath)
     errors = {
         one.height_mm: error

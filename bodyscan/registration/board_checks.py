@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
@@ -53,30 +52,6 @@ def describe_findings(rig: Rig, views: Sequence[BoardView], images: int) -> str:
                 )
             )
     return "\n  ".join(lines)
-
-
-def drop_inconsistently_mirrored(views: Sequence[BoardView]) -> tuple[list[BoardView], list[str]]:
-    """Drop views that one camera saw mirrored unlike most of its images; also a line for each.
-
-    In those an image was flipped, or showed a mirror.
-    """
-    groups: dict[tuple[str, str], list[BoardView]] = defaultdict(list)
-    for view in views:
-        groups[view.pair, view.board].append(view)
-    odd: list[BoardView] = []
-    for group in groups.values():
-        mirrored = [view for view in group if view.appearance.mirrored]
-        unmirrored = [view for view in group if not view.appearance.mirrored]
-        if mirrored and unmirrored:
-            odd += mirrored if len(mirrored) <= len(unmirrored) else unmirrored
-    notes = [
-        f"{view.pair}: board {view.board} is {'' if view.appearance.mirrored else 'not '}mirrored in "
-        f"shot {view.shot}, unlike in most images of this camera: a flipped picture, or one with a "
-        "mirror; not used"
-        for view in odd
-    ]
-    dropped = set(map(id, odd))
-    return [view for view in views if id(view) not in dropped], notes
 
 
 def appearance_notes(rig: Rig, views: Sequence[BoardView]) -> list[str]:

@@ -19,6 +19,7 @@ from bodyscan.evaluation.body import (
     girth_errors,
     measure_visible_coverage,
     sway_residual,
+    true_girths,
 )
 from bodyscan.evaluation.surface import (
     Deviation,
@@ -153,12 +154,14 @@ def _scan_lines(stored: StoredScan, calibration: RigCalibration, truth: Truth) -
     assert truth.vertices is not None
     assert truth.faces is not None
     surface, pairs = (truth.vertices, truth.faces), truth.facts["pairs"]
-    sway = sway_residual(_aligned_poses(stored, calibration), pairs, truth.vertices)
+    rig_from_still, sway_mm = sway_residual(
+        _aligned_poses(stored, calibration), pairs, truth.vertices
+    )
     still_from_rig = RigidTransform.identity()
     if "motion" in truth.facts:  # fit to the body as it was then
         still_from_rig = fit_to_surface(stored.cloud.points, *surface)
     elif truth.facts["settings"]["person"]["sway_mm"]:
-        still_from_rig = sway.rig_from_still.inverse()  # a swaying subject has no fixed pose
+        still_from_rig = rig_from_still.inverse()  # a swaying subject has no fixed pose
     in_rig, body = stored.mesh, transform_mesh(stored.mesh, still_from_rig)
     points = still_from_rig.apply(stored.cloud.points)
     cloud = signed_distances(points, *surface)
@@ -174,10 +177,12 @@ def _scan_lines(stored: StoredScan, calibration: RigCalibration, truth: Truth) -
     with part("mesh"):
         lines += _mesh_lines(mesh, in_rig)
     with part("torso girths"):
-        lines.append(f"  torso girths (tape)     {_girth_figures(girth_errors(body, *surface))}")
+        girths = girth_errors(body, true_girths(*surface))
+        lines.append(f"  torso girths (tape)     {_girth_figures(girths)}")
     if truth.at_mean_breath is not None:
         with part("torso girths at mean breath"):
-            girths = girth_errors(body, truth.at_mean_breath, truth.faces, mean_breath=True)
+            true = true_girths(truth.at_mean_breath, truth.faces)
+            girths = girth_errors(body, true, mean_breath=True)
             lines.append(f"  ... against mean breath {_girth_figures(girths)}")
     with part("coverage"):
         visible, covered = measure_visible_coverage(points, *surface, pairs)
@@ -185,9 +190,7 @@ def _scan_lines(stored: StoredScan, calibration: RigCalibration, truth: Truth) -
             f"  covered within 1 mm     {100.0 * covered:.1f} % of the {100.0 * visible:.1f} % of "
             "the surface that a camera and its projector see"
         )
-    lines.append(
-        f"  pairs to each other     {sway.rms_mm:.3f} mm RMS over the body, along and across"
-    )
+    lines.append(f"  pairs to each other     {sway_mm:.3f} mm RMS over the body, along and across")
     return lines
 
 

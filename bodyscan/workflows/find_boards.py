@@ -43,7 +43,6 @@ from bodyscan.progress import Progress, attempt_each, map_threads, silent
 from bodyscan.registration.board_checks import (
     appearance_notes,
     describe_findings,
-    drop_inconsistently_mirrored,
 )
 from bodyscan.registration.soundness import camera_faults
 from bodyscan.rig.pair import AUTO, Pair
@@ -85,7 +84,7 @@ def find_all_boards(rig: Rig, captures: Captures, progress: Progress = silent) -
         return found, None
 
     results = map_threads(find, captures.sequences, stage="finding boards", progress=progress)
-    views, odd = drop_inconsistently_mirrored([view for found, _ in results for view in found])
+    views = [view for found, _ in results for view in found]
     without = [
         sequence
         for sequence, (found, error) in zip(captures.sequences, results, strict=True)
@@ -99,7 +98,7 @@ def find_all_boards(rig: Rig, captures: Captures, progress: Progress = silent) -
     ]
     errors = zip(captures.sequences, (error for _, error in results), strict=True)
     refused = {sequence: error for sequence, error in errors if error is not None}
-    notes = (*map(str, refused.values()), *missing, *odd, *appearance_notes(rig, views))
+    notes = (*map(str, refused.values()), *missing, *appearance_notes(rig, views))
     return FoundBoards(views, notes, refused=refused)
 
 

@@ -15,7 +15,7 @@ from bodyscan.boards.charuco import Markers, detect_markers, locate_face
 from bodyscan.boards.detection import find_boards
 from bodyscan.boards.unfound import describe_unfound
 from bodyscan.boards.view import BoardView
-from bodyscan.registration.board_checks import appearance_notes, drop_inconsistently_mirrored
+from bodyscan.registration.board_checks import appearance_notes
 from bodyscan.rig.board import Board
 from bodyscan.rig.pair import CameraSpec, Pair
 from bodyscan.rig.rig import Rig
@@ -143,17 +143,6 @@ def test_another_grid_is_named() -> None:
     described = plain.model_copy(update={"columns": 8, "rows": 6})
     assert found(image, described) == []
     assert "one of 8 x 6: 9 columns x 7 rows" in describe_unfound(image, described)
-
-
-def test_a_flipped_picture_among_others_is_named_and_left_out(picture: Bytes) -> None:
-    flipped = found(np.ascontiguousarray(picture[:, ::-1]), MARKED)
-    kept, notes = drop_inconsistently_mirrored([*found(picture, MARKED) * 2, *flipped])
-    assert len(kept) == 2
-    (note,) = notes
-    assert "is mirrored in shot s" in note
-    assert drop_inconsistently_mirrored(flipped * 3)[1] == [], (
-        "all of them mirrored: through a glass"
-    )
 
 
 def tag_picture(*, border_bits: int, turns: int, from_below: bool) -> tuple[Bytes, Array]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -13,7 +12,6 @@ from bodyscan.registration.board_checks import (
     appearance_notes,
     boards_not_found,
     describe_findings,
-    drop_inconsistently_mirrored,
 )
 from bodyscan.rig.board import Board
 from bodyscan.rig.rig import Rig
@@ -52,24 +50,6 @@ def test_every_other_look_is_told_with_how_many_views_had_it() -> None:
         assert words in note
         assert "Other cameras" not in note  # the same camera saw it both ways
     assert not said(view(COLUMNS, ROWS))
-
-
-def test_where_a_camera_saw_a_board_both_ways_round_the_rarer_is_left_out() -> None:
-    usual, flipped = view(COLUMNS, ROWS), view(COLUMNS, ROWS, Appearance(mirrored=True))
-    for views, odd in (([usual] * 3 + [flipped], True), ([usual] + [flipped] * 3, False),
-                       ([usual] * 2 + [flipped] * 2, True)):  # fmt: skip
-        views = [replace(each) for each in views]  # each an image of its own
-        kept, notes = drop_inconsistently_mirrored(views)
-        assert all(one.appearance.mirrored is not odd for one in kept)
-        assert len(kept) + len(notes) == len(views)
-        assert ("is mirrored in shot s" in notes[0]) is odd
-        assert ("is not mirrored in shot s" in notes[0]) is not odd
-    # Another camera may stand behind the glass.
-    elsewhere = replace(flipped, pair="q")
-    assert drop_inconsistently_mirrored([usual] * 3 + [elsewhere]) == (
-        [usual] * 3 + [elsewhere],
-        [],
-    )
 
 
 TWO_BOARDS = Rig.model_validate(
