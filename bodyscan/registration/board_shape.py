@@ -23,7 +23,12 @@ from bodyscan.calibration.model_selection import MIN_GAIN, ResidualPair, gain
 from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
 from bodyscan.geometry.robust import rms, rms_length
 from bodyscan.geometry.transforms import fit_rigid_transform, twist_jacobian
-from bodyscan.registration.bundle_adjustment import CORNERS, refine_solution, view_sigmas
+from bodyscan.registration.bundle_adjustment import (
+    CORNERS,
+    refine_solution,
+    reprojection_errors,
+    view_sigmas,
+)
 from bodyscan.registration.joint_solve import JointSolution
 from bodyscan.registration.view_consistency import fit_board
 
@@ -310,18 +315,13 @@ def _by_corner(views: Sequence[LocatedView], solution: JointSolution) -> tuple[A
     (N, 2, 3) px/mm: of pixels by the corners' places on their boards.
     (M, 2) px of each view: residuals.
     """
-    pair = views[0].pair
-    camera, camera_from_root = solution.cameras[pair], solution.root_from_camera[pair].inverse()
-    camera_from_board = [camera_from_root @ solution.root_from_board[view.target] for view in views]
-    points = np.concatenate(
-        [p.apply(view.points) for p, view in zip(camera_from_board, views, strict=True)]
-    )
-    rotations = np.repeat(
-        [p.rotation for p in camera_from_board], [len(view.points) for view in views], axis=0
-    )
-    pixels = np.concatenate([view.pixels for view in views])
-    cuts = np.cumsum([len(view.points) for view in views])[:-1]
-    return camera.jacobians(points)[1] @ rotations, np.split(camera.project(points) - pixels, cuts)
+    poses = solution.cameras, solution.root_from_camera, solution.root_from_board
+    residuals, linearize = reprojection_errors(views, *poses, cameras_free=False)
+    counts = [len(view.points) for view in views]
+    rotations = [solution.root_from_board[view.target].rotation for view in views]
+    # A corner's position in the root frame acts as its board's translation does.
+    by_corner = linearize().reshape(-1, 2, 12)[:, :, 9:] @ np.repeat(rotations, counts, axis=0)
+    return by_corner, np.split(residuals.reshape(-1, 2), np.cumsum(counts)[:-1])
 
 
 def _hold_out(

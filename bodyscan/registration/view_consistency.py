@@ -19,8 +19,8 @@ from bodyscan.calibration.board_views import LocatedView
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.least_squares import Block, Noise, minimize
 from bodyscan.geometry.robust import rms_length
-from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
-from bodyscan.registration.bundle_adjustment import refine_solution
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.registration.bundle_adjustment import refine_solution, reprojection_errors
 from bodyscan.registration.joint_solve import JointSolution
 from bodyscan.registration.view_graph import by_target
 
@@ -146,17 +146,9 @@ def fit_board(
 
 def _corners(view: LocatedView, solution: JointSolution, root_from_board: RigidTransform) -> Block:
     """Reprojection errors, px; derivatives by the board's motion."""
-    camera = solution.cameras[view.pair]
-    camera_from_root = solution.root_from_camera[view.pair].inverse()
-    in_root = root_from_board.apply(view.points)
-    in_camera = camera_from_root.apply(in_root)
-
-    def linearize() -> Array:
-        by_root = camera.jacobians(in_camera)[1] @ camera_from_root.rotation
-        return (by_root @ twist_jacobian(in_root)).reshape(-1, 6)
-
-    residuals = (camera.project(in_camera) - view.pixels).ravel()
-    return Block(residuals, linearize, slice(0, 6), CORNERS)
+    poses = solution.cameras, solution.root_from_camera, {view.target: root_from_board}
+    residuals, linearize = reprojection_errors([view], *poses, cameras_free=False)
+    return Block(residuals, lambda: linearize()[:, 6:], slice(0, 6), CORNERS)
 
 
 def _error(
