@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from bodyscan.arrays import Array, Floats, Greys, Indices, Mask, find_crop
+from bodyscan.arrays import Array, Floats, Indices, Mask, find_crop
 from bodyscan.compiled import compiled
 from bodyscan.stripes.scan_lines import ScanLines
 
@@ -41,13 +41,12 @@ class Brightness:
     def from_images(images: ScanLines, variance: Floats, usable: Mask) -> Brightness:
         """Measure it. variance: (256,) of each grey level; usable: (L, P) pixels on a lit
         surface."""
-        if images.lit.dtype == np.uint8:
-            logarithms = np.log(np.maximum(np.arange(256), 1)).astype(np.float32)
-            logarithm, noise2 = _measure(images.lit, images.dark, variance, logarithms)
-        else:
-            contrast = np.maximum(images.lit - images.dark, 0.02).astype(np.float32)
-            at_lit, at_dark = (variance[g.astype(np.uint8)] for g in (images.lit, images.dark))
-            logarithm, noise2 = np.log(contrast), (at_lit + at_dark) / np.square(contrast)
+        # With whole grey levels there is at least one wherever there is any light.
+        floor = np.float32(1.0 if images.lit.dtype == np.uint8 else 0.02)
+        contrast: Floats = np.maximum(images.contrast, floor)
+        at_lit, at_dark = (variance[g.astype(np.uint8)] for g in (images.lit, images.dark))
+        logarithm: Floats = np.log(contrast)
+        noise2: Floats = (at_lit + at_dark) / (contrast * contrast)
         along, across = fit_gradient(logarithm, usable)
         _sharpen(logarithm, noise2, across)
         return Brightness(logarithm, noise2, across, along)
@@ -87,7 +86,8 @@ class BoundaryBrightness:
 
     def shift_sigma(self, blur2: float) -> Array:
         """Compute the standard deviation (N,) px of the shift blur2 * (along, across)."""
-        return _shift_sigma(self.along, self.across, self.sigma, blur2)
+        noise = np.minimum(self.sigma, np.abs(self.along))
+        return blur2 * np.hypot(UNEXPLAINED * np.hypot(self.along, self.across), noise)
 
 
 def correct_across_lines(
@@ -141,22 +141,6 @@ def _shrink(gradient: float, variance: float) -> float:
 
 
 @compiled
-def _measure(
-    lit: Greys, dark: Greys, variance: Floats, logarithms: Floats
-) -> tuple[Floats, Floats]:
-    """The logarithm of lit minus dark (L, P), and its variance."""
-    logarithm, noise2 = np.empty(lit.shape, np.float32), np.empty(lit.shape, np.float32)
-    for line in range(lit.shape[0]):
-        for x in range(lit.shape[1]):
-            light, black = lit[line, x], dark[line, x]
-            contrast = max(np.int32(light) - np.int32(black), np.int32(1))
-            logarithm[line, x] = logarithms[contrast]
-            square = np.float32(contrast * contrast)
-            noise2[line, x] = (variance[light] + variance[black]) / square
-    return logarithm, noise2
-
-
-@compiled
 def _sharpen(logarithm: Floats, noise2: Floats, across: Floats) -> None:
     """Add to the smooth gradient from line to line (L, P) what noise does not explain."""
     for line in range(1, logarithm.shape[0] - 1):
@@ -199,16 +183,6 @@ def _measure_shifts(along: Array, sigma: Array, position: Array, joined: Mask) -
             shifts[count] = shift / steepness
             count += 1
     return shifts[:count].copy()
-
-
-@compiled
-def _shift_sigma(along: Array, across: Array, sigma: Array, blur2: float) -> Array:
-    total = np.empty(along.size)
-    for k in range(along.size):
-        noise = min(sigma[k], abs(along[k]))
-        unexplained = UNEXPLAINED**2 * (along[k] ** 2 + across[k] ** 2)
-        total[k] = blur2 * math.sqrt(unexplained + noise * noise)
-    return total
 
 
 @compiled
