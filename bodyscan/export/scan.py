@@ -17,8 +17,8 @@ from bodyscan.export.formats import BODY_FORMATS
 from bodyscan.files.model import did_you_mean
 from bodyscan.fusion.storage import StoredScan
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.measurement.measurements import rig_from_body
 from bodyscan.mesh.body import BodyMesh
+from bodyscan.mesh.body_parts import find_body_frame
 from bodyscan.mesh.repair import decimate
 from bodyscan.settings import ExportSettings
 
@@ -56,7 +56,7 @@ def export_scan(
                 f"there is no {name!r} to export{did_you_mean(name, known)}",
                 remedy=f"Choose from {', '.join(known)}.",
             )
-    pose = rig_from_body(scan.mesh.vertices) if frame == "body" else None
+    pose = find_body_frame(scan.mesh.vertices).rig_from_body if frame == "body" else None
     facts = scan.facts
     origin = Provenance(
         facts.get("subject"), facts["calibration_id"], deface, scan_facts(facts), pose

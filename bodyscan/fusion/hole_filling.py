@@ -20,6 +20,7 @@ from scipy.optimize import linprog
 
 from bodyscan.arrays import Array, Floats, Indices, Mask
 from bodyscan.compiled import compiled
+from bodyscan.fusion.regions import DARK
 from bodyscan.fusion.signed_distances import REACH_CELLS, Distances, splat_planes
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform
@@ -67,7 +68,11 @@ def fill_distances(
     bound = np.full(values.shape, -np.inf, np.float32)
     certain = 0.75 * reach  # so far from the surface a coarser grid has the side right
     guess = np.maximum(fill_harmonically(values, fixed, bound, certain), -height)
-    free = _find_free_nodes(guess, measured, bricks, range_images, rig_from_camera, workers)
+    dark, grey = np.zeros(values.shape, bool), cloud.colours[:, 0]
+    points = cloud.points[grey < DARK * np.median(grey)]
+    dark[tuple(np.rint((points - bricks.origin) / cell_mm).astype(int).T)] = True
+    dark = _dilate(dark, 2)
+    free = _find_free_nodes(guess, measured, dark, bricks, range_images, rig_from_camera, workers)
     bound[free] = 0.5 * cell_mm
     _bound_crown(bound, guess, measured, bricks, Crown.from_cloud(cloud.points, cloud.normals))
     if np.isfinite(bound).any():
@@ -116,6 +121,7 @@ def _grid_around(points: Array, cell_mm: float) -> Bricks:
 def _find_free_nodes(
     guess: Floats,
     fixed: Mask,
+    dark: Mask,
     bricks: Bricks,
     range_images: Sequence[RangeImage],
     rig_from_camera: dict[str, RigidTransform],
@@ -127,8 +133,13 @@ def _find_free_nodes(
         return free
     vertices, faces = extract_surface(bricks, split_into_bricks(guess))
     nearest = np.rint((vertices - bricks.origin) / bricks.cell_mm).astype(int)
-    filled = ~fixed[tuple(nearest.T)]
-    surface = PartialSurface(vertices.astype(np.float32), faces, filled[faces].any(axis=1))
+    filled, near_dark = ~fixed[tuple(nearest.T)], dark[tuple(nearest.T)]
+    surface = PartialSurface(
+        vertices.astype(np.float32),
+        faces,
+        filled[faces].any(axis=1),
+        near_dark[faces].any(axis=1),
+    )
     index = np.argwhere((guess < 0.0) & ~fixed)
     nodes = (bricks.origin + bricks.cell_mm * index).astype(np.float32)
     votes = map_threads(
@@ -223,12 +234,13 @@ CROWN_RADIUS_MM = 100.0
 
 @dataclass(frozen=True, eq=False)
 class PartialSurface:
-    """A closed surface, partly filled: vertices (V, 3) float32, rig frame; faces (F, 3); filled
-    (F,)."""
+    """A closed surface, partly filled: vertices (V, 3) float32, rig frame; faces (F, 3); filled and
+    dark (F,), dark ones near dark cloth or hair, next to which a lack of points proves nothing."""
 
     vertices: Floats
     faces: Indices
     filled: Mask
+    dark: Mask
 
 
 def find_free_points(
@@ -273,8 +285,8 @@ def find_gaps(
     """Find the blocks of stride x stride pixels in a window that look through a gap of the body.
 
     In such a block nothing was measured, its middle shows only filled faces, and there is measured
-    surface to the left and to the right: between the legs, between arm and trunk. A filled face in
-        front of or behind measured surface is a part in shadow instead.
+    surface that is not dark to the left and to the right: between the legs, between arm and trunk. A
+    filled face in front of or behind measured surface is a part in shadow instead.
     """
     rows, columns = (stride * np.arange(some.start, some.stop) + stride // 2 for some in blocks)
     vertices = _project_to_blocks(surface.vertices, image, rig_from_camera, stride, blocks)
@@ -283,6 +295,7 @@ def find_gaps(
     filled = np.zeros(hit.shape, bool)
     filled[hit] = surface.filled[first[hit]]
     body = hit & ~filled
+    body[hit] &= ~surface.dark[first[hit]]
     near = np.ones((2 * stride + 1, 2 * stride + 1), np.uint8)
     measured = np.pad(cv2.dilate((image.open_depth > 0).astype(np.uint8), near), stride)
     reach = int(200.0 / RAY_SPACING_MM)  # the widest gap

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,10 +11,20 @@ from bodyscan.arrays import Array, Bytes, Mask
 from bodyscan.errors import BadInput
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.measurement.head import HeadTop, estimate_head_top
-from bodyscan.measurement.outline import Range, find_outline, holds_middle
-from bodyscan.mesh.body import HAIR, REGION_NAMES, SKIN, UNSURE, BodyMesh, compute_region_shares
-from bodyscan.mesh.slices import Loop, MeshSlicer
-from bodyscan.mesh.topology import LAYER_MM, face_areas, find_handles, signed_volume
+from bodyscan.measurement.outline import Range, bound_girths, girth_sigma
+from bodyscan.mesh.body import (
+    HAIR,
+    REGION_NAMES,
+    SKIN,
+    UNSURE,
+    BodyMesh,
+    BreathAt,
+    compute_region_shares,
+    select_regions,
+)
+from bodyscan.mesh.body_parts import Piece, find_body_frame, find_parts
+from bodyscan.mesh.slices import MeshSlicer
+from bodyscan.mesh.topology import face_areas, signed_volume
 
 CROWN_MM = 20.0
 """Height of the crown below the top."""
@@ -24,18 +34,19 @@ CROWN_MM = 20.0
 class Girth:
     """One part of the body in a horizontal slice.
 
-    part: trunk (neck and head too), left leg, right leg, left arm, right arm; "trunk and left arm"
-        where a hand touches the trunk and the outline goes round both.
-    girth_mm: along the surface. A trunk joined to arms by filled surface is cut there, and closed
-        straight.
+    part: trunk (neck and head too), left leg, right leg, left arm, right arm, other; "trunk and left
+        arm" where the outline goes round both and nothing tells them apart.
+    girth_mm: along the surface, closed straight where the part touches others.
     tape_mm: as a tape runs (convex hull).
     width_mm, depth_mm: extent to the side and forward.
     centre_mm: (x, y), body frame.
     measured: share of girth_mm that was measured, not filled.
-    girth_range_mm, tape_range_mm: possible values, given what was not measured: see `Outline`.
-    breath_sigma_mm: sigma of girth_mm and tape_mm due to the breath's uncertainty; None if that
-        is not known.
+    girth_range_mm, tape_range_mm: least and most, given noise and motion (95 %), what was not
+        measured, and what touches: see `bound_girths`.
+    breath_sigma_mm: sigma of girth_mm and tape_mm due to the breath's uncertainty, for the mean
+        breath or the scan's moment; None if that is not known.
     regions: shares of girth_mm over skin, hair, dark cloth and unsure, by name; None if not known.
+    touches: parts that it touches, skin on skin.
     """
 
     part: str
@@ -50,6 +61,7 @@ class Girth:
     tape_range_mm: Range
     breath_sigma_mm: float | None = None
     regions: dict[str, float] | None = None
+    touches: tuple[str, ...] = ()
 
     @property
     def measured_skin(self) -> float:
@@ -81,6 +93,7 @@ class Measurements:
     crown: the region of most of the measured crown; None if not known.
     head: where the head ends, even under hair; None if unknown.
     regions: shares of the area.
+    facing_known: whether the feet tell front from back, and so left from right; else that is assumed.
     """
 
     stature_mm: float
@@ -94,6 +107,7 @@ class Measurements:
     crown: str | None = None
     head: HeadTop | None = None
     regions: dict[str, float] | None = None
+    facing_known: bool = True
 
 
 def measure(
@@ -106,28 +120,33 @@ def measure(
 
     Raises BadInput for a height at which there is no body.
     """
-    breathes = mean_breath and mesh.breath is not None
-    mesh, fuller = (mesh.at_mean_breath(), mesh.at_mean_breath(1.0)) if breathes else (mesh, None)
+    breath, breathes = mesh.breath, mean_breath and mesh.breath is not None
+    mesh = mesh.at_mean_breath() if breathes else mesh
     stature = float(mesh.vertices[:, 2].max())
-    frame = rig_from_body(mesh.vertices)
-    vertices = frame.inverse().apply(mesh.vertices)
-    slicer = MeshSlicer(vertices, mesh.faces, mesh.filled, mesh.face_regions)
-    contacts = _contacts(slicer)
+    frame = find_body_frame(mesh.vertices)
+    vertices = frame.rig_from_body.inverse().apply(mesh.vertices)
     # If only part of a body was seen, whatever there is of it.
-    heights = np.arange(100.0, stature, 100.0).tolist() if heights_mm is None else heights_mm
-    slices = [_slice(slicer, float(height), contacts) for height in heights]
-    if heights_mm is not None and None in slices:
+    given = np.arange(100.0, stature, 100.0).tolist() if heights_mm is None else heights_mm
+    heights = [float(height) for height in given]
+    parts = find_parts(MeshSlicer(vertices, mesh.faces, mesh.filled), heights)
+    missing = [height for height in heights if not parts.slices[height]]
+    if heights_mm is not None and missing:
         low, high = vertices[:, 2].min(), vertices[:, 2].max()
         raise BadInput(
-            f"there is no body at a height of {heights_mm[slices.index(None)]:g} mm",
+            f"there is no body at a height of {missing[0]:g} mm",
             remedy=f"Give heights between {low:.0f} and {high:.0f} mm.",
         )
-    if fuller is not None:
-        more = replace(slicer, vertices=frame.inverse().apply(fuller.vertices))
-        slices = [
-            found and _add_breath_sigmas(found, _slice(more, found.height_mm, contacts))
-            for found in slices
-        ]
+    slices = [
+        Slice(
+            height,
+            tuple(
+                _girth(piece, mesh, breath)
+                for piece in sorted(parts.slices[height], key=lambda piece: piece.part)
+            ),
+        )
+        for height in heights
+        if height not in missing
+    ]
     areas = face_areas(mesh.vertices, mesh.faces)
     crown = mesh.vertices[mesh.faces, 2].max(axis=1) > stature - CROWN_MM
     kinds, crown_measured = mesh.face_regions, _share(areas, ~mesh.filled, crown)
@@ -139,12 +158,13 @@ def measure(
         signed_volume(mesh.vertices, mesh.faces) / 1e6,
         float(areas.sum()) / 1e6,
         _share(areas, ~mesh.filled, np.ones_like(crown)),
-        tuple(found for found in slices if found is not None),
-        frame,
+        tuple(slices),
+        frame.rig_from_body,
         breathes,
         top,
         head,
         None if kinds is None else compute_region_shares(kinds, areas),
+        frame.known,
     )
 
 
@@ -172,16 +192,6 @@ def _head_top(vertices: Array, mesh: BodyMesh, stature: float, crown: str | None
     return estimate_head_top(vertices[skin], stature)
 
 
-def _add_breath_sigmas(level: Slice, fuller: Slice | None) -> Slice:
-    """The slice with sigmas: how much longer girths are on a body one sigma of breath fuller."""
-    girths = []
-    for girth in level.girths:
-        other = fuller.of(girth.part) if fuller and girth is level.of(girth.part) else None
-        sigma = None if other is None else abs(other.tape_mm - girth.tape_mm)
-        girths.append(replace(girth, breath_sigma_mm=sigma))
-    return replace(level, girths=tuple(girths))
-
-
 def heights_from(text: str) -> list[float]:
     """Heights written as "800,1050", mm. Raises BadInput if one is not a number."""
     try:
@@ -196,102 +206,35 @@ def _share(areas: Array, which: Mask, among: Mask) -> float:
     return float(areas[which & among].sum() / max(areas[among].sum(), 1e-12))
 
 
-@dataclass(frozen=True)
-class _Contact:
-    """An arm whose hand touches the trunk at heights from low_mm to high_mm; y_mm: of the arm's
-    middle just above, body frame. Below the first touch, the hand may keep touching for 200 mm."""
-
-    side: str
-    low_mm: float
-    high_mm: float
-    y_mm: float
-
-    def joins(self, loop: Loop, height_mm: float) -> bool:
-        """Whether a trunk's outline goes round the arm as well."""
-        reach = loop.segments[..., 1]
-        beyond = reach.max() > self.y_mm if self.y_mm > 0 else reach.min() < self.y_mm
-        return self.low_mm <= height_mm <= self.high_mm and bool(beyond)
-
-
-def _contacts(slicer: MeshSlicer) -> list[_Contact]:
-    found = []
-    for ring in find_handles(slicer.vertices, slicer.faces):
-        above = ring.low_mm + 1.5 * LAYER_MM
-        loops = _loops(slicer, above)
-        side = "left" if ring.y_mm > 0 else "right"
-        for part, loop in zip(name_parts(loops), loops, strict=True):
-            if part == f"{side} arm":
-                y = float(loop.centre[1])
-                found.append(_Contact(side, ring.low_mm - 200.0, above, y))
-                break
-    return found
-
-
-def _loops(slicer: MeshSlicer, height_mm: float) -> list[Loop]:
-    return [loop for loop in slicer.slice(height_mm) if loop.area_mm2 > 50.0]  # less: a fingertip
-
-
-def _slice(slicer: MeshSlicer, height_mm: float, contacts: Sequence[_Contact]) -> Slice | None:
-    """The slice at one height, None if there is no body."""
-    loops = _loops(slicer, height_mm)
-    if not loops:
-        return None
-    girths = []
-    for part, loop in zip(name_parts(loops), loops, strict=True):
-        arms = [one.side for one in contacts if part == "trunk" and one.joins(loop, height_mm)]
-        joined = "".join(f" and {side} arm" for side in dict.fromkeys(arms))
-        girths.append(_girth(part + joined, loop))
-    return Slice(height_mm, tuple(sorted(girths, key=lambda girth: (girth.part, -girth.area_mm2))))
-
-
-def name_parts(loops: Sequence[Loop]) -> list[str]:
-    """Which part of the body each loop of a slice is; body frame, largest loop first.
-
-    A loop with the middle (y = 0) well inside is the trunk, and then all others are arms. If there
-    is none, the largest on each side is a leg.
-    """
-    reach = [(loop.segments[..., 1].min(), loop.segments[..., 1].max()) for loop in loops]
-    is_trunk = [holds_middle(loop.segments[..., 1]) for loop in loops]
-    names: list[str] = []
-    for (low, high), trunk in zip(reach, is_trunk, strict=True):
-        side = "left" if low + high > 0 else "right"
-        leg = not any(is_trunk) and f"{side} leg" not in names
-        names.append("trunk" if trunk else f"{side} leg" if leg else f"{side} arm")
-    return names
-
-
-def _girth(part: str, meshed: Loop) -> Girth:
-    found = find_outline(meshed)
-    loop = found.loop
-    corners = loop.segments[:, 0]
-    depth, width = np.ptp(corners, axis=0)
+def _girth(piece: Piece, mesh: BodyMesh, breath: BreathAt | None) -> Girth:
+    loop, kinds = piece.loop, mesh.face_regions
+    known = loop.faces >= 0
+    corners = mesh.faces[loop.faces]
+    noise = np.where(known, mesh.sigma_mm[corners].mean(axis=1), np.nan)
+    sigma = girth_sigma(loop, noise, sectors=4)
+    lean = (
+        None if breath is None else np.where(known, breath.sigma_mm[corners].mean(axis=1), np.nan)
+    )
+    lows, highs = bound_girths(loop)
+    depth, width = np.ptp(loop.segments[:, 0], axis=0)
     x, y = loop.centre
+    values = loop.girth_mm, loop.tape_mm
+    girths, tapes = (
+        (min(value, low) - 1.96 * sigma, max(value, high) + 1.96 * sigma)
+        for value, low, high in zip(values, lows, highs, strict=True)
+    )
+    shares = None if kinds is None else select_regions(kinds, loop.faces)
     return Girth(
-        part,
-        loop.girth_mm,
-        loop.tape_mm,
+        piece.part,
+        *values,
         float(width),
         float(depth),
         loop.area_mm2,
         (float(x), float(y)),
         loop.measured_share,
-        found.girth_range_mm,
-        found.tape_range_mm,
-        regions=loop.region_shares,
+        girths,
+        tapes,
+        None if lean is None else girth_sigma(loop, lean, sectors=1),
+        None if shares is None else compute_region_shares(shares, loop.lengths),
+        piece.touches,
     )
-
-
-def rig_from_body(vertices: Array) -> RigidTransform:
-    """Estimate the pose of a standing body in the rig frame from evenly spread vertices (V, 3) mm:
-    z = 0 on the floor, origin under the body, x where it faces, y to its left.
-
-    The upper body is widest from side to side; it faces the direction nearer to the rig's x.
-    """
-    # Hips, trunk and arms, which together are wider than deep.
-    upper = vertices[vertices[:, 2] > 0.45 * vertices[:, 2].max(), :2]
-    middle = 0.5 * (np.percentile(upper, 2, axis=0) + np.percentile(upper, 98, axis=0))
-    _, axes = np.linalg.eigh(np.cov((upper - upper.mean(axis=0)).T))
-    forward = axes[:, 0] * (1.0 if axes[0, 0] >= 0 else -1.0)
-    rotation = np.eye(3)
-    rotation[:2, 0], rotation[:2, 1] = forward, [-forward[1], forward[0]]
-    return RigidTransform(rotation, np.array([middle[0], middle[1], 0.0]))

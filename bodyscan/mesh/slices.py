@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import depth_first_order
 from scipy.spatial import ConvexHull, QhullError
 
-from bodyscan.arrays import Array, Bytes, Indices, Mask
-from bodyscan.mesh.body import compute_region_shares, select_regions
-from bodyscan.mesh.topology import connect
+from bodyscan.arrays import Array, Indices, Mask
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,44 +18,42 @@ class MeshSlicer:
     """Cuts a closed mesh at any number of heights.
 
     vertices: (V, 3) mm. faces: (F, 3), outward.
-    filled: (F,) which faces were filled. regions: (F,) of the faces.
+    filled: (F,) which faces were filled.
     """
 
     vertices: Array
     faces: Indices
     filled: Mask | None = None
-    regions: Bytes | None = None
 
     @cached_property
-    def height_ranges(self) -> tuple[Array, Array]:
-        """Lowest and highest z (F,) mm of each face."""
+    def height_ranges(self) -> tuple[Indices, Array, Array]:
+        """The faces from the lowest up (F,), and the lowest and highest z (F,) mm of each."""
         # Corner by corner: numpy's reduction over rows of three takes ten times as long.
         heights = np.ascontiguousarray(self.vertices[:, 2])
         a, b, c = (heights[self.faces[:, k]] for k in range(3))
-        return np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
+        low, high = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
+        order = np.argsort(low)
+        return order, low[order], high[order]
+
+    @cached_property
+    def tallest_mm(self) -> float:
+        """Height of the tallest face."""
+        _, low, high = self.height_ranges
+        return float((high - low).max(initial=0.0))
 
     def slice(self, height_mm: float) -> tuple[Loop, ...]:
         """Cut at z = height_mm into loops, largest area first; () if the plane misses the mesh.
 
         A vertex exactly in the plane counts as above it, so that loops always close.
         """
-        low, high = self.height_ranges
-        crossed = np.flatnonzero((low < height_mm) & (high >= height_mm))
+        order, low, high = self.height_ranges
+        some = slice(*np.searchsorted(low, [height_mm - self.tallest_mm, height_mm]))
+        crossed = np.sort(order[some][high[some] >= height_mm])
         if not crossed.size:
             return ()
         segments, ends = _cut(self.vertices, self.faces[crossed], height_mm)
-        labels = connect(ends, int(ends.max()) + 1)[1][ends[:, 0]]
         filled = np.zeros(crossed.size, bool) if self.filled is None else self.filled[crossed]
-        order = np.argsort(labels, kind="stable")
-        loops = [
-            Loop(
-                segments[part],
-                ~filled[part],
-                ends[part],
-                select_regions(self.regions, crossed[part]),
-            )
-            for part in np.split(order, np.flatnonzero(np.diff(labels[order])) + 1)
-        ]
+        loops = [Loop(segments[part], ~filled[part], crossed[part]) for part in _follow(ends)]
         return tuple(sorted(loops, key=lambda loop: -loop.area_mm2))
 
 
@@ -64,16 +61,15 @@ class MeshSlicer:
 class Loop:
     """One closed curve of a slice, mm.
 
-    segments: (N, 2, 2) from (x, y) to (x, y), unordered; seen from above, the body is on the left.
+    segments: (N, 2, 2) from (x, y) to (x, y), each from where the one before ends; seen from above,
+        the body is on the left.
     measured: (N,) whether the segment crosses a measured face.
-    ends: (N, 2), ids of the mesh's edges on which each starts and ends; neighbours share them.
-    regions: (N,) of the faces, if known.
+    faces: (N,) of the mesh; -1 for segments that close a gap.
     """
 
     segments: Array
     measured: Mask
-    ends: Indices
-    regions: Bytes | None = None
+    faces: Indices
 
     @cached_property
     def lengths(self) -> Array:
@@ -109,25 +105,6 @@ class Loop:
         """Share of the girth that crosses measured faces."""
         return float(self.lengths[self.measured].sum() / max(self.girth_mm, 1e-12))
 
-    @property
-    def region_shares(self) -> dict[str, float] | None:
-        """Share of the girth that crosses each region, by name."""
-        return None if self.regions is None else compute_region_shares(self.regions, self.lengths)
-
-
-@dataclass(frozen=True, eq=False)
-class Run:
-    """A maximal stretch of a loop that was measured, or was not.
-
-    segments: (N,) indices of the loop's segments, unordered.
-    first, last: indices of the segments where it begins and ends.
-    """
-
-    measured: bool
-    segments: Indices
-    first: int
-    last: int
-
 
 def hull_perimeter(points: Array) -> float:
     """Compute the perimeter of the convex hull of points (N, 2)."""
@@ -137,58 +114,50 @@ def hull_perimeter(points: Array) -> float:
         return 2.0 * float(np.linalg.norm(np.ptp(points, axis=0)))
 
 
-def split_runs(loop: Loop, min_gap_mm: float = 15.0) -> tuple[Run, ...]:
-    """Split a loop into measured and unmeasured runs, in order.
+def split_runs(loop: Loop, min_gap_mm: float = 15.0) -> tuple[Mask, list[Indices]]:
+    """Split a loop into measured and unmeasured runs: which are measured, and the segments of each.
 
     min_gap_mm: shorter gaps count as measured. Across 15 mm of a limb a straight line is less than
         0.5 mm shorter than the curve.
     """
-    nodes, number = np.unique(loop.ends, return_inverse=True)
-    ends = number.reshape(-1, 2)
-    label = _label_runs(ends, loop.measured, len(nodes))
-    lengths = np.bincount(label, loop.lengths)
-    measured = loop.measured | (lengths[label] < min_gap_mm)
-    if (measured != loop.measured).any():
-        label = _label_runs(ends, measured, len(nodes))
-    runs = [_make_run(ends, np.flatnonzero(label == k), measured) for k in range(label.max() + 1)]
-    begins = {int(ends[run.first, 0]): k for k, run in enumerate(runs)}
-    order = [0]
-    while len(order) < len(runs):
-        order.append(begins[int(ends[runs[order[-1]].last, 1])])
-    return tuple(runs[k] for k in order)
+    measured = loop.measured.copy()
+    for run in _runs(measured):
+        measured[run] |= loop.lengths[run].sum() < min_gap_mm
+    runs = _runs(measured)
+    return np.array([measured[run[0]] for run in runs]), runs
 
 
-def join_runs(loop: Loop, runs: Sequence[Run]) -> Loop:
-    """Close some runs of a loop to a new loop, by straight unmeasured segments between them."""
-    here = np.array([run.last for run in runs])
-    there = np.array([run.first for run in [*runs[1:], runs[0]]])
-    gap = loop.ends[here, 1] != loop.ends[there, 0]
-    here, there = here[gap], there[gap]
-    kept = np.concatenate([run.segments for run in runs])
-    bridges = np.stack([loop.segments[here, 1], loop.segments[there, 0]], axis=1)
-    bridge_ends = np.stack([loop.ends[here, 1], loop.ends[there, 0]], axis=1)
-    return Loop(
-        np.concatenate([loop.segments[kept], bridges]),
-        np.concatenate([loop.measured[kept], np.zeros(len(bridges), bool)]),
-        np.concatenate([loop.ends[kept], bridge_ends]),
-        select_regions(loop.regions, np.concatenate([kept, np.full(len(bridges), -1)])),
-    )
+def _runs(labels: Indices | Mask) -> list[Indices]:
+    """Indices of each stretch of equal labels (N,) around a closed curve, in order."""
+    begins = np.flatnonzero(labels != np.roll(labels, 1))
+    if not begins.size:
+        return [np.arange(len(labels))]
+    return np.split(np.roll(np.arange(len(labels)), -begins[0]), np.cumsum(np.diff(begins)))
 
 
-def _make_run(ends: Indices, segments: Indices, measured: Mask) -> Run:
-    """Make a run of these segments (N,). A whole loop begins and ends anywhere."""
-    first = segments[~np.isin(ends[segments, 0], ends[segments, 1])]
-    last = segments[~np.isin(ends[segments, 1], ends[segments, 0])]
-    if not (first.size and last.size):
-        first, last = segments[:1], segments[ends[segments, 1] == ends[segments[0], 0]]
-    return Run(bool(measured[segments[0]]), segments, int(first[0]), int(last[0]))
+def keep_segments(loop: Loop, kept: Mask) -> Loop:
+    """Make a loop of some of a loop's segments, closed by straight unmeasured segments between them."""
+    index = np.flatnonzero(kept)
+    here, there = loop.segments[index, 1], loop.segments[np.roll(index, -1), 0]
+    gap = np.flatnonzero((here != there).any(axis=1))
+    bridges = np.stack([here[gap], there[gap]], axis=1)
+    segments = np.insert(loop.segments[index], gap + 1, bridges, axis=0)
+    measured = np.insert(loop.measured[index], gap + 1, False)
+    return Loop(segments, measured, np.insert(loop.faces[index], gap + 1, -1))
 
 
-def _label_runs(ends: Indices, measured: Mask, count: int) -> Indices:
-    """Label each segment, with ends (N, 2) at `count` nodes, with the number (N,) of its run."""
-    split = ends + count * ~measured[:, None]  # measured and unmeasured segments share no nodes
-    labels = connect(split, 2 * count)[1]
-    return np.unique(labels[split[:, 0]], return_inverse=True)[1]
+def _follow(ends: Indices) -> list[Indices]:
+    """Indices of the segments of each closed curve, in order, from the ids of their ends (N, 2)."""
+    start, end = np.argsort(ends[:, 0], kind="stable"), np.argsort(ends[:, 1], kind="stable")
+    following = np.empty(len(ends), np.int64)
+    following[end] = start  # every id is the start of one segment, and the end of one
+    graph = coo_array((np.ones(len(ends)), (np.arange(len(ends)), following))).tocsr()
+    left, curves = np.ones(len(ends), bool), []
+    while left.any():
+        first = int(np.argmax(left))
+        curves.append(depth_first_order(graph, first, return_predecessors=False).astype(np.int64))
+        left[curves[-1]] = False
+    return curves
 
 
 def _cut(vertices: Array, faces: Indices, height_mm: float) -> tuple[Array, Indices]:

@@ -1,4 +1,4 @@
-"""Edges, components and handles of triangle meshes, and whether one is a closed manifold.
+"""Edges and components of triangle meshes, and whether one is a closed manifold.
 
 Linear in the number of faces (Open3D's is_watertight also looks for self-intersections and is
 quadratic). Half-edge 3 f + k runs from corner k of face f to the next corner.
@@ -202,46 +202,3 @@ def used_vertices(faces: Indices, count: int) -> Indices:
     used = np.zeros(count, bool)
     used[faces] = True
     return np.flatnonzero(used)
-
-
-LAYER_MM = 20.0
-
-
-@dataclass(frozen=True)
-class Handle:
-    """A handle of the surface: its lowest and highest point, the y of its middle; mm."""
-
-    low_mm: float
-    high_mm: float
-    y_mm: float
-
-
-def find_handles(vertices: Array, faces: Indices, *, min_height_mm: float = 80.0) -> list[Handle]:
-    """Find the handles of a closed mesh that are upright and high enough, from the lowest up.
-
-    Parts of a body form one where they touch: a hand on the hip, one knee against the other. The
-    mesh is cut into layers; the components of all layers, linked where they meet, are a Reeb graph
-    (Reeb 1946) of the height. Without handles that graph is a tree; each cycle of it is a handle.
-    """
-    edges = directed_edges(faces)
-    edges = edges[edges[:, 0] < edges[:, 1]]
-    # An edge that skipped a layer would create a cycle where there is none.
-    layer_mm = max(LAYER_MM, float(np.abs(np.diff(vertices[edges, 2], axis=1)).max()))
-    layer = np.floor(vertices[:, 2] / layer_mm).astype(np.int64)
-    within = layer[edges[:, 0]] == layer[edges[:, 1]]
-    count, component = connect(edges[within], len(vertices))
-    height = np.zeros(count)
-    height[component] = layer_mm * (layer + 0.5)
-    y = np.bincount(component, vertices[:, 1], count) / np.bincount(component, minlength=count)
-    links = np.unique(np.sort(component[edges[~within]], axis=1), axis=0)
-    if len(links) == count - connect(links, count)[0]:
-        return []  # a forest
-    import networkx as nx  # takes a fifth of a second to load; few bodies have a handle
-
-    handles = []
-    for cycle in nx.minimum_cycle_basis(nx.k_core(nx.Graph(links.tolist()), 2)):
-        heights = height[cycle]
-        if np.ptp(heights) >= min_height_mm:
-            low, high = float(heights.min()), float(heights.max())
-            handles.append(Handle(low, high, float(y[cycle].mean())))
-    return sorted(handles, key=lambda handle: (handle.low_mm, handle.y_mm))

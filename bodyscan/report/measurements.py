@@ -31,6 +31,8 @@ def tables(measured: Measurements) -> Iterator[Table]:
     over = _name_covered(measured.regions)
     if over:
         body.add_row("of it covered", over)
+    if not measured.facing_known:
+        body.add_row("left and right", "assumed: no feet show which way the body faces")
     yield body
     breath = ", at mean breath" if measured.at_mean_breath else ""
     slices = Table(title=f"horizontal slices{breath}, mm")
@@ -42,8 +44,8 @@ def tables(measured: Measurements) -> Iterator[Table]:
             slices.add_row(
                 f"{level.height_mm:.0f}",
                 girth.part,
-                _format_girth(girth.tape_mm, girth.tape_range_mm),
-                _format_girth(girth.girth_mm, girth.girth_range_mm),
+                _format_girth(girth.tape_mm, girth.tape_range_mm, girth.measured),
+                _format_girth(girth.girth_mm, girth.girth_range_mm, girth.measured),
                 f"{girth.width_mm:.1f}",
                 f"{girth.depth_mm:.1f}",
                 f"{100.0 * girth.measured:.0f} %",
@@ -61,13 +63,14 @@ def _name_covered(regions: Mapping[str, float] | None) -> str:
     return ", ".join(f"{name} {100.0 * s:.0f} %" for name, s in shares.items() if s > 0.05)
 
 
-def _format_girth(value: float, between: Range) -> str:
-    """Give the range if unmeasured parts leave more open than a tape does, else the value.
+def _format_girth(value: float, between: Range, measured: float) -> str:
+    """Give the range if more is open than a tape leaves, or more than a tenth was not measured.
 
     Two measurers with a tape differ by 4 mm (ISO 20685-1).
     """
     low, high = between
-    return f"{low:.0f} to {high:.0f}" if high - low > 4.0 else f"{value:.1f}"
+    known = high - low <= 4.0 and measured >= 0.9
+    return f"{value:.1f}" if known else f"{low:.0f} to {high:.0f}"
 
 
 def measurements_document(measured: Measurements, facts: Mapping[str, Any]) -> dict[str, Any]:
@@ -92,5 +95,6 @@ def measurements_document(measured: Measurements, facts: Mapping[str, Any]) -> d
         "measured": measured.measured,
         "at_mean_breath": measured.at_mean_breath,
         "rig_from_body": measured.rig_from_body.matrix,
+        "facing_known": measured.facing_known,
         "slices": [asdict(level) for level in measured.slices],
     }

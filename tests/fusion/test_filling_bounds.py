@@ -43,7 +43,7 @@ def test_a_wall_and_something_beyond_the_volume_are_seen_through_alike() -> None
     far = replace(seen(np.where(beyond, np.nan, depth)), beyond=beyond)
     sheet = o3d.geometry.TriangleMesh.create_box(10.0, 900.0, 600.0).translate((0, -450, 600))
     vertices, faces = np.asarray(sheet.vertices), np.asarray(sheet.triangles).astype(np.int64)
-    guess = PartialSurface(vertices, faces, np.ones(len(faces), bool))
+    guess = PartialSurface(vertices, faces, np.ones(len(faces), bool), np.zeros(len(faces), bool))
     places = np.random.default_rng(0).uniform([-50, -400, 650], [50, 400, 1150], (5000, 3))
     points = places.astype(np.float32)
     through = find_free_points(points, guess, wall, POSE, 10.0)
@@ -67,7 +67,8 @@ def plates(*parts: tuple[float, float, float, bool]) -> PartialSurface:
         vertices += [depth * np.array(ray) for ray in rays]
         faces += [[4 * k, 4 * k + 1, 4 * k + 2], [4 * k, 4 * k + 2, 4 * k + 3]]
         filled += [fill, fill]
-    return PartialSurface(np.array(vertices), np.array(faces), np.array(filled))
+    nothing = np.zeros(len(faces), bool)
+    return PartialSurface(np.array(vertices), np.array(faces), np.array(filled), nothing)
 
 
 def shown(columns: np.ndarray) -> RangeImage:
@@ -98,6 +99,14 @@ def test_a_gap_is_what_is_made_up_between_what_was_measured_but_for_its_rims() -
     some = find_gaps(plates(*BETWEEN), shown(measured), HERE, 1, np.s_[5:9, 12:45])
     assert some.shape == (4, 33)
     assert np.flatnonzero(some[0]).tolist() == list(range(10, 27))
+
+
+@pytest.mark.parametrize("side", [0, 2])
+def test_beside_dark_cloth_a_lack_of_points_is_no_gap(side: int) -> None:
+    """Of which too little light came back: a pelvis in dark shorts is no hole."""
+    guess = plates(*BETWEEN)
+    dark = replace(guess, dark=np.arange(6) // 2 == side)
+    assert open_columns(dark, (COLUMN < 21) | (COLUMN > 39)) == []
 
 
 def test_what_was_measured_on_one_side_only_leaves_no_gap() -> None:

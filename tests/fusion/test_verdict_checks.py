@@ -10,17 +10,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+from made_bodies import cylinder, ellipsoid, mesh_of, together
 from made_scan import MadeScan, egg, make_scan
+from standing_body import HAND_ON_HIP, hanging, standing_body
 from verdict_given import verdict_given
 
 from bodyscan.alignment.displaced_poles import DisplacedPole, DisplacementSearch
 from bodyscan.alignment.icp import Alignment, Overlap
 from bodyscan.alignment.pose_evidence import ScaleError
-from bodyscan.arrays import Array, Mask
+from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.fusion.consistency import Contradictions
 from bodyscan.fusion.verdict.evidence import Coverage, Seam, SeamReport
 from bodyscan.fusion.verdict.rig import find_silent_poles
-from bodyscan.mesh.body import BodyCloud, BodyMesh
+from bodyscan.mesh.body import BodyCloud
 from bodyscan.motion.person_motion import PartMotion, PersonMotion
 from bodyscan.reconstruction.range_image import Agreement
 from bodyscan.registration.rig_calibration import NominalSize
@@ -279,59 +281,41 @@ def scattered(columns: Sequence[Column], counts: Sequence[int]) -> BodyCloud:
     return cloud_of(np.concatenate(parts))
 
 
-def boxes(columns: Sequence[Column]) -> BodyMesh:
-    """A closed box for each column."""
-    corner = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], float)
-    sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    faces = np.array([f for a, b, c, d in sides for f in ((a, b, c), (a, c, d))], np.int64)
-    vertices = np.concatenate(
-        [
-            corner * [a, b, high - low] + [x - a / 2, y - b / 2, low]
-            for (x, y), (a, b), low, high in columns
-        ]
-    )
-    all_faces = np.concatenate([faces + 8 * k for k in range(len(columns))])
-    nothing = np.zeros((len(vertices), 3), np.float32)
-    sigma = np.ones(len(vertices), np.float32)
-    filled = np.zeros(len(all_faces), bool)
-    return BodyMesh(vertices, all_faces, nothing, nothing.astype(np.uint8), sigma, filled)
-
-
 def square(area: float) -> tuple[float, float]:
     return float(np.sqrt(area)), float(np.sqrt(area))
 
 
 TRUNK: Column = ((0.0, 0.0), square(90_000.0), 0.0, TALL_MM)
-BODY: list[Column] = [
-    ((0.0, 0.0), square(90_000.0), 800.0, TALL_MM),
-    ((0.0, 100.0), (170.0, 170.0), 0.0, 800.0),
-    ((0.0, -100.0), (170.0, 170.0), 0.0, 800.0),
-]
-ARMS: list[Column] = [((0.0, y), square(2000.0), 900.0, 1500.0) for y in (300.0, -300.0)]
+SHAPES = ("more than one person", "touches the", "mm wide and")
+PERSON = standing_body(hanging(25.0))
+
+
+def beside(thing: tuple[Array, Indices]) -> tuple[Array, Indices]:
+    return together(PERSON, (thing[0] + [0.0, 900.0, 0.0], thing[1]))
 
 
 @pytest.mark.parametrize(
-    ("columns", "words"),
+    ("body", "grade", "words"),
     [
-        (BODY, ""),
-        ([*BODY, *ARMS], ""),
-        ([*BODY, *ARMS, ((0.0, 400.0), square(2000.0), 900.0, 1500.0)], "more limbs than one person"),
-        ([*BODY, ((0.0, 400.0), square(20_000.0), 1100.0, 1500.0)], ""),  # a thick arm
-        ([*BODY, ((0.0, 400.0), square(40_000.0), 1100.0, 1500.0)], "more than one person"),
-        ([*BODY, ((0.0, 400.0), square(400.0), 0.0, 1000.0)], "more than two legs"),  # a stick
-        ([*BODY, ((0.0, 400.0), square(400.0), 600.0, 1000.0)], ""),  # fingers
-        # Arms raised beside a neck are as large as the neck.
-        ([*BODY[1:], ((0.0, 0.0), square(20_000.0), 800.0, TALL_MM),
-          ((0.0, 400.0), square(18_000.0), 1200.0, 1600.0)], ""),
-        ([((0.0, 0.0), (300.0, 1700.0), 0.0, 300.0)], "1700 mm wide and 300 mm tall"),
+        (PERSON, "good", ""),
+        (standing_body(hanging(25.0), scale=0.6), "good", ""),
+        (standing_body(hanging(20.0), stout=1.25), "good", ""),
+        (standing_body(hanging(25.0), apart_mm=66.0), "good", ""),  # thighs that touch
+        (standing_body(hanging(0.0)), "usable", "the left arm touches the trunk from"),
+        (standing_body(HAND_ON_HIP), "usable", "hold the arms off"),
+        (beside(PERSON), "repeat", "more than one person: at heights"),
+        (beside(cylinder(15.0, 0.0, 1000.0)), "usable", "causes: a stick"),
+        (beside(cylinder(130.0, 0.0, 450.0)), "usable", "a chair"),
+        (ellipsoid((150.0, 850.0, 150.0), (0.0, 0.0, 150.0)), "usable", "1700 mm wide and 300 mm"),
     ],
-)  # fmt: skip
-def test_shapes(columns: Sequence[Column], words: str) -> None:
-    mesh = boxes(columns)
-    found = str(verdict_given(cloud_of(mesh.vertices), mesh))
-    shapes = ("more than one person", "more limbs", "more than two legs", "mm wide and")
-    assert words in found
-    assert words or not any(shape in found for shape in shapes), found
+)
+def test_shapes(body: tuple[Array, Indices], grade: str, words: str) -> None:
+    mesh = mesh_of(*body)
+    found = verdict_given(cloud_of(mesh.vertices[:: 1 if words.startswith("1700") else 2]), mesh)
+    shape = [line for line in found.reasons if any(one in line for one in SHAPES)]
+    assert words in str(shape)
+    assert (grade == "good") == (not shape)
+    assert grade != "repeat" or found.grade == "repeat"
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import open3d as o3d
 import pytest
-from made_bodies import boxes, cylinder, ellipsoid, mesh_of, together
+from made_bodies import cylinder, ellipsoid, mesh_of
+from standing_body import hanging, standing_body, trunk_tape
 
 from bodyscan.errors import BadInput
 from bodyscan.geometry.transforms import RigidTransform
@@ -62,7 +63,7 @@ def test_parts_by_height(subject: BodyMesh) -> None:
     assert breast.of("left leg") is None
 
 
-@pytest.mark.parametrize("degrees", [-60.0, 25.0, 80.0])
+@pytest.mark.parametrize("degrees", [-60.0, 25.0, 80.0, 180.0])
 def test_how_the_subject_stands_changes_nothing(subject: BodyMesh, degrees: float) -> None:
     straight = measure(subject, [350.0, 900.0])
     askew = measure(turned(subject, degrees, [120.0, -80.0, 0.0]), [350.0, 900.0])
@@ -104,22 +105,8 @@ def test_girths_are_those_at_mean_breath_and_say_how_well_it_is_known() -> None:
     assert tape_mm(mean, "trunk") == pytest.approx(2 * np.pi * 98.0, rel=1e-3)
     assert tape_mm(moment, "trunk") == pytest.approx(2 * np.pi * 100.0, rel=1e-3)
     assert mean.girths[0].breath_sigma_mm == pytest.approx(2 * np.pi * 0.5, rel=0.01)
-    assert moment.girths[0].breath_sigma_mm is None
     assert measure(full).at_mean_breath
     assert not measure(still).at_mean_breath
-
-
-def test_fingers_are_no_legs() -> None:
-    """Two legs, and hands beside them that hang lower than the crotch."""
-    limbs = together(
-        cylinder(70.0, 0.0, 900.0, y=90.0),
-        cylinder(70.0, 0.0, 900.0, y=-90.0),
-        cylinder(15.0, 500.0, 1300.0, y=300.0),
-        cylinder(15.0, 500.0, 1300.0, y=-300.0),
-    )
-    (level,) = measure(mesh_of(*limbs), [600.0]).slices
-    assert [g.part for g in level.girths] == ["left arm", "left leg", "right arm", "right leg"]
-    assert tape_mm(level, "left leg") == pytest.approx(2 * np.pi * 70.0, rel=1e-3)
 
 
 def test_no_body_at_that_height(subject: BodyMesh) -> None:
@@ -147,25 +134,42 @@ def test_of_a_body_seen_from_the_knees_up_the_slices_there_are_are_given(subject
     assert "Give heights between 430 and 1632 mm" in str(error.value)
 
 
-@pytest.mark.parametrize("side", [1, -1])
-def test_a_girth_that_goes_round_a_hand_on_the_hip_is_not_the_trunks(side: int) -> None:
-    """A trunk on a foot, an arm 100 mm beside it from the shoulder down to a hand that touches."""
-    trunk = ((-10, -15, 0), (10, 15, 150))
-    arm, shoulder = ((-4, 25, 80), (4, 33, 140)), ((-4, 15, 130), (4, 33, 140))
-    hand = ((-4, 15, 80), (4, 33, 88))
-    parts = [
-        ((x, min(side * y, side * far), z), (other, max(side * y, side * far), top))
-        for (x, y, z), (other, far, top) in (trunk, arm, shoulder, hand)
-    ]
-    measured = measure(mesh_of(*boxes(*parts)), [705.0, 845.0, 1005.0])
-    below, touched, beside = measured.slices
-    arm_of = f"{'left' if side > 0 else 'right'} arm"
-    assert [girth.part for girth in touched.girths] == [f"trunk and {arm_of}"]
-    assert touched.of("trunk") is None
-    # 300 by 200 mm, where nothing touches.
-    assert tape_mm(below, "trunk") == pytest.approx(1000.0)
-    assert tape_mm(beside, "trunk") == pytest.approx(1000.0)
-    assert tape_mm(beside, arm_of) == pytest.approx(320.0)
+def test_a_girth_that_touches_another_part_is_a_range() -> None:
+    """A trunk with arms against it, measured all round: what lies between was not."""
+    found = measure(mesh_of(*standing_body(hanging(0.0))), [1000.0])
+    girths = {girth.part: girth for girth in found.slices[0].girths}
+    trunk = girths["trunk"]
+    assert set(trunk.touches) == {"left arm", "right arm"}
+    low, high = trunk.tape_range_mm
+    assert low < trunk_tape() < high
+    assert high - low < 60.0  # with the arms it has 200 mm more
+    assert trunk.measured < 0.99
+
+
+def test_every_girth_has_the_width_of_noise_and_breath() -> None:
+    still = mesh_of(*cylinder(100.0, 0.0, 1000.0))
+    sigma = np.full(len(still.vertices), 0.3, np.float32)
+    noisy = replace(still, sigma_mm=sigma)
+    (girth,) = measure(noisy, [500.0]).slices[0].girths
+    assert np.ptp(girth.tape_range_mm) == pytest.approx(2.0 * 1.96 * np.pi * 0.3, rel=0.02)
+    assert np.ptp(girth.girth_range_mm) == pytest.approx(2.0 * 1.96 * np.pi * 0.3, rel=0.02)
+    breathing = replace(noisy, breath=BreathAt(0.0 * sigma, sigma))
+    for mean_breath in (True, False):
+        (girth,) = measure(breathing, [500.0], mean_breath=mean_breath).slices[0].girths
+        assert girth.breath_sigma_mm == pytest.approx(2.0 * np.pi * 0.3, rel=0.02)
+
+
+@pytest.mark.parametrize("degrees", [90.0, 180.0])
+def test_left_is_the_bodys_left_however_it_faces(degrees: float) -> None:
+    vertices, faces = standing_body(hanging(25.0))
+    lifted = vertices + np.where(vertices[:, 1:2] > 330.0, [0.0, 0.0, 100.0], 0.0)
+    found = measure(turned(mesh_of(lifted, faces), degrees, [0.0, 0.0, 0.0]), [740.0])
+    assert found.facing_known
+    assert {girth.part for girth in found.slices[0].girths} == {
+        "left leg",
+        "right leg",
+        "right arm",
+    }
 
 
 def test_heights_are_numbers_with_commas_between() -> None:

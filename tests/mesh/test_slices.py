@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from made_bodies import arrays, cylinder, ellipsoid, together
 from scipy.special import ellipe
 
-from bodyscan.mesh.slices import Loop, MeshSlicer, hull_perimeter, join_runs, split_runs
+from bodyscan.mesh.slices import Loop, MeshSlicer, hull_perimeter, keep_segments, split_runs
 
 
 @pytest.mark.parametrize("height", [55.0, 100.0, 123.4])  # 100 lies on a ring of vertices
@@ -75,53 +75,41 @@ def test_a_plane_outside_the_body_cuts_nothing() -> None:
     assert MeshSlicer(*ELLIPSOID).slice(-251.0) == ()
 
 
-def square(*measured: bool, regions: list[int] | None = None) -> Loop:
-    """A square of 40 mm, anticlockwise in pieces of 10, each measured or not; their order is mixed."""
+def square(*measured: bool) -> Loop:
+    """A square of 40 mm, anticlockwise in pieces of 10, each measured or not."""
     corners = np.array([[0, 0], [40, 0], [40, 40], [0, 40], [0, 0]], float)
     points = np.concatenate([np.linspace(corners[k], corners[k + 1], 5)[:4] for k in range(4)])
     segments = np.stack([points, np.roll(points, -1, axis=0)], axis=1)
-    ends = np.stack([np.arange(16), np.roll(np.arange(16), -1)], axis=1) + 100
-    known = np.array(measured or (True,) * 16)
-    order = np.random.default_rng(1).permutation(16)
-    labels = None if regions is None else np.array(regions, np.uint8)[order]
-    return Loop(segments[order], known[order], ends[order], labels)
+    return Loop(segments, np.array(measured or (True,) * 16), np.arange(16))
+
+
+def test_segments_follow_each_other() -> None:
+    for loop in MeshSlicer(*ELLIPSOID).slice(30.0):
+        np.testing.assert_array_equal(loop.segments[:, 1], np.roll(loop.segments[:, 0], -1, axis=0))
 
 
 def test_a_loop_is_split_at_long_unmeasured_gaps() -> None:
     measured = np.ones(16, bool)
     measured[[2, 3, 9]] = False
     loop = square(*measured.tolist())
-    runs = split_runs(loop, 15.0)  # the 10 mm of number 9 count as measured
-    assert sorted(len(run.segments) for run in runs) == [2, 14]
-    (gap,) = (run for run in runs if not run.measured)
-    assert loop.segments[gap.first, 0].tolist() == [20.0, 0.0]
-    assert loop.segments[gap.last, 1].tolist() == [40.0, 0.0]
-    (rest,) = (run for run in runs if run.measured)
-    assert loop.segments[rest.first, 0].tolist() == [40.0, 0.0]
-    assert loop.segments[rest.last, 1].tolist() == [20.0, 0.0]
-    assert len(split_runs(loop, 9.0)) == 4
-    assert len(split_runs(loop, 25.0)) == 1
-    runs = split_runs(loop, 9.0)
-    for run, following in zip(runs, (*runs[1:], runs[0]), strict=True):
-        assert loop.ends[run.last, 1] == loop.ends[following.first, 0]
+    seen, runs = split_runs(loop, 15.0)  # the 10 mm of number 9 count as measured
+    (gap,) = (run for run, known in zip(runs, seen, strict=True) if not known)
+    assert gap.tolist() == [2, 3]
+    (rest,) = (run for run, known in zip(runs, seen, strict=True) if known)
+    assert rest.tolist() == [*range(4, 16), 0, 1]
+    assert len(split_runs(loop, 9.0)[1]) == 4
+    assert len(split_runs(loop, 25.0)[1]) == 1
 
 
-def test_runs_are_joined_by_straight_unmeasured_segments() -> None:
-    measured = np.ones(16, bool)
-    measured[3:6] = False  # round one corner
-    loop = square(*measured.tolist(), regions=[1] * 8 + [2] * 8)
-    (kept,) = (run for run in split_runs(loop, 5.0) if run.measured)
-    found = join_runs(loop, [kept])
+def test_what_is_kept_of_a_loop_is_closed_by_straight_unmeasured_segments() -> None:
+    kept = np.ones(16, bool)
+    kept[3:6] = False  # round one corner
+    found = keep_segments(square(), kept)
     assert found.girth_mm == pytest.approx(130.0 + np.hypot(10.0, 20.0))
     assert found.area_mm2 == pytest.approx(1600.0 - 0.5 * 10.0 * 20.0)
     assert found.measured_share == pytest.approx(130.0 / found.girth_mm)
-    shares = found.region_shares
-    assert shares is not None
-    assert list(shares.values()) == pytest.approx(
-        [np.hypot(10.0, 20.0) / found.girth_mm, 50.0 / found.girth_mm, 80.0 / found.girth_mm]
-        + [0.0] * (len(shares) - 3)
-    )
-    whole = join_runs(loop, split_runs(loop, 5.0))
+    assert found.faces.tolist() == [0, 1, 2, -1, *range(6, 16)]
+    whole = keep_segments(square(), np.ones(16, bool))
     assert whole.girth_mm == pytest.approx(160.0)
     assert len(whole.segments) == 16
 
@@ -131,6 +119,6 @@ def test_figures_of_a_square() -> None:
     assert (loop.girth_mm, loop.tape_mm) == pytest.approx((160.0, 160.0))
     assert loop.area_mm2 == pytest.approx(1600.0)
     np.testing.assert_allclose(loop.centre, [20.0, 20.0])
-    assert (loop.measured_share, loop.region_shares) == (1.0, None)
+    assert loop.measured_share == 1.0
     # A speck in one line has a hull as well: there and back.
     assert hull_perimeter(np.array([[0.0, 0.0], [3.0, 4.0], [1.5, 2.0]])) == pytest.approx(10.0)

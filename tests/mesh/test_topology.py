@@ -7,7 +7,7 @@ import open3d as o3d
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from made_bodies import arrays, together
+from made_bodies import arrays
 
 from bodyscan.arrays import Indices
 from bodyscan.mesh.topology import (
@@ -16,7 +16,6 @@ from bodyscan.mesh.topology import (
     compute_topology,
     drop_unused_vertices,
     face_normals,
-    find_handles,
     find_twins,
     label_components,
     label_corner_fans,
@@ -119,40 +118,3 @@ def test_normals() -> None:
     vertices, faces = rng.normal(size=(30, 3)), rng.integers(0, 30, (80, 3))
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     np.testing.assert_array_equal(face_normals(vertices, faces), np.cross(b - a, c - a))
-
-
-def upright_ring(radius_mm: float, at: tuple[float, float, float]) -> tuple[np.ndarray, Indices]:
-    torus = make.create_torus(radius_mm, 0.25 * radius_mm, 60, 30)
-    torus.rotate(torus.get_rotation_matrix_from_xyz((np.pi / 2.0, 0.0, 0.0)), (0.0, 0.0, 0.0))
-    vertices, faces = arrays(torus)
-    return vertices + at, faces
-
-
-def test_a_handle_has_its_height_and_position() -> None:
-    """From the lowest layer to the highest that its hole separates, and those that close it."""
-    (handle,) = find_handles(*upright_ring(120.0, (30.0, -70.0, 1000.0)))
-    assert handle.y_mm == pytest.approx(-70.0, abs=5.0)
-    assert 0.5 * (handle.low_mm + handle.high_mm) == pytest.approx(1000.0, abs=10.0)
-    # The hole is 180 mm high: of layers of 20 mm nine, and one on either side.
-    assert handle.high_mm - handle.low_mm == pytest.approx(200.0, abs=20.0)
-
-
-def test_surfaces_without_a_handle_and_with_small_ones() -> None:
-    for radius in (150.0, 5.0):  # the second within one layer
-        vertices, faces = arrays(make.create_sphere(radius, 40))
-        assert not find_handles(vertices + [0.0, 0.0, 1010.0], faces, min_height_mm=0.0)
-    small = upright_ring(40.0, (0.0, 0.0, 500.0))
-    assert not find_handles(*small)
-    assert len(find_handles(*small, min_height_mm=50.0)) == 1
-    assert len(find_handles(*upright_ring(60.0, (0.0, 0.0, 500.0)))) == 1  # its hole: 90 mm
-    # A tetrahedron 200 mm high, one of whose edges has a vertex half way up.
-    corners = np.array([[0, 0, 0], [90, 0, 0], [0, 90, 0], [0, 0, 200], [0, 0, 100]], float)
-    faces = np.array([[0, 2, 1], [1, 2, 3], [0, 1, 4], [4, 1, 3], [2, 0, 4], [2, 4, 3]])
-    assert not find_handles(corners, faces)
-
-
-def test_handles_are_sorted_by_height_then_from_right_to_left() -> None:
-    centres = ((0.0, 200.0, 1000.0), (0.0, 0.0, 1400.0), (0.0, -200.0, 1000.0), (0.0, 0.0, 500.0))
-    found = find_handles(*together(*(upright_ring(80.0, centre) for centre in centres)))
-    assert [round(handle.y_mm, -2) for handle in found] == [0.0, -200.0, 200.0, 0.0]
-    assert np.diff([handle.low_mm for handle in found]).tolist() == [500.0, 0.0, 400.0]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -12,6 +13,8 @@ from bodyscan.alignment.sway_prior import centre_sigmas
 from bodyscan.arrays import Array, Mask
 from bodyscan.fusion.consistency import Contradictions
 from bodyscan.mesh.body import BodyCloud, BodyMesh
+from bodyscan.mesh.body_parts import BodyParts, find_body_frame, find_parts
+from bodyscan.mesh.slices import MeshSlicer
 from bodyscan.motion.person_alignment import PersonAlignment
 from bodyscan.motion.person_motion import PersonMotion
 from bodyscan.reconstruction.range_image import Agreement
@@ -155,6 +158,15 @@ class ScanEvidence:
             return None
         filled = self.coverage.filled_share if self.coverage else self.mesh.filled_share
         return self.mesh if filled <= 0.5 else None
+
+    @cached_property
+    def parts(self) -> BodyParts | None:
+        """The parts of the body, None without a `shape`."""
+        mesh = self.shape
+        if mesh is None:
+            return None
+        body_from_rig = find_body_frame(mesh.vertices).rig_from_body.inverse()
+        return find_parts(MeshSlicer(body_from_rig.apply(mesh.vertices), mesh.faces))
 
 
 Check = Callable[[ScanEvidence], Iterable[Finding]]

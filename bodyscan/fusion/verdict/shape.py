@@ -9,8 +9,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from bodyscan.fusion.verdict.evidence import Finding, ScanEvidence
-from bodyscan.mesh.slices import MeshSlicer
-from bodyscan.mesh.topology import find_handles
+from bodyscan.mesh.body_parts import ARMPIT
 
 SECOND_BODY = 0.4
 """of the first one's height: as tall, it is a body and not a thing beside one."""
@@ -44,45 +43,35 @@ def check_pieces(scan: ScanEvidence) -> Iterator[Finding]:
 
 
 def check_limbs(scan: ScanEvidence) -> Iterator[Finding]:
-    """More trunks, legs or arms side by side than one person has, and things beside the legs."""
-    mesh = scan.shape
-    if mesh is None:
+    """What is no trunk, leg or arm of one person: another one, or a thing beside the legs."""
+    if scan.parts is None:
         return
-    top = float(mesh.vertices[:, 2].max())
-    slicer = MeshSlicer(mesh.vertices, mesh.faces)
-    bodies, limbs, things = [], [], []
-    for share in np.arange(0.08, 0.95, 0.03):  # every 50 mm of an adult
-        level = share * top
-        areas = np.array([loop.area_mm2 for loop in slicer.slice(level)])
-        if not areas.size:
-            continue
-        # An arm has 0.2 of the trunk's area, a hand 0.1 of a thigh's; arms raised beside a neck
-        # are as large as the neck, but not as a trunk.
-        large = int(np.sum(areas > 0.35 * areas.max()))
-        legs = share < 0.62  # even if hair hides some of the stature
-        if large > (2 if legs else 1) and (legs or areas.max() > 25_000.0):
-            bodies.append(level)
-        elif np.sum(areas > 1500.0) > (4 if legs else 3):  # a wrist; fingers are smaller
-            limbs.append(level)
-        elif share < 0.33 and np.sum(areas > 300.0) > 2:  # below hanging hands; a stick of 20 mm
-            things.append(level)
-    if len(bodies) > 1:
+    largest = {
+        height: max(piece.loop.area_mm2 for piece in pieces)
+        for height, pieces in scan.parts.slices.items()
+        if pieces
+    }
+    other = {
+        height: max(
+            (p.loop.area_mm2 for p in scan.parts.slices[height] if p.part == "other"), default=0.0
+        )
+        for height in largest
+    }
+    # An arm has 0.2 of the trunk's area; a stick of 20 mm has 300 mm2.
+    bodies = [height for height, area in other.items() if area > 0.35 * largest[height]]
+    things = [height for height, area in other.items() if area > 300.0]
+    if bodies and max(bodies) - min(bodies) > SECOND_BODY * max(largest):
         yield (
             "repeat",
             f"more than one person: at heights from {min(bodies):.0f} to {max(bodies):.0f} mm there "
             "are more trunks or legs than one has",
         )
-    if len(limbs) > 1:
+    elif len(things) > 3:  # 50 mm of an adult
         yield (
             "usable",
-            f"more limbs than one person has at heights from {min(limbs):.0f} to {max(limbs):.0f} mm. "
-            "Possible causes: somebody or something else is in the volume; a pair is misaligned",
-        )
-    if len(things) > 1:
-        yield (
-            "usable",
-            f"more than two legs at heights from {min(things):.0f} to {max(things):.0f} mm. Possible "
-            "causes: a stick, a rail, a chair or an animal. What touches the body is measured as body",
+            f"more than one person's trunk, legs and arms at heights from {min(things):.0f} to "
+            f"{max(things):.0f} mm. Possible causes: a stick, a rail, a chair or an animal; somebody's "
+            "arm; a pair is misaligned. What touches the body is measured as body",
         )
 
 
@@ -131,24 +120,17 @@ def check_omissions(scan: ScanEvidence) -> Iterator[Finding]:
 
 
 def check_contacts(scan: ScanEvidence) -> Iterator[Finding]:
-    """Closed rings of the body: a hand on the hip, one knee against the other."""
-    mesh = scan.shape
-    if mesh is None:
+    """Arms that touch the trunk or a leg, beyond the last centimetres below an armpit."""
+    if scan.parts is None:
         return
-    middle = 0.5 * (mesh.vertices[:, 1].min() + mesh.vertices[:, 1].max())
-    found = find_handles(mesh.vertices, mesh.faces)
-    # Both hands on the hips or holding each other, and touching thighs, knees and heels make five.
-    if len(found) > 5:
-        yield (
-            "usable",
-            f"{len(found)} closed rings, more than touching parts of a body form. Possible causes: "
-            "something else is in the volume; pairs are misaligned",
-        )
-        return
-    for ring in found:
-        side = "left" if ring.y_mm > middle else "right"
-        yield (
-            "usable",
-            f"parts of the body touch: a closed ring on the {side} from {ring.low_mm:.0f} to "
-            f"{ring.high_mm:.0f} mm, such as a hand on the hip; girths there hold both parts",
-        )
+    top = max(scan.parts.slices)
+    for contact in scan.parts.contacts:
+        arm = next((part for part in contact.parts if part.endswith("arm")), None)
+        other = next((part for part in contact.parts if part != arm), None)
+        at_armpit = contact.high_mm > (ARMPIT - 0.06) * top
+        if arm and other and contact.high_mm - contact.low_mm > (0.06 if at_armpit else 0.01) * top:
+            yield (
+                "usable",
+                f"the {arm} touches the {other} from {contact.low_mm:.0f} to {contact.high_mm:.0f} mm: "
+                "hold the arms off. Girths there are given as a range, or of both parts together",
+            )
