@@ -15,7 +15,6 @@ from itertools import pairwise
 import numpy as np
 
 from bodyscan.arrays import Array, Bytes, Floats
-from bodyscan.compiled import compiled
 from bodyscan.fusion.consistency import Consistency
 from bodyscan.fusion.smoothing import SmoothSurface
 from bodyscan.fusion.voxel_thinning import Samples
@@ -121,14 +120,11 @@ def estimate_light_power(overlaps: Sequence[tuple[Floats, Floats]]) -> float:
         for k in range(2)
     )
     some = np.abs(shade) > 1e-6
+    if not some.any():
+        return 0.0
     slopes, weights = ratio[some] / shade[some], np.abs(shade[some])
-    return float(np.clip(_weighted_median(slopes, weights), 0.0, 1.0)) if some.any() else 0.0
-
-
-def _weighted_median(values: Array, weights: Array) -> float:
-    order = np.argsort(values, kind="stable")
-    below = np.cumsum(weights[order])
-    return float(values[order][np.searchsorted(below, 0.5 * below[-1])])
+    median = np.quantile(slopes, 0.5, weights=weights, method="inverted_cdf")
+    return float(np.clip(median, 0.0, 1.0))
 
 
 def solve_gains(ratios: Sequence[tuple[int, int, float, int]], count: int) -> Floats:
@@ -149,18 +145,11 @@ def solve_gains(ratios: Sequence[tuple[int, int, float, int]], count: int) -> Fl
     return np.exp(logarithms - logarithms.mean()).astype(np.float32)
 
 
-@compiled
 def log_irradiance(points: Floats, normals: Floats, centre: Array) -> Floats:
     """Logarithm (N,) of a surface's irradiance from a lamp at a camera's centre, up to a
     constant: cosine of incidence over squared distance. Below a cosine of 0.1 the room's light
     prevails."""
-    shades = np.empty(len(points), np.float32)
-    for n in range(len(points)):
-        towards = distance2 = 0.0
-        for k in range(3):
-            away = centre[k] - points[n, k]
-            towards += normals[n, k] * away
-            distance2 += away * away
-        cosine = max(towards / np.sqrt(distance2), 0.1)
-        shades[n] = np.log(cosine / distance2)
-    return shades
+    away = centre - points
+    distance2 = np.einsum("nk,nk->n", away, away)
+    cosine = np.maximum(np.einsum("nk,nk->n", normals, away) / np.sqrt(distance2), 0.1)
+    return np.log(cosine / distance2).astype(np.float32)

@@ -22,7 +22,6 @@ from bodyscan.arrays import Array, Floats, Indices, Mask
 from bodyscan.compiled import compiled
 from bodyscan.fusion.regions import DARK
 from bodyscan.fusion.signed_distances import REACH_CELLS, Distances, splat_planes
-from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud
 from bodyscan.mesh.depth_buffer import nearest_faces
@@ -266,7 +265,8 @@ def find_free_points(
     # The nearest depth around, 0 if anything is missing: rims and flying pixels prove nothing.
     nearest = cv2.erode(image.open_depth, np.ones((5, 5), np.uint8))
     through[index] = in_camera[index, 2] < nearest[rows, columns] - margin_mm
-    stride = _stride(image.camera, float(np.median(in_camera[index, 2])))
+    depth_mm = float(np.median(in_camera[index, 2]))
+    stride = max(1, round(RAY_SPACING_MM * image.camera.alpha / depth_mm))
     block_rows, block_columns = rows // stride, columns // stride
     top, left = block_rows.min(), block_columns.min()
     blocks = slice(top, block_rows.max() + 1), slice(left, block_columns.max() + 1)
@@ -303,11 +303,6 @@ def find_gaps(
     open_ &= _has_left_neighbour(body, reach) & _has_left_neighbour(body[:, ::-1], reach)[:, ::-1]
     real = nearest_faces(vertices, surface.faces[~surface.filled], len(rows), len(columns))
     return open_ & (real < 0)
-
-
-def _stride(camera: Camera, depth_mm: float) -> int:
-    """Pixels between rays at that depth."""
-    return max(1, round(RAY_SPACING_MM * camera.alpha / depth_mm))
 
 
 def _project_to_blocks(

@@ -7,10 +7,9 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bodyscan.arrays import Array, Bytes, Floats, Indices, Mask
-from bodyscan.mesh.topology import drop_unused_vertices, face_areas, face_normals, label_components
+from bodyscan.mesh.topology import drop_unused_vertices, face_areas, label_components
 
 UNSURE, SKIN, HAIR, DARK_CLOTH = range(4)
 REGION_NAMES = ("unsure", "skin", "hair", "dark cloth")
@@ -150,23 +149,15 @@ def compute_face_regions(regions: Bytes, faces: Indices) -> Bytes:
     return np.where((a == b) | (a == c), a, np.where(b == c, b, np.uint8(UNSURE)))
 
 
-DIRECTIONS = {
-    "front": (1.0, 0.0, 0.0), "back": (-1.0, 0.0, 0.0),
-    "left": (0.0, 1.0, 0.0), "right": (0.0, -1.0, 0.0),
-    "up": (0.0, 0.0, 1.0), "down": (0.0, 0.0, -1.0),
-}  # fmt: skip
-
-
 @dataclass(frozen=True, eq=False)
 class FilledPatch:
     """A connected patch of filled faces.
 
-    area_mm2: of the faces. centre: (3,) mm, rig frame. facing: a key of DIRECTIONS.
+    area_mm2: of the faces. centre: (3,) mm, rig frame.
     """
 
     area_mm2: float
     centre: Array
-    facing: str
 
 
 def find_filled_patches(mesh: BodyMesh) -> list[FilledPatch]:
@@ -176,15 +167,10 @@ def find_filled_patches(mesh: BodyMesh) -> list[FilledPatch]:
         return []
     patch = label_components(filled, len(mesh.vertices))
     area = face_areas(mesh.vertices, filled)
-    corners, normal = mesh.vertices[filled], face_normals(mesh.vertices, filled)
     total = np.bincount(patch, area)
-    centre = _sum_by_patch(patch, corners.mean(axis=1) * area[:, None]) / total[:, None]
-    facing = _sum_by_patch(patch, normal) @ np.array(list(DIRECTIONS.values())).T
-    names = [list(DIRECTIONS)[k] for k in np.argmax(facing, axis=1)]
+    weighted = mesh.vertices[filled].mean(axis=1) * area[:, None]
+    centre = (
+        np.stack([np.bincount(patch, column) for column in weighted.T], axis=1) / total[:, None]
+    )
     order = np.argsort(-total, kind="stable")
-    return [FilledPatch(float(total[k]), centre[k], names[k]) for k in order]
-
-
-def _sum_by_patch(patch: NDArray[np.int32], values: Array) -> Array:
-    """Sum values (N, 3) by patch (N,) to (P, 3)."""
-    return np.stack([np.bincount(patch, column) for column in values.T], axis=1)
+    return [FilledPatch(float(total[k]), centre[k]) for k in order]

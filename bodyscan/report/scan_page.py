@@ -277,14 +277,13 @@ def _pairs(facts: Mapping[str, Any]) -> list[Block]:
 def _holes(scan: StoredScan) -> list[Block]:
     found = [hole for hole in find_filled_patches(scan.mesh) if hole.area_mm2 >= 100.0]
     rows = tuple(
-        (str(k), hole.area_mm2 / 100.0, hole.centre[2], hole.centre[0], hole.centre[1], hole.facing)
+        (str(k), hole.area_mm2 / 100.0, hole.centre[2], hole.centre[0], hole.centre[1])
         for k, hole in enumerate(found[:8], start=1)
     )
     columns = (
         Column("hole"),
         Column("area", "cm²", digits=1),
         *(Column(name, "mm", digits=0) for name in ("height", "x", "y")),
-        Column("faces"),
     )
     intro = (
         f"Patches of at least 1 cm² that nothing measured and that were filled: {len(found)}"

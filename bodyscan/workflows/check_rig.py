@@ -262,25 +262,17 @@ def check_boards(
     stripes = _stripe_offsets(calibration, captures, views.value, located.value, progress)
     notes = (*views.notes, *located.notes, *stripes.notes)
     if not drift.rig_from_board and not stripes.value:
-        raise _nothing_to_compare(captures, located.value, notes)
+        raise _nothing_to_compare(captures, notes)
     checked = tuple(sorted({view.pair for view in (unique or located.value)}))
     unchecked = tuple(sorted(set(calibration.pairs) - set(checked)))
     return BoardCheck(drift, stripes.value, checked, unchecked, notes)
 
 
-def _nothing_to_compare(
-    captures: Captures, located: Sequence[LocatedView], notes: Sequence[str]
-) -> BoardNotFound:
-    symmetric = sorted({view.board for view in located if view.ambiguous})
-    what = (
-        f"board {', '.join(symmetric)} looks the same when turned by 180 degrees, so cameras cannot "
-        "be compared by it"
-        if symmetric
-        else "no board is seen by two calibrated pairs at once"
-    )
+def _nothing_to_compare(captures: Captures, notes: Sequence[str]) -> BoardNotFound:
     why = "".join(f"\n  {note}" for note in dict.fromkeys(notes))
     return BoardNotFound(
-        f"{what}, and no stripes on one were decoded{why}",
+        "no board is seen by two calibrated pairs at once (one that looks the same when turned by 180 "
+        f"degrees does not count), and no stripes on one were decoded{why}",
         where=", ".join(str(folder) for folder in captures.folders),
         remedy="show a board whose corners are numbered (ChArUco) to as many cameras as can see "
         "it together, or take the stripe sequence on a board",
