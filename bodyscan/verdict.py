@@ -14,6 +14,8 @@ MARKS: dict[str, Mark] = {
     "not judged": "usable",
 }
 """The mark that each grade stands for; any other grade is bad."""
+STYLES: dict[Mark, str] = {"good": "green", "usable": "yellow", "bad": "red"}
+"""The colour in which a terminal shows a grade of each mark."""
 
 LEFT_OUT = "left out: "
 """Begins a reason that names pairs that were lost, then a colon and why."""

@@ -29,12 +29,12 @@ from bodyscan.cli.options import SHARED
 from bodyscan.errors import BodyscanError, FailedWork
 from bodyscan.files.messages import translate_os_error
 from bodyscan.optional import optional
+from bodyscan.verdict import STYLES, Verdict
 
 if TYPE_CHECKING:
     from rich.progress import Progress as Bar
 
     from bodyscan.outcome import Outcome
-    from bodyscan.verdict import Verdict
 
 # Tables keep their lines whole when the output goes into a file.
 CONSOLE = Console(width=None if sys.stdout.isatty() or "COLUMNS" in os.environ else 120)
@@ -119,11 +119,7 @@ class Output:
     def verdict(self, verdict: Verdict) -> None:
         """A grade and its reasons."""
         self._verdict = verdict
-        self._print(
-            str(verdict),
-            style={"good": "green", "usable": "yellow", "bad": "red"}[verdict.mark],
-            wrong=verdict.mark == "bad",
-        )
+        self._print(str(verdict), style=STYLES[verdict.mark], wrong=verdict.mark == "bad")
 
     @contextmanager
     def stages(self) -> Iterator[StageClock]:

@@ -3,9 +3,6 @@ batch or by `watch`, not by hand."""
 
 import sys
 
-if sys.argv[1] == "--resident":
-    from bodyscan.jobs.resident_worker import main
-else:
-    from bodyscan.jobs.worker import main
+from bodyscan.jobs.worker import main, stay
 
-sys.exit(main())
+sys.exit(stay() if sys.argv[1] == "--resident" else main())

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import os
-import time
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
+from itertools import chain
 from pathlib import Path
 
 from bodyscan.errors import BadInput, BodyscanError, FailedWork
 from bodyscan.files.atomic import lock_file, restrict_to_owner
-from bodyscan.jobs.job import BATCH_LOCK, STAGE, Job, write_job
+from bodyscan.jobs.job import BATCH_LOCK, Job, write_job
 from bodyscan.jobs.supervision import (
     COMMAND,
     JobProcess,
@@ -38,50 +38,43 @@ def run_batch(
     A job that fails is set aside with its reason, and the others go on. Raises BadInput if another
     batch is working in `out`, or `out` is not writable.
     """
+    with hold_output(out):
+        listen({"event": "batch", "jobs": [job.name for job in jobs]})
+        refused = {job.name: refusal for job in jobs if (refusal := write_or_refuse(job))}
+        outcomes: dict[str, JobResult] = {}
+        for outcome in chain(
+            refused.values(), run([job for job in jobs if job.name not in refused])
+        ):
+            outcomes[outcome.job] = outcome
+            listen({"event": "job", **asdict(outcome)})
+            listen({"event": "progress", "ended": len(outcomes), "jobs": len(jobs)})
+    return [outcomes[job.name] for job in jobs]
+
+
+@contextmanager
+def hold_output(out: Path) -> Iterator[None]:
+    """Make an output folder and lock it; what a killed batch was writing there is removed.
+
+    Raises BadInput if another batch is working in it, or it is not writable.
+    """
     with restrict_to_owner():
         try:
             out.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise BadInput(f"cannot be written: {error.strerror}", where=str(out)) from error
         with lock_file(out / BATCH_LOCK, wait=False):
-            sweep(out)
-            listen({"event": "batch", "jobs": [job.name for job in jobs]})
-            outcomes: dict[str, JobResult] = {}
-            ready = []
-            for job in jobs:
-                try:
-                    write_job(job)
-                    ready.append(job)
-                except (BodyscanError, OSError) as error:
-                    outcomes[job.name] = JobResult(job.name, "set aside", reason=str(error))
-            for outcome in outcomes.values():
-                listen({"event": "job", **asdict(outcome)})
-            since = time.monotonic()
-            waiting = {job.name for job in ready if not (job.folder / job.until / STAGE).exists()}
-            for outcome in run(ready):
-                outcomes[outcome.job] = outcome
-                waiting.discard(outcome.job)
-                listen({"event": "job", **asdict(outcome)})
-                left = seconds_left(list(outcomes.values()), waiting, time.monotonic() - since)
-                ended = {"ended": len(outcomes), "jobs": len(jobs), "seconds_left": left}
-                listen({"event": "progress", **ended})
-    return [outcomes[job.name] for job in jobs]
+            for path in (*out.glob(".summary.*.tmp.csv"), *out.glob(".manifest.*.tmp.json")):
+                path.unlink(missing_ok=True)
+            yield
 
 
-def seconds_left(
-    ended: Sequence[JobResult], waiting: Collection[str], spent_s: float
-) -> float | None:
-    """Estimated time to the end of a batch, from the durations of jobs that had something to do.
-
-    waiting: jobs without a result; those up to date take no time.
-
-    None if no job has shown yet how long one takes.
-    """
-    took = [outcome.seconds for outcome in ended if outcome.state == "done" and outcome.stages]
-    if not waiting or not took:
-        return None if waiting else 0.0
-    at_once = max(1.0, sum(outcome.seconds for outcome in ended) / max(spent_s, 1e-3))
-    return round(len(waiting) * sum(took) / len(took) / at_once, 1)
+def write_or_refuse(job: Job) -> JobResult | None:
+    """Write job.json; if that fails, the result of a job that is set aside for it."""
+    try:
+        write_job(job)
+    except (BodyscanError, OSError) as error:
+        return JobResult(job.name, "set aside", reason=str(error))
+    return None
 
 
 def run_locally(
@@ -103,12 +96,6 @@ def run_locally(
             pool.shutdown(wait=False, cancel_futures=True)
 
     return run
-
-
-def sweep(out: Path) -> None:
-    """Remove files that a batch was writing when it was killed."""
-    for path in (*out.glob(".summary.*.tmp.csv"), *out.glob(".manifest.*.tmp.json")):
-        path.unlink(missing_ok=True)
 
 
 def finish(jobs: Sequence[Job], outcomes: Sequence[JobResult], out: Path) -> dict[str, object]:

@@ -11,11 +11,18 @@ from contextlib import contextmanager, suppress
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeRemainingColumn,
+)
 from rich.text import Text
 
 from bodyscan.jobs.supervision import Listen
-from bodyscan.verdict import LEFT_OUT, MARKS
+from bodyscan.verdict import LEFT_OUT, MARKS, STYLES
 
 
 @contextmanager
@@ -45,9 +52,11 @@ def screen() -> Iterator[Listen]:
         TextColumn("{task.description}", markup=False),
         BarColumn(bar_width=20),
         MofNCompleteColumn(),
+        TimeRemainingColumn(),
         TextColumn("{task.fields[more]}", markup=False),
     )
-    with Progress(*columns, console=Console(stderr=True)) as bars:
+    day_s = 24.0 * 3600.0  # jobs take minutes: the time left follows from all that ended
+    with Progress(*columns, console=Console(stderr=True), speed_estimate_period=day_s) as bars:
         yield _Screen(bars)
 
 
@@ -61,7 +70,7 @@ def lines() -> Iterator[Listen]:
         if event["event"] == "verdict":
             console.print(_verdict_text(event), soft_wrap=True)
         elif "kept" in event:
-            console.print(_kept_text(event), soft_wrap=True)
+            console.print(Text(_kept_text(event)), soft_wrap=True)
         elif event["event"] == "job" and event["state"] in ("done", "set aside"):
             style = "dim" if event["state"] == "done" else "red"
             console.print(Text(ending(event), style=style), soft_wrap=True)
@@ -82,27 +91,35 @@ class _Screen:
         with self._lock:
             getattr(self, f"_{event['event']}")(event)
 
+    def _print(self, text: str | Text, style: str = "") -> None:
+        text = text if isinstance(text, Text) else Text(text, style)
+        self._bars.console.print(text, soft_wrap=True)
+
     def _batch(self, event: dict[str, Any]) -> None:
         self._all = self._bars.add_task("all jobs", total=len(event["jobs"]), more="")
 
     def _shares(self, event: dict[str, Any]) -> None:
         jobs = "job" if event["workers"] == 1 else "jobs"
         text = f"{event['workers']} {jobs} at a time, {event['threads']} threads each"
-        self._bars.console.print(Text(f"{text} ({event['why']})", style="dim"), soft_wrap=True)
+        self._print(f"{text} ({event['why']})", "dim")
 
     def _summary(self, event: dict[str, Any]) -> None:
         aside = len(event["set_aside"])
         text = f"{event['done']} of {event['jobs']} jobs done ({event['ran']} of them now)"
         text += f", {aside} set aside" if aside else ""
         text += f"\nto be scanned again: {', '.join(event['repeat'])}" if event["repeat"] else ""
-        text += _drift_text(event["drifted"])
-        text += _stature_text(event["odd_stature_mm"])
-        self._bars.console.print(Text(f"{text}\ntable: {event['table']}"), soft_wrap=True)
+        text += _drift_text(event["drifted"]) if event["drifted"] else ""
+        if event["odd_stature_mm"] is not None:
+            text += (
+                f"\nthe median stature of these scans is {event['odd_stature_mm']:.0f} mm, which no "
+                "nation's adults have. Possible causes: they are children; square_mm is wrong in the "
+                "rig file; the floor is not at z = 0"
+            )
+        self._print(f"{text}\ntable: {event['table']}")
 
     def _progress(self, event: dict[str, Any]) -> None:
         if self._all is not None:
-            more = f"about {_duration(event['seconds_left'])} left" if event["seconds_left"] else ""
-            self._bars.update(self._all, completed=event["ended"], more=more)
+            self._bars.update(self._all, completed=event["ended"])
 
     def _job(self, event: dict[str, Any]) -> None:
         job, state = event["job"], event["state"]
@@ -114,18 +131,16 @@ class _Screen:
             return
         if job in self._running:
             self._bars.remove_task(self._running.pop(job))
-        style = "" if state == "done" else "red"
-        self._bars.console.print(Text(ending(event), style=style), soft_wrap=True)
+        self._print(ending(event), "" if state == "done" else "red")
 
     def _verdict(self, event: dict[str, Any]) -> None:
         if event["final"]:
-            self._bars.console.print(_verdict_text(event), soft_wrap=True)
+            self._print(_verdict_text(event))
 
     def _stage(self, event: dict[str, Any]) -> None:
         if "kept" in event:
-            self._bars.console.print(_kept_text(event), soft_wrap=True)
-            return
-        if event["job"] in self._running:
+            self._print(_kept_text(event))
+        elif event["job"] in self._running:
             self._bars.update(
                 self._running[event["job"]],
                 description=f"{event['job']}: {event.get('part', event['stage'])}",
@@ -141,16 +156,11 @@ def _verdict_text(event: dict[str, Any]) -> Text:
     others = [reason for reason in event["reasons"][1:] if reason.startswith(LEFT_OUT)]
     lost = ", ".join(reason.removeprefix(LEFT_OUT).partition(": ")[0] for reason in others)
     text += f"\n  also left out: {lost}" if lost else ""
-    return Text(
-        text,
-        style={"good": "green", "usable": "yellow"}.get(MARKS.get(event["grade"], "bad"), "red"),
-    )
+    return Text(text, STYLES[MARKS.get(event["grade"], "bad")])
 
 
-def _kept_text(event: dict[str, Any]) -> Text:
-    return Text(
-        f"{event['job']}: files that were added to {event['stage']} are now in {event['kept']}"
-    )
+def _kept_text(event: dict[str, Any]) -> str:
+    return f"{event['job']}: files that were added to {event['stage']} are now in {event['kept']}"
 
 
 def ending(event: dict[str, Any]) -> str:
@@ -169,20 +179,8 @@ def _duration(seconds: float) -> str:
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
-def _stature_text(median_mm: float | None) -> str:
-    if median_mm is None:
-        return ""
-    return (
-        f"\nthe median stature of these scans is {median_mm:.0f} mm, which no nation's adults have. "
-        "Possible causes: they are children; square_mm is wrong in the rig file; the floor is not at "
-        "z = 0"
-    )
-
-
 def _drift_text(drifted: dict[str, float]) -> str:
-    """A warning of drift; drifted: mm, by pair."""
-    if not drifted:
-        return ""
+    """A warning of drift; drifted: mm, by pair, the largest first."""
     name, mm = next(iter(drifted.items()))
     more = f", and {len(drifted) - 1} more" if len(drifted) > 1 else ""
     return (

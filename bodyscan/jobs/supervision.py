@@ -5,15 +5,15 @@ from __future__ import annotations
 import json
 import os
 import signal
-import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from subprocess import PIPE, Popen
+from typing import Any, Protocol
 
 from bodyscan.files.atomic import write_json
 from bodyscan.jobs.job import LOG, STATE, Job, printable
@@ -36,9 +36,39 @@ class JobResult:
     reason: str = ""
 
 
+class Process(Protocol):
+    """Where jobs run: a process for each attempt, or one that stays (see watching)."""
+
+    def attempt(self, job: Job, listen: Listen) -> tuple[str, tuple[str, ...]]:
+        """Why the job failed, "" if it did not; and the stages that ran."""
+
+
+def ignore_events(event: dict[str, Any]) -> None:
+    """Ignore events, for callers that do not need them."""
+
+
+def supervise_job(job: Job, process: Process, listen: Listen = ignore_events) -> JobResult:
+    """Attempt a job in its folder, twice if necessary; return failures, never raise them."""
+    path, since = job.folder, time.monotonic()
+    stages: tuple[str, ...] = ()
+    reason = ""
+    for attempt in range(1, ATTEMPTS + 1):
+        listen({"event": "job", "job": path.name, "state": "running", "attempt": attempt})
+        _note_state(path, {"state": "running", "attempts": attempt, "reason": reason})
+        reason, ran = process.attempt(job, listen)
+        stages += ran
+        if not reason:
+            break
+    state, seconds = "set aside" if reason else "done", round(time.monotonic() - since, 1)
+    ran = tuple(dict.fromkeys(stages))
+    outcome = JobResult(path.name, state, attempt, ran, seconds, reason)
+    _note_state(path, asdict(outcome))
+    return outcome
+
+
 @dataclass(frozen=True)
 class JobProcess:
-    """How a job's process is run.
+    """A new process for each attempt.
 
     threads: of the libraries in it.
     command: arguments to this Python.
@@ -47,98 +77,83 @@ class JobProcess:
     threads: int
     command: tuple[str, ...] = COMMAND
 
-
-def ignore_events(event: dict[str, Any]) -> None:
-    """Ignore events, for callers that do not need them."""
-
-
-def supervise_job(job: Job, process: JobProcess, listen: Listen = ignore_events) -> JobResult:
-    """Run a job's process in its folder, twice if necessary; return failures, never raise them."""
-    path, since = job.folder, time.monotonic()
-    stages: tuple[str, ...] = ()
-    reason = ""
-    for attempt in range(1, ATTEMPTS + 1):
-        listen({"event": "job", "job": path.name, "state": "running", "attempt": attempt})
-        note_state(path, {"state": "running", "attempts": attempt, "reason": reason})
-        reason, ran = _attempt(job, process, listen)
-        stages += ran
-        if not reason:
-            break
-    outcome = JobResult(
-        path.name,
-        "set aside" if reason else "done",
-        attempt,
-        tuple(dict.fromkeys(stages)),
-        round(time.monotonic() - since, 1),
-        reason,
-    )
-    note_state(path, asdict(outcome))
-    return outcome
-
-
-def _attempt(job: Job, how: JobProcess, listen: Listen) -> tuple[str, tuple[str, ...]]:
-    """Why it failed, "" if it did not; and the stages that ran."""
-    folder, minutes = job.folder, job.pipeline.resources.limit_minutes
-    try:
-        log = open_log(folder / LOG)
-    except OSError as error:
-        return f"its log cannot be written: {error.strerror}", ()
-    with log:
+    def attempt(self, job: Job, listen: Listen) -> tuple[str, tuple[str, ...]]:
+        """Why the job failed, "" if it did not; and the stages that ran."""
+        folder = job.folder
         try:
-            process = subprocess.Popen(
-                [sys.executable, *how.command, str(folder)],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=log,
-                env=environment(how.threads),
-                start_new_session=True,
-            )
+            log = open_log(folder / LOG)
         except OSError as error:
-            return f"its process cannot be started: {error.strerror}", ()
-        stuck = threading.Timer(60.0 * minutes, process.kill)
-        stuck.start()
-        try:
-            reason, ran = _listen_to(process, folder.name, listen)
-            status = process.wait()
-        finally:
-            in_time = stuck.is_alive()
-            stuck.cancel()
-            if process.stdin:
-                process.stdin.close()
-    if status == 0:
-        return "", ran
-    if reason:
-        return reason, ran
-    if not in_time:
-        return f"was stopped: it took longer than {minutes:g} minutes", ran
-    return describe_death(status, folder / LOG), ran
-
-
-def _listen_to(
-    process: subprocess.Popen[bytes], job: str, listen: Listen
-) -> tuple[str, tuple[str, ...]]:
-    """Pass on the process's messages; returns its reason for failing, if it gives one, and the
-    stages that it ran."""
-    reason, ran = "", []
-    assert process.stdout is not None
-    with process.stdout as stream:
-        for line in stream:
+            return f"its log cannot be written: {error.strerror}", ()
+        with log:
             try:
-                message = json.loads(line)
-            except ValueError:
-                continue
-            if "failed" in message:
-                reason = printable(message["failed"])
+                process = start_process((*self.command, str(folder)), self.threads, log)
+            except OSError as error:
+                return f"its process cannot be started: {error.strerror}", ()
+            try:
+                return listen_to(process, job, listen)
+            finally:
+                process.communicate()
+
+
+def start_process(arguments: Sequence[str], threads: int, log: Any = None) -> Popen[str]:
+    """Start this Python, which must end when its standard input closes.
+
+    threads: of its libraries; BLAS gets one, since stages use the rest themselves.
+    """
+    return Popen(
+        [sys.executable, *arguments],
+        stdin=PIPE,
+        stdout=PIPE,
+        stderr=log,
+        encoding="utf-8",
+        errors="replace",
+        env=os.environ
+        | {
+            "OMP_NUM_THREADS": str(threads),
+            "OPENCV_FOR_THREADS_NUM": str(threads),
+            "OPENBLAS_NUM_THREADS": "1",
+            "MKL_NUM_THREADS": "1",
+        },
+        start_new_session=True,
+    )
+
+
+def listen_to(process: Popen[str], job: Job, listen: Listen) -> tuple[str, tuple[str, ...]]:
+    """Pass on a process's messages until the job has ended, or the process; a stuck one is killed.
+
+    Returns why the job failed, "" if it did not; and the stages that ran.
+    """
+    minutes, ran = job.pipeline.resources.limit_minutes, []
+    stuck = threading.Timer(60.0 * minutes, process.kill)
+    stuck.start()
+    try:
+        for message in read_messages(process):
             if "why" in message:
                 ran.append(message["stage"])
             if "grade" in message:
-                listen({"event": "verdict", "job": job, **message})
+                listen({"event": "verdict", "job": job.name, **message})
             if "stage" in message:
-                listen({"event": "stage", "job": job, **message})
-    return reason, tuple(ran)
+                listen({"event": "stage", "job": job.name, **message})
+            if "ended" in message:
+                return printable(message["failed"]), tuple(ran)
+        status = process.wait()
+        in_time = stuck.is_alive()
+    finally:
+        stuck.cancel()
+    if in_time:
+        return _describe_death(status, job.folder / LOG), tuple(ran)
+    return f"was stopped: it took longer than {minutes:g} minutes", tuple(ran)
 
 
-def describe_death(status: int, log: Path) -> str:
+def read_messages(process: Popen[str]) -> Iterator[dict[str, Any]]:
+    """The JSON objects that a process prints, one a line; whatever else it prints is left out."""
+    assert process.stdout is not None
+    for line in process.stdout:
+        with suppress(ValueError):
+            yield json.loads(line)
+
+
+def _describe_death(status: int, log: Path) -> str:
     """Describe how a process died without giving a reason: exit status, last line of its log."""
     how = f"its process ended with {status}"
     if status < 0:
@@ -164,17 +179,7 @@ def open_log(path: Path) -> Any:
     return stream
 
 
-def environment(threads: int) -> dict[str, str]:
-    """Set the libraries' threads; BLAS gets one, since stages use the rest themselves."""
-    return os.environ | {
-        "OMP_NUM_THREADS": str(threads),
-        "OPENCV_FOR_THREADS_NUM": str(threads),
-        "OPENBLAS_NUM_THREADS": "1",
-        "MKL_NUM_THREADS": "1",
-    }
-
-
-def note_state(folder: Path, state: dict[str, Any]) -> None:
+def _note_state(folder: Path, state: dict[str, Any]) -> None:
     """Write state.json, for people and --explain; a full disk must not end the batch here."""
     with suppress(OSError):
         write_json(folder / STATE, state | {"when": time.strftime("%Y-%m-%dT%H:%M:%S%z")})

@@ -1,4 +1,5 @@
-"""The job's own process: works through the stages, so that a crash in native code costs one job.
+"""The process of a job, or one that stays for many: works through the stages, so that a crash in
+native code costs one job.
 
 Results are made in a folder with another name, flushed to disk, and renamed: whatever has its
 proper name is complete. The process reports progress to its parent on standard output, one JSON
@@ -16,10 +17,13 @@ import shutil
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Sequence
-from contextlib import suppress
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from functools import partial
+from importlib import import_module
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any
 
 from bodyscan.errors import BodyscanError, CaptureError
@@ -31,9 +35,10 @@ from bodyscan.files.hashing import (
     list_files,
     list_relative_files,
 )
-from bodyscan.jobs.job import KEPT, LOCK, MANIFEST, STAGE, Job, read_job, results_in
+from bodyscan.jobs.job import KEPT, LOCK, LOG, MANIFEST, STAGE, Job, read_job, results_in
 from bodyscan.jobs.plan import Origin, origin_of, reason_to_run
-from bodyscan.jobs.stages import KINDS, Kinds, Stage, stages_until
+from bodyscan.jobs.stages import KINDS, Kinds, Stage, run_scan, stages_until
+from bodyscan.jobs.supervision import open_log
 from bodyscan.memory import keep_freed_memory
 from bodyscan.verdict import Verdict
 
@@ -44,12 +49,43 @@ _BEING_MADE, _TAKEN_AWAY = ".making-", ".old-"
 
 def main(kinds: Kinds = KINDS) -> int:
     """Do the job in the folder on the command line; 0: done, 2: bad input, 1: failed."""
-    emit = become_worker()
-    _end_with_parent()
-    failure = attempt(Path(sys.argv[1]), kinds, emit)
-    if failure is not None:
-        emit(failed=failure.reason)
+    emit = _become_worker()
+    _read_requests()
+    failure = _attempt(Path(sys.argv[1]), kinds, emit)
+    emit(ended=sys.argv[1], failed=failure.reason if failure else "")
     return failure.exit_code if failure else 0
+
+
+def stay() -> int:
+    """Answer requests for the calibration on the command line, until there is no one left to ask.
+
+    A request is a JSON object on a line of standard input. With `pairs` it asks to decode those of
+    a scan that is still arriving, without to do the job in `folder` as a process of its own would,
+    with the same stages, locks and manifests. Returns 2 if the calibration cannot be used.
+    """
+    from bodyscan.workflows.range_images import Preparation
+
+    emit = _become_worker()
+    requests = _read_requests()
+    try:
+        preparation = Preparation(Path(sys.argv[2]))
+    except BodyscanError as error:
+        emit(unusable=str(error))
+        return error.exit_code
+    scan, *others = KINDS["fuse"]
+    run = partial(run_scan, preparation=preparation)
+    # Now, not while someone waits for the first verdict.
+    import_module("bodyscan.workflows.scan_person")
+    emit(ready=True)
+    while True:
+        request = requests.get()
+        folder = Path(request["folder"])
+        if "pairs" in request:
+            preparation.prepare(folder, request["pairs"])
+            continue
+        with _log_of(folder):
+            failure = _attempt(folder, {"fuse": (replace(scan, run=run), *others)}, emit)
+        emit(ended=request["folder"], failed=failure.reason if failure else "")
 
 
 @dataclass(frozen=True)
@@ -60,11 +96,11 @@ class Failure:
     exit_code: int
 
 
-def attempt(folder: Path, kinds: Kinds, emit: Emit) -> Failure | None:
-    """Do `work`; None if all went well."""
+def _attempt(folder: Path, kinds: Kinds, emit: Emit) -> Failure | None:
+    """Do the job; None if all went well."""
     try:
         with restrict_to_owner():
-            work(folder, kinds, emit)
+            _work(folder, kinds, emit)
     except BodyscanError as error:
         return Failure(str(error), error.exit_code)
     except Exception as error:
@@ -76,7 +112,7 @@ def attempt(folder: Path, kinds: Kinds, emit: Emit) -> Failure | None:
     return None
 
 
-def become_worker() -> Emit:
+def _become_worker() -> Emit:
     """Set up a process of jobs; returns the function that reports to its parent."""
     keep_freed_memory()
     logging.basicConfig(format="%(message)s")  # on standard error, which is the job's log
@@ -86,7 +122,7 @@ def become_worker() -> Emit:
     return _take_over_output()
 
 
-def work(folder: Path, kinds: Kinds, emit: Emit) -> None:
+def _work(folder: Path, kinds: Kinds, emit: Emit) -> None:
     """Bring a job's results up to date, waiting for anyone else at work on it."""
     with lock_file(folder / LOCK, wait=True):
         _tidy(folder, emit)
@@ -215,12 +251,35 @@ def _take_over_output() -> Emit:
     return emit
 
 
-def _end_with_parent() -> None:
-    """Exit with the parent, which holds the other end of standard input open and sends nothing."""
+def _read_requests() -> SimpleQueue[dict[str, Any]]:
+    """Requests, read by a thread; it ends this process with its parent, which holds the other end
+    of standard input."""
+    requests: SimpleQueue[dict[str, Any]] = SimpleQueue()
 
-    def watch() -> None:
-        while os.read(0, 1024):
-            pass
+    def read() -> None:
+        for line in sys.stdin:
+            requests.put(json.loads(line))
         os._exit(1)
 
-    threading.Thread(target=watch, daemon=True).start()
+    threading.Thread(target=read, daemon=True).start()
+    return requests
+
+
+@contextmanager
+def _log_of(folder: Path) -> Iterator[None]:
+    """Send what is printed meanwhile to the job's log."""
+    before = os.dup(2)
+    try:
+        with open_log(folder / LOG) as log:
+            _send_output_to(log.fileno())
+            yield
+    finally:
+        _send_output_to(before)
+        os.close(before)
+
+
+def _send_output_to(handle: int) -> None:
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os.dup2(handle, 1)
+    os.dup2(handle, 2)

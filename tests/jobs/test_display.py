@@ -19,7 +19,7 @@ EVENTS: list[dict[str, Any]] = [
     {"event": "job", "job": "b", "state": "sent"},
     {"event": "job", "job": "b", "state": "done", "attempts": 1, "stages": [], "seconds": 0.4,
      "reason": ""},
-    {"event": "progress", "ended": 1, "jobs": 2, "seconds_left": 4000.0},
+    {"event": "progress", "ended": 1, "jobs": 2},
     {"event": "job", "job": "[red]a", "state": "running", "attempt": 2},
     {"event": "job", "job": "[red]a", "state": "set aside", "attempts": 2, "stages": ["scan"],
      "seconds": 9.0, "reason": "[/bold] broken"},

@@ -13,7 +13,6 @@ import pytest
 from cheap_batch import jobs_of
 
 from bodyscan.arrays import Array
-from bodyscan.jobs.batch import seconds_left
 from bodyscan.jobs.job import Job
 from bodyscan.jobs.summary import find_drift, find_odd_stature, scans_to_repeat, write_summary
 from bodyscan.jobs.supervision import JobResult
@@ -125,16 +124,3 @@ def test_one_person_scanned_all_day_is_no_nation(day: tuple[list[Job], Path]) ->
         path.write_text(json.dumps(json.loads(path.read_text()) | {"stature_mm": 1400.0}))
     assert find_odd_stature(jobs) is not None
     assert find_odd_stature([replace(job, subject="anna") for job in jobs]) is None
-
-
-def test_the_time_left_counts_only_what_has_to_be_done() -> None:
-    """Two jobs of 60 s ran side by side; one was up to date, one failed at once; four wait."""
-    ended = [
-        JobResult("a", "done", 1, ("scan",), 60.0),
-        JobResult("b", "done", 1, ("scan", "export"), 60.0),
-        JobResult("c", "done", 1, (), 0.5),
-        JobResult("d", "set aside", 2, (), 1.0, "bad"),
-    ]
-    assert seconds_left(ended, {"e", "f", "g", "h"}, 60.0) == pytest.approx(120.0, rel=0.03)
-    assert seconds_left(ended[2:], {"e"}, 2.0) is None
-    assert seconds_left(ended, set(), 60.0) == 0.0
