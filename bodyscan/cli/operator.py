@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -290,7 +290,7 @@ def _run(
 ) -> None:
     """The exit code is 1 if a job was set aside, or a scan has to be repeated."""
     from bodyscan.jobs import batch as batches
-    from bodyscan.jobs import display, object_storage
+    from bodyscan.jobs import object_storage
     from bodyscan.jobs.cluster import run_on_cluster
     from bodyscan.jobs.supervision import supervise_job
 
@@ -300,7 +300,7 @@ def _run(
         resources, len(jobs), workers, batches.cores(), batches.free_memory_mb()
     )
     work = partial(object_storage.work_on_stored, store=store) if store else supervise_job
-    with _listening(output, display.screen) as listen:
+    with _listening(output) as listen:
         if cluster:
             run = run_on_cluster(cluster, resources.threads, listen=listen, work=work)
         else:
@@ -317,13 +317,13 @@ def _run(
 
 
 @contextmanager
-def _listening(
-    output: Output, default: Callable[[], AbstractContextManager[Listen]]
-) -> Iterator[Listen]:
+def _listening(output: Output) -> Iterator[Listen]:
     """Show how jobs go; the process ends at once when it is interrupted."""
     from bodyscan.jobs import display
 
-    show = display.json_lines if output.json else display.silence if output.quiet else default
+    show = (
+        display.json_lines if output.json else display.silence if output.quiet else display.screen
+    )
     try:
         with show() as listen:
             yield listen
@@ -361,7 +361,6 @@ def watch(
     You can stop it at any moment; started again, it continues. docs/inbox.md describes the protocol.
     """
     from bodyscan.files.model_file import apply_settings
-    from bodyscan.jobs import display
     from bodyscan.jobs.pipeline import Pipeline, load_pipeline
     from bodyscan.jobs.watching import Watched
     from bodyscan.jobs.watching import watch as watch_inbox
@@ -374,7 +373,7 @@ def watch(
         else apply_settings(Pipeline(name="watch", kind="fuse"), changes or (), BadInput)
     )
     watched = Watched(inbox, out, calibration, settings, quiet_s)
-    with _listening(output, display.lines) as listen:
+    with _listening(output) as listen:
         summary = watch_inbox(watched, listen, once=once)
     output.exit_code = 1 if summary["set_aside"] or summary["repeat"] else 0
 

@@ -47,7 +47,10 @@ def silence() -> Iterator[Listen]:
 
 @contextmanager
 def screen() -> Iterator[Listen]:
-    """Show one bar for all jobs with the time left, and a line for each that runs or has ended."""
+    """Show one bar for a batch with the time left, and a line for each job that runs or has ended.
+
+    A watch has no such bar; instead a line for each scan as soon as its points are judged.
+    """
     columns = (
         TextColumn("{task.description}", markup=False),
         BarColumn(bar_width=20),
@@ -58,24 +61,6 @@ def screen() -> Iterator[Listen]:
     day_s = 24.0 * 3600.0  # jobs take minutes: the time left follows from all that ended
     with Progress(*columns, console=Console(stderr=True), speed_estimate_period=day_s) as bars:
         yield _Screen(bars)
-
-
-@contextmanager
-def lines() -> Iterator[Listen]:
-    """Print a line per scan as soon as its points are judged, one for its verdict, and one
-    when its job has ended."""
-    console = Console()
-
-    def listen(event: dict[str, Any]) -> None:
-        if event["event"] == "verdict":
-            console.print(_verdict_text(event), soft_wrap=True)
-        elif "kept" in event:
-            console.print(Text(_kept_text(event)), soft_wrap=True)
-        elif event["event"] == "job" and event["state"] in ("done", "set aside"):
-            style = "dim" if event["state"] == "done" else "red"
-            console.print(Text(ending(event), style=style), soft_wrap=True)
-
-    yield listen
 
 
 class _Screen:
@@ -104,6 +89,8 @@ class _Screen:
         self._print(f"{text} ({event['why']})", "dim")
 
     def _summary(self, event: dict[str, Any]) -> None:
+        if self._all is None:
+            return
         aside = len(event["set_aside"])
         text = f"{event['done']} of {event['jobs']} jobs done ({event['ran']} of them now)"
         text += f", {aside} set aside" if aside else ""
@@ -134,12 +121,13 @@ class _Screen:
         self._print(ending(event), "" if state == "done" else "red")
 
     def _verdict(self, event: dict[str, Any]) -> None:
-        if event["final"]:
+        if event["final"] or self._all is None:
             self._print(_verdict_text(event))
 
     def _stage(self, event: dict[str, Any]) -> None:
         if "kept" in event:
-            self._print(_kept_text(event))
+            added = f"files that were added to {event['stage']} are now in {event['kept']}"
+            self._print(f"{event['job']}: {added}")
         elif event["job"] in self._running:
             self._bars.update(
                 self._running[event["job"]],
@@ -157,10 +145,6 @@ def _verdict_text(event: dict[str, Any]) -> Text:
     lost = ", ".join(reason.removeprefix(LEFT_OUT).partition(": ")[0] for reason in others)
     text += f"\n  also left out: {lost}" if lost else ""
     return Text(text, STYLES[MARKS.get(event["grade"], "bad")])
-
-
-def _kept_text(event: dict[str, Any]) -> str:
-    return f"{event['job']}: files that were added to {event['stage']} are now in {event['kept']}"
 
 
 def ending(event: dict[str, Any]) -> str:

@@ -9,7 +9,7 @@ storage has no locks: running one batch at a time is up to the user.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -45,16 +45,17 @@ def find_stored_jobs(store: Store, pipeline: Pipeline, until: str, work: Path) -
 
     Raises BadInput as `find_jobs` does, or if fsspec cannot open the store.
     """
-    files = _Files(store.scans)
-    for name in files.folders():
-        (_inside(work / "scans", name)).mkdir(parents=True)
-        for small in (CAPTURES, "rig.yaml"):
-            files.fetch_one(f"{name}/{small}", work / "scans" / name / small)
-    (work / "scans").mkdir(exist_ok=True)
+    files = _open(store.scans)
+    (work / "scans").mkdir(parents=True)
+    for entry in files.ls("", detail=True) if files.exists("") else ():
+        if entry["type"] == "directory":
+            _inside(work / "scans", entry["name"]).mkdir()
+            for small in (f"{entry['name']}/{name}" for name in (CAPTURES, "rig.yaml")):
+                _fetch_one(files, small, work / "scans" / small)
     calibration = None
     if store.calibration is not None:
         calibration = work / "calibration"
-        _Files(store.calibration).fetch(calibration)
+        _fetch(store.calibration, calibration)
     return find_jobs(pipeline, work / "scans", work / "out", calibration, until)
 
 
@@ -71,15 +72,14 @@ def work_on_stored(
                 source=work / "scans" / job.source.name,
                 calibration=work / "calibration" if store.calibration else None,
             )
-            _Files(f"{store.scans.rstrip('/')}/{job.source.name}").fetch(local.source)
+            _fetch(f"{store.scans.rstrip('/')}/{job.source.name}", local.source)
             if store.calibration:
-                _Files(store.calibration).fetch(work / "calibration")
-            there = _Files(store.job(job.name))
-            there.fetch(local.folder)
+                _fetch(store.calibration, work / "calibration")
+            _fetch(store.job(job.name), local.folder)
             was = _stages(local.folder)
             write_job(local)
             outcome = supervise_job(local, process, listen)
-            _put_back(local.folder, there, was, outcome.stages)
+            _put_back(local.folder, _open(store.job(job.name)), was, outcome.stages)
             return outcome
     except Exception as error:  # a store fails in as many ways as there are stores
         return JobResult(job.name, "set aside", reason=f"{type(error).__name__}: {error}")
@@ -88,16 +88,16 @@ def work_on_stored(
 def fetch_figures(jobs: Sequence[Job], store: Store) -> None:
     """Fetch what the summary needs of every job into the outline."""
     for job in jobs:
-        files = _Files(store.job(job.name))
+        files = _open(store.job(job.name))
         for name in ("scan/scan.json", "calibration/calibration.json", MANIFEST):
-            files.fetch_one(name, job.folder / name)
+            _fetch_one(files, name, job.folder / name)
 
 
 def put_summary(out: Path, store: Store) -> str:
     """Put back the table and the manifest over all jobs; returns the table's URL."""
-    files = _Files(store.out)
+    files = _open(store.out)
     for name in (SUMMARY, MANIFEST):
-        files.put(out / name, name)
+        _put(files, name, out / name)
     return store.job(SUMMARY)
 
 
@@ -105,78 +105,66 @@ def _stages(folder: Path) -> dict[str, bytes]:
     return {path.parent.name: path.read_bytes() for path in folder.glob(f"*/{STAGE}")}
 
 
-def _put_back(folder: Path, there: _Files, was: dict[str, bytes], ran: tuple[str, ...]) -> None:
+def _put_back(folder: Path, there: Any, was: dict[str, bytes], ran: tuple[str, ...]) -> None:
     """Put back results. was: the stages as fetched. ran: those made again, perhaps identical."""
-    for path in sorted(path for kept in folder.glob(f"{KEPT}*") for path in list_files(kept)):
-        there.put(path, path.relative_to(folder).as_posix())  # before what it is taken from goes
+
+    def put(paths: Iterable[Path], last: str) -> None:
+        for path in sorted(paths, key=lambda path: (path.name == last, path)):
+            _put(there, path.relative_to(folder).as_posix(), path)
+
+    for kept in folder.glob(f"{KEPT}*"):
+        put(list_files(kept), "")  # before what it is taken from goes
     now = _stages(folder)
-    for stage in was.keys() - now.keys():
-        there.remove(stage)
-    for stage in sorted(now):
-        if stage in ran or now[stage] != was.get(stage):
-            there.remove(stage)
-            paths = sorted(list_files(folder / stage), key=lambda path: path.name == STAGE)
-            for path in paths:
-                there.put(path, path.relative_to(folder).as_posix())
-    for path in sorted(folder.iterdir(), key=lambda path: path.name == MANIFEST):
-        if path.is_file() and path.name != LOCK:
-            there.put(path, path.name)
+    for stage in sorted(was.keys() | now.keys()):
+        if stage in ran or now.get(stage) != was.get(stage):
+            _remove(there, stage)
+            put(list_files(folder / stage), STAGE)
+    put((path for path in folder.iterdir() if path.is_file() and path.name != LOCK), MANIFEST)
 
 
-class _Files:
-    """The files below one URL."""
+def _open(url: str) -> Any:
+    """The files below a URL, as fsspec's file system with names relative to it."""
+    try:
+        import fsspec
+        from fsspec.implementations.dirfs import DirFileSystem
+    except ImportError:
+        raise BadInput(
+            "object storage needs fsspec, which is not installed",
+            where=url,
+            remedy="pip install 'bodyscan[cluster]', and what fsspec needs for this store",
+        ) from None
+    try:
+        system, root = fsspec.core.url_to_fs(url)
+    except (ImportError, ValueError) as error:
+        raise BadInput(
+            f"cannot be opened: {error}", where=url, remedy="install what fsspec asks for"
+        ) from error
+    return DirFileSystem(str(root).rstrip("/"), system)
 
-    def __init__(self, url: str) -> None:
-        try:
-            import fsspec
-        except ImportError:
-            raise BadInput(
-                "object storage needs fsspec, which is not installed",
-                where=url,
-                remedy="pip install 'bodyscan[cluster]', and what fsspec needs for this store",
-            ) from None
-        try:
-            self._system, root = fsspec.core.url_to_fs(url)
-        except (ImportError, ValueError) as error:
-            raise BadInput(
-                f"cannot be opened: {error}", where=url, remedy="install what fsspec asks for"
-            ) from error
-        self._root = str(root).rstrip("/")
 
-    def folders(self) -> list[str]:
-        """Names of the folders at the top."""
-        if not self._system.exists(self._root):
-            return []
-        listed: list[dict[str, Any]] = self._system.ls(self._root, detail=True)
-        names = [PurePosixPath(e["name"]).name for e in listed if e["type"] == "directory"]
-        return sorted(names)
+def _fetch(url: str, folder: Path) -> None:
+    """Fetch every file below a URL to its place in `folder`."""
+    files = _open(url)
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in sorted(files.find("")):
+        _fetch_one(files, name, _inside(folder, name))
 
-    def fetch(self, folder: Path) -> None:
-        """Fetch every file to its place below `folder`."""
-        folder.mkdir(parents=True, exist_ok=True)
-        for name in self._names():
-            self.fetch_one(name, _inside(folder, name))
 
-    def fetch_one(self, name: str, path: Path) -> None:
-        """Fetch one file if it exists."""
-        if self._system.isfile(f"{self._root}/{name}"):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self._system.get_file(f"{self._root}/{name}", str(path))
+def _fetch_one(files: Any, name: str, path: Path) -> None:
+    """Fetch one file if it exists."""
+    if files.isfile(name):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        files.get_file(name, str(path))
 
-    def put(self, path: Path, name: str) -> None:
-        self._system.makedirs(str(PurePosixPath(self._root, name).parent), exist_ok=True)
-        self._system.put_file(str(path), f"{self._root}/{name}")
 
-    def remove(self, name: str) -> None:
-        if self._system.exists(f"{self._root}/{name}"):
-            self._system.rm(f"{self._root}/{name}", recursive=True)
+def _put(files: Any, name: str, path: Path) -> None:
+    files.makedirs(str(PurePosixPath(name).parent), exist_ok=True)
+    files.put_file(str(path), name)
 
-    def _names(self) -> list[str]:
-        if not self._system.exists(self._root):
-            return []
-        root = self._root.lstrip("/") + "/"
-        found = (str(path).lstrip("/") for path in self._system.find(self._root))
-        return sorted(path.removeprefix(root) for path in found if path.startswith(root))
+
+def _remove(files: Any, name: str) -> None:
+    if files.exists(name):
+        files.rm(name, recursive=True)
 
 
 def _inside(folder: Path, name: str) -> Path:

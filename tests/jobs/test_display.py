@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from bodyscan.jobs.display import ending, json_lines, lines, screen
+from bodyscan.jobs.display import ending, json_lines, screen
 
 EVENTS: list[dict[str, Any]] = [
     {"event": "shares", "workers": 2, "threads": 1, "why": "2 cores"},
@@ -61,7 +61,6 @@ def test_a_reader_that_goes_away_stops_nothing(monkeypatch: pytest.MonkeyPatch) 
         listen(EVENTS[0])
 
 
-@pytest.mark.parametrize("show", [lines, screen])
 @pytest.mark.parametrize(
     ("reasons", "said"),
     [
@@ -77,10 +76,10 @@ def test_a_reader_that_goes_away_stops_nothing(monkeypatch: pytest.MonkeyPatch) 
     ],
 )
 def test_a_verdict_names_every_pair_that_was_lost(
-    show: Any, reasons: list[str], said: str, capsys: pytest.CaptureFixture[str]
+    reasons: list[str], said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     event = {"event": "verdict", "job": "anna", "grade": "usable", "reasons": reasons}
-    with show() as listen:
+    with screen() as listen:
         listen(event | {"final": True})
     told = capsys.readouterr()
     assert said in told.out + told.err
