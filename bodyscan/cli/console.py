@@ -200,26 +200,22 @@ class StageClock:
 
     bar: Bar
     seconds: dict[str, float] = field(default_factory=dict)
-    _running: tuple[str, float] | None = None
+    _stage: str | None = None
+    _since: float = 0.0
     _tasks: dict[str, Any] = field(default_factory=dict)
 
     def __call__(self, stage: str, done: int, total: int) -> None:
-        now = time.perf_counter()
-        if self._running is None or self._running[0] != stage:
-            self._close(now)
-            self._running = (stage, now)
+        self.finish(following=stage)
         if stage not in self._tasks:
             self._tasks[stage] = self.bar.add_task(stage, total=total)
         self.bar.update(self._tasks[stage], completed=done, total=total)
 
-    def _close(self, now: float) -> None:
-        if self._running is not None:
-            stage, since = self._running
-            self.seconds[stage] = self.seconds.get(stage, 0.0) + now - since
-        self._running = None
-
-    def finish(self) -> None:
-        self._close(time.perf_counter())
+    def finish(self, following: str | None = None) -> None:
+        """Count the time since the last report to its stage."""
+        now = time.perf_counter()
+        if self._stage is not None:
+            self.seconds[self._stage] = self.seconds.get(self._stage, 0.0) + now - self._since
+        self._stage, self._since = following, now
 
 
 def complain(text: str) -> None:

@@ -291,7 +291,6 @@ def _run(
     """The exit code is 1 if a job was set aside, or a scan has to be repeated."""
     from bodyscan.jobs import batch as batches
     from bodyscan.jobs import object_storage
-    from bodyscan.jobs.cluster import run_on_cluster
     from bodyscan.jobs.supervision import supervise_job
 
     output.stream_events()
@@ -302,7 +301,7 @@ def _run(
     work = partial(object_storage.work_on_stored, store=store) if store else supervise_job
     with _listening(output) as listen:
         if cluster:
-            run = run_on_cluster(cluster, resources.threads, listen=listen, work=work)
+            run = batches.run_on_cluster(cluster, resources.threads, listen=listen, work=work)
         else:
             listen({"event": "shares", **asdict(shares)})
             run = batches.run_locally(shares, listen=listen, work=work)

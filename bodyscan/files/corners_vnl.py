@@ -83,21 +83,18 @@ def _corner(
     words: list[str], order: list[int], where: str
 ) -> tuple[str, tuple[float, float] | None]:
     """Parse an image's name and its next corner; None for an image without a board."""
-    name, x, y, level = (words[k] if 0 <= k < len(words) else None for k in order)
-    if name is None or x is None or y is None:
-        raise CaptureError(f"has {len(words)} columns, too few", where=where, remedy=_REMEDY)
-    if "-" in (x, y):
-        return name, None
+    name, x, y, level = (words[k] if 0 <= k < len(words) else "" for k in order)
     try:
-        corner, used = (float(x), float(y)), level in (None, "-") or float(level or 0) >= 0.0
+        if not (name and x and y):
+            raise ValueError("columns are missing")
+        if "-" in (x, y):
+            return name, None
+        corner = float(x), float(y)
+        if level == "-" or float(level or 0) < 0.0:
+            return name, (math.nan, math.nan)
+        if all(map(math.isfinite, corner)):
+            return name, corner
     except ValueError:
-        raise CaptureError(
-            f"holds something that is not a number: {' '.join(words)}", where=where, remedy=_REMEDY
-        ) from None
-    if level == "-" or not used:
-        return name, (math.nan, math.nan)
-    if not all(map(math.isfinite, corner)):
-        raise CaptureError(
-            f"holds something that is not a pixel: {' '.join(words)}", where=where, remedy=_REMEDY
-        )
-    return name, corner
+        pass
+    shown = " ".join(words)[:100]
+    raise CaptureError(f"is not an image and a corner: {shown}", where=where, remedy=_REMEDY)

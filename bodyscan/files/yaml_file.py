@@ -173,49 +173,42 @@ class _Builder:
         return [self.build(item, (*where, index), depth + 1) for index, item in items]
 
     def _mapping(self, node: yaml.MappingNode, where: Where, depth: int) -> dict[str, Any]:
-        entries: dict[str, tuple[yaml.Node, yaml.Node]] = {}
-        merged: list[yaml.Node] = []
-        for key, value in node.value:
+        keys: set[str] = set()
+        for key, _ in node.value:
             place = _place(key.start_mark)
             if not isinstance(key, yaml.ScalarNode):
                 self._problem(place, where, "has a key that is not text")
-            elif key.value in entries or (key.value == "<<" and merged):
+                continue
+            if key.value in keys:
                 text = f"is given twice in the same place: one of the two '{key.value}' must go"
                 self._problem(place, (*where, key.value), text)
-            elif key.value == "<<" and not key.style:
-                merged = value.value if isinstance(value, yaml.SequenceNode) else [value]
-            else:
-                entries[key.value] = (key, value)
-        for base in merged:
-            if isinstance(base, yaml.MappingNode):
-                for name, entry in self._merge_entries(base, depth + 1).items():
-                    entries.setdefault(name, entry)
-            else:
-                self._problem(_place(base.start_mark), where, "can merge (<<) only mappings")
+            keys.add(key.value)
         result = {}
-        for name, (key, value) in entries.items():
+        for name, (key, value) in self._entries(node, where, depth).items():
             self.document.keys[*where, name] = _place(key.start_mark)
             result[name] = self.build(value, (*where, name), depth + 1)
         return result
 
-    def _merge_entries(
-        self, node: yaml.MappingNode, depth: int
+    def _entries(
+        self, node: yaml.MappingNode, where: Where, depth: int
     ) -> dict[str, tuple[yaml.Node, yaml.Node]]:
-        """Keys and values of a mapping that another one merges, including what it merges itself."""
-        self.nodes += 1 + len(node.value)
+        """Keys and values of a mapping, after those of mappings that it merges."""
         if depth > MAX_DEPTH or self.nodes > MAX_NODES:
             raise _error(_place(node.start_mark), "merges (<<) too much")
-        entries: dict[str, tuple[yaml.Node, yaml.Node]] = {
-            k.value: (k, v) for k, v in node.value if isinstance(k, yaml.ScalarNode)
-        }
-        merge = entries.pop("<<", None)
-        bases = [] if merge is None else [merge[1]]
-        if bases and isinstance(bases[0], yaml.SequenceNode):
-            bases = bases[0].value
+        own = {k.value: (k, v) for k, v in node.value if isinstance(k, yaml.ScalarNode)}
+        key, merged = own.get("<<", (None, None))
+        if key is None or key.style:
+            return own
+        del own["<<"]
+        bases = merged.value if isinstance(merged, yaml.SequenceNode) else [merged]
+        entries: dict[str, tuple[yaml.Node, yaml.Node]] = {}
         for base in bases:
             if isinstance(base, yaml.MappingNode):
-                entries = self._merge_entries(base, depth + 1) | entries
-        return entries
+                self.nodes += 1 + len(base.value)
+                entries = self._entries(base, where, depth + 1) | entries
+            else:
+                self._problem(_place(base.start_mark), where, "can merge (<<) only mappings")
+        return entries | own
 
     def _problem(self, place: Place, where: Where, text: str) -> None:
         self.document.problems.append(YamlProblem(place, dotted_path(where), text))

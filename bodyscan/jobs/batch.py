@@ -1,4 +1,5 @@
-"""Many jobs: how many at once, a lock on the output folder, events, and the final state."""
+"""Many jobs: how many at once, here or on a cluster, a lock on the output folder, events, and the
+final state."""
 
 from __future__ import annotations
 
@@ -98,18 +99,80 @@ def run_locally(
     return run
 
 
+def run_on_cluster(
+    address: str,
+    threads: int,
+    command: Sequence[str] = COMMAND,
+    listen: Listen = ignore_events,
+    work: Work = supervise_job,
+) -> Run:
+    """Run jobs on the dask cluster whose scheduler listens at `address`, such as tcp://host:8786.
+
+    Scans and output are in folders that all machines see under the same path, or in object storage.
+    dask sends a job again if its worker is lost; the lost worker's process ends by itself, its
+    unfinished results are removed, and a job that was already done is found done.
+
+    threads: per job. The cluster decides how many jobs run at once: one for each thread of each
+        worker (`dask worker --nthreads`).
+
+    Raises BadInput if dask.distributed is not installed, FailedWork if nobody answers or there is
+    no worker.
+    """
+    try:
+        from distributed import Client
+        from distributed import as_completed as as_ended
+    except ImportError:
+        raise BadInput(
+            "--cluster needs dask.distributed, which is not installed",
+            remedy="pip install 'bodyscan[cluster]' here and on every worker",
+        ) from None
+
+    def run(jobs: Sequence[Job]) -> Iterator[JobResult]:
+        try:
+            client = Client(address, timeout=20, set_as_default=False)
+            client.wait_for_workers(1, timeout=20)
+        except (OSError, ValueError) as error:
+            raise FailedWork(
+                f"no dask scheduler with a worker answers ({error})",
+                where=address,
+                remedy="start one with `dask scheduler`, and `dask worker ADDRESS` on each machine",
+            ) from error
+        process = JobProcess(threads, tuple(command))
+        with client:
+            futures = {
+                client.submit(_run_on_worker, work, job, process, pure=False): job.name
+                for job in jobs
+            }
+            for future in futures:
+                listen({"event": "job", "job": futures[future], "state": "sent"})
+            for future in as_ended(futures, loop=client.loop):
+                lost = future.exception()
+                if lost is None:
+                    yield future.result()
+                else:
+                    yield JobResult(futures[future], "set aside", reason=f"on the cluster: {lost}")
+
+    return run
+
+
+def _run_on_worker(work: Work, job: Job, process: JobProcess) -> JobResult:
+    """Do one job on a worker."""
+    os.umask(0o077)
+    if work is supervise_job and not job.folder.is_dir():
+        return JobResult(
+            job.name,
+            "set aside",
+            reason=f"{job.folder} is not there on this worker: share folders under one path",
+        )
+    return work(job, process, ignore_events)
+
+
 def finish(jobs: Sequence[Job], outcomes: Sequence[JobResult], out: Path) -> dict[str, object]:
     """Write the table and the manifest over all jobs; returns the event that ends a batch.
 
     Raises FailedWork if they cannot be written.
     """
-    from bodyscan.jobs.summary import (
-        find_drift,
-        find_odd_stature,
-        scans_to_repeat,
-        write_out_manifest,
-        write_summary,
-    )
+    from bodyscan.jobs.summary import find_drift, scans_to_repeat, write_out_manifest, write_summary
 
     try:
         with restrict_to_owner():
@@ -131,7 +194,6 @@ def finish(jobs: Sequence[Job], outcomes: Sequence[JobResult], out: Path) -> dic
         "set_aside": aside,
         "repeat": scans_to_repeat(done),
         "drifted": {one.pair: round(one.shift_mm, 2) for one in find_drift(done)},
-        "odd_stature_mm": find_odd_stature(done),
         "table": str(table),
     }
 

@@ -96,12 +96,6 @@ class _Screen:
         text += f", {aside} set aside" if aside else ""
         text += f"\nto be scanned again: {', '.join(event['repeat'])}" if event["repeat"] else ""
         text += _drift_text(event["drifted"]) if event["drifted"] else ""
-        if event["odd_stature_mm"] is not None:
-            text += (
-                f"\nthe median stature of these scans is {event['odd_stature_mm']:.0f} mm, which no "
-                "nation's adults have. Possible causes: they are children; square_mm is wrong in the "
-                "rig file; the floor is not at z = 0"
-            )
         self._print(f"{text}\ntable: {event['table']}")
 
     def _progress(self, event: dict[str, Any]) -> None:

@@ -33,8 +33,6 @@ COLUMNS = {
         "overlap_rms_after_mm",
         "sway_mm",
         "sway_pair",
-        "drift_mm",
-        "drift_pair",
     ),
     "calibrate": ("pairs", "pairs_failed", "corners_rms_px", "sheets_rms_mm"),
 }
@@ -45,8 +43,6 @@ def write_summary(jobs: Sequence[Job], outcomes: Sequence[JobResult], out: Path)
     """Write summary.csv (one row per job, columns as in docs/formats.md); returns its path."""
     kind = jobs[0].pipeline.kind
     rows = [_row(job, outcome) for job, outcome in zip(jobs, outcomes, strict=True)]
-    if kind == "fuse":
-        _add_drift(jobs, rows)
     first = ("job", "subject", "when", "state", "attempts", "seconds", "stages")
     text = io.StringIO()
     table = csv.DictWriter(text, (*first, *COLUMNS[kind], "reason"), extrasaction="ignore")
@@ -78,26 +74,6 @@ def find_drift(jobs: Sequence[Job]) -> list[PairDrift]:
             shifts.setdefault((job.calibration, pair), []).append(shift)
     found = [estimate_drift(pair, np.array(each)) for (_, pair), each in shifts.items()]
     return sorted((one for one in found if one.moved), key=lambda one: -one.shift_mm)
-
-
-def find_odd_stature(jobs: Sequence[Job]) -> float | None:
-    """Return the median stature, mm, if it is outside the range of any nation's adults: children, or a
-    wrong size. None if it is within, or for fewer than eight people, whose median is known to 31 mm.
-
-    Means for the men and women of whole nations are 1490 to 1830 (NCD-RisC, 2016), and a day's may
-    differ by 3 %. Around 1700 mm this reveals a size 15 % too small, or 11 % too large; nominal poses,
-    if the rig file has some, reveal 3 %.
-    """
-    statures: dict[str, list[float]] = {}
-    for job in jobs:
-        facts = _facts(job)
-        graded = (facts.get("verdict") or {}).get("grade")
-        if facts.get("stature_mm") and graded != "repeat":
-            statures.setdefault(job.subject or job.name, []).append(facts["stature_mm"])
-    if len(statures) < 8:
-        return None
-    median = float(np.median([np.median(each) for each in statures.values()]))
-    return None if 1450.0 <= median <= 1890.0 else median
 
 
 def _row(job: Job, outcome: JobResult) -> dict[str, Any]:
@@ -152,31 +128,6 @@ def _rig_figures(content: Mapping[str, Any]) -> dict[str, Any]:
         "corners_rms_px": _round(max(corners)) if corners else None,
         "sheets_rms_mm": _round(max(sheets)) if sheets else None,
     }
-
-
-def _add_drift(jobs: Sequence[Job], rows: Sequence[dict[str, Any]]) -> None:
-    """Fill in drift_mm and drift_pair of scans that have neighbours on the day.
-
-    A person's sway differs from scan to scan; what a pair's motion has in common over a scan and
-    two neighbours in time on either side is the rig's: the median of each coordinate, the largest
-    over the pairs.
-    """
-    measured = [
-        (str(row.get("when") or ""), number, motions)
-        for number, (job, row) in enumerate(zip(jobs, rows, strict=True))
-        if row["state"] == "done" and (motions := _motions(job))
-    ]
-    measured.sort(key=lambda one: one[:2])
-    for k, (_, number, motions) in enumerate(measured):
-        around = measured[max(0, k - 2) : k + 3]
-        if len(around) < 3:
-            continue
-        drift = {
-            pair: float(np.linalg.norm(np.median([m[pair] for *_, m in around if pair in m], 0)))
-            for pair in motions
-        }
-        pair = max(drift, key=lambda name: drift[name])
-        rows[number].update(drift_mm=_round(drift[pair]), drift_pair=pair)
 
 
 def _facts(job: Job) -> dict[str, Any]:

@@ -15,8 +15,7 @@ import pytest
 from cheap_batch import jobs_of, results, run_cheap
 
 from bodyscan.errors import BodyscanError
-from bodyscan.jobs.batch import run_batch
-from bodyscan.jobs.cluster import run_on_cluster
+from bodyscan.jobs.batch import run_batch, run_on_cluster
 
 
 def test_a_lost_worker_loses_nothing_and_nothing_is_done_twice(

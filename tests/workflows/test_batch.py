@@ -122,7 +122,6 @@ def test_the_table_has_a_row_for_every_scan(day: Path, night: tuple[Result, Resu
     assert 0.0 < float(anna["overlap_rms_after_mm"]) < 1.0
     assert 0.0 <= float(anna["sway_mm"]) < 5.0
     assert rows["hurt"]["pairs_failed"] == "p1-2 p1-3"
-    assert float(anna["drift_mm"]) < 1.0  # three scans with the calibration's own rig
     assert "symbolic link" in rows["link"]["reason"]
 
 
