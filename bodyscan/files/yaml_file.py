@@ -195,14 +195,14 @@ class _Builder:
         """Keys and values of a mapping, after those of mappings that it merges."""
         if depth > MAX_DEPTH or self.nodes > MAX_NODES:
             raise _error(_place(node.start_mark), "merges (<<) too much")
-        own = {k.value: (k, v) for k, v in node.value if isinstance(k, yaml.ScalarNode)}
-        key, merged = own.get("<<", (None, None))
-        if key is None or key.style:
+        own: dict[str, tuple[yaml.Node, yaml.Node]] = {
+            k.value: (k, v) for k, v in node.value if isinstance(k, yaml.ScalarNode)
+        }
+        if "<<" not in own or own["<<"][0].style:
             return own
-        del own["<<"]
-        bases = merged.value if isinstance(merged, yaml.SequenceNode) else [merged]
+        _, merged = own.pop("<<")
         entries: dict[str, tuple[yaml.Node, yaml.Node]] = {}
-        for base in bases:
+        for base in merged.value if isinstance(merged, yaml.SequenceNode) else [merged]:
             if isinstance(base, yaml.MappingNode):
                 self.nodes += 1 + len(base.value)
                 entries = self._entries(base, where, depth + 1) | entries

@@ -104,8 +104,8 @@ def test_a_rig_is_calibrated_without_its_images_and_again_from_what_it_wrote(
         ("a.png 1 2 0\n", ":1"),
         ("# filename x\na.png 1\n", "has the columns filename x"),
         ("# filename x y level\na.png 1\n", ":2"),
-        ("# filename x y level\na.png 1 two 0\n", "not a number: a.png 1 two 0"),
-        ("# filename x y level\na.png 1 inf 0\n", "not a pixel"),
+        ("# filename x y level\na.png 1 two 0\n", "not an image and a corner: a.png 1 two 0"),
+        ("# filename x y level\na.png 1 inf 0\n", "not an image and a corner"),
     ],
 )
 def test_a_wrong_line_is_named(tmp_path: Path, text: str, said: str) -> None:
