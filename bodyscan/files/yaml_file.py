@@ -198,7 +198,7 @@ class _Builder:
         own: dict[str, tuple[yaml.Node, yaml.Node]] = {
             k.value: (k, v) for k, v in node.value if isinstance(k, yaml.ScalarNode)
         }
-        if "<<" not in own or own["<<"][0].style:
+        if "<<" not in own or getattr(own["<<"][0], "style", None):
             return own
         _, merged = own.pop("<<")
         entries: dict[str, tuple[yaml.Node, yaml.Node]] = {}
