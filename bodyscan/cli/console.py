@@ -136,9 +136,8 @@ class Output:
                 clock.finish()
                 self._seconds |= clock.seconds
         if self.verbose:
-            from bodyscan.cli.tables import times_table
-
-            self.show(times_table(clock.seconds))
+            for stage, taken in {**clock.seconds, "all": sum(clock.seconds.values())}.items():
+                self._print(f"{taken:8.1f} s  {stage}")
 
     def as_document(self, error: BodyscanError | None = None) -> dict[str, Any]:
         """What --json prints; docs/commands.md says what each key holds."""

@@ -14,16 +14,6 @@ from bodyscan.mesh.body import compute_cover_shares
 from bodyscan.registration.rig_calibration import RigCalibration
 
 
-def times_table(seconds: dict[str, float]) -> Table:
-    """Seconds of each stage and of all."""
-    table = Table("stage", "seconds", title="time")
-    table.columns[1].justify = "right"
-    for stage, taken in seconds.items():
-        table.add_row(stage, f"{taken:.1f}")
-    table.add_row("all", f"{sum(seconds.values()):.1f}", style="bold")
-    return table
-
-
 def calibration_table(calibration: RigCalibration) -> Table:
     """One row a pair: residuals, stripes, position and its sigma in the rig frame."""
     table = Table("pair", title=f"rig {calibration.rig.name}")

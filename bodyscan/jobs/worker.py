@@ -19,7 +19,7 @@ import threading
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -51,9 +51,9 @@ def main(kinds: Kinds = KINDS) -> int:
     """Do the job in the folder on the command line; 0: done, 2: bad input, 1: failed."""
     emit = _become_worker()
     _read_requests()
-    failure = _attempt(Path(sys.argv[1]), kinds, emit)
-    emit(ended=sys.argv[1], failed=failure.reason if failure else "")
-    return failure.exit_code if failure else 0
+    reason, exit_code = _attempt(Path(sys.argv[1]), kinds, emit)
+    emit(ended=sys.argv[1], failed=reason)
+    return exit_code
 
 
 def stay() -> int:
@@ -84,42 +84,46 @@ def stay() -> int:
             preparation.prepare(folder, request["pairs"])
             continue
         with _log_of(folder):
-            failure = _attempt(folder, {"fuse": (replace(scan, run=run), *others)}, emit)
-        emit(ended=request["folder"], failed=failure.reason if failure else "")
+            reason, _ = _attempt(folder, {"fuse": (replace(scan, run=run), *others)}, emit)
+        emit(ended=request["folder"], failed=reason)
 
 
-@dataclass(frozen=True)
-class Failure:
-    """Why a job failed, and the exit code of its process."""
-
-    reason: str
-    exit_code: int
-
-
-def _attempt(folder: Path, kinds: Kinds, emit: Emit) -> Failure | None:
-    """Do the job; None if all went well."""
+def _attempt(folder: Path, kinds: Kinds, emit: Emit) -> tuple[str, int]:
+    """Do the job; return why it failed, "" if it did not, and the exit code."""
     try:
         with restrict_to_owner():
             _work(folder, kinds, emit)
     except BodyscanError as error:
-        return Failure(str(error), error.exit_code)
+        return str(error), error.exit_code
     except Exception as error:
-        full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
-        named = str(error) if isinstance(error, OSError) else f"{type(error).__name__}: {error}"
         with suppress(OSError):  # the log is on that same disk
             traceback.print_exc()
-        return Failure("the disk is full: make room, then start again" if full else named, 1)
-    return None
+        if not isinstance(error, OSError):
+            return f"{type(error).__name__}: {error}", 1
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+        return "the disk is full: make room, then start again" if full else str(error), 1
+    return "", 0
 
 
 def _become_worker() -> Emit:
-    """Set up a process of jobs; returns the function that reports to its parent."""
+    """Set up a process of jobs; returns the function that reports to its parent.
+
+    Standard output is the parent's alone; what libraries print there goes into the log.
+    """
     keep_freed_memory()
     logging.basicConfig(format="%(message)s")  # on standard error, which is the job's log
     logging.getLogger("bodyscan").setLevel(logging.DEBUG)
     with suppress(OSError):  # if memory runs out: a job is tried again, a batch is not
         Path("/proc/self/oom_score_adj").write_text("900")
-    return _take_over_output()
+    stream = os.fdopen(os.dup(1), "w", encoding="utf-8", buffering=1)
+    os.dup2(2, 1)
+    lock = threading.Lock()
+
+    def emit(**what: Any) -> None:
+        with lock:
+            stream.write(json.dumps(what) + "\n")
+
+    return emit
 
 
 def _work(folder: Path, kinds: Kinds, emit: Emit) -> None:
@@ -236,19 +240,6 @@ def _tidy(folder: Path, emit: Emit) -> None:
                 shutil.rmtree(path)
             else:
                 path.unlink(missing_ok=True)
-
-
-def _take_over_output() -> Emit:
-    """Reserve standard output for the parent; what libraries print there goes into the log."""
-    stream = os.fdopen(os.dup(1), "w", encoding="utf-8", buffering=1)
-    os.dup2(2, 1)
-    lock = threading.Lock()
-
-    def emit(**what: Any) -> None:
-        with lock:
-            stream.write(json.dumps(what) + "\n")
-
-    return emit
 
 
 def _read_requests() -> SimpleQueue[dict[str, Any]]:
