@@ -168,7 +168,7 @@ def put_image(
 
     Raises BadInput for a pair that the rig does not have.
     """
-    from bodyscan.jobs.inbox import put_image as put
+    from bodyscan.jobs.watching import put_image as put
 
     return put(Path(inbox), calibration.rig, scan, pair, frame, image, shot=shot)
 

@@ -3,6 +3,6 @@
 Read in this order: pipeline (what to do), job (one folder, and which jobs there are), stages (the
 steps), plan (what has to run again), worker (the job's process), supervision (starts it, tries
 again), batch (many jobs, on many machines), display and summary; object_storage.
-watching, with inbox: scans fused while they arrive. verification, forgetting:
-checking and removing what is kept of a day.
+watching: scans fused while they arrive. verification, forgetting: checking and removing what is
+kept of a day.
 """

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bodyscan.errors import BadInput
-from bodyscan.jobs.inbox import STABLE_S, IncomingScan, put_image
+from bodyscan.jobs.watching import STABLE_S, IncomingScan, put_image
 from bodyscan.rig.rig import Rig
 
 QUIET_S = 30.0
