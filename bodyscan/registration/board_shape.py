@@ -23,13 +23,13 @@ from bodyscan.calibration.model_selection import MIN_GAIN, ResidualPair, gain
 from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
 from bodyscan.geometry.robust import rms, rms_length
 from bodyscan.geometry.transforms import fit_rigid_transform, twist_jacobian
-from bodyscan.registration.bundle_adjustment import (
+from bodyscan.registration.joint_solve import (
     CORNERS,
+    JointSolution,
     refine_solution,
     reprojection_errors,
     view_sigmas,
 )
-from bodyscan.registration.joint_solve import JointSolution
 from bodyscan.registration.view_consistency import fit_board
 
 PRIOR = 4e-3

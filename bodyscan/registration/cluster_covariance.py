@@ -21,7 +21,7 @@ from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.registration.board_shape import BoardShape
-from bodyscan.registration.bundle_adjustment import CORNERS, reprojection_errors, view_sigmas
+from bodyscan.registration.joint_solve import CORNERS, reprojection_errors, view_sigmas
 from bodyscan.registration.view_graph import Target
 
 

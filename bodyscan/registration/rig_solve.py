@@ -1,8 +1,8 @@
 """From board views of many pairs to one solved rig: graph, joint solve, bad views out, rig frame.
 
-Two solvers follow each other. pycolmap's bundle adjustment (`joint_solve`) brings everything
-together from the graph's rough start; our own least squares (`bundle_adjustment`) finishes with every
-parameter of our cameras, and is repeated when views are dropped or boards found to be bent.
+Two solvers follow each other (`joint_solve`): pycolmap's bundle adjustment brings everything together
+from the graph's rough start; our own least squares finishes with every parameter of our cameras, and
+is repeated when views are dropped or boards found to be bent.
 """
 
 from __future__ import annotations
@@ -32,13 +32,12 @@ from bodyscan.registration.board_shape import (
     estimate_board_shapes,
     reestimate_board_shapes,
 )
-from bodyscan.registration.bundle_adjustment import CORNERS
 from bodyscan.registration.cluster_covariance import (
     cluster_board_poses,
     cluster_robust_covariance,
     normal_equations,
 )
-from bodyscan.registration.joint_solve import JointSolution, solve_jointly
+from bodyscan.registration.joint_solve import CORNERS, JointSolution, solve_jointly
 from bodyscan.registration.rig_calibration import ObservedCorners
 from bodyscan.registration.rig_frame import frame_board_turn, frame_target, rig_from_root
 from bodyscan.registration.rig_lenses import ChosenLenses, choose_lenses, lens_notes

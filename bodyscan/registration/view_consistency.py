@@ -20,8 +20,7 @@ from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.least_squares import Block, Noise, minimize
 from bodyscan.geometry.robust import rms_length
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.registration.bundle_adjustment import refine_solution, reprojection_errors
-from bodyscan.registration.joint_solve import JointSolution
+from bodyscan.registration.joint_solve import JointSolution, refine_solution, reprojection_errors
 from bodyscan.registration.view_graph import by_target
 
 MIN_ERROR_PX = 0.2

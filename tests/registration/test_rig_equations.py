@@ -14,8 +14,8 @@ from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 from bodyscan.registration.board_shape import PRIOR, BoardShape
-from bodyscan.registration.bundle_adjustment import view_sigmas
 from bodyscan.registration.cluster_covariance import NormalEquations, normal_equations
+from bodyscan.registration.joint_solve import view_sigmas
 from bodyscan.registration.view_graph import Target
 
 CAMERAS = {

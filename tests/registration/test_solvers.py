@@ -14,10 +14,10 @@ from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.lenses.opencv import Brown, Radial
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.registration.bundle_adjustment import refine_solution
 from bodyscan.registration.cluster_covariance import normal_equations
 from bodyscan.registration.joint_solve import (
     JointSolution,
+    refine_solution,
     solve_jointly,
 )
 
