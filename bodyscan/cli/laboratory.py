@@ -30,12 +30,6 @@ Look = Annotated[
     Literal["matt", "skin", "dressed"],
     typer.Option(help="Matt all over, like skin, or skin with dark hair and shorts."),
 ]
-MannequinSway = Annotated[
-    float,
-    typer.Option(
-        min=0.0, help="How far a mannequin moves, as a rigid body, between the pairs' captures."
-    ),
-]
 TruthChanges = Annotated[
     list[str] | None,
     typer.Option(
@@ -67,7 +61,6 @@ def simulate(
     ] = "workshop",
     subject_preset: SubjectPreset = "standing",
     look: Look = "matt",
-    sway_mm: MannequinSway = 0.0,
     changes: TruthChanges = None,
     board_shots: Annotated[
         int | None,
@@ -87,7 +80,7 @@ def simulate(
     from bodyscan.simulation import simulate as run
 
     settings = settings_for(
-        projector, preset=preset, subject=subject_preset, look=look, sway_mm=sway_mm,
+        projector, preset=preset, subject=subject_preset, look=look,
         changes=changes or (),
     )  # fmt: skip
     with output.stages() as progress:

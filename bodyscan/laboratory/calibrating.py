@@ -4,18 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from bodyscan.arrays import Array
-from bodyscan.boards.board_layout import corner_points
-from bodyscan.calibration.board_views import PlanarView, planar_view
+from bodyscan.calibration.board_views import planar_view
 from bodyscan.calibration.boundary_points import select, subsample
-from bodyscan.calibration.camera import CameraCalibration, calibrate_camera
+from bodyscan.calibration.camera import CameraCalibration
 from bodyscan.calibration.joint_refinement import StripedBoard, refine_jointly
 from bodyscan.calibration.light_sheets import fit_light_sheets
 from bodyscan.calibration.sheet_fit import PlaneFit, fit_light_planes
 from bodyscan.calibration.striped_view import BIN_PX
-from bodyscan.geometry.camera import camera_from_fields
 from bodyscan.geometry.light_planes import SmoothSheets
 from bodyscan.laboratory import apparatus
 from bodyscan.laboratory.approaches import (
@@ -33,7 +29,6 @@ from bodyscan.laboratory.approaches import (
     remapped_planes,
 )
 from bodyscan.laboratory.chapter_captures import ChapterCaptures
-from bodyscan.simulation.files import describe_camera
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,40 +118,3 @@ def calibrate_ours(
     refined = refine_jointly(boards.camera, reference.poses, fit.sheets, striped, flatness)
     approach = Approach("ours", refined.camera, refined.sheets)
     return approach, refined.camera_covariance, fit.model, "joint solve"
-
-
-@dataclass(frozen=True, eq=False)
-class SigmaTrial:
-    """Errors over sigmas of many calibrations from noisy corners, (seeds, P) for the
-    `parameters`."""
-
-    parameters: tuple[str, ...]
-    errors: Array
-
-    @property
-    def rms(self) -> Array:
-        """Root mean square (P,); 1 if the sigmas are right."""
-        return np.sqrt(np.mean(self.errors**2, axis=0))
-
-    @property
-    def beyond_three(self) -> int:
-        """Number of parameters, over all seeds, that were off by more than three sigmas."""
-        return int(np.count_nonzero(np.abs(self.errors) > 3.0))
-
-
-def run_sigma_trial(seeds: int, seed: int = 0) -> SigmaTrial:
-    """Calibrate Table 1's camera from three poses, `seeds` times with corner noise of 0.012 px."""
-    corners = corner_points(apparatus.BOARD)
-    poses = apparatus.board_poses()
-    images = [apparatus.CAMERA.image(pose.apply(corners)) for pose in poses]
-    true, errors = camera_from_fields(describe_camera(apparatus.CAMERA)), []
-    for number in range(seeds):
-        rng = np.random.default_rng([seed, number])
-        views = [
-            PlanarView(f"s{k}", corners, pixels + rng.normal(0.0, 0.012, pixels.shape))
-            for k, pixels in enumerate(images)
-        ]
-        found = calibrate_camera(views, apparatus.CAMERA.width, apparatus.CAMERA.height)
-        sigmas = np.sqrt(np.diag(found.covariance))
-        errors.append((found.camera.parameters - true.parameters) / sigmas)
-    return SigmaTrial(true.parameter_names, np.stack(errors))

@@ -50,13 +50,11 @@ def plate_scene() -> list[Surface]:
 
 
 def expose_scene(
-    setup: ChapterSetup, surfaces: Sequence[Surface], number: int, times: int = 1
-) -> list[tuple[Bytes, StripeMap]]:
-    """Render the sequence; return the lit image and the decoded stripes of each exposure.
+    setup: ChapterSetup, surfaces: Sequence[Surface], number: int
+) -> tuple[Bytes, StripeMap]:
+    """Render the sequence; return the lit image and the decoded stripes.
 
     number: selects the shot's noise.
-
-    times: how often the sensor's noise is drawn anew on the same light (jitter and speckle too).
     """
     rng = np.random.default_rng([setup.seed, apparatus.Stream.NOISE, number])
     settings = setup.settings
@@ -64,13 +62,7 @@ def expose_scene(
     images = render_pair(
         Scene(surfaces), setup.view, setup.projector, lamps, settings.projection, rng
     )
-    return [
-        _read({name: expose(image, settings.noise, rng) for name, image in images.items()})
-        for _ in range(times)
-    ]
-
-
-def _read(frames: dict[str, Bytes]) -> tuple[Bytes, StripeMap]:
+    frames = {name: expose(image, settings.noise, rng) for name, image in images.items()}
     code = apparatus.PROJECTOR
     coded = np.stack([frames[name] for name in FrameNames().code_names(code)])
     return frames["lit"], decode_stripes(code, frames["lit"], frames["dark"], coded)
@@ -92,10 +84,9 @@ def _wall() -> Surface:
 
 @dataclass(frozen=True, eq=False)
 class SceneCapture:
-    """One scene: its stripes, those of the same light exposed a second time, and the truth."""
+    """One scene: its stripes, and the truth."""
 
     stripes: StripeMap
-    again: StripeMap
     truth: PixelTruth
 
 
@@ -155,7 +146,7 @@ def take_captures(
 
 
 def _board_shot(setup: ChapterSetup, pose: RigidTransform, shot: str, number: int) -> StripedShot:
-    ((lit, stripes),) = expose_scene(setup, board_scene(setup, pose), number)
+    lit, stripes = expose_scene(setup, board_scene(setup, pose), number)
     views = find_boards(lit, [apparatus.BOARD], pair="chapter", shot=shot)
     if not views:
         raise BoardNotFound("the simulated board was not found", where=f"shot {shot}")
@@ -163,9 +154,9 @@ def _board_shot(setup: ChapterSetup, pose: RigidTransform, shot: str, number: in
 
 
 def _expose(setup: ChapterSetup, surfaces: Sequence[Surface], number: int) -> SceneCapture:
-    (_, first), (_, second) = expose_scene(setup, surfaces, number, times=2)
+    _, stripes = expose_scene(setup, surfaces, number)
     truth = compute_pixel_truth(Scene(surfaces), apparatus.CAMERA, setup.projector)
-    return SceneCapture(first, second, truth)
+    return SceneCapture(stripes, truth)
 
 
 def _label_spheres(setup: ChapterSetup, truth: PixelTruth) -> Indices:

@@ -146,39 +146,6 @@ def make_true_approach(setup: ChapterSetup) -> Approach:
     )
 
 
-@dataclass(frozen=True)
-class NoiseBound:
-    """Effect of the sensor's noise alone on E, mm^2, for each sphere: with the true calibration,
-    half the mean square difference of two exposures of the same light.
-
-    everything: over all measured pixels.
-    best_share: over the 90 % of the lit pixels where the decoder itself expects the least noise.
-    """
-
-    everything: tuple[float, ...]
-    best_share: tuple[float, ...]
-
-
-def estimate_noise_bound(captures: ChapterCaptures) -> NoiseBound:
-    """Estimate what sensor noise alone contributes to E, from two exposures of the same light."""
-    truth = make_true_approach(captures.setup)
-    capture = captures.spheres
-    everything, best = [], []
-    for number, centre in enumerate(apparatus.CENTRES):
-        pixels = captures.owner == number
-        both = (
-            triangulate_pixels(truth, stripes.s, pixels)
-            for stripes in (capture.stripes, capture.again)
-        )
-        distance = [np.linalg.norm(points - centre, axis=1) for points in both]
-        half = 0.5 * (distance[0] - distance[1]) ** 2
-        sigma = capture.stripes.sigma[pixels]
-        order = np.argsort(np.where(np.isfinite(half), sigma, np.inf))[: int(0.9 * pixels.sum())]
-        everything.append(float(np.nanmean(half)))
-        best.append(float(np.nanmean(half[order])))
-    return NoiseBound(tuple(everything), tuple(best))
-
-
 def _drop_unknown(points: Array) -> Array:
     return points[np.isfinite(points[..., 2])]
 

@@ -12,12 +12,11 @@ from bodyscan.files.atomic import write_text
 from bodyscan.geometry.transforms import fit_rigid_transform
 from bodyscan.laboratory import apparatus
 from bodyscan.laboratory.approaches import Approach
-from bodyscan.laboratory.calibrating import Calibrations, calibrate_all, run_sigma_trial
+from bodyscan.laboratory.calibrating import Calibrations, calibrate_all
 from bodyscan.laboratory.chapter_captures import ChapterCaptures, take_captures
 from bodyscan.laboratory.measuring import (
     ApproachAccuracy,
     compare_point_sigmas,
-    estimate_noise_bound,
     make_true_approach,
     measure_artefacts,
     triangulate_pixels,
@@ -54,7 +53,7 @@ def reproduce(
     stops = 3 if quick else 7
     captures = take_captures(setup, boards=boards, stage_stops=stops, progress=progress)
     calibrated = calibrate_all(captures)
-    found = _measure_all(captures, calibrated, seed, quick, real_light, progress)
+    found = _measure_all(captures, calibrated, seed, real_light, progress)
     text = reproduction_text(found)
     draw(captures, calibrated, Path(out), figure_names(real_light))
     write_text(Path(out) / text_name(real_light), text)
@@ -65,7 +64,6 @@ def _measure_all(
     captures: ChapterCaptures,
     calibrated: Calibrations,
     seed: int,
-    quick: bool,
     real_light: bool,
     progress: Progress,
 ) -> Reproduction:
@@ -87,12 +85,10 @@ def _measure_all(
         real_light=real_light,
         boards=len(captures.boards),
         calibrated=calibrated,
-        trial=run_sigma_trial(5 if quick else 250, seed),
         whole=measure(compared, whole=True),
         fine=measure(compared),
         by_stage=measure(calibrated.by_stage),
         by_reference=measure(calibrated.by_reference),
-        noise=estimate_noise_bound(captures),
         # Of the approaches whose sheets know their covariance.
         sigmas=tuple(
             compare_point_sigmas(one, captures) for one in compared if one.name in ("(iii)", "ours")

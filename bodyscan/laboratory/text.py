@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodyscan.laboratory import apparatus
-from bodyscan.laboratory.calibrating import Calibrations, SigmaTrial
-from bodyscan.laboratory.measuring import ApproachAccuracy, NoiseBound, PointSigma
+from bodyscan.laboratory.calibrating import Calibrations
+from bodyscan.laboratory.measuring import ApproachAccuracy, PointSigma
 
 CHAPTER_TABLE_2 = {
     "(i)": (0.41, 0.38, 0.26, 0.26, 0.31),
@@ -32,12 +32,10 @@ class Reproduction:
     real_light: bool
     boards: int
     calibrated: Calibrations
-    trial: SigmaTrial
     whole: tuple[ApproachAccuracy, ...]
     fine: tuple[ApproachAccuracy, ...]
     by_stage: tuple[ApproachAccuracy, ...]
     by_reference: tuple[ApproachAccuracy, ...]
-    noise: NoiseBound
     sigmas: tuple[PointSigma, ...]
 
 
@@ -46,7 +44,6 @@ def reproduction_text(found: Reproduction) -> str:
     parts = [
         _heading(found),
         _table_1(found),
-        _sigma_table(found.trial),
         _table_2(found),
         _against_truth(found),
         _point_sigmas(found),
@@ -99,16 +96,6 @@ def _table_1(found: Reproduction) -> str:
     )
 
 
-def _sigma_table(trial: SigmaTrial) -> str:
-    rows = [["RMS of error / sigma", *(f"{value:.2f}" for value in trial.rms)]]
-    return (
-        f"Over {len(trial.errors)} draws of corner noise:\n\n"
-        + _table(["", *trial.parameters], rows)
-        + f"\n\n{trial.beyond_three} of {trial.errors.size} parameters were off by more than three "
-        "sigmas."
-    )
-
-
 def _table_2(found: Reproduction) -> str:
     numbers = [f"No. {number}" for number in range(1, 6)]
     points = ["Measuring points", *(f"{s.points:,}" for s in found.fine[-1].spheres)]
@@ -124,10 +111,6 @@ def _table_2(found: Reproduction) -> str:
         [m.name, *(f"{s.e_given:.5f}" for s in m.spheres), f"{_times(found.fine, m):.2f}"]
         for m in found.fine
     ]
-    noise = [
-        ["noise alone", *(f"{e:.5f}" for e in found.noise.everything), ""],
-        ["noise alone, best 90 %", *(f"{e:.5f}" for e in found.noise.best_share), ""],
-    ]
     fitted = [
         [m.name, *(f"{s.e_fitted:.5f} ({s.fitted.radius:.3f})" for s in m.spheres)]
         for m in found.fine
@@ -140,14 +123,12 @@ def _table_2(found: Reproduction) -> str:
             "level is a stripe's number):",
             _table(["", *numbers, last], [[*points, ""], [*covered, ""], *whole, *printed]),
             "Sub-pixel boundaries, radius held at 25:",
-            _table(["", *numbers, last], [*fine, *noise]),
+            _table(["", *numbers, last], fine),
             "Sub-pixel boundaries, radius fitted (the radius in brackets):",
             _table(["", *numbers], fitted),
             "Every measured pixel whose centre sees a sphere that the projector lights counts; none is "
             "left out as an outlier. `true calibration`: the simulator's own camera and sheets, "
-            "smile and all, on the decoded stripes: what nothing can better but by chance. `noise "
-            "alone`: the same light exposed twice, half the mean square of the difference; `best "
-            "90 %`: of the lit pixels, by the sigma that the decoder gave them.",
+            "smile and all, on the decoded stripes: what nothing can better but by chance.",
         ]
     )
 

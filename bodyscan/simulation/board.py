@@ -188,8 +188,6 @@ def _print_error(board: Board, making: BoardMaking, rng: np.random.Generator) ->
     shape = (2, board.rows + 1, board.columns + 1)
     if making.print_error_mm == 0:
         return np.zeros(shape)
-    if making.print_error == "corner":
-        return making.print_error_mm * rng.standard_normal(shape)
     row, column = np.indices(shape[1:]) / max(shape[1:])
     waves = np.zeros(shape)
     for _ in range(6):

@@ -1,4 +1,4 @@
-"""The subject: a mesh with skin, hair and clothes, and its sway between pairs."""
+"""The subject: a mesh with skin, hair and clothes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ import open3d as o3d
 from bodyscan.arrays import Array, Mask
 from bodyscan.errors import BadInput
 from bodyscan.files.atomic import atomic_replacement
-from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.simulation.scene import Surface
 from bodyscan.simulation.settings import Person, Skin
 
@@ -51,32 +50,6 @@ def skin(vertices: Array, person: Person, rng: np.random.Generator) -> Array:
     """Draw the albedo (N,) of vertices (N, 3): a sum of waves 60 to 400 mm long."""
     waves = sum_waves(vertices, 60.0, 400.0, rng)
     return person.skin * (1.0 + person.skin_variation * waves / 4.0)
-
-
-def draw_sways(
-    person: Person, height_mm: float, count: int, rng: np.random.Generator
-) -> list[RigidTransform]:
-    """Draw `swayed_from_still` at `count` successive moments: a smooth walk from standing still.
-
-    At each moment a lean about the feet and a shift in the same direction, together at most sway_mm
-    at the head, and a slight rotation. Seven tenths come from leaning, because a standing person
-    sways like a pole on its ankles.
-    """
-    if person.sway_mm == 0:
-        return [RigidTransform.identity()] * count
-    moment = np.linspace(0.0, 1.0, count)[:, None]
-    path = np.zeros((count, 3))  # to x, to y, turn
-    for waves in (0.5, 1.0, 1.5):
-        size, phase = rng.standard_normal(3) / waves, rng.uniform(0.0, 2.0 * np.pi, 3)
-        path += size * (np.sin(2.0 * np.pi * waves * moment + phase) - np.sin(phase))
-    at_head = np.linalg.norm(path[:, :2], axis=1).max()
-    x, y, turn = path.T * person.sway_mm / max(at_head, 1e-9)
-    angles = np.stack([-0.7 * y, 0.7 * x, 0.3 * turn], axis=1) / height_mm
-    shifts = 0.3 * np.stack([x, y, np.zeros(count)], axis=1)
-    return [
-        RigidTransform.from_rotation_vector(angle, shift)
-        for angle, shift in zip(angles, shifts, strict=True)
-    ]
 
 
 def save_truth(surface: Surface, path: Path) -> None:

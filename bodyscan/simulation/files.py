@@ -136,13 +136,11 @@ class Motion:
 
     times: by pair, then by frame, ms.
     moment_ms: the middle of all times, which the truth's surface shows.
-    stances: by pair, additional displacement of the person (`body.draw_sways`).
     """
 
     body: LivingBody
     times: Mapping[str, Mapping[str, float]]
     moment_ms: float
-    stances: Mapping[str, RigidTransform]
 
     def middle_ms(self, pair: str) -> float:
         """Compute the middle of the time in which a pair takes its frames."""
@@ -150,7 +148,7 @@ class Motion:
 
     def trunk(self, pair: str) -> RigidTransform:
         """Compute `swayed_from_still` of the trunk at the middle of a pair's frames."""
-        return self.stances[pair] @ self.body.trunk_motion(self.middle_ms(pair), self.moment_ms)
+        return self.body.trunk_motion(self.middle_ms(pair), self.moment_ms)
 
 
 @dataclass(frozen=True, eq=False)

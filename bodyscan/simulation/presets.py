@@ -107,7 +107,6 @@ def settings_for(
     preset: str = IDEAL,
     subject: str = "mannequin",
     look: str = "matt",
-    sway_mm: float = 0.0,
     changes: Iterable[str] = (),
 ) -> SimulationSettings:
     """Compose settings of a kind of projector, a preset of devices, a person, and single changes.
@@ -115,7 +114,6 @@ def settings_for(
     projector: `mirror` or `pinhole`.
     preset: `ideal` or `workshop`.
     subject, look: names in `SUBJECTS` and `LOOKS`.
-    sway_mm: of a mannequin.
     changes: such as `person.breath_mm=5`.
 
     Raises BadInput for unknown names and invalid values.
@@ -131,14 +129,9 @@ def settings_for(
                 f"there is no {what} {name!r} to simulate",
                 remedy=f"Choose {format_alternatives(known)}.",
             )
-    if sway_mm and SUBJECTS[subject]:
-        raise BadInput(
-            f"a subject that is {subject} sways by itself",
-            remedy="Leave --sway-mm out, or say --subject-preset mannequin.",
-        )
     values = asdict(SimulationSettings())
     values["projection"]["kind"] = projector
-    values["person"] |= {"sway_mm": sway_mm, **SUBJECTS[subject]}
+    values["person"] |= SUBJECTS[subject]
     values["skin"] |= LOOKS[look]
     if preset == WORKSHOP:
         for part, changed in _WORKSHOP.items():

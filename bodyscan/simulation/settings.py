@@ -146,8 +146,8 @@ class BoardMaking:
     bow_mm: how far its middle stands out towards the front.
     warp_mm: each board is also bent and twisted by between these two, from its highest to its
         lowest place.
-    print_error_mm: standard deviation, per axis, of where a corner of a square was printed.
-    print_error: `smooth` (a slow wave over the board) or `corner` (each corner independently).
+    print_error_mm: standard deviation, per axis, of where a corner of a square was printed: a slow
+        wave over the board.
     """
 
     white: float = 0.8
@@ -156,7 +156,6 @@ class BoardMaking:
     bow_mm: float = 0.0
     warp_mm: tuple[float, float] = (0.0, 0.0)
     print_error_mm: float = 0.0
-    print_error: Literal["smooth", "corner"] = "smooth"
 
 
 @dataclass(frozen=True)
@@ -165,8 +164,6 @@ class Person:
 
     skin: mean albedo.
     skin_variation: how much it varies over the body, relative.
-    sway_mm: while the pairs capture one after another, in the rig file's order, the person moves as
-        a whole, by at most this much at head height.
     subdivisions: Loop subdivisions of the subject's mesh.
     size: factor on the subject's mesh.
 
@@ -180,7 +177,6 @@ class Person:
 
     skin: float = 0.62
     skin_variation: float = 0.10
-    sway_mm: float = 0.0
     subdivisions: int = 2
     size: float = 1.0
     sway_mm_s: float = 0.0

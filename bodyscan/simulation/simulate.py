@@ -48,7 +48,6 @@ class Stream(IntEnum):
     BOARDS = 2
     PLAN = 3
     SKIN = 4
-    SWAY = 5
     RAYS = 6
     NOISE = 7
     LIFE = 8
@@ -151,19 +150,16 @@ def _decide(
     person = body.load_subject(
         subject, settings.person, random_stream(seed, Stream.SKIN), settings.skin
     )
-    height = float(person.vertices[:, 2].max())
-    sways = body.draw_sways(settings.person, height, len(pairs), random_stream(seed, Stream.SWAY))
-    by_pair = dict(zip(pairs, sways, strict=True))
-    motion = None
+    motion, sways = None, dict.fromkeys(pairs, RigidTransform.identity())
     if moves(settings.person):
         living = animate(person, settings.person, random_stream(seed, Stream.LIFE))
         times = files.compute_person_times(rig, PERSON_SHOT, settings.pace)
         every = [ms for by_frame in times.values() for ms in by_frame.values()]
-        motion = Motion(living, times, (min(every) + max(every)) / 2.0, by_pair)
+        motion = Motion(living, times, (min(every) + max(every)) / 2.0)
         person = living.surface(motion.moment_ms)
-        by_pair = {name: motion.trunk(name) for name in by_pair}
+        sways = {name: motion.trunk(name) for name in pairs}
     pseudonym = f"sim-{subject.stem.replace('_', '-')}"
-    return replace(truth, subject=pseudonym, person=person, sways=by_pair, motion=motion)
+    return replace(truth, subject=pseudonym, person=person, sways=sways, motion=motion)
 
 
 def draw_true_pairs(rig: Rig, settings: SimulationSettings, seed: int) -> dict[str, TruePair]:
@@ -183,10 +179,9 @@ def _tasks(truth: Truth, pair: str) -> list[Task]:
     if truth.person is None:
         return tasks
     surface = truth.person if motion is None else motion.body.surface(motion.middle_ms(pair))
-    pose = truth.sways[pair] if motion is None else motion.stances[pair]
     person = Task(
-        len(truth.plan), PERSON_SHOT, PERSON, (surface,), pose, light.person_grey,
-        truth.pairs[pair].has_stripes,
+        len(truth.plan), PERSON_SHOT, PERSON, (surface,), RigidTransform.identity(),
+        light.person_grey, truth.pairs[pair].has_stripes,
     )  # fmt: skip
     if motion is not None:
         person = replace(person, body=motion.body, frames_ms=motion.times[pair])

@@ -160,7 +160,7 @@ def _scan_lines(stored: StoredScan, calibration: RigCalibration, truth: Truth) -
     still_from_rig = RigidTransform.identity()
     if "motion" in truth.facts:  # fit to the body as it was then
         still_from_rig = fit_to_surface(stored.cloud.points, *surface)
-    elif truth.facts["settings"]["person"]["sway_mm"]:
+    elif truth.facts["settings"]["person"].get("sway_mm"):
         still_from_rig = rig_from_still.inverse()  # a swaying subject has no fixed pose
     in_rig, body = stored.mesh, transform_mesh(stored.mesh, still_from_rig)
     points = still_from_rig.apply(stored.cloud.points)

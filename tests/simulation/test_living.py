@@ -105,12 +105,6 @@ def test_only_a_mannequin_stands_still() -> None:
     assert still == {"mannequin": False, "standing": True, "restless": True, "child": True}
 
 
-def test_who_sways_alone_is_not_swayed_besides() -> None:
-    assert settings_for("mirror", sway_mm=5.0).person.sway_mm == 5.0
-    with pytest.raises(BadInput, match="standing sways by itself"):
-        settings_for("mirror", subject="standing", sway_mm=5.0)
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [

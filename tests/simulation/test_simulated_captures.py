@@ -17,7 +17,7 @@ from bodyscan.captures.folder import open_scan
 from bodyscan.errors import BadInput
 from bodyscan.rig.rig import load_rig
 from bodyscan.simulation import SimulationSettings, simulate
-from bodyscan.simulation.body import draw_sways, load_subject
+from bodyscan.simulation.body import load_subject
 from bodyscan.simulation.settings import Person
 
 PROJECT = Path(__file__).parents[2]
@@ -159,22 +159,6 @@ def test_names_of_frames_and_files_are_the_rig_files_own(tmp_path: Path) -> None
     names = {path.name for path in folder.iterdir()} - {"captures.yaml"}
     bits = [f"b01_{sign}{k}.png" for k in range(5) for sign in "pn"]  # 25 stripes
     assert names == {"b01_white.png", *bits}
-
-
-def test_sway_is_a_smooth_walk_bounded_at_the_head() -> None:
-    body = np.array([[0.0, 0, 0], [0, 0, 850], [0, 0, 1700.0]])
-    for seed in range(50):
-        sways = draw_sways(Person(sway_mm=8.0), 1700.0, 12, np.random.default_rng(seed))
-        places = np.array([sway.apply(body) for sway in sways])
-        moved = np.linalg.norm(places - body, axis=2)
-        assert moved[0].max() == 0  # from standing still
-        assert moved[:, 2].max() == pytest.approx(8.0, abs=0.01)
-        # Three tenths at the feet: the rest is leaning.
-        assert moved[:, 0].max() == pytest.approx(0.3 * 8.0, abs=0.01)
-        # Three waves of at most a period and a half: no step of twelve is the whole way.
-        assert np.linalg.norm(np.diff(places[:, 2], axis=0), axis=1).max() < 0.7 * 16.0
-    still = draw_sways(Person(), 1700.0, 3, np.random.default_rng(0))
-    assert all(np.array_equal(sway.matrix, np.eye(4)) for sway in still)
 
 
 def test_a_subject_that_is_no_mesh_is_refused(tmp_path: Path) -> None:
