@@ -13,11 +13,16 @@ from bodyscan.arrays import Array
 from bodyscan.boards.board_layout import corner_points
 from bodyscan.boards.view import BoardView
 from bodyscan.calibration.board_views import LocatedView, planar_view
-from bodyscan.calibration.boundary_points import BoundaryPoints, concatenate
+from bodyscan.calibration.boundary_points import (
+    BoardBoundaries,
+    BoundaryPoints,
+    StripedView,
+    concatenate,
+    on_board,
+)
 from bodyscan.calibration.camera import CameraCalibration, locate_board
-from bodyscan.calibration.light_sheets import fit_light_sheets, fit_planes
-from bodyscan.calibration.sheet_fit import fit_pinhole
-from bodyscan.calibration.striped_view import BoardBoundaries, StripedView, on_board
+from bodyscan.calibration.light_sheets import fit_light_sheets
+from bodyscan.calibration.sheet_fit import fit_light_planes, fit_pinhole
 from bodyscan.captures.folder import Captures
 from bodyscan.errors import PairFailed
 from bodyscan.geometry.light_planes import Axis, LightPlanes, LightSheets
@@ -84,7 +89,7 @@ def _models(
         pinhole,
     )
     return {
-        "free planes": fit_planes(points, stripes, direction, 0.0).planes,
+        "free planes": fit_light_planes(points, stripes, direction, min_points=2).planes,
         "chosen by held-out boards": fit_light_sheets(points, stripes, direction).sheets,
         "pinhole (2 x 4, stripes)": _planes(pinhole, stripes, direction),
         "pinhole (OpenCV, corners)": _planes(opencv, stripes, direction),

@@ -140,7 +140,7 @@ def free_pairs(boards: PoseCovariance, pairs: Collection[str]) -> PoseCovariance
 
     A pole displaced farther shares no surface with the others.
     """
-    return boards.add_common_motion(pairs, SwayPrior(30.0, 5.0, 1.0, 1.0).pair_covariance())
+    return boards.add_motions(pairs, SwayPrior(30.0, 5.0, 1.0, 1.0).pair_covariance(), common=True)
 
 
 def motions_between(

@@ -73,7 +73,7 @@ class SwayPrior:
 
     def loosen(self, boards: PoseCovariance, names: Collection[str]) -> PoseCovariance:
         """Add the usual sway to the covariance of these pairs."""
-        return boards.add_independent_motions(names, self.pair_covariance())
+        return boards.add_motions(names, self.pair_covariance(), common=False)
 
 
 def centre_shifts(motion: Array) -> Array:

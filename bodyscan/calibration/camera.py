@@ -104,9 +104,11 @@ def calibrate_camera(
     )
     focal = np.diag(matrix)[:2] if np.isfinite(matrix).all() else np.full(2, 1.2 * width)
     alpha, beta = focal.tolist()
-    start = Camera(alpha, beta, 0.0, width / 2, height / 2, type(lens)(), width, height)
+    start = Camera(alpha, beta, 0.0, width / 2, height / 2, CHAPTER_LENS, width, height)
     poses = [estimate_pose(start, view) for view in views]
-    return fit_camera(replace(start, lens=lens), poses, views)
+    # From so rough a start, a richer lens could end in a minimum of its own.
+    plain = fit_camera(start, poses, views)
+    return plain if lens == CHAPTER_LENS else _fit(type(lens), plain.camera, plain.poses, views)
 
 
 def refuse_parallel(views: Sequence[PlanarView], width: int, height: int) -> None:

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 
 from bodyscan.arrays import Indices
-from bodyscan.calibration.boundary_points import BoundaryPoints, subsample
+from bodyscan.calibration.boundary_points import FIT_BINS, BoundaryPoints, subsample
 from bodyscan.calibration.model_selection import (
     Candidate,
     HeldOutModel,
@@ -28,9 +28,6 @@ from bodyscan.errors import PairFailed
 from bodyscan.geometry.bowed_sheets import BowedSheets
 from bodyscan.geometry.lens_sheets import LensSheets
 from bodyscan.geometry.light_planes import Axis, LightPlanes, LightSheets, SmoothSheets
-
-FIT_BINS = 25000
-"""Points to which the chosen model is fitted; more do not change it by a tenth of its sigma."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,10 +78,14 @@ def fit_light_sheets(bins: BoundaryPoints, stripes: int, direction: Axis) -> She
     starts = smooth_models(few, stripes, direction)
     candidates = [Candidate(name, partial(_fit_held_out, start)) for name, start in starts]
 
-    def planes(data: BoundaryPoints) -> LightSheets:
-        return fit_planes(data, stripes, direction, 1.0).planes
+    def fit_planes(data: BoundaryPoints, board_error_mm: float = 1.0) -> PlaneFit:
+        # Boards count from two bins of a boundary.
+        return fit_light_planes(
+            data, stripes, direction, board_error_mm=board_error_mm, min_points=2
+        )
 
-    candidates.append(Candidate("free planes", planes, complete=False))
+    planes = Candidate("free planes", lambda data: fit_planes(data).planes, complete=False)
+    candidates.append(planes)
     folds = split(few)
     tried = [hold_out(candidate, few, folds) for candidate in candidates]
     chosen, figures = select_model(candidates, tried, few)
@@ -102,7 +103,7 @@ def fit_light_sheets(bins: BoundaryPoints, stripes: int, direction: Axis) -> She
                 remedy="capture the stripe sequence on the board in more poses, nearer and farther",
             )
     else:
-        fit = fit_planes(bins, stripes, direction, error)
+        fit = fit_planes(bins, error)
         sheets = fit.planes
     return SheetsFit(
         sheets, candidates[chosen].name, figures, fit.rms_mm, error, count_boards(bins, stripes)
@@ -141,13 +142,6 @@ def _lens_start(plain: LensSheets, data: BoundaryPoints) -> LensSheets:
     starts = [plain.rotate_to(float(centre)).with_lens(2) for centre in centres]
     fits = [fit_sheets(start, data, max_steps=15) for start in starts]
     return min(fits, key=lambda fit: np.nan_to_num(fit.noise, nan=np.inf)).sheets
-
-
-def fit_planes(
-    bins: BoundaryPoints, stripes: int, direction: Axis, board_error_mm: float
-) -> PlaneFit:
-    """Fit the chapter's free planes to binned points; boards count from two bins of a boundary."""
-    return fit_light_planes(bins, stripes, direction, board_error_mm=board_error_mm, min_points=2)
 
 
 def _fit_held_out(start: SmoothSheets, data: BoundaryPoints) -> LightSheets:

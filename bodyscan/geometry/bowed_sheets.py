@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -36,8 +37,7 @@ BOW_SIGMAS = (0.1, 0.03, 0.03)
 polynomial is expected to be FALL times as large as coefficient m - 1."""
 
 
-@dataclass(frozen=True, eq=False)
-class SheetsAtStripe:
+class SheetsAtStripe(NamedTuple):
     """Coefficients (..., K) at s, their derivatives by s, and the Chebyshev polynomials (...,
     M)."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,8 +20,7 @@ MATRIX_PRIOR_PX = (50.0, 50.0, 5.0, 50.0, 50.0)
 one pair leave open."""
 
 
-@dataclass(frozen=True, eq=False)
-class CameraPrior:
+class CameraPrior(NamedTuple):
     """Parameters (P,) of a camera and their standard deviations (P,), known before any board was
     seen."""
 

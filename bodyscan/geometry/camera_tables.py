@@ -65,11 +65,8 @@ def look_up(table: Table, x: float, y: float) -> tuple[float, float]:
     Without a branch: with one, Numba counts references to the arrays, which takes longer than all
     the rest.
     """
-    cells, frame = table
-    across, down = (x - frame[0]) * frame[2], (y - frame[1]) * frame[3]
-    column = min(max(int(across), 0), cells.shape[1] - 1)
-    row = min(max(int(down), 0), cells.shape[0] - 1)
-    x, y = across - column, down - row
+    cells = table[0]
+    row, column, x, y = _locate_cell(table, x, y)
     return _quadratic(cells, row, column, 0, x, y), _quadratic(cells, row, column, 1, x, y)
 
 
@@ -77,13 +74,20 @@ def look_up(table: Table, x: float, y: float) -> tuple[float, float]:
 def look_up_derivatives(table: Table, x: float, y: float) -> tuple[float, float, float, float]:
     """Derivatives of the first value by x and y, then of the second, at (x, y)."""
     cells, frame = table
-    across, down = (x - frame[0]) * frame[2], (y - frame[1]) * frame[3]
-    column = min(max(int(across), 0), cells.shape[1] - 1)
-    row = min(max(int(down), 0), cells.shape[0] - 1)
-    x, y = across - column, down - row
+    row, column, x, y = _locate_cell(table, x, y)
     a, b = _derivatives(cells, row, column, 0, x, y)
     c, d = _derivatives(cells, row, column, 1, x, y)
     return a * frame[2], b * frame[3], c * frame[2], d * frame[3]
+
+
+@compiled
+def _locate_cell(table: Table, x: float, y: float) -> tuple[int, int, float, float]:
+    """Row and column of the cell that holds (x, y), and the place in it."""
+    cells, frame = table
+    across, down = (x - frame[0]) * frame[2], (y - frame[1]) * frame[3]
+    column = min(max(int(across), 0), cells.shape[1] - 1)
+    row = min(max(int(down), 0), cells.shape[0] - 1)
+    return row, column, across - column, down - row
 
 
 @compiled

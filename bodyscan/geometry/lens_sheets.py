@@ -137,15 +137,10 @@ class LensSheets(SmoothSheets):
 
     def _measure(self, rays: Array, s: Array, found: Array) -> None:
         covariance = np.ascontiguousarray(self.covariance)
-        frame, lens = self._frame_and_lens()
-        measure_rays(frame, lens, covariance, self.distance_mm, self.stripes, rays, s, found)
-
-    def _frame_and_lens(self) -> tuple[Array, Array]:
-        """projector_from_camera (3, 4), and f, c, k1, ..., k6 (10,) with 0 for missing
-        coefficients."""
         lens = np.zeros(SCALE + len(LENS_SIGMAS))
         lens[: len(self.parameters)] = self.parameters
-        return np.ascontiguousarray(self.projector_from_camera.matrix[:3]), lens
+        frame = np.ascontiguousarray(self.projector_from_camera.matrix[:3])
+        measure_rays(frame, lens, covariance, self.distance_mm, self.stripes, rays, s, found)
 
 
 def _frame_and_scale(above: Array, below: Array, x: float) -> tuple[RigidTransform, Array]:

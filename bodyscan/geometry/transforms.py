@@ -127,6 +127,6 @@ def fit_rigid_transform(source: Array, target: Array) -> RigidTransform:
     Source: Arun, Huang, Blostein 1987, with Umeyama's correction against reflections.
     """
     source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
-    u, _, vt = np.linalg.svd((target - target_mean).T @ (source - source_mean))
-    rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    products = (target - target_mean).T @ (source - source_mean)
+    rotation = RigidTransform.from_matrix(np.pad(products, ((0, 0), (0, 1)))).rotation
     return RigidTransform(rotation, target_mean - rotation @ source_mean)

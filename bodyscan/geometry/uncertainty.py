@@ -31,24 +31,19 @@ class PoseCovariance:
         rows = self._rows(names)
         return self.matrix[np.ix_(rows, rows)]
 
-    def add_independent_motions(self, names: Collection[str], covariance: Array) -> PoseCovariance:
-        """Add an independent motion of covariance (6, 6) to each of these pairs."""
-        rows, matrix = self._rows(names), self.matrix.copy()
-        matrix[np.ix_(rows, rows)] += np.kron(np.eye(len(names)), covariance)
-        return PoseCovariance(self.names, matrix)
-
     def relative(self, a: str, b: str) -> Array:
         """Covariance (6, 6) of the motion of b relative to a."""
         difference = np.concatenate([-np.eye(6), np.eye(6)], axis=1)
         return difference @ self.select([a, b]) @ difference.T
 
-    def add_common_motion(self, names: Collection[str], covariance: Array) -> PoseCovariance:
-        """After these pairs, such as those of a pole, made one motion of covariance (6, 6).
-
-        What they know of each other stays as it was.
-        """
-        rows, matrix = self._rows(names), self.matrix.copy()
-        matrix[np.ix_(rows, rows)] += np.tile(covariance, (len(names), len(names)))
+    def add_motions(
+        self, names: Collection[str], covariance: Array, *, common: bool
+    ) -> PoseCovariance:
+        """After these pairs made motions of covariance (6, 6): each its own, or all a `common` one, as
+        those of a pole, which leaves what they know of each other as it was."""
+        rows, matrix, count = self._rows(names), self.matrix.copy(), len(names)
+        correlation = np.ones((count, count)) if common else np.eye(count)
+        matrix[np.ix_(rows, rows)] += np.kron(correlation, covariance)
         return PoseCovariance(self.names, matrix)
 
     def _rows(self, names: Collection[str]) -> Indices:

@@ -16,10 +16,16 @@ import numpy as np
 from bodyscan.arrays import Array
 from bodyscan.boards.view import BoardView
 from bodyscan.calibration.board_views import PlanarView, planar_view
-from bodyscan.calibration.boundary_points import BoundaryPoints, concatenate, subsample
+from bodyscan.calibration.boundary_points import (
+    BoundaryPoints,
+    boundaries_near,
+    box_around,
+    concatenate,
+    on_board,
+    subsample,
+)
 from bodyscan.calibration.camera import CameraCalibration, calibrate_camera, locate_board
 from bodyscan.calibration.sheet_fit import fit_light_planes, fit_pinhole
-from bodyscan.calibration.striped_view import boundaries_near, box_around, on_board
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.light_planes import Axis, LightPlanes, LightSheets
 from bodyscan.geometry.transforms import RigidTransform

@@ -6,12 +6,11 @@ from dataclasses import dataclass
 
 from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import planar_view
-from bodyscan.calibration.boundary_points import select, subsample
+from bodyscan.calibration.boundary_points import BIN_PX, select, subsample
 from bodyscan.calibration.camera import CameraCalibration
 from bodyscan.calibration.joint_refinement import StripedBoard, refine_jointly
 from bodyscan.calibration.light_sheets import fit_light_sheets
 from bodyscan.calibration.sheet_fit import PlaneFit, fit_light_planes
-from bodyscan.calibration.striped_view import BIN_PX
 from bodyscan.geometry.light_planes import SmoothSheets
 from bodyscan.laboratory import apparatus
 from bodyscan.laboratory.approaches import (

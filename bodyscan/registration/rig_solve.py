@@ -17,9 +17,9 @@ import numpy as np
 from bodyscan.arrays import Array
 from bodyscan.boards.view import ViewKey
 from bodyscan.calibration.board_views import LocatedView, PlanarView
+from bodyscan.calibration.boundary_points import BoardBoundaries, StripedView
 from bodyscan.calibration.camera import CameraCalibration, LensTrial, locate_board
 from bodyscan.calibration.pair import LocatedPair, PairCalibration
-from bodyscan.calibration.striped_view import BoardBoundaries, StripedView
 from bodyscan.errors import RigDisconnected
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform

@@ -10,9 +10,9 @@ from pathlib import Path
 
 from bodyscan.boards.view import BoardView, ViewKey
 from bodyscan.calibration.board_views import LocatedView, coverage_notes
+from bodyscan.calibration.boundary_points import BoardBoundaries
 from bodyscan.calibration.camera import CameraCalibration
 from bodyscan.calibration.pair import PairCalibration, calibrate_pair
-from bodyscan.calibration.striped_view import BoardBoundaries
 from bodyscan.captures.check import describe_unlisted_images
 from bodyscan.captures.folder import Captures, open_captures
 from bodyscan.errors import BadInput, BodyscanError, FailedWork, format_error

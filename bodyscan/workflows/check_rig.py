@@ -24,9 +24,9 @@ from bodyscan.alignment.sway_prior import BODY_CENTRE
 from bodyscan.arrays import Array
 from bodyscan.boards.view import BoardView
 from bodyscan.calibration.board_views import LocatedView
+from bodyscan.calibration.boundary_points import BoardBoundaries, StripedView, on_board
 from bodyscan.calibration.camera import CameraCalibration
 from bodyscan.calibration.pair import PairCalibration
-from bodyscan.calibration.striped_view import BoardBoundaries, StripedView, on_board
 from bodyscan.captures.folder import Captures, join_captures, open_check
 from bodyscan.errors import BadInput, BoardNotFound, FailedWork
 from bodyscan.fusion.cleaning import clean, require_subject
@@ -291,7 +291,7 @@ def apply_moves(calibration: RigCalibration, moves: Sequence[Move]) -> RigCalibr
         carried = {poles[pair] for pair in move.pairs if len(move.pairs) > 1}
         pairs = [pair for pair in poses if pair in move.pairs or poles.get(pair) in carried]
         poses |= {pair: move.motion @ poses[pair] for pair in pairs}
-        covariance = covariance.add_common_motion(pairs, move.covariance)
+        covariance = covariance.add_motions(pairs, move.covariance, common=True)
     notes = tuple(f"repaired: {move_line(move)}" for move in moves)
     notes = (*calibration.notes, *notes)
     return replace(calibration, rig_from_camera=poses, covariance=covariance, notes=notes)

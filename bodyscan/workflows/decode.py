@@ -11,8 +11,7 @@ from itertools import groupby
 from bodyscan.arrays import WHOLE, Crop
 from bodyscan.boards.view import BoardView, ViewKey
 from bodyscan.calibration.board_views import LocatedView
-from bodyscan.calibration.camera import CameraCalibration
-from bodyscan.calibration.striped_view import (
+from bodyscan.calibration.boundary_points import (
     BIN_PX,
     BoardBoundaries,
     Box,
@@ -25,6 +24,7 @@ from bodyscan.calibration.striped_view import (
     max_band_step,
     on_print,
 )
+from bodyscan.calibration.camera import CameraCalibration
 from bodyscan.captures.folder import Captures, ImageSequence
 from bodyscan.captures.images import read_sequence
 from bodyscan.errors import BodyscanError, DecodingFailed, ImageError, format_error

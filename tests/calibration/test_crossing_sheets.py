@@ -10,9 +10,9 @@ import pytest
 from bodyscan.arrays import Array
 from bodyscan.boards.board_layout import corner_points
 from bodyscan.calibration.board_views import LocatedView, PlanarView
+from bodyscan.calibration.boundary_points import BoardBoundaries, StripedView
 from bodyscan.calibration.camera import calibrate_camera
 from bodyscan.calibration.pair import LocatedPair, PairCalibration, calibrate_pair
-from bodyscan.calibration.striped_view import BoardBoundaries, StripedView
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.light_sheets import intersect_rays

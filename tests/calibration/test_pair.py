@@ -8,10 +8,9 @@ import pytest
 
 from bodyscan.calibration import pair
 from bodyscan.calibration.board_views import LocatedView
+from bodyscan.calibration.boundary_points import BoardBoundaries, StripedView
 from bodyscan.calibration.model_selection import HeldOutModel
-from bodyscan.calibration.pair import PairQuality, drop_inconsistent
-from bodyscan.calibration.stripe_agreement import ProjectorMotion
-from bodyscan.calibration.striped_view import BoardBoundaries, StripedView
+from bodyscan.calibration.pair import PairQuality, ProjectorMotion, drop_inconsistent
 from bodyscan.errors import PairFailed
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.outcome import Outcome

@@ -19,7 +19,7 @@ from lit_boards import (
 
 from bodyscan.calibration.boundary_points import BoundaryPoints, boundary_points, concatenate
 from bodyscan.calibration.light_sheets import fit_light_sheets
-from bodyscan.calibration.stripe_agreement import (
+from bodyscan.calibration.pair import (
     ProjectorMotion,
     board_offsets,
     find_projector_motion,

@@ -10,7 +10,7 @@ from lit_boards import CHAPTER_POSES, chapter_scene
 
 from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import BoardFace, LocatedView
-from bodyscan.calibration.striped_view import (
+from bodyscan.calibration.boundary_points import (
     BIN_PX,
     BoardBoundaries,
     StripedView,

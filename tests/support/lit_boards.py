@@ -13,9 +13,14 @@ from table_one import CAMERA
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.calibration.board_views import PlanarView
-from bodyscan.calibration.boundary_points import BoundaryPoints, boundary_points, concatenate
+from bodyscan.calibration.boundary_points import (
+    BoardBoundaries,
+    BoundaryPoints,
+    bin_boundaries,
+    boundary_points,
+    concatenate,
+)
 from bodyscan.calibration.camera import locate_board
-from bodyscan.calibration.striped_view import BoardBoundaries, bin_boundaries
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.light_planes import Axis

@@ -11,7 +11,7 @@ import yaml
 from typer.testing import CliRunner, Result
 
 from bodyscan.boards.view import BoardView, ViewKey
-from bodyscan.calibration.striped_view import BoardBoundaries
+from bodyscan.calibration.boundary_points import BoardBoundaries
 from bodyscan.captures.folder import Captures, open_captures
 from bodyscan.cli.main import app
 from bodyscan.rig.rig import Rig, load_rig

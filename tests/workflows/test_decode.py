@@ -12,7 +12,7 @@ from stripe_rendering import code_light, render
 
 from bodyscan.arrays import Array
 from bodyscan.boards.view import BoardView
-from bodyscan.calibration.striped_view import boundaries_near, box_around, crop_around
+from bodyscan.calibration.boundary_points import boundaries_near, box_around, crop_around
 from bodyscan.captures.folder import ImageSequence, open_scan
 from bodyscan.errors import DecodingFailed, ImageError
 from bodyscan.rig.rig import Rig, load_rig

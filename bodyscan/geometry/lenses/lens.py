@@ -21,8 +21,6 @@ NEWTON_STEPS = 20
 """Five or six reach rounding; close to where a lens folds it takes more."""
 TOLERANCE, NOT_FOUND = 1e-14, 1e-9
 """A millionth of a pixel is about 1e-9."""
-FARTHEST, DIRECTIONS = 20.0, 16
-"""A lens is examined up to 87 degrees from its axis (radius 20), in 16 directions."""
 
 
 @dataclass(frozen=True)
@@ -147,9 +145,10 @@ def _at_most(points: Array, radius: Array | float) -> Array:
 
 @lru_cache(256)
 def _fold_radius(lens: Lens) -> float:
-    turns = 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
+    # Up to 87 degrees from its axis (radius 20), in 16 directions.
+    turns = 2.0 * np.pi * np.arange(16) / 16
     around = np.stack([np.cos(turns), np.sin(turns)], axis=-1)
-    radii = np.append(0.0, np.geomspace(0.02, FARTHEST, 1000))
+    radii = np.append(0.0, np.geomspace(0.02, 20.0, 1000))
     with np.errstate(all="ignore"):
         by_point = lens.by_point(radii[:, None, None] * around)
         (a, b), (c, d) = np.moveaxis(by_point, (-2, -1), (0, 1))

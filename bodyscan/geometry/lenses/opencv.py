@@ -74,13 +74,8 @@ class OpenCVLens(Lens):
     @classmethod
     def from_opencv(cls, coefficients: Array) -> Self | None:
         count = len(cls().names)
-        return (
-            None
-            if np.any(coefficients[count:])
-            else cls().with_coefficients(
-                np.pad(coefficients[:count], (0, max(count - len(coefficients), 0)))
-            )
-        )
+        given = np.append(coefficients, np.zeros(count))
+        return None if np.any(given[count:]) else cls().with_coefficients(given[:count])
 
     @property
     def _eight(self) -> tuple[float, ...]:
