@@ -25,8 +25,9 @@ from bodyscan.calibration.model_selection import (
 from bodyscan.errors import DegeneratePoses
 from bodyscan.geometry.camera import MATRIX, Camera
 from bodyscan.geometry.least_squares import EXACT, Block, Noise, Solution, minimize
+from bodyscan.geometry.lenses.fisheye import Fisheye
 from bodyscan.geometry.lenses.lens import Lens
-from bodyscan.geometry.lenses.opencv import Radial
+from bodyscan.geometry.lenses.opencv import Radial, Rational
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 from bodyscan.geometry.uncertainty import RayUncertainty, node_pixels
 
@@ -47,6 +48,11 @@ class LensTrial:
     rms_px: float
     gain: float | None = None
     chosen: bool = False
+
+    @property
+    def is_open(self) -> bool:
+        """Whether held-out boards speak neither for this lens nor against it."""
+        return self.gain is not None and abs(self.gain) < MIN_GAIN
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,28 +287,38 @@ class ChosenLens:
 
     fit: the camera fitted with it.
     trials: how each lens did; () if there were too few clusters of poses, or one lens only.
+    tried: the fit of each trial.
     rays: how well the boards determine each pixel's ray.
-    refused: the fit with the lens tried last, if it was not taken.
     """
 
     fit: CameraCalibration
     trials: tuple[LensTrial, ...]
+    tried: tuple[CameraCalibration, ...]
     rays: RayUncertainty
-    refused: CameraCalibration | None = None
 
 
-def calibrate_with_lenses(
+def calibrate_widest(
     kinds: Sequence[type[Lens]], views: Sequence[PlanarView], width: int, height: int
 ) -> CameraCalibration:
-    """Calibrate a camera like `calibrate_camera`, with the lens that held-out boards choose.
+    """Calibrate a camera like `calibrate_camera`, with the lens that fits most of its corners: the
+    richest; of a wide one a fisheye, unless that is clearly worse.
 
-    kinds: lenses to choose from, simplest first.
+    kinds: lenses to choose from, as in `FAMILY`.
 
     Raises DegeneratePoses as `calibrate_camera` does.
     """
-    start = calibrate_camera(views, width, height, kinds[-1]())
-    chosen = choose_lens(kinds, start.camera, start.poses, views)
-    return replace(chosen.fit, lenses=chosen.trials, rays=chosen.rays)
+    ordinary = [kind for kind in kinds if kind is not Fisheye]
+    fits = [calibrate_camera(views, width, height, kind()) for kind in ordinary[-1:]]
+    if Fisheye in kinds:
+        fits.append(calibrate_camera(views, width, height, Fisheye()))
+    folds = [_folds(fit, views) for fit in fits]
+    if len(fits) == 1 or folds == [False, True]:
+        return fits[0]
+    if folds == [True, False]:
+        return fits[1]
+    needed = -MIN_GAIN if _is_wide(fits[1].camera, views) else MIN_GAIN
+    better_by = gain(_compare_fits(fits[0], fits[1], views, cluster_poses(views)))
+    return fits[1] if better_by > needed else fits[0]
 
 
 def choose_lens(
@@ -313,34 +329,46 @@ def choose_lens(
 ) -> ChosenLens:
     """Choose the simplest lens that no richer one clearly beats.
 
-    kinds: simplest first, each with all coefficients of the one before and more.
-    camera: a start, with the last kind of lens.
+    kinds: simplest first, as in `FAMILY`.
+    camera: a start, with the lens that fits most of the corners.
     poses: approximate `camera_from_board` of each view.
     """
     chosen = _fit(kinds[0], camera, poses, views)
     cluster = cluster_poses(views)
     if len(kinds) == 1 or len(set(cluster.tolist())) < MIN_CLUSTERS:
         richest = chosen if len(kinds) == 1 else _fit(kinds[1], camera, poses, views)
-        return ChosenLens(chosen, (), ray_uncertainty(chosen.camera, richest, views))
+        return ChosenLens(chosen, (), (), ray_uncertainty(chosen.camera, richest, views))
     residuals = _hold_out(chosen, views, cluster)
     trials: list[tuple[CameraCalibration, Array, float | None]] = [(chosen, residuals, None)]
-    corner_cluster = np.repeat(cluster, [len(view.points) for view in views])
+    corner_cluster = _by_corner(cluster, views)
     for kind in kinds[1:]:
+        if kind is Fisheye and not _is_wide(camera, views):
+            continue
         tried = _fit(kind, camera, poses, views)
-        richer = _hold_out(tried, views, cluster)
-        better_by = gain(ResidualPair(residuals, richer, corner_cluster))
-        trials.append((tried, richer, better_by))
-        if better_by < MIN_GAIN:
-            break  # the next has all coefficients of this one, and more
-        chosen, residuals = tried, richer
+        # A fisheye has half of a rational lens's coefficients: where it does as well, it is right.
+        simpler = kind is Fisheye and type(chosen.camera.lens) is Rational
+        if _folds(tried, views) or not (
+            simpler
+            or kind is kinds[1]
+            or gain(_compare_fits(chosen, tried, views, cluster))
+            >= MIN_GAIN  # not worth holding out
+        ):
+            continue
+        held_out = _hold_out(tried, views, cluster)
+        better_by = gain(ResidualPair(residuals, held_out, corner_cluster))
+        trials.append((tried, held_out, better_by))
+        if better_by >= (-MIN_GAIN if simpler else MIN_GAIN):
+            chosen, residuals = tried, held_out
     weights = shared_weights([one for _, one, _ in trials])
     figures = tuple(
         LensTrial(fit.camera.lens.kind, weighted_rms(one, weights), better_by, fit is chosen)
         for fit, one, better_by in trials
     )
-    last = trials[-1][0]
-    rays = ray_uncertainty(chosen.camera, last, views)
-    return ChosenLens(chosen, figures, rays, None if last is chosen else last)
+    tried_fits = tuple(fit for fit, _, _ in trials)
+    after = tried_fits.index(chosen) + 1
+    open_ = (f for f, t in zip(tried_fits[after:], figures[after:], strict=True) if t.is_open)
+    rays = ray_uncertainty(chosen.camera, next(open_, chosen), views)
+    return ChosenLens(chosen, figures, tried_fits, rays)
 
 
 def _fit(
@@ -351,6 +379,37 @@ def _fit(
     )
     lens = kind().fit_to(camera.lens, ideal[:, :2] / ideal[:, 2:])
     return fit_camera(replace(camera, lens=lens), poses, views)
+
+
+def _compare_fits(
+    first: CameraCalibration,
+    second: CameraCalibration,
+    views: Sequence[PlanarView],
+    cluster: Indices,
+) -> ResidualPair:
+    """Residuals of the same views in two fits to them."""
+    first_px, second_px = (
+        np.concatenate(locate_boards(fit.camera, views, fit.poses, tolerance=1e-2)[1])
+        for fit in (first, second)
+    )
+    return ResidualPair(first_px, second_px, _by_corner(cluster, views))
+
+
+def _folds(fit: CameraCalibration, views: Sequence[PlanarView]) -> bool:
+    """Whether a lens folds over before the outermost corner: what it does there is no camera's."""
+    return not np.isfinite(fit.camera.rays(np.concatenate([v.pixels for v in views]))).all()
+
+
+def _is_wide(camera: Camera, views: Sequence[PlanarView]) -> bool:
+    """Whether some corner is more than 60 degrees off the axis, where r^6 is 27: there lenses that go
+    by the tangent run away, and elsewhere decentring, which a fisheye lacks, must not hide."""
+    rays = camera.rays(np.concatenate([view.pixels for view in views]))
+    return bool(np.any(np.linalg.norm(rays[:, :2], axis=1) > 1.73))
+
+
+def _by_corner(number: Indices, views: Sequence[PlanarView]) -> Indices:
+    """Numbers (N,) of all corners from those (V,) of their views."""
+    return np.repeat(number, [len(view.points) for view in views])
 
 
 def cluster_poses(views: Sequence[PlanarView]) -> Indices:

@@ -14,12 +14,12 @@ import numpy as np
 
 from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import LocatedView, PlanarView
-from bodyscan.calibration.camera import CameraCalibration, ChosenLens, LensTrial, choose_lens
+from bodyscan.calibration.camera import ChosenLens, LensTrial, choose_lens
 from bodyscan.calibration.model_selection import MIN_GAIN
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lenses import family_up_to
+from bodyscan.geometry.lenses import FAMILY
 from bodyscan.geometry.lenses.lens import Lens
-from bodyscan.geometry.lenses.opencv import Brown
+from bodyscan.geometry.lenses.opencv import Brown, Radial
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import RayUncertainty
 from bodyscan.progress import map_threads
@@ -67,7 +67,7 @@ def choose_lenses(rig: Rig, views: Sequence[LocatedView], solution: JointSolutio
         and any(view.pair == name for view in views)
     }
     kinds = {
-        name: family_up_to(candidate.kind) if name in open_lens else (candidate.kind,)
+        name: FAMILY if name in open_lens and candidate.kind in FAMILY else (candidate.kind,)
         for name, candidate in candidates.items()
     }
     names = list(candidates)
@@ -134,33 +134,24 @@ def _pool_decentring(
     open_ = [
         name
         for name, lens in chosen.items()
-        if (gain := _gain(lens, Brown)) is not None and -MIN_GAIN < gain < MIN_GAIN
+        if lens.fit.camera.lens.kind == Radial.kind
+        and any(trial.kind == Brown.kind and trial.is_open for trial in lens.trials)
     ]
-    decentring = np.array([_decentring(chosen[name].refused) for name in open_]).ravel()
+    decentring = np.array([_decentring(chosen[name]) for name in open_]).ravel()
     if not open_ or np.mean(decentring**2) < 1.0 + MIN_GAIN * np.sqrt(2.0 / len(decentring)):
         return {}
     found = {}
     for name in open_:
         again = candidates[name].choose(kinds[name][kinds[name].index(Brown) :])
-        found[name] = replace(again, trials=_with_what_followed(chosen[name].trials, again))
+        simple, brown = chosen[name].trials[:2]
+        first = replace(brown, chosen=again.trials[0].chosen)
+        trials = (replace(simple, chosen=False), first, *again.trials[1:])
+        found[name] = replace(again, trials=trials)
     return found
 
 
-def _decentring(fit: CameraCalibration | None) -> Array:
-    """p1 and p2 in their sigmas, (2,), of a fit with a lens that has them."""
-    assert fit is not None
-    names = fit.camera.parameter_names
-    columns = [names.index("p1"), names.index("p2")]
+def _decentring(lens: ChosenLens) -> Array:
+    """p1 and p2 in their sigmas, (2,), of the fit with Brown's lens."""
+    fit = next(fit for fit in lens.tried if type(fit.camera.lens) is Brown)
+    columns = [fit.camera.parameter_names.index(name) for name in ("p1", "p2")]
     return np.asarray(fit.camera.parameters[columns] / np.sqrt(np.diag(fit.covariance)[columns]))
-
-
-def _gain(lens: ChosenLens, kind: type[Lens]) -> float | None:
-    """Standard errors by which this camera's own boards call for such a lens; None if not tried."""
-    return next((trial.gain for trial in lens.trials if trial.kind == kind.kind), None)
-
-
-def _with_what_followed(trials: Sequence[LensTrial], again: ChosenLens) -> tuple[LensTrial, ...]:
-    """The trials, when a lens first refused was taken after all and richer ones were tried."""
-    *before, refused = trials
-    taken = replace(refused, chosen=again.fit.camera.lens.kind == refused.kind)
-    return (*(replace(trial, chosen=False) for trial in before), taken, *again.trials[1:])

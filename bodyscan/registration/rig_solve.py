@@ -149,7 +149,7 @@ def solve_rig(
             for name, rig_from_camera in start.items()
             if name not in unsynchronised
         }
-    solution = _transfer_to_rig_frame(rig, solved, len(start) > 1)
+    solution = _transfer_to_rig_frame(rig, solved)
     notes = (*solved.judged.notes, *solved.shaped.notes, *lens_notes(solution.lenses))
     return Outcome(solution, notes, left_out)
 
@@ -175,21 +175,21 @@ def _solve(
         [view for view in resolved if view.target in inconsistent], solution, 30.0
     ).wrong
     kept = [view for view in resolved if view not in gross]
-    # A single camera was solved with its skew already, and there is nothing to join.
+    # COLMAP's lenses lack skew, and a single camera was solved with it already.
     several = len(names) > 1
     for loss_px in LOSSES_PX:
         solution = solve_jointly(kept, solution, root=root, loss_px=loss_px)
     solve = partial(
         solve_consistently,
         root=root,
-        refine_cameras=several,
+        refine_cameras=True,
         limit_px=error_limit(single_view_errors(kept, cameras)),
     )
     judged = solve(resolved, solution, wrong=[view.key for view in gross])
     shaped = ShapedSolution(judged.solution, judged.select_consistent(resolved), {}, ())
     lenses: ChosenLenses | None = None
     # If pairs are to be left out, the others are solved again anyway.
-    if several and not _find_unsynchronised(shaped.views, _select_rejected(resolved, judged)):
+    if not _find_unsynchronised(shaped.views, _select_rejected(resolved, judged)):
         shaped = estimate_board_shapes(
             shaped.views, judged.solution, root=root, refine_cameras=True
         )
@@ -219,7 +219,7 @@ def _find_unsynchronised(kept: Sequence[LocatedView], dropped: Sequence[LocatedV
     return sorted(name for name, number in shared.items() if 2 * dropped_count[name] > number)
 
 
-def _transfer_to_rig_frame(rig: Rig, solved: _Solved, refine: bool) -> RigSolution:
+def _transfer_to_rig_frame(rig: Rig, solved: _Solved) -> RigSolution:
     """The solution carried into the rig frame, with its covariance there."""
     shaped = solved.shaped
     solution, kept = _orient_frame_board(rig, shaped.solution, shaped.views)
@@ -233,7 +233,7 @@ def _transfer_to_rig_frame(rig: Rig, solved: _Solved, refine: bool) -> RigSoluti
         {target: to_rig @ t for target, t in shaped.solution.root_from_board.items()},
         fixed_pair=rig.frame_pair.name if rig.frame_pair else None,
         fixed_target=frame_target(rig),
-        cameras_free=refine,
+        cameras_free=True,
         shapes=shaped.shapes,
     )
     covariance = cluster_robust_covariance(equations, cluster_board_poses(kept, rig_from_board))

@@ -24,9 +24,8 @@ from bodyscan.calibration.board_views import (
 from bodyscan.calibration.camera import (
     MIN_POSES,
     CameraCalibration,
-    calibrate_camera,
     calibrate_known_camera,
-    calibrate_with_lenses,
+    calibrate_widest,
     estimate_pose,
     locate_boards,
 )
@@ -177,8 +176,8 @@ def calibrate_cameras(
     """Calibrate every pair's camera by itself; those that fail are in `failures`.
 
     What is `known` of a camera is read from files relative to `folder`, and held fixed or used as a
-    start. The rig file names the lenses; otherwise a pair by itself gets the one that its held-out
-    boards choose, and pairs of a rig get the richest, since the joint solve chooses later.
+    start. The lens is the one that the rig file names; otherwise the richest, since the joint solve
+    chooses.
     """
 
     def calibrate(name: str) -> CameraCalibration:
@@ -201,9 +200,7 @@ def calibrate_cameras(
         if rig.pair(name).known is not None:
             return calibrate_known_camera(planar, read_known_camera(rig.pair(name), folder))
         kinds = FAMILY if spec.lens == AUTO else (LENSES[spec.lens],)
-        if len(rig.pairs) == 1:
-            return calibrate_with_lenses(kinds, planar, spec.width, spec.height)
-        return calibrate_camera(planar, spec.width, spec.height, kinds[-1]())
+        return calibrate_widest(kinds, planar, spec.width, spec.height)
 
     names = [pair.name for pair in rig.pairs]
     cameras, errors = attempt_each(

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from bodyscan.errors import BadInput
 from bodyscan.geometry.camera import Camera, camera_from_fields, camera_to_fields
 from bodyscan.geometry.lenses import LENSES, lens_from_opencv
+from bodyscan.geometry.lenses.fisheye import Fisheye
 from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.lenses.opencv import Brown, Radial, Rational
 
@@ -93,6 +94,22 @@ def test_opencv_projects_alike(lens: Lens) -> None:
     assert np.allclose(camera.project(points), expected.reshape(-1, 2), rtol=0.0, atol=1e-9)
 
 
+def test_opencv_projects_a_fisheye_alike() -> None:
+    """Up to 80 degrees from the axis, and on it."""
+    lens = Fisheye(0.05, -0.02, 0.01, -0.003)
+    camera = Camera(400.0, 402.0, 0.0, 640.0, 480.0, lens, 1280, 960)
+    angle = np.radians(np.linspace(0.0, 80.0, 41))
+    turn = np.linspace(0.0, 40.0, 41)
+    axes = np.sin(angle) * np.array([np.cos(turn), np.sin(turn)])
+    points = np.stack([*axes, np.cos(angle)], axis=1)
+    expected, _ = cv2.fisheye.projectPoints(
+        points[:, None], np.zeros(3), np.zeros(3), camera.matrix, lens.coefficients
+    )
+    assert np.allclose(camera.project(points), expected.reshape(-1, 2), rtol=0.0, atol=1e-9)
+    back = camera.rays(camera.project(points))
+    assert np.allclose(back[:, :2], points[:, :2] / points[:, 2:], rtol=1e-9, atol=1e-9)
+
+
 @given(cameras)
 def test_jacobians_are_derivatives(camera: Camera) -> None:
     points = camera.rays(pixels_of(camera)) * 1200.0
@@ -149,7 +166,7 @@ def test_points_in_whole_numbers_are_distorted_as_others_are(lens: Lens) -> None
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"lens": "fisheye"}, "lens 'fisheye' is unknown, there are"),
+        ({"lens": "fish"}, "lens 'fish' is unknown, there are"),
         ({"p1": 0.1}, "lacks or does not have p1"),
         ({"alpha": float("nan")}, "alpha of a camera is nan, not a number"),
         ({"alpha": "600"}, "alpha of a camera is '600', not a number"),

@@ -23,6 +23,8 @@ def real_rig_file(
             known["file"] = str(captures.resolve() / name / Path(known["file"]).name)
     for entry in rig.get("calibration", ()):
         entry["folder"] = str(captures.resolve() / name)
+        if "corners" in entry:
+            entry["corners"] = str(captures.resolve() / name / Path(entry["corners"]).name)
         if shots is not None:
             entry["shots"] = list(shots)
     path = folder / f"{name}.yaml"

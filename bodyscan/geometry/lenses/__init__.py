@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 from bodyscan.arrays import Array
+from bodyscan.geometry.lenses.fisheye import Fisheye
 from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.lenses.opencv import Brown, Radial, Rational
 
-LENSES: dict[str, type[Lens]] = {lens.kind: lens for lens in (Radial, Brown, Rational)}
+FAMILY: tuple[type[Lens], ...] = (Radial, Brown, Rational, Fisheye)
+"""The models tried for a camera. Each of the first three has all coefficients of the one before and
+more; a fisheye has a picture where theirs, which go by the tangent, run out of range."""
+
+LENSES: dict[str, type[Lens]] = {lens.kind: lens for lens in FAMILY}
 """By name in files, the simplest first: the first that has all of the given OpenCV coefficients is
 chosen."""
-
-FAMILY: tuple[type[Lens], ...] = (Radial, Brown, Rational)
-"""The models tried for a camera; each has all coefficients of the one before and more."""
-
-
-def family_up_to(kind: type[Lens]) -> tuple[type[Lens], ...]:
-    """The members of the family up to a kind; that kind alone if it is not of the family."""
-    return FAMILY[: FAMILY.index(kind) + 1] if kind in FAMILY else (kind,)
 
 
 def lens_from_opencv(coefficients: Array) -> Lens:
