@@ -22,6 +22,7 @@ from bodyscan.calibration.model_selection import (
     gain,
     shared_weights,
 )
+from bodyscan.calibration.zhang import matrix_from_homographies
 from bodyscan.errors import DegeneratePoses
 from bodyscan.geometry.camera import MATRIX, Camera
 from bodyscan.geometry.least_squares import EXACT, Block, Noise, Solution, minimize
@@ -93,8 +94,8 @@ def calibrate_camera(
 ) -> CameraCalibration:
     """Calibrate a camera from planes, with skew and a lens of the kind of `lens`, the start.
 
-    Started by OpenCV with focal lengths alone (Zhang's closed form, the axis in the middle). Raises
-    DegeneratePoses for fewer than three poses, or poses that differ only by a translation.
+    Started by Zhang's closed form. Raises DegeneratePoses for fewer than three poses, or poses that
+    differ only by a translation.
     """
     if len(views) < MIN_POSES:
         raise DegeneratePoses(
@@ -102,19 +103,18 @@ def calibrate_camera(
             remedy="capture the board in more poses, tilted differently, well inside the image",
         )
     refuse_parallel(views, width, height)
-    matrix = cv2.initCameraMatrix2D(
-        [(view.points * [1.0, 1.0, 0.0]).astype(np.float32) for view in views],
-        [view.pixels.astype(np.float32) for view in views],
-        (width, height),
-        0,
-    )
-    focal = np.diag(matrix)[:2] if np.isfinite(matrix).all() else np.full(2, 1.2 * width)
-    alpha, beta = focal.tolist()
-    start = Camera(alpha, beta, 0.0, width / 2, height / 2, CHAPTER_LENS, width, height)
+    homographies = [find_homography(view) for view in views]
+    alpha, gamma, u0, _, beta, v0 = matrix_from_homographies(homographies, width, height)[
+        :2
+    ].ravel()
+    start = Camera(alpha, beta, gamma, u0, v0, type(lens)(), width, height)
     poses = [estimate_pose(start, view) for view in views]
-    # From so rough a start, a richer lens could end in a minimum of its own.
-    plain = fit_camera(start, poses, views)
-    return plain if lens == CHAPTER_LENS else _fit(type(lens), plain.camera, plain.poses, views)
+    return fit_camera(replace(start, lens=lens), poses, views)
+
+
+def find_homography(view: PlanarView) -> Array:
+    """H (3, 3), pixels ~ H (x, y, 1), of a view's corners."""
+    return np.asarray(cv2.findHomography(view.points[:, :2], view.pixels, 0)[0])
 
 
 def refuse_parallel(views: Sequence[PlanarView], width: int, height: int) -> None:
@@ -123,8 +123,7 @@ def refuse_parallel(views: Sequence[PlanarView], width: int, height: int) -> Non
     Parallel planes share their vanishing line, which a rough camera turns into a plane normal.
     """
     rough = np.array([[1.2 * width, 0, width / 2], [0, 1.2 * width, height / 2], [0, 0, 1.0]])
-    homographies = [cv2.findHomography(view.points[:, :2], view.pixels, 0)[0] for view in views]
-    normals = np.stack([np.linalg.inv(h).T[:, 2] for h in homographies]) @ rough
+    normals = np.stack([np.linalg.inv(find_homography(view)).T[:, 2] for view in views]) @ rough
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     angles = np.degrees(np.arccos(np.clip(np.abs(normals @ normals.T), 0.0, 1.0)))
     if np.max(angles) < 3.0:
