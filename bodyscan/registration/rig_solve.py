@@ -175,8 +175,6 @@ def _solve(
         [view for view in resolved if view.target in inconsistent], solution, 30.0
     ).wrong
     kept = [view for view in resolved if view not in gross]
-    # COLMAP's lenses lack skew, and a single camera was solved with it already.
-    several = len(names) > 1
     for loss_px in LOSSES_PX:
         solution = solve_jointly(kept, solution, root=root, loss_px=loss_px)
     solve = partial(
