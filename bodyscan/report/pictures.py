@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 from bodyscan.arrays import Array, Bytes, Floats
 from bodyscan.files.atomic import write_bytes
 from bodyscan.mesh.body import BodyCloud, BodyMesh
+from bodyscan.mesh.body_parts import find_body_frame
 from bodyscan.mesh.depth_buffer import nearest_faces, nearest_points
 from bodyscan.optional import optional
 from bodyscan.outcome import Outcome
@@ -141,14 +142,18 @@ class _Frame:
 
 
 def _frames(points: Array, views: Sequence[str], height_px: int) -> list[_Frame]:
-    """Frames of a subject's views, all with the scale of its greatest extent."""
+    """Frames of a subject's views, all with the scale of its greatest extent; what faces x is front
+    where no feet tell which way the subject faces."""
     low, high = points.min(axis=0), points.max(axis=0)
     step = float((high - low).max() + 40.0) / height_px
     middle = 0.5 * (low[2] + high[2])
+    body = find_body_frame(points)
+    turn = body.rig_from_body.rotation if body.known else np.eye(3)
     frames = []
     for view in views:
-        axes = _axes(view)
-        ends = np.stack([low, high]) @ axes[0]
+        axes = _axes(view) @ turn.T
+        across = points @ axes[0]
+        ends = np.array([across.min(), across.max()])
         width = int(np.ceil((np.ptp(ends) + 40.0) / step))
         top = middle + step * height_px / 2
         frames.append(_Frame(axes, float(ends.min()) - 20.0, top, step, width, height_px))
@@ -156,7 +161,7 @@ def _frames(points: Array, views: Sequence[str], height_px: int) -> list[_Frame]
 
 
 def _axes(view: str) -> Array:
-    """Rows (3, 3): the picture's right, its up, and the direction to the viewer, rig frame."""
+    """Rows (3, 3): the picture's right, its up, and the direction to the viewer, body frame."""
     azimuth = np.radians(AZIMUTHS_DEG[view])
     right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
     towards = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])

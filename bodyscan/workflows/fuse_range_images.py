@@ -21,7 +21,7 @@ from bodyscan.fusion.verdict import grade_scan
 from bodyscan.fusion.verdict.coverage import measure_coverage
 from bodyscan.fusion.verdict.evidence import Coverage, ImageEvidence, RigEvidence, ScanEvidence
 from bodyscan.fusion.verdict.overlaps import find_seams
-from bodyscan.fusion.verdict.rig import find_floor, find_silent_poles
+from bodyscan.fusion.verdict.rig import find_floor, find_misplaced, find_silent_poles
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.mesh.body import BodyCloud, BodyMesh
@@ -88,6 +88,9 @@ def fuse(
         calibrated, volume = calibration.rig_from_camera, calibration.rig.volume
         cleaned = clean(measured.value, calibrated, volume, empty=empty)
         subject = _Subject(require_subject(cleaned), dict(calibrated), calibration.covariance)
+        seeing = {image.pair for image in subject.images}
+        misplaced = find_misplaced(measured.value, seeing, calibrated, volume)
+        measured = replace(measured, failures={**measured.failures, **misplaced})
     if settings.alignment.matching != "none" and len(subject.images) > 1:
         with step(progress, "aligning"):
             subject = _align(subject, calibration, settings.alignment)

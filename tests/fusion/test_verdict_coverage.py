@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bodyscan.arrays import Array, Indices
+from bodyscan.arrays import Array, Bytes, Indices
 from bodyscan.fusion.verdict.coverage import measure_coverage
 from bodyscan.fusion.verdict.evidence import Coverage
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.mesh.body import DARK_CLOTH, SKIN
 
 CAMERA = Camera(500.0, 500.0, 0.0, 60.0, 40.0, Radial(), 121, 81)
 AWAY_MM = 1000.0
@@ -45,11 +46,15 @@ def seen(pair: str, *, shift_mm: float = 0.0, left_of: int = 121, camera: Camera
 
 
 def checked(
-    *images: Any, columns: int = 20, rows: int = 14, turn: RigidTransform = HERE
+    *images: Any,
+    columns: int = 20,
+    rows: int = 14,
+    turn: RigidTransform = HERE,
+    regions: Bytes | None = None,
 ) -> Coverage:
     """turn: of the wall."""
     vertices, faces = grid(columns, rows)
-    mesh: Any = SimpleNamespace(vertices=turn.apply(vertices), faces=faces)
+    mesh: Any = SimpleNamespace(vertices=turn.apply(vertices), faces=faces, face_regions=regions)
     return measure_coverage(mesh, images, {image.pair: HERE for image in images})
 
 
@@ -72,6 +77,14 @@ def test_a_camera_is_asked_for_what_another_measured_and_for_that_alone() -> Non
     assert alone.yields == {}, "what a pair alone says of itself is no witness"
     assert alone.filled_share == pytest.approx(0.5, abs=0.03)
     assert np.mean(alone.filled) == pytest.approx(0.5, abs=0.03)
+
+
+def test_a_camera_is_not_asked_for_hair_and_dark_cloth() -> None:
+    """Of the half that it did not measure, the other pair's longer exposure showed dark cloth."""
+    regions = np.full(2 * 20 * 14, SKIN, np.uint8)
+    regions[grid(20, 14)[0][grid(20, 14)[1]].mean(axis=1)[:, 0] > 0.0] = DARK_CLOTH
+    found = checked(seen("a", left_of=61), seen("b"), regions=regions)
+    assert found.yields == {"a": pytest.approx(1.0, abs=0.02), "b": 1.0}
 
 
 @pytest.mark.parametrize(("lean_deg", "asked"), [(58.0, True), (62.0, False)])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from bodyscan.arrays import Array
-from bodyscan.fusion.verdict.rig import find_floor
+from bodyscan.fusion.verdict.rig import find_floor, find_misplaced
 from bodyscan.geometry.transforms import RigidTransform
 
 WITHIN: Any = SimpleNamespace(radius_mm=700.0)
@@ -77,3 +77,18 @@ def test_heights_are_those_of_the_rig_wherever_the_camera_stands() -> None:
         seen(name, there.apply(ground(12.0)), there.rotate(STRAIGHT_UP[None])[0]) for name in "ab"
     ]
     assert find_floor(images, dict.fromkeys("ab", at), WITHIN) == pytest.approx(12.0)
+
+
+@pytest.mark.parametrize(
+    ("depth_mm", "seeing", "named"),
+    [(1400.0, (), True), (1400.0, ("a",), False), (3000.0, (), False)],
+)
+def test_a_pair_whose_points_all_lie_elsewhere_is_named(
+    depth_mm: float, seeing: tuple[str, ...], named: bool
+) -> None:
+    """As far away as the subject, with a pose that is wrong; not a wall behind a child's head."""
+    image = seen("a", np.tile([0.0, 0.0, depth_mm], (1000, 1)))
+    pose = RigidTransform(np.eye(3), np.array([1500.0, 0.0, 900.0]))
+    found = find_misplaced([image], seeing, {"a": pose}, WITHIN)
+    assert ("a" in found) == named
+    assert not named or "none of its 4000 points" in found["a"]

@@ -14,7 +14,7 @@ from bodyscan.arrays import Array, Mask
 from bodyscan.fusion.hole_filling import Crown
 from bodyscan.fusion.verdict.evidence import Coverage, Finding, ScanEvidence
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.mesh.body import BodyMesh
+from bodyscan.mesh.body import SKIN, BodyMesh
 from bodyscan.mesh.topology import face_normals
 from bodyscan.reconstruction.range_image import RangeImage
 
@@ -35,10 +35,13 @@ def measure_coverage(
     normals = cross / np.maximum(doubled_area[:, None], 1e-12)
     views = [_view_points(points, normals, image, rig_from_camera[image.pair]) for image in images]
     count = np.sum([view.measured for view in views], axis=0)
+    # Dark hair and cloth return too little light to whatever pair; fair hair is unsure.
+    kinds = mesh.face_regions
+    skin = np.ones(len(points), bool) if kinds is None else kinds[sample] == SKIN
     yields, saturated = {}, {}
     for image, view in zip(images, views, strict=True):
         # What a pair alone measured is no evidence against it.
-        expected = view.visible & (count - view.measured > 0)
+        expected = view.visible & skin & (count - view.measured > 0)
         if np.count_nonzero(expected) >= 50:
             yields[image.pair] = float(np.mean(view.valid[expected]))
             saturated[image.pair] = float(np.mean(view.white[expected]))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -40,6 +40,31 @@ def find_silent_poles(
     count = Counter(poles[name] for name in working if name in poles)
     seeing_poles = {poles.get(name) for name in seeing}
     return tuple(pole for pole, n in count.items() if n > 1 and pole not in seeing_poles)
+
+
+def find_misplaced(
+    images: Sequence[RangeImage],
+    seeing: Container[str],
+    rig_from_camera: Mapping[str, RigidTransform],
+    volume: Volume,
+) -> dict[str, str]:
+    """Pairs that measured something as far away as the scan volume, and nothing of the subject in it;
+    with the reason. A pair that looks over a child's head measures nothing, or what is farther away.
+
+    images: as decoded. seeing: the pairs that saw the subject.
+    """
+    found = {}
+    for image in images:
+        if image.pair in seeing or (count := int(np.count_nonzero(image.valid))) < 1000:
+            continue
+        axis_mm = float(np.linalg.norm(rig_from_camera[image.pair].translation[:2]))
+        depth_mm = float(np.median(image.points[image.valid][:, 2]))
+        if abs(depth_mm - axis_mm) < volume.radius_mm:
+            found[image.pair] = (
+                f"none of its {count} points is in the scan volume, though they are as far away. "
+                "Possible causes: its pose is wrong; its images are another pair's. Calibrate again"
+            )
+    return found
 
 
 def check_silent_poles(scan: ScanEvidence) -> Iterator[Finding]:
