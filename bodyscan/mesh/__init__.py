@@ -1,6 +1,5 @@
-"""Triangle meshes of bodies: the types (`body`), topology, repair, decimation, slices,
-and what part of a body each piece of a slice is (`body_parts`).
+"""Triangle meshes of bodies: the types (`body`), topology, repair, slices, body_parts (what each
+piece of a slice is, and which way a body faces).
 
-ply: files. surface_nets: a mesh from signed distances. nearest_surface, depth_buffer: what
-is near, and what is visible.
+ply: files. surface_nets: a mesh from signed distances. depth_buffer: what is visible.
 """
