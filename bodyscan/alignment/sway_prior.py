@@ -27,11 +27,11 @@ point as far as a unit of translation."""
 def stance_correlation(seconds: Array) -> Array:
     """Correlation of a standing person's posture with itself after so many seconds.
 
-    Matern's of order 5/2, so that its velocity is smooth too, with a length of 0.8 s: people sway
-    at 0.1 to 1 Hz.
+    Matern's of order 3/2 with a length of 0.8 s: people sway at 0.1 to 1 Hz, and muscles change the
+    acceleration at once, so that only the velocity tells where a limb will be.
     """
-    r = np.sqrt(5.0) * np.abs(seconds) / 0.8
-    return np.asarray((1.0 + r + r**2 / 3.0) * np.exp(-r))
+    r = np.sqrt(3.0) * np.abs(seconds) / 0.8
+    return np.asarray((1.0 + r) * np.exp(-r))
 
 
 @dataclass(frozen=True)

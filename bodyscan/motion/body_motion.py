@@ -54,14 +54,18 @@ class BodyMotion:
 
     @staticmethod
     def at_rest(
-        cells: BodyCells, seconds: Sequence[float | None], boards: Array, sway: Array
+        cells: BodyCells,
+        seconds: Sequence[float | None],
+        middle_s: float,
+        boards: Array,
+        sway: Array,
     ) -> BodyMotion:
         """The state before anything has moved; arguments as in `build_kinds`."""
-        kinds = build_kinds(cells, seconds, boards, sway)
+        kinds = build_kinds(cells, seconds, middle_s, boards, sway)
         count = sum(kind.count for kind in kinds)
         matrix, vector = np.zeros((count, count)), np.zeros(count)
         fields = np.concatenate([kind.fields for kind in kinds], axis=2)
-        breaths = breath_covariances(kinds[-1].modes, seconds)
+        breaths = breath_covariances(kinds[-1].modes, seconds, middle_s)
         return BodyMotion(kinds, fields, vector, matrix, vector, matrix, np.ones(count), breaths)
 
     @cached_property
@@ -151,21 +155,6 @@ class BodyMotion:
             motion = motion._update_prior_variances()._solve()
         return motion
 
-    def covariance_with_min_parts(self) -> Array:
-        """Covariance (n, n) if parts moved at least by a fifteenth of the breath.
-
-        The evidence sizes the motion of all parts at once, and legs that stood still say nothing
-        about a hip: 0.1 mm in those who stand, 0.25 in the restless.
-        """
-        breath = self.kind("breath").mode_covariance
-        assert breath is not None
-        min_size = 1.0 / 15.0 * float(np.sqrt(np.linalg.eigvalsh(breath)[-1]))
-        kinds = (
-            replace(kind, size=max(kind.size, min_size)) if kind.name == "parts" else kind
-            for kind in self.kinds
-        )
-        return replace(self, kinds=tuple(kinds))._solve().covariance
-
     def pose_equations(self) -> LinearGaussianSystem:
         """Normal equations of pose errors beyond the calibration's uncertainty.
 
@@ -241,13 +230,17 @@ class BodyMotion:
         return replace(self, kinds=tuple(kinds))
 
     def _update_prior_variances(self) -> BodyMotion:
-        """Update each kind's prior variance by type-II maximum likelihood (MacKay 1992)."""
+        """Update each kind's prior variance by type-II maximum likelihood (MacKay 1992).
+
+        The usual size counts as much as the six amplitudes of a rigid motion: what the overlaps
+        hardly see did not stand still.
+        """
         kinds, variances = [], self.variances
         for kind, block in zip(self.kinds, self.slices, strict=True):
             if kind.precision is None and kind.mode_covariance is None:
                 determined = kind.count - np.sum(variances[block]) / kind.size**2
-                size = np.sqrt(np.sum(self.amplitudes[block] ** 2) / max(determined, 1e-6))
-                kind = replace(kind, size=max(float(size), 1e-3))
+                square = np.sum(self.amplitudes[block] ** 2) + 6.0 * kind.usual**2
+                kind = replace(kind, size=float(np.sqrt(square / (max(determined, 0.0) + 6.0))))
             kinds.append(kind)
         return replace(self, kinds=tuple(kinds))
 

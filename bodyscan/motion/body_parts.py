@@ -9,10 +9,11 @@ from bodyscan.motion.body_cells import BodyCells, modulate_fields, rigid_fields
 
 PARTS = ("trunk", "head", "left arm", "right arm", "left leg", "right leg")
 LEGS = PARTS[-2:]
-LIMBS = ("head", "left arm", "right arm")
+LIMBS = ("head", "left arm", "right arm", "left forearm", "right forearm")
 # Shares of the stature (Drillis and Contini 1966, rounded).
 NECK, CROTCH = 0.86, 0.47
 FOOT, ANKLE, SHIN = 0.03, 0.05, 0.15
+ARM, FOREARM = 0.38, 0.25  # from the fingertips
 
 
 def name_parts(cells: BodyCells) -> Indices:
@@ -31,7 +32,7 @@ def name_parts(cells: BodyCells) -> Indices:
         tip = int(np.argmax(np.where(hands, outward, -np.inf)))
         if from_navel[tip] > 0.35:  # through the body; a fingertip is farther from the navel
             from_tip = cells.distances(np.array([tip]))[0] / stature
-            part[from_tip < 0.38] = PARTS.index(name)  # up to the shoulder
+            part[from_tip < ARM] = PARTS.index(name)  # up to the shoulder
     return part
 
 
@@ -64,12 +65,18 @@ def leftward(cells: BodyCells) -> Array:
 def limb_weights(cells: BodyCells) -> dict[str, Array]:
     """Share (C,) with which each cell follows each of LIMBS: 1 on it, 0 on the trunk.
 
-    It fades over 60 mm, the width of a neck's or shoulder's border.
+    It fades over 60 mm, the width of a neck's or shoulder's border. Forearms follow their arms too.
     """
-    part = name_parts(cells)
+    part = name_parts(cells)[cells.landmarks]
     kernel = np.exp(-0.5 * (cells.landmark_distances / 60.0) ** 2)
     total = np.maximum(kernel.sum(axis=0), 1e-12)
-    members = {limb: part[cells.landmarks] == PARTS.index(limb) for limb in LIMBS}
+    members = {limb: part == PARTS.index(limb.replace("forearm", "arm")) for limb in LIMBS}
+    for limb in ("left forearm", "right forearm"):
+        inside = cells.landmarks[members[limb]]
+        if len(inside):
+            tip = inside[np.argmin(cells.centres[inside, 2])]
+            from_tip = cells.distances(np.array([tip]))[0, cells.landmarks]
+            members[limb] &= from_tip < FOREARM * cells.centres[:, 2].max()
     return {limb: np.minimum((marks @ kernel) / total, 1.0) for limb, marks in members.items()}
 
 

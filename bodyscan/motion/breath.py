@@ -14,11 +14,14 @@ from bodyscan.motion.body_cells import (
     rigid_fields,
 )
 from bodyscan.motion.body_parts import PARTS, leftward, name_parts
+from bodyscan.motion.temporal_modes import HARMONICS
 from bodyscan.progress import map_threads
 
-SIZES_MM = np.array([0.02, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8])
-"""Standard deviations over time of the largest displacement: a chest or belly moves by 2 to 8 mm at
-rest, and 4 mm are a standard deviation of 1.4."""
+SIZES_MM = np.array([0.7, 1.0, 1.4, 2.0, 2.8])
+"""Standard deviations over time of the largest displacement: everyone's chest or belly moves by 2 to 8
+mm at rest, however little of a breath a scan saw; 4 mm are a standard deviation of 1.4."""
+
+USUAL_BREATH_MM = 1.4
 
 
 def breath_fields(cells: BodyCells) -> Array:
@@ -70,8 +73,8 @@ def estimate_breath_covariance(
     """
     modes = covariances.shape[1]
     eigenvalues, eigenvectors = np.linalg.eigh(covariances)
-    # With less than 0.005 of the variance, directions do not distinguish breaths, and cost most.
-    main = (eigenvalues > 0.005 * eigenvalues[:, -1:]).any(axis=0)
+    # Harmonics and less do not distinguish breaths, and cost most.
+    main = (eigenvalues > HARMONICS**2 * eigenvalues[:, -1:]).any(axis=0)
     roots = eigenvectors[:, :, main] * np.sqrt(eigenvalues[:, None, main])
     blocks = information.reshape(-1, modes, len(information) // modes, modes)
     count = len(vector) // modes
@@ -107,8 +110,8 @@ def _mean_shape(cells: BodyCells, axes: Array) -> Array:
     """
     stature = cells.centres[:, 2].max()
     height = cells.centres[:, 2] / stature
-    # Breath begins above the hips and ends above the collarbones.
-    at_height = _smoothstep(height, 0.47, 0.54) * (1.0 - _smoothstep(height, 0.79, 0.86))
+    # A belly's wall begins at the pubic bone and moves most at the navel; ribs end at the collarbones.
+    at_height = _smoothstep(height, 0.51, 0.60) * (1.0 - _smoothstep(height, 0.79, 0.86))
     weight = at_height * (name_parts(cells) == PARTS.index("trunk"))
     breathes = weight > 0.5
     if not breathes.any():

@@ -28,6 +28,7 @@ from bodyscan.mesh.body import BodyMesh, BreathAt
 from bodyscan.motion.body_cells import BodyCells, evaluate_field
 from bodyscan.motion.body_motion import BodyMotion
 from bodyscan.motion.body_parts import LIMBS
+from bodyscan.motion.breath import USUAL_BREATH_MM, breath_along_normals
 from bodyscan.motion.cell_equations import CellEquations
 from bodyscan.motion.motion_uncertainty import girth_sigmas, shape_sigmas
 from bodyscan.progress import THREADS
@@ -70,7 +71,7 @@ class EstimatedMotion:
     sigma_mm: standard deviation of a cell's surface along its normal, from the uncertainty of the
         motion and of the pairs' poses, (C,).
     moment_ms: the middle of the scan; None (the mean of all) if no pair's moment is known.
-    breath: None without moments.
+    breath: without moments it is 0, as uncertain as people breathe; None for no estimate.
     """
 
     cells: BodyCells
@@ -151,7 +152,8 @@ def estimate_motion(
         )
         sway = np.repeat([np.radians(settings.sway_deg), settings.sway_mm], 3)
         boards = SwayPrior(0.0, 0.0, 0.0, 0.0).covariance(names, prior)
-        at_rest = BodyMotion.at_rest(cells, seconds, boards, sway)
+        middle_s = 1e-3 * (_middle_of_scan(images) or 0.0)
+        at_rest = BodyMotion.at_rest(cells, seconds, middle_s, boards, sway)
         solution = _solve(pool, views, (at_rest, cells), observed, settings)
         if solution is None:
             return aligned, None, None
@@ -182,17 +184,24 @@ def _from_middle(
     images: Sequence[RangeImage], motion: BodyMotion, cells: BodyCells, observed: Mask
 ) -> EstimatedMotion:
     """The motion between each pair's moment and the middle of the scan."""
-    known = [image.time_ms for image in images if image.time_ms is not None]
+    moment_ms = _middle_of_scan(images)
+    sigma_mm, girth_sigma_mm = shape_sigmas(motion, cells, observed)
     warps = motion.non_rigid(from_middle=True)
     return EstimatedMotion(
         cells,
         {image.pair: warp for image, warp in zip(images, warps, strict=True)},
         motion.displacements((*RIGID, *NON_RIGID), from_middle=True)[..., :3],
         observed,
-        shape_sigmas(motion, cells, observed),
-        0.5 * (min(known) + max(known)) if known else None,
-        _offset_to_mean_breath(motion, cells) if known else None,
+        sigma_mm,
+        moment_ms,
+        _offset_to_mean_breath(motion, cells, girth_sigma_mm, timed=moment_ms is not None),
     )
+
+
+def _middle_of_scan(images: Sequence[RangeImage]) -> float | None:
+    """Midway between the first and the last frame, ms; None if no pair's moment is known."""
+    ends = [i.span_ms or (i.time_ms, i.time_ms) for i in images if i.time_ms is not None]
+    return 0.5 * (min(a for a, _ in ends) + max(b for _, b in ends)) if ends else None
 
 
 def _divide_into_cells(
@@ -246,12 +255,21 @@ def _solve(
     return _Solution(motion, reach)
 
 
-def _offset_to_mean_breath(motion: BodyMotion, cells: BodyCells) -> BreathOffset:
-    """At mean breath the temporal modes, which have zero mean, are zero."""
+def _offset_to_mean_breath(
+    motion: BodyMotion, cells: BodyCells, girth_sigma_mm: Array, *, timed: bool
+) -> BreathOffset:
+    """At mean breath the temporal modes, which have zero mean, are zero.
+
+    girth_sigma_mm: (C,) of the shape at the scan's moment.
+    """
+    if not timed:
+        breath = USUAL_BREATH_MM * np.abs(breath_along_normals(cells))
+        return BreathOffset(np.zeros((len(breath), 12)), np.hypot(breath, girth_sigma_mm))
     middle = motion.kind("breath").modes.middle
     field = motion.kind("breath").fields @ motion.amplitudes_at("breath", middle)
     errors = motion.error_factor("breath", middle, cells.normals)
-    return BreathOffset(field, girth_sigmas(errors, cells.centres[:, 2]))
+    sigma_mm = girth_sigmas(errors, cells.centres[:, 2])
+    return BreathOffset(field, np.hypot(sigma_mm, girth_sigma_mm))
 
 
 def _map_matches(

@@ -30,6 +30,7 @@ class MotionKind:
     mode_covariance: prior covariance (J, J) of each field's amplitudes, instead of `size`.
     twists: (6, M) about the rig's origin, if the body moves as a whole.
     remainder: fields less twists, (C, 12, M), if the feet stay.
+    usual: size in people who stand, which holds as far as the overlaps say nothing, mm.
     """
 
     name: str
@@ -40,6 +41,7 @@ class MotionKind:
     mode_covariance: Array | None = None
     twists: Array | None = None
     remainder: Array | None = None
+    usual: float = 1.0
 
     @property
     def count(self) -> int:
@@ -61,17 +63,22 @@ class MotionKind:
 
 
 def build_kinds(
-    cells: BodyCells, seconds: Sequence[float | None], boards: Array, sway: Array
+    cells: BodyCells,
+    seconds: Sequence[float | None],
+    middle_s: float,
+    boards: Array,
+    sway: Array,
 ) -> tuple[MotionKind, ...]:
     """All kinds of motion, beginning with the pairs' pose errors.
 
     seconds: each pair's moment, None if not known.
+    middle_s: of the scan.
     boards: covariance (6P, 6P) of the pairs' poses.
     sway: standard deviations (6,) of a usual rotation (radians) and translation (mm) about the
         body's centre.
     """
-    stance = TemporalModes.from_correlation(stance_correlation, seconds)
-    breathing = TemporalModes.from_correlation(breath_correlation, seconds)
+    stance = TemporalModes.from_correlation(stance_correlation, seconds, middle_s)
+    breathing = TemporalModes.from_correlation(breath_correlation, seconds, middle_s)
     pairs = len(seconds)
     by_freedom = np.arange(6 * pairs).reshape(pairs, 6).T.ravel()
     pose = _whole_body("pose", cells, np.eye(6), TemporalModes.constant_per_pair(pairs))
@@ -83,7 +90,10 @@ def build_kinds(
         replace(pose, precision=invert_scaled(boards)[np.ix_(by_freedom, by_freedom)]),
         _lean(cells, stance),
         _whole_body("sway", cells, any_twist, stance),
-        *(MotionKind(name, field, stance) for name, field in limb_fields(cells, LEVER_MM).items()),
+        *(
+            MotionKind(name, field, stance, usual=2.0)
+            for name, field in limb_fields(cells, LEVER_MM).items()
+        ),
         MotionKind("parts", parts, stance),
         MotionKind("breath", breath_fields(cells), breathing, mode_covariance=identity),
     )

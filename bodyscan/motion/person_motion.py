@@ -11,6 +11,11 @@ from bodyscan.motion.body_parts import PARTS, name_parts
 from bodyscan.motion.breath import breath_along_normals
 from bodyscan.motion.estimation import EstimatedMotion
 
+NO_TIMES = (
+    "`timing` is missing in captures.yaml: with it a moving person is measured to two thirds of the "
+    "error, and the breath can be told; "
+)
+
 
 @dataclass(frozen=True)
 class PartMotion:
@@ -64,6 +69,7 @@ class PersonMotion:
             return ""
         remaining = np.sqrt(np.mean([part.left_mm**2 for part in self.parts]))
         summary = (
+            f"{'' if self.moment_ms is not None else NO_TIMES}"
             f"moved {max(part.moved_mm for part in self.parts):.0f} mm while being scanned; "
             f"corrected to {remaining:.2f} mm"
         )
@@ -86,6 +92,12 @@ class PersonMotion:
             breath = f"breath of {self.breathed_mm:.1f} mm, corrected to one moment"
         if self.fuller_mm is None or self.fuller_sigma_mm is None:
             return (breath,)
+        if self.moment_ms is None:
+            unknown = "without frame times it is unknown how full chest and belly were: girths are"
+            return (
+                breath,
+                f"{unknown} those of mean breath to +- {self.fuller_sigma_mm:.1f} mm there",
+            )
         side = "in front of" if self.fuller_mm > 0 else "behind"
         return (
             breath,
@@ -142,7 +154,7 @@ def measure_breath(motion: EstimatedMotion) -> float | None:
 def measure_fullness(motion: EstimatedMotion) -> tuple[float, float] | None:
     """Mean offset of the trunk's front from its position at mean breath, mm, and its sigma.
 
-    None without moments, or without a trunk.
+    None without a trunk.
     """
     breathes = breath_along_normals(motion.cells) > 0.5
     if motion.breath is None or not breathes.any():

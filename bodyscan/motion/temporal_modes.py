@@ -15,15 +15,18 @@ BREATHS_S = np.geomspace(2.5, 5.8, 12)
 """Duration of a breath at rest: 10 to 24 a minute."""
 PHASES = np.arange(8) * np.pi / 8.0
 """Half a turn later each phase recurs with the opposite sign."""
+HARMONICS = 0.25
+"""Of a breath that rests after breathing out, over its first harmonic: its mean is nearer to breathed
+out than to breathed in by an eighth of its range."""
 
 
 def breath_correlation(seconds: Array) -> Array:
-    """Correlation of a breath with itself after so many seconds, averaged over its duration.
-
-    A twentieth of its variance does not recur.
-    """
+    """Correlation of a breath with itself after so many seconds, averaged over its duration."""
     phase = 2.0 * np.pi * np.asarray(seconds)[..., None] / BREATHS_S
-    return np.asarray(0.95 * np.cos(phase).mean(axis=-1) + 0.05 * stance_correlation(seconds))
+    share = HARMONICS**2
+    return np.asarray(
+        (1.0 - share) * np.cos(phase).mean(axis=-1) + share * stance_correlation(seconds)
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +46,9 @@ class TemporalModes:
 
     @staticmethod
     def from_correlation(
-        correlation: Callable[[Array], Array], seconds: Sequence[float | None]
+        correlation: Callable[[Array], Array],
+        seconds: Sequence[float | None],
+        middle_s: float,
     ) -> TemporalModes:
         """Modes of a correlation over time; seconds: each pair's moment, None if not known.
 
@@ -58,7 +63,7 @@ class TemporalModes:
         middle = np.zeros(len(untimed))
         if not timed:
             return TemporalModes(independent, middle)
-        knots = np.append(at, 0.5 * (at.min() + at.max()))
+        knots = np.append(at, middle_s)
         covariance = correlation(knots[:, None] - knots)
         eigenvalues, eigenvectors = np.linalg.eigh(covariance)
         kept = eigenvalues > MIN_SHARE * eigenvalues[-1]
@@ -74,7 +79,7 @@ class TemporalModes:
 
 
 def breath_covariances(
-    modes: TemporalModes, seconds: Sequence[float | None]
+    modes: TemporalModes, seconds: Sequence[float | None], middle_s: float
 ) -> tuple[Array, Array]:
     """Covariances (K, J, J) of the modes' amplitudes for K breaths, and their priors (K,).
 
@@ -84,7 +89,7 @@ def breath_covariances(
     at = np.array([second for second in seconds if second is not None])
     if len(at) < len(seconds):
         return np.eye(modes.count)[None], np.ones(1)
-    knots = np.append(at, 0.5 * (at.min() + at.max()))
+    knots = np.append(at, middle_s)
     amplitudes_from_values = np.linalg.pinv(np.vstack([modes.values, modes.middle]))
     phase = (2.0 * np.pi * knots / BREATHS_S[:, None, None] + PHASES[:, None]).reshape(
         -1, len(knots)
@@ -92,7 +97,7 @@ def breath_covariances(
     # Belly and chest differ in phase by 10 to 30 degrees at rest (Konno and Mead 1967): tan 0.35.
     waves = amplitudes_from_values @ np.stack([np.cos(phase), 0.35 * np.sin(phase)], axis=2)
     sines = 2.0 * waves @ np.swapaxes(waves, 1, 2)
-    # A twentieth of a breath is not a sine. The small diagonal keeps the sum positive definite.
+    # The small diagonal keeps the sum positive definite.
     irregular = amplitudes_from_values @ stance_correlation(
         knots[:, None] - knots
     ) @ amplitudes_from_values.T + MIN_SHARE * np.eye(modes.count)
@@ -100,4 +105,4 @@ def breath_covariances(
     # alone looks much like a third of a deeper and slower one.
     prior = np.exp(-0.5 * (np.log(BREATHS_S / 3.75) / 0.2) ** 2)
     priors = np.repeat(prior / (prior.sum() * len(PHASES)), len(PHASES))
-    return sines + 0.05**2 * irregular, priors
+    return sines + HARMONICS**2 * irregular, priors

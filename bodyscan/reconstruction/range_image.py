@@ -81,6 +81,7 @@ class RangeImage:
         pixel has a point.
     agreement: of stripes of two directions, if both were projected.
     time_ms: the moment for which the depths hold, ms since the scan began; None if not known.
+    span_ms: when its first and its last frame were taken.
     common_mm: (h, w) float32, the part of sigma_mm that neighbours share because it comes from the
         calibration: it does not shrink when they are averaged. None if there is none.
     warped: whether points were displaced to another moment, off the rays of their pixels.
@@ -99,6 +100,7 @@ class RangeImage:
     beyond: Mask | None = None
     agreement: Agreement | None = None
     time_ms: float | None = None
+    span_ms: tuple[float, float] | None = None
     common_mm: Floats | None = None
     warped: bool = False
     corner: tuple[int, int] = (0, 0)

@@ -52,7 +52,9 @@ def reconstruct_sequence(
     image = reconstruct_range_image(pair, stripes)
     frame_ms = captures.frame_ms(sequence.shot, sequence.pair)
     if frame_ms is not None and spec.projector is not None:
-        image = replace(image, time_ms=calibration.rig.frames.moment_ms(spec.projector, frame_ms))
+        moment = calibration.rig.frames.moment_ms(spec.projector, frame_ms)
+        span = min(frame_ms.values()), max(frame_ms.values())
+        image = replace(image, time_ms=moment, span_ms=span)
     if volume_only:
         image = cut_to_volume(image, at, calibration.rig.volume)
     return image, tuple(responses_in(stripes)), stripes.crossing_fault

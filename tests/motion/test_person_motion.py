@@ -118,17 +118,17 @@ def test_who_shows_no_toes_faces_the_rigs_x() -> None:
 
 
 def test_breath_shows_on_the_trunk() -> None:
-    """Hips 0.797, waist 0.915, collarbones 1.339 m, and the neck."""
+    """Pubic bone 0.864, navel 1.017, collarbones 1.339 m, and the neck."""
     cells = person()
     found = breath_along_normals(cells)
     assert found[at(cells, 0.0, 1125.0)] == pytest.approx(1.0)
-    assert found[at(cells, 0.0, 945.0)] == pytest.approx(1.0)
-    half = found[at(cells, 0.0, 855.0)]  # 0.5044 of the stature, 0.4917 of the way to the waist
-    t = (855.0 / 1695.0 - 0.47) / 0.07
+    assert found[at(cells, 0.0, 1035.0)] == pytest.approx(1.0)
+    half = found[at(cells, 0.0, 945.0)]
+    t = (945.0 / 1695.0 - 0.51) / 0.09
     assert half == pytest.approx(t * t * (3.0 - 2.0 * t))
     t = (1395.0 / 1695.0 - 0.79) / 0.07
     assert found[at(cells, 0.0, 1395.0)] == pytest.approx(1.0 - t * t * (3.0 - 2.0 * t))
-    assert not found[[at(cells, 0.0, z) for z in (1665.0, 765.0, 100.0)]].any()
+    assert not found[[at(cells, 0.0, z) for z in (1665.0, 855.0, 100.0)]].any()
     assert found[at(cells, 780.0, 1365.0)] == 0.0
     # Skin that faces up or down as much as forward goes out by less, whatever it is that moves.
     slanting = replace(cells, normals=np.tile([0.6, 0.0, -0.8], (len(cells.centres), 1)))
@@ -150,7 +150,7 @@ def test_a_trunk_swells_away_from_its_back_and_its_middle() -> None:
     cells = deep(person())
     slanting = replace(cells, normals=np.tile([0.6, 0.0, -0.8], (len(cells.centres), 1)))
     height = cells.centres[:, 2]
-    full = (height > 930.0) & (height < 1330.0) & (np.abs(cells.centres[:, 1]) < 250.0)
+    full = (height > 1020.0) & (height < 1330.0) & (np.abs(cells.centres[:, 1]) < 250.0)
     x, y = cells.centres[full, :2].T
     for body in (cells, slanting):
         as_one = breath_fields(body)[full, :3, 0]
@@ -268,11 +268,13 @@ def test_how_far_a_part_moved_is_what_all_but_a_twentieth_of_it_did_at_most() ->
 
 def told_of(*left: tuple[str, float, float]) -> str:
     parts = tuple(PartMotion(name, moved, known, 0.0) for name, moved, known in left)
-    return PersonMotion(parts, None, None).summary
+    return PersonMotion(parts, None, 900.0).summary
 
 
 def test_who_needs_a_part_better_than_a_girth_of_two_millimetres_is_told_which() -> None:
     assert told_of() == ""
+    untimed = PersonMotion((PartMotion("head", 2.0, 0.1, 0.0),), None, None)
+    assert untimed.summary.startswith("`timing` is missing in captures.yaml")
     assert told_of(("trunk", 4.4, 0.3), ("head", 11.6, 0.1)) == (
         "moved 12 mm while being scanned; corrected to 0.22 mm"
     )
@@ -283,11 +285,12 @@ def test_who_needs_a_part_better_than_a_girth_of_two_millimetres_is_told_which()
 
 @pytest.mark.parametrize(("fuller_mm", "side"), [(1.24, "in front of"), (-1.24, "behind")])
 def test_lines_say_which_way_a_breath_stood(fuller_mm: float, side: str) -> None:
-    person = PersonMotion((PartMotion("head", 2.04, 0.1, 0.0),), 4.2, None, fuller_mm, 0.36)
+    person = PersonMotion((PartMotion("head", 2.04, 0.1, 0.0),), 4.2, 900.0, fuller_mm, 0.36)
     assert person.lines == (
         "head: moved by 2.0 mm, corrected to 0.10 mm",
         "breath of 4.2 mm, corrected to one moment",
         f"chest and belly were 1.2 +- 0.4 mm {side} their position at mean breath: girths are given "
         "at mean breath",
     )
+    assert PersonMotion((), None, None, 0.0, 1.42).lines[-1].endswith("mean breath to +- 1.4 mm there")
     assert PersonMotion((), None, None).lines == ("breath cannot be separated from other motion",)
