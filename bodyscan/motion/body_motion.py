@@ -15,7 +15,7 @@ from itertools import pairwise
 
 import numpy as np
 from scipy.linalg import cho_solve
-from scipy.linalg.lapack import dpotrf, dpotri, dtrtri, dtrtrs
+from scipy.linalg.lapack import dpotrf, dpotri, dtrtrs
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
@@ -79,12 +79,6 @@ class BodyMotion:
         """Posterior covariance of the amplitudes, (n, n)."""
         lower = np.tril(dpotri(self.factor, lower=True)[0])
         return (lower + np.tril(lower, -1).T) * self.units[:, None] * self.units
-
-    @property
-    def variances(self) -> Array:
-        """Posterior variances of the amplitudes, (n,), at half the cost of `covariance`."""
-        root = dtrtri(self.factor, lower=True)[0]
-        return np.asarray(np.einsum("ij,ij->j", root, root) * self.units**2, np.float64)
 
     def kind(self, name: str) -> MotionKind:
         return next(kind for kind in self.kinds if kind.name == name)
@@ -235,7 +229,7 @@ class BodyMotion:
         The usual size counts as much as the six amplitudes of a rigid motion: what the overlaps
         hardly see did not stand still.
         """
-        kinds, variances = [], self.variances
+        kinds, variances = [], np.diag(self.covariance)
         for kind, block in zip(self.kinds, self.slices, strict=True):
             if kind.precision is None and kind.mode_covariance is None:
                 determined = kind.count - np.sum(variances[block]) / kind.size**2

@@ -21,8 +21,6 @@ SIZES_MM = np.array([0.7, 1.0, 1.4, 2.0, 2.8])
 """Standard deviations over time of the largest displacement: everyone's chest or belly moves by 2 to 8
 mm at rest, however little of a breath a scan saw; 4 mm are a standard deviation of 1.4."""
 
-USUAL_BREATH_MM = 1.4
-
 
 def breath_fields(cells: BodyCells) -> Array:
     """Displacement fields (C, 12, M): of the trunk as one, and of its places forward and sideways.

@@ -28,7 +28,7 @@ from bodyscan.mesh.body import BodyMesh, BreathAt
 from bodyscan.motion.body_cells import BodyCells, evaluate_field
 from bodyscan.motion.body_motion import BodyMotion
 from bodyscan.motion.body_parts import LIMBS
-from bodyscan.motion.breath import USUAL_BREATH_MM, breath_along_normals
+from bodyscan.motion.breath import SIZES_MM, breath_along_normals
 from bodyscan.motion.cell_equations import CellEquations
 from bodyscan.motion.motion_uncertainty import girth_sigmas, shape_sigmas
 from bodyscan.progress import THREADS
@@ -263,7 +263,7 @@ def _offset_to_mean_breath(
     girth_sigma_mm: (C,) of the shape at the scan's moment.
     """
     if not timed:
-        breath = USUAL_BREATH_MM * np.abs(breath_along_normals(cells))
+        breath = SIZES_MM.mean() * np.abs(breath_along_normals(cells))
         return BreathOffset(np.zeros((len(breath), 12)), np.hypot(breath, girth_sigma_mm))
     middle = motion.kind("breath").modes.middle
     field = motion.kind("breath").fields @ motion.amplitudes_at("breath", middle)

@@ -49,7 +49,6 @@ def test_amplitudes_are_those_of_what_was_seen_and_of_the_prior() -> None:
     motion, square = seen()
     truth = np.linalg.inv(square + prior())
     np.testing.assert_allclose(motion.covariance, truth, rtol=1e-8, atol=1e-12)
-    np.testing.assert_allclose(motion.variances, np.diag(truth), rtol=1e-8)
     np.testing.assert_allclose(motion.amplitudes, truth @ motion.vector, rtol=1e-8, atol=1e-12)
 
 
@@ -124,7 +123,7 @@ def test_what_is_not_known_of_one_kind_is_that_of_its_amplitudes() -> None:
 def test_a_kind_is_as_large_as_the_evidence_and_people_say() -> None:
     """MacKay's: amplitudes over as many of them as were told, and six of the usual size."""
     motion, _ = seen()
-    told = 6.0 - np.sum(motion.variances[12:]) / 0.8**2
+    told = 6.0 - np.sum(np.diag(motion.covariance)[12:]) / 0.8**2
     size = np.sqrt((np.sum(motion.amplitudes[12:] ** 2) + 6.0) / (told + 6.0))
     pose, parts = motion._update_prior_variances().kinds
     assert parts.size == pytest.approx(size)

@@ -292,5 +292,7 @@ def test_lines_say_which_way_a_breath_stood(fuller_mm: float, side: str) -> None
         f"chest and belly were 1.2 +- 0.4 mm {side} their position at mean breath: girths are given "
         "at mean breath",
     )
-    assert PersonMotion((), None, None, 0.0, 1.42).lines[-1].endswith("mean breath to +- 1.4 mm there")
+    assert (
+        PersonMotion((), None, None, 0.0, 1.42).lines[-1].endswith("mean breath to +- 1.4 mm there")
+    )
     assert PersonMotion((), None, None).lines == ("breath cannot be separated from other motion",)
