@@ -263,7 +263,7 @@ def _offset_to_mean_breath(
     girth_sigma_mm: (C,) of the shape at the scan's moment.
     """
     if not timed:
-        breath = SIZES_MM.mean() * np.abs(breath_along_normals(cells))
+        breath = rms(SIZES_MM) * np.abs(breath_along_normals(cells))
         return BreathOffset(np.zeros((len(breath), 12)), np.hypot(breath, girth_sigma_mm))
     middle = motion.kind("breath").modes.middle
     field = motion.kind("breath").fields @ motion.amplitudes_at("breath", middle)
