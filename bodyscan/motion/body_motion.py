@@ -233,7 +233,7 @@ class BodyMotion:
         for kind, block in zip(self.kinds, self.slices, strict=True):
             if kind.precision is None and kind.mode_covariance is None:
                 determined = kind.count - np.sum(variances[block]) / kind.size**2
-                square = np.sum(self.amplitudes[block] ** 2) + 6.0 * kind.usual**2
+                square = np.sum(self.amplitudes[block] ** 2) + 6.0 * kind.standing_size**2
                 kind = replace(kind, size=float(np.sqrt(square / (max(determined, 0.0) + 6.0))))
             kinds.append(kind)
         return replace(self, kinds=tuple(kinds))

@@ -30,7 +30,7 @@ class MotionKind:
     mode_covariance: prior covariance (J, J) of each field's amplitudes, instead of `size`.
     twists: (6, M) about the rig's origin, if the body moves as a whole.
     remainder: fields less twists, (C, 12, M), if the feet stay.
-    usual: size in people who stand, which holds as far as the overlaps say nothing, mm.
+    standing_size: in people who stand, mm; it holds as far as the overlaps determine nothing.
     """
 
     name: str
@@ -41,7 +41,7 @@ class MotionKind:
     mode_covariance: Array | None = None
     twists: Array | None = None
     remainder: Array | None = None
-    usual: float = 1.0
+    standing_size: float = 1.0
 
     @property
     def count(self) -> int:
@@ -91,7 +91,7 @@ def build_kinds(
         _lean(cells, stance),
         _whole_body("sway", cells, any_twist, stance),
         *(
-            MotionKind(name, field, stance, usual=2.0)
+            MotionKind(name, field, stance, standing_size=2.0)
             for name, field in limb_fields(cells, LEVER_MM).items()
         ),
         MotionKind("parts", parts, stance),
