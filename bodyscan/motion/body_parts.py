@@ -13,7 +13,7 @@ LIMBS = ("head", "left arm", "right arm", "left forearm", "right forearm")
 # Shares of the stature (Drillis and Contini 1966, rounded).
 NECK, CROTCH = 0.86, 0.47
 FOOT, ANKLE, SHIN = 0.03, 0.05, 0.15
-ARM, FOREARM = 0.38, 0.25  # from the fingertips
+FOREARM = 0.25  # from the fingertips
 
 
 def name_parts(cells: BodyCells) -> Indices:
@@ -32,7 +32,7 @@ def name_parts(cells: BodyCells) -> Indices:
         tip = int(np.argmax(np.where(hands, outward, -np.inf)))
         if from_navel[tip] > 0.35:  # through the body; a fingertip is farther from the navel
             from_tip = cells.distances(np.array([tip]))[0] / stature
-            part[from_tip < ARM] = PARTS.index(name)  # up to the shoulder
+            part[from_tip < 0.38] = PARTS.index(name)  # up to the shoulder
     return part
 
 

@@ -11,11 +11,6 @@ from bodyscan.motion.body_parts import PARTS, name_parts
 from bodyscan.motion.breath import breath_along_normals
 from bodyscan.motion.estimation import EstimatedMotion
 
-NO_TIMES = (
-    "`timing` is missing in captures.yaml: with it a moving person is measured to two thirds of the "
-    "error, and the breath can be told; "
-)
-
 
 @dataclass(frozen=True)
 class PartMotion:
@@ -68,8 +63,12 @@ class PersonMotion:
         if not self.parts:
             return ""
         remaining = np.sqrt(np.mean([part.left_mm**2 for part in self.parts]))
+        missing = (
+            "`timing` is missing in captures.yaml: with it a moving person is measured to two thirds "
+            "of the error, and the breath can be told; "
+        )
         summary = (
-            f"{'' if self.moment_ms is not None else NO_TIMES}"
+            f"{missing if self.moment_ms is None else ''}"
             f"moved {max(part.moved_mm for part in self.parts):.0f} mm while being scanned; "
             f"corrected to {remaining:.2f} mm"
         )
