@@ -117,16 +117,21 @@ def import_(
 
 
 def _calibration_folder(rig_file: Path, out: Path | None, overwrite: bool) -> Path:
+    from bodyscan.captures.folder import capture_path
+    from bodyscan.rig.rig import load_rig
+
+    # A default beside the rig file may lie among its captures: their shots are told by name.
+    named = load_rig(rig_file).calibration if out else ()
     folder = out or rig_file.parent / "calibration"
-    _require_writable(folder, overwrite)
+    _require_writable(folder, overwrite, *(capture_path(rig_file, entry) for entry in named))
     return folder
 
 
-def _require_writable(folder: Path, overwrite: bool) -> None:
+def _require_writable(folder: Path, overwrite: bool, *inputs: Path | None) -> None:
     """Raise BadInput if no calibration can be written there: now, not after minutes of work."""
     from bodyscan.registration.storage import refuse_existing
 
-    require_writable(folder)
+    require_writable(folder, *inputs)
     refuse_existing(folder, overwrite)
 
 
@@ -161,7 +166,7 @@ def check_calibration(
     from bodyscan.workflows.check_rig import check_rig
 
     if repair is not None:
-        _require_writable(repair, overwrite)
+        _require_writable(repair, overwrite, *folders, calibration)
     rig = load_calibration(calibration)
     with output.stages() as progress:
         found = check_rig(rig, folders, progress, follow_links=follow_links)
@@ -199,7 +204,7 @@ def refine_rig(
     from bodyscan.registration.storage import archive_previous, load_calibration, save_calibration
     from bodyscan.workflows.check_rig import refine_rig as refine
 
-    _require_writable(out, overwrite)
+    _require_writable(out, overwrite, folder, calibration)
     rig = load_calibration(calibration)
     with output.stages() as progress:
         found = refine(rig, open_scan(rig.rig, folder), folder.name, progress)
@@ -238,7 +243,7 @@ def export_rig(
     from bodyscan.export.rig import export_rig as write
     from bodyscan.registration.storage import load_calibration
 
-    require_writable(out)
+    require_writable(out, calibration)
     written = write(load_calibration(calibration), out, formats.split(","))
     for path in written.value:
         output.add_files("rig", path)

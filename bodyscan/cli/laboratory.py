@@ -172,6 +172,7 @@ def accept(
     file = load_acceptance(artefact, dict(limit_from(text) for text in limit or ()))
     place = calibration or (simulate or Path()) / "calibration"
     folder = out or (place if place.is_dir() else place.parent).parent / "acceptance"
+    require_writable(folder, *captured, place)
     refuse_existing_test(folder, overwrite)
     rig = load_calibration(place)
     with output.stages() as progress:

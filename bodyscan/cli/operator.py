@@ -82,7 +82,7 @@ def scan(
     from bodyscan.workflows.scan_person import scan_folder
 
     out = out or folder.with_name(f"{folder.name}-model")
-    require_writable(out)
+    require_writable(out, folder, calibration, empty)
     make_room(out, overwrite)
     fusion, alignment = FusionSettings(points=points), AlignmentSettings(matching=align)
     settings = ScanSettings(fusion=fusion, alignment=alignment)
@@ -249,7 +249,8 @@ def batch(
         if explain:
             _explain(output, jobs, stages)
         else:
-            require_writable(Path(out))
+            read = (path for job in jobs for path in (job.source, job.calibration))
+            require_writable(Path(out), *read)
             _run(output, jobs, Path(out), workers, cluster)
         return
     fuses = settings.kind == "fuse"
@@ -364,7 +365,7 @@ def watch(
     from bodyscan.jobs.watching import Watched
     from bodyscan.jobs.watching import watch as watch_inbox
 
-    require_writable(out)
+    require_writable(out, inbox, calibration)
     output.stream_events()
     settings = (
         load_pipeline(pipeline, changes or ())

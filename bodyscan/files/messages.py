@@ -31,11 +31,16 @@ def translate_os_error(error: OSError) -> BodyscanError:
     return FailedWork(what, where=where, remedy="check the disk or the network, then start again")
 
 
-def require_writable(folder: Path) -> None:
-    """Raise BadInput or FailedWork if nothing can be written into `folder`, which need not exist.
+def require_writable(folder: Path, *inputs: Path | None) -> None:
+    """Raise BadInput or FailedWork if nothing can, or may, be written into `folder`, which need not
+    exist.
+
+    inputs: folders of images and calibrations that the work reads (of a file, its folder): `folder`
+        is none of them, lies in none and holds none. None is no input.
 
     It is tested before the work, not after: by writing to the nearest existing folder above.
     """
+    _refuse_overlap(folder, filter(None, inputs))
     if folder.exists() and not folder.is_dir():
         raise BadInput(
             "is a file; results go into a folder", where=str(folder), remedy="give another --out"
@@ -49,6 +54,19 @@ def require_writable(folder: Path) -> None:
             probe.flush()
     except OSError as error:
         raise translate_os_error(OSError(error.errno, error.strerror, str(folder))) from error
+
+
+def _refuse_overlap(folder: Path, inputs: Iterable[Path]) -> None:
+    out = folder.resolve()
+    for path in inputs:
+        read = (path.parent if path.is_file() else path).resolve()
+        if out == read or read in out.parents or out in read.parents:
+            how = "is" if out == read else "lies inside" if read in out.parents else "contains"
+            raise BadInput(
+                f"{how} {path}, which is read: results would be taken for input, or replace it",
+                where=str(folder),
+                remedy="give --out (or --repair) a folder beside what is read",
+            )
 
 
 def make_paths_relative(text: str, base: Path, below: Iterable[Path] = ()) -> str:

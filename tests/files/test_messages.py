@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import errno
 import os
+import re
+import shutil
 from pathlib import Path
 from typing import Any
 
 import pytest
-from small_workspace import run
+from small_workspace import run, small_rig
 
 from bodyscan.errors import BadInput, BodyscanError, FailedWork
 from bodyscan.files.atomic import write_text
@@ -41,6 +43,43 @@ def test_a_folder_need_not_exist_to_be_writable(tmp_path: Path) -> None:
     with pytest.raises(BodyscanError) as refused:
         require_writable(Path("/proc/results"))  # not even root can
     assert refused.value.where == "/proc/results"
+
+
+@pytest.mark.parametrize(
+    ("command", "how"),
+    [
+        ("scan day/anna --calibration rig --out day/anna", "is"),
+        ("scan day/anna --calibration rig --out rig --overwrite", "is"),
+        ("scan day/anna --calibration rig/calibration.json --out rig/new", "lies inside"),
+        ("scan day/anna --calibration rig --empty day/empty --out day/empty/new", "lies inside"),
+        ("scan day/../day/anna --calibration rig --out day", "contains"),
+        ("scan link --calibration rig --out day/anna/new", "lies inside"),
+        ("check-calibration day/anna --calibration rig --repair rig --overwrite", "is"),
+        ("refine-rig day/anna --calibration rig --out day/anna", "is"),
+        ("export-rig rig --out rig/for-colmap", "lies inside"),
+        ("watch day --calibration rig --out day/out", "lies inside"),
+        ("batch pipeline.yaml --scans day --calibration rig --out day", "contains"),
+        ("batch pipeline.yaml --scans day --calibration rig --out rig", "is"),
+        ("calibrate-rig small.yaml --out captures/calibration", "is"),
+        ("accept --spheres day/anna --calibration rig --out day/anna/new", "lies inside"),
+    ],
+)
+def test_no_result_goes_where_images_or_a_calibration_are_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, how: str
+) -> None:
+    for folder in ("day/anna", "day/empty", "captures/calibration"):
+        (tmp_path / folder).mkdir(parents=True)
+    (tmp_path / "link").symlink_to("day/anna")
+    shutil.copytree(STORED / "calibration", tmp_path / "rig")
+    (tmp_path / "pipeline.yaml").write_text("version: 1\nname: small\nkind: fuse\n")
+    small_rig(tmp_path)
+    before = sorted(tmp_path.rglob("*"))
+    monkeypatch.chdir(tmp_path)
+    refused = run(*command.split()).exception
+    assert isinstance(refused, BadInput)
+    assert re.match(rf"{how} [\w/.-]+, which is read", refused.what)
+    assert refused.where == re.findall(r"--(?:out|repair) (\S+)", command)[0]
+    assert sorted(tmp_path.rglob("*")) == before
 
 
 def refuse(*_: Any, **__: Any) -> Any:
