@@ -137,14 +137,18 @@ def _require_writable(folder: Path, overwrite: bool, *inputs: Path | None) -> No
 
 def _report_calibration(output: Output, found: RigCalibration, saved: Path) -> None:
     from bodyscan.cli import tables
+    from bodyscan.registration.calibration_verdict import grade_calibration
 
     output.notes(found.notes)
-    output.failures(found.failed)
     with output.optional("table"):
         output.show(tables.calibration_table(found))
         output.figures(**tables.calibration_figures(found))
     output.say(*found.advice)
+    output.failures(found.failed, "")
+    verdict = grade_calibration(found)
+    output.verdict(verdict)
     output.add_files("calibration", saved)
+    output.exit_code = 1 if verdict.mark == "bad" else 0
 
 
 def check_calibration(

@@ -99,8 +99,10 @@ class Output:
             self._print(f"and {len(every) - 20} more: see --verbose", style="yellow")
 
     def failures(self, failures: Mapping[str, str], what: str = "failed") -> None:
-        """Report pairs that were lost, with the reason."""
+        """Report pairs that were lost, with the reason; `what` "": --json alone, a verdict says it."""
         self._failures |= failures
+        if not what:
+            return
         parts = {name: reason.partition("\n") for name, reason in failures.items()}
         for name, (reason, _, _) in parts.items():
             self._print(f"{what}: {name}: {reason}", style="red")

@@ -11,14 +11,15 @@ from pathlib import Path
 import numpy as np
 
 from bodyscan.calibration.camera import MIN_CLUSTERS
+from bodyscan.registration.calibration_verdict import LIMITS, figures_of, grade_calibration
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.storage import FILE_NAME, calibration_id, load_calibration
 from bodyscan.report import calibration_charts as draw
 from bodyscan.report import charts
 from bodyscan.report.calibration_charts import rig_model
-from bodyscan.report.calibration_verdict import PAIR_COLUMNS, figures_of, grade_calibration
 from bodyscan.report.page import (
     Block,
+    Column,
     Lines,
     Page,
     Picture,
@@ -28,6 +29,31 @@ from bodyscan.report.page import (
     make_sections,
 )
 from bodyscan.report.sigma_map import draw_sigma_map, why_no_sigma
+
+TITLES = {
+    "corners_rms_px": ("corners", "px RMS", "distance of corners from where camera and pose put them."),
+    "poses": ("poses", "", "views of a board that were used."),
+    "covered_percent": ("covered", "% of picture",
+                        "by the boards' corners; the lens is extrapolated beyond."),
+    "sheets_rms_mm": ("sheets", "mm RMS", "distance of stripe boundaries on boards from their sheet."),
+    "held_out_mm": ("held out", "mm mean", "distance of points from boards that the light was not "
+                    "fitted to; outliers capped."),
+    "stripe_shots": ("striped", "", "boards on which stripes were decoded."),
+    "stripes_percent": ("stripes", "% known", "boundaries between stripes that have a sheet, of those "
+                        "projected; the others fell beyond the boards."),
+    "sigma_mm": ("sigma", "mm", "of the camera's position in the rig frame, all axes together, from "
+                 "the covariance of the joint solve."),
+}  # fmt: skip
+"""Heading, unit and meaning of each figure that has a limit."""
+PAIR_COLUMNS = (
+    Column("pair"),
+    *(
+        Column(*TITLES[figure], limit.value, limit.at_least, digits=0 if limit.at_least else 3)
+        for figure, limit in LIMITS.items()
+    ),
+    Column("light", "", "model of the light sheets, chosen by held-out boards."),
+    Column("lens", "", "chosen by held-out boards, or named in the rig file; see below."),
+)
 
 
 def calibration_page(folder: Path) -> Page:

@@ -14,11 +14,11 @@ from bodyscan.calibration.pair import PairCalibration, PairQuality
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance
+from bodyscan.registration.calibration_verdict import grade_calibration
 from bodyscan.registration.rig_calibration import ObservedCorners, RigCalibration
 from bodyscan.registration.storage import load_calibration, save_calibration
 from bodyscan.report.calibration_charts import shared_boards
 from bodyscan.report.calibration_page import calibration_page
-from bodyscan.report.calibration_verdict import grade_calibration
 from bodyscan.report.page import render
 from bodyscan.verdict import Verdict
 
@@ -71,7 +71,7 @@ def test_what_exceeds_a_limit_is_named_with_pair_value_and_limit(
 ) -> None:
     assert grade_calibration(calibration) == Verdict("good")
     verdict = grade_calibration(replace(calibration, failed={"c9": "saw nothing"}))
-    assert verdict == Verdict("recalibrate", ("recalibrate: pair c9 failed: saw nothing",))
+    assert verdict == Verdict("usable", ("pair c9 failed: saw nothing",))
     name = min(calibration.pairs)
     verdict = grade_calibration(worse(calibration, name, corners_rms_px=0.4))
     assert verdict.grade == "usable"
@@ -114,7 +114,7 @@ def test_everything_is_said_and_read_back_from_disk(
         assert np.array_equal(stored.observed[name].target, seen.target)
     text = render(calibration_page(tmp_path))
     assert text == render(calibration_page(tmp_path))
-    for part in ("Verdict: recalibrate", "c9: saw nothing", "<li>n1</li>", "<li>a1</li>"):
+    for part in ("Verdict: usable", "c9: saw nothing", "<li>n1</li>", "<li>a1</li>"):
         assert part in text
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from ring import board_poses, ring_of_cameras
+from small_workspace import run
 
 from bodyscan.arrays import Array
 from bodyscan.boards.board_layout import corner_points
@@ -142,3 +144,16 @@ def test_whatever_lies_there_is_read_or_refused(text: str) -> None:
         except BodyscanError:
             return
         assert all(len(corner) == 2 for corners in found.values() for corner in corners)
+
+
+@pytest.mark.parametrize(("noise_px", "grade"), [(0.03, "usable"), (2.0, "recalibrate")])
+def test_a_calibration_ends_in_a_verdict_that_the_exit_code_repeats(
+    tmp_path: Path, noise_px: float, grade: str
+) -> None:
+    write_corners(tmp_path / "corners.vnl", as_listed(seen_corners(noise_px)))
+    done = run("calibrate-rig", rig_file(tmp_path), "--json")
+    told = json.loads(done.stdout)
+    assert told["verdict"]["grade"] == grade, told["verdict"]
+    assert done.exit_code == told["exit_code"] == (1 if grade == "recalibrate" else 0)
+    said = "\n".join(told["verdict"]["reasons"])
+    assert ("px RMS (at most 0.3 is good)" in said) == (noise_px > 1.0)

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from bodyscan.report.calibration_verdict import PairFigures
+from bodyscan.registration.calibration_verdict import PairFigures
 
 AT_THE_LIMITS = PairFigures("p", 0.3, 6, 40.0, 0.3, 0.5, 4, 50.0, 0.5)
 NOTHING_KNOWN = PairFigures("p", None, None, None, None, None, None, None, None)
@@ -41,11 +41,12 @@ def test_a_limit_that_is_not_kept_is_told_with_how_far_it_is_missed(
 ) -> None:
     for others in (AT_THE_LIMITS, NOTHING_KNOWN):
         changed: dict[str, Any] = {name: value}
-        ((missed_by, said),) = replace(others, **changed).beyond()
+        ((missed_by, error, said),) = replace(others, **changed).beyond()
         assert missed_by == pytest.approx(times)
         assert said == words
+        assert error == ("at most" in words)
 
 
 def test_of_nothing_at_all_a_limit_is_missed_without_end() -> None:
-    ((times, _),) = replace(AT_THE_LIMITS, stripe_shots=0).beyond()
+    ((times, _, _),) = replace(AT_THE_LIMITS, stripe_shots=0).beyond()
     assert times > 1e6

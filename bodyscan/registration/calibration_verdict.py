@@ -1,0 +1,125 @@
+"""What makes a calibration good, usable, or to be repeated."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from bodyscan.calibration.board_views import covered_share
+from bodyscan.geometry.uncertainty import position_sigma
+from bodyscan.registration.rig_calibration import RigCalibration, nominal_size
+from bodyscan.verdict import Grade, Verdict
+
+
+@dataclass(frozen=True)
+class Limit:
+    """How large, or how small, a figure of a good pair may be.
+
+    reason: what a verdict says of a figure beyond it.
+    at_least: it bounds from below how much was seen; otherwise from above how large an error is.
+    """
+
+    value: float
+    reason: str
+    at_least: bool = False
+
+
+LIMITS = {
+    # Corners are found to less than a tenth of a pixel in sharp, well-lit images.
+    "corners_rms_px": Limit(0.3, "corner residuals are {:.3g} px RMS"),
+    "poses": Limit(6, "was calibrated from {:.3g} board poses", at_least=True),
+    "covered_percent": Limit(40.0, "boards covered {:.3g} % of its picture", at_least=True),
+    # A scan's overlaps are doubted from 0.4 mm on (fusion/verdict/overlaps.py).
+    "sheets_rms_mm": Limit(0.3, "light sheets have residuals of {:.3g} mm RMS"),
+    "held_out_mm": Limit(0.5, "held-out boards are missed by {:.3g} mm"),
+    "stripe_shots": Limit(4, "stripes were decoded on {:.3g} boards", at_least=True),
+    "stripes_percent": Limit(50.0, "has planes for {:.3g} % of its stripes", at_least=True),
+    "sigma_mm": Limit(0.5, "its position has a sigma of {:.3g} mm"),
+}
+"""The limits of a pair's figures, by the names that these have in `PairFigures`."""
+
+
+@dataclass(frozen=True)
+class PairFigures:
+    """The figures by which a calibrated pair is judged; None if not applicable or not stored."""
+
+    name: str
+    corners_rms_px: float | None
+    poses: int | None
+    covered_percent: float | None
+    sheets_rms_mm: float | None
+    held_out_mm: float | None
+    stripe_shots: int | None
+    stripes_percent: float | None
+    sigma_mm: float | None
+
+    def beyond(self) -> Iterator[tuple[float, bool, str]]:
+        """Yield each limit that is exceeded: by what factor, whether by an error, and in words."""
+        for figure, limit in LIMITS.items():
+            value = getattr(self, figure)
+            if value is None or (value >= limit.value if limit.at_least else value <= limit.value):
+                continue
+            times = limit.value / max(value, 1e-9) if limit.at_least else value / limit.value
+            side = "at least" if limit.at_least else "at most"
+            sentence = f"{limit.reason.format(value)} ({side} {limit.value:g} is good)"
+            yield times, not limit.at_least, sentence
+
+
+def figures_of(calibration: RigCalibration) -> list[PairFigures]:
+    """Collect the figures of every calibrated pair, in the order of the rig."""
+    names = [pair.name for pair in calibration.rig.pairs if pair.name in calibration.pairs]
+    return [_figures(calibration, name) for name in names]
+
+
+def grade_calibration(calibration: RigCalibration) -> Verdict:
+    """Grade a calibration: recalibrate if an error of a pair is beyond twice its limit.
+
+    Pairs that failed cost a scan what they alone would have measured, and boards that covered little
+    leave the rest of a picture to extrapolation: such a rig is usable, where it measures.
+    """
+    findings = [(np.inf, f"pair {name} failed: {why}") for name, why in calibration.failed.items()]
+    grade: Grade = "good"
+    for pair in figures_of(calibration):
+        for times, error, words in pair.beyond():
+            far = error and times > 2.0
+            grade = "recalibrate" if far else grade
+            findings.append((times, f"{'recalibrate: ' if far else ''}pair {pair.name}: {words}"))
+    size = nominal_size(calibration.rig, calibration.rig_from_camera)
+    if size and size.mark != "good":  # one in use is reported; a new one is not made
+        findings.append((1.0, f"{size.words}: {size.remedy}"))
+    # What forbids its use comes first.
+    findings.sort(key=lambda finding: (not finding[1].startswith("recalibrate"), -finding[0]))
+    unjudged = [
+        f"pair {name}: imported from {pair.quality.imported}, its accuracy is not known: check it with "
+        "a board (check-calibration), or state it (import --sigma-px)"
+        for name, pair in calibration.pairs.items()
+        if pair.quality.unjudged
+    ]
+    if grade != "recalibrate":
+        grade = "not judged" if unjudged else "usable" if findings else "good"
+    return Verdict(grade, (*(words for _, words in findings), *unjudged))
+
+
+def _figures(calibration: RigCalibration, name: str) -> PairFigures:
+    pair = calibration.pairs[name]
+    quality, camera, seen = pair.quality, pair.camera, calibration.observed.get(name)
+    position = calibration.rig_from_camera[name].translation
+    striped, ours = pair.sheets is not None, not quality.imported
+    sigma = position_sigma(calibration.covariance, name, position)
+    share = None
+    if seen is not None:
+        views = [seen.pixels[seen.target == k].astype(float) for k in np.unique(seen.target)]
+        share = 100.0 * covered_share(views, camera.width, camera.height)
+    return PairFigures(
+        name,
+        quality.corners_rms_px,
+        quality.poses if ours else None,
+        share,
+        quality.planes_rms_mm,
+        next((tried.mean_mm for tried in quality.held_out if tried.chosen), None),
+        quality.stripe_shots if striped and ours else None,
+        100.0 * quality.stripes_calibrated / max(quality.stripes_projected, 1) if striped else None,
+        None if quality.unjudged else float(np.linalg.norm(sigma)),
+    )
