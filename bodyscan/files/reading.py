@@ -13,6 +13,7 @@ import math
 import os
 import stat
 import struct
+import tokenize
 import zipfile
 import zlib
 from pathlib import Path
@@ -91,7 +92,8 @@ def read_npz(path: Path, max_bytes: int = 1 << 28) -> dict[str, Any]:
                     for entry in entries
                 }
         except (
-            zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, OverflowError
+            zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, OverflowError,
+            tokenize.TokenError, SyntaxError, TypeError, KeyError, AttributeError, MemoryError,
         ) as error:  # fmt: skip
             raise ValueError(f"is damaged ({error})") from error
         except (NotImplementedError, RuntimeError) as error:  # compressed otherwise, encrypted

@@ -26,7 +26,7 @@ _Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 class _PlainLoader(_Loader):  # type: ignore[misc]  # the stubs know no CSafeLoader
-    """Resolves nothing by itself: `_parse_scalar` decides what a plain scalar means."""
+    """Resolves nothing by itself: `parse_scalar` decides what a plain scalar means."""
 
     yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012 (PyYAML's own name and type)
 
@@ -105,17 +105,32 @@ def read_yaml(path: Path) -> Document:
         before = content[: error.start].split(b"\n")
         place = Place(len(before), len(before[-1]) + 1)
         raise _error(place, "is not UTF-8 text: save it as UTF-8") from None
+    return parse_yaml(text)
+
+
+def parse_yaml(text: str, max_nodes: int = MAX_NODES, *, foreign: bool = False) -> Document:
+    """Parse one YAML document.
+
+    max_nodes: how many values it may hold.
+    foreign: as other programs write it: OpenCV's head `%YAML:1.0` and tags are passed over, and of
+        several documents the first is taken.
+
+    Raises YamlError if it is unreadable.
+    """
+    if foreign:
+        text = re.sub(r"\A\s*%YAML[^\n]*", lambda head: "\n" * head[0].count("\n"), text)
     try:
-        _refuse_deep(text)
-        node = yaml.compose(text, Loader=_PlainLoader)
+        _refuse_deep(text, only_first=foreign)
+        compose = yaml.compose_all if foreign else lambda *args: iter([yaml.compose(*args)])
+        node = next(iter(compose(text, _PlainLoader)), None)
     except yaml.MarkedYAMLError as error:
         raise _error(_place(error.problem_mark or error.context_mark), _describe(error)) from None
     except yaml.YAMLError as error:
         raise _error(Place(1, 1), f"is not YAML: {error}".splitlines()[0]) from None
     document = Document()
     if node is not None:
-        _refuse_many(node, {})
-        document.data = _Builder(document).build(node, (), 0)
+        _refuse_many(node, {}, max_nodes)
+        document.data = _Builder(document, max_nodes, foreign).build(node, (), 0)
     return document
 
 
@@ -137,7 +152,7 @@ class _Dumper(yaml.SafeDumper):
 
 
 def _represent_text(dumper: _Dumper, text: str) -> yaml.Node:
-    style = None if _parse_scalar(text) == text and text.isprintable() else '"'
+    style = None if parse_scalar(text) == text and text.isprintable() else '"'
     return dumper.represent_scalar("tag:yaml.org,2002:str", text, style=style)
 
 
@@ -147,26 +162,28 @@ _Dumper.add_representer(str, _represent_text)
 class _Builder:
     """Turns nodes into plain data and records their places."""
 
-    def __init__(self, document: Document) -> None:
-        self.document, self.nodes = document, 0
+    def __init__(self, document: Document, max_nodes: int, foreign: bool) -> None:
+        self.document, self.max_nodes, self.foreign, self.nodes = document, max_nodes, foreign, 0
 
     def build(self, node: yaml.Node, where: Where, depth: int) -> Any:
         self.nodes += 1
         place = _place(node.start_mark)
-        if self.nodes > MAX_NODES:
-            raise _too_many(place)
+        if self.nodes > self.max_nodes:
+            raise _too_many(place, self.max_nodes)
         if depth > MAX_DEPTH:
             raise _error(place, f"is nested more than {MAX_DEPTH} deep")
         self.document.values[where] = place
         kinds = {"str": yaml.ScalarNode, "seq": yaml.SequenceNode, "map": yaml.MappingNode}
-        if not isinstance(node, kinds.get(node.tag.removeprefix("tag:yaml.org,2002:"), ())):
+        if not self.foreign and not isinstance(
+            node, kinds.get(node.tag.removeprefix("tag:yaml.org,2002:"), ())
+        ):
             self._problem(place, where, f"has the tag {node.tag!r}: write the value without a tag")
             return None
         if isinstance(node, yaml.ScalarNode):
             if node.style:
                 return node.value
             self.document.raw[where] = node.value
-            return _parse_scalar(node.value)
+            return parse_scalar(node.value)
         if isinstance(node, yaml.MappingNode):
             return self._mapping(node, where, depth)
         items = enumerate(node.value)
@@ -193,7 +210,7 @@ class _Builder:
         self, node: yaml.MappingNode, where: Where, depth: int
     ) -> dict[str, tuple[yaml.Node, yaml.Node]]:
         """Keys and values of a mapping, after those of mappings that it merges."""
-        if depth > MAX_DEPTH or self.nodes > MAX_NODES:
+        if depth > MAX_DEPTH or self.nodes > self.max_nodes:
             raise _error(_place(node.start_mark), "merges (<<) too much")
         own: dict[str, tuple[yaml.Node, yaml.Node]] = {
             k.value: (k, v) for k, v in node.value if isinstance(k, yaml.ScalarNode)
@@ -214,8 +231,8 @@ class _Builder:
         self.document.problems.append(YamlProblem(place, dotted_path(where), text))
 
 
-def _parse_scalar(text: str) -> Any:
-    """The value of a plain scalar by the core schema of YAML 1.2 (section 10.3.2)."""
+def parse_scalar(text: str) -> Any:
+    """The value of a plain scalar by the core schema of YAML 1.2 (section 10.3.2), or OpenCV's NaN."""
     if re.fullmatch(r"~|null|Null|NULL|", text):
         return None
     if re.fullmatch(r"true|True|TRUE|false|False|FALSE", text):
@@ -226,12 +243,12 @@ def _parse_scalar(text: str) -> Any:
         return int(text[2:], 8 if text[1] == "o" else 16)
     if re.fullmatch(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?", text):
         return float(text)
-    if re.fullmatch(r"[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)", text):
+    if re.fullmatch(r"[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN|Nan)", text):
         return float(text.replace(".", "").lower())
     return text
 
 
-def _refuse_deep(text: str) -> None:
+def _refuse_deep(text: str, *, only_first: bool) -> None:
     """Check the depth by events: composing is recursive, and a deep file would exhaust the stack."""
     depth = 0
     for event in yaml.parse(text, Loader=_PlainLoader):
@@ -239,9 +256,11 @@ def _refuse_deep(text: str) -> None:
         depth -= isinstance(event, yaml.CollectionEndEvent)
         if depth > MAX_DEPTH:
             raise _error(_place(event.start_mark), f"is nested more than {MAX_DEPTH} deep")
+        if only_first and isinstance(event, yaml.DocumentEndEvent):
+            return
 
 
-def _refuse_many(node: yaml.Node, sizes: dict[int, int]) -> int:
+def _refuse_many(node: yaml.Node, sizes: dict[int, int], most: int) -> int:
     """Count the values of a node once aliases are followed, and raise if there are too many.
 
     Each node is counted once: building an alias bomb until it is too large takes half a second.
@@ -254,14 +273,14 @@ def _refuse_many(node: yaml.Node, sizes: dict[int, int]) -> int:
         parts = [value for key, value in node.value if key.value != "<<"]
     elif isinstance(node, yaml.SequenceNode):
         parts = node.value
-    sizes[id(node)] += sum(_refuse_many(part, sizes) for part in parts)
-    if sizes[id(node)] > MAX_NODES:
-        raise _too_many(_place(node.start_mark))
+    sizes[id(node)] += sum(_refuse_many(part, sizes, most) for part in parts)
+    if sizes[id(node)] > most:
+        raise _too_many(_place(node.start_mark), most)
     return sizes[id(node)]
 
 
-def _too_many(place: Place) -> YamlError:
-    return _error(place, f"has more than {MAX_NODES:,} values once aliases are followed")
+def _too_many(place: Place, most: int) -> YamlError:
+    return _error(place, f"has more than {most:,} values once aliases are followed")
 
 
 def _place(mark: Any) -> Place:

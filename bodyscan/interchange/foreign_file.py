@@ -2,26 +2,43 @@
 
 from __future__ import annotations
 
+import json
 import re
 import tomllib
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 
 from bodyscan.arrays import Array
 from bodyscan.errors import CalibrationFileError
 from bodyscan.files.reading import read_regular
+from bodyscan.files.yaml_file import Place, YamlError, parse_scalar, parse_yaml
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses import lens_from_opencv
+from bodyscan.geometry.lenses.fisheye import Fisheye
 from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.interchange.found_camera import FoundCamera
-from bodyscan.interchange.rig_format import opencv_coefficients
+from bodyscan.interchange.rig_format import opencv_lens
 
 MAX_BYTES = 100_000_000  # mrcal's files hold all corners of a calibration, some megabytes
+MAX_VALUES = 1_000_000  # OpenCV's as well
+
+LENS_KEYS = ("distortion_model", "camera_model", "lens_model", "projection_model", "camera_type")
+LENS_WORDS = {
+    "fisheye": r"(opencv)?fisheye|(pinhole)?equi(distant)?|kannalabrandt[48]?|kb4",
+    "polynomial": r"plumbbob|rationalpolynomial|(pinhole)?radtan|radialtangential|brown(conrady)?"
+    r"|(full)?opencv|radial|rational|pinhole|perspective|none",
+    "other": r"ds|doublesphere|e?ucm|omni(directional)?|mei|fov|atan|scaramuzza|ocam|division|ftheta"
+    r"|thinprism(fisheye)?|fisheye624|cahvore?|stereographic|equirectangular",
+}
+"""In small letters and digits alone. A camera's product name may stand under all keys but the first:
+there only `other` is refused."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +69,7 @@ class ForeignFile:
 
         name: such as `cam0`, or `cam0.intrinsics` for the first `intrinsics` after `cam0`.
         """
-        after, _, word = name.rpartition(".")
+        after, _, word = name.replace("/", ".").rpartition(".")
         first = self._find(name, 0)
         outer = self._find(after, 0) if first is None and after else 0
         found = self._find(word, outer) if first is None and outer is not None else first
@@ -85,7 +102,7 @@ class ForeignFile:
         """`value` as a flat array of one of these lengths."""
         try:
             array: Array = np.asarray(value, np.float64).ravel()
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             raise self.error(f"holds what is not a number ({value!r:.60})", name) from None
         if len(array) not in counts:
             wanted = " or ".join(map(str, counts))
@@ -111,15 +128,39 @@ class ForeignFile:
         fx, fy, cx, cy = self.numbers(value, name, 4)
         return self.matrix([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0], name)
 
-    def lens(self, value: Any, name: str) -> Lens:
-        """The lens with OpenCV's coefficients in OpenCV's order, 0 to 14 of them."""
+    def lens(self, value: Any, name: str, around: Mapping[str, Any] | None = None) -> Lens:
+        """The lens with OpenCV's coefficients in OpenCV's order, 0 to 14 of them.
+
+        around: what stands around them, whose words decide whether it is OpenCV's fisheye.
+        """
         given = self.numbers(value, name, 0, 1, 2, 3, 4, 5, 8, 12, 14)
+        if self._is_fisheye(around or {}, name.rpartition(".")[0]):
+            if np.any(given[4:]):
+                raise self.error(f"holds {len(given)} numbers, a fisheye has 4", name)
+            return Fisheye(*given[:4].tolist())
         coefficients = np.zeros(max(len(given), 5))
         coefficients[: len(given)] = given
         try:
             return lens_from_opencv(coefficients)
         except ValueError as error:
             raise self.error(str(error), name, "calibrate it with a supported lens") from None
+
+    def _is_fisheye(self, around: Mapping[str, Any], owner: str) -> bool:
+        found = False
+        for key, value in around.items():
+            word = re.sub(r"[^a-z0-9]", "", str(value).lower())
+            if key.lower() in ("fisheye", "fisheye_model", "is_fisheye"):
+                found |= word in ("true", "1", "yes")
+            elif key.lower() in LENS_KEYS and isinstance(value, str) and word:
+                kinds = [kind for kind, words in LENS_WORDS.items() if re.fullmatch(words, word)]
+                found |= "fisheye" in kinds
+                if "other" in kinds or (not kinds and key.lower() == LENS_KEYS[0]):
+                    raise self.error(
+                        f"{value!r} is a lens that is not supported",
+                        f"{owner}.{key}".removeprefix("."),
+                        "calibrate it with plumb_bob (radtan), rational_polynomial or equidistant",
+                    )
+        return found
 
     def size(self, value: Any, name: str) -> tuple[int, int]:
         """Width and height of an image, px."""
@@ -152,6 +193,47 @@ class ForeignFile:
         return RigidTransform.from_matrix(np.column_stack([matrix, shift]))
 
 
+def read_document(file: ForeignFile) -> Any:
+    """Parse YAML in any program's dialect, JSON, or the XML of OpenCV's FileStorage to plain data.
+
+    Raises CalibrationFileError, with the line, if it is none of them.
+    """
+    text = file.text.lstrip()
+    try:
+        if text.startswith("<"):
+            return _plain_xml(ElementTree.fromstring(text))
+        if text.startswith("{"):
+            with suppress(ValueError):
+                return json.loads(text)
+        document = parse_yaml(file.text, MAX_VALUES, foreign=True)
+    except YamlError as error:
+        place, what = error.problem.place, error.problem.text
+    except ElementTree.ParseError as error:
+        place, what = Place(error.position[0], error.position[1] + 1), f"is not XML: {error}"
+    except RecursionError:
+        raise file.error("is nested too deep") from None
+    else:
+        if not document.problems:
+            return document.data
+        first = document.problems[0]
+        place, what = first.place, f"{first.path}: {first.text}"
+    where, remedy = f"{file.path}:{place.line}", "give the file as that program wrote it"
+    raise CalibrationFileError(what, where=where, remedy=remedy)
+
+
+def _plain_xml(element: ElementTree.Element) -> Any:
+    parts = list(element)
+    if parts and all(part.tag == "_" for part in parts):
+        return [_plain_xml(part) for part in parts]
+    if parts:
+        return {part.tag: _plain_xml(part) for part in parts}
+    text = (element.text or "").strip()
+    values = [parse_scalar(word) for word in text.split()]
+    if not all(isinstance(value, int | float) for value in values):
+        return text.strip('"')
+    return values[0] if len(values) == 1 else values
+
+
 # What the TOML of caliscope and of aniposelib share: a table of OpenCV's numbers per camera.
 
 TOML_NOTE = (
@@ -165,23 +247,20 @@ def read_toml(file: ForeignFile) -> dict[str, Any]:
     """Parse a TOML file. Raises CalibrationFileError, with the line, if it is not TOML."""
     try:
         return tomllib.loads(file.text)
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:  # TOMLDecodeError, a number of 5,000 digits
         raise file.error(f"is not TOML: {error}") from None
 
 
 def read_camera_table(file: ForeignFile, table: dict[str, Any], key: str) -> FoundCamera:
     """Read the camera in a table; key: of the table, as written in the file."""
     file.require(table, ("size", "matrix", "distortions"), key)
-    if table.get("fisheye", False):
-        what = "is OpenCV's fisheye lens, which is not supported"
-        raise file.error(what, f"{key}.fisheye", "calibrate it with an ordinary lens")
     pose = None
-    if "rotation" in table and "translation" in table:
+    if all(table.get(word, "null") != "null" for word in ("rotation", "translation")):
         names = f"{key}.rotation", f"{key}.translation"
         pose = file.pose(table["rotation"], table["translation"], *names)
     return FoundCamera(
         file.matrix(table["matrix"], f"{key}.matrix"),
-        file.lens(table["distortions"], f"{key}.distortions"),
+        file.lens(table["distortions"], f"{key}.distortions", table),
         file.size(table["size"], f"{key}.size"),
         pose,
         file.where(key),
@@ -191,16 +270,18 @@ def read_camera_table(file: ForeignFile, table: dict[str, Any], key: str) -> Fou
 def format_camera_table(
     name: str, camera: Camera, camera_from_rig: RigidTransform, mm_a_unit: float
 ) -> str:
-    """Format the lines for size, matrix, distortions, rotation and translation.
+    """Format the lines for size, fisheye, matrix, distortions, rotation and translation.
 
     Raises BadInput for a lens that OpenCV does not have.
     """
+    is_fisheye, coefficients = opencv_lens(name, camera)
     return "".join(
-        f"{word} = {value!r}\n"
+        f"{word} = {json.dumps(value)}\n"
         for word, value in (
             ("size", [camera.width, camera.height]),
+            ("fisheye", is_fisheye),
             ("matrix", camera.matrix.tolist()),
-            ("distortions", opencv_coefficients(name, camera).tolist()),
+            ("distortions", coefficients.tolist()),
             ("rotation", camera_from_rig.rotation_vector.tolist()),
             ("translation", (camera_from_rig.translation / mm_a_unit).tolist()),
         )

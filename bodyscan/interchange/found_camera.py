@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -85,12 +85,50 @@ class FoundCamera:
         return camera
 
 
-def find_camera(cameras: Mapping[str, FoundCamera], name: str, where: str) -> FoundCamera:
-    """Find a camera by name. Raises CalibrationFileError, which lists all, if there is none."""
-    if name not in cameras:
-        raise CalibrationFileError(
-            f"has no camera {name!r}{did_you_mean(name, cameras)}",
-            where=where,
-            remedy=f"it has {', '.join(cameras) or 'none'}; say which is meant in the rig file",
-        )
-    return cameras[name]
+@dataclass(frozen=True, eq=False)
+class FoundCameras(Mapping[str, FoundCamera]):
+    """A file's cameras by name, each checked only when it is taken, so that one that cannot be used
+    hinders no other.
+
+    readers: what reads each; raises CalibrationFileError, which `cameras[name]` passes on.
+    """
+
+    readers: Mapping[str, Callable[[], FoundCamera]]
+
+    def __getitem__(self, name: str) -> FoundCamera:
+        return self.readers[name]()
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.readers
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.readers)
+
+    def __len__(self) -> int:
+        return len(self.readers)
+
+
+def find_camera(cameras: FoundCameras, name: str, where: str) -> FoundCamera:
+    """Find a camera by name.
+
+    Raises CalibrationFileError if it cannot be used, or is not there: then all that are there are
+    listed, those that cannot be used with the reasons.
+    """
+    if name in cameras:
+        return cameras[name]
+    usable, reasons = [], []
+    for other in cameras:
+        try:
+            cameras[other]
+            usable.append(other)
+        except CalibrationFileError as error:
+            reasons.append(f"{other} cannot be used ({error.where}: {error.what})")
+    listed = [
+        f"it has {', '.join(usable) or 'none that can be used'}",
+        *reasons[:8],
+    ]  # more cannot be read at a glance
+    raise CalibrationFileError(
+        f"has no camera {name!r}{did_you_mean(name, cameras)}",
+        where=where,
+        remedy="; ".join([*listed, "say which is meant in the rig file"]),
+    )

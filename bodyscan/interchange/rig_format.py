@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from bodyscan.arrays import Array
     from bodyscan.geometry.camera import Camera
     from bodyscan.geometry.transforms import RigidTransform
-    from bodyscan.interchange.found_camera import FoundCamera
+    from bodyscan.interchange.found_camera import FoundCamera, FoundCameras
 
 RigCameras: TypeAlias = "Mapping[str, tuple[Camera, RigidTransform]]"
 """Camera and `rig_from_camera` by the pair's name; projectors, as cameras, by `projector_name`."""
@@ -33,7 +33,7 @@ class RigFormat:
     unit: of lengths in such files; None if the format leaves it open.
     write: writes cameras to that path, which it returns; raises BadInput for a lens that the format
         cannot express.
-    read: returns every camera of such a file or folder, by name.
+    read: returns every camera of such a file or folder, by name, each checked when it is taken.
     read_nodes: reads one camera of a file whose nodes may have any name; None if the format fixes
         the names. Both raise CalibrationFileError.
     """
@@ -41,7 +41,7 @@ class RigFormat:
     path: str
     unit: Unit | None
     write: Callable[[RigCameras, Path], Path]
-    read: Callable[[Path], dict[str, FoundCamera]]
+    read: Callable[[Path], FoundCameras]
     read_nodes: Callable[[Path, Nodes], FoundCamera] | None = None
 
 
@@ -59,6 +59,16 @@ def opencv_coefficients(name: str, camera: Camera) -> Array:
         return camera.lens.opencv()
     except BadInput as error:
         raise BadInput(error.what, where=f"pair {name}", remedy=error.remedy) from None
+
+
+def opencv_lens(name: str, camera: Camera) -> tuple[bool, Array]:
+    """Return whether the lens of a pair's camera is OpenCV's fisheye, and OpenCV's coefficients of it.
+
+    Raises BadInput, which names the pair, for a lens that OpenCV does not have.
+    """
+    if camera.lens.kind == "fisheye":
+        return True, camera.lens.coefficients
+    return False, opencv_coefficients(name, camera)
 
 
 RIG_FORMATS: Registry[RigFormat] = Registry("bodyscan.interchange.formats", "a rig")

@@ -50,7 +50,7 @@ def import_rig(rig: Rig, folder: Path, sigma_px: float | None = None) -> RigCali
     failed: dict[str, BodyscanError] = {}
     for pair in rig.pairs:
         try:
-            known[pair.name] = _read(pair, folder, several=len(rig.pairs) > 1)
+            known[pair.name] = _read(pair, folder, posed=_needs_pose(rig, pair))
         except BodyscanError as error:
             failed[pair.name] = error
     if not known:
@@ -95,7 +95,18 @@ def find_known_errors(rig_file: Path) -> list[str]:
     return errors
 
 
-def _read(pair: Pair, folder: Path, *, several: bool) -> KnownPair:
+def _needs_pose(rig: Rig, pair: Pair) -> bool:
+    """Whether a pair's camera needs a pose: all but the only one whose nodes are named without it,
+    which is the world of the others."""
+    worlds = [
+        one.name
+        for one in rig.pairs
+        if one.known and one.known.camera.nodes and not one.known.camera.rotation
+    ]
+    return len(rig.pairs) > 1 and worlds != [pair.name]
+
+
+def _read(pair: Pair, folder: Path, *, posed: bool) -> KnownPair:
     if pair.known is None:
         raise CalibrationFileError(
             "the rig file does not say where this pair is calibrated",
@@ -109,9 +120,9 @@ def _read(pair: Pair, folder: Path, *, several: bool) -> KnownPair:
             remedy="add `projector` to its `known`; calibrate-rig measures one that is not known",
         )
     known = read_known_pair(pair, folder)
-    if several and known.camera_from_world is None:
+    if posed and known.camera_from_world is None:
         raise CalibrationFileError(
-            "does not say where the camera stands, which a rig of several pairs needs",
+            "does not say where the camera stands, which all but one of a rig need",
             where=f"pair {pair.name}: {known.source}",
             remedy="give rotation and translation below `known.camera` in the rig file, or another "
             "format",

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 from bodyscan.files.atomic import atomic_replacement, json_text, write_bytes, write_json, write_npz
 from bodyscan.files.hashing import content_hash, file_hash, file_hashes, list_files
+from bodyscan.files.reading import read_npz
 
 
 def test_a_failed_write_leaves_the_old_file_and_no_litter(tmp_path: Path) -> None:
@@ -87,6 +88,24 @@ def test_npz_is_exact_and_its_bytes_do_not_depend_on_time_or_order(tmp_path: Pat
         assert back["points"].dtype == np.float32
         assert back["names"].tolist() == names.tolist()
         assert np.isnan(back["path"])
+
+
+def test_an_npz_is_read_or_refused_whatever_its_headers_say(tmp_path: Path) -> None:
+    header = "{'descr': '<f8', 'fortran_order': False, 'shape': (1,), }"
+    random = np.random.default_rng(3)
+    junk = ["(", "'", "{", "[", "}", "\n", "None", "''", "-1,", "9" * 30, "'O'", "\x00"]
+    refused = 0
+    for at in range(len(header)):
+        for text in random.choice(junk, 3):
+            spoilt = header[:at] + text + header[at + int(random.integers(0, 9)) :]
+            with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+                magic = b"\x93NUMPY\x01\x00" + len(spoilt).to_bytes(2, "little")
+                archive.writestr("a.npy", magic + spoilt.encode("latin1") + b"\x00" * 8)
+            try:
+                read_npz(tmp_path / "a.npz")
+            except ValueError:
+                refused += 1
+    assert refused > 2 * len(header)
 
 
 def test_npz_never_pickles(tmp_path: Path) -> None:

@@ -24,8 +24,10 @@ from bodyscan.arrays import Array
 from bodyscan.errors import BadInput, CalibrationFileError
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses import lens_from_opencv
+from bodyscan.geometry.lenses.fisheye import Fisheye
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.interchange.formats.opencv import read_nodes
+from bodyscan.interchange.found_camera import find_camera
 from bodyscan.interchange.rig_format import MILLIMETRES, RIG_FORMATS, RigCameras
 
 WORLDS = {"opencv", "colmap", "mrcal", "aniposelib", "caliscope"}  # Kalibr's is its first camera
@@ -59,22 +61,23 @@ def test_the_same_cameras_are_read_back(tmp_path: Path, kind: str) -> None:
         np.testing.assert_allclose(read.matrix, world.matrix, rtol=0, atol=1e-8)
 
 
-COEFFICIENTS = {
-    "brown": np.array([-0.2, 0.1, 1e-3, -2e-3, 0.05]),
-    "rational": np.array([0.4, 0.2, 1e-3, -2e-3, 0.05, 0.5, 0.3, 0.02]),
+LENSES = {
+    "brown": lens_from_opencv(np.array([-0.2, 0.1, 1e-3, -2e-3, 0.05])),
+    "rational": lens_from_opencv(np.array([0.4, 0.2, 1e-3, -2e-3, 0.05, 0.5, 0.3, 0.02])),
+    "fisheye": Fisheye(0.1, -0.02, 0.01, -0.003),
 }
 
 
-@pytest.mark.parametrize("lens", COEFFICIENTS)
+@pytest.mark.parametrize("lens", LENSES)
 @pytest.mark.parametrize("kind", RIG_FORMATS.names())
 def test_every_lens_that_a_format_has_is_read_back(tmp_path: Path, kind: str, lens: str) -> None:
     form, cameras = RIG_FORMATS.find(kind), dict(ring())
     name = "p2-1"
-    own = replace(cameras[name][0], lens=lens_from_opencv(COEFFICIENTS[lens]))
+    own = replace(cameras[name][0], lens=LENSES[lens])
     assert own.lens.kind == lens
     cameras[name] = own, cameras[name][1]
-    if kind == "kalibr":
-        with pytest.raises(BadInput, match=f"pair {name}: Kalibr has no lens like '{lens}'"):
+    if kind == ("mrcal" if lens == "fisheye" else "kalibr"):
+        with pytest.raises(BadInput, match=f"pair {name}: .* no lens like '{lens}'"):
             form.write(cameras, tmp_path / form.path)
         assert not list(tmp_path.iterdir())
         return
@@ -244,7 +247,9 @@ def spoilt(kind: str, old: str, new: str) -> str:
 
 
 WRONG = [
-    ("kalibr", "radtan", "equidistant", r":12: cam1.distortion_model: 'equidistant' is a lens"),
+    ("kalibr", "radtan", "fov", r":12: cam1.distortion_model: 'fov' is a lens"),
+    ("kalibr", "1000.0, 1010.0", "9" * 400 + ", 1010.0", r":5: cam0.intrinsics: holds what is not a n"),
+    ("kalibr", "  note: no camera", "  note: a\n  note: b", r":9: right.note: is given twice"),
     ("kalibr", "pinhole", "ds", r":2: cam0.camera_model: 'ds' is a model that is not supported"),
     ("kalibr", "cam0", "camera0", r"it has no cam0"),
     ("kalibr", "[1.0, 0.0, 0.0, -0.2]", "[-1.0, 0.0, 0.0, -0.2]", r"T_cn_cnm1: is a reflection"),
@@ -259,9 +264,9 @@ WRONG = [
     ("mrcal", "[ 1280, 720,]", "[ 1280, 720", r":\d+: is not a cameramodel of mrcal's"),
     ("aniposelib", "-0.2, 0.05, 0.0, 0.0, 0.0", "-0.2, nan, 0, 0, 0", r":5: cam_0.distortions: .*f"),
     ("aniposelib", "size", "sizes", r":1: cam_0: has no size"),
-    ("aniposelib", "[metadata]", "fisheye = true\n[metadata]", r":9: cam_0.fisheye: is OpenCV's f"),
+    ("aniposelib", "0.0, 0.0, 0.0,]\nrot", "0, 0, 1]\nfisheye = true\nrot", r":5: .* a fisheye has 4"),
+    ("aniposelib", "[ -0.2,", "[" * 9999, r"is not TOML"),
     ("aniposelib", "0.05, 0.0", "0.05, 0, 0.0", r":5: cam_0.distortions: holds 6 numbers, not"),
-    ("caliscope", "rotation_count = 0", "rotation_count = 1", r":4: cameras.3.rotation_count: rotates"),
     ("caliscope", "[cameras.3]", "[camera.3]", r"holds no cameras"),
     ("caliscope", "1280, 720]", "1280, 720", r"is not TOML: .*line"),
     ("caliscope", "0.0, 0.0, 1.0", "0.0, 1.0, 0.0", r":6: cameras.3.matrix: is not a camera matrix"),
@@ -275,7 +280,7 @@ def test_what_is_wrong_is_named_with_its_line(
     path = tmp_path / WRITTEN_BY_OTHERS[kind][0]
     path.write_text(spoilt(kind, old, new))
     with pytest.raises(CalibrationFileError, match=said) as caught:
-        RIG_FORMATS.find(kind).read(path)
+        list(RIG_FORMATS.find(kind).read(path).values())
     assert str(path) in caught.value.where
     assert caught.value.remedy
 
@@ -370,6 +375,131 @@ def test_numbers_that_cannot_be_are_named(tmp_path: Path) -> None:
         read_nodes(tmp_path / "nowhere.yaml", NODES)
 
 
+ROS_CAMERA = """\
+image_width: 1280
+image_height: 720
+distortion_model: MODEL
+camera_matrix: {rows: 3, cols: 3, data: [1000.0, 0, 640, 0, 1010, 360, 0, 0, 1]}
+distortion_coefficients: {rows: 1, cols: 4, data: [-0.2, 0.05, 0.0, 0.0]}
+"""
+ROS_NODES = {"matrix": "camera_matrix", "distortion": "distortion_coefficients"}
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "lens"),
+    [
+        ("MODEL", "equidistant", Fisheye(-0.2, 0.05)),
+        ("MODEL", "plumb_bob", lens_from_opencv(np.array([-0.2, 0.05, 0, 0, 0]))),
+        ("distortion_model: MODEL", "fisheye_model: 1", Fisheye(-0.2, 0.05)),
+        (
+            "distortion_model: MODEL",
+            "camera_model: my-camera 7",
+            lens_from_opencv(np.array([-0.2, 0.05, 0, 0, 0])),
+        ),
+        ("MODEL", "thin_prism_fisheye", None),
+        ("distortion_model: MODEL", "camera_model: omni", None),
+    ],
+)
+def test_words_beside_coefficients_decide_the_lens(
+    tmp_path: Path, old: str, new: str, lens: object
+) -> None:
+    path = tmp_path / "ros.yaml"
+    path.write_text(ROS_CAMERA.replace(old, new))
+    if lens is None:
+        with pytest.raises(CalibrationFileError, match=r":3: \w+_model: '.*' is a lens"):
+            read_nodes(path, ROS_NODES)
+    else:
+        assert read_nodes(path, ROS_NODES).lens == lens
+
+
+@pytest.mark.parametrize(
+    "head", ["", "%YAML:1.0\n", "%YAML:1.0\n---\n", "---\n", "%YAML 1.2\n---\n"]
+)
+@pytest.mark.parametrize("tail", ["", "---\nother: [\n"])
+def test_every_dialect_of_yaml_is_read(tmp_path: Path, head: str, tail: str) -> None:
+    path = tmp_path / "any.yaml"
+    coefficients = "\n- -0.2\n- 0.05\n- 0.0\n- 0.0"
+    path.write_text(
+        head
+        + ROS_CAMERA.replace("MODEL", "plumb_bob")
+        + f"d:{coefficients}\nk: !!opencv-matrix\n   data: [ 1., 2. ]\n"
+        + tail
+    )
+    assert read_nodes(path, ROS_NODES | {"distortion": "d"}).lens.coefficients[0] == -0.2
+    _, text, camera = WRITTEN_BY_OTHERS["kalibr"]
+    path.write_text(
+        head + text.replace(" [-0.2, 0.05, 0.0, 0.0]", coefficients.replace("\n", "\n  ")) + tail
+    )
+    assert RIG_FORMATS.find("kalibr").read(path)[camera].lens.coefficients[0] == -0.2
+    path.write_text(head + "a: b\n  c: d\n" + tail)
+    with pytest.raises(
+        CalibrationFileError, match=rf"any.yaml:{head.count(chr(10)) + 2}: is not YAML"
+    ):
+        read_nodes(path, ROS_NODES)
+
+
+def test_what_json_cannot_hold_is_named_with_its_line(tmp_path: Path) -> None:
+    path = tmp_path / "any.json"
+    path.write_text(re.sub(r"-0\.2\d*", "NaN", storage("json"), count=1))
+    with pytest.raises(
+        CalibrationFileError, match=r"any.json:\d+: kc: holds a number that is not fin"
+    ):
+        read_nodes(path, NODES)
+    path.write_text('{"a": ' + "[" * 100_000)
+    with pytest.raises(CalibrationFileError, match="nested"):
+        read_nodes(path, NODES)
+
+
+def test_a_camera_that_nobody_asked_for_hinders_no_other(tmp_path: Path) -> None:
+    path = tmp_path / "camchain.yaml"
+    path.write_text(spoilt("kalibr", "radtan", "fov"))
+    cameras = RIG_FORMATS.find("kalibr").read(path)
+    assert find_camera(cameras, "cam0", str(path)).size == (1280, 720)
+    with pytest.raises(CalibrationFileError, match="'fov' is a lens"):
+        find_camera(cameras, "cam1", str(path))
+    with pytest.raises(CalibrationFileError, match="has no camera 'cam7'") as caught:
+        find_camera(cameras, "cam7", str(path))
+    assert "it has cam0; cam1 cannot be used" in caught.value.remedy
+    assert "camchain.yaml:12: cam1.distortion_model: 'fov' is a lens" in caught.value.remedy
+    (tmp_path / "left.cameramodel").write_text(WRITTEN_BY_OTHERS["mrcal"][1])
+    (tmp_path / "right.cameramodel").write_text(spoilt("mrcal", "OPENCV8", "SPLINED_STEREOGRAPHIC"))
+    assert RIG_FORMATS.find("mrcal").read(tmp_path)["left"].size == (1280, 720)
+    path.write_text("[cameras.0]\ncam_id = 0\nsize = [9, 9]\n" + WRITTEN_BY_OTHERS["caliscope"][1])
+    assert RIG_FORMATS.find("caliscope").read(path)["3"].size == (1280, 720)
+
+
+@pytest.mark.parametrize("words", [("T_cam_imu", "T_cam_imu"), ("T_imu_cam", "T_cam_imu")])
+def test_kalibr_cameras_are_placed_by_the_imu(tmp_path: Path, words: tuple[str, str]) -> None:
+    first = RigidTransform.from_rotation_vector(
+        np.array([0.1, 0.2, -0.3]), np.array([0.1, 0, 0.05])
+    )
+    second = RigidTransform.from_rotation_vector(np.array([0, -0.2, 0.4]), np.array([-0.2, 0.1, 0]))
+    text = WRITTEN_BY_OTHERS["kalibr"][1].split("  T_cn_cnm1")[0]
+    given = [first if words[0] == "T_cam_imu" else first.inverse(), second]
+    lines = [f"  {word}: {pose.matrix.tolist()}\n" for word, pose in zip(words, given, strict=True)]
+    path = tmp_path / "imucam.yaml"
+    path.write_text(text.replace("right:", f"{lines[0]}right:") + lines[1])
+    pose = RIG_FORMATS.find("kalibr").read(path)["cam1"].camera_from_world
+    assert pose is not None
+    np.testing.assert_allclose(pose.matrix, (second @ first.inverse()).matrix, rtol=0, atol=1e-12)
+
+
+def test_caliscope_turns_no_calibration_and_null_is_no_pose(tmp_path: Path) -> None:
+    path, caliscope = tmp_path / "camera_array.toml", RIG_FORMATS.find("caliscope")
+    path.write_text(spoilt("caliscope", "rotation_count = 0", "rotation_count = 1"))
+    assert caliscope.read(path)["3"].camera_from_world is not None
+    path.write_text(spoilt("caliscope", "rotation = [0.0, 0.0, 0.0]", 'rotation = "null"'))
+    assert caliscope.read(path)["3"].camera_from_world is None
+
+
+def test_the_newer_key_of_mrcal_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "left.cameramodel"
+    path.write_text(spoilt("mrcal", "extrinsics", "rt_cam_ref"))
+    pose = RIG_FORMATS.find("mrcal").read(path)["left"].camera_from_world
+    assert pose is not None
+    assert pose.translation[0] == -0.2
+
+
 def test_a_size_may_be_given_by_two_nodes(tmp_path: Path) -> None:
     path = tmp_path / "any.yaml"
     path.write_text(storage("yaml") + "w: 1280\nh: 720\nhalf: 0.5\n")
@@ -397,7 +527,7 @@ def test_what_is_no_rig_is_refused(tmp_path: Path) -> None:
     torn = tmp_path / "torn.yaml"
     torn.write_text("%YAML 1.2\n---\npairs:\n   -\n      name: a\n")
     with pytest.raises(BadInput, match="has no node 'image_width' below pairs/0"):
-        opencv.read(torn)
+        opencv.read(torn)["a"]
     torn.write_text(storage("yaml"))
     with pytest.raises(BadInput, match="no list of pairs") as caught:
         opencv.read(torn)
@@ -408,6 +538,10 @@ def test_what_is_no_rig_is_refused(tmp_path: Path) -> None:
     (folder / "bodyscan.json").write_text(json.dumps(content))
     with pytest.raises(BadInput, match="stranger"):
         colmap.read(folder)
+    for wrong in ('{"pairs": ' + "[" * 100_000, '{"pairs": {"p1-1": {"gamma": NaN}}}'):
+        (folder / "bodyscan.json").write_text(wrong)
+        with pytest.raises(BadInput, match=r"nested too deep|NaN is not a finite number"):
+            colmap.read(folder)
 
 
 def test_a_colmap_model_of_others(tmp_path: Path) -> None:
@@ -449,15 +583,21 @@ def test_a_colmap_model_of_others(tmp_path: Path) -> None:
     assert pose is not None
     np.testing.assert_allclose(pose.matrix[:3, 3], [-0.2, 0.0, 0.0])
     fisheye = pycolmap.Camera(
-        model="OPENCV_FISHEYE", width=1280, height=720, params=[900, 900, 640, 360, 0, 0, 0, 0],
+        model="OPENCV_FISHEYE", width=1280, height=720, params=[900, 900, 640, 360, 0.1, 0.2, 0, 0],
         camera_id=1,
     )  # fmt: skip
     strange = pycolmap.Reconstruction()
+    fov = pycolmap.Camera(
+        model="FOV", width=1280, height=720, params=[900, 900, 640, 360, 0.5], camera_id=2
+    )
     strange.add_camera(fisheye)
-    (tmp_path / "fisheye").mkdir()
-    strange.write(tmp_path / "fisheye")
-    with pytest.raises(CalibrationFileError, match="OPENCV_FISHEYE, which is not supported"):
-        RIG_FORMATS.find("colmap").read(tmp_path / "fisheye")
+    strange.add_camera(fov)
+    (tmp_path / "strange").mkdir()
+    strange.write(tmp_path / "strange")
+    cameras = RIG_FORMATS.find("colmap").read(tmp_path / "strange")
+    assert cameras["1"].lens == Fisheye(0.1, 0.2, 0.0, 0.0)
+    with pytest.raises(CalibrationFileError, match="FOV, which is not supported"):
+        cameras["2"]
 
 
 def test_a_colmap_sensor_without_a_place_in_its_rig_has_none(tmp_path: Path) -> None:
@@ -500,7 +640,10 @@ def test_whatever_a_file_holds_is_read_or_refused(kind: str, at: int, cut: int, 
         path = Path(folder) / name
         path.write_text(text[:at] + junk + text[at + cut :])
         with suppress(CalibrationFileError):
-            read_nodes(path, NODES) if kind in STORAGES else RIG_FORMATS.find(kind).read(path)
+            if kind in STORAGES:
+                read_nodes(path, NODES)
+            else:
+                list(RIG_FORMATS.find(kind).read(path).values())
 
 
 def test_a_colmap_model_whose_names_are_no_text_is_refused(tmp_path: Path) -> None:

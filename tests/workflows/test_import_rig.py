@@ -210,6 +210,23 @@ def test_a_pair_that_cannot_be_read_costs_that_pair(folder: Path) -> None:
         import_rig(load_rig(write_rig_file(folder, content)), folder)
 
 
+def test_the_only_camera_without_a_pose_is_the_world(folder: Path) -> None:
+    """Two cameras as stereoCalibrate gives them: R and T are the second's, from the first."""
+    content = json.loads(json.dumps(described("a", "b")))
+    for pair in content["pairs"]:
+        del pair["projector"], pair["known"]["projector"]
+    first = content["pairs"][0]["known"]["camera"]
+    pose = {key: first.pop(key) for key in ("rotation", "translation")}
+    found = import_rig(load_rig(write_rig_file(folder, content)), folder)
+    assert not found.failed
+    np.testing.assert_array_equal(found.rig_from_camera["a"].matrix, np.eye(4))
+    np.testing.assert_allclose(found.rig_from_camera["b"].matrix, WORLD_FROM["b"].matrix, atol=1e-9)
+    for key in pose:
+        del content["pairs"][1]["known"]["camera"][key]
+    with pytest.raises(CalibrationFileError, match="all but one of a rig"):
+        import_rig(load_rig(write_rig_file(folder, content)), folder)
+
+
 @pytest.mark.parametrize(
     ("where", "value", "said"),
     [

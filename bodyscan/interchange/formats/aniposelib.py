@@ -6,6 +6,7 @@ Lengths are in the unit in which its board's squares were given.
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 
 from bodyscan.files.atomic import write_text
@@ -16,7 +17,7 @@ from bodyscan.interchange.foreign_file import (
     read_camera_table,
     read_toml,
 )
-from bodyscan.interchange.found_camera import FoundCamera
+from bodyscan.interchange.found_camera import FoundCameras
 from bodyscan.interchange.rig_format import RigCameras, RigFormat
 
 
@@ -31,19 +32,17 @@ def write_aniposelib(cameras: RigCameras, path: Path) -> Path:
     return Path(path)
 
 
-def read_aniposelib(path: Path) -> dict[str, FoundCamera]:
+def read_aniposelib(path: Path) -> FoundCameras:
     """Read cameras by their names, and by those of their tables."""
     file = ForeignFile.read(path)
-    tables = {key: table for key, table in read_toml(file).items() if key != "metadata"}
-    found: dict[str, FoundCamera] = {}
-    for key, table in tables.items():
-        if not isinstance(table, dict) or "matrix" not in table:
-            raise file.error("is not a camera as aniposelib writes it", key)
-        found[key] = read_camera_table(file, table, key)
-    named = {str(table["name"]): found[key] for key, table in tables.items() if "name" in table}
-    if not found:
-        raise file.error("holds no cameras")
-    return found | named
+    readers = {}
+    for key, table in read_toml(file).items():
+        if key != "metadata" and isinstance(table, dict):
+            readers[key] = partial(read_camera_table, file, table, key)
+            readers[str(table.get("name", key))] = readers[key]
+    if not readers:
+        raise file.error("holds no cameras as aniposelib writes them")
+    return FoundCameras(readers)
 
 
 FORMAT = RigFormat("aniposelib.toml", None, write_aniposelib, read_aniposelib)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 
 from bodyscan.files.atomic import write_text
@@ -13,7 +14,7 @@ from bodyscan.interchange.foreign_file import (
     read_camera_table,
     read_toml,
 )
-from bodyscan.interchange.found_camera import FoundCamera
+from bodyscan.interchange.found_camera import FoundCameras
 from bodyscan.interchange.rig_format import RigCameras, RigFormat
 
 
@@ -26,32 +27,27 @@ def write_caliscope(cameras: RigCameras, path: Path) -> Path:
     text = "# Lengths in metres.\n" + TOML_NOTE
     for number, (name, (camera, rig_from_camera)) in enumerate(cameras.items()):
         text += f"\n[cameras.{number}]\ncam_id = {number}\nname = {json.dumps(name)}\n"
-        text += "rotation_count = 0\nfisheye = false\n"
+        text += "rotation_count = 0\n"
         text += format_camera_table(name, camera, rig_from_camera.inverse(), 1000.0)
     write_text(Path(path), text)
     return Path(path)
 
 
-def read_caliscope(path: Path) -> dict[str, FoundCamera]:
-    """Read cameras by their numbers, and by the pair's name if bodyscan wrote the file."""
+def read_caliscope(path: Path) -> FoundCameras:
+    """Read cameras by their numbers, and by the pair's name if bodyscan wrote the file.
+
+    `rotation_count` turns what caliscope shows, not what it calibrates, and is not looked at.
+    """
     file = ForeignFile.read(path)
     tables = read_toml(file).get("cameras")
     if not isinstance(tables, dict) or not tables:
         raise file.error("holds no cameras: it is not a camera_array.toml of caliscope's")
-    found: dict[str, FoundCamera] = {}
+    readers = {}
     for key, table in tables.items():
-        if not isinstance(table, dict):
-            raise file.error("is not a camera as caliscope writes it", f"cameras.{key}")
-        if table.get("rotation_count", 0):
-            what = "rotates the pictures before they are used; bodyscan takes them as they are"
-            name, remedy = (
-                f"cameras.{key}.rotation_count",
-                "rotate the pictures, or calibrate without",
-            )
-            raise file.error(what, name, remedy)
-        found[key] = read_camera_table(file, table, f"cameras.{key}")
-    named = {str(table["name"]): found[key] for key, table in tables.items() if "name" in table}
-    return found | named
+        if isinstance(table, dict):
+            readers[key] = partial(read_camera_table, file, table, f"cameras.{key}")
+            readers.setdefault(str(table.get("name", key)), readers[key])
+    return FoundCameras(readers)
 
 
 FORMAT = RigFormat("camera_array.toml", "m", write_caliscope, read_caliscope)

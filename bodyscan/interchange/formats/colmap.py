@@ -5,9 +5,9 @@ COLMAP's cameras have no skew, so bodyscan writes it in a file beside them.
 
 from __future__ import annotations
 
-import json
 import tempfile
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +16,12 @@ import pycolmap
 
 from bodyscan.errors import CalibrationFileError
 from bodyscan.files.atomic import write_bytes, write_json
+from bodyscan.files.reading import read_json_object
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.interchange.foreign_file import ForeignFile
-from bodyscan.interchange.found_camera import FoundCamera
-from bodyscan.interchange.rig_format import RigCameras, RigFormat, opencv_coefficients
+from bodyscan.interchange.found_camera import FoundCamera, FoundCameras
+from bodyscan.interchange.rig_format import RigCameras, RigFormat, opencv_lens
 
 PIXEL_CENTRE = 0.5  # COLMAP's pixels have their centres at + 0.5, ours at whole numbers
 SKEW_FILE = "bodyscan.json"
@@ -29,6 +30,7 @@ NO_SKEW = (
     "numbers, v0 = cy - 0.5) to (u - gamma / beta * (v - v0), v) before using it with them."
 )
 # Positions of fx, fy, cx, cy in each model's parameters, then of OpenCV's k1, k2, p1, p2, ...
+# or, of a fisheye, of its k1 to k4.
 LENSES: dict[str, tuple[int, ...]] = {
     "SIMPLE_PINHOLE": (0, 0, 1, 2),
     "PINHOLE": (0, 1, 2, 3),
@@ -36,6 +38,9 @@ LENSES: dict[str, tuple[int, ...]] = {
     "RADIAL": (0, 0, 1, 2),
     "OPENCV": (0, 1, 2, 3),
     "FULL_OPENCV": (0, 1, 2, 3),
+    "SIMPLE_RADIAL_FISHEYE": (0, 0, 1, 2),
+    "RADIAL_FISHEYE": (0, 0, 1, 2),
+    "OPENCV_FISHEYE": (0, 1, 2, 3),
 }
 
 
@@ -61,7 +66,7 @@ def write_colmap(cameras: RigCameras, folder: Path) -> Path:
     return folder
 
 
-def read_colmap(folder: Path) -> dict[str, FoundCamera]:
+def read_colmap(folder: Path) -> FoundCameras:
     """Read every image by its name, and every camera with several images by their folder or its
     number, with its pose in its rig if there is one.
 
@@ -81,25 +86,25 @@ def read_colmap(folder: Path) -> dict[str, FoundCamera]:
             remedy="give the folder that holds cameras, images and points3D, .bin or .txt",
         ) from error
     gammas = _read_gammas(folder)
-    found: dict[str, FoundCamera] = {}
+    readers = {}
     for number, camera in sorted(model.cameras.items()):
         taken = [image for image in images if image.camera_id == number]
         folders = {names_of[image.image_id].rpartition("/")[0] for image in taken}
         names = {str(number), *(folders - {""} if len(folders) == 1 else ())}
         rig_pose = _find_pose_in_rig(model, number)
         for name in names - {image.name for image in taken}:
-            found[name] = _read_camera(folder, camera, 0.0, rig_pose)
+            readers[name] = partial(_read_camera, folder, camera, 0.0, rig_pose)
         for image in taken:
             gamma = gammas.get(image.name, 0.0)
-            found[image.name] = _read_camera(folder, camera, gamma, _image_pose(image))
+            readers[image.name] = partial(_read_camera, folder, camera, gamma, _image_pose(image))
     for name in gammas:
-        if name not in found:
+        if name not in readers:
             raise CalibrationFileError(
                 f"names a pair {name!r} that the model does not have",
                 where=str(folder / SKEW_FILE),
                 remedy="give both as `bodyscan export-rig --format colmap` wrote them",
             )
-    return found
+    return FoundCameras(readers)
 
 
 def _read_gammas(folder: Path) -> dict[str, float]:
@@ -108,9 +113,9 @@ def _read_gammas(folder: Path) -> dict[str, float]:
     if not file.is_file():
         return {}
     try:
-        pairs = json.loads(file.read_text("utf-8"))["pairs"]
+        pairs = read_json_object(file)["pairs"]
         return {name: float(pair["gamma"]) for name, pair in pairs.items()}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         raise CalibrationFileError(
             f"is not what bodyscan writes beside a COLMAP model ({type(error).__name__}: {error})",
             where=str(file),
@@ -153,7 +158,8 @@ def _read_camera(
     four = [fx, fy, cx - PIXEL_CENTRE, cy - PIXEL_CENTRE]
     matrix = file.pinhole_matrix(four, f"camera {camera.camera_id}")
     matrix[0, 1] = gamma
-    lens = file.lens(params[max(LENSES[model]) + 1 :], f"camera {camera.camera_id}")
+    around = {"fisheye": model.endswith("FISHEYE")}
+    lens = file.lens(params[max(LENSES[model]) + 1 :], f"camera {camera.camera_id}", around)
     return FoundCamera(matrix, lens, (camera.width, camera.height), pose, str(folder))
 
 
@@ -184,13 +190,14 @@ def _colmap_model(cameras: Mapping[str, tuple[Camera, RigidTransform]]) -> pycol
 def _colmap_camera(name: str, camera: Camera, camera_id: int) -> pycolmap.Camera:
     centre = [camera.u0 + PIXEL_CENTRE, camera.v0 + PIXEL_CENTRE]
     # COLMAP's OPENCV is a prefix of its FULL_OPENCV, which has OpenCV's first eight coefficients.
-    lens = np.append(opencv_coefficients(name, camera), np.zeros(8))[:8]
-    model = "FULL_OPENCV" if lens[4:].any() else "OPENCV"
+    is_fisheye, coefficients = opencv_lens(name, camera)
+    lens = np.append(coefficients, np.zeros(8))[:8]
+    model = "FULL_OPENCV" if lens[4:].any() else "OPENCV_FISHEYE" if is_fisheye else "OPENCV"
     return pycolmap.Camera(
         model=model,
         width=camera.width,
         height=camera.height,
-        params=[camera.alpha, camera.beta, *centre, *lens[: 4 if model == "OPENCV" else 8]],
+        params=[camera.alpha, camera.beta, *centre, *lens[: 8 if model == "FULL_OPENCV" else 4]],
         camera_id=camera_id,
     )
 

@@ -6,6 +6,7 @@ world.
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +14,11 @@ import numpy as np
 
 from bodyscan.errors import BadInput
 from bodyscan.files.atomic import write_text
-from bodyscan.files.yaml_file import YamlError, dump_yaml, read_yaml
+from bodyscan.files.yaml_file import dump_yaml
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.interchange.foreign_file import ForeignFile
-from bodyscan.interchange.found_camera import FoundCamera
-from bodyscan.interchange.rig_format import RigCameras, RigFormat, opencv_coefficients
+from bodyscan.interchange.foreign_file import ForeignFile, read_document
+from bodyscan.interchange.found_camera import FoundCamera, FoundCameras
+from bodyscan.interchange.rig_format import RigCameras, RigFormat, opencv_lens
 
 NOTE = """\
 # Metres. Pixel centres at whole numbers. `name` is the pair's. Kalibr's cameras have no skew: shear
@@ -28,12 +29,13 @@ NOTE = """\
 def write_kalibr(cameras: RigCameras, path: Path) -> Path:
     """Write cam0, cam1, ... in the order of the pairs; returns `path`.
 
-    Raises BadInput for a lens with more than Kalibr's radtan has, k1, k2, p1, p2.
+    Raises BadInput for a lens that is neither a fisheye, Kalibr's equidistant, nor of k1, k2, p1,
+    p2 alone, its radtan.
     """
     content: dict[str, Any] = {}
     before: RigidTransform | None = None
     for number, (name, (camera, rig_from_camera)) in enumerate(cameras.items()):
-        coefficients = opencv_coefficients(name, camera)
+        is_fisheye, coefficients = opencv_lens(name, camera)
         if np.any(coefficients[4:]):
             raise BadInput(
                 f"Kalibr has no lens like {camera.lens.kind!r}: its radtan ends with k1, k2, p1, p2",
@@ -43,7 +45,7 @@ def write_kalibr(cameras: RigCameras, path: Path) -> Path:
         entry: dict[str, Any] = {
             "camera_model": "pinhole",
             "intrinsics": [camera.alpha, camera.beta, camera.u0, camera.v0],
-            "distortion_model": "radtan",
+            "distortion_model": "equidistant" if is_fisheye else "radtan",
             "distortion_coeffs": coefficients[:4].tolist(),
             "resolution": [camera.width, camera.height],
             "rostopic": f"/{name}/image_raw",
@@ -60,13 +62,14 @@ def write_kalibr(cameras: RigCameras, path: Path) -> Path:
     return Path(path)
 
 
-def read_kalibr(path: Path) -> dict[str, FoundCamera]:
-    """Read cameras by cam0, cam1, ..., and by the pair's name if bodyscan wrote the file."""
+def read_kalibr(path: Path) -> FoundCameras:
+    """Read cameras by cam0, cam1, ..., and by the pair's name if bodyscan wrote the file.
+
+    A camera without T_cn_cnm1 is placed by T_cam_imu, which takes the IMU's coordinates to the
+    camera's, or by its inverse, T_imu_cam, where cam0 has one of them too.
+    """
     file = ForeignFile.read(path)
-    try:
-        data = read_yaml(path).data
-    except YamlError as error:
-        raise file.error(error.problem.text) from None
+    data = read_document(file)
     chain = data if isinstance(data, dict) else {}
     cameras = {key: entry for key, entry in chain.items() if isinstance(entry, dict)}
     if "cam0" not in cameras:
@@ -74,52 +77,68 @@ def read_kalibr(path: Path) -> dict[str, FoundCamera]:
             "is not a camchain of Kalibr's: it has no cam0",
             remedy="give camchain-....yaml, which kalibr_calibrate_cameras wrote",
         )
-    found: dict[str, FoundCamera] = {}
-    pose: RigidTransform | None = RigidTransform.identity()
+    readers = {}
     for number in range(len(cameras)):
         key = f"cam{number}"
         if key not in cameras:
             break
-        entry = cameras[key]
-        if number > 0:
-            pose = _compute_next_pose(file, key, entry, pose)
-        one = _read_camera(file, key, entry, pose)
-        found[key] = one
-        if isinstance(entry.get("name"), str):
-            found[entry["name"]] = one
-    return found
+        readers[key] = partial(_read_camera, file, cameras, number)
+        if isinstance(cameras[key].get("name"), str):
+            readers[cameras[key]["name"]] = readers[key]
+    return FoundCameras(readers)
 
 
-def _compute_next_pose(
-    file: ForeignFile, key: str, entry: dict[str, Any], before: RigidTransform | None
+def _pose_in_first(
+    file: ForeignFile, cameras: dict[str, dict[str, Any]], number: int
 ) -> RigidTransform | None:
-    """Compute the next camera's pose; after a gap in the chain there is none."""
-    if "T_cn_cnm1" not in entry or before is None:
-        return None
-    name = f"{key}.T_cn_cnm1"
-    matrix = file.numbers(entry["T_cn_cnm1"], name, 16).reshape(4, 4)
-    step = file.pose(matrix[:3, :3], matrix[:3, 3], name)
-    return step @ before
+    """Compute a camera's pose, `camera_from_cam0`; None if neither chain nor IMU gives it."""
+    pose: RigidTransform | None = RigidTransform.identity()
+    for k in range(1, number + 1):
+        key = f"cam{k}"
+        if "T_cn_cnm1" in cameras[key]:
+            pose = _transform(file, cameras, key, "T_cn_cnm1") @ pose if pose else None
+        else:
+            own, first = (_camera_from_imu(file, cameras, one) for one in (key, "cam0"))
+            pose = own @ first.inverse() if own and first else None
+    return pose
 
 
-def _read_camera(
-    file: ForeignFile, key: str, entry: dict[str, Any], pose: RigidTransform | None
-) -> FoundCamera:
+def _camera_from_imu(
+    file: ForeignFile, cameras: dict[str, dict[str, Any]], key: str
+) -> RigidTransform | None:
+    if "T_cam_imu" in cameras[key]:
+        return _transform(file, cameras, key, "T_cam_imu")
+    if "T_imu_cam" in cameras[key]:
+        return _transform(file, cameras, key, "T_imu_cam").inverse()
+    return None
+
+
+def _transform(
+    file: ForeignFile, cameras: dict[str, dict[str, Any]], key: str, word: str
+) -> RigidTransform:
+    name = f"{key}.{word}"
+    matrix = file.numbers(cameras[key][word], name, 16).reshape(4, 4)
+    return file.pose(matrix[:3, :3], matrix[:3, 3], name)
+
+
+def _read_camera(file: ForeignFile, cameras: dict[str, dict[str, Any]], number: int) -> FoundCamera:
+    key = f"cam{number}"
+    entry = cameras[key]
     words = ("camera_model", "intrinsics", "distortion_model", "resolution")
     file.require(entry, words, key)
-    supported = {"camera_model": ("model", "pinhole"), "distortion_model": ("lens", "radtan")}
-    for word, (what, wanted) in supported.items():
-        if entry[word] not in (wanted, "none" if what == "lens" else wanted):
-            wrong = f"{entry[word]!r} is a {what} that is not supported, {wanted} is"
-            raise file.error(wrong, f"{key}.{word}", "calibrate it with pinhole-radtan")
-    lens = entry.get("distortion_coeffs", []) if entry["distortion_model"] == "radtan" else []
+    if entry["camera_model"] != "pinhole":
+        wrong = f"{entry['camera_model']!r} is a model that is not supported, pinhole is"
+        remedy = "calibrate it with pinhole-radtan or pinhole-equi"
+        raise file.error(wrong, f"{key}.camera_model", remedy)
+    lens = [] if entry["distortion_model"] == "none" else entry.get("distortion_coeffs", [])
+    around = {"distortion_model": str(entry["distortion_model"])}
     matrix = file.pinhole_matrix(entry["intrinsics"], f"{key}.intrinsics")
     matrix[0, 1] = file.numbers(entry.get("skew", 0.0), f"{key}.skew", 1)[0]
     return FoundCamera(
         matrix,
-        file.lens(lens, f"{key}.distortion_coeffs"),
+        file.lens(lens, f"{key}.distortion_coeffs", around),
         file.size(entry["resolution"], f"{key}.resolution"),
-        pose,
+        _pose_in_first(file, cameras, number),
         file.where(key),
     )
 

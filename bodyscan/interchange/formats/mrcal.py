@@ -1,4 +1,5 @@
-"""mrcal's .cameramodel: one file per camera, a Python literal; rt_cam_ref is rotation and shift.
+"""mrcal's .cameramodel: one file per camera, a Python literal; rt_cam_ref, formerly extrinsics, is
+rotation and shift.
 
 Lengths are in the unit in which its board was given.
 """
@@ -8,6 +9,7 @@ from __future__ import annotations
 import ast
 import re
 import warnings
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +18,7 @@ import numpy as np
 from bodyscan.errors import BadInput, CalibrationFileError
 from bodyscan.files.atomic import write_text
 from bodyscan.interchange.foreign_file import ForeignFile
-from bodyscan.interchange.found_camera import FoundCamera
+from bodyscan.interchange.found_camera import FoundCamera, FoundCameras
 from bodyscan.interchange.rig_format import RigCameras, RigFormat, opencv_coefficients
 
 COEFFICIENTS = {"PINHOLE": 0, "OPENCV4": 4, "OPENCV5": 5, "OPENCV8": 8, "OPENCV12": 12}
@@ -35,14 +37,14 @@ def write_mrcal(cameras: RigCameras, folder: Path) -> Path:
     return Path(folder)
 
 
-def read_mrcal(path: Path) -> dict[str, FoundCamera]:
+def read_mrcal(path: Path) -> FoundCameras:
     """Read the cameras of one file, or of all in a folder, by the files' names without suffix."""
     files = sorted(path.glob(f"*{SUFFIX}")) if path.is_dir() else [path]
     if not files:
         raise CalibrationFileError(
             f"holds no {SUFFIX} files", where=str(path), remedy="give a file or their folder"
         )
-    return {file.stem: _read_model(file) for file in files}
+    return FoundCameras({file.stem: partial(_read_model, file) for file in files})
 
 
 def _format_model(name: str, camera: Any, rig_from_camera: Any) -> str:
@@ -77,7 +79,8 @@ def _read_model(path: Path) -> FoundCamera:
     model = str(content.get("lensmodel", content.get("distortion_model", "")))
     kind = re.sub(r"^(LENSMODEL|DISTORTION)_", "", model)
     kind = "PINHOLE" if kind == "NONE" else kind
-    for word in ("intrinsics", "extrinsics", "imagersize"):
+    pose_key = "extrinsics" if "extrinsics" in content else "rt_cam_ref"
+    for word in ("intrinsics", pose_key, "imagersize"):
         if word not in content:
             raise file.error(f"has no {word!r}", remedy=f"it has {', '.join(map(str, content))}")
     if kind not in COEFFICIENTS:
@@ -89,12 +92,12 @@ def _read_model(path: Path) -> FoundCamera:
     skew = re.search(rf"^# {SKEW}(\S+)$", file.text, re.MULTILINE)
     if skew:
         matrix[0, 1] = file.numbers(skew[1], "skew", 1)[0]
-    pose = file.numbers(content["extrinsics"], "extrinsics", 6)
+    pose = file.numbers(content[pose_key], pose_key, 6)
     return FoundCamera(
         matrix,
         file.lens(numbers[4:], "intrinsics"),
         file.size(content["imagersize"], "imagersize"),
-        file.pose(pose[:3], pose[3:], "extrinsics"),
+        file.pose(pose[:3], pose[3:], pose_key),
         file.where("intrinsics"),
     )
 

@@ -9,6 +9,7 @@ OpenCV's camera functions have no skew, so the file says what to do about it.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +20,13 @@ from bodyscan.files.atomic import write_text
 from bodyscan.files.model import did_you_mean
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.interchange.foreign_file import ForeignFile
-from bodyscan.interchange.found_camera import FoundCamera
+from bodyscan.interchange.foreign_file import ForeignFile, read_document
+from bodyscan.interchange.found_camera import FoundCamera, FoundCameras
 from bodyscan.interchange.rig_format import (
     Nodes,
     RigCameras,
     RigFormat,
-    opencv_coefficients,
+    opencv_lens,
     projector_name,
 )
 
@@ -71,49 +72,54 @@ def write_opencv(cameras: RigCameras, path: Path) -> Path:
 
 
 def _write_camera(store: Any, name: str, camera: Camera, pose: RigidTransform) -> None:
+    is_fisheye, coefficients = opencv_lens(name, camera)
     store.write("image_width", camera.width)
     store.write("image_height", camera.height)
     store.write("camera_matrix", camera.matrix)
     store.write("skew", camera.gamma)
-    store.write("distortion_coefficients", opencv_coefficients(name, camera)[None])
+    if is_fisheye:
+        store.write("distortion_model", "equidistant")
+    store.write("distortion_coefficients", coefficients[None])
     store.write("R", pose.rotation)
     store.write("T", pose.translation.reshape(3, 1))
 
 
-def read_opencv(path: Path) -> dict[str, FoundCamera]:
+def read_opencv(path: Path) -> FoundCameras:
     """Read a file that `write_opencv` wrote: cameras, and projectors by `projector_name`."""
     file = ForeignFile.read(path)
-    store = _open_storage(file)
-    pairs = store.getNode("pairs")
-    if not pairs.isSeq():
+    root = _read_root(file)
+    if not isinstance(root.get("pairs"), list):
         raise file.error(
             "has no list of pairs as bodyscan writes it",
             remedy="say which of its nodes are meant, such as camera: {matrix: K, distortion: D}; "
-            f"it has {', '.join(store.root().keys())}",
+            f"it has {', '.join(root)}",
         )
-    found = {}
-    for k in range(int(pairs.size())):
-        entry, name = pairs.at(k), f"pairs/{k}"
-        label = _find_below(file, entry, "name", name).string()
-        camera = found[label] = _read_camera(file, entry, name, label)
-        if "projector" in entry.keys():  # noqa: SIM118 (it is no dict)
-            light = _find_below(file, entry, "projector", name)
-            inner = _read_camera(file, light, f"{name}/projector", label)
-            assert inner.camera_from_world is not None
-            assert camera.camera_from_world is not None
-            from_rig = inner.camera_from_world @ camera.camera_from_world
-            found[projector_name(label)] = replace(inner, camera_from_world=from_rig)
-    return found
+    readers = {}
+    for k, entry in enumerate(root["pairs"]):
+        label = str(_find_below(file, entry, "name", f"pairs/{k}"))
+        readers[label] = partial(_read_camera, file, entry, f"pairs/{k}", label)
+        if "projector" in entry:
+            light = partial(_read_projector, file, entry, f"pairs/{k}", label)
+            readers[projector_name(label)] = light
+    return FoundCameras(readers)
+
+
+def _read_projector(file: ForeignFile, entry: Any, name: str, label: str) -> FoundCamera:
+    camera = _read_camera(file, entry, name, label)
+    inner = _read_camera(file, entry["projector"], f"{name}/projector", label)
+    assert inner.camera_from_world is not None
+    assert camera.camera_from_world is not None
+    return replace(inner, camera_from_world=inner.camera_from_world @ camera.camera_from_world)
 
 
 def _read_camera(file: ForeignFile, entry: Any, name: str, label: str) -> FoundCamera:
     def numbers(key: str) -> Any:
-        return _read_values(file, _find_below(file, entry, key, name), f"{name}/{key}")
+        return _values(_find_below(file, entry, key, name))
 
     size = [numbers("image_width"), numbers("image_height")]
     return FoundCamera(
         file.matrix(numbers("camera_matrix"), f"{label}.camera_matrix"),
-        file.lens(numbers("distortion_coefficients"), f"{label}.distortion_coefficients"),
+        file.lens(numbers("distortion_coefficients"), f"{label}.distortion_coefficients", entry),
         file.size(size, f"{label}.image_width"),
         file.pose(numbers("R"), numbers("T"), f"{label}.R", f"{label}.T"),
         file.where(f"{label}.camera_matrix"),
@@ -124,10 +130,10 @@ def read_nodes(path: Path, nodes: Nodes) -> FoundCamera:
     """Read the camera whose numbers are in these nodes: matrix; distortion, size (or width and height),
     rotation and translation if given."""
     file = ForeignFile.read(path)
-    store = _open_storage(file)
+    root = _read_root(file)
 
     def values(what: str) -> Any:
-        return _read_values(file, _find_node(file, store, nodes[what]), nodes[what])
+        return _values(_find_node(file, root, nodes[what])[0])
 
     size = file.size(values("size"), nodes["size"]) if "size" in nodes else None
     if "width" in nodes:
@@ -136,39 +142,34 @@ def read_nodes(path: Path, nodes: Nodes) -> FoundCamera:
     if "rotation" in nodes:
         names = nodes["rotation"], nodes["translation"]
         pose = file.pose(values("rotation"), values("translation"), *names)
-    coefficients = values("distortion") if "distortion" in nodes else []
-    lens = file.lens(coefficients, nodes.get("distortion", nodes["matrix"]))
     matrix = file.matrix(values("matrix"), nodes["matrix"])
+    coefficients = values("distortion") if "distortion" in nodes else []
+    name = nodes.get("distortion", nodes["matrix"])
+    lens = file.lens(coefficients, name, _find_node(file, root, name)[1])
     return FoundCamera(matrix, lens, size, pose, file.where(nodes["matrix"].split("/")[-1]))
 
 
-def _open_storage(file: ForeignFile) -> Any:
-    """Open the storage; its nodes live only as long as it does."""
-    text = file.text.lstrip()
-    if not text.startswith(("%YAML", "<?xml", "{")):
-        text = "%YAML:1.0\n---\n" + text  # OpenCV needs it, ROS leaves it out
-    read = cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY
-    try:
-        store = cv2.FileStorage(text, read)
-        if store.isOpened() and store.root().isMap():
-            return store
-    except (SystemError, cv2.error):
-        pass
-    raise file.error("is neither YAML, XML nor JSON as OpenCV's FileStorage reads them")
+def _read_root(file: ForeignFile) -> dict[str, Any]:
+    root = read_document(file)
+    if not isinstance(root, dict):
+        raise file.error("is neither YAML, XML nor JSON as OpenCV's FileStorage reads them")
+    return root
 
 
-def _find_node(file: ForeignFile, store: Any, name: str) -> Any:
-    """Find a node by its name, with those around it first: `stereo/K1`."""
-    node, passed = store.root(), ""
+def _find_node(file: ForeignFile, root: dict[str, Any], name: str) -> tuple[Any, dict[str, Any]]:
+    """Find a node by its name, with those around it first: `stereo/K1`; and what stands beside it
+    and beside those around it, the innermost of a name."""
+    node, passed, around = root, "", dict[str, Any]()
     for part in name.split("/"):
-        node = _find_below(file, node, part, passed)
-        passed = f"{passed}/{part}" if passed else part
-    return node
+        below = _find_below(file, node, part, passed)
+        around |= node
+        node, passed = below, f"{passed}/{part}" if passed else part
+    return node, around
 
 
 def _find_below(file: ForeignFile, node: Any, name: str, passed: str) -> Any:
     """Find a node below another. Raises CalibrationFileError, which lists those there are."""
-    keys = list(node.keys()) if node.isMap() else []
+    keys = list(node) if isinstance(node, dict) else []
     if name not in keys:
         parent = f"below {passed}" if passed else "in it"
         raise CalibrationFileError(
@@ -176,18 +177,12 @@ def _find_below(file: ForeignFile, node: Any, name: str, passed: str) -> Any:
             where=file.where(passed.split("/")[-1]) if passed else str(file.path),
             remedy=f"there is {', '.join(keys) or 'none'}",
         )
-    return node.getNode(name)
+    return node[name]
 
 
-def _read_values(file: ForeignFile, node: Any, name: str) -> Any:
-    """Read a number, or a list of what is in the node; of a matrix its numbers row by row."""
-    if node.isMap() and "data" in node.keys():  # noqa: SIM118 (it is no dict)
-        return _read_values(file, node.getNode("data"), name)
-    if node.isSeq():
-        return [_read_values(file, node.at(k), name) for k in range(int(node.size()))]
-    if node.isInt() or node.isReal():
-        return float(node.real())
-    raise file.error("holds what is not a number", name.split("/")[-1])
+def _values(node: Any) -> Any:
+    """What is in a node; of a matrix its numbers row by row."""
+    return node["data"] if isinstance(node, dict) and "data" in node else node
 
 
 FORMAT = RigFormat("rig-opencv.yaml", "mm", write_opencv, read_opencv, read_nodes)
