@@ -29,11 +29,15 @@ def format_error(error: BodyscanError) -> str:
 
 
 def format_list(reasons: Mapping[str, str]) -> str:
-    """Format several failures: name and reason, one a line, then each distinct remedy once."""
-    parts = {name: reason.partition("\n") for name, reason in reasons.items()}
-    first = [f"\n  {name}: {what}" for name, (what, _, _) in parts.items()]
-    rest = dict.fromkeys(remedy for _, _, remedy in parts.values())
-    return "".join(first + [f"\n{remedy}" for remedy in rest if remedy])
+    """Format several failures: name and reason, one a line; a remedy stands once, after all those
+    that it helps."""
+    groups: dict[str, list[str]] = {}
+    for name, reason in reasons.items():
+        what, _, remedy = reason.partition("\n")
+        groups.setdefault(remedy, []).append(f"\n  {name}: {what}")
+    return "".join(
+        "".join(lines) + (f"\n{remedy}" if remedy else "") for remedy, lines in groups.items()
+    )
 
 
 class BadInput(BodyscanError):

@@ -38,7 +38,9 @@ class Verdict:
         return MARKS.get(self.grade, "bad")
 
     def __str__(self) -> str:
-        return "\n  ".join([f"verdict: {self.grade}", *self.reasons])
+        return "\n  ".join(
+            [f"verdict: {self.grade}", *(r.replace("\n", "\n  ") for r in self.reasons)]
+        )
 
 
 class Announce(Protocol):

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
-from bodyscan.calibration.board_views import board_symmetries
+from bodyscan.calibration.board_views import LocatedView, board_symmetries
 from bodyscan.errors import BadInput
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.view_graph import Target
 from bodyscan.rig.pair import NominalPose, Pair
 from bodyscan.rig.rig import Rig
+from bodyscan.rig.rig_frame import RigFrame
 
 
 def nominal_pose(nominal: NominalPose) -> RigidTransform:
@@ -29,6 +31,24 @@ def frame_target(rig: Rig) -> Target | None:
     """The (shot, board) that fixes the rig frame, or None if a pair does."""
     board, shot = rig.frame_board, rig.rig_frame.shot
     return (shot, board.name) if board and shot else None
+
+
+def hold_frame(rig: Rig, views: Sequence[LocatedView], solved: Collection[str]) -> Rig:
+    """The rig with its frame held by a pair that was solved, where the rig file names none.
+
+    By default that is the first pair; without it the one that sees the most boards together with
+    others takes its place, one with a nominal pose if the first has one.
+    """
+    first = rig.frame_pair
+    if first is None or rig.rig_frame.pair or first.name in solved:
+        return rig
+    seen = Counter(view.target for view in views)
+    shared = Counter(view.pair for view in views if seen[view.target] > 1)
+    names = [pair.name for pair in rig.pairs if pair.name in solved]
+    if first.nominal:
+        names = [name for name in names if rig.pair(name).nominal] or names
+    best = max(names, key=lambda name: shared[name])
+    return rig.model_copy(update={"rig_frame": RigFrame(pair=best)})
 
 
 def refuse_without_frame_shot(rig: Rig, shots: Collection[str]) -> None:

@@ -39,7 +39,12 @@ from bodyscan.registration.cluster_covariance import (
 )
 from bodyscan.registration.joint_solve import CORNERS, JointSolution, solve_jointly
 from bodyscan.registration.rig_calibration import ObservedCorners
-from bodyscan.registration.rig_frame import frame_board_turn, frame_target, rig_from_root
+from bodyscan.registration.rig_frame import (
+    frame_board_turn,
+    frame_target,
+    hold_frame,
+    rig_from_root,
+)
 from bodyscan.registration.rig_lenses import ChosenLenses, choose_lenses, lens_notes
 from bodyscan.registration.view_consistency import (
     ConsistentSolve,
@@ -149,7 +154,7 @@ def solve_rig(
             for name, rig_from_camera in start.items()
             if name not in unsynchronised
         }
-    solution = _transfer_to_rig_frame(rig, solved)
+    solution = _transfer_to_rig_frame(hold_frame(rig, solved.shaped.views, start), solved)
     notes = (*solved.judged.notes, *solved.shaped.notes, *lens_notes(solution.lenses))
     return Outcome(solution, notes, left_out)
 

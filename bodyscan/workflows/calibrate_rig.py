@@ -24,7 +24,7 @@ from bodyscan.registration.board_checks import boards_not_found
 from bodyscan.registration.halves import compare_halves
 from bodyscan.registration.references import find_rig_size, rescale_boards, select_solving_views
 from bodyscan.registration.rig_calibration import RigCalibration, check_nominal_size
-from bodyscan.registration.rig_frame import refuse_without_frame_shot
+from bodyscan.registration.rig_frame import hold_frame, refuse_without_frame_shot
 from bodyscan.registration.rig_solve import (
     RigSolution,
     collect_corners,
@@ -56,8 +56,8 @@ def calibrate_rig(
     folder: what the paths of `known` cameras are relative to.
 
     A bad image or pair costs only that image or pair, and is named in `failed` or `notes`. Raises
-    FailedWork if no pair is left, RigDisconnected if nothing ties the pairs together, BadInput if
-    nothing fixes the rig frame.
+    FailedWork if no pair is left (of a rig with projectors: none that has one), RigDisconnected if
+    nothing ties the pairs together, BadInput if nothing fixes the rig frame.
     """
     refuse_without_frame_shot(rig, captures.shots)
     boards = find_all_boards(rig, captures, progress)
@@ -105,11 +105,12 @@ def solve_boards(
     solution = solved.solution.value
     stages = (boards, cameras, solved.located, stripes, pairs, solved.solution)
     failed = {name: reason for stage in stages for name, reason in stage.failures.items()}
-    if not pairs.value:
+    projecting = {pair.name for pair in rig.pairs if pair.projector}
+    if not pairs.value or (projecting and not projecting & pairs.value.keys()):
         raise no_pair_calibrated(rig, failed)
     for pair in pairs.value.values():
         solution = update_poses(solved.rig, solution, pair)
-    notes = (*solved.size_notes, *(note for stage in stages for note in stage.notes))
+    notes = (*solved.rig_notes, *(note for stage in stages for note in stage.notes))
     calibration = RigCalibration(
         solved.rig,
         pairs.value,
@@ -134,13 +135,13 @@ def solve_boards(
 class _Adjusted:
     """The joint solve and what led to it.
 
-    rig: with board sizes corrected by reference lengths.
-    size_notes: on that correction.
+    rig: with board sizes corrected by reference lengths, and a frame held by a pair that is there.
+    rig_notes: on these.
     located: each view's board pose by itself.
     """
 
     rig: Rig
-    size_notes: tuple[str, ...]
+    rig_notes: tuple[str, ...]
     located: Outcome[list[LocatedView]]
     solution: Outcome[RigSolution]
 
@@ -203,8 +204,14 @@ def _bundle_adjust(
         rig = rescale_boards(rig, size.value.factor)
         located = locate_views(rig, select_solving_views(rig, boards), cameras.value)
         solution = _solve_rig(rig, located.value, cameras)
-    notes = (*size.notes, *check_nominal_size(rig, solution.value.rig_from_camera))
-    return _Adjusted(rig, notes, located, solution)
+    held = hold_frame(rig, solution.value.views, solution.value.rig_from_camera)
+    notes = [*size.notes, *check_nominal_size(rig, solution.value.rig_from_camera)]
+    if held is not rig:
+        notes.append(
+            f"pair {rig.pairs[0].name}, the first in the rig file, could not be calibrated: the rig "
+            f"frame is held by pair {held.rig_frame.pair} (name a pair in `rig_frame` to choose one)"
+        )
+    return _Adjusted(held, tuple(notes), located, solution)
 
 
 def _solve_rig(

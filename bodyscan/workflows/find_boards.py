@@ -254,8 +254,9 @@ def require_cameras(
 
 
 def no_pair_calibrated(rig: Rig, failed: Mapping[str, str], remedy: str = "") -> FailedWork:
-    """The error for a rig of which nothing is left."""
-    what = f"no pair could be calibrated:{format_list(failed)}"
+    """The error for a rig of which nothing is left, or only cameras whose projectors are not."""
+    of_rig = "pair with a projector" if any(pair.projector for pair in rig.pairs) else "pair"
+    what = f"no {of_rig} could be calibrated:{format_list(failed)}"
     return FailedWork(what, where=f"rig {rig.name}", remedy=remedy)
 
 

@@ -18,12 +18,13 @@ from small_workspace import Detected
 from bodyscan.arrays import Array
 from bodyscan.boards.view import BoardView
 from bodyscan.captures.folder import Captures
-from bodyscan.errors import BodyscanError, FailedWork, RigDisconnected
+from bodyscan.errors import BodyscanError, FailedWork, RigDisconnected, format_list
 from bodyscan.progress import Progress
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.storage import load_calibration, save_calibration
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_frame import RigFrame
+from bodyscan.stripes.codes.gray import Gray
 from bodyscan.workflows import calibrate_rig, find_boards
 from bodyscan.workflows.calibrate_rig import add_remarks, solve_boards
 from bodyscan.workflows.decode import BoardStripes, PairStripes, PrintAreas
@@ -247,3 +248,40 @@ def test_decoding_stops_when_the_joint_solve_has_failed(monkeypatch: pytest.Monk
     with pytest.raises(RigDisconnected):
         solve_boards(boards.rig, boards.captures(boards.views), boards.found(boards.views))
     assert len(decoded) < len(boards.placings)
+
+
+def test_the_frame_passes_from_an_unusable_first_camera_to_the_best_connected() -> None:
+    boards = seen(4, shots=10)
+    views = [
+        view
+        for view in boards.views
+        if (view.pair != "c1" or view.shot == "s02") and (view.pair != "c2" or view.shot > "s03")
+    ]
+    rig = boards.rig.model_copy(update={"rig_frame": RigFrame()})
+    found = calibrated(replace(boards, rig=rig), views)
+    assert sorted(found.pairs) == ["c2", "c3", "c4"]
+    assert np.allclose(found.rig_from_camera["c3"].matrix, np.eye(4))
+    assert found.axes.startswith("that of camera c3")
+    assert any("pair c1, the first" in note and "pair c3" in note for note in found.notes)
+    with pytest.raises(BodyscanError, match="fixed by pair c1"):
+        calibrated(boards, views)
+
+
+def test_cameras_whose_projectors_are_not_calibrated_are_no_rig() -> None:
+    boards = seen(3, shots=8)
+    projector = Gray(code="gray", stripes=12, direction="vertical")
+    pairs = [
+        pair.model_copy(update={"projector": None if pair.name == "c3" else projector})
+        for pair in boards.rig.pairs
+    ]
+    dark = replace(boards, rig=boards.rig.model_copy(update={"pairs": tuple(pairs)}))
+    with pytest.raises(FailedWork, match="no pair with a projector") as caught:
+        calibrated(dark, dark.views)
+    assert caught.value.exit_code == 1
+    assert "c1: stripes were decoded on 0 board poses" in str(caught.value)
+    assert "c2: stripes were decoded on 0 board poses" in str(caught.value)
+
+
+def test_each_failure_is_followed_by_its_own_remedy() -> None:
+    reasons = {"a": "dark\n  open it", "b": "blurred\n  focus", "c": "black\n  open it"}
+    assert format_list(reasons) == "\n  a: dark\n  c: black\n  open it\n  b: blurred\n  focus"

@@ -29,7 +29,9 @@ def simulate_pair(folder: Path, *more: object, **code: object) -> Path:
         ("calibrate-rig", out / "rig.yaml"),
     ):
         result = run(*command)
-        assert result.exit_code == 0, result.output
+        # A pair of so few pixels and boards may be judged as not good enough for a body.
+        judged = command[0] == "calibrate-rig" and "verdict: recalibrate" in result.output
+        assert result.exit_code == (1 if judged else 0), result.output
     return out
 
 
