@@ -76,6 +76,7 @@ def simulate(
             where=str(out),
             remedy="give another --out, or --overwrite to replace them",
         )
+    from bodyscan.mesh.surface_file import read_surface
     from bodyscan.simulation import settings_for
     from bodyscan.simulation import simulate as run
 
@@ -83,6 +84,8 @@ def simulate(
         projector, preset=preset, subject=subject_preset, look=look,
         changes=changes or (),
     )  # fmt: skip
+    if subject is not None:
+        output.notes(read_surface(subject).notes)
     with output.stages() as progress:
         run(
             rig_file, out, subject=subject, scale=scale, seed=seed, settings=settings,

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bodyscan.arrays import Array, Indices, Mask
-from bodyscan.errors import BadInput
 from bodyscan.fusion.storage import FILE_NAME, load_scan
 from bodyscan.geometry.robust import rms
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyMesh
+from bodyscan.mesh.surface_file import read_surface, refuse_size
 from bodyscan.mesh.topology import directed_edges
 
 
@@ -164,14 +164,7 @@ def compare_surfaces(mesh: BodyMesh, other: Path) -> list[Comparison]:
     First as they stand, then with the scan fitted to the other as a whole. Raises ResultError or
     BadInput if `other` cannot be read, or cannot be the same subject.
     """
-    vertices, faces = _surface(other)
-    share = np.ptp(mesh.vertices, axis=0).max() / max(float(np.ptp(vertices, axis=0).max()), 1e-9)
-    if not 0.2 < share < 5.0:  # another subject, or not both in mm
-        raise BadInput(
-            f"is {1.0 / share:.3g} times as large as the scan",
-            where=str(other),
-            remedy="give a surface of the same subject, in millimetres",
-        )
+    vertices, faces = _surface(other, np.ptp(mesh.vertices, axis=0))
     measured = np.unique(mesh.faces[~mesh.filled])
     points = mesh.vertices[measured]
     fit = fit_to_surface(points, vertices, faces)
@@ -214,19 +207,17 @@ def _name(path: Path) -> str:
     return whole.name if path.is_dir() else f"{whole.parent.name}/{whole.name}"
 
 
-def _surface(path: Path) -> tuple[Array, Indices]:
-    """Vertices (V, 3) mm and faces (F, 3)."""
+def _surface(path: Path, sides_mm: Array) -> tuple[Array, Indices]:
+    """Vertices (V, 3) mm and faces (F, 3) of what may be the same subject as a scan with these sides
+    (3,)."""
     if _is_scan(path):
         mesh = load_scan(path if path.is_dir() else path.parent).mesh
         return mesh.vertices, mesh.faces
-    read = o3d.io.read_triangle_mesh(str(path)) if path.is_file() else o3d.geometry.TriangleMesh()
-    if not read.has_triangles():
-        raise BadInput(
-            "no surface can be read here",
-            where=str(path),
-            remedy="give a scan's folder, or a PLY with faces, in mm",
-        )
-    return np.asarray(read.vertices), np.asarray(read.triangles).astype(np.int64)
+    size_mm = float(sides_mm.max())
+    sizes_mm = (0.2 * size_mm, size_mm, 5.0 * size_mm)
+    vertices, faces = read_surface(path).value
+    refuse_size(vertices, path, "millimetres", sizes_mm, int(sides_mm.argmax()))
+    return vertices, faces
 
 
 def _build_centred_scene(

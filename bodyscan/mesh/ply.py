@@ -16,6 +16,7 @@ from bodyscan.errors import ResultError
 from bodyscan.files.atomic import atomic_replacement
 from bodyscan.files.reading import read_regular
 from bodyscan.mesh.body import REGION_NAMES, BodyCloud, BodyMesh, BreathAt
+from bodyscan.mesh.topology import find_fault
 
 Records = NDArray[np.void]
 
@@ -96,8 +97,9 @@ def read_ply_mesh(path: Path) -> BodyMesh:
     vertices, faces = _read(Path(path), "mesh")
     points, normals, sigma_mm, colours = _vertex_arrays(vertices)
     corners = faces["vertex_indices"]["corners"].astype(np.int64)
-    if corners.size and (corners.min() < 0 or corners.max() >= len(points)):
-        raise ResultError("a face names a vertex that is not there", where=str(path))
+    fault = find_fault(points, corners)
+    if fault:
+        raise ResultError(fault, where=str(path))
     breath = None
     if "breath_mm" in (vertices.dtype.names or ()):
         breath = BreathAt(vertices["breath_mm"].copy(), vertices["breath_sigma_mm"].copy())

@@ -9,8 +9,8 @@ import numpy as np
 import open3d as o3d
 
 from bodyscan.arrays import Array, Mask
-from bodyscan.errors import BadInput
 from bodyscan.files.atomic import atomic_replacement
+from bodyscan.mesh.surface_file import read_surface, refuse_size
 from bodyscan.simulation.scene import Surface
 from bodyscan.simulation.settings import Person, Skin
 
@@ -20,17 +20,17 @@ def load_subject(
 ) -> Surface:
     """Load a subject's PLY (metres, z up, facing -y) as a smooth surface, rig frame, mm.
 
-    The mesh is subdivided by Loop's rule, turned to face +x and centred over the rig's origin. The
-    surface returned is itself the truth.
+    The mesh is read by `read_surface`, subdivided by Loop's rule, turned to face +x and centred over
+    the rig's origin. The surface returned is itself the truth.
     covered_by: skin, hair and cloth; matt skin all over if not given.
+
+    Raises BadInput for what is no surface, or in another unit or axis.
     """
-    mesh = o3d.io.read_triangle_mesh(str(path)) if path.is_file() else o3d.geometry.TriangleMesh()
-    if not mesh.has_triangles():
-        raise BadInput(
-            "no triangle mesh can be read here",
-            where=str(path),
-            remedy="Give a PLY in metres, z up, facing -y: see data/subjects/README.md.",
-        )
+    points, faces = read_surface(path).value
+    refuse_size(points, path, "metres")
+    mesh = o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(points), o3d.utility.Vector3iVector(faces.astype(np.int32))
+    )
     mesh = mesh.subdivide_loop(person.subdivisions)
     mesh.compute_vertex_normals()
     turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])

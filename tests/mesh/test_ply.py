@@ -113,5 +113,5 @@ def test_a_face_without_its_vertex_is_refused(tmp_path: Path) -> None:
     mesh = ball()
     mesh.faces[7, 1] = len(mesh.vertices)
     write_ply(tmp_path / "mesh.ply", mesh)
-    with pytest.raises(ResultError, match="vertex that is not there"):
+    with pytest.raises(ResultError, match="face 7 names vertex 762, which is not there"):
         read_ply_mesh(tmp_path / "mesh.ply")

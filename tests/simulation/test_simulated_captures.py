@@ -162,7 +162,7 @@ def test_names_of_frames_and_files_are_the_rig_files_own(tmp_path: Path) -> None
 
 
 def test_a_subject_that_is_no_mesh_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(BadInput, match="no triangle mesh"):
+    with pytest.raises(BadInput, match="no surface can be read here"):
         load_subject(tmp_path / "none.ply", Person(), np.random.default_rng(0))
 
 

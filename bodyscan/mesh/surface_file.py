@@ -1,0 +1,107 @@
+"""Meshes of other programs: read, checked, and mended where only one thing can be meant."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import open3d as o3d
+
+from bodyscan.arrays import Array, Indices
+from bodyscan.errors import BadInput
+from bodyscan.mesh.topology import (
+    check_manifold,
+    drop_unused_vertices,
+    find_fault,
+    signed_volume,
+)
+from bodyscan.outcome import Outcome
+
+UNITS_MM = {"millimetres": 1.0, "centimetres": 10.0, "inches": 25.4, "feet": 304.8, "metres": 1e3}
+PERSON_MM = (300.0, 1700.0, 3000.0)
+"""The longest side of a person: at least, usually, at most."""
+
+
+def read_surface(path: Path) -> Outcome[tuple[Array, Indices]]:
+    """Read vertices (V, 3), in the file's unit, and faces (F, 3), outwards if they enclose a volume.
+
+    Vertices at one place are joined, faces without area between them and vertices that no face uses
+    are dropped, and faces that all run inwards are turned; the notes say so. Raises BadInput, which
+    names the vertex or face, counted from 0.
+    """
+    read = o3d.io.read_triangle_mesh(str(path)) if path.is_file() else o3d.geometry.TriangleMesh()
+    vertices, faces = np.asarray(read.vertices), np.asarray(read.triangles).astype(np.int64)
+    fault = find_fault(vertices, faces) if faces.size else "no surface can be read here"
+    if fault:
+        remedy = "give a PLY with faces, sound where it was made, z up"
+        raise BadInput(fault, where=str(path), remedy=remedy)
+    vertices, faces, notes = _mend(vertices, faces)
+    return Outcome((vertices, faces), tuple(f"{path}: {note}" for note in notes))
+
+
+def refuse_size(
+    vertices: Array,
+    path: Path,
+    unit: str,
+    sizes_mm: tuple[float, float, float] = PERSON_MM,
+    along: int = 2,
+) -> None:
+    """Raise BadInput for a surface (V, 3) that cannot be of its subject in `unit` and z up, and name
+    the unit that would fit.
+
+    unit: of `UNITS_MM`.
+    sizes_mm: what the longest side is at least, usually, and at most.
+    along: number of the axis along which it is at least half as long as its longest side: z for a
+        person who stands.
+    """
+    sides = np.ptp(vertices, axis=0)
+    least, usual, most = sizes_mm
+    longest = int(np.argmax(sides))
+    size = float(sides[longest])
+    if not least < size * UNITS_MM[unit] < most:
+        fits = [name for name, mm in UNITS_MM.items() if least < size * mm < most]
+        meant = min(fits, key=lambda n: abs(math.log(size * UNITS_MM[n] / usual)), default=None)
+        remedy = f"give a surface of such a subject, in {unit}"
+        if meant is not None:
+            factor = UNITS_MM[meant] / UNITS_MM[unit]
+            remedy += f"; if this one is in {meant}, multiply its coordinates by {factor:.6g}"
+        raise BadInput(
+            f"is {size * UNITS_MM[unit]:,.4g} mm long, read as {unit}; "
+            f"{least:,.0f} to {most:,.0f} mm can be right",
+            where=str(path),
+            remedy=remedy,
+        )
+    if sides[along] < 0.5 * size:
+        raise BadInput(
+            f"is long along {'xyz'[longest]} ({size:,.4g} {unit}), not along {'xyz'[along]} "
+            f"({sides[along]:,.4g}): it lies on its side, or another axis than z is up",
+            where=str(path),
+            remedy="turn it so that z is up",
+        )
+
+
+def _mend(vertices: Array, faces: Indices) -> tuple[Array, Indices, list[str]]:
+    """Join, drop and turn as `read_surface` says; also what was done. What is sound stays as it is."""
+    notes = []
+    places, same = np.unique(vertices, axis=0, return_inverse=True)
+    if len(places) < len(vertices):
+        notes.append(
+            f"{len(vertices) - len(places)} vertices lie where another does, and are joined"
+        )
+        vertices, faces = places, same.reshape(-1)[faces]
+    flat = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
+    if flat.any():
+        notes.append(
+            f"{flat.sum()} faces name a vertex twice (the first is {flat.argmax()}): dropped"
+        )
+        faces = faces[~flat]
+    count = len(vertices)
+    vertices, faces, _ = drop_unused_vertices(vertices, faces)
+    if len(vertices) < count:
+        notes.append(f"{count - len(vertices)} vertices belong to no face: dropped")
+    closed, _ = check_manifold(faces, len(vertices))
+    if closed and signed_volume(vertices - vertices.mean(axis=0), faces) < 0.0:
+        notes.append("all faces run inwards: turned")
+        faces = np.ascontiguousarray(faces[:, ::-1])
+    return vertices, faces, notes

@@ -1,0 +1,87 @@
+"""Meshes of other programs are read as they are meant, or refused by vertex, face or unit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import open3d as o3d
+import pytest
+from small_bodies import ball
+
+from bodyscan.arrays import Array, Indices
+from bodyscan.errors import BadInput
+from bodyscan.mesh.surface_file import read_surface, refuse_size
+from bodyscan.mesh.topology import signed_volume
+
+VERTICES, FACES = ball().vertices, ball().faces
+
+
+def write(folder: Path, vertices: Array, faces: Indices) -> Path:
+    mesh = o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(vertices), o3d.utility.Vector3iVector(faces.astype(np.int32))
+    )
+    o3d.io.write_triangle_mesh(str(folder / "made.ply"), mesh)
+    return folder / "made.ply"
+
+
+def test_a_sound_mesh_is_read_as_it_is(tmp_path: Path) -> None:
+    read = read_surface(write(tmp_path, VERTICES, FACES))
+    np.testing.assert_array_equal(read.value[0], VERTICES)
+    np.testing.assert_array_equal(read.value[1], FACES)
+    assert read.notes == ()
+
+
+@pytest.mark.parametrize(
+    ("vertices", "faces", "said"),
+    [
+        (VERTICES, FACES[:, ::-1], "all faces run inwards"),
+        (VERTICES + 1e4, FACES[:, ::-1], "all faces run inwards"),
+        (np.vstack([VERTICES, [[9e3, 0, 0], [0, 0, -9e3]]]), FACES, "2 vertices belong to no face"),
+        (VERTICES, np.vstack([FACES, [[4, 4, 5]]]), f"twice (the first is {len(FACES)})"),
+        (VERTICES[FACES].reshape(-1, 3), np.arange(FACES.size).reshape(-1, 3)[:, ::-1], "joined"),
+    ],
+)
+def test_what_can_mean_one_thing_is_mended_and_said(
+    vertices: Array, faces: Indices, said: str, tmp_path: Path
+) -> None:
+    path = write(tmp_path, vertices, faces)
+    read = read_surface(path)
+    assert len(read.value[0]) == len(VERTICES)
+    assert len(read.value[1]) == len(FACES)
+    assert signed_volume(*read.value) == pytest.approx(signed_volume(VERTICES, FACES), rel=1e-6)
+    assert any(said in note for note in read.notes)
+    assert all(note.startswith(str(path)) for note in read.notes)
+
+
+def test_what_is_no_mesh_is_refused_by_vertex_or_face(tmp_path: Path) -> None:
+    unknown, wrong = VERTICES.copy(), FACES.copy()
+    unknown[7, 1], wrong[5, 2] = np.nan, 99_999
+    with pytest.raises(BadInput, match="vertex 7 "):
+        read_surface(write(tmp_path, unknown, FACES))
+    with pytest.raises(BadInput, match="face 5 names vertex 99999"):
+        read_surface(write(tmp_path, VERTICES, wrong))
+
+
+@pytest.mark.parametrize(
+    ("size", "said"),
+    [
+        ((0.5, 0.3, 1.7), None),
+        ((1.8, 0.3, 1.7), None),  # arms held out
+        ((500, 300, 1700), "in millimetres, multiply its coordinates by 0.001"),
+        ((50, 30, 170), "in centimetres, multiply its coordinates by 0.01"),
+        ((20, 12, 67), "in inches, multiply its coordinates by 0.0254"),
+        ((0.0005, 0.0003, 0.0017), "give a surface"),
+        ((0.5, 1.7, 0.3), "is long along y"),
+    ],
+)
+def test_a_person_in_another_unit_or_who_lies_is_refused(
+    size: tuple[float, float, float], said: str | None
+) -> None:
+    corners = np.array([[0.0, 0.0, 0.0], size])
+    if said is None:
+        return refuse_size(corners, Path("made.ply"), "metres")
+    with pytest.raises(BadInput) as refused:
+        refuse_size(corners, Path("made.ply"), "metres")
+    assert said in str(refused.value)
+    return None
