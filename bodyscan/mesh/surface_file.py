@@ -56,19 +56,19 @@ def refuse_size(
         person who stands.
     """
     sides = np.ptp(vertices, axis=0)
-    least, usual, most = sizes_mm
+    lowest, expected, highest = sizes_mm
     longest = int(np.argmax(sides))
     size = float(sides[longest])
-    if not least < size * UNITS_MM[unit] < most:
-        fits = [name for name, mm in UNITS_MM.items() if least < size * mm < most]
-        meant = min(fits, key=lambda n: abs(math.log(size * UNITS_MM[n] / usual)), default=None)
+    if not lowest < size * UNITS_MM[unit] < highest:
+        fits = [name for name, mm in UNITS_MM.items() if lowest < size * mm < highest]
+        meant = min(fits, key=lambda n: abs(math.log(size * UNITS_MM[n] / expected)), default=None)
         remedy = f"give a surface of such a subject, in {unit}"
         if meant is not None:
             factor = UNITS_MM[meant] / UNITS_MM[unit]
             remedy += f"; if this one is in {meant}, multiply its coordinates by {factor:.6g}"
         raise BadInput(
             f"is {size * UNITS_MM[unit]:,.4g} mm long, read as {unit}; "
-            f"{least:,.0f} to {most:,.0f} mm can be right",
+            f"{lowest:,.0f} to {highest:,.0f} mm can be right",
             where=str(path),
             remedy=remedy,
         )
