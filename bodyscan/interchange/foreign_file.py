@@ -8,6 +8,7 @@ import tomllib
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -23,7 +24,7 @@ from bodyscan.geometry.lenses import lens_from_opencv
 from bodyscan.geometry.lenses.fisheye import Fisheye
 from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.interchange.found_camera import FoundCamera
+from bodyscan.interchange.found_camera import FoundCamera, FoundCameras
 from bodyscan.interchange.rig_format import opencv_lens
 
 MAX_BYTES = 100_000_000  # mrcal's files hold all corners of a calibration, some megabytes
@@ -251,8 +252,22 @@ def read_toml(file: ForeignFile) -> dict[str, Any]:
         raise file.error(f"is not TOML: {error}") from None
 
 
-def read_camera_table(file: ForeignFile, table: dict[str, Any], key: str) -> FoundCamera:
-    """Read the camera in a table; key: of the table, as written in the file."""
+def read_camera_tables(file: ForeignFile, tables: Mapping[str, Any], prefix: str) -> FoundCameras:
+    """Find cameras by their tables' keys, which follow `prefix` in the file, and by their `name`.
+
+    Raises CalibrationFileError if there are none.
+    """
+    readers = {}
+    for key, table in tables.items():
+        if isinstance(table, dict) and key != "metadata":
+            readers[key] = partial(_read_camera_table, file, table, prefix + key)
+            readers[str(table.get("name", key))] = readers[key]
+    if not readers:
+        raise file.error("holds no cameras as this program writes them")
+    return FoundCameras(readers)
+
+
+def _read_camera_table(file: ForeignFile, table: dict[str, Any], key: str) -> FoundCamera:
     file.require(table, ("size", "matrix", "distortions"), key)
     pose = None
     if all(table.get(word, "null") != "null" for word in ("rotation", "translation")):

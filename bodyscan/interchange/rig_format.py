@@ -50,25 +50,18 @@ def projector_name(pair: str) -> str:
     return f"{pair}-projector"
 
 
-def opencv_coefficients(name: str, camera: Camera) -> Array:
-    """Return OpenCV's coefficients (5,) or more of a pair's camera.
-
-    Raises BadInput, which names the pair, for a lens that OpenCV does not have.
-    """
-    try:
-        return camera.lens.opencv()
-    except BadInput as error:
-        raise BadInput(error.what, where=f"pair {name}", remedy=error.remedy) from None
-
-
 def opencv_lens(name: str, camera: Camera) -> tuple[bool, Array]:
-    """Return whether the lens of a pair's camera is OpenCV's fisheye, and OpenCV's coefficients of it.
+    """Return whether the lens of a pair's camera is OpenCV's fisheye, and OpenCV's coefficients of it:
+    four, or else five or more.
 
     Raises BadInput, which names the pair, for a lens that OpenCV does not have.
     """
     if camera.lens.kind == "fisheye":
         return True, camera.lens.coefficients
-    return False, opencv_coefficients(name, camera)
+    try:
+        return False, camera.lens.opencv()
+    except BadInput as error:
+        raise BadInput(error.what, where=f"pair {name}", remedy=error.remedy) from None
 
 
 RIG_FORMATS: Registry[RigFormat] = Registry("bodyscan.interchange.formats", "a rig")

@@ -6,7 +6,6 @@ Lengths are in the unit in which its board's squares were given.
 from __future__ import annotations
 
 import json
-from functools import partial
 from pathlib import Path
 
 from bodyscan.files.atomic import write_text
@@ -14,7 +13,7 @@ from bodyscan.interchange.foreign_file import (
     TOML_NOTE,
     ForeignFile,
     format_camera_table,
-    read_camera_table,
+    read_camera_tables,
     read_toml,
 )
 from bodyscan.interchange.found_camera import FoundCameras
@@ -35,14 +34,7 @@ def write_aniposelib(cameras: RigCameras, path: Path) -> Path:
 def read_aniposelib(path: Path) -> FoundCameras:
     """Read cameras by their names, and by those of their tables."""
     file = ForeignFile.read(path)
-    readers = {}
-    for key, table in read_toml(file).items():
-        if key != "metadata" and isinstance(table, dict):
-            readers[key] = partial(read_camera_table, file, table, key)
-            readers[str(table.get("name", key))] = readers[key]
-    if not readers:
-        raise file.error("holds no cameras as aniposelib writes them")
-    return FoundCameras(readers)
+    return read_camera_tables(file, read_toml(file), "")
 
 
 FORMAT = RigFormat("aniposelib.toml", None, write_aniposelib, read_aniposelib)

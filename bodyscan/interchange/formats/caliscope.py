@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from functools import partial
 from pathlib import Path
 
 from bodyscan.files.atomic import write_text
@@ -11,7 +10,7 @@ from bodyscan.interchange.foreign_file import (
     TOML_NOTE,
     ForeignFile,
     format_camera_table,
-    read_camera_table,
+    read_camera_tables,
     read_toml,
 )
 from bodyscan.interchange.found_camera import FoundCameras
@@ -40,14 +39,7 @@ def read_caliscope(path: Path) -> FoundCameras:
     """
     file = ForeignFile.read(path)
     tables = read_toml(file).get("cameras")
-    if not isinstance(tables, dict) or not tables:
-        raise file.error("holds no cameras: it is not a camera_array.toml of caliscope's")
-    readers = {}
-    for key, table in tables.items():
-        if isinstance(table, dict):
-            readers[key] = partial(read_camera_table, file, table, f"cameras.{key}")
-            readers.setdefault(str(table.get("name", key)), readers[key])
-    return FoundCameras(readers)
+    return read_camera_tables(file, tables if isinstance(tables, dict) else {}, "cameras.")
 
 
 FORMAT = RigFormat("camera_array.toml", "m", write_caliscope, read_caliscope)

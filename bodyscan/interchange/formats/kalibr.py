@@ -6,6 +6,7 @@ world.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -89,39 +90,37 @@ def read_kalibr(path: Path) -> FoundCameras:
 
 
 def _pose_in_first(
-    file: ForeignFile, cameras: dict[str, dict[str, Any]], number: int
+    file: ForeignFile, cameras: Mapping[str, Any], number: int
 ) -> RigidTransform | None:
     """Compute a camera's pose, `camera_from_cam0`; None if neither chain nor IMU gives it."""
     pose: RigidTransform | None = RigidTransform.identity()
     for k in range(1, number + 1):
         key = f"cam{k}"
         if "T_cn_cnm1" in cameras[key]:
-            pose = _transform(file, cameras, key, "T_cn_cnm1") @ pose if pose else None
+            step = _transform(file, cameras, key, "T_cn_cnm1")
+            pose = step @ pose if step and pose else None
         else:
-            own, first = (_camera_from_imu(file, cameras, one) for one in (key, "cam0"))
+            own, first = (
+                _transform(file, cameras, one, "T_cam_imu")
+                or _transform(file, cameras, one, "T_imu_cam", inverse=True)
+                for one in (key, "cam0")
+            )
             pose = own @ first.inverse() if own and first else None
     return pose
 
 
-def _camera_from_imu(
-    file: ForeignFile, cameras: dict[str, dict[str, Any]], key: str
-) -> RigidTransform | None:
-    if "T_cam_imu" in cameras[key]:
-        return _transform(file, cameras, key, "T_cam_imu")
-    if "T_imu_cam" in cameras[key]:
-        return _transform(file, cameras, key, "T_imu_cam").inverse()
-    return None
-
-
 def _transform(
-    file: ForeignFile, cameras: dict[str, dict[str, Any]], key: str, word: str
-) -> RigidTransform:
+    file: ForeignFile, cameras: Mapping[str, Any], key: str, word: str, *, inverse: bool = False
+) -> RigidTransform | None:
+    if word not in cameras[key]:
+        return None
     name = f"{key}.{word}"
     matrix = file.numbers(cameras[key][word], name, 16).reshape(4, 4)
-    return file.pose(matrix[:3, :3], matrix[:3, 3], name)
+    pose = file.pose(matrix[:3, :3], matrix[:3, 3], name)
+    return pose.inverse() if inverse else pose
 
 
-def _read_camera(file: ForeignFile, cameras: dict[str, dict[str, Any]], number: int) -> FoundCamera:
+def _read_camera(file: ForeignFile, cameras: Mapping[str, Any], number: int) -> FoundCamera:
     key = f"cam{number}"
     entry = cameras[key]
     words = ("camera_model", "intrinsics", "distortion_model", "resolution")

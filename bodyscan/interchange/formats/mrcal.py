@@ -19,7 +19,7 @@ from bodyscan.errors import BadInput, CalibrationFileError
 from bodyscan.files.atomic import write_text
 from bodyscan.interchange.foreign_file import ForeignFile
 from bodyscan.interchange.found_camera import FoundCamera, FoundCameras
-from bodyscan.interchange.rig_format import RigCameras, RigFormat, opencv_coefficients
+from bodyscan.interchange.rig_format import RigCameras, RigFormat, opencv_lens
 
 COEFFICIENTS = {"PINHOLE": 0, "OPENCV4": 4, "OPENCV5": 5, "OPENCV8": 8, "OPENCV12": 12}
 SUFFIX = ".cameramodel"
@@ -48,11 +48,11 @@ def read_mrcal(path: Path) -> FoundCameras:
 
 
 def _format_model(name: str, camera: Any, rig_from_camera: Any) -> str:
-    coefficients = opencv_coefficients(name, camera)
+    is_fisheye, coefficients = opencv_lens(name, camera)
     rest = np.flatnonzero(coefficients)
     used = int(rest[-1]) + 1 if len(rest) else 0
     model = next((m for m, count in COEFFICIENTS.items() if count >= used), None)
-    if model is None:
+    if model is None or is_fisheye:
         what = f"mrcal has no lens like {camera.lens.kind!r}"
         raise BadInput(what, where=f"pair {name}", remedy="choose another format")
     lens = np.append(coefficients, np.zeros(12))[: COEFFICIENTS[model]]
