@@ -69,23 +69,23 @@ def calibrate_folder(
 ) -> tuple[RigCalibration, Path]:
     """Calibrate a rig like `calibrate_rig` and save it; return it and the path of its JSON.
 
-    It is saved once as soon as it is solved and again with the remarks on it. A calibration already
-    in `folder` moves into its history. Raises RigFileError and CaptureError as well.
+    It is saved last and whole: after an interruption `folder` holds what it held, and the same call
+    completes it. A calibration already there moves into its history. Raises RigFileError and
+    CaptureError as well.
     """
     rig = load_rig(rig_file)
     captures = open_captures(rig, rig_file)
     refuse_without_frame_shot(rig, captures.shots)
     boards = find_all_boards(rig, captures, progress)
     solved = solve_boards(rig, captures, boards, progress, folder=Path(rig_file).parent)
+    remarked = add_remarks(solved, progress)
     archive_previous(folder)
-    save_calibration(solved.calibration, folder)
-    notes: list[str] = []
+    notes = list(remarked.notes)
     with optional(CORNERS_NAME, notes.append):
         write_found_corners(folder / CORNERS_NAME, rig, captures, boards.value)
     with optional("images that are not used", notes.append):
         notes += filter(None, [describe_unlisted_images(captures)])
-    calibration = add_remarks(solved, progress)
-    calibration = replace(calibration, notes=(*calibration.notes, *notes))
+    calibration = replace(remarked, notes=tuple(notes))
     return calibration, save_calibration(calibration, folder)
 
 

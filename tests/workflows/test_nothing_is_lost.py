@@ -1,4 +1,4 @@
-"""What a result stands without fails after the result is written, and costs itself alone."""
+"""What a result stands without costs itself alone; a result is there whole or not at all."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ from typing import NoReturn
 import pytest
 from made_scan import make_scan
 from seen_boards import SeenBoards, seen_boards
+from small_workspace import run
 from verdict_given import verdict_given
 
 from bodyscan.files.hashing import file_hash
+from bodyscan.fusion import verdict
 from bodyscan.fusion.storage import load_scan
 from bodyscan.registration.storage import load_calibration
 from bodyscan.report import calibration_page, pictures
@@ -29,29 +31,47 @@ def ring() -> SeenBoards:
 
 
 @pytest.fixture
-def calibrated(ring: SeenBoards, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The folder of a calibration whose remarks all failed, each after it was written."""
-    folder = tmp_path / "calibration"
-
-    def broken_later(*_: object, **__: object) -> NoReturn:
-        assert load_calibration(folder).pairs
-        raise KeyError("p2-2")
-
+def boards(ring: SeenBoards, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every rig file is that of the ring, whose boards are found."""
     monkeypatch.setattr(calibrate_rig, "load_rig", lambda _: ring.rig)
     monkeypatch.setattr(calibrate_rig, "open_captures", lambda *_: ring.captures(ring.views))
     monkeypatch.setattr(calibrate_rig, "find_all_boards", lambda *_: ring.found(ring.views))
+
+
+@pytest.fixture
+def calibrated(boards: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder of a calibration whose remarks all failed."""
     for name in (
         *("coverage_notes", "boards_not_found"),
         *("advise", "compare_halves", "stripe_board_notes"),
     ):
-        monkeypatch.setattr(calibrate_rig, name, broken_later)
-    calibrate_rig.calibrate_folder(tmp_path / "rig.yaml", folder)
-    return folder
+        monkeypatch.setattr(calibrate_rig, name, broken)
+    calibrate_rig.calibrate_folder(tmp_path / "rig.yaml", tmp_path / "calibration")
+    return tmp_path / "calibration"
 
 
-def test_a_calibration_is_written_before_anything_is_said_of_it(
-    ring: SeenBoards, calibrated: Path
+def killed(*_: object, **__: object) -> NoReturn:
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("at", ["advise", "write_found_corners", "save_calibration"])
+def test_a_calibration_that_is_killed_at_its_end_is_made_by_the_same_command(
+    boards: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: str
 ) -> None:
+    (tmp_path / "rig.yaml").touch()
+    with monkeypatch.context() as kill:
+        if at == "save_calibration":  # between its two files
+            kill.setattr("bodyscan.registration.storage.write_json", killed)
+        else:
+            kill.setattr(calibrate_rig, at, killed)
+        run("calibrate-rig", tmp_path / "rig.yaml")
+    assert not (tmp_path / "calibration" / "calibration.json").exists()
+    result = run("calibrate-rig", tmp_path / "rig.yaml")
+    assert result.exit_code == 0, result.output
+    assert load_calibration(tmp_path / "calibration").advice
+
+
+def test_a_remark_that_fails_costs_itself_alone(ring: SeenBoards, calibrated: Path) -> None:
     found = load_calibration(calibrated)
     assert sorted(found.pairs) == sorted(ring.placings)
     failures = [note.partition(":")[0] for note in found.notes if "KeyError" in note]
@@ -102,9 +122,9 @@ def test_a_verdict_that_misses_a_check_is_not_good(
 ) -> None:
     scan = make_scan(tmp_path / "scan")
     whole = verdict_given(scan.cloud, scan.mesh)
-    monkeypatch.setattr("bodyscan.fusion.verdict.shape.find_handles", broken)
+    monkeypatch.setattr(verdict, "CHECKS", (*verdict.CHECKS, broken))
     missed = verdict_given(scan.cloud, scan.mesh)
     said = set(missed.reasons) - set(whole.reasons)
     assert len(said) == 1
-    assert "verdict on contacts" in said.pop()
+    assert "verdict on broken" in said.pop()
     assert missed.grade == "usable"
