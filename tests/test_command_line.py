@@ -60,6 +60,17 @@ def test_bad_input_exits_with_2_and_no_traceback(tmp_path: Path) -> None:
     assert "pairs" in done.stderr
 
 
+def test_warnings_of_numpy_stay_off_the_terminal() -> None:
+    divide = (
+        "import numpy; from bodyscan.cli import main; "
+        "main._run = lambda *_, **__: int((numpy.zeros(1) / 0.0).size - 1); main.main()"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", divide], capture_output=True, text=True, check=False, timeout=120
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 def test_debug_shows_the_traceback(tmp_path: Path) -> None:
     done = in_a_process("check", tmp_path / "missing.yaml", "--debug")
     assert done.returncode != 0

@@ -28,7 +28,7 @@ def find_checkerboard(image: Bytes, board: Board, *, quick: bool = False) -> Det
 
     quick: use the two quickest detectors only, on any board.
 
-    Raises BadInput for a board that no detector finds, or whose numbering would be ambiguous.
+    Raises BadInput for a board that no detector finds.
     """
     if not quick:
         _refuse_unsuitable(board)
@@ -40,13 +40,6 @@ def find_checkerboard(image: Bytes, board: Board, *, quick: bool = False) -> Det
 
 
 def _refuse_unsuitable(board: Board) -> None:
-    if board.columns == board.rows:
-        raise BadInput(
-            "a plain checkerboard with as many columns as rows cannot be told from itself turned "
-            "by a quarter",
-            where=f"board {board.name}",
-            remedy="use a board whose columns and rows differ, or a charuco board",
-        )
     if min(board.columns, board.rows) < MIN_SQUARES:
         raise BadInput(
             f"a plain checkerboard of {board.columns} columns and {board.rows} rows cannot be found: "

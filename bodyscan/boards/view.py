@@ -74,7 +74,8 @@ def number_corners(
 
     pixels: (N, 2) px of all corners row by row, NaN where one was not found. The board is seen from
         its front; rows may run from either side, and the end from which a plain board whose print
-        looks the same turned is numbered stays open.
+        looks the same turned is numbered stays open. A ChArUco board may be mirrored, or seen
+        through the glass that it is printed on: its markers number it as it is.
     size: of the image, px.
 
     Raises CaptureError if the number of corners differs from the board's, or one is outside the
@@ -100,7 +101,8 @@ def number_corners(
         )
     grid = pixels.reshape(-1, columns, 2)
     along, across = np.diff(grid, axis=1)[:-1], np.diff(grid, axis=0)[:, :-1]
-    if np.nansum(along[..., 0] * across[..., 1] - along[..., 1] * across[..., 0]) < 0.0:
+    from_right = np.nansum(along[..., 0] * across[..., 1] - along[..., 1] * across[..., 0]) < 0.0
+    if from_right and board.kind != "charuco":
         grid = grid[:, ::-1]  # rows from the right
     pixels = grid.reshape(-1, 2)
     ids = np.flatnonzero(np.isfinite(pixels).all(axis=1))

@@ -128,12 +128,17 @@ def board_symmetries(board: Board) -> tuple[RigidTransform, ...]:
     """Every `board_from_seen` under which a plain board looks the same to the detector.
 
     A plain board may be numbered from its other end, unless the colour of its first square shows
-    which end it is, or seen from its back.
+    which end it is, or from any corner if it has as many columns as rows; or be seen from its back.
     """
     width, height = board.size_mm
     found = [RigidTransform.identity()]
     if (board.columns + board.rows) % 2 == 0:
         found.append(RigidTransform(np.diag([-1.0, -1.0, 1.0]), np.array([width, height, 0.0])))
+    if board.columns == board.rows:
+        quarter = RigidTransform(
+            np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.array([width, 0, 0])
+        )
+        found += [quarter @ symmetry for symmetry in found]
     if board.faces == 2:
         front_from_back = RigidTransform(
             np.diag([-1.0, 1.0, -1.0]), np.array([width, 0.0, board.thickness_mm])
@@ -154,15 +159,17 @@ def covered_share(pixels: Sequence[Array], width: int, height: int) -> float:
 
 
 def coverage_notes(rig: Rig, views: Sequence[BoardView]) -> list[str]:
-    """Name each camera whose boards cover too little of the image to determine its lens."""
-    notes = []
+    """One line that names the cameras whose boards cover too little of the image to determine the
+    lens."""
+    narrow = []
     for pair in rig.pairs:
         pixels = [view.pixels for view in views if view.pair == pair.name]
         share = covered_share(pixels, pair.camera.width, pair.camera.height)
         if pixels and share < 0.2:
-            notes.append(
-                f"{pair.name}: in all {len(pixels)} views together the board covers only "
-                f"{100 * share:.0f} % of the picture, so its lens and focal length are poorly "
-                "known: bring the board closer, and into the corners"
-            )
-    return notes
+            narrow.append(f"{100 * share:.0f} % of {pair.name}'s")
+    if not narrow:
+        return []
+    return [
+        f"in all views together the board covers only {', '.join(narrow)} picture, so that lens and "
+        "focal length are poorly known there: bring the board closer, and into the corners"
+    ]

@@ -154,7 +154,6 @@ def test_a_plain_board_with_two_faces_is_turnable() -> None:
 @pytest.mark.parametrize(
     ("columns", "rows", "message"),
     [
-        (10, 10, "quarter"),
         (9, 3, "9 columns and 3 rows cannot be found"),
         (3, 9, "cannot be found"),
     ],

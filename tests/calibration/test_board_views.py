@@ -126,20 +126,24 @@ def test_the_covered_share_of_the_picture_is_that_of_the_hulls() -> None:
 def test_only_a_small_board_is_noted(tmp_path: Path, size: float, named: bool) -> None:
     rig = load_rig(Path("rigs/one-pair.yaml"))
     (pair,) = rig.pairs
+    pairs = (pair, pair.model_copy(update={"name": "other"}))
+    rig = rig.model_copy(update={"pairs": pairs})
     width, height = pair.camera.width, pair.camera.height
     views = [
         BoardView(
-            pair=pair.name,
+            pair=name,
             shot=f"shot{number}",
             board=rig.boards[0].name,
             corner_ids=np.arange(48),
             pixels=corners(0.2 * width, 0.2 * height, size * width, size * height),
         )
         for number in range(3)
+        for name in (pair.name, "other")
     ]
     notes = coverage_notes(rig, views)
-    assert bool(notes) == named
+    assert len(notes) == named, "one line for all cameras"
     if named:
         assert pair.name in notes[0]
+        assert "other" in notes[0]
         assert "5 %" in notes[0]
         assert "closer" in notes[0]
