@@ -88,9 +88,9 @@ class ForeignFile:
     def error(self, what: str, name: str = "", remedy: str = "") -> CalibrationFileError:
         """An error about the file, or about what a name in it stands for."""
         return CalibrationFileError(
-            f"{name}: {what}" if name else what,
+            f"{name[:100]}: {what[:300]}" if name else what[:300],  # a name may fill the file
             where=self.where(name),
-            remedy=remedy or "give the file as that program wrote it",
+            remedy=remedy[:800] or "give the file as that program wrote it",
         )
 
     def require(self, table: Mapping[str, Any], words: Iterable[str], key: str) -> None:

@@ -620,7 +620,8 @@ def test_a_colmap_sensor_without_a_place_in_its_rig_has_none(tmp_path: Path) -> 
 
 JUNK = st.sampled_from(
     ["", "[", "]", "{", "}", "nan", "1e999", "-1", '"', "x", "\n", "\t", ":", "null", "[[1, 2], 3]",
-     "\x00", "- ", 'b"x"', "</a>", "!!opencv-matrix", "9" * 30]
+     "\x00", "- ", 'b"x"', "</a>", "!!opencv-matrix", "9" * 400, "9" * 5000,
+     "[" * 2000]
 )  # fmt: skip
 
 
