@@ -144,16 +144,17 @@ def measure(
         ),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Default: `measurements.json` inside the result.")
+        Path | None,
+        typer.Option(help="Default: `measurements.json` inside the result; .csv for CSV."),
     ] = None,
     anyway: Anyway = False,
 ) -> None:
     """Measure a scan's mesh: stature, girths of horizontal slices, volume, area."""
-    from bodyscan.files.atomic import write_json
+    from bodyscan.files.atomic import write_json, write_text
     from bodyscan.fusion.storage import load_scan, refuse_repeat
     from bodyscan.measurement.measurements import heights_from
     from bodyscan.measurement.measurements import measure as measure_mesh
-    from bodyscan.report.measurements import measurements_document, tables
+    from bodyscan.report.measurements import measurements_csv, measurements_document, tables
 
     levels = None if heights is None else heights_from(heights)
     stored = load_scan(result)
@@ -162,7 +163,12 @@ def measure(
     measured = measure_mesh(stored.mesh, levels)
     content = measurements_document(measured, stored.facts)
     path = out or result / "measurements.json"
-    write_json(path, content)
+    if path.suffix.lower() == ".csv":
+        write_text(path, measurements_csv(content))
+        # As beside an export, so that `bodyscan forget` knows whose it is.
+        write_json(path.with_name(f"{path.name}.json"), {"subject": content["subject"]})
+    else:
+        write_json(path, content)
     output.show(*tables(measured))
     output.figures(**content)
     output.add_files("measurements", path)

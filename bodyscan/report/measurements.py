@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from typing import Any
@@ -98,3 +100,22 @@ def measurements_document(measured: Measurements, facts: Mapping[str, Any]) -> d
         "facing_known": measured.facing_known,
         "slices": [asdict(level) for level in measured.slices],
     }
+
+
+def measurements_csv(content: Mapping[str, Any]) -> str:
+    """The `measurements_document` as CSV: a row for each part of each slice, beside what is of the
+    whole body; lengths in mm, ranges as `low` and `high`."""
+    keys = ("subject", "when", "stature_mm", "volume_l", "area_m2", "at_mean_breath")
+    body = {key: content[key] for key in keys}
+    body |= {"grade": (content["verdict"] or {}).get("grade")}
+    ends = ("girth_low_mm", "girth_high_mm", "tape_low_mm", "tape_high_mm")
+    part = ("part", "girth_mm", "tape_mm", "width_mm", "depth_mm", "area_mm2", "measured")
+    text = io.StringIO()
+    table = csv.DictWriter(text, (*body, "height_mm", *part, *ends), extrasaction="ignore")
+    table.writeheader()
+    for level in content["slices"]:
+        for girth in level["girths"]:
+            between = (*girth["girth_range_mm"], *girth["tape_range_mm"])
+            row = body | girth | {"height_mm": level["height_mm"]}
+            table.writerow(row | dict(zip(ends, between, strict=True)))
+    return text.getvalue()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import csv
 import json
 import re
 from dataclasses import replace
@@ -15,6 +16,7 @@ import pytest
 from browser import browser_page, find_browser
 from made_scan import MIDDLE_MM, SEMI_AXES_MM, MadeScan, egg, make_scan
 from required import missing
+from small_workspace import run
 from typer.testing import CliRunner
 
 from bodyscan.cli.main import app
@@ -274,3 +276,20 @@ def test_the_footer_says_where_the_rig_frame_lies(tmp_path: Path) -> None:
     for axes in ("origin on the floor", "that of camera L"):
         write_json(folder / "scan.json", facts | Origin("01", None, None, axes=axes).facts)
         assert f"Rig frame: {axes}. This" in render(build_page(folder))
+
+
+def test_measurements_are_written_as_csv_by_their_suffix(tmp_path: Path) -> None:
+    scan = make_scan(tmp_path / "scan")
+    for name in ("girths.csv", "girths.json"):
+        assert run("measure", scan.folder, "--anyway", "--out", tmp_path / name).exit_code == 0
+    whole = json.loads((tmp_path / "girths.json").read_text("utf-8"))
+    with (tmp_path / "girths.csv").open(newline="", encoding="utf-8") as stream:
+        rows = list(csv.DictReader(stream))
+    girths = [girth for level in whole["slices"] for girth in level["girths"]]
+    assert len(rows) == len(girths) > 3
+    for row, girth in zip(rows, girths, strict=True):
+        assert float(row["tape_mm"]) == girth["tape_mm"]
+        assert [float(row["tape_low_mm"]), float(row["tape_high_mm"])] == girth["tape_range_mm"]
+        assert float(row["stature_mm"]) == whole["stature_mm"]
+    beside = json.loads((tmp_path / "girths.csv.json").read_text("utf-8"))
+    assert beside == {"subject": whole["subject"]}
