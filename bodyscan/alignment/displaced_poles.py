@@ -168,22 +168,22 @@ def find_displaced_pole(
     farthest off is returned.
     """
     several = len(scans) >= MIN_SCANS
-    seen = _PoseMotions.from_scans(scans, poles, displaced, timed=not several)
-    if len(set(seen.names)) < MIN_PAIRS:
+    measured = _PoseMotions.from_scans(scans, poles, displaced, timed=not several)
+    if len(set(measured.names)) < MIN_PAIRS:
         return DisplacementSearch(None, np.inf)
-    nothing = np.zeros_like(seen.sway)
+    nothing = np.zeros_like(measured.sway)
     null, covariance, sway_mm, offset_mm = _maximize_likelihood(
-        seen, SWAYS_MM, nothing, np.zeros(1)
+        measured, SWAYS_MM, nothing, np.zeros(1)
     )
     candidates: list[tuple[float, DisplacedPole]] = []
     detectable, ambiguous = MIN_STEP_MM, bool(displaced)
-    for name, pairs in group_by_pole(sorted(set(seen.names)), poles).items():
-        members = np.array([pair in pairs for pair in seen.names])
-        if not pairs.isdisjoint(displaced) or not set(seen.names) - pairs - set(displaced):
+    for name, pairs in group_by_pole(sorted(set(measured.names)), poles).items():
+        members = np.array([pair in pairs for pair in measured.names])
+        if not pairs.isdisjoint(displaced) or not set(measured.names) - pairs - set(displaced):
             continue
         # Correlation 0.8 s apart: if a pole fires at no other pole's time, the person may have
         # moved meanwhile.
-        if not several and seen.sway[np.ix_(members, ~members)].max() <= 0.5:
+        if not several and measured.sway[np.ix_(members, ~members)].max() <= 0.5:
             detectable, ambiguous = np.inf, ambiguous or len(pairs) > 1
             continue
         sigma = 1.0 / np.sqrt(members @ np.linalg.solve(covariance, members.astype(float)))
@@ -197,14 +197,16 @@ def find_displaced_pole(
             detectable = np.inf
         sways = SWAYS_MM if any_sway else SWAYS_MM[SWAYS_MM < STILL_MM]
         stepped = np.outer(members, members)
-        gain = _maximize_likelihood(seen, sways, stepped, STEPS_MM)[0] - null
-        motions = [{n: m[n] for n in m if n in seen.names and n not in displaced} for m, _ in scans]
+        gain = _maximize_likelihood(measured, sways, stepped, STEPS_MM)[0] - null
+        motions = [
+            {n: m[n] for n in m if n in measured.names and n not in displaced} for m, _ in scans
+        ]
         candidates.append((gain, DisplacedPole.from_motions(name, pairs, _mean_motions(motions))))
     if not candidates:
         return DisplacementSearch(None, np.inf)
     if not ambiguous:
-        same_pole = _same_pole(seen.names, poles)
-        each = _maximize_likelihood(seen, SWAYS_MM, same_pole, STEPS_MM)[0] - null
+        same_pole = _same_pole(measured.names, poles)
+        each = _maximize_likelihood(measured, SWAYS_MM, same_pole, STEPS_MM)[0] - null
         candidates = _with_all_moved(candidates, each)
     gain, best = max(candidates, key=lambda one: one[0])
     lever = np.radians(best.rotation_deg) * LEVER_MM
@@ -289,7 +291,7 @@ def _same_pole(names: Sequence[str], poles: Mapping[str, str]) -> Array:
 
 
 def _maximize_likelihood(
-    seen: _PoseMotions, sways_mm: Array, stepped: Array, steps_mm: Array
+    measured: _PoseMotions, sways_mm: Array, stepped: Array, steps_mm: Array
 ) -> tuple[float, Array, float, float]:
     """Maximize the log likelihood of the motions over the sizes of sway, displacement and noise.
 
@@ -302,20 +304,20 @@ def _maximize_likelihood(
     # is 0.6 of the sway and at most 0.9 mm (ten sound standing people: 1.5 to 4 mm at a pole).
     side2 = np.minimum(0.6**2 * sway2, 0.9**2)
     covariances = (
-        sway2[:, None, None] * seen.sway
-        + side2[:, None, None] * seen.sides
+        sway2[:, None, None] * measured.sway
+        + side2[:, None, None] * measured.sides
         + step2[:, None, None] * stepped
-        + seen.nuisance
+        + measured.nuisance
     )
     # Noise adds to the eigenvalues, so one decomposition serves all its sizes.
     eigenvalues, eigenvectors = np.linalg.eigh(covariances)
     noise2 = np.geomspace(0.05, 5.0, 9) ** 2
     variance = np.maximum(eigenvalues, 0.0)[:, None, :] + noise2[:, None]
-    squares = np.sum((eigenvectors.transpose(0, 2, 1) @ seen.motions) ** 2, axis=2)
+    squares = np.sum((eigenvectors.transpose(0, 2, 1) @ measured.motions) ** 2, axis=2)
     chi2 = np.sum(squares[:, None, :] / variance, axis=2)
-    log_det = seen.motions.shape[1] * np.sum(np.log(variance), axis=2)
+    log_det = measured.motions.shape[1] * np.sum(np.log(variance), axis=2)
     log_likelihood = -0.5 * chi2 - 0.5 * log_det
     size, noise = np.unravel_index(np.argmax(log_likelihood), log_likelihood.shape)
-    covariance = covariances[size] + noise2[noise] * np.eye(len(seen.names))
+    covariance = covariances[size] + noise2[noise] * np.eye(len(measured.names))
     scales = float(np.sqrt(sway2[size])), float(np.sqrt(noise2[noise]))
     return float(log_likelihood[size, noise]), covariance, *scales

@@ -258,15 +258,15 @@ def _refine(
 
     solution = minimize((projector, from_camera), blocks, retract, unknowns=len(free))
     sigma = np.concatenate([samples.sigma for samples in both])
-    sigmas_off = rms(np.concatenate([block.residuals for block in solution.blocks[:2]]) / sigma)
+    misfit = rms(np.concatenate([block.residuals for block in solution.blocks[:2]]) / sigma)
     predicted = float(np.sqrt(len(sigma) / np.sum(sigma**-2.0)))
-    if not sigmas_off < 3.0:
+    if not misfit < 3.0:
         raise BadInput(
             f"no projector with a lens explains its light sheets: the best fit has an RMS misfit of "
-            f"{predicted * sigmas_off:.2g} of its pixels, the noise of the sheets explains "
+            f"{predicted * misfit:.2g} of its pixels, the noise of the sheets explains "
             f"{predicted:.2g}"
         )
-    return FittedProjector(*solution.state, predicted * sigmas_off, predicted)
+    return FittedProjector(*solution.state, predicted * misfit, predicted)
 
 
 def _residuals(light: Camera, from_camera: RigidTransform, samples: _Samples) -> Array:

@@ -262,5 +262,5 @@ def _repeatability(rows: Sequence[SpacingRow]) -> tuple[float | None, str]:
     ranges = {key: max(errors) - min(errors) for key, errors in groups.items() if len(errors) > 1}
     if not ranges:
         return None, "not repeated"
-    (place, between), value = max(ranges.items(), key=lambda item: item[1])
-    return value, f"{place}, spheres {between}"
+    (position, between), value = max(ranges.items(), key=lambda item: item[1])
+    return value, f"{position}, spheres {between}"

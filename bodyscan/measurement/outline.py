@@ -30,7 +30,7 @@ def bound_girths(loop: Loop) -> tuple[tuple[float, float], tuple[float, float]]:
     if not measured.any():
         return (0.0, 0.0), (2.0 * loop.girth_mm, 2.0 * loop.girth_mm)
     kept = np.zeros(len(loop.segments), bool)
-    kept[np.concatenate([run for run, seen in zip(runs, measured, strict=True) if seen])] = True
+    kept[np.concatenate([run for run, known in zip(runs, measured, strict=True) if known])] = True
     closed = keep_segments(loop, kept)
     bulges = [
         _bulge(loop, runs[k - 1], runs[k], runs[(k + 1) % len(runs)])

@@ -347,10 +347,10 @@ def _join_pieces(nodes: Sequence[_Node]) -> list[Piece]:
     """Make the pieces of a slice: what was cut within one part is joined again."""
     pieces = []
     for loop in {id(node.loop): node.loop for node in nodes}.values():
-        own = {node.label: node for node in nodes if node.loop is loop}
-        names = [own[label].part for label in range(len(own))]
+        by_label = {node.label: node for node in nodes if node.loop is loop}
+        names = [by_label[label].part for label in range(len(by_label))]
         parts = list(dict.fromkeys(names))
-        label = np.array([parts.index(name) for name in names])[own[0].labels]
+        label = np.array([parts.index(name) for name in names])[by_label[0].labels]
         adjacent = np.unique(np.stack([label, np.roll(label, 1)]), axis=1).T
         for k, part in enumerate(parts):
             touches = tuple(parts[other] for one, other in adjacent if one == k != other)

@@ -31,7 +31,7 @@ LIMITS = {
     "corners_rms_px": Limit(0.3, "corner residuals are {:.3g} px RMS"),
     "poses": Limit(6, "was calibrated from {:.3g} board poses", at_least=True),
     "covered_percent": Limit(40.0, "boards covered {:.3g} % of its picture", at_least=True),
-    # A scan's overlaps are doubted from 0.4 mm on (fusion/verdict/overlaps.py).
+    # A scan's overlaps are downweighted from 0.4 mm on (fusion/verdict/overlaps.py).
     "sheets_rms_mm": Limit(0.3, "light sheets have residuals of {:.3g} mm RMS"),
     "held_out_mm": Limit(0.5, "held-out boards are missed by {:.3g} mm"),
     "stripe_shots": Limit(4, "stripes were decoded on {:.3g} boards", at_least=True),
@@ -104,13 +104,15 @@ def grade_calibration(calibration: RigCalibration) -> Verdict:
 
 def _figures(calibration: RigCalibration, name: str) -> PairFigures:
     pair = calibration.pairs[name]
-    quality, camera, seen = pair.quality, pair.camera, calibration.observed.get(name)
+    quality, camera, corners = pair.quality, pair.camera, calibration.observed.get(name)
     position = calibration.rig_from_camera[name].translation
     striped, ours = pair.sheets is not None, not quality.imported
     sigma = position_sigma(calibration.covariance, name, position)
     share = None
-    if seen is not None:
-        views = [seen.pixels[seen.target == k].astype(float) for k in np.unique(seen.target)]
+    if corners is not None:
+        views = [
+            corners.pixels[corners.target == k].astype(float) for k in np.unique(corners.target)
+        ]
         share = 100.0 * covered_share(views, camera.width, camera.height)
     return PairFigures(
         name,

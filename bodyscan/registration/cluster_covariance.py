@@ -110,7 +110,7 @@ def normal_equations(
     known = [(of_shape[name], shape.prior_information) for name, shape in shapes.items()]
     if cameras_free:
         known += [(of_camera[name], np.diag(cameras[name].prior_sigmas ** -2)) for name in names]
-    priors = [(own, LinearGaussianSystem.from_prior(variance * each)) for own, each in known]
+    priors = [(block, LinearGaussianSystem.from_prior(variance * each)) for block, each in known]
     prior = LinearGaussianSystem.assemble(priors, size)
     free = np.arange(size)
     if fixed_target is None:

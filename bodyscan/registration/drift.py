@@ -180,13 +180,13 @@ def _fit(
     size = basis.shape[1]
     padded = LinearGaussianSystem.assemble([(np.arange(prior.size), prior)], size)
     for _ in range(5):  # the problem is nearly linear
-        placed = dict(rig_from_camera)
+        solution = dict(rig_from_camera)
         for motion, (_, moved) in zip(motions, groups, strict=True):
-            placed |= {pair: motion @ rig_from_camera[pair] for pair in moved}
+            solution |= {pair: motion @ rig_from_camera[pair] for pair in moved}
         views, squares = [], 0.0
         for pose in poses:
-            offset = placed[pose.pair] @ pose.camera_from_board @ boards[pose.target].inverse()
-            root = pose.whitener @ adjoint(placed[pose.pair].inverse())
+            offset = solution[pose.pair] @ pose.camera_from_board @ boards[pose.target].inverse()
+            root = pose.whitener @ adjoint(solution[pose.pair].inverse())
             residual = root @ offset.twist
             squares += float(residual @ residual)
             columns = 6 * np.array([[rows[pose.pair]], [rows[pose.target]]]) + np.arange(6)

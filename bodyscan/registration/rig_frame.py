@@ -42,8 +42,8 @@ def hold_frame(rig: Rig, views: Sequence[LocatedView], solved: Collection[str]) 
     first = rig.frame_pair
     if first is None or rig.rig_frame.pair or first.name in solved:
         return rig
-    seen = Counter(view.target for view in views)
-    shared = Counter(view.pair for view in views if seen[view.target] > 1)
+    count = Counter(view.target for view in views)
+    shared = Counter(view.pair for view in views if count[view.target] > 1)
     names = [pair.name for pair in rig.pairs if pair.name in solved]
     if first.nominal:
         names = [name for name in names if rig.pair(name).nominal] or names

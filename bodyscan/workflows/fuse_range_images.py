@@ -108,8 +108,8 @@ def fuse(
         announce(grade_scan(evidence), final=False)
     with step(progress, "meshing"):
         cloud, mesh = _mesh(merged.cloud, measured.value, subject, settings, made)
-        seen = _coverage(mesh, cleaned, subject)
-        verdict = grade_scan(replace(evidence, mesh=mesh, coverage=seen))
+        coverage = _coverage(mesh, cleaned, subject)
+        verdict = grade_scan(replace(evidence, mesh=mesh, coverage=coverage))
     return Scan(
         cloud,
         mesh,

@@ -100,12 +100,12 @@ def _pose_in_first(
             step = _transform(file, cameras, key, "T_cn_cnm1")
             pose = step @ pose if step and pose else None
         else:
-            own, first = (
+            camera_from_imu, first = (
                 _transform(file, cameras, one, "T_cam_imu")
                 or _transform(file, cameras, one, "T_imu_cam", inverse=True)
                 for one in (key, "cam0")
             )
-            pose = own @ first.inverse() if own and first else None
+            pose = camera_from_imu @ first.inverse() if camera_from_imu and first else None
     return pose
 
 
