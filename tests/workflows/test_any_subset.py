@@ -197,8 +197,9 @@ def test_what_no_camera_can_be_is_left_out_and_never_written(
     assert sorted(cameras.value) == ["c1", "c3"]
     assert "alpha is not a focal length" in cameras.failures["c2"]
     # Whatever else such a camera may come from, what the solve makes of it is not kept.
-    monkeypatch.setattr(find_boards, "camera_faults", lambda *_: ())
-    with pytest.raises(FailedWork, match="impossible rig"):
+    fault = ("pairs.c1.camera.alpha", "is not a focal length")
+    monkeypatch.setattr("bodyscan.workflows.calibrate_rig.find_faults", lambda _: [fault])
+    with pytest.raises(FailedWork, match="impossible rig: pairs.c1"):
         calibrated(boards, views)
 
 
