@@ -10,10 +10,11 @@ import csv
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
+from statistics import median
 from typing import Annotated, Literal, TypeAlias
 
-import numpy as np
 from pydantic import Field
 
 from bodyscan.errors import CaptureError
@@ -236,8 +237,8 @@ def _read_times(path: Path, rig: Rig, sequences: Sequences) -> FrameTimes:
         if absent:
             text = f"has no time of {', '.join(absent)} (pair {pair}, shot {shot})"
             problems.append(YamlProblem(Place(len(lines), 1), "", text))
-    steps = [np.diff(list(times.values())) for times in found.values()]
-    fault = _step_fault(float(np.median(np.concatenate(steps)))) if any(map(len, steps)) else ""
+    steps = [b - a for times in found.values() for a, b in pairwise(times.values())]
+    fault = _step_fault(median(steps)) if steps else ""
     if fault:
         problems.append(YamlProblem(Place(1, 1), "", f"ms: {fault}"))
     if problems:

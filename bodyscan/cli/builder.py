@@ -121,8 +121,9 @@ def _calibration_folder(rig_file: Path, out: Path | None, overwrite: bool) -> Pa
     from bodyscan.rig.rig import load_rig
 
     # A default beside the rig file may lie among its captures: their shots are told by name.
-    named = load_rig(rig_file).calibration if out else ()
     folder = out or rig_file.parent / "calibration"
+    _require_writable(folder, overwrite)
+    named = load_rig(rig_file).calibration if out else ()
     _require_writable(folder, overwrite, *(capture_path(rig_file, entry) for entry in named))
     return folder
 

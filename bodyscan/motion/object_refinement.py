@@ -73,7 +73,7 @@ def refine_on_object(
             "no two pairs see the same part of the object",
             remedy="take a larger object, or put it in view of more pairs",
         )
-    _require_still(images, rig_from_camera, prior, poles)
+    _require_still(images, rig_from_camera, prior, poles, found.rms_after_mm)
     return ObjectRefinement(found, dict(rig_from_camera) | found.rig_from_camera)
 
 
@@ -82,15 +82,17 @@ def _require_still(
     rig_from_camera: Mapping[str, RigidTransform],
     prior: PoseCovariance,
     poles: Mapping[str, str],
+    rigid_rms_mm: float,
 ) -> None:
-    """Raise FailedWork if a scan of these images would estimate a motion.
+    """Raise FailedWork if motion brings overlaps closer than rigid poses do, with `rigid_rms_mm`.
 
-    Overlaps of what moved come closer too, but with wrong poses.
+    Overlaps of what moved come closer by rigid poses too, but by wrong ones.
     """
     settings = AlignmentSettings()
     aligned = align(images, rig_from_camera, prior, settings)
-    motion = align_person(images, rig_from_camera, aligned, prior, poles, settings).motion
-    if motion is None:
+    person = align_person(images, rig_from_camera, aligned, prior, poles, settings)
+    motion = person.motion
+    if motion is None or person.alignment.rms_after_mm > 0.95 * rigid_rms_mm:
         return
     parts = PersonMotion.from_motion(motion).parts
     largest = max(parts, key=lambda part: part.moved_mm, default=None)

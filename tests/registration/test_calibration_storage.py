@@ -214,7 +214,7 @@ def test_an_edit_that_is_meant_is_stored_with_a_note(stored_now: Path, tmp_path:
     content["pairs"]["p1-2"]["rig_from_camera"][0][3] += 2.0
     write(tmp_path, content)
     shutil.copy(stored_now / "calibration.npz", tmp_path)
-    refused = run("export-rig", tmp_path, "--out", tmp_path / "out")
+    refused = run("export-rig", tmp_path, "--out", tmp_path.with_name("out"))
     assert isinstance(refused.exception, CalibrationFileError)
     assert "bodyscan accept-changed" in refused.exception.remedy
     assert run("accept-changed", tmp_path).exit_code == 0

@@ -199,7 +199,7 @@ def test_what_no_camera_can_be_is_left_out_and_never_written(
     # Whatever else such a camera may come from, what the solve makes of it is not kept.
     fault = ("pairs.c1.camera.alpha", "is not a focal length")
     monkeypatch.setattr("bodyscan.workflows.calibrate_rig.find_faults", lambda _: [fault])
-    with pytest.raises(FailedWork, match="impossible rig: pairs.c1"):
+    with pytest.raises(FailedWork, match="impossible rig"):
         calibrated(boards, views)
 
 
