@@ -49,7 +49,8 @@ def register(
     for _ in range(3):  # each with the sway that the last solution found
         motions = _solve_graph(edges, sway.covariance(names, prior, scale))
         scale = sway.scale(motions)
-    return np.round(motions, 9)  # Open3D's threads sum in any order
+    # Open3D's threads sum in any order, which shows at 1e-11; a micrometre at a metre is nothing.
+    return np.round(motions, 6)
 
 
 @dataclass(frozen=True, eq=False)
