@@ -63,16 +63,12 @@ class CameraCalibration:
     covariance: of the camera's parameters, (P, P).
     poses: `camera_from_board` of each view that it was fitted to.
     rms_px: RMS distance of corners from their reprojection, robustly weighted.
-    lenses: lenses tried on held-out boards; empty if the lens was given.
-    rays: how well each pixel's ray is known; None if that was not computed.
     """
 
     camera: Camera
     covariance: Array
     poses: tuple[RigidTransform, ...]
     rms_px: float
-    lenses: tuple[LensTrial, ...] = ()
-    rays: RayUncertainty | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,11 +98,10 @@ def calibrate_camera(
             f"{len(views)} usable board poses, at least {MIN_POSES} are needed",
             remedy="capture the board in more poses, tilted differently, well inside the image",
         )
-    refuse_parallel(views, width, height)
     homographies = [find_homography(view) for view in views]
-    alpha, gamma, u0, _, beta, v0 = matrix_from_homographies(homographies, width, height)[
-        :2
-    ].ravel()
+    refuse_parallel(homographies, width, height)
+    matrix = matrix_from_homographies(homographies, width, height)
+    alpha, gamma, u0, _, beta, v0 = matrix[:2].ravel()
     start = Camera(alpha, beta, gamma, u0, v0, type(lens)(), width, height)
     poses = [estimate_pose(start, view) for view in views]
     return fit_camera(replace(start, lens=lens), poses, views)
@@ -117,18 +112,18 @@ def find_homography(view: PlanarView) -> Array:
     return np.asarray(cv2.findHomography(view.points[:, :2], view.pixels, 0)[0])
 
 
-def refuse_parallel(views: Sequence[PlanarView], width: int, height: int) -> None:
+def refuse_parallel(homographies: Sequence[Array], width: int, height: int) -> None:
     """Raise DegeneratePoses if all boards have one orientation (pure translation, Zhang 1998).
 
     Parallel planes share their vanishing line, which a rough camera turns into a plane normal.
     """
     rough = np.array([[1.2 * width, 0, width / 2], [0, 1.2 * width, height / 2], [0, 0, 1.0]])
-    normals = np.stack([np.linalg.inv(find_homography(view)).T[:, 2] for view in views]) @ rough
+    normals = np.stack([np.linalg.inv(h).T[:, 2] for h in homographies]) @ rough
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     angles = np.degrees(np.arccos(np.clip(np.abs(normals @ normals.T), 0.0, 1.0)))
     if np.max(angles) < 3.0:
         raise DegeneratePoses(
-            f"the {len(views)} board poses differ by a translation only "
+            f"the {len(homographies)} board poses differ by a translation only "
             f"(their orientations agree within {np.max(angles):.1f} degrees)",
             remedy="tilt the board by 15 to 35 degrees about different axes between the shots",
         )
@@ -344,15 +339,14 @@ def choose_lens(
         if kind is Fisheye and not _is_wide(camera, views):
             continue
         tried = _fit(kind, camera, poses, views)
+        if _folds(tried, views):
+            continue
         # A fisheye has half of a rational lens's coefficients: where it does as well, it is right.
         simpler = kind is Fisheye and type(chosen.camera.lens) is Rational
-        if _folds(tried, views) or not (
-            simpler
-            or kind is kinds[1]
-            or gain(_compare_fits(chosen, tried, views, cluster))
-            >= MIN_GAIN  # not worth holding out
-        ):
-            continue
+        # Whether Brown's was close is asked for all cameras of a make together.
+        needed = simpler or kind is kinds[1]
+        if not needed and gain(_compare_fits(chosen, tried, views, cluster)) < MIN_GAIN:
+            continue  # what gains nothing on its own boards gains less on others
         held_out = _hold_out(tried, views, cluster)
         better_by = gain(ResidualPair(residuals, held_out, corner_cluster))
         trials.append((tried, held_out, better_by))
@@ -388,7 +382,7 @@ def _compare_fits(
 ) -> ResidualPair:
     """Residuals of the same views in two fits to them."""
     first_px, second_px = (
-        np.concatenate(locate_boards(fit.camera, views, fit.poses, tolerance=1e-2)[1])
+        _corner_block(_State(fit.camera, fit.poses), views).residuals.reshape(-1, 2)
         for fit in (first, second)
     )
     return ResidualPair(first_px, second_px, _by_corner(cluster, views))
@@ -396,14 +390,19 @@ def _compare_fits(
 
 def _folds(fit: CameraCalibration, views: Sequence[PlanarView]) -> bool:
     """Whether a lens folds over before the outermost corner: what it does there is no camera's."""
-    return not np.isfinite(fit.camera.rays(np.concatenate([v.pixels for v in views]))).all()
+    return not np.isfinite(_corner_rays(fit.camera, views)).all()
 
 
 def _is_wide(camera: Camera, views: Sequence[PlanarView]) -> bool:
     """Whether some corner is more than 60 degrees off the axis, where r^6 is 27: there lenses that go
     by the tangent run away, and elsewhere decentring, which a fisheye lacks, must not hide."""
-    rays = camera.rays(np.concatenate([view.pixels for view in views]))
-    return bool(np.any(np.linalg.norm(rays[:, :2], axis=1) > 1.73))
+    radius = np.linalg.norm(_corner_rays(camera, views)[:, :2], axis=1)
+    return bool(np.any(radius > 1.73))
+
+
+def _corner_rays(camera: Camera, views: Sequence[PlanarView]) -> Array:
+    """Rays (N, 3) of all corners, z = 1; NaN where the lens folds."""
+    return camera.rays(np.concatenate([view.pixels for view in views]))
 
 
 def _by_corner(number: Indices, views: Sequence[PlanarView]) -> Indices:

@@ -131,7 +131,7 @@ class ShapedSolution:
 
 
 def estimate_board_shapes(
-    views: Sequence[LocatedView], solution: JointSolution, *, root: str, refine_cameras: bool
+    views: Sequence[LocatedView], solution: JointSolution, *, root: str
 ) -> ShapedSolution:
     """Estimate board shapes if the residuals call for it; keep them if held-out boards agree."""
     plain = ShapedSolution(solution, list(views), {}, ())
@@ -140,8 +140,8 @@ def estimate_board_shapes(
     # 48 corners or more by 1.25 once in 700 times.
     if len(targets) < 6 or _gain_per_unknown(views, solution) < 1.25:
         return plain
-    held_out = _hold_out(views, solution, root, refine_cameras)
-    shaped = _estimate(views, solution, root, refine_cameras)
+    held_out = _hold_out(views, solution, root)
+    shaped = _estimate(views, solution, root)
     sizes = "; ".join(_describe(name, shape) for name, shape in sorted(shaped.shapes.items()))
     better_by = gain(held_out)
     figures = (
@@ -159,7 +159,7 @@ def reestimate_board_shapes(
     """Estimate the shapes in `found` again, for other lenses or other views."""
     if not found.shapes:
         return replace(found, solution=solution, views=list(views))
-    return replace(_estimate(views, solution, root, True, found.shapes), notes=found.notes)
+    return replace(_estimate(views, solution, root, found.shapes), notes=found.notes)
 
 
 def apply_shape(view: LocatedView, shapes: Mapping[str, BoardShape]) -> LocatedView:
@@ -182,7 +182,6 @@ def _estimate(
     views: Sequence[LocatedView],
     solution: JointSolution,
     root: str,
-    refine_cameras: bool,
     start: Mapping[str, BoardShape] | None = None,
     *,
     equal_noise: bool = False,
@@ -211,9 +210,7 @@ def _estimate(
             replace(view, points=view.points + shapes[view.board].offsets[corners])
             for view, corners in zip(views, numbers, strict=True)
         ]
-        solution = refine_solution(
-            shaped, solution, root=root, refine_cameras=refine_cameras, equal_noise=equal_noise
-        )
+        solution = refine_solution(shaped, solution, root=root, equal_noise=equal_noise)
         moved = (np.sqrt(np.mean(steps[name] ** 2)) / s.diagonal for name, s in shapes.items())
         # RMS of a step, as a share of the board's diagonal: at twice that a stretch was found to
         # 88 %.
@@ -324,9 +321,7 @@ def _by_corner(views: Sequence[LocatedView], solution: JointSolution) -> tuple[A
     return by_corner, np.split(residuals.reshape(-1, 2), np.cumsum(counts)[:-1])
 
 
-def _hold_out(
-    views: Sequence[LocatedView], solution: JointSolution, root: str, refine_cameras: bool
-) -> ResidualPair:
+def _hold_out(views: Sequence[LocatedView], solution: JointSolution, root: str) -> ResidualPair:
     """Residuals of held-out boards, flat and in the shape found from the rest, both posed by the
     rest's cameras."""
     targets = sorted({view.target for view in views})
@@ -337,10 +332,8 @@ def _hold_out(
         kept = {t: p for t, p in solution.root_from_board.items() if t not in left_out}
         start = replace(solution, root_from_board=kept)
         # While it is open whether boards are as described, what they err by for that is no noise.
-        flat = refine_solution(
-            others, start, root=root, refine_cameras=refine_cameras, equal_noise=True
-        )
-        shaped = _estimate(others, flat, root, refine_cameras, equal_noise=True)
+        flat = refine_solution(others, start, root=root, equal_noise=True)
+        shaped = _estimate(others, flat, root, equal_noise=True)
         for target in sorted(left_out):
             of_board = [view for view in views if view.target == target]
             true = [apply_shape(view, shaped.shapes) for view in of_board]

@@ -181,14 +181,13 @@ def refine_solution(
     solution: JointSolution,
     *,
     root: str,
-    refine_cameras: bool,
     equal_noise: bool = False,
 ) -> JointSolution:
     """Least squares from a solution of `solve_jointly`, in the root camera's frame.
 
     equal_noise: whether all views are taken to be as noisy as each other.
     """
-    unknowns = _Unknowns(solution, root, refine_cameras)
+    unknowns = _Unknowns(solution, root)
     of_pair = [
         [view for view in views if view.pair == name] for name in sorted({v.pair for v in views})
     ]
@@ -208,15 +207,13 @@ def refine_solution(
 class _Unknowns:
     """Columns of the unknowns: motions of all pairs but the root, of boards, then cameras."""
 
-    def __init__(self, solution: JointSolution, root: str, refine_cameras: bool) -> None:
-        self.refine_cameras = refine_cameras
+    def __init__(self, solution: JointSolution, root: str) -> None:
         names = sorted(solution.root_from_camera)
         self.count = 0
         self.of_pair = {name: self._next(6) for name in names if name != root}
         self.of_pair[root] = np.zeros(0, np.int64)
         self.of_board = {target: self._next(6) for target in sorted(solution.root_from_board)}
-        sizes = {n: len(solution.cameras[n].parameters) if refine_cameras else 0 for n in names}
-        self.of_camera = {name: self._next(size) for name, size in sizes.items()}
+        self.of_camera = {n: self._next(len(solution.cameras[n].parameters)) for n in names}
 
     def _next(self, size: int) -> Indices:
         self.count += size
@@ -231,12 +228,10 @@ class _Unknowns:
             target: pose.retract(step[self.of_board[target]])
             for target, pose in solution.root_from_board.items()
         }
-        cameras = dict(solution.cameras)
-        if self.refine_cameras:
-            cameras |= {
-                name: cameras[name].retract(step[columns])
-                for name, columns in self.of_camera.items()
-            }
+        cameras = solution.cameras | {
+            name: solution.cameras[name].retract(step[columns])
+            for name, columns in self.of_camera.items()
+        }
         return JointSolution(root_from_camera, boards, cameras)
 
 
@@ -248,10 +243,7 @@ def _blocks(
 ) -> Iterator[Block]:
     """The corners of each pair's views, then the priors on the cameras."""
     poses = solution.cameras, solution.root_from_camera, solution.root_from_board
-    errors = [
-        reprojection_errors(views, *poses, cameras_free=unknowns.refine_cameras)
-        for views in of_pair
-    ]
+    errors = [reprojection_errors(views, *poses, cameras_free=True) for views in of_pair]
     runs = [np.array([2 * len(view.points) for view in views]) for views in of_pair]
     by_view = [
         np.split(residuals, np.cumsum(lengths)[:-1])
@@ -269,9 +261,8 @@ def _blocks(
             linearize = partial(_drop_motion, linearize)  # the root camera fixes the frame
         sigma = np.repeat([next(sigmas) for _ in views], lengths)
         yield Block(residuals, linearize, np.array(columns), CORNERS, sigma, runs=lengths)
-    if unknowns.refine_cameras:
-        for name, parameters in unknowns.of_camera.items():
-            yield from camera_priors(solution.cameras[name], parameters)
+    for name, parameters in unknowns.of_camera.items():
+        yield from camera_priors(solution.cameras[name], parameters)
 
 
 def camera_priors(camera: Camera, columns: Indices) -> Iterator[Block]:

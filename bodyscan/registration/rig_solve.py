@@ -185,7 +185,6 @@ def _solve(
     solve = partial(
         solve_consistently,
         root=root,
-        refine_cameras=True,
         limit_px=error_limit(single_view_errors(kept, cameras)),
     )
     judged = solve(resolved, solution, wrong=[view.key for view in gross])
@@ -193,9 +192,7 @@ def _solve(
     lenses: ChosenLenses | None = None
     # If pairs are to be left out, the others are solved again anyway.
     if not _find_unsynchronised(shaped.views, _select_rejected(resolved, judged)):
-        shaped = estimate_board_shapes(
-            shaped.views, judged.solution, root=root, refine_cameras=True
-        )
+        shaped = estimate_board_shapes(shaped.views, judged.solution, root=root)
         solution = shaped.solution
         if choose:
             lenses = choose_lenses(rig, shaped.views, solution)
@@ -347,8 +344,8 @@ def solved_pair(
         name,
         solution.cameras[name],
         solution.camera_covariances.get(name, single.covariance),
-        solution.rays.get(name, single.rays),
-        solution.lenses.get(name, single.lenses),
+        solution.rays.get(name),
+        solution.lenses.get(name, ()),
         solution.rms_px[name],
         rig.pair(name).projector,
         tuple(_with_pose(solution, view) for view in views),

@@ -188,7 +188,6 @@ def solve_consistently(
     solution: JointSolution,
     *,
     root: str,
-    refine_cameras: bool,
     limit_px: float,
     wrong: Collection[ViewKey] = (),
 ) -> ConsistentSolve:
@@ -197,9 +196,7 @@ def solve_consistently(
     rounds = 4
     for number in range(rounds):
         kept = at.select_consistent(views)
-        solved = refine_solution(
-            kept, _with_boards_of(kept, at.solution), root=root, refine_cameras=refine_cameras
-        )
+        solved = refine_solution(kept, _with_boards_of(kept, at.solution), root=root)
         found = find_inconsistent_views(views, solved, limit_px)
         now = frozenset(view.key for view in found.wrong)
         if now == at.wrong:

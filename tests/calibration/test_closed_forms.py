@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 
 from bodyscan.calibration.board_views import PlanarView
-from bodyscan.calibration.camera import calibrate_camera, estimate_pose, refuse_parallel
+from bodyscan.calibration.camera import (
+    calibrate_camera,
+    estimate_pose,
+    find_homography,
+    refuse_parallel,
+)
 from bodyscan.calibration.sheet_fit import fit_pinhole
 from bodyscan.errors import DegeneratePoses
 from bodyscan.geometry.camera import Camera
@@ -48,11 +53,12 @@ def test_planes_that_turn_by_less_than_three_degrees_are_one_plane() -> None:
     for degrees, refused in ((2.5, True), (3.6, False)):
         turned = [posed(0.3, 0.1, 0.0), posed(0.3 + np.radians(degrees), 0.1, 0.0, z=800.0)]
         views = [seen(matrix(1536, 1536, 0, 640, 512), pose) for pose in turned]
+        homographies = [find_homography(view) for view in views]
         if refused:
             with pytest.raises(DegeneratePoses, match="the 2 board poses differ by a translation"):
-                refuse_parallel(views, WIDTH, HEIGHT)
+                refuse_parallel(homographies, WIDTH, HEIGHT)
         else:
-            refuse_parallel(views, WIDTH, HEIGHT)
+            refuse_parallel(homographies, WIDTH, HEIGHT)
 
 
 @pytest.mark.parametrize(

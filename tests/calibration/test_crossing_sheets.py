@@ -75,7 +75,7 @@ def calibrated(*, alone: bool, crossed: int = len(POSES)) -> Outcome[PairCalibra
             for shot, pose in zip(shots, own.poses, strict=True)
         ]
     located = tuple(shot.view for shot in shots)
-    known = (camera, own.covariance, own.rays, own.lenses, 0.05, COLUMNS, located)
+    known = (camera, own.covariance, None, (), 0.05, COLUMNS, located)
     return calibrate_pair(LocatedPair("p", *known, tuple(shots), (BOARD,), alone))
 
 

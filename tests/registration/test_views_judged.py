@@ -46,7 +46,7 @@ def solve(
 
     def fully(views: Sequence[LocatedView], start: JointSolution, **keys: Any) -> JointSolution:
         given.append({int(one.shot[1:]) for one in views})
-        assert keys == {"root": "p", "refine_cameras": True}
+        assert keys == {"root": "p"}
         # Each board that is seen starts where it was, or where its own view has it; no other does.
         assert start.root_from_board.keys() == {one.target for one in views}
         for one in views:
@@ -62,9 +62,7 @@ def solve(
 
     monkeypatch.setattr(view_consistency, "refine_solution", fully)
     monkeypatch.setattr(view_consistency, "find_inconsistent_views", judge)
-    found = solve_consistently(
-        VIEWS, START, root="p", refine_cameras=True, limit_px=0.7, wrong=keys_of(wrong)
-    )
+    found = solve_consistently(VIEWS, START, root="p", limit_px=0.7, wrong=keys_of(wrong))
     return found, given
 
 
