@@ -212,12 +212,12 @@ class _Builder:
         """Keys and values of a mapping, after those of mappings that it merges."""
         if depth > MAX_DEPTH or self.nodes > self.max_nodes:
             raise _error(_place(node.start_mark), "merges (<<) too much")
-        own: dict[str, tuple[yaml.Node, yaml.Node]] = {
+        direct: dict[str, tuple[yaml.Node, yaml.Node]] = {
             k.value: (k, v) for k, v in node.value if isinstance(k, yaml.ScalarNode)
         }
-        if "<<" not in own or getattr(own["<<"][0], "style", None):
-            return own
-        _, merged = own.pop("<<")
+        if "<<" not in direct or getattr(direct["<<"][0], "style", None):
+            return direct
+        _, merged = direct.pop("<<")
         entries: dict[str, tuple[yaml.Node, yaml.Node]] = {}
         for base in merged.value if isinstance(merged, yaml.SequenceNode) else [merged]:
             if isinstance(base, yaml.MappingNode):
@@ -225,7 +225,7 @@ class _Builder:
                 entries = self._entries(base, where, depth + 1) | entries
             else:
                 self._problem(_place(base.start_mark), where, "can merge (<<) only mappings")
-        return entries | own
+        return entries | direct
 
     def _problem(self, place: Place, where: Where, text: str) -> None:
         self.document.problems.append(YamlProblem(place, dotted_path(where), text))
@@ -260,7 +260,7 @@ def _refuse_deep(text: str, *, only_first: bool) -> None:
             return
 
 
-def _refuse_many(node: yaml.Node, sizes: dict[int, int], most: int) -> int:
+def _refuse_many(node: yaml.Node, sizes: dict[int, int], max_nodes: int) -> int:
     """Count the values of a node once aliases are followed, and raise if there are too many.
 
     Each node is counted once: building an alias bomb until it is too large takes half a second.
@@ -273,14 +273,14 @@ def _refuse_many(node: yaml.Node, sizes: dict[int, int], most: int) -> int:
         parts = [value for key, value in node.value if key.value != "<<"]
     elif isinstance(node, yaml.SequenceNode):
         parts = node.value
-    sizes[id(node)] += sum(_refuse_many(part, sizes, most) for part in parts)
-    if sizes[id(node)] > most:
-        raise _too_many(_place(node.start_mark), most)
+    sizes[id(node)] += sum(_refuse_many(part, sizes, max_nodes) for part in parts)
+    if sizes[id(node)] > max_nodes:
+        raise _too_many(_place(node.start_mark), max_nodes)
     return sizes[id(node)]
 
 
-def _too_many(place: Place, most: int) -> YamlError:
-    return _error(place, f"has more than {most:,} values once aliases are followed")
+def _too_many(place: Place, max_nodes: int) -> YamlError:
+    return _error(place, f"has more than {max_nodes:,} values once aliases are followed")
 
 
 def _place(mark: Any) -> Place:

@@ -17,7 +17,7 @@ from bodyscan.verdict import Grade, Verdict
 class Limit:
     """How large, or how small, a figure of a good pair may be.
 
-    reason: what a verdict says of a figure beyond it.
+    reason: the sentence for a figure beyond it, with a field for the figure.
     at_least: it bounds from below how much was seen; otherwise from above how large an error is.
     """
 
@@ -31,7 +31,7 @@ LIMITS = {
     "corners_rms_px": Limit(0.3, "corner residuals are {:.3g} px RMS"),
     "poses": Limit(6, "was calibrated from {:.3g} board poses", at_least=True),
     "covered_percent": Limit(40.0, "boards covered {:.3g} % of its picture", at_least=True),
-    # A scan's overlaps are downweighted from 0.4 mm on (fusion/verdict/overlaps.py).
+    # A scan whose overlaps disagree by 0.4 mm is no longer good (fusion/verdict/overlaps.py).
     "sheets_rms_mm": Limit(0.3, "light sheets have residuals of {:.3g} mm RMS"),
     "held_out_mm": Limit(0.5, "held-out boards are missed by {:.3g} mm"),
     "stripe_shots": Limit(4, "stripes were decoded on {:.3g} boards", at_least=True),
@@ -79,27 +79,28 @@ def grade_calibration(calibration: RigCalibration) -> Verdict:
     Pairs that failed cost a scan what they alone would have measured, and boards that covered little
     leave the rest of a picture to extrapolation: such a rig is usable, where it measures.
     """
-    findings = [(np.inf, f"pair {name} failed: {why}") for name, why in calibration.failed.items()]
-    grade: Grade = "good"
+    failed = calibration.failed.items()
+    findings = [(False, np.inf, f"pair {name} failed: {why}") for name, why in failed]
     for pair in figures_of(calibration):
         for times, error, words in pair.beyond():
             far = error and times > 2.0
-            grade = "recalibrate" if far else grade
-            findings.append((times, f"{'recalibrate: ' if far else ''}pair {pair.name}: {words}"))
+            prefix = "recalibrate: " if far else ""
+            findings.append((far, times, f"{prefix}pair {pair.name}: {words}"))
     size = nominal_size(calibration.rig, calibration.rig_from_camera)
     if size and size.mark != "good":  # one in use is reported; a new one is not made
-        findings.append((1.0, f"{size.words}: {size.remedy}"))
+        findings.append((False, 1.0, f"{size.words}: {size.remedy}"))
     # What forbids its use comes first.
-    findings.sort(key=lambda finding: (not finding[1].startswith("recalibrate"), -finding[0]))
+    findings.sort(key=lambda finding: (not finding[0], -finding[1]))
     unjudged = [
         f"pair {name}: imported from {pair.quality.imported}, its accuracy is not known: check it with "
         "a board (check-calibration), or state it (import --sigma-px)"
         for name, pair in calibration.pairs.items()
         if pair.quality.unjudged
     ]
-    if grade != "recalibrate":
-        grade = "not judged" if unjudged else "usable" if findings else "good"
-    return Verdict(grade, (*(words for _, words in findings), *unjudged))
+    grade: Grade = "not judged" if unjudged else "usable" if findings else "good"
+    if any(far for far, _, _ in findings):
+        grade = "recalibrate"
+    return Verdict(grade, (*(words for _, _, words in findings), *unjudged))
 
 
 def _figures(calibration: RigCalibration, name: str) -> PairFigures:

@@ -204,14 +204,14 @@ def _bundle_adjust(
         rig = rescale_boards(rig, size.value.factor)
         located = locate_views(rig, select_solving_views(rig, boards), cameras.value)
         solution = _solve_rig(rig, located.value, cameras)
-    held = hold_frame(rig, solution.value.views, solution.value.rig_from_camera)
+    framed = hold_frame(rig, solution.value.views, solution.value.rig_from_camera)
     notes = [*size.notes, *check_nominal_size(rig, solution.value.rig_from_camera)]
-    if held is not rig:
+    if framed is not rig:
         notes.append(
             f"pair {rig.pairs[0].name}, the first in the rig file, could not be calibrated: the rig "
-            f"frame is held by pair {held.rig_frame.pair} (name a pair in `rig_frame` to choose one)"
+            f"frame is held by pair {framed.rig_frame.pair} (name a pair in `rig_frame` to choose one)"
         )
-    return _Adjusted(held, tuple(notes), located, solution)
+    return _Adjusted(framed, tuple(notes), located, solution)
 
 
 def _solve_rig(
