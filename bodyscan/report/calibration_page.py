@@ -217,7 +217,7 @@ def _sigma(calibration: RigCalibration) -> list[Block]:
             "mm), in two upright planes through the rig's axis. Stripe noise and the subject's sway "
             "are not in it. Light grey: nothing is measured there (no camera sees it, or a single one "
             "without a projector).",
-            draw_sigma_map(calibration, height_px=charts.PICTURE_PX),
+            draw_sigma_map(calibration),
         )
     ]
 

@@ -10,7 +10,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 
-from bodyscan.arrays import Array
+from bodyscan.arrays import Array, Bytes
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -18,7 +18,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 INK, GREY, BLUE, RED = "#1d2430", "#8a93a0", "#0072b2", "#d55e00"
-PICTURE_PX = 760  # height of a picture in a page
 STYLE: Any = {
     "svg.hashsalt": "bodyscan",
     "font.size": 9.0,
@@ -41,20 +40,25 @@ def style() -> Iterator[None]:
 
 def svg(figure: Figure) -> bytes:
     """A figure as SVG; the same figure gives the same bytes: no date, no random ids."""
-    stream = io.BytesIO()
-    with style():
-        figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})
-    plt.close(figure)
-    return stream.getvalue()
+    return _save(figure, format="svg", metadata={"Date": None, "Creator": None})
 
 
 def png(figure: Figure, height_px: int) -> bytes:
     """A figure as PNG of this height."""
+    return _save(figure, format="png", dpi=height_px / figure.get_figheight())
+
+
+def _save(figure: Figure, **options: Any) -> bytes:
     stream = io.BytesIO()
     with style():
-        figure.savefig(stream, format="png", dpi=height_px / figure.get_figheight())
+        figure.savefig(stream, **options)
     plt.close(figure)
     return stream.getvalue()
+
+
+def diverging() -> Bytes:
+    """The colour map of signed values, blue below and red above: (256, 3) red, green, blue."""
+    return np.asarray(matplotlib.colormaps["RdBu_r"](np.arange(256), bytes=True))[:, :3]
 
 
 def histogram(values: Array, limit: float, label: str) -> bytes:

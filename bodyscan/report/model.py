@@ -95,11 +95,5 @@ def encode(array: NDArray[Any]) -> str:
     return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode("ascii")
 
 
-def ramp_legend(caption: str, table: Bytes, ends: tuple[str, str]) -> Legend:
-    """A colour bar; table (256, 3) red, green, blue."""
-    some = table[np.linspace(0, 255, 12).astype(int)]
-    return {"caption": caption, "gradient": [css(c) for c in some], "ends": list(ends)}
-
-
 def css(colour: Sequence[int] | Bytes) -> str:
     return "#{:02x}{:02x}{:02x}".format(*(int(part) for part in colour))

@@ -24,7 +24,7 @@ from bodyscan.optional import optional
 from bodyscan.outcome import Outcome
 
 FILLED_TINT = (60, 160, 255)  # blue, green, red: orange
-BACKGROUND, INK = (250, 250, 250), (40, 40, 40)
+BACKGROUND, INK, UNKNOWN = (250, 250, 250), (40, 40, 40), (128, 128, 128)
 Pictures = Outcome[dict[str, bytes]]
 """PNG files by name; those that could not be drawn are noted."""
 AZIMUTHS_DEG = {"front": 0.0, "side": 90.0, "back": 180.0}
@@ -78,31 +78,31 @@ def draw_cloud(
     height_px: int = 900,
 ) -> bytes:
     """Pictures of a cloud; `colour` is photo, sigma or pairs_seen."""
+    points, normals, values = cloud.points, cloud.normals, cloud.sigma_mm
     if colour == "photo":
-        return _draw_points(cloud.points, cloud.normals, cloud.colours[:, ::-1], views, height_px)
+        return png(_draw_points(points, normals, cloud.colours[:, ::-1], views, height_px), views)
     if colour == "sigma":
-        top = float(np.percentile(cloud.sigma_mm, 98))
-        scale, values = Scale(0.0, top, "sigma, mm", turbo()), cloud.sigma_mm
+        scale = Scale(0.0, float(np.percentile(values, 98)), "sigma, mm", turbo())
     elif colour == "pairs_seen":
         scale, values = Scale(0.0, 6.0, "pairs", turbo()), cloud.pairs_seen.astype(np.float32)
     else:
         raise ValueError(f"colour is photo, sigma or pairs_seen, not {colour!r}")
-    colours = scale.colours(values)
-    return _draw_points(cloud.points, cloud.normals, colours, views, height_px, scale)
+    return draw_values(points, normals, values, scale, views, height_px=height_px)
 
 
-def draw_deviation(
+def draw_values(
     points: Array,
     normals: NDArray[np.floating],
-    signed_mm: Array,
+    values: NDArray[np.floating],
+    scale: Scale,
     views: Sequence[str] = tuple(AZIMUTHS_DEG),
     *,
-    limit_mm: float = 1.0,
     height_px: int = 900,
 ) -> bytes:
-    """Points coloured by signed distance to a known surface: blue inside, red outside."""
-    scale = Scale(-limit_mm, limit_mm, "deviation, mm", blue_white_red())
-    return _draw_points(points, normals, scale.colours(signed_mm), views, height_px, scale)
+    """Points (N, 3) coloured by a number each, with the scale's bar."""
+    colours = scale.colours(values)
+    panels = _draw_points(points, normals, colours, views, height_px)
+    return png([*panels, colour_bar(scale, height_px)], views)
 
 
 def _draw_points(
@@ -111,13 +111,11 @@ def _draw_points(
     colours: Bytes,
     views: Sequence[str],
     height_px: int,
-    scale: Scale | None = None,
-) -> bytes:
+) -> list[Bytes]:
     """Draw points (N, 3) with colours (N, 3) blue, green, red; those facing away are left out."""
     dot_mm = _dot_size(points)
     frames = _frames(points, views, height_px)
-    panels = [_splat_view(points, normals, colours, frame, dot_mm) for frame in frames]
-    return png(panels if scale is None else [*panels, colour_bar(scale, height_px)], views)
+    return [_splat_view(points, normals, colours, frame, dot_mm) for frame in frames]
 
 
 @dataclass(frozen=True)
@@ -216,37 +214,28 @@ class Scale:
     low: float
     high: float
     caption: str
-    table: Bytes  # (256, 3) blue, green, red
+    table: Bytes  # (256, 3)
 
     def colours(self, values: NDArray[np.floating]) -> Bytes:
         """Colours (N, 3) of values (N,); clipped to the ends, grey for NaN."""
         share = (np.nan_to_num(values) - self.low) / (self.high - self.low)
         colours = self.table[np.clip(np.rint(255 * share), 0, 255).astype(np.uint8)]
-        return np.where(np.isfinite(values)[:, None], colours, 128).astype(np.uint8)
+        return np.where(np.isfinite(values)[:, None], colours, UNKNOWN).astype(np.uint8)
 
 
 def colour_bar(scale: Scale, height_px: int) -> Bytes:
-    """Draw a colour bar with round numbers beside it, and its caption."""
+    """Draw a colour bar with the numbers at its ends and middle beside it, and its caption."""
     panel = np.full((height_px, 130, 3), BACKGROUND, np.uint8)
     top, bottom = height_px // 6, height_px - height_px // 6
     ramp = scale.table[np.linspace(255, 0, bottom - top).astype(np.uint8)]
     panel[top:bottom, 20:50] = ramp[:, None]
-    for value in round_ticks(scale.low, scale.high):
-        share = (value - scale.low) / (scale.high - scale.low)
-        row = round(bottom - share * (bottom - top))
+    for value, row in zip(
+        np.linspace(scale.low, scale.high, 3), (bottom, (top + bottom) // 2, top), strict=True
+    ):
         panel[row, 50:54] = INK
-        write_label(panel, f"{value:g}", (58, row + 5))
+        write_label(panel, f"{value:.2g}", (58, row + 5))
     write_label(panel, scale.caption, (8, top - 20))
     return panel
-
-
-def round_ticks(low: float, high: float) -> list[float]:
-    """Choose three to six round numbers from low to high; whole ones if the range is large enough."""
-    rough = (high - low) / 5.0
-    unit = 10.0 ** np.floor(np.log10(rough))
-    step = next(unit * times for times in (1.0, 2.0, 5.0, 10.0) if unit * times >= rough * 0.999)
-    first, last = np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9)
-    return [float(np.round(k * step, 10)) + 0.0 for k in np.arange(first, last + 1)]
 
 
 def write_label(panel: Bytes, text: str, corner: tuple[int, int]) -> None:
@@ -260,19 +249,8 @@ def turbo() -> Bytes:
     return np.asarray(cv2.applyColorMap(ramp, cv2.COLORMAP_TURBO)).reshape(256, 3)
 
 
-def blue_white_red() -> Bytes:
-    """Return a diverging colour map: (256, 3) blue, green, red."""
-    share = np.linspace(-1.0, 1.0, 256)[:, None]
-    blue, white, red = np.array([[180, 60, 20], [245, 245, 245], [30, 20, 180]], float)
-    ends = np.where(share < 0, blue, red)
-    return np.rint(white + np.abs(share) ** 0.8 * (ends - white)).astype(np.uint8)
-
-
 def png(panels: Sequence[Bytes], views: Sequence[str]) -> bytes:
     """Encode panels of equal height, side by side, as PNG, each with its view's name if it has one."""
     for panel, view in zip(panels, views, strict=False):
         write_label(panel, view, (6, 16))
-    ok, data = cv2.imencode(".png", np.concatenate(panels, axis=1))
-    if not ok:
-        raise ValueError("no PNG could be made")
-    return data.tobytes()
+    return cv2.imencode(".png", np.concatenate(panels, axis=1))[1].tobytes()

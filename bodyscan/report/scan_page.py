@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import calendar
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import astuple
 from datetime import datetime
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +37,7 @@ from bodyscan.report.page import (
     is_synthetic,
     make_sections,
 )
-from bodyscan.report.pictures import draw_cloud, draw_deviation, draw_mesh
+from bodyscan.report.pictures import Scale, draw_pictures, draw_values
 from bodyscan.verdict import Verdict
 
 
@@ -79,7 +77,7 @@ def _in_words(when: str | None) -> str:
         moment = datetime.fromisoformat(when)
     except ValueError:
         return when
-    return f"{moment.day} {calendar.month_name[moment.month]} {moment.year}, {moment:%H:%M}"
+    return f"{moment.day} {moment:%B %Y, %H:%M}"
 
 
 def _sections(scan: StoredScan, found: list[Comparison]) -> list[Section]:
@@ -196,10 +194,8 @@ def _comparison(
     points = mesh.vertices[shown.vertices]
     fit = found[-1].other_from_scan
     moved = float(np.linalg.norm(fit.apply(points.mean(axis=0)) - points.mean(axis=0)))
-    deviation_map = draw_deviation(
-        points, mesh.normals[shown.vertices], shown.signed_mm, limit_mm=limit,
-        height_px=charts.PICTURE_PX,
-    )  # fmt: skip
+    scale = Scale(-limit, limit, "deviation, mm", charts.diverging()[:, ::-1])
+    deviation_map = draw_values(points, mesh.normals[shown.vertices], shown.signed_mm, scale)
     return [
         f"Distances of the {len(points):,} measured vertices of this scan's mesh from the surface of "
         f"{shown.name}; what was filled is left out. To fit it, the scan was moved by {moved:.2f} mm "
@@ -221,16 +217,20 @@ def _comparison(
 
 def _pictures(scan: StoredScan) -> list[Block]:
     views = "From the front, from the subject's left side, from the back."
-    draw = partial(draw_cloud, scan.cloud, height_px=charts.PICTURE_PX)
-    mesh = partial(draw_mesh, scan.mesh, height_px=charts.PICTURE_PX)
-    by_sigma, by_pairs = partial(draw, colour="sigma"), partial(draw, colour="pairs_seen")
-    table = (
-        ("Measured points, as photographed", "White: nothing was measured there.", draw),
-        ("Mesh", "Orange: filled to close the mesh.", mesh),
-        ("Sigma of the points", "Standard deviation of each along its normal, mm.", by_sigma),
-        ("Pairs", "How many pairs measured each place.", by_pairs),
-    )
-    return [Picture(title, f"{views} {caption}", drawn()) for title, caption, drawn in table]
+    table = {
+        "cloud.png": ("Measured points, as photographed", "White: nothing was measured there."),
+        "mesh.png": ("Mesh", "Orange: filled to close the mesh."),
+        "sigma.png": ("Sigma of the points", "Standard deviation of each along its normal, mm."),
+        "pairs.png": ("Pairs", "How many pairs measured each place."),
+    }
+    cloud, mesh = draw_pictures(scan.cloud), draw_pictures(scan.mesh)
+    drawn = cloud.value | mesh.value
+    shown = [
+        Picture(title, f"{views} {caption}", drawn[name])
+        for name, (title, caption) in table.items()
+        if name in drawn
+    ]
+    return [*shown, Lines((*cloud.notes, *mesh.notes))]
 
 
 def _pairs(facts: Mapping[str, Any]) -> list[Block]:

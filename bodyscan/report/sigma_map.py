@@ -81,7 +81,7 @@ def why_no_sigma(calibration: RigCalibration) -> tuple[str, str] | None:
     return None
 
 
-def draw_sigma_map(calibration: RigCalibration, *, height_px: int = 900) -> bytes:
+def draw_sigma_map(calibration: RigCalibration) -> bytes:
     """Maps of `sigma_at` in the planes x = 0 (front) and y = 0 (side) on one colour scale, as PNG.
 
     Light grey where nothing is measured. Raises BadInput if no sigma is known (`why_no_sigma`).
@@ -113,7 +113,7 @@ def draw_sigma_map(calibration: RigCalibration, *, height_px: int = 900) -> byte
             axis.set_title(f"{caption}, mm")
             axis.set_xticks([])
         figure.colorbar(shown, ax=axes, shrink=0.7, label="sigma, mm")
-    return charts.png(figure, height_px)
+    return charts.png(figure, 900)
 
 
 def write_sigma_map(calibration: Path, path: Path | None = None) -> Path:

@@ -97,7 +97,7 @@ def test_a_report_goes_on_after_a_section_that_fails(
 
 def test_a_scans_report_goes_on_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scan = make_scan(tmp_path / "scan")
-    monkeypatch.setattr("bodyscan.report.scan_page.draw_cloud", broken)
+    monkeypatch.setattr(pictures, "draw_mesh", broken)
     path, _ = write_report(scan.folder)
     assert path.read_text("utf-8").count("failed with KeyError") == 1
 
