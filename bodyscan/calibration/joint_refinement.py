@@ -207,7 +207,7 @@ def refine_jointly(
     return JointFit(
         state.camera,
         state.poses,
-        state.sheets.with_covariance(_depth_covariance(state, boards, covariance)),
+        replace(state.sheets, covariance=_depth_covariance(state, boards, covariance)),
         covariance[: state.first_pose, : state.first_pose],
         float(np.sqrt(CORNERS.mean_square(corners)) * np.sqrt(2.0)),
         state.warps,

@@ -3,7 +3,7 @@ sheets that are smooth in s, or a projector without a lens as their start."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -98,7 +98,7 @@ def fit_sheets(
     if board_error_mm > 0.0:
         covariance = covariance + _board_covariance(solution, data, by_point, board_error_mm)
     return SheetFit(
-        sheets.with_covariance(0.5 * (covariance + covariance.T)),
+        replace(sheets, covariance=0.5 * (covariance + covariance.T)),
         points.residuals / np.linalg.norm(by_point, axis=1),
         solution.weights[0],
         solution.scales[0],

@@ -19,14 +19,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.polynomial import chebyshev
 
 from bodyscan.arrays import Array
 from bodyscan.compiled import compiled
-from bodyscan.geometry.lens_sheets import LensSheets
+from bodyscan.geometry.lens_sheets import CONVERGED, EXACT, LensSheets, variance_along
 from bodyscan.geometry.light_planes import Offset, SmoothSheets
 
 PLANE_DEGREE, BOW_DEGREE = 7, 3
@@ -54,6 +54,8 @@ class BowedSheets(SmoothSheets):
         degree first, and x0 (mm).
     """
 
+    kind: ClassVar[str] = "bowed"
+
     @staticmethod
     def from_pinhole(pinhole: LensSheets, bow_terms: int) -> BowedSheets:
         """The planes of a projector without a lens, y' = (s - c) / f: the start of a fit."""
@@ -69,10 +71,6 @@ class BowedSheets(SmoothSheets):
             parameters,
             np.full((size, size), np.nan),
         )
-
-    @property
-    def kind(self) -> str:
-        return "bowed"
 
     @property
     def bow_terms(self) -> int:
@@ -167,7 +165,6 @@ class BowedSheets(SmoothSheets):
 
 
 NODES_PER_STRIPE = 8
-EXACT, CONVERGED = 1e-7, 1e-6  # relative: the next step would be about the square of the last
 
 
 @compiled
@@ -203,7 +200,7 @@ def _measure(frame: Array, rows: Array, terms: int, rays: Array, s: Array, found
         by[terms] = sideways / reach
         scale = reach / rise
         found[0, n], found[1, n] = depth, -fall * scale
-        found[2, n] = _variance(row[2 * terms :], by) * scale * scale
+        found[2, n] = variance_along(row[2 * terms :], by) * scale * scale
 
 
 @compiled
@@ -245,16 +242,3 @@ def _rotate_direction(frame: Array, axis: int, x: float, y: float) -> float:
 def _at(frame: Array, axis: int, x: float, y: float, depth: float) -> float:
     """One coordinate, in the sheets' frame, of the ray's point at the depth."""
     return depth * _rotate_direction(frame, axis, x, y) + frame[4 * axis + 3]
-
-
-@compiled
-def _variance(upper: Array, by: Array) -> float:
-    """by^T C by, given the upper triangle of C row by row."""
-    total, first, size = 0.0, 0, len(by)
-    for i in range(size):
-        row = 0.5 * upper[first] * by[i]
-        for j in range(i + 1, size):
-            row += upper[first + j - i] * by[j]
-        total += 2.0 * row * by[i]
-        first += size - i
-    return total

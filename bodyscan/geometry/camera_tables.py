@@ -166,27 +166,20 @@ def _within_tolerance(
     return table
 
 
-def look_up_rays(rays: Table, wanted: Mask, first_row: int = 0) -> Array:
+@compiled
+def look_up_rays(table: Table, wanted: Mask, first_row: int = 0) -> Array:
     """Rays (N, 3) through the N pixels that are `wanted` (rows, width), row by row.
 
-    rays: the camera's `ray_table`.
+    table: the camera's `ray_table`.
     first_row: the image row of the first row of `wanted`.
     """
-    found = np.empty((np.count_nonzero(wanted), 3))
-    _look_up_rays(rays, first_row, wanted, found)
-    return found
-
-
-@compiled
-def _look_up_rays(table: Table, first_row: int, wanted: Mask, rays: Array) -> None:
-    """Fill rays (N, 3) of the N pixels `wanted` (rows, width)."""
-    n = 0
+    rays, n = np.ones((np.count_nonzero(wanted), 3)), 0
     for v in range(wanted.shape[0]):
         for u in range(wanted.shape[1]):
             if wanted[v, u]:
                 rays[n, 0], rays[n, 1] = look_up(table, float(u), float(first_row + v))
-                rays[n, 2] = 1.0
                 n += 1
+    return rays
 
 
 def is_in_image(camera: Camera, points: Array) -> Mask:

@@ -29,14 +29,14 @@ from bodyscan.geometry.robust import cauchy_cost, cauchy_weights, robust_scale
 Columns = Indices | slice
 State = TypeVar("State")
 
-FASTER, SLOWER = 10.0, 10.0
-"""A step that lowers the cost divides the damping by the first; one that does not multiplies it by
-the second."""
+FACTOR = 10.0
+"""A step that lowers the cost divides the damping by this; one that does not multiplies it."""
 MIN_DAMPING, EFFECTIVE_DAMPING = 1e-12, 1e-4
 """Shares of the scaled diagonal: below the first, rounding dominates; below the second, damping has
 no effect, so a refused step raises it there at once."""
 
 Ending = Literal["settled", "out of steps", "stuck"]
+OUT_OF_STEPS: Ending = "out of steps"
 
 
 @dataclass(frozen=True)
@@ -105,26 +105,6 @@ class Block:
         return self.linearize()
 
 
-@dataclass(frozen=True)
-class Report:
-    """How a solve went.
-
-    steps: how many were taken.
-    cost_before, cost_after: in variances, both with the noise estimated at the end.
-    ending: `settled` (see above); `out of steps`; or `stuck`: no step lowers the cost although the
-        equations predict one (a wrong Jacobian, a kink).
-    """
-
-    steps: int
-    cost_before: float
-    cost_after: float
-    ending: Ending
-
-    @property
-    def converged(self) -> bool:
-        return self.ending == "settled"
-
-
 @dataclass(frozen=True, eq=False)
 class Solution(Generic[State]):
     """The minimum and what is needed for its covariance.
@@ -134,6 +114,9 @@ class Solution(Generic[State]):
     weights: robust weights (N,) in [0, 1] of each block.
     scales: of each block, in its residuals' sigmas.
     unknowns: P.
+    steps: how many were taken.
+    ending: `settled` (see above); `out of steps`; or `stuck`: no step lowers the cost although the
+        equations predict one (a wrong Jacobian, a kink).
     """
 
     state: State
@@ -141,24 +124,20 @@ class Solution(Generic[State]):
     weights: tuple[Array, ...]
     scales: tuple[float, ...]
     unknowns: int
-    report: Report
+    steps: int
+    ending: Ending
 
     @cached_property
     def covariance(self) -> Array:
         """Covariance (P, P) of the unknowns, with the residuals' spread as their noise."""
-        normal, _ = _equations(self.blocks, self.weights, self.scales, self.unknowns)
-        return invert_scaled(normal)
+        parts = zip(self.blocks, self.weights, self.scales, strict=True)
+        return invert_scaled(_equations(parts, self.unknowns)[0])
 
     def normal(self, kinds: Collection[Noise]) -> Array:
         """Normal matrix (P, P), J^T W J over variances, of the blocks with these kinds of noise
         alone."""
-        chosen = [k for k, block in enumerate(self.blocks) if block.noise in kinds]
-        return _equations(
-            [self.blocks[k] for k in chosen],
-            [self.weights[k] for k in chosen],
-            [self.scales[k] for k in chosen],
-            self.unknowns,
-        )[0]
+        parts = zip(self.blocks, self.weights, self.scales, strict=True)
+        return _equations([part for part in parts if part[0].noise in kinds], self.unknowns)[0]
 
     @property
     def variance(self) -> float:
@@ -189,12 +168,12 @@ def minimize(
     damping: of the first step, as a share of a unit diagonal.
     """
     state, blocks = start, tuple(blocks_at(start))
-    first, taken = blocks, 0
-    ending: Ending = "out of steps"
+    taken, ending = 0, OUT_OF_STEPS
     weights, scales = _weigh(blocks)
     while taken < steps:
         cost = _cost(blocks, blocks, scales)
-        normal, gradient = _equations(blocks, weights, scales, unknowns)
+        parts = zip(blocks, weights, scales, strict=True)
+        normal, gradient = _equations(parts, unknowns)
         promised = 0.0
         # After ten increases of the damping nothing moves any more.
         for attempt in range(10):
@@ -205,19 +184,17 @@ def minimize(
             gained = cost - _cost(tried, blocks, scales)
             if gained > 0.0 or promised < tolerance:
                 break
-            damping = max(SLOWER * damping, EFFECTIVE_DAMPING)
+            damping = max(FACTOR * damping, EFFECTIVE_DAMPING)
         if not gained > 0.0:
             ending = "settled" if promised < tolerance else "stuck"
             break
         state, blocks, taken = candidate, tried, taken + 1
-        damping = max(damping / FASTER, MIN_DAMPING)
+        damping = max(damping / FACTOR, MIN_DAMPING)
         weights, scales = _weigh(blocks)
         if gained < tolerance:
             ending = "settled"
             break
-    before, after = (_cost(these, blocks, scales) for these in (first, blocks))
-    report = Report(taken, before, after, ending)
-    return Solution(state, blocks, weights, scales, unknowns, report)
+    return Solution(state, blocks, weights, scales, unknowns, taken, ending)
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,17 +211,6 @@ class StackedEquations:
     gradient: Array
     cost: Array
     freedoms: Array
-
-    @staticmethod
-    def from_residuals(residuals: Array, jacobian: Array, weights: Array) -> StackedEquations:
-        """Equations of residuals (N, M), their Jacobian (N, M, P) and weights (N, M)."""
-        weighted = np.swapaxes(jacobian * weights[..., None], 1, 2)
-        return StackedEquations(
-            weighted @ jacobian,
-            (weighted @ residuals[..., None])[..., 0],
-            np.sum(weights * residuals**2, axis=1),
-            np.maximum(np.sum(weights, axis=1) - jacobian.shape[2], 1.0),
-        )
 
     def where(self, chosen: Mask, others: StackedEquations) -> StackedEquations:
         """Take the `chosen` (N,) problems from here and the rest from `others`."""
@@ -268,13 +234,11 @@ class StackedSolution:
     state: (N, P).
     equations: evaluated there.
     converged: (N,), which problems settled.
-    steps: how many were taken.
     """
 
     state: Array
     equations: StackedEquations
     converged: Mask
-    steps: int
 
     def covariance(self) -> Array:
         """Covariance (N, P, P), with each problem's noise estimated from its remaining cost."""
@@ -298,25 +262,25 @@ def minimize_each(
     """
     state, at = start, equations_at(start)
     strength, converged = np.full(len(start), damping), np.zeros(len(start), bool)
-    for taken in range(steps):
+    for _ in range(steps):
         step = -solve_scaled(at.normal, at.gradient, strength)
         enough = tolerance * np.maximum(at.variance, min_sigma**2)
         promised = -np.sum(step * at.gradient, axis=1)
         trial = within(state + step)
         tried = equations_at(trial)
-        better = tried.cost < at.cost
         gained = at.cost - tried.cost
+        better = gained > 0.0
         # A small predicted gain that is due to damping is no sign of convergence.
         converged |= (better & (gained < enough)) | (
             (promised < enough) & (strength <= EFFECTIVE_DAMPING)
         )
         state = np.where(better[:, None], trial, state)
         at = tried.where(better, at)
-        eased, raised = np.maximum(strength / FASTER, MIN_DAMPING), SLOWER * strength
-        strength = np.where(better, eased, np.maximum(raised, EFFECTIVE_DAMPING))
+        eased = np.maximum(strength / FACTOR, MIN_DAMPING)
+        strength = np.where(better, eased, np.maximum(FACTOR * strength, EFFECTIVE_DAMPING))
         if converged.all():
-            return StackedSolution(state, at, converged, taken + 1)
-    return StackedSolution(state, at, converged, steps)
+            break
+    return StackedSolution(state, at, converged)
 
 
 def _weigh(blocks: Sequence[Block]) -> tuple[tuple[Array, ...], tuple[float, ...]]:
@@ -355,21 +319,20 @@ def _normalize_residuals(
     return np.concatenate([blocks[k].residuals / there[k].sigma for k in numbers])
 
 
-def _equations(
-    blocks: Sequence[Block], weights: Sequence[Array], scales: Sequence[float], unknowns: int
-) -> tuple[Array, Array]:
-    """Normal matrix (P, P) and gradient (P,) of half the cost."""
+def _equations(parts: Iterable[tuple[Block, Array, float]], unknowns: int) -> tuple[Array, Array]:
+    """Normal matrix (P, P) and gradient (P,) of half the cost of blocks with weights and scales."""
     normal, gradient = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
-    for block, weight, size in zip(blocks, weights, scales, strict=True):
+    for block, weight, size in parts:
         if not len(block.residuals):
             continue
         weighted = block.jacobian * (weight / (block.sigma * size) ** 2)[:, None]
         if block.runs is not None:
             _add_runs(block, weighted, normal, gradient)
             continue
-        square = _square(block.columns)
+        by = block.columns
+        square = (by, by) if isinstance(by, slice) else np.ix_(by, by)
         normal[square] += multiply_transposed(weighted, block.jacobian)
-        gradient[block.columns] += weighted.T @ block.residuals
+        gradient[by] += weighted.T @ block.residuals
     return normal, gradient
 
 
@@ -392,9 +355,3 @@ def _stack_runs(rows: Array, runs: Indices) -> Array:
     stacked = np.zeros((len(runs), longest, rows.shape[1]))
     stacked[np.arange(longest) < runs[:, None]] = rows
     return stacked
-
-
-def _square(columns: Columns) -> tuple[Columns, Columns] | tuple[Indices, ...]:
-    if isinstance(columns, slice):
-        return columns, columns
-    return np.ix_(columns, columns)

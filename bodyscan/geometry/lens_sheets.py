@@ -16,6 +16,7 @@ k3, k4, k5, k6.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -44,6 +45,8 @@ class LensSheets(SmoothSheets):
     in mm, applied on its left), then the parameters.
     """
 
+    kind: ClassVar[str] = "lens"
+
     @staticmethod
     def from_matrix(matrix: Array, middle: Array, stripes: int, direction: Axis) -> LensSheets:
         """A projector without a lens: s = (row 0 . X) / (row 1 . X), matrix (2, 4), X homogeneous,
@@ -54,10 +57,6 @@ class LensSheets(SmoothSheets):
         frame, size = RigidTransform(frame.rotation, opposite), FRAME + SCALE
         unknown = np.full((size, size), np.nan)
         return LensSheets(frame, middle, stripes, direction, scale, unknown)
-
-    @property
-    def kind(self) -> str:
-        return "lens"
 
     @property
     def only_centre_uncertain(self) -> bool:
@@ -136,7 +135,7 @@ class LensSheets(SmoothSheets):
         )
 
     def _measure(self, rays: Array, s: Array, found: Array) -> None:
-        covariance = np.ascontiguousarray(self.covariance)
+        covariance = self.covariance[np.triu_indices(len(self.covariance))]
         lens = np.zeros(SCALE + len(LENS_SIGMAS))
         lens[: len(self.parameters)] = self.parameters
         frame = np.ascontiguousarray(self.projector_from_camera.matrix[:3])
@@ -176,10 +175,10 @@ def measure_rays(
     """Fill `found` (3, N) with depth z, dz/ds and the variance of z for rays (N, 3) at s (N,).
 
     NaN where a ray meets no sheet.
-    covariance: (P, P) of the freedoms of a fit.
+    covariance: of the P freedoms of a fit, its upper triangle row by row.
     distance: of the boards, mm.
     """
-    jacobian = np.empty(len(covariance))
+    jacobian = np.empty(int(np.sqrt(2 * len(covariance))))
     for n in range(len(s)):
         found[:, n] = np.nan
         x, y = rays[n, 0], rays[n, 1]
@@ -190,13 +189,21 @@ def measure_rays(
         image = _distort(lens, point[0], point[1])
         per_stripe = point[2] / _slope_times_reach(frame, point, image, x, y)
         _by_freedom(lens, point, image, jacobian)
-        variance = 0.0
-        for i in range(len(jacobian)):
-            row = 0.5 * covariance[i, i] * jacobian[i]
-            for j in range(i):
-                row += covariance[i, j] * jacobian[j]
-            variance += 2.0 * row * jacobian[i]
-        found[0, n], found[1, n], found[2, n] = depth, per_stripe, variance * per_stripe**2
+        variance = variance_along(covariance, jacobian) * per_stripe**2
+        found[0, n], found[1, n], found[2, n] = depth, per_stripe, variance
+
+
+@compiled
+def variance_along(upper: Array, by: Array) -> float:
+    """by^T C by, given the upper triangle of C row by row."""
+    total, first, size = 0.0, 0, len(by)
+    for i in range(size):
+        row = 0.5 * upper[first] * by[i]
+        for j in range(i + 1, size):
+            row += upper[first + j - i] * by[j]
+        total += 2.0 * row * by[i]
+        first += size - i
+    return total
 
 
 @compiled

@@ -8,8 +8,8 @@ derivatives: what a fit needs. Depths along rays are found by compiled functions
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple, Protocol, TypeVar
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
@@ -35,19 +35,17 @@ class RayDepths(NamedTuple):
 class LightSheets(Protocol):
     """What triangulation needs from a projector, whatever its model.
 
+    kind: `planes`, `bowed` or `lens`: see `light_sheets.sheets_from_arrays`.
     direction: which way the stripes run in the image.
     """
+
+    kind: ClassVar[str]
 
     @property
     def direction(self) -> Axis: ...
 
     @property
     def stripes(self) -> int: ...
-
-    @property
-    def kind(self) -> str:
-        """`planes`, `bowed` or `lens`: see `light_sheets.sheets_from_arrays`."""
-        ...
 
     def measure(self, rays: Array, s: Array) -> RayDepths:
         """Intersect rays (..., 3) with z = 1, camera frame, with the sheets at real s (...)."""
@@ -74,6 +72,8 @@ class LightPlanes:
     direction: which way the stripes run in the image.
     """
 
+    kind: ClassVar[str] = "planes"
+
     coefficients: Array
     covariance: Array
     direction: Axis
@@ -85,10 +85,6 @@ class LightPlanes:
         return LightPlanes(towards_camera(unit), np.full((len(planes), 4, 4), np.nan), direction)
 
     @property
-    def kind(self) -> str:
-        return "planes"
-
-    @property
     def stripes(self) -> int:
         return len(self.coefficients) - 1
 
@@ -97,7 +93,7 @@ class LightPlanes:
         """Which boundaries have a plane, (S + 1,)."""
         return np.isfinite(self.coefficients[:, 0])
 
-    def at(self, s: Array) -> Array:
+    def tangent_planes(self, s: Array) -> Array:
         """Planes (..., 4) at real s (...), interpolated linearly; NaN beside a missing one."""
         below, share = self._locate(s)
         share = share[..., None]
@@ -106,10 +102,6 @@ class LightPlanes:
         upper = np.where(share > 0.0, self.coefficients[below + 1], 0.0)
         return (1.0 - share) * lower + share * upper
 
-    def tangent_planes(self, s: Array) -> Array:
-        """The planes themselves."""
-        return self.at(s)
-
     def measure(self, rays: Array, s: Array) -> RayDepths:
         """z by Eq. 13, -d / (a x/z + b y/z + c), and dz/ds from the two planes around s; at the last
         plane, from the two before it.
@@ -117,7 +109,7 @@ class LightPlanes:
         Neighbouring planes come from the same boards, so their errors are treated as one.
         """
         below, share = self._locate(s)
-        planes = self.at(s)
+        planes = self.tangent_planes(s)
         facing = np.sum(planes[..., :3] * rays, axis=-1)
         depth = -planes[..., 3] / np.where(facing == 0.0, np.nan, facing)
         depth = np.where(depth > 0.0, depth, np.nan)
@@ -186,17 +178,14 @@ class SmoothSheets(ABC):
     covariance: (P, P) of the freedoms that `retract` takes.
     """
 
+    kind: ClassVar[str]
+
     projector_from_camera: RigidTransform
     middle: Array
     stripes: int
     direction: Axis
     parameters: Array
     covariance: Array
-
-    @property
-    @abstractmethod
-    def kind(self) -> str:
-        """Name of the model in files."""
 
     @abstractmethod
     def prior(self) -> tuple[Array, Array]:
@@ -248,7 +237,3 @@ class SmoothSheets(ABC):
         normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
         planes = np.concatenate([normals, -np.sum(normals * points, -1, keepdims=True)], axis=-1)
         return towards_camera(planes)
-
-    def with_covariance(self: Sheets, covariance: Array) -> Sheets:
-        """The same sheets with another covariance (P, P)."""
-        return replace(self, covariance=covariance)

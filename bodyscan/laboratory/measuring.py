@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,6 +99,8 @@ def measure_artefacts(
 class TrueSheets:
     """The simulator's pixels light as exactly known sheets for triangulation, including smile."""
 
+    kind: ClassVar[str] = "true"
+
     setup: ChapterSetup
 
     @property
@@ -108,10 +110,6 @@ class TrueSheets:
     @property
     def stripes(self) -> int:
         return self.setup.projector.stripes
-
-    @property
-    def kind(self) -> str:
-        return "true"
 
     def measure(self, rays: Array, s: Array) -> RayDepths:
         """Intersect rays with the light; it is known exactly."""

@@ -63,7 +63,7 @@ def noisy(seed: int, sigma: float = 0.01) -> Array:
 def test_the_minimum_of_exact_data_is_the_truth() -> None:
     solution = fit(decay(TRUE), [1.0, 1.5, 0.0])
     assert np.allclose(solution.state, TRUE, atol=1e-9)
-    assert solution.report.converged
+    assert solution.ending == "settled"
 
 
 def test_rosenbrocks_valley_is_followed_to_its_end() -> None:
@@ -75,7 +75,6 @@ def test_rosenbrocks_valley_is_followed_to_its_end() -> None:
 
     solution = minimize(np.array([-1.2, 1.0]), blocks, add, unknowns=2)
     assert np.allclose(solution.state, 1.0, atol=1e-6)
-    assert solution.report.cost_before == pytest.approx(24.2)
 
 
 def test_a_start_from_which_undamped_steps_run_away_is_recovered() -> None:
@@ -87,7 +86,7 @@ def test_a_start_from_which_undamped_steps_run_away_is_recovered() -> None:
 
     solution = minimize(np.array([30.0]), blocks, add, unknowns=1, damping=1e-9)
     assert abs(solution.state[0]) < 1e-3
-    assert solution.report.converged
+    assert solution.ending == "settled"
 
 
 def test_states_without_finite_residuals_are_stepped_back_from() -> None:
@@ -206,14 +205,13 @@ def test_one_block_of_runs_gives_what_a_block_for_each_run_gives() -> None:
 
 
 def test_a_fit_cut_short_says_so() -> None:
-    report = fit(noisy(2), [0.5, 3.0, 1.0], steps=2).report
-    assert (report.ending, report.steps, report.converged) == ("out of steps", 2, False)
-    assert report.cost_after < report.cost_before
+    solution = fit(noisy(2), [0.5, 3.0, 1.0], steps=2)
+    assert (solution.ending, solution.steps) == ("out of steps", 2)
 
 
 def test_a_wrong_jacobian_is_reported_as_stuck() -> None:
-    report = fit(noisy(3), [1.0, 1.5, 0.0], jacobian=lambda state: -decay_jacobian(state)).report
-    assert report.ending == "stuck"
+    backwards = fit(noisy(3), [1.0, 1.5, 0.0], jacobian=lambda state: -decay_jacobian(state))
+    assert backwards.ending == "stuck"
 
 
 def test_steps_that_are_refused_ask_for_no_jacobian() -> None:
@@ -224,7 +222,7 @@ def test_steps_that_are_refused_ask_for_no_jacobian() -> None:
         return decay_jacobian(state)
 
     solution = fit(noisy(5), [0.1, 8.0, 3.0], jacobian=jacobian, damping=1e-12)
-    assert len(asked) <= solution.report.steps + 1
+    assert len(asked) <= solution.steps + 1
 
 
 @dataclass(frozen=True)
@@ -237,7 +235,13 @@ class Many:
     def equations(self, states: Array) -> StackedEquations:
         residuals = np.stack([decay(state) for state in states]) - self.measured
         jacobians = np.stack([decay_jacobian(state) for state in states])
-        return StackedEquations.from_residuals(residuals, jacobians, self.weights)
+        weighted = np.swapaxes(jacobians * self.weights[..., None], 1, 2)
+        return StackedEquations(
+            weighted @ jacobians,
+            (weighted @ residuals[..., None])[..., 0],
+            np.sum(self.weights * residuals**2, axis=1),
+            np.sum(self.weights, axis=1) - 3.0,
+        )
 
 
 def many(count: int = 5) -> Many:

@@ -1,6 +1,7 @@
 """Every model of the light against its own derivatives, and against the chapter's planes."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -193,7 +194,7 @@ def test_planes_have_slope_and_variance_between_two_and_at_the_last() -> None:
         nearby = chapter.measure(ray, s + side * 1e-6).depth
         slope = (nearby - depth) / (side * 1e-6)
         assert np.allclose(chapter.measure(ray, s).per_stripe, slope, rtol=1e-4)
-        facing = chapter.at(s)[0, :3] @ ray[0]
+        facing = chapter.tangent_planes(s)[0, :3] @ ray[0]
         # A plane's offset, 0.1 mm uncertain, moves the depth by that over n . ray.
         assert np.allclose(chapter.measure(ray, s).variance_mm2, 0.01 / facing**2)
     assert np.isnan(chapter.measure(ray, np.array([149.5])).variance_mm2).all()
@@ -241,7 +242,7 @@ def test_what_is_too_uncertain_is_not_measured() -> None:
     )
     for at_the_boards, most in ((1e-4, 1e-3), (1e-3, 3e-3), (1e-2, 3e-2)):
         scaled = share * at_the_boards / amid
-        worse = model.with_covariance(model.covariance * (at_the_boards / amid) ** 2)
+        worse = replace(model, covariance=model.covariance * (at_the_boards / amid) ** 2)
         kept = np.isfinite(intersect_rays(worse, rays[inside], s[inside]).depth)
         clear = np.abs(scaled / most - 1.0) > 0.02  # the stripe amid the boards is a whole one
         np.testing.assert_array_equal(kept[clear], scaled[clear] < most)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from sheet_models import MIDDLE, STRIPES, by_offset, models
@@ -96,7 +98,7 @@ def test_what_boards_leave_open_everywhere_is_no_guess(sheets: BowedSheets) -> N
     s = np.full((CAMERA.height, CAMERA.width), np.nan, np.float32)
     s[row, column] = stripe
     sigma = np.full(s.shape, 0.02, np.float32)
-    vague = sheets.with_covariance(sheets.covariance * (5e-3 / share) ** 2)
+    vague = replace(sheets, covariance=sheets.covariance * (5e-3 / share) ** 2)
     known = np.isfinite(triangulate_image(vague, CAMERA, s, sigma)[1])
     assert known[row, column]
     assert known.sum() == 1

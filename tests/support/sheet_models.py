@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
@@ -53,4 +54,4 @@ def moved(model: Sheets, rng: np.random.Generator) -> Sheets:
         size[3:6], size[6:8] = 5.0, 1.0
     step = size * rng.standard_normal(len(size))
     spread = 1e-4 * size[:, None] * rng.standard_normal((len(size), len(size)))
-    return model.retract(step).with_covariance(spread @ spread.T)
+    return replace(model.retract(step), covariance=spread @ spread.T)
