@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
-from bodyscan.arrays import Array, Bytes, Floats, Mask
-from bodyscan.compiled import compiled
+from bodyscan.arrays import Array
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.mesh.body import BodyCloud
 from bodyscan.motion.estimation import EstimatedMotion
-from bodyscan.progress import map_threads, split_range
+from bodyscan.progress import map_threads
 
 
 def add_pose_variance(
@@ -27,17 +26,32 @@ def add_pose_variance(
     """
     centres = np.array([pose.translation for pose in rig_from_camera.values()])
     size = len(centres)
-    joint = prior.select(tuple(rig_from_camera)).reshape(size, 6, size, 6).swapaxes(1, 2)
-    rows, columns = np.triu_indices(6)
-    packed = joint[..., rows, columns] + np.where(rows < columns, joint[..., columns, rows], 0.0)
-    sigma_mm = np.empty(len(cloud.points))
+    joint = prior.select(tuple(rig_from_camera)).reshape(size, 6, size, 6)
 
-    def fill(part: slice) -> None:
-        surface = cloud.points[part], cloud.normals[part], cloud.pairs_seen[part]
-        _pose_sigmas(*surface, centres, packed, sigma_mm[part])
+    def compute(part: slice) -> Array:
+        points, normals = cloud.points[part], cloud.normals[part].astype(np.float64)
+        towards = normals @ centres.T - np.sum(points * normals, axis=1)[:, None]
+        facing = towards > 0.2 * cdist(points, centres)
+        groups, group = np.unique(facing, axis=0, return_inverse=True)  # the same pairs for many
+        shares = groups.astype(np.float64)
+        alone = np.einsum("gp,piqj,pq->gij", shares, joint, np.eye(size))
+        between = np.einsum("gp,gq,piqj->gij", shares, shares, joint, optimize=True) - alone
+        lever = np.hstack([np.cross(points, normals), normals])
+        variance, covariance = (
+            np.einsum("ni,nij,nj->n", lever, matrices[group.ravel()], lever)
+            for matrices in (alone, between)
+        )
+        count = facing.sum(axis=1)
+        share = 1.0 / np.clip(np.minimum(cloud.pairs_seen[part], count), 1, None)
+        mean = share * variance / np.maximum(count, 1)
+        mean += (1.0 - share) * covariance / np.maximum(count * (count - 1), 1)
+        return np.asarray(np.maximum(mean, 0.0))
 
-    map_threads(fill, split_range(len(sigma_mm)), stage="sigmas of poses")
-    return replace(cloud, sigma_mm=np.hypot(cloud.sigma_mm, sigma_mm).astype(np.float32))
+    block = 1 << 16  # points whose matrices fit into some tens of megabytes
+    parts = [slice(start, start + block) for start in range(0, len(cloud.points), block)]
+    variance = np.concatenate(map_threads(compute, parts, stage="sigmas of poses"))
+    sigma_mm = np.sqrt(cloud.sigma_mm**2 + variance).astype(np.float32)
+    return replace(cloud, sigma_mm=sigma_mm)
 
 
 def add_motion_variance(
@@ -51,56 +65,3 @@ def add_motion_variance(
     cell = followed.cells.find_by_groups(cloud.points, cloud.normals.astype(np.float64))
     sigma_mm = np.hypot(cloud.sigma_mm, followed.sigma_mm[cell])
     return replace(cloud, sigma_mm=np.maximum(sigma_mm, with_poses.sigma_mm).astype(np.float32))
-
-
-@compiled
-def _pose_sigmas(
-    points: Array, normals: Floats, pairs_seen: Bytes, centres: Array, joint: Array, sigma_mm: Array
-) -> None:
-    """Write standard deviations (N,) mm along the normals due to errors of pairs at `centres` (P,
-    3).
-
-    joint: their covariances (P, P, 21), the upper triangle with what lies below it added.
-    """
-    lever, products, facing = np.empty(6), np.empty(21), np.zeros(len(centres), np.bool_)
-    alone, between = np.zeros(21), np.zeros(21)
-    for n in range(len(points)):
-        (x, y, z), (a, b, c) = points[n], normals[n]
-        lever[0], lever[1], lever[2] = y * c - z * b, z * a - x * c, x * b - y * a
-        lever[3], lever[4], lever[5] = a, b, c
-        k = 0
-        for row in range(6):
-            for column in range(row, 6):
-                products[k] = lever[row] * lever[column]
-                k += 1
-        count, changed = 0, False
-        for pair in range(len(centres)):
-            dx, dy, dz = centres[pair, 0] - x, centres[pair, 1] - y, centres[pair, 2] - z
-            towards = a * dx + b * dy + c * dz
-            faces = towards > 0.2 * math.sqrt(dx * dx + dy * dy + dz * dz)
-            changed |= faces != facing[pair]
-            facing[pair] = faces
-            count += faces
-        if changed:  # most points face the same pairs as the one before
-            _sum_covariances(joint, facing, alone, between)
-        variance, covariance = 0.0, 0.0
-        for k in range(21):
-            variance += alone[k] * products[k] / max(count, 1)
-            covariance += between[k] * products[k] / max(count * (count - 1) / 2, 1.0)
-        share = 1.0 / max(min(pairs_seen[n], count), 1)
-        sigma_mm[n] = math.sqrt(max(share * variance + (1.0 - share) * covariance, 0.0))
-
-
-@compiled
-def _sum_covariances(joint: Array, facing: Mask, alone: Array, between: Array) -> None:
-    """Write the sums of the facing pairs' covariances, and of those of each two of them."""
-    alone[:], between[:] = 0.0, 0.0
-    for i in range(len(facing)):
-        if not facing[i]:
-            continue
-        for k in range(21):
-            alone[k] += joint[i, i, k]
-        for j in range(i):
-            if facing[j]:
-                for k in range(21):
-                    between[k] += joint[i, j, k]

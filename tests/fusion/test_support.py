@@ -1,13 +1,12 @@
-"""Support of a mesh's vertices by a cloud's points, and the search for the nearest of them."""
+"""Support of a mesh's vertices by a cloud's points."""
 
 from __future__ import annotations
 
 import numpy as np
 import open3d as o3d
 import pytest
-from scipy.spatial import cKDTree
 
-from bodyscan.fusion.support import PointColumns, Support, fit_to_points, measure_support
+from bodyscan.fusion.support import Support, fit_to_points, measure_support
 from bodyscan.mesh.body import BodyCloud
 from bodyscan.mesh.topology import vertex_normals
 
@@ -176,24 +175,3 @@ def test_a_vertex_moves_by_a_quarter_of_the_reach_at_most_and_less_where_points_
     normals = (vertices / 50.0).astype(np.float32)
     moved = fit_to_points(vertices, faces, normals, around)
     np.testing.assert_allclose(np.linalg.norm(moved, axis=1), 50.0 + moved_mm, atol=1e-4)
-
-
-def test_the_same_as_a_tree() -> None:
-    rng = np.random.default_rng(0)
-    points = rng.uniform([-30.0, -40.0, 0.0], [30.0, 40.0, 90.0], (20_000, 3))
-    places = rng.uniform([-50.0, -60.0, -20.0], [50.0, 60.0, 110.0], (3000, 3))
-    for reach in (2.0, 7.5):
-        found = PointColumns.from_points(points, reach).find_nearest(places, 8)
-        wanted = cKDTree(points).query(places, 8, distance_upper_bound=reach)
-        np.testing.assert_allclose(found[0], wanted[0], rtol=1e-12)
-        np.testing.assert_array_equal(found[1], wanted[1])
-        assert np.isinf(found[0]).any()
-
-
-def test_points_in_one_place() -> None:
-    points = np.zeros((5, 3))
-    distance, near = PointColumns.from_points(points, 4.0).find_nearest(
-        np.array([[1.0, 0.0, 0.0]]), 8
-    )
-    np.testing.assert_array_equal(distance[0], [1.0] * 5 + [np.inf] * 3)
-    np.testing.assert_array_equal(near[0], [0, 1, 2, 3, 4, 5, 5, 5])
