@@ -128,7 +128,7 @@ def _find(known: Known, device: KnownCamera, name: str, folder: Path) -> FoundCa
     cameras = form.read(path)
     only = device.file is not None or device is known.camera
     if device.name is None and only and len(cameras) == 1:
-        return next(iter(cameras.values()))
+        return next(iter(cameras.values()))()
     return find_camera(cameras, device.name or name, str(path))
 
 

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import json
 import re
-import tomllib
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -19,13 +17,10 @@ from bodyscan.arrays import Array
 from bodyscan.errors import CalibrationFileError
 from bodyscan.files.reading import read_regular
 from bodyscan.files.yaml_file import Place, YamlError, parse_scalar, parse_yaml
-from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses import lens_from_opencv
 from bodyscan.geometry.lenses.fisheye import Fisheye
 from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.interchange.found_camera import FoundCamera, FoundCameras
-from bodyscan.interchange.rig_format import opencv_lens
 
 MAX_BYTES = 100_000_000  # mrcal's files hold all corners of a calibration, some megabytes
 MAX_VALUES = 1_000_000  # OpenCV's as well
@@ -233,71 +228,3 @@ def _plain_xml(element: ElementTree.Element) -> Any:
     if not all(isinstance(value, int | float) for value in values):
         return text.strip('"')
     return values[0] if len(values) == 1 else values
-
-
-# What the TOML of caliscope and of aniposelib share: a table of OpenCV's numbers per camera.
-
-TOML_NOTE = (
-    "# Pixel centres at whole numbers; x_camera = R(rotation) x_rig + translation. matrix holds the\n"
-    "# skew, which OpenCV's functions ignore: use it with pixels sheared to\n"
-    "# u - skew / fy * (v - cy), v.\n"
-)
-
-
-def read_toml(file: ForeignFile) -> dict[str, Any]:
-    """Parse a TOML file. Raises CalibrationFileError, with the line, if it is not TOML."""
-    try:
-        return tomllib.loads(file.text)
-    except (ValueError, RecursionError) as error:  # TOMLDecodeError, a number of 5,000 digits
-        raise file.error(f"is not TOML: {error}") from None
-
-
-def read_camera_tables(file: ForeignFile, tables: Mapping[str, Any], prefix: str) -> FoundCameras:
-    """Find cameras by their tables' keys, which follow `prefix` in the file, and by their `name`.
-
-    Raises CalibrationFileError if there are none.
-    """
-    readers = {}
-    for key, table in tables.items():
-        if isinstance(table, dict) and key != "metadata":
-            readers[key] = partial(_read_camera_table, file, table, prefix + key)
-            readers[str(table.get("name", key))] = readers[key]
-    if not readers:
-        raise file.error("holds no cameras as this program writes them")
-    return FoundCameras(readers)
-
-
-def _read_camera_table(file: ForeignFile, table: dict[str, Any], key: str) -> FoundCamera:
-    file.require(table, ("size", "matrix", "distortions"), key)
-    pose = None
-    if all(table.get(word, "null") != "null" for word in ("rotation", "translation")):
-        names = f"{key}.rotation", f"{key}.translation"
-        pose = file.pose(table["rotation"], table["translation"], *names)
-    return FoundCamera(
-        file.matrix(table["matrix"], f"{key}.matrix"),
-        file.lens(table["distortions"], f"{key}.distortions", table),
-        file.size(table["size"], f"{key}.size"),
-        pose,
-        file.where(key),
-    )
-
-
-def format_camera_table(
-    name: str, camera: Camera, camera_from_rig: RigidTransform, mm_a_unit: float
-) -> str:
-    """Format the lines for size, fisheye, matrix, distortions, rotation and translation.
-
-    Raises BadInput for a lens that OpenCV does not have.
-    """
-    is_fisheye, coefficients = opencv_lens(name, camera)
-    return "".join(
-        f"{word} = {json.dumps(value)}\n"
-        for word, value in (
-            ("size", [camera.width, camera.height]),
-            ("fisheye", is_fisheye),
-            ("matrix", camera.matrix.tolist()),
-            ("distortions", coefficients.tolist()),
-            ("rotation", camera_from_rig.rotation_vector.tolist()),
-            ("translation", (camera_from_rig.translation / mm_a_unit).tolist()),
-        )
-    )

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 
@@ -85,27 +86,9 @@ class FoundCamera:
         return camera
 
 
-@dataclass(frozen=True, eq=False)
-class FoundCameras(Mapping[str, FoundCamera]):
-    """A file's cameras by name, each checked only when it is taken, so that one that cannot be used
-    hinders no other.
-
-    readers: what reads each; raises CalibrationFileError, which `cameras[name]` passes on.
-    """
-
-    readers: Mapping[str, Callable[[], FoundCamera]]
-
-    def __getitem__(self, name: str) -> FoundCamera:
-        return self.readers[name]()
-
-    def __contains__(self, name: object) -> bool:
-        return name in self.readers
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.readers)
-
-    def __len__(self) -> int:
-        return len(self.readers)
+FoundCameras: TypeAlias = Mapping[str, Callable[[], FoundCamera]]
+"""What reads each of a file's cameras, by name, or raises CalibrationFileError: one that cannot be
+used hinders no other."""
 
 
 def find_camera(cameras: FoundCameras, name: str, where: str) -> FoundCamera:
@@ -115,18 +98,16 @@ def find_camera(cameras: FoundCameras, name: str, where: str) -> FoundCamera:
     listed, those that cannot be used with the reasons.
     """
     if name in cameras:
-        return cameras[name]
+        return cameras[name]()
     usable, reasons = [], []
-    for other in cameras:
+    for other, read in cameras.items():
         try:
-            cameras[other]
+            read()
             usable.append(other)
         except CalibrationFileError as error:
             reasons.append(f"{other} cannot be used ({error.where}: {error.what})")
-    listed = [
-        f"it has {', '.join(usable) or 'none that can be used'}",
-        *reasons[:8],
-    ]  # more cannot be read at a glance
+    has = f"it has {', '.join(usable) or 'none that can be used'}"
+    listed = [has, *reasons[:8]]  # more cannot be read at a glance
     raise CalibrationFileError(
         f"has no camera {name!r}{did_you_mean(name, cameras)}",
         where=where,

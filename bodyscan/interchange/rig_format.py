@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
-from bodyscan.errors import BadInput
 from bodyscan.files.registry import Registry
 
 if TYPE_CHECKING:
@@ -50,18 +49,11 @@ def projector_name(pair: str) -> str:
     return f"{pair}-projector"
 
 
-def opencv_lens(name: str, camera: Camera) -> tuple[bool, Array]:
-    """Return whether the lens of a pair's camera is OpenCV's fisheye, and OpenCV's coefficients of it:
-    four, or else five or more.
-
-    Raises BadInput, which names the pair, for a lens that OpenCV does not have.
-    """
-    if camera.lens.kind == "fisheye":
-        return True, camera.lens.coefficients
-    try:
-        return False, camera.lens.opencv()
-    except BadInput as error:
-        raise BadInput(error.what, where=f"pair {name}", remedy=error.remedy) from None
+def opencv_lens(camera: Camera) -> tuple[bool, Array]:
+    """Return whether a camera's lens is OpenCV's fisheye, and OpenCV's coefficients of it: four, or
+    else five or more."""
+    is_fisheye = camera.lens.kind == "fisheye"
+    return is_fisheye, camera.lens.coefficients if is_fisheye else camera.lens.opencv()
 
 
 RIG_FORMATS: Registry[RigFormat] = Registry("bodyscan.interchange.formats", "a rig")

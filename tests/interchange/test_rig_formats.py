@@ -52,9 +52,9 @@ def test_the_same_cameras_are_read_back(tmp_path: Path, kind: str) -> None:
     scale = MILLIMETRES[form.unit or "mm"]
     first = next(iter(cameras.values()))[1]
     for name, (camera, rig_from_camera) in cameras.items():
-        own = found[name].camera(camera.width, camera.height)
+        own = found[name]().camera(camera.width, camera.height)
         np.testing.assert_allclose(own.parameters, camera.parameters, rtol=0, atol=1e-9)
-        pose = found[name].camera_from_world
+        pose = found[name]().camera_from_world
         assert pose is not None
         world = rig_from_camera if kind in WORLDS else first.inverse() @ rig_from_camera
         read = RigidTransform(pose.rotation, pose.translation * scale).inverse()
@@ -81,7 +81,7 @@ def test_every_lens_that_a_format_has_is_read_back(tmp_path: Path, kind: str, le
             form.write(cameras, tmp_path / form.path)
         assert not list(tmp_path.iterdir())
         return
-    found = form.read(form.write(cameras, tmp_path / form.path))[name]
+    found = form.read(form.write(cameras, tmp_path / form.path))[name]()
     read = found.camera(own.width, own.height)
     assert read.lens.kind == lens
     np.testing.assert_allclose(read.parameters, own.parameters, rtol=0, atol=1e-9)
@@ -230,7 +230,7 @@ WRITTEN_BY_OTHERS = {
 def test_what_others_write_is_read(tmp_path: Path, kind: str) -> None:
     file, text, name = WRITTEN_BY_OTHERS[kind]
     (tmp_path / file).write_text(text)
-    found = RIG_FORMATS.find(kind).read(tmp_path / file)[name]
+    found = RIG_FORMATS.find(kind).read(tmp_path / file)[name]()
     assert found.camera(1280, 720) == Camera(
         1000.0, 1010.0, 0.0, 640.0, 360.0,
         lens_from_opencv(np.array([-0.2, 0.05, 0.0, 0.0, 0.0])), 1280, 720,
@@ -280,7 +280,7 @@ def test_what_is_wrong_is_named_with_its_line(
     path = tmp_path / WRITTEN_BY_OTHERS[kind][0]
     path.write_text(spoilt(kind, old, new))
     with pytest.raises(CalibrationFileError, match=said) as caught:
-        list(RIG_FORMATS.find(kind).read(path).values())
+        [camera() for camera in RIG_FORMATS.find(kind).read(path).values()]
     assert str(path) in caught.value.where
     assert caught.value.remedy
 
@@ -430,7 +430,7 @@ def test_every_dialect_of_yaml_is_read(tmp_path: Path, head: str, tail: str) -> 
     path.write_text(
         head + text.replace(" [-0.2, 0.05, 0.0, 0.0]", coefficients.replace("\n", "\n  ")) + tail
     )
-    assert RIG_FORMATS.find("kalibr").read(path)[camera].lens.coefficients[0] == -0.2
+    assert RIG_FORMATS.find("kalibr").read(path)[camera]().lens.coefficients[0] == -0.2
     path.write_text(head + "a: b\n  c: d\n" + tail)
     with pytest.raises(
         CalibrationFileError, match=rf"any.yaml:{head.count(chr(10)) + 2}: is not YAML"
@@ -463,9 +463,9 @@ def test_a_camera_that_nobody_asked_for_hinders_no_other(tmp_path: Path) -> None
     assert "camchain.yaml:12: cam1.distortion_model: 'fov' is a lens" in caught.value.remedy
     (tmp_path / "left.cameramodel").write_text(WRITTEN_BY_OTHERS["mrcal"][1])
     (tmp_path / "right.cameramodel").write_text(spoilt("mrcal", "OPENCV8", "SPLINED_STEREOGRAPHIC"))
-    assert RIG_FORMATS.find("mrcal").read(tmp_path)["left"].size == (1280, 720)
+    assert RIG_FORMATS.find("mrcal").read(tmp_path)["left"]().size == (1280, 720)
     path.write_text("[cameras.0]\ncam_id = 0\nsize = [9, 9]\n" + WRITTEN_BY_OTHERS["caliscope"][1])
-    assert RIG_FORMATS.find("caliscope").read(path)["3"].size == (1280, 720)
+    assert RIG_FORMATS.find("caliscope").read(path)["3"]().size == (1280, 720)
 
 
 @pytest.mark.parametrize("words", [("T_cam_imu", "T_cam_imu"), ("T_imu_cam", "T_cam_imu")])
@@ -479,7 +479,7 @@ def test_kalibr_cameras_are_placed_by_the_imu(tmp_path: Path, words: tuple[str, 
     lines = [f"  {word}: {pose.matrix.tolist()}\n" for word, pose in zip(words, given, strict=True)]
     path = tmp_path / "imucam.yaml"
     path.write_text(text.replace("right:", f"{lines[0]}right:") + lines[1])
-    pose = RIG_FORMATS.find("kalibr").read(path)["cam1"].camera_from_world
+    pose = RIG_FORMATS.find("kalibr").read(path)["cam1"]().camera_from_world
     assert pose is not None
     np.testing.assert_allclose(pose.matrix, (second @ first.inverse()).matrix, rtol=0, atol=1e-12)
 
@@ -487,15 +487,15 @@ def test_kalibr_cameras_are_placed_by_the_imu(tmp_path: Path, words: tuple[str, 
 def test_caliscope_turns_no_calibration_and_null_is_no_pose(tmp_path: Path) -> None:
     path, caliscope = tmp_path / "camera_array.toml", RIG_FORMATS.find("caliscope")
     path.write_text(spoilt("caliscope", "rotation_count = 0", "rotation_count = 1"))
-    assert caliscope.read(path)["3"].camera_from_world is not None
+    assert caliscope.read(path)["3"]().camera_from_world is not None
     path.write_text(spoilt("caliscope", "rotation = [0.0, 0.0, 0.0]", 'rotation = "null"'))
-    assert caliscope.read(path)["3"].camera_from_world is None
+    assert caliscope.read(path)["3"]().camera_from_world is None
 
 
 def test_the_newer_key_of_mrcal_is_read(tmp_path: Path) -> None:
     path = tmp_path / "left.cameramodel"
     path.write_text(spoilt("mrcal", "extrinsics", "rt_cam_ref"))
-    pose = RIG_FORMATS.find("mrcal").read(path)["left"].camera_from_world
+    pose = RIG_FORMATS.find("mrcal").read(path)["left"]().camera_from_world
     assert pose is not None
     assert pose.translation[0] == -0.2
 
@@ -527,7 +527,7 @@ def test_what_is_no_rig_is_refused(tmp_path: Path) -> None:
     torn = tmp_path / "torn.yaml"
     torn.write_text("%YAML 1.2\n---\npairs:\n   -\n      name: a\n")
     with pytest.raises(BadInput, match="has no node 'image_width' below pairs/0"):
-        opencv.read(torn)["a"]
+        opencv.read(torn)["a"]()
     torn.write_text(storage("yaml"))
     with pytest.raises(BadInput, match="no list of pairs") as caught:
         opencv.read(torn)
@@ -578,8 +578,8 @@ def test_a_colmap_model_of_others(tmp_path: Path) -> None:
     found = RIG_FORMATS.find("colmap").read(tmp_path / "sparse")
     assert {"1", "2", "cam1", "cam2", "cam1/1.jpg", "cam2/2.jpg"} < set(found)
     lens = lens_from_opencv(np.array([-0.2, 0, 0, 0, 0]))
-    assert found["cam1"].camera(1280, 720) == Camera(1000, 1000, 0, 640, 360, lens, 1280, 720)
-    pose = found["cam2"].camera_from_world
+    assert found["cam1"]().camera(1280, 720) == Camera(1000, 1000, 0, 640, 360, lens, 1280, 720)
+    pose = found["cam2"]().camera_from_world
     assert pose is not None
     np.testing.assert_allclose(pose.matrix[:3, 3], [-0.2, 0.0, 0.0])
     fisheye = pycolmap.Camera(
@@ -595,9 +595,9 @@ def test_a_colmap_model_of_others(tmp_path: Path) -> None:
     (tmp_path / "strange").mkdir()
     strange.write(tmp_path / "strange")
     cameras = RIG_FORMATS.find("colmap").read(tmp_path / "strange")
-    assert cameras["1"].lens == Fisheye(0.1, 0.2, 0.0, 0.0)
+    assert cameras["1"]().lens == Fisheye(0.1, 0.2, 0.0, 0.0)
     with pytest.raises(CalibrationFileError, match="FOV, which is not supported"):
-        cameras["2"]
+        cameras["2"]()
 
 
 def test_a_colmap_sensor_without_a_place_in_its_rig_has_none(tmp_path: Path) -> None:
@@ -614,8 +614,8 @@ def test_a_colmap_sensor_without_a_place_in_its_rig_has_none(tmp_path: Path) -> 
     rigs[-1] = " ".join([*fields[:6], "0", *fields[14:]])
     (folder / "rigs.txt").write_text("\n".join(rigs) + "\n", "utf-8")
     found = RIG_FORMATS.find("colmap").read(folder)
-    assert found[names[1]].camera_from_world is None
-    assert found[names[2]].camera_from_world is not None
+    assert found[names[1]]().camera_from_world is None
+    assert found[names[2]]().camera_from_world is not None
 
 
 JUNK = st.sampled_from(
@@ -644,7 +644,7 @@ def test_whatever_a_file_holds_is_read_or_refused(kind: str, at: int, cut: int, 
             if kind in STORAGES:
                 read_nodes(path, NODES)
             else:
-                list(RIG_FORMATS.find(kind).read(path).values())
+                [camera() for camera in RIG_FORMATS.find(kind).read(path).values()]
 
 
 def test_a_colmap_model_whose_names_are_no_text_is_refused(tmp_path: Path) -> None:

@@ -29,19 +29,9 @@ NO_SKEW = (
     "Cameras here have no skew. Shear an image point (u, v) of the pair (pixel centres at whole "
     "numbers, v0 = cy - 0.5) to (u - gamma / beta * (v - v0), v) before using it with them."
 )
-# Positions of fx, fy, cx, cy in each model's parameters, then of OpenCV's k1, k2, p1, p2, ...
-# or, of a fisheye, of its k1 to k4.
-LENSES: dict[str, tuple[int, ...]] = {
-    "SIMPLE_PINHOLE": (0, 0, 1, 2),
-    "PINHOLE": (0, 1, 2, 3),
-    "SIMPLE_RADIAL": (0, 0, 1, 2),
-    "RADIAL": (0, 0, 1, 2),
-    "OPENCV": (0, 1, 2, 3),
-    "FULL_OPENCV": (0, 1, 2, 3),
-    "SIMPLE_RADIAL_FISHEYE": (0, 0, 1, 2),
-    "RADIAL_FISHEYE": (0, 0, 1, 2),
-    "OPENCV_FISHEYE": (0, 1, 2, 3),
-}
+# Their further parameters are OpenCV's k1, k2, p1, p2, ... or, of a fisheye, its k1 to k4.
+PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+FISHEYES = ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE")
 
 
 def write_colmap(cameras: RigCameras, folder: Path) -> Path:
@@ -49,7 +39,7 @@ def write_colmap(cameras: RigCameras, folder: Path) -> Path:
     empty image per pair, which gives their poses: COLMAP's world is the rig frame, mm.
 
     `bodyscan.json` beside it holds what COLMAP has no place for: each camera's gamma. Returns
-    `folder`. Raises BadInput for a lens that COLMAP does not have.
+    `folder`.
     """
     model = _colmap_model(cameras)
     folder = Path(folder)
@@ -104,7 +94,7 @@ def read_colmap(folder: Path) -> FoundCameras:
                 where=str(folder / SKEW_FILE),
                 remedy="give both as `bodyscan export-rig --format colmap` wrote them",
             )
-    return FoundCameras(readers)
+    return readers
 
 
 def _read_gammas(folder: Path) -> dict[str, float]:
@@ -147,19 +137,18 @@ def _read_camera(
     folder: Path, camera: Any, gamma: float, pose: RigidTransform | None
 ) -> FoundCamera:
     file = ForeignFile(folder)
-    model = camera.model.name
-    if model not in LENSES:
+    name, model = f"camera {camera.camera_id}", camera.model.name
+    if model not in PERSPECTIVE + FISHEYES:
         raise file.error(
             f"has a camera of COLMAP's model {model}, which is not supported",
-            remedy=f"calibrate it with one of {', '.join(LENSES)}",
+            remedy=f"calibrate it with one of {', '.join(PERSPECTIVE + FISHEYES)}",
         )
-    params = [float(value) for value in camera.params]
-    fx, fy, cx, cy = (params[k] for k in LENSES[model])
-    four = [fx, fy, cx - PIXEL_CENTRE, cy - PIXEL_CENTRE]
-    matrix = file.pinhole_matrix(four, f"camera {camera.camera_id}")
+    centre = camera.principal_point_x - PIXEL_CENTRE, camera.principal_point_y - PIXEL_CENTRE
+    four = [camera.focal_length_x, camera.focal_length_y, *centre]
+    matrix = file.pinhole_matrix(four, name)
     matrix[0, 1] = gamma
-    around = {"fisheye": model.endswith("FISHEYE")}
-    lens = file.lens(params[max(LENSES[model]) + 1 :], f"camera {camera.camera_id}", around)
+    further = [camera.params[k] for k in camera.extra_params_idxs()]
+    lens = file.lens(further, name, {"fisheye": model in FISHEYES})
     return FoundCamera(matrix, lens, (camera.width, camera.height), pose, str(folder))
 
 
@@ -168,8 +157,8 @@ def _colmap_model(cameras: Mapping[str, tuple[Camera, RigidTransform]]) -> pycol
     model, rig = pycolmap.Reconstruction(), pycolmap.Rig(rig_id=1)
     frame = pycolmap.Frame(frame_id=1, rig_id=1)
     reference = next(iter(cameras.values()))[1]
-    for number, (name, (camera, rig_from_camera)) in enumerate(cameras.items(), start=1):
-        model.add_camera(_colmap_camera(name, camera, number))
+    for number, (camera, rig_from_camera) in enumerate(cameras.values(), start=1):
+        model.add_camera(_colmap_camera(camera, number))
         sensor = pycolmap.sensor_t(pycolmap.SensorType.CAMERA, number)
         if number == 1:
             rig.add_ref_sensor(sensor)
@@ -187,10 +176,10 @@ def _colmap_model(cameras: Mapping[str, tuple[Camera, RigidTransform]]) -> pycol
     return model
 
 
-def _colmap_camera(name: str, camera: Camera, camera_id: int) -> pycolmap.Camera:
+def _colmap_camera(camera: Camera, camera_id: int) -> pycolmap.Camera:
     centre = [camera.u0 + PIXEL_CENTRE, camera.v0 + PIXEL_CENTRE]
     # COLMAP's OPENCV is a prefix of its FULL_OPENCV, which has OpenCV's first eight coefficients.
-    is_fisheye, coefficients = opencv_lens(name, camera)
+    is_fisheye, coefficients = opencv_lens(camera)
     lens = np.append(coefficients, np.zeros(8))[:8]
     model = "FULL_OPENCV" if lens[4:].any() else "OPENCV_FISHEYE" if is_fisheye else "OPENCV"
     return pycolmap.Camera(

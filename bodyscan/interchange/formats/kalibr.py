@@ -36,7 +36,7 @@ def write_kalibr(cameras: RigCameras, path: Path) -> Path:
     content: dict[str, Any] = {}
     before: RigidTransform | None = None
     for number, (name, (camera, rig_from_camera)) in enumerate(cameras.items()):
-        is_fisheye, coefficients = opencv_lens(name, camera)
+        is_fisheye, coefficients = opencv_lens(camera)
         if np.any(coefficients[4:]):
             raise BadInput(
                 f"Kalibr has no lens like {camera.lens.kind!r}: its radtan ends with k1, k2, p1, p2",
@@ -86,7 +86,7 @@ def read_kalibr(path: Path) -> FoundCameras:
         readers[key] = partial(_read_camera, file, cameras, number)
         if isinstance(cameras[key].get("name"), str):
             readers[cameras[key]["name"]] = readers[key]
-    return FoundCameras(readers)
+    return readers
 
 
 def _pose_in_first(

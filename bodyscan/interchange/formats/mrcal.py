@@ -44,11 +44,11 @@ def read_mrcal(path: Path) -> FoundCameras:
         raise CalibrationFileError(
             f"holds no {SUFFIX} files", where=str(path), remedy="give a file or their folder"
         )
-    return FoundCameras({file.stem: partial(_read_model, file) for file in files})
+    return {file.stem: partial(_read_model, file) for file in files}
 
 
 def _format_model(name: str, camera: Any, rig_from_camera: Any) -> str:
-    is_fisheye, coefficients = opencv_lens(name, camera)
+    is_fisheye, coefficients = opencv_lens(camera)
     rest = np.flatnonzero(coefficients)
     used = int(rest[-1]) + 1 if len(rest) else 0
     model = next((m for m, count in COEFFICIENTS.items() if count >= used), None)

@@ -45,7 +45,7 @@ def write_opencv(cameras: RigCameras, path: Path) -> Path:
     (OpenCV's, in its order), R and T of `camera_from_rig`; and if its projector is known,
     `projector` with R and T of `projector_from_camera`.
 
-    Returns `path`. Raises BadInput for a lens that OpenCV does not have.
+    Returns `path`.
     """
     memory = cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY | cv2.FILE_STORAGE_FORMAT_YAML
     store = cv2.FileStorage("rig.yaml", memory)
@@ -57,13 +57,13 @@ def write_opencv(cameras: RigCameras, path: Path) -> Path:
             continue
         store.startWriteStruct("", cv2.FILE_NODE_MAP)
         store.write("name", name)
-        _write_camera(store, name, camera, rig_from_camera.inverse())
+        _write_camera(store, camera, rig_from_camera.inverse())
         light = projector_name(name)
         if light in cameras:
             projector, rig_from_projector = cameras[light]
             store.startWriteStruct("projector", cv2.FILE_NODE_MAP)
             from_camera = rig_from_projector.inverse() @ rig_from_camera
-            _write_camera(store, light, projector, from_camera)
+            _write_camera(store, projector, from_camera)
             store.endWriteStruct()
         store.endWriteStruct()
     store.endWriteStruct()
@@ -71,8 +71,8 @@ def write_opencv(cameras: RigCameras, path: Path) -> Path:
     return Path(path)
 
 
-def _write_camera(store: Any, name: str, camera: Camera, pose: RigidTransform) -> None:
-    is_fisheye, coefficients = opencv_lens(name, camera)
+def _write_camera(store: Any, camera: Camera, pose: RigidTransform) -> None:
+    is_fisheye, coefficients = opencv_lens(camera)
     store.write("image_width", camera.width)
     store.write("image_height", camera.height)
     store.write("camera_matrix", camera.matrix)
@@ -101,7 +101,7 @@ def read_opencv(path: Path) -> FoundCameras:
         if "projector" in entry:
             light = partial(_read_projector, file, entry, f"pairs/{k}", label)
             readers[projector_name(label)] = light
-    return FoundCameras(readers)
+    return readers
 
 
 def _read_projector(file: ForeignFile, entry: Any, name: str, label: str) -> FoundCamera:
