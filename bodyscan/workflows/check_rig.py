@@ -53,8 +53,6 @@ class Findings:
     @property
     def valid(self) -> bool:
         """Whether the rig is known to be unchanged; False if that is undecided."""
-        if isinstance(self.check, ScanCheck) and not self.check.decided:
-            return self.check.quiet
         return self.check.valid
 
     def repair(self, calibration: RigCalibration) -> RigCalibration:
@@ -162,7 +160,7 @@ def describe_scan_check(check: ScanCheck) -> Findings:
     step = check.search.found
     count = len(check.before_mm)
     scans = "1 scan" if count == 1 else f"{count} scans"
-    if not check.valid:
+    if check.moved:
         verdict = "NOT valid: no motion of a person explains how the pairs differ"
     elif check.groups:
         groups = "; ".join(", ".join(group) for group in check.groups)
@@ -191,7 +189,7 @@ def describe_scan_check(check: ScanCheck) -> Findings:
             f"{step.name} is displaced by {step.shift_mm:.1f} mm and rotated by "
             f"{step.rotation_deg:.2f} degrees"
         )
-    for drift in (*check.poles, *check.pairs):
+    for drift in check.pairs:
         if drift.moved and (step is None or drift.pair not in step.name):
             lines.append(f"{drift.pair}: {drift.shift_mm:.2f} mm (sigma {drift.sigma_mm:.2f})")
     before, after = max(check.before_mm), max(check.after_mm)
@@ -215,6 +213,16 @@ class StripeOffset:
     offset_mm: float
     tilt_mm: float
     sigma_mm: float
+
+    @staticmethod
+    def from_distances(pair: str, rows: Array) -> StripeOffset:
+        """The medians of rows (N, 3) as `_stripe_distances` returns them."""
+        away, across, sigma = rows.T
+        low, high = across < -0.4, across > 0.4
+        tilt = 0.0
+        if min(low.sum(), high.sum()) > 20:
+            tilt = 0.5 * float(np.median(away[high]) - np.median(away[low]))
+        return StripeOffset(pair, float(np.median(away)), tilt, float(np.median(sigma)))
 
     @property
     def moved(self) -> bool:
@@ -249,12 +257,12 @@ def check_boards(
     Raises BoardNotFound if no board is seen by two pairs and none has decoded stripes on it.
     """
     views = find_all_boards(calibration.rig, captures, progress)
-    located = locate_views(calibration.rig, views.value, _cameras(calibration))
+    cameras = {name: _camera(pair) for name, pair in calibration.pairs.items()}
+    located = locate_views(calibration.rig, views.value, cameras)
     unique = [view for view in located.value if not view.ambiguous]
-    poses = [
-        observe_pose(view, calibration.pairs[view.pair].camera, _noise_px(calibration, view.pair))
-        for view in unique
-    ]
+    # Sigma of one coordinate of a corner.
+    noise_px = {name: max(one.rms_px / np.sqrt(2.0), 0.02) for name, one in cameras.items()}
+    poses = [observe_pose(v, cameras[v.pair].camera, noise_px[v.pair]) for v in unique]
     drift = find_drift(
         poses, calibration.rig_from_camera, calibration.covariance, calibration.rig.poles
     )
@@ -305,22 +313,11 @@ def move_line(move: Move) -> str:
     )
 
 
-def _noise_px(calibration: RigCalibration, pair: str) -> float:
-    """Sigma of one coordinate of a corner, px, as measured by the calibration."""
-    return max(_corners_px(calibration.pairs[pair]) / np.sqrt(2.0), 0.02)
-
-
-def _corners_px(pair: PairCalibration) -> float:
-    """RMS error of a pair's corners, px; 0.5, which OpenCV's users reach, if none is known."""
-    known = pair.quality.corners_rms_px
-    return known if known is not None else pair.quality.imported_sigma_px or 0.5
-
-
-def _cameras(calibration: RigCalibration) -> Mapping[str, CameraCalibration]:
-    return {
-        name: CameraCalibration(pair.camera, pair.camera_covariance, (), _corners_px(pair))
-        for name, pair in calibration.pairs.items()
-    }
+def _camera(pair: PairCalibration) -> CameraCalibration:
+    """A pair's camera; errors of corners are 0.5 px, which OpenCV's users reach, if not known."""
+    known, imported = pair.quality.corners_rms_px, pair.quality.imported_sigma_px
+    rms_px = known if known is not None else imported or 0.5
+    return CameraCalibration(pair.camera, pair.camera_covariance, (), rms_px)
 
 
 def _stripe_offsets(
@@ -338,7 +335,11 @@ def _stripe_offsets(
     for key, boundaries in decoded.value.items():
         parts[key[0]].append(_stripe_distances(calibration, known[key], boundaries))
     rows = {pair: np.concatenate(found) for pair, found in sorted(parts.items())}
-    offsets = tuple(_offset(pair, found) for pair, found in rows.items() if len(found) >= 100)
+    offsets = tuple(
+        StripeOffset.from_distances(pair, found)
+        for pair, found in rows.items()
+        if len(found) >= 100
+    )
     lost = (f"{pair}: {reason}" for pair, reason in decoded.failures.items())
     return Outcome(offsets, (*decoded.notes, *lost))
 
@@ -367,23 +368,12 @@ def _stripe_distances(
     return rows[np.all(np.isfinite(rows), axis=1)]
 
 
-def _offset(pair: str, rows: Array) -> StripeOffset:
-    """Medians of such distances over all boards."""
-    away, across, sigma = rows.T
-    low, high = across < -0.4, across > 0.4
-    tilt = 0.0
-    if min(low.sum(), high.sum()) > 20:
-        tilt = 0.5 * float(np.median(away[high]) - np.median(away[low]))
-    return StripeOffset(pair, float(np.median(away)), tilt, float(np.median(sigma)))
-
-
 @dataclass(frozen=True, eq=False)
 class ScanCheck:
     """What scans of people tell about a rig.
 
     before_mm, after_mm: of each scan, RMS distance of its overlaps before and after alignment.
     pairs: the mean motion of each pair by alignment.
-    poles: the same of poles, where their pairs moved together.
     search: the search for single moves, given the time at which each pair saw the person.
     groups: groups of pairs that no overlap of any scan connects, the largest first; empty if there
         is only one group. How groups stand relative to each other is not observed: pairs that moved
@@ -393,15 +383,13 @@ class ScanCheck:
     before_mm: tuple[float, ...]
     after_mm: tuple[float, ...]
     pairs: tuple[PairDrift, ...]
-    poles: tuple[PairDrift, ...]
     search: DisplacementSearch
     groups: tuple[tuple[str, ...], ...] = ()
 
     @property
     def detectable_mm(self) -> float:
         """The largest move of a pair or pole, mm, that could pass for a person's motion."""
-        by_mean = max(drift.limit_mm for drift in (*self.pairs, *self.poles))
-        return min(by_mean, self.search.detectable_mm)
+        return min(max(drift.limit_mm for drift in self.pairs), self.search.detectable_mm)
 
     @property
     def decided(self) -> bool:
@@ -418,9 +406,12 @@ class ScanCheck:
         return still and max(self.before_mm) < 0.5 and not self.groups
 
     @property
+    def moved(self) -> bool:
+        return any(drift.moved for drift in self.pairs) or self.search.found is not None
+
+    @property
     def valid(self) -> bool:
-        drifted = any(drift.moved for drift in (*self.pairs, *self.poles))
-        return not drifted and self.search.found is None
+        return not self.moved and (self.decided or self.quiet)
 
 
 def check_scans(
@@ -443,7 +434,7 @@ def judge_scans(
     alignments: Sequence[Alignment],
     rig_from_camera: Mapping[str, RigidTransform],
     poles: Mapping[str, str],
-    moments_ms: Sequence[Mapping[str, float | None]] | None = None,
+    moments_ms: Sequence[Mapping[str, float | None]],
 ) -> ScanCheck:
     """Judge a rig by the alignments of its scans.
 
@@ -451,24 +442,11 @@ def judge_scans(
     poles: the pole of each pair that stands on one.
     moments_ms: of each scan, the time at which each pair saw the person; None if not known.
     """
-    shifts = {
-        name: np.array(
-            [
-                (found.rig_from_camera[name] @ at.inverse()).apply(BODY_CENTRE) - BODY_CENTRE
-                for found in alignments
-                if name in found.rig_from_camera
-            ]
-        ).reshape(-1, 3)
-        for name, at in rig_from_camera.items()
-    }
-    pairs = [estimate_drift(name, each) for name, each in sorted(shifts.items()) if len(each)]
-    whole_poles = []
-    for pole in sorted(set(poles.values())):
-        of_pole = [shifts[n] for n in sorted(shifts) if poles.get(n) == pole and len(shifts[n])]
-        if len(of_pole) > 1 and len({len(one) for one in of_pole}) == 1:
-            whole_poles.append(estimate_drift(f"pole {pole}", np.mean(of_pole, axis=0)))
-    if moments_ms is None:
-        moments_ms = [dict.fromkeys(found.rig_from_camera) for found in alignments]
+    shifts: dict[str, list[Array]] = defaultdict(list)
+    for found in alignments:
+        for name, pose in found.rig_from_camera.items():
+            change = pose @ rig_from_camera[name].inverse()
+            shifts[name].append(change.apply(BODY_CENTRE) - BODY_CENTRE)
     motions = [
         motions_between(rig_from_camera, {n: found.rig_from_camera[n] for n in found.motion_mm})
         for found in alignments
@@ -476,8 +454,7 @@ def judge_scans(
     return ScanCheck(
         tuple(found.rms_before_mm for found in alignments),
         tuple(found.rms_after_mm for found in alignments),
-        tuple(pairs),
-        tuple(whole_poles),
+        tuple(estimate_drift(name, np.array(each)) for name, each in sorted(shifts.items())),
         find_displaced_pole(list(zip(motions, moments_ms, strict=True)), poles),
         _separate_groups(alignments),
     )

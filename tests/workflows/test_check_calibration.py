@@ -4,6 +4,7 @@ import shutil
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from bodyscan.alignment.icp import Alignment, Overlap
 from bodyscan.errors import BoardNotFound
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.storage import load_calibration, save_calibration
-from bodyscan.workflows.check_rig import describe_scan_check, judge_scans
+from bodyscan.workflows.check_rig import ScanCheck, describe_scan_check, judge_scans
 
 
 @pytest.fixture
@@ -112,6 +113,11 @@ def aligned(motions: dict[str, np.ndarray], joined: bool = True) -> Alignment:
     return Alignment(placing, {}, {}, overlaps)
 
 
+def judge(scans: list[Alignment], start: dict[str, RigidTransform], poles: Any = None) -> ScanCheck:
+    """Scans whose pairs have no times."""
+    return judge_scans(scans, start, poles or {}, [dict.fromkeys(start)] * len(scans))
+
+
 @pytest.mark.parametrize("shift", [0.0, 0.8])
 def test_a_move_is_told_from_sway_by_several_scans(shift: float) -> None:
     rng = np.random.default_rng(3)
@@ -121,12 +127,12 @@ def test_a_move_is_told_from_sway_by_several_scans(shift: float) -> None:
         aligned({name: constant[name] + rng.normal(0, 0.3, 3) for name in names}) for _ in range(12)
     ]
     start = {name: RigidTransform.identity() for name in names}
-    check = judge_scans(scans, start, {name: name[:2] for name in names})
+    check = judge(scans, start, {name: name[:2] for name in names})
     assert check.valid == (shift == 0.0)
     assert [drift.pair for drift in check.pairs if drift.moved] == (["p2-1"] if shift else [])
     # Of two scans nothing can be said.
-    assert judge_scans(scans[:2], start, {}).valid
-    assert not judge_scans(scans[:2], start, {}).decided
+    assert not judge(scans[:2], start).moved
+    assert not judge(scans[:2], start).decided
 
 
 def test_pairs_that_share_nothing_with_the_others_are_not_confirmed() -> None:
@@ -135,10 +141,10 @@ def test_pairs_that_share_nothing_with_the_others_are_not_confirmed() -> None:
     names = ["p1-1", "p1-2", "p2-1", "p3-1"]
     still = {name: np.zeros(3) for name in names}
     start = {name: RigidTransform.identity() for name in names}
-    good = judge_scans([aligned(still)], start, {})
+    good = judge([aligned(still)], start)
     assert good.quiet
-    assert judge_scans([aligned(still)] * 3, start, {}).decided
-    apart = judge_scans([aligned(still, joined=False)] * 3, start, {})
+    assert judge([aligned(still)] * 3, start).decided
+    apart = judge([aligned(still, joined=False)] * 3, start)
     assert not apart.quiet
     assert not apart.decided
     assert apart.groups == (("p1-1", "p1-2", "p2-1"), ("p3-1",))
@@ -147,4 +153,4 @@ def test_pairs_that_share_nothing_with_the_others_are_not_confirmed() -> None:
     assert "undecided: no surface is seen by more than one" in findings.lines[0]
     assert "p1-1, p1-2, p2-1; p3-1" in findings.lines[0]
     # One scan that joins them is enough.
-    assert judge_scans([aligned(still, joined=False), aligned(still)], start, {}).quiet
+    assert judge([aligned(still, joined=False), aligned(still)], start).quiet

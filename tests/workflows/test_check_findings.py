@@ -125,7 +125,7 @@ def test_shots_of_several_folders_are_told_apart_by_their_folders_number() -> No
 def test_an_undecided_check_asks_for_more_scans(scans: int, asked: str) -> None:
     still = SimpleNamespace(pair="p", moved=False, shift_mm=0.1, sigma_mm=0.1)
     check = SimpleNamespace(
-        search=SimpleNamespace(found=None), poles=(), pairs=(still,), valid=True, groups=(),
+        search=SimpleNamespace(found=None), pairs=(still,), moved=False, groups=(),
         decided=False, quiet=False, detectable_mm=1.84, before_mm=(0.4,) * scans,
         after_mm=(0.2,) * scans,
     )  # fmt: skip
