@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import typer
 
 from bodyscan.cli.console import Output, add_command
-from bodyscan.cli.options import OutFolder, Overwrite, RigFile
+from bodyscan.cli.options import Calibration, OutFolder, Overwrite, RigFile
 from bodyscan.errors import BadInput
 from bodyscan.files.messages import require_writable
 from bodyscan.progress import step
@@ -118,10 +118,6 @@ Artefact = Annotated[
     Path | None,
     typer.Argument(metavar="ARTEFACT.YAML", help="The calibrated artefacts, and limits."),
 ]
-AcceptedCalibration = Annotated[
-    Path | None,
-    typer.Option(help="What calibrate-rig wrote. Default with --simulate: the one beside the rig."),
-]
 Spheres = Annotated[
     list[Path] | None,
     typer.Option(metavar="FOLDER", help="Scan of the spheres at one place; repeatable."),
@@ -130,23 +126,14 @@ Plate = Annotated[
     list[Path] | None,
     typer.Option(metavar="FOLDER", help="Scan of the plate at one place; repeatable."),
 ]
-SimulatedRig = Annotated[
-    Path | None,
-    typer.Option(metavar="WORKSPACE", help="Simulate the artefacts in this simulated rig."),
-]
 
 
 def accept(
     output: Output,
+    calibration: Calibration,
     artefact: Artefact = None,
-    calibration: AcceptedCalibration = None,
     spheres: Spheres = None,
     plate: Plate = None,
-    simulate: SimulatedRig = None,
-    repeats: Annotated[int, typer.Option(min=1, help="Simulated shots at each place.")] = 2,
-    places: Annotated[
-        int | None, typer.Option(min=1, help="Simulate only this many of the places.")
-    ] = None,
     limit: Annotated[
         list[str] | None,
         typer.Option(metavar="NAME=MM", help="A limit, such as flatness_mm=0.5; repeatable."),
@@ -158,33 +145,24 @@ def accept(
 ) -> None:
     """Measure spheres and a plate of known size at several places, and judge the figures."""
     from bodyscan.evaluation.acceptance import limit_from, load_acceptance
-    from bodyscan.laboratory.simulated_acceptance import simulate_readings
     from bodyscan.registration.storage import load_calibration
     from bodyscan.report.acceptance_page import NO_STANDARD, screen_table
     from bodyscan.report.page import is_synthetic
     from bodyscan.workflows.accept_rig import judge_readings, read_captures, refuse_existing_test
 
     captured = [*(spheres or ()), *(plate or ())]
-    if bool(captured) == (simulate is not None):
-        raise BadInput(
-            "either captures or --simulate must be given",
-            remedy="give --spheres and --plate folders, or --simulate WORKSPACE",
-        )
-    if calibration is None and simulate is None:
-        raise BadInput("no calibration", remedy="give --calibration, what calibrate-rig wrote")
+    if not captured:
+        raise BadInput("there is nothing to measure", remedy="give --spheres and --plate folders")
     file = load_acceptance(artefact, dict(limit_from(text) for text in limit or ()))
-    place = calibration or (simulate or Path()) / "calibration"
-    folder = out or (place if place.is_dir() else place.parent).parent / "acceptance"
-    require_writable(folder, *captured, place)
+    beside = calibration if calibration.is_dir() else calibration.parent
+    folder = out or beside.parent / "acceptance"
+    require_writable(folder, *captured, calibration)
     refuse_existing_test(folder, overwrite)
-    rig = load_calibration(place)
+    rig = load_calibration(calibration)
     with output.stages() as progress:
-        if simulate is not None:
-            readings = simulate_readings(rig, simulate, file, repeats, places, progress)
-        else:
-            readings = read_captures(rig, spheres or [], plate or [], file, progress)
-    synthetic = simulate is not None or any(map(is_synthetic, captured))
-    found = judge_readings(readings, file, rig, place, folder, synthetic=synthetic)
+        readings = read_captures(rig, spheres or [], plate or [], file, progress)
+    synthetic = any(map(is_synthetic, captured))
+    found = judge_readings(readings, file, rig, calibration, folder, synthetic=synthetic)
     with output.optional("table"):
         output.show(screen_table(found.figures, synthetic))
     output.figures(**{one.name: one.value_mm for one in found.figures})

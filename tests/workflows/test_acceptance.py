@@ -33,8 +33,6 @@ from bodyscan.evaluation.artefacts import (
     spacing_errors,
 )
 from bodyscan.evaluation.primitives import Sphere
-from bodyscan.laboratory.simulated_acceptance import plates_at, spheres_at
-from bodyscan.rig.rig import Volume
 from bodyscan.workflows import accept_rig
 
 RADIUS = 60.0
@@ -166,18 +164,6 @@ def test_no_plate_is_said() -> None:
         read_plate(*plate(wave_mm=3.0))
 
 
-def test_artefacts_stand_inside_the_volume_as_they_are_described() -> None:
-    volume = Volume()
-    for _, at in spheres_at(volume, CENTRES[:2]):
-        placed = at.apply(CENTRES[:2])
-        assert np.linalg.norm(placed[1] - placed[0]) == pytest.approx(400.0)
-        assert np.hypot(*placed[:, :2].T).max() + RADIUS < volume.radius_mm
-        assert volume.bottom_mm < placed[:, 2].min() - RADIUS
-        assert placed[:, 2].max() + RADIUS < volume.top_mm
-    faces = [at.rotate(np.array([[1.0, 0, 0]]))[0] for _, at in plates_at(volume)]
-    assert faces[0] == pytest.approx([1.0, 0.0, 0.0])
-
-
 def sphere_row(**more: Any) -> SphereRow:
     row = SphereRow("a", "s01", ALL, 1, 5000, 0.3, 0.2, 0.1)
     return replace(row, **more)
@@ -229,16 +215,14 @@ def test_a_wrong_file_is_explained(tmp_path: Path, text: str, said: str) -> None
     [
         [],
         ["--spheres", "a"],
-        ["--spheres", "a", "--simulate", "b"],
-        ["--simulate", "nowhere"],
-        ["--spheres", "a", "--calibration", "c", "--limit", "flatness_mm=flat"],
+        ["--spheres", "a", "--limit", "flatness_mm=flat"],
     ],
 )
 def test_what_cannot_be_measured_is_bad_input(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    result = CliRunner().invoke(app, ["accept", *arguments])
+    result = CliRunner().invoke(app, ["accept", "--calibration", "c", *arguments])
     assert result.exception is not None
     assert getattr(result.exception, "exit_code", None) == 2
 
