@@ -16,9 +16,8 @@ from bodyscan.evaluation.primitives import compare_centre_distances
 from bodyscan.geometry.camera import camera_from_fields
 from bodyscan.geometry.robust import rms
 from bodyscan.laboratory import apparatus
-from bodyscan.laboratory.approaches import calibrate_by_reference_plane
-from bodyscan.laboratory.calibrating import calibrate_ours
-from bodyscan.laboratory.chapter_captures import take_captures
+from bodyscan.laboratory.apparatus import take_captures
+from bodyscan.laboratory.approaches import calibrate_by_reference_plane, calibrate_ours
 from bodyscan.laboratory.measuring import (
     ApproachAccuracy,
     PointSigma,

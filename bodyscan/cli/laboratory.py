@@ -195,13 +195,11 @@ def reproduce(
 ) -> None:
     """Simulate the chapter's own set-up: Tables 1 and 2, Fig. 6 and 7, and all rival models."""
     from bodyscan.laboratory.reproduce import reproduce as run
-    from bodyscan.laboratory.text import figure_names, text_name
 
     require_writable(out)
     with output.stages() as progress:
-        text = run(
+        text, names = run(
             out, seed=seed, quick=quick, real_light=real_light, boards=boards, progress=progress
         )
     output.say(*text.splitlines())
-    names = (text_name(real_light), *figure_names(real_light))
     output.add_files("written", *(out / name for name in names))

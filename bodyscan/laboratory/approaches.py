@@ -1,4 +1,4 @@
-"""The chapter's ways to calibrate a pair (4.2), all as a camera and light sheets.
+"""The chapter's ways to calibrate a pair (4.2), and ours, all as a camera and light sheets.
 
 With a reference plane held anywhere or on a slide stage: both give a camera, and stripe boundaries
 at known points in its frame, to which every model of the projector is fitted.
@@ -7,53 +7,46 @@ at known points in its frame, to which every model of the projector is fitted.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import cv2
 import numpy as np
 
 from bodyscan.arrays import Array
-from bodyscan.boards.view import BoardView
 from bodyscan.calibration.board_views import PlanarView, planar_view
 from bodyscan.calibration.boundary_points import (
+    BIN_PX,
     BoundaryPoints,
     boundaries_near,
     box_around,
     concatenate,
     on_board,
+    select,
     subsample,
 )
 from bodyscan.calibration.camera import CameraCalibration, calibrate_camera, locate_board
-from bodyscan.calibration.sheet_fit import fit_light_planes, fit_pinhole
+from bodyscan.calibration.joint_refinement import StripedBoard, refine_jointly
+from bodyscan.calibration.light_sheets import fit_light_sheets
+from bodyscan.calibration.sheet_fit import PlaneFit, fit_light_planes, fit_pinhole
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.light_planes import Axis, LightPlanes, LightSheets
+from bodyscan.geometry.light_planes import Axis, LightPlanes, LightSheets, SmoothSheets
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.laboratory.apparatus import BOARD, PROJECTOR
+from bodyscan.laboratory.apparatus import BOARD, CAMERA, PROJECTOR, ChapterCaptures, StripedShot
 from bodyscan.laboratory.rival_cameras import (
-    TsaiCamera,
     calibrate_tsai,
     projection_matrix,
     split_projection_matrix,
 )
 from bodyscan.laboratory.rival_projectors import fit_baseline, fit_remapped_pinhole
-from bodyscan.stripes.stripe_map import StripeMap
-
-
-@dataclass(frozen=True, eq=False)
-class StripedShot:
-    """One board in one shot: its corners, and the stripes that fell on it."""
-
-    view: BoardView
-    stripes: StripeMap
 
 
 @dataclass(frozen=True, eq=False)
 class LocatedBoards:
-    """A camera, camera_from_board by shot, and the boundaries on the boards, camera frame."""
+    """A camera, camera_from_board of each shot, and the boundaries on the boards, camera frame."""
 
     camera: Camera
-    camera_from_board: dict[str, RigidTransform]
+    camera_from_board: Sequence[RigidTransform]
     points: BoundaryPoints
 
 
@@ -61,29 +54,21 @@ def calibrate_by_reference_plane(
     shots: Sequence[StripedShot],
 ) -> tuple[CameraCalibration, LocatedBoards]:
     """Calibrate by Zhang's method (section 3), which also gives the boards' poses."""
-    height, width = shots[0].stripes.s.shape
-    views = [planar_view(shot.view, BOARD) for shot in shots]
-    found = calibrate_camera(views, width, height)
-    poses = {view.shot: pose for view, pose in zip(views, found.poses, strict=True)}
-    return found, locate_boundaries(shots, found.camera, poses)
+    found = calibrate_camera(_planar_views(shots), CAMERA.width, CAMERA.height)
+    return found, locate_boundaries(shots, found.camera, found.poses)
 
 
 def calibrate_by_slide_stage(
     shots: Sequence[StripedShot], readings: Array, *, skewed: bool = False
-) -> tuple[TsaiCamera, LocatedBoards]:
+) -> LocatedBoards:
     """Calibrate Tsai's camera, with a skew if wanted, from a board slid along its normal.
 
     readings: (shots,) mm, of the stage.
     """
-    height, width = shots[0].stripes.s.shape
-    points, pixels = stage_points(shots, readings)
-    middle = np.array([(width - 1) / 2.0, (height - 1) / 2.0])
-    tsai = calibrate_tsai(points, pixels, middle, skewed=skewed)
-    poses = {
-        shot.view.shot: tsai.camera_from_points @ _stage_pose(float(reading))
-        for shot, reading in zip(shots, readings, strict=True)
-    }
-    return tsai, locate_boundaries(shots, tsai.camera(width, height), poses)
+    middle = (np.array([CAMERA.width, CAMERA.height]) - 1.0) / 2.0
+    tsai = calibrate_tsai(*_stage_points(shots, readings), middle, skewed=skewed)
+    poses = _stage_poses(tsai.camera_from_points, readings)
+    return locate_boundaries(shots, tsai.camera(CAMERA.width, CAMERA.height), poses)
 
 
 def calibrate_by_matrix(shots: Sequence[StripedShot], readings: Array) -> LocatedBoards:
@@ -91,31 +76,28 @@ def calibrate_by_matrix(shots: Sequence[StripedShot], readings: Array) -> Locate
 
     The stripes' positions are read off each board by its own homography, which has no lens either.
     """
-    height, width = shots[0].stripes.s.shape
-    points, pixels = stage_points(shots, readings)
-    matrix = projection_matrix(points, pixels)
-    camera, camera_from_stage = split_projection_matrix(matrix, width, height)
-    poses, parts = {}, []
-    for number, (shot, reading) in enumerate(zip(shots, readings, strict=True)):
-        pose = camera_from_stage @ _stage_pose(float(reading))
-        poses[shot.view.shot] = pose
-        view = planar_view(shot.view, BOARD)
-        parts.append(_locate_by_homography(shot, view, camera, pose, number))
+    matrix = projection_matrix(*_stage_points(shots, readings))
+    camera, camera_from_stage = split_projection_matrix(matrix, CAMERA.width, CAMERA.height)
+    poses = _stage_poses(camera_from_stage, readings)
+    # The same test of what lies on the checkered area as for every other model.
+    points = locate_boundaries(shots, camera, poses).points
+    parts = [
+        _read_by_homography(select(points, points.board == number), camera, view, pose)
+        for number, (view, pose) in enumerate(zip(_planar_views(shots), poses, strict=True))
+    ]
     return LocatedBoards(camera, poses, concatenate(parts))
 
 
 def locate_boards(shots: Sequence[StripedShot], camera: Camera) -> LocatedBoards:
     """Locate boards held anywhere with a camera that is already known."""
-    poses = {
-        shot.view.shot: locate_board(camera, planar_view(shot.view, BOARD))[0] for shot in shots
-    }
+    poses = [locate_board(camera, view)[0] for view in _planar_views(shots)]
     return locate_boundaries(shots, camera, poses)
 
 
 def locate_boundaries(
     shots: Sequence[StripedShot],
     camera: Camera,
-    camera_from_board: dict[str, RigidTransform],
+    camera_from_board: Sequence[RigidTransform],
     *,
     bin_px: int = 1,
 ) -> LocatedBoards:
@@ -125,57 +107,49 @@ def locate_boundaries(
             camera,
             PROJECTOR,
             BOARD,
-            camera_from_board[shot.view.shot],
+            pose,
             boundaries_near(shot.stripes, box_around(shot.view)),
             number,
             bin_px=bin_px,
         )
-        for number, shot in enumerate(shots)
+        for number, (shot, pose) in enumerate(zip(shots, camera_from_board, strict=True))
     ]
     return LocatedBoards(camera, camera_from_board, concatenate(parts))
 
 
-def stage_points(shots: Sequence[StripedShot], readings: Array) -> tuple[Array, Array]:
+def _planar_views(shots: Sequence[StripedShot]) -> list[PlanarView]:
+    return [planar_view(shot.view, BOARD) for shot in shots]
+
+
+def _stage_points(shots: Sequence[StripedShot], readings: Array) -> tuple[Array, Array]:
     """Stack all corners (N, 3) mm, frame of the board at reading 0, and their pixels (N, 2)."""
-    views = [planar_view(shot.view, BOARD) for shot in shots]
+    views = _planar_views(shots)
     points = [
         view.points + [0.0, 0.0, reading] for view, reading in zip(views, readings, strict=True)
     ]
     return np.concatenate(points), np.concatenate([view.pixels for view in views])
 
 
-def _stage_pose(reading: float) -> RigidTransform:
-    return RigidTransform.from_translation([0.0, 0.0, reading])
+def _stage_poses(camera_from_stage: RigidTransform, readings: Array) -> list[RigidTransform]:
+    return [
+        camera_from_stage @ RigidTransform.from_translation([0.0, 0.0, reading])
+        for reading in readings.tolist()
+    ]
 
 
-def _locate_by_homography(
-    shot: StripedShot,
-    view: PlanarView,
-    camera: Camera,
-    camera_from_board: RigidTransform,
-    number: int,
+def _read_by_homography(
+    points: BoundaryPoints, camera: Camera, view: PlanarView, camera_from_board: RigidTransform
 ) -> BoundaryPoints:
     """Locate a board's boundaries on it by the homography of its corners alone."""
-    near = boundaries_near(shot.stripes, box_around(shot.view))
     onto_board = np.linalg.inv(cv2.findHomography(view.points[:, :2], view.pixels, 0)[0])
 
     def onto_plane(pixels: Array) -> Array:
-        image = np.column_stack([pixels, np.ones(len(pixels))]) @ onto_board.T
-        flat = np.column_stack([image[:, :2] / image[:, 2:], np.zeros(len(image))])
-        return camera_from_board.apply(flat)
+        flat = cv2.perspectiveTransform(pixels[None], onto_board)[0]
+        return camera_from_board.apply(np.column_stack([flat, np.zeros(len(flat))]))
 
-    # The same test of what lies on the checkered area as for every other model.
-    everything = on_board(camera, PROJECTOR, BOARD, camera_from_board, near, number, bin_px=1)
-    pixels = camera.project(everything.points)
-    horizontal = PROJECTOR.direction == "horizontal"
-    across = np.array([0.0, 0.5]) if horizontal else np.array([0.5, 0.0])
-    return BoundaryPoints(
-        everything.index,
-        everything.board,
-        onto_plane(pixels),
-        onto_plane(pixels + across) - onto_plane(pixels - across),
-        everything.sigma_px,
-    )
+    pixels, half = camera.project(points.points), np.array([0.5, 0.0])
+    per_pixel = onto_plane(pixels + half) - onto_plane(pixels - half)
+    return replace(points, points=onto_plane(pixels), per_pixel=per_pixel)
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,3 +199,80 @@ def fit_approach(name: str, where: LocatedBoards, model: Model) -> Approach:
     """Fit one model of the projector to boundaries at known points."""
     sheets = model(where.points, PROJECTOR.stripes, PROJECTOR.direction)
     return Approach(name, where.camera, sheets)
+
+
+@dataclass(frozen=True, eq=False)
+class Calibrations:
+    """Everything calibrated from the same images.
+
+    reference: Zhang's camera.
+    planes: the chapter's fit of its free planes.
+    ours: our approach, with the camera of the joint solve.
+    model, refinement: what ours chose.
+    approaches: (i), (i) mended, (ii), (ii) with skew, (iii), ours.
+    by_stage, by_reference: every model of the projector, calibrated either way.
+    """
+
+    reference: CameraCalibration
+    planes: PlaneFit
+    ours: Approach
+    camera_covariance: Array
+    model: str
+    refinement: str
+    approaches: tuple[Approach, ...]
+    by_stage: tuple[Approach, ...]
+    by_reference: tuple[Approach, ...]
+
+
+def calibrate_all(captures: ChapterCaptures) -> Calibrations:
+    """Calibrate everything that is compared, from the same shots."""
+    reference, reference_boards = calibrate_by_reference_plane(captures.boards)
+    stage = calibrate_by_slide_stage(captures.stage, captures.readings)
+    skewed = calibrate_by_slide_stage(captures.stage, captures.readings, skewed=True)
+    by_matrix = calibrate_by_matrix(captures.stage, captures.readings)
+    planes = fit_light_planes(reference_boards.points, PROJECTOR.stripes, PROJECTOR.direction)
+    ours, covariance, model, refinement = calibrate_ours(captures, reference, reference_boards)
+    second, with_skew = (
+        locate_boards(captures.boards, boards.camera) for boards in (stage, skewed)
+    )
+    approaches = (
+        # 3 x 4 and 2 x 4 matrices from the stage, no lens, the index taken as linear.
+        fit_approach("(i)", by_matrix, pinhole_planes),
+        # Tsai's camera with its lens, and a re-mapped index.
+        fit_approach("(i) mended", stage, remapped_planes),
+        # Tsai's camera from the stage, planes from the reference plane: the chapter's text, not its
+        # heading `calibrated by slide stage`.
+        fit_approach("(ii)", second, free_planes),
+        fit_approach("(ii) with skew", with_skew, free_planes),
+        Approach("(iii)", reference_boards.camera, planes.planes),
+        ours,
+    )
+    by_stage, by_reference = (
+        tuple(fit_approach(name, boards, model) for name, model in PROJECTORS.items())
+        for boards in (stage, reference_boards)
+    )
+    return Calibrations(
+        reference, planes, ours, covariance, model, refinement, approaches, by_stage, by_reference
+    )
+
+
+def calibrate_ours(
+    captures: ChapterCaptures, reference: CameraCalibration, boards: LocatedBoards
+) -> tuple[Approach, Array, str, str]:
+    """Calibrate as `bodyscan calibrate-rig` does for a single pair: the light model that held-out
+    boards choose, and a joint solve of corners and stripes."""
+    shots, camera = captures.boards, boards.camera
+    bins = locate_boundaries(shots, camera, boards.camera_from_board, bin_px=BIN_PX).points
+    fit = fit_light_sheets(bins, PROJECTOR.stripes, PROJECTOR.direction)
+    if not isinstance(fit.sheets, SmoothSheets):
+        approach = Approach("ours", camera, fit.sheets)
+        return approach, reference.covariance, fit.model, "corners, then stripes"
+    data = subsample(bins, 6000)
+    striped = [
+        StripedBoard.from_points(BOARD.name, view, camera, select(data, data.board == number))
+        for number, view in enumerate(_planar_views(shots))
+    ]
+    flatness = {BOARD.name: BOARD.flatness_sigma_mm}
+    refined = refine_jointly(camera, reference.poses, fit.sheets, striped, flatness)
+    approach = Approach("ours", refined.camera, refined.sheets)
+    return approach, refined.camera_covariance, fit.model, "joint solve"

@@ -22,9 +22,8 @@ from bodyscan.geometry.light_planes import Axis, RayDepths, towards_camera
 from bodyscan.geometry.light_sheets import intersect_rays
 from bodyscan.geometry.robust import rms
 from bodyscan.laboratory import apparatus
-from bodyscan.laboratory.apparatus import ChapterSetup
+from bodyscan.laboratory.apparatus import ChapterCaptures, ChapterSetup, SceneCapture
 from bodyscan.laboratory.approaches import Approach
-from bodyscan.laboratory.chapter_captures import ChapterCaptures, SceneCapture
 from bodyscan.simulation.files import describe_camera
 
 Stripes = NDArray[np.floating[Any]]

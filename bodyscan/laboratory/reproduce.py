@@ -2,31 +2,57 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+from jinja2 import Environment, StrictUndefined
 
 from bodyscan.files.atomic import write_text
 from bodyscan.geometry.transforms import fit_rigid_transform
 from bodyscan.laboratory import apparatus
-from bodyscan.laboratory.approaches import Approach
-from bodyscan.laboratory.calibrating import Calibrations, calibrate_all
-from bodyscan.laboratory.chapter_captures import ChapterCaptures, take_captures
+from bodyscan.laboratory.apparatus import ChapterCaptures
+from bodyscan.laboratory.approaches import Approach, Calibrations, calibrate_all
+from bodyscan.laboratory.figures import draw_projector, draw_range_data
 from bodyscan.laboratory.measuring import (
     ApproachAccuracy,
+    PointSigma,
     compare_point_sigmas,
     make_true_approach,
     measure_artefacts,
     triangulate_pixels,
 )
-from bodyscan.laboratory.text import Reproduction, figure_names, reproduction_text, text_name
 from bodyscan.progress import Progress, silent
 from bodyscan.reconstruction.triangulation import grid_normals
 
-if TYPE_CHECKING:
-    from bodyscan.laboratory.figures import RangeData
+CHAPTER_TABLE_2 = {
+    "(i)": (0.41, 0.38, 0.26, 0.26, 0.31),
+    "(ii)": (0.22, 0.31, 0.19, 0.13, 0.20),
+    "(iii)": (0.23, 0.32, 0.21, 0.15, 0.21),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Reproduction:
+    """Everything that was found.
+
+    whole, fine: the approaches and, last, the true calibration, from one whole stripe per pixel and
+        from sub-pixel boundaries.
+    by_stage, by_reference: every projector model, sub-pixel.
+    sigmas: depth errors over the points' sigmas.
+    """
+
+    seed: int
+    real_light: bool
+    boards: int
+    calibrated: Calibrations
+    whole: Sequence[ApproachAccuracy]
+    fine: Sequence[ApproachAccuracy]
+    by_stage: Sequence[ApproachAccuracy]
+    by_reference: Sequence[ApproachAccuracy]
+    sigmas: Sequence[PointSigma]
 
 
 def reproduce(
@@ -35,102 +61,183 @@ def reproduce(
     seed: int = 0,
     quick: bool = False,
     real_light: bool = False,
-    boards: int = apparatus.BOARDS,
+    boards: int = 3,
     progress: Progress = silent,
-) -> str:
-    """Simulate, calibrate every approach, measure; returns the text, which is also written into
-    `out` beside the figures.
+) -> tuple[str, tuple[str, ...]]:
+    """Simulate, calibrate every approach, measure; returns the text, and the names of the files in
+    `out`: that text, and the figures.
 
     seed: of all noise.
     quick: coarser rendering and fewer shots, for a trial.
     real_light: a bowed board, speckle and everything else that an ideal simulation leaves out.
     boards: number of board poses, from 3 as in the chapter to 10.
     """
-    settings = (apparatus.real_settings if real_light else apparatus.ideal_settings)(
-        3 if quick else 5
-    )
-    setup = apparatus.chapter_setup(settings, seed)
+    settings = apparatus.real_settings if real_light else apparatus.ideal_settings
+    setup = apparatus.chapter_setup(settings(3 if quick else 5), seed)
     stops = 3 if quick else 7
-    captures = take_captures(setup, boards=boards, stage_stops=stops, progress=progress)
+    captures = apparatus.take_captures(setup, boards=boards, stage_stops=stops, progress=progress)
     calibrated = calibrate_all(captures)
-    found = _measure_all(captures, calibrated, seed, real_light, progress)
-    text = reproduction_text(found)
-    draw(captures, calibrated, Path(out), figure_names(real_light))
-    write_text(Path(out) / text_name(real_light), text)
-    return text
+    compared = [*calibrated.approaches, make_true_approach(setup)]
 
+    def measure(approaches: Sequence[Approach], whole: bool = False) -> list[ApproachAccuracy]:
+        return [measure_artefacts(one, captures, whole=whole) for one in approaches]
 
-def _measure_all(
-    captures: ChapterCaptures,
-    calibrated: Calibrations,
-    seed: int,
-    real_light: bool,
-    progress: Progress,
-) -> Reproduction:
-    """Measure the artefacts by every approach, whole-stripe and sub-pixel."""
-    compared = [*calibrated.approaches, make_true_approach(captures.setup)]
-    total = 2 * len(compared) + len(calibrated.by_stage) + len(calibrated.by_reference)
-    done = 0
-
-    def measure(
-        approaches: Sequence[Approach], whole: bool = False
-    ) -> tuple[ApproachAccuracy, ...]:
-        nonlocal done
-        progress("measuring", done, total)
-        done += len(approaches)
-        return tuple(measure_artefacts(one, captures, whole=whole) for one in approaches)
-
+    progress("measuring", 0, 1)
     found = Reproduction(
-        seed=seed,
-        real_light=real_light,
-        boards=len(captures.boards),
-        calibrated=calibrated,
+        seed,
+        real_light,
+        boards,
+        calibrated,
         whole=measure(compared, whole=True),
         fine=measure(compared),
         by_stage=measure(calibrated.by_stage),
         by_reference=measure(calibrated.by_reference),
         # Of the approaches whose sheets know their covariance.
-        sigmas=tuple(
+        sigmas=[
             compare_point_sigmas(one, captures) for one in compared if one.name in ("(iii)", "ours")
-        ),
+        ],
     )
-    progress("measuring", total, total)
-    return found
+    progress("measuring", 1, 1)
+    text, figures = reproduction_text(found), figure_names(real_light)
+    draw(captures, calibrated, Path(out), figures)
+    name = "reproduction-real-light.md" if real_light else "reproduction.md"
+    write_text(Path(out) / name, text)
+    return text, (name, *figures)
+
+
+def figure_names(real_light: bool) -> tuple[str, str]:
+    """Name the files of Fig. 6 and Fig. 7, which lie beside the text."""
+    light = "-real-light" if real_light else ""
+    return f"fig6-projector{light}.png", f"fig7-range-data{light}.png"
 
 
 def draw(
     captures: ChapterCaptures, calibrated: Calibrations, out: Path, names: tuple[str, str]
 ) -> None:
     """Write Fig. 6 and Fig. 7 into the folder `out`, in files of these names."""
-    # Matplotlib takes a second to import; only drawing should wait for it.
-    from bodyscan.laboratory.figures import PlaneCurve, draw_projector, draw_range_data
-
     by_name = {approach.name: approach for approach in calibrated.approaches}
     s = np.arange(apparatus.PROJECTOR.stripes + 1.0)
-    curves = [
-        PlaneCurve(name, s, by_name[name].sheets.tangent_planes(s))
-        for name in ("(iii)", "ours", "(i)")
-    ]
-    true = PlaneCurve("true", s, apparatus.true_planes(captures.setup))
+    planes = {name: by_name[name].sheets.tangent_planes(s) for name in ("(iii)", "ours", "(i)")}
     distances = calibrated.planes.distances_mm
     known = distances[np.isfinite(distances)]
-    draw_projector(curves, true, known, apparatus.PROJECTOR.direction, out / names[0])
-    wanted = [by_name[name] for name in ("(i)", "(ii)", "(iii)", "ours")]
-    draw_range_data([_range_data(approach, captures) for approach in wanted], out / names[1])
+    draw_projector(planes, s, apparatus.true_planes(captures.setup), known, out / names[0])
+
+    # Fig. 7: the spheres by each approach, aligned with the truth.
+    measured, truth = captures.spheres.stripes.s, captures.spheres.truth
+    true = apparatus.CAMERA.directions(apparatus.CAMERA.grid()) * truth.depth[..., None]
+    data = {}
+    for name in ("(i)", "(ii)", "(iii)", "ours"):
+        points = triangulate_pixels(by_name[name], measured).reshape(true.shape)
+        both = np.isfinite(points[..., 2]) & np.isfinite(truth.s)
+        laid = np.full(points.shape, np.nan)
+        laid[both] = fit_rigid_transform(points[both], true[both]).apply(points[both])
+        normals = grid_normals(laid.astype(np.float32)).astype(float)
+        data[name] = normals, laid[..., 2] - true[..., 2]
+    draw_range_data(data, out / names[1])
 
 
-def _range_data(approach: Approach, captures: ChapterCaptures) -> RangeData:
-    """Triangulate the spheres by an approach and align them with the truth, for Fig. 7."""
-    from bodyscan.laboratory.figures import RangeData
-
-    s = captures.spheres.stripes.s
-    points = triangulate_pixels(approach, s).reshape(*s.shape, 3)
-    true = (
-        apparatus.CAMERA.directions(apparatus.CAMERA.grid())
-        * captures.spheres.truth.depth[..., None]
+def reproduction_text(found: Reproduction) -> str:
+    """Fill in the whole report, `reproduction.md.j2`, as Markdown."""
+    template = (files("bodyscan.laboratory") / "reproduction.md.j2").read_text("utf-8")
+    page = Environment(undefined=StrictUndefined, keep_trailing_newline=True).from_string(template)
+    sixth, seventh = figure_names(found.real_light)
+    whole_times, fine_times = _times(found.whole), _times(found.fine)
+    numbers = [f"No. {number}" for number in range(1, 6)]
+    against_third = ["", *numbers, "mean over (iii)'s"]
+    fitted = [
+        [m.name, *(f"{s.e_fitted:.5f} ({s.fitted.radius:.3f})" for s in m.spheres)]
+        for m in found.fine
+    ]
+    sigmas = [
+        [
+            one.name,
+            *(f"{one.median_mm:.4f}", f"{one.spheres:.2f}", f"{one.plate:.2f}"),
+            f"{100 * one.beyond_three:.2f} %",
+        ]
+        for one in found.sigmas
+    ]
+    return page.render(
+        vars(found),
+        sixth=sixth,
+        seventh=seventh,
+        table_1=_table_1(found.calibrated),
+        whole_table=_table(
+            against_third,
+            [
+                ["Measuring points", *(f"{s.points:,}" for s in found.fine[-1].spheres), ""],
+                ["of lit pixels", *(f"{100 * c:.1f} %" for c in found.fine[-1].covered), ""],
+                *_e_rows(found.whole, whole_times, digits=3),
+                *(
+                    [f"chapter {name}", *(f"{e:.2f}" for e in row), ""]
+                    for name, row in CHAPTER_TABLE_2.items()
+                ),
+            ],
+        ),
+        fine_table=_table(against_third, _e_rows(found.fine, fine_times, digits=5)),
+        fitted_table=_table(["", *numbers], fitted),
+        accuracy=_accuracy_table(found.fine),
+        point_sigmas=_table(["", "median sigma", "spheres", "plate", "beyond 3 sigmas"], sigmas),
+        by_stage=_accuracy_table(found.by_stage),
+        by_reference=_accuracy_table(found.by_reference),
+        whole_times=whole_times,
+        fine_times=fine_times,
+        systematic_mm={m.name: m.plate_systematic_mm for m in found.fine},
     )
-    both = np.isfinite(points[..., 2]) & np.isfinite(captures.spheres.truth.s)
-    laid = np.full(points.shape, np.nan)
-    laid[both] = fit_rigid_transform(points[both], true[both]).apply(points[both])
-    normals = grid_normals(laid.astype(np.float32)).astype(float)
-    return RangeData(approach.name, normals, laid[..., 2] - true[..., 2])
+
+
+def _times(all_: Iterable[ApproachAccuracy]) -> dict[str, float]:
+    """Divide each approach's mean E by that of (iii)."""
+    mean = {m.name: m.mean_e for m in all_}
+    return {name: e / mean["(iii)"] for name, e in mean.items()}
+
+
+def _e_rows(
+    all_: Iterable[ApproachAccuracy], times: Mapping[str, float], digits: int
+) -> list[list[str]]:
+    return [
+        [m.name, *(f"{s.e_given:.{digits}f}" for s in m.spheres), f"{times[m.name]:.2f}"]
+        for m in all_
+    ]
+
+
+def _table_1(calibrated: Calibrations) -> str:
+    zhang, ours = calibrated.reference, calibrated.ours.camera
+    estimates = (
+        (zhang.camera.parameters, np.sqrt(np.diag(zhang.covariance))),
+        (ours.parameters, np.sqrt(np.diag(calibrated.camera_covariance))),
+    )
+    rows = []
+    for number, name in enumerate(zhang.camera.parameter_names):
+        true = getattr(apparatus.CAMERA, name)
+        row = [name, f"{true:.7g}"]
+        for values, sigmas in estimates:
+            value, sigma = values[number], sigmas[number]
+            row += [f"{value:.7g}", f"{sigma:.2g}", f"{(value - true) / sigma:+.1f}"]
+        rows.append(row)
+    return _table(["", "true", "corners", "sigma", "off by", "joint", "sigma", "off by"], rows)
+
+
+def _accuracy_table(all_: Iterable[ApproachAccuracy]) -> str:
+    columns: dict[str, Callable[[ApproachAccuracy], str]] = {
+        "": lambda m: m.name,
+        "mean E": lambda m: f"{m.mean_e:.5f}",
+        "plate RMS": lambda m: f"{m.plate.rms_mm:.4f}",
+        "smooth part": lambda m: f"{m.plate.systematic_rms_mm:.4f}",
+        "systematic": lambda m: f"{m.plate_systematic_mm:.4f}",
+        "centres RMS": lambda m: f"{m.distances.rms_mm:.4f}",
+        "scale ppm": lambda m: f"{m.distances.scale_ppm:+.0f}",
+    }
+    return _table([*columns], [[cell(m) for cell in columns.values()] for m in all_])
+
+
+def _table(heading: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Format a Markdown table whose columns are padded so that its source is readable too."""
+    cells = [heading, *rows]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    cells.insert(1, ["-" * widths[0], *("-" * (width - 1) + ":" for width in widths[1:])])
+    sides = ["<", *">" * (len(widths) - 1)]
+    padded = (
+        [f"{cell:{side}{width}}" for cell, side, width in zip(row, sides, widths, strict=True)]
+        for row in cells
+    )
+    return "\n".join(f"| {' | '.join(row)} |" for row in padded)

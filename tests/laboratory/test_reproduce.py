@@ -7,8 +7,8 @@ import pytest
 
 from bodyscan.evaluation.primitives import find_spheres
 from bodyscan.laboratory import apparatus
-from bodyscan.laboratory.calibrating import Calibrations, calibrate_all
-from bodyscan.laboratory.chapter_captures import ChapterCaptures, take_captures
+from bodyscan.laboratory.apparatus import ChapterCaptures, take_captures
+from bodyscan.laboratory.approaches import Calibrations, calibrate_all
 from bodyscan.laboratory.measuring import (
     ApproachAccuracy,
     compare_point_sigmas,
@@ -16,8 +16,7 @@ from bodyscan.laboratory.measuring import (
     measure_artefacts,
     triangulate_pixels,
 )
-from bodyscan.laboratory.reproduce import draw
-from bodyscan.laboratory.text import Reproduction, figure_names, reproduction_text
+from bodyscan.laboratory.reproduce import Reproduction, draw, figure_names, reproduction_text
 from bodyscan.reconstruction.triangulation import grid_normals
 
 Measured = dict[bool, dict[str, ApproachAccuracy]]
