@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
@@ -137,50 +137,28 @@ def settings_for(
         for part, changed in _WORKSHOP.items():
             values[part] |= changed
         values["projection"] |= _WORKSHOP_LIGHT[projector]
-    return with_changes(settings_from_dict(values), changes)
-
-
-def with_changes(settings: SimulationSettings, changes: Iterable[str]) -> SimulationSettings:
-    """Change single numbers of settings, such as `person.breath_mm=5`.
-
-    Raises BadInput for an unknown setting, or a value that it cannot have.
-    """
-    values = asdict(settings)
     for text in changes:
-        key, equals, value = text.partition("=")
-        part, dot, name = key.strip().partition(".")
-        if not (equals and dot):
-            raise BadInput(
-                f"--set {text} is not a change",
-                remedy="write --set PART.KEY=VALUE, such as person.breath_mm=5",
-            )
-        for word, known in ((part, values), (name, values.get(part, {}))):
-            if word not in known:
-                raise BadInput(
-                    f"--set {key}: {word} is not a setting{did_you_mean(word, known)}",
-                    remedy=f"there are {', '.join(known)}",
-                )
-        values[part][name] = _value(value.strip())
-    return settings_from_dict(values)
-
-
-def settings_from_dict(values: Mapping[str, Any]) -> SimulationSettings:
-    """Read settings from `dataclasses.asdict` values; missing parts get their defaults.
-
-    Raises BadInput for a value that a setting cannot have.
-    """
-    known = {field.name for field in fields(SimulationSettings)}
-    changed = {name: part for name, part in values.items() if name in known}
+        _change(values, text)
     try:
-        return TypeAdapter(SimulationSettings).validate_python(changed)
+        return TypeAdapter(SimulationSettings).validate_python(values)
     except ValidationError as refused:
         first = refused.errors(include_url=False)[0]
         where = ".".join(str(part) for part in first["loc"][:2])
         raise BadInput(f"{where}: {first['msg']} (got {first['input']!r})") from None
 
 
-def _value(text: str) -> Any:
+def _change(values: Mapping[str, dict[str, Any]], text: str) -> None:
+    """Change a number as `person.breath_mm=5` says; BadInput if there is none of that name."""
+    key, _, value = text.partition("=")
+    part, _, name = key.strip().partition(".")
+    for word, known in ((part, values), (name, values.get(part, {}))):
+        if word not in known:
+            raise BadInput(
+                f"--set {key}: {word} is not a setting{did_you_mean(word, known)}",
+                remedy="write --set PART.KEY=VALUE, such as person.breath_mm=5; there are "
+                f"{', '.join(known)}",
+            )
     try:
-        return json.loads(text)
+        values[part][name] = json.loads(value)
     except ValueError:
-        return text
+        values[part][name] = value.strip()

@@ -212,17 +212,3 @@ def mean_light(
                 total += weight[r, c, k] * table[index[r, c, k]]
             mean[r, c] = total / np.float32(samples)
     return mean
-
-
-@compiled
-def min_over_samples(samples: Floats) -> Floats:
-    """Take the minimum (R, C) over samples (R, C, K)."""
-    rows, columns, count = samples.shape
-    result = np.empty((rows, columns), np.float32)
-    for r in range(rows):
-        for c in range(columns):
-            value = samples[r, c, 0]
-            for k in range(1, count):
-                value = min(value, samples[r, c, k])
-            result[r, c] = value
-    return result

@@ -16,7 +16,7 @@ from bodyscan.simulation.lamps import Lamps, compute_laser_light, spread_light
 from bodyscan.simulation.lens import TrueCamera
 from bodyscan.simulation.patterns import make_light_table, make_patterns, table_index
 from bodyscan.simulation.projector import Projector
-from bodyscan.simulation.rays import Band, View, mean_light, min_over_samples, trace_band
+from bodyscan.simulation.rays import Band, View, mean_light, trace_band
 from bodyscan.simulation.scene import Scene
 from bodyscan.simulation.sensor import Brightness, add_speckle, blur, defocus, list_blurs, shade
 from bodyscan.simulation.settings import Projection
@@ -206,8 +206,8 @@ class _LitRays:
             index=table_index(ends.s, source.projector.stripes, blurs),
             ambient=(ends.room * ends.albedo).mean(axis=-1),
             skin=ends.skin.mean(axis=-1),
-            depth=min_over_samples(ends.depth),
-            surface=min_over_samples(ends.surface),
+            depth=ends.depth.min(axis=-1),
+            surface=ends.surface.min(axis=-1),
         )
 
     def light(self, table: Floats, *, gloss: bool = False) -> Floats:

@@ -62,6 +62,7 @@ class Hits:
     surface: (N,) number of the surface, one past the last if none.
     skin: (N,) as `Surface.skin`.
     facets: (N, 3) normals of the triangles, of any length.
+    albedo: (N,) of what has no print; `Scene.print_on` writes that of prints.
     print_xy: (N, 2) position on the surface's print, if it has one.
     """
 
@@ -85,7 +86,7 @@ class Scene:
         self._ball = _bounding_ball(standing)
         # Open3D holds Python's lock while it casts: threads of Python would take turns.
         self._rays = o3d.t.geometry.RaycastingScene(nthreads=2)
-        self._finish = [_Finish.from_surface(surface) for surface in self.surfaces]
+        self._corners = [_corner_values(surface) for surface in self.surfaces]
         for surface in self.surfaces:
             self._rays.add_triangles(
                 Tensor(surface.vertices.astype(np.float32)),
@@ -101,29 +102,24 @@ class Scene:
         depth, facets = found["t_hit"], found["primitive_normals"]
         normals, print_xy = facets.copy(), np.zeros((len(depth), 2), np.float32)
         surface = np.minimum(found["geometry_ids"], len(self.surfaces))
-        albedo = np.array([finish.albedo for finish in self._finish] + [0.0], np.float32)[surface]
-        skin = np.zeros_like(depth)
-        for number, finish in enumerate(self._finish):
-            if finish.plain:
-                continue
+        albedo, skin = np.zeros((len(depth), 1), np.float32), np.zeros((len(depth), 1), np.float32)
+        for number, corners in enumerate(self._corners):
             chosen = np.flatnonzero(surface == number)
             triangles, uv = found["primitive_ids"][chosen], found["primitive_uvs"][chosen]
-            albedo[chosen] = finish.albedo_at(triangles, uv)
-            if finish.normals is not None:
-                normals[chosen] = _interpolate(finish.normals, triangles, uv)
-            if finish.skin is not None:
-                skin[chosen] = _interpolate(finish.skin, triangles, uv)[:, 0]
-            if finish.print_xy is not None:
-                print_xy[chosen] = _interpolate(finish.print_xy, triangles, uv)
+            for name, values in (
+                ("albedo", albedo), ("normals", normals), ("skin", skin), ("print_xy", print_xy)
+            ):  # fmt: skip
+                if name in corners:
+                    values[chosen] = _interpolate(corners[name], triangles, uv)
         points = directions * np.where(np.isfinite(depth), depth, np.float32(0.0))[:, None]
-        return Hits(depth, points, normals, albedo, surface, skin, facets, print_xy)
+        return Hits(depth, points, normals, albedo[:, 0], surface, skin[:, 0], facets, print_xy)
 
     def print_on(self, surface: Floats, across: Floats, down: Floats, albedo: Floats) -> None:
         """Write the prints' albedo wherever the surface is a printed one."""
-        for number, finish in enumerate(self._finish):
-            if finish.printed is not None:
+        for number, one in enumerate(self.surfaces):
+            if one.printed is not None:
                 on = surface == number
-                albedo[on] = finish.printed.albedo(np.stack([across[on], down[on]], axis=1))
+                albedo[on] = one.printed.albedo(np.stack([across[on], down[on]], axis=1))
 
     def is_shadowed(self, points: Floats, towards: Floats, surface: NDArray[np.uint32]) -> Mask:
         """Test whether something is between points (N, 3) on surfaces and the source of their light.
@@ -168,48 +164,23 @@ def dot(a: Floats, b: Floats) -> Floats:
     return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]
 
 
-@dataclass(frozen=True, eq=False)
-class _Finish:
-    """A surface's albedo, print and normals at its triangles' corners, in the form for rendering:
+def _corner_values(surface: Surface) -> dict[str, Floats]:
+    """List what varies over a surface, at its triangles' corners, in the form for rendering:
     (T, 3, k) the value at the first corner, and the differences of the other two from it."""
-
-    albedo: float
-    albedos: Floats | None
-    print_xy: Floats | None
-    printed: Print | None
-    normals: Floats | None
-    skin: Floats | None
-
-    @staticmethod
-    def from_surface(surface: Surface) -> _Finish:
-        def corners(values: Array | None) -> Floats | None:
-            if values is None:
-                return None
-            first, second, third = (values[surface.triangles[:, i]] for i in range(3))
-            return np.stack([first, second - first, third - first], axis=1).astype(np.float32)
-
-        varied = surface.albedo if isinstance(surface.albedo, np.ndarray) else None
-        return _Finish(
-            0.0 if isinstance(surface.albedo, np.ndarray) else float(surface.albedo),
-            corners(varied[:, None] if varied is not None else None),
-            corners(surface.print_xy) if surface.printed is not None else None,
-            surface.printed,
-            corners(surface.normals),
-            corners(None if surface.skin is None else surface.skin[:, None]),
-        )
-
-    @property
-    def plain(self) -> bool:
-        """Whether nothing varies over the surface."""
-        varied = (self.albedos, self.print_xy, self.normals, self.skin)
-        return all(values is None for values in varied)
-
-    def albedo_at(self, triangles: NDArray[np.integer], uv: Floats) -> Floats | float:
-        if self.printed is not None and self.print_xy is not None:
-            return self.printed.albedo(_interpolate(self.print_xy, triangles, uv))
-        if self.albedos is not None:
-            return _interpolate(self.albedos, triangles, uv)[:, 0]
-        return self.albedo
+    varied = {
+        "albedo": np.broadcast_to(surface.albedo, len(surface.vertices)),
+        "normals": surface.normals,
+        "skin": surface.skin,
+        "print_xy": None if surface.printed is None else surface.print_xy,
+    }
+    corners = {}
+    for name, values in varied.items():
+        if values is not None:
+            rows = values.reshape(len(values), -1)
+            first, second, third = (rows[surface.triangles[:, i]] for i in range(3))
+            stacked = np.stack([first, second - first, third - first], axis=1)
+            corners[name] = stacked.astype(np.float32)
+    return corners
 
 
 def _interpolate(corners: Floats, triangles: NDArray[np.integer], uv: Floats) -> Floats:

@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 
 from bodyscan.arrays import Bytes, Floats
-from bodyscan.compiled import compiled
 from bodyscan.simulation.lens import TrueCamera
 from bodyscan.simulation.settings import Lighting, Noise, Optics, SimulationSettings
 
@@ -81,30 +80,9 @@ def expose(
     if fixed is not None:
         image = image * fixed.gain + fixed.grey
     electrons = noise.electrons_per_grey * noise.photons
-    draws = rng.standard_normal(image.shape, dtype=np.float32)
-    grey = np.empty(image.shape, np.uint8)
-    read = np.float32(noise.read_grey**2)
-    digitise(image, draws, np.float32(electrons), read, grey)
-    return grey
-
-
-@compiled
-def digitise(
-    image: Floats, draws: Floats, electrons: np.float32, read: np.float32, grey: Bytes
-) -> None:
-    """Fill 8 bits (H, W) of an image (H, W) with noise.
-
-    draws: (H, W) standard normal.
-    electrons: per grey level.
-    read: square of the read noise.
-    """
-    low, high = np.float32(0.0), np.float32(255.0)
-    for v in range(image.shape[0]):
-        for u in range(image.shape[1]):
-            value = image[v, u]
-            sigma = np.sqrt(max(value, low) / electrons + read)
-            noisy = np.rint(value + sigma * draws[v, u])
-            grey[v, u] = np.uint8(min(max(noisy, low), high))
+    sigma = np.sqrt(np.maximum(image, 0) / np.float32(electrons) + np.float32(noise.read_grey**2))
+    noisy = image + sigma * rng.standard_normal(image.shape, dtype=np.float32)
+    return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
 
 
 def add_speckle(image: Floats, size: float, rng: np.random.Generator) -> Floats:

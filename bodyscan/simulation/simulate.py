@@ -52,8 +52,6 @@ class Stream(IntEnum):
     NOISE = 7
     LIFE = 8
     PIXELS = 9
-    ARTEFACT_RAYS = 11
-    ARTEFACT_NOISE = 12
 
 
 CALIBRATION, PERSON = "captures/calibration", "captures/person"
@@ -204,7 +202,7 @@ def _render_all(rig: Rig, truth: Truth, out: Path, workers: int, progress: Progr
         fixed = fixed_pattern(pair.camera, settings.noise, pixels)
         for task in tasks[pair.name]:
             noise = random_stream(truth.seed, Stream.NOISE, number, task.number)
-            render_task(rig, pair, view, room, task, settings, out, noise, fixed)
+            _render_task(rig, pair, view, room, task, settings, out, noise, fixed)
             with lock:
                 done += 1
                 progress("simulate", done, total)
@@ -212,7 +210,7 @@ def _render_all(rig: Rig, truth: Truth, out: Path, workers: int, progress: Progr
     map_threads(render, enumerate(truth.pairs.values()), stage="simulate", workers=workers)
 
 
-def render_task(
+def _render_task(
     rig: Rig,
     pair: TruePair,
     view: View,
@@ -221,7 +219,7 @@ def render_task(
     settings: SimulationSettings,
     out: Path,
     rng: np.random.Generator,
-    fixed: FixedPattern | None = None,
+    fixed: FixedPattern | None,
 ) -> None:
     """Cast, expose and write one pair's images of one shot; `fixed` is of its camera's sensor."""
     scene, moving = _scenes(pair, room, task)

@@ -112,8 +112,8 @@ def test_only_a_mannequin_stands_still() -> None:
         ("persons.breath_mm=5", r"persons is not a setting \(did you mean 'person'"),
         ("person.breath_mm=deep", r"person.breath_mm: .*valid number.*deep"),
         ("pace.start=later", "pace.start: .*one-after-another"),
-        ("breath_mm=5", "is not a change"),
-        ("person.breath_mm", "is not a change"),
+        ("breath_mm=5", "breath_mm is not a setting"),
+        ("person.breath_mm", "person.breath_mm: Input should be a valid number"),
     ],
 )
 def test_a_wrong_change_is_named(change: str, message: str) -> None:
