@@ -154,8 +154,8 @@ def accept(
     if not captured:
         raise BadInput("there is nothing to measure", remedy="give --spheres and --plate folders")
     file = load_acceptance(artefact, dict(limit_from(text) for text in limit or ()))
-    beside = calibration if calibration.is_dir() else calibration.parent
-    folder = out or beside.parent / "acceptance"
+    place = calibration if calibration.is_dir() else calibration.parent
+    folder = out or place.parent / "acceptance"
     require_writable(folder, *captured, calibration)
     refuse_existing_test(folder, overwrite)
     rig = load_calibration(calibration)
