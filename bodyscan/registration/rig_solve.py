@@ -1,8 +1,8 @@
 """From board views of many pairs to one solved rig: graph, joint solve, bad views out, rig frame.
 
-Two solvers follow each other (`joint_solve`): pycolmap's bundle adjustment brings everything together
-from the graph's rough start; our own least squares finishes with every parameter of our cameras, and
-is repeated when views are dropped or boards found to be bent.
+Two solves follow each other (`joint_solve`): the first brings all poses together from the graph's rough
+start; the second, with every parameter of the cameras, is repeated when views are dropped or boards
+found to be bent.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from bodyscan.registration.cluster_covariance import (
     cluster_robust_covariance,
     normal_equations,
 )
-from bodyscan.registration.joint_solve import CORNERS, JointSolution, solve_jointly
+from bodyscan.registration.joint_solve import CORNERS, JointSolution, solve_poses
 from bodyscan.registration.rig_calibration import ObservedCorners
 from bodyscan.registration.rig_frame import (
     frame_board_turn,
@@ -181,7 +181,7 @@ def _solve(
     ).wrong
     kept = [view for view in resolved if view not in gross]
     for loss_px in LOSSES_PX:
-        solution = solve_jointly(kept, solution, root=root, loss_px=loss_px)
+        solution = solve_poses(kept, solution, root=root, loss_px=loss_px)
     solve = partial(
         solve_consistently,
         root=root,
