@@ -70,21 +70,15 @@ def load_acceptance(path: Path | None, changes: Mapping[str, float] = {}) -> Acc
 
     Raises AcceptanceError that names every problem.
     """
-    file = (
-        AcceptanceFile()
-        if path is None
-        else load_model(
-            path,
-            AcceptanceFile,
-            AcceptanceError,
-            remedy="Correct the acceptance file; docs/report.md explains every key.",
-        )
+    file, remedy = (
+        AcceptanceFile(),
+        "Correct the acceptance file; docs/report.md explains every key.",
     )
-    if not changes:
-        return file
-    return apply_changes(
-        file, {("limits", name): value for name, value in changes.items()}, AcceptanceError
-    )
+    if path is not None:
+        file = load_model(path, AcceptanceFile, AcceptanceError, remedy=remedy)
+    limits: dict[tuple[str | int, ...], float]
+    limits = {("limits", name): value for name, value in changes.items()}
+    return apply_changes(file, limits, AcceptanceError)
 
 
 def limit_from(text: str) -> tuple[str, float]:

@@ -12,6 +12,7 @@ import open3d as o3d
 from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.evaluation.surface import covered_spots, sample_surface
 from bodyscan.geometry.camera import camera_from_fields
+from bodyscan.geometry.camera_tables import is_in_image
 from bodyscan.geometry.robust import rms
 from bodyscan.geometry.transforms import RigidTransform, fit_rigid_transform
 from bodyscan.measurement.measurements import Measurements, Slice, measure
@@ -47,8 +48,7 @@ def sway_residual(
 @dataclass(frozen=True)
 class GirthErrors:
     """Tape girths of the trunk, mesh minus truth, in slices (`heights` many) where at least 97 % of
-    the
-    girth was measured: RMS, worst error and its height; and the error of the stature."""
+    the girth was measured: RMS, worst error and its height; and the error of the stature."""
 
     heights: int
     rms_mm: float
@@ -116,23 +116,20 @@ def measure_visible_coverage(
     scene.add_triangles(vertices.astype(np.float32), faces.astype(np.uint32))
     visible = np.zeros(len(spots), bool)
     for pair in true_pairs.values():
-        still_from_camera = RigidTransform.from_matrix(
-            pair["swayed_from_still"]
-        ).inverse() @ RigidTransform.from_matrix(pair["rig_from_camera"])
+        swayed, pose = (
+            RigidTransform.from_matrix(pair[key])
+            for key in ("swayed_from_still", "rig_from_camera")
+        )
+        still_from_camera = swayed.inverse() @ pose
         camera = camera_from_fields(pair["camera"])
-        in_camera = still_from_camera.inverse().apply(spots)
-        ahead = in_camera[:, 2] > 100.0
-        u, v = camera.project(np.where(ahead[:, None], in_camera, 1.0)).T
-        inside = ahead & (u > 0) & (u < camera.width - 1) & (v > 0) & (v < camera.height - 1)
+        inside = is_in_image(camera, still_from_camera.inverse().apply(spots))
         index = np.flatnonzero(inside & ~visible)
-        for eye in (np.zeros(3), np.array(pair["projector"]["centre"])):
-            index = index[
-                _in_sight(scene, spots[index], normals[index], still_from_camera.apply(eye))
-            ]
+        for centre in (np.zeros(3), np.array(pair["projector"]["centre"])):
+            eye = still_from_camera.apply(centre)
+            index = index[_in_sight(scene, spots[index], normals[index], eye)]
         visible[index] = True
-    return float(visible.mean()), float(
-        covered_spots(points, spots[visible], normals[visible]).mean()
-    )
+    covered = covered_spots(points, spots[visible], normals[visible])
+    return float(visible.mean()), float(covered.mean())
 
 
 def _in_sight(scene: Any, spots: Array, normals: Array, eye: Array) -> Mask:

@@ -137,11 +137,16 @@ class Flatness:
 
 def fit_plane(points: Array) -> tuple[Array, float]:
     """Fit a plane to points (N, 3) by total least squares; return unit normal (3,) and offset."""
+    middle, axes = _principal_axes(points)
+    normal = axes[:, 0] * (np.sign(axes[:, 0] @ middle) or 1.0)
+    return normal, float(normal @ middle)
+
+
+def _principal_axes(points: Array) -> tuple[Array, Array]:
+    """Mean (3,) of points (N, 3), and unit vectors (3, 3), columns, of growing spread about it."""
     middle = points.mean(axis=0)
     centred = points - middle
-    _, vectors = np.linalg.eigh(centred.T @ centred)
-    normal = vectors[:, 0] * (np.sign(vectors[:, 0] @ middle) or 1.0)
-    return normal, float(normal @ middle)
+    return middle, np.linalg.eigh(centred.T @ centred)[1]
 
 
 def measure_flatness(points: Array, degree: int = 6) -> Flatness:
@@ -158,10 +163,8 @@ def measure_flatness(points: Array, degree: int = 6) -> Flatness:
 
 def fit_polynomial(points: Array, values: Array, degree: int = 6) -> Array:
     """Fit a polynomial over a plane to values (N,) at points (N, 3); return it there, (N,)."""
-    middle = points.mean(axis=0)
-    centred = points - middle
-    _, vectors = np.linalg.eigh(centred.T @ centred)
-    position = centred @ vectors[:, 1:]
+    middle, axes = _principal_axes(points)
+    position = (points - middle) @ axes[:, 1:]
     position /= np.abs(position).max(axis=0)
     rows = legendre.legvander2d(position[:, 0], position[:, 1], [degree, degree])
     total = np.add.outer(np.arange(degree + 1), np.arange(degree + 1)).ravel()

@@ -17,7 +17,7 @@ from bodyscan.geometry.robust import rms
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyMesh
 from bodyscan.mesh.surface_file import read_surface, refuse_size
-from bodyscan.mesh.topology import directed_edges
+from bodyscan.mesh.topology import face_normals, find_twins
 
 
 @dataclass(frozen=True)
@@ -53,27 +53,18 @@ def _pseudo_normals(vertices: Array, faces: Indices, face: Indices, barycentric:
     """(N, 3): normals, of any length, at spots on faces: the face's, or its edge's or corner's."""
     corners = vertices[faces]
     sides = np.roll(corners, -1, axis=1) - corners  # side k runs from corner k to the next
-    cross = np.cross(sides[:, 0], sides[:, 1])
+    cross = face_normals(vertices, faces)
     unit = cross / np.maximum(np.linalg.norm(cross, axis=-1, keepdims=True), 1e-300)
     normals = unit[face]
     low = barycentric < 1e-5  # in float32
     on_side = low[:, [2, 0, 1]]  # side k lies opposite corner k + 2
     spot, side = np.nonzero(on_side & (low.sum(axis=1, keepdims=True) == 1))
-    normals[spot] += unit[_neighbours(faces)[face[spot], side]]
+    twin = find_twins(faces, len(vertices))[face[spot], side]
+    normals[spot] += unit[np.where(twin < 0, face[spot], twin // 3)]
     spot = np.flatnonzero(low.sum(axis=1) >= 2)
     corner = faces[face[spot], np.argmax(barycentric[spot], axis=1)]
     normals[spot] = _corner_normals(len(vertices), faces, sides, unit)[corner]
     return normals
-
-
-def _neighbours(faces: Indices) -> Indices:
-    """(F, 3): the face across each side, or the face itself if there is none."""
-    edges, count = directed_edges(faces), int(faces.max()) + 1
-    keys, opposite = edges[:, 0] * count + edges[:, 1], edges[:, 1] * count + edges[:, 0]
-    order = np.argsort(keys)
-    match = order[np.minimum(np.searchsorted(keys[order], opposite), len(keys) - 1)]
-    face = np.tile(np.arange(len(faces)), 3)
-    return np.where(keys[match] == opposite, match % len(faces), face).reshape(3, -1).T
 
 
 def _corner_normals(count: int, faces: Indices, sides: Array, unit: Array) -> Array:
@@ -129,7 +120,7 @@ def sample_surface(
     """Random points (N, 3) on a mesh, uniform in area, and the normals (N, 3) of their faces."""
     rng = np.random.default_rng(seed)
     a, b, c = (vertices[faces[:, k]] for k in range(3))
-    cross = np.cross(b - a, c - a)
+    cross = face_normals(vertices, faces)
     area = np.linalg.norm(cross, axis=-1)
     chosen = rng.choice(len(faces), count, p=area / area.sum())
     root, t = np.sqrt(rng.random((count, 1))), rng.random((count, 1))

@@ -17,8 +17,9 @@ from bodyscan.errors import FailedWork
 from bodyscan.mesh.body import BodyMesh, select_regions
 from bodyscan.mesh.slices import MeshSlicer, hull_perimeter
 from bodyscan.mesh.topology import (
-    directed_edges,
+    RIM,
     drop_unused_vertices,
+    find_twins,
     label_components,
     vertex_normals,
 )
@@ -102,15 +103,11 @@ def deface(mesh: BodyMesh, neck: Neck) -> BodyMesh:
     index[used] = np.arange(len(used))
     # Free edges of the head run opposite to those of what was kept.
     rims = _trace_loops(index[_free_edges(mesh.faces[head])[:, ::-1]]) if closed else []
-    all_vertices, all_faces = [vertices], [faces]
     for number, rim in enumerate(sorted(rims, key=len, reverse=True)):
-        start = sum(map(len, all_vertices))
         cap = vertices[rim].mean(axis=0)[None] if number else _dome(vertices[rim], crown_mm)
-        all_vertices.append(cap)
-        all_faces.append(_stitch(rim, start, len(cap)))
-    return _attach_attributes(
-        mesh, head, used, np.concatenate(all_vertices), np.concatenate(all_faces)
-    )
+        faces = np.concatenate([faces, _stitch(rim, len(vertices), len(cap))])
+        vertices = np.concatenate([vertices, cap])
+    return _attach_attributes(mesh, head, used, vertices, faces)
 
 
 def _attach_attributes(
@@ -160,10 +157,8 @@ def _simplify_rim(faces: Indices, head: Mask) -> Mask:
 
 def _free_edges(faces: Indices) -> Indices:
     """Find directed edges (E, 2) without a twin."""
-    edges = directed_edges(faces)
-    count = int(faces.max(initial=-1)) + 1
-    twins = np.isin(edges[:, 0] * count + edges[:, 1], edges[:, 1] * count + edges[:, 0])
-    return edges[~twins]
+    face, corner = np.nonzero(find_twins(faces, int(faces.max(initial=-1)) + 1) == RIM)
+    return np.stack([faces[face, corner], faces[face, (corner + 1) % 3]], axis=-1)
 
 
 def _trace_loops(edges: Indices) -> list[Indices]:

@@ -94,8 +94,7 @@ def find_parts(slicer: MeshSlicer, heights_mm: Sequence[float] = ()) -> BodyPart
     heights = np.union1d(np.arange(0.5 * step, top, step), heights_mm)
     graph = _link_layers(slicer, heights)
     _name_trunk_and_legs(graph, top)
-    limbs = _name_limbs(graph, top)
-    zones = _find_hidden_arms(graph, limbs, top)
+    zones = _find_hidden_arms(graph, _name_limbs(graph, top), top)
     layers: dict[float, list[_Node]] = {float(height): [] for height in heights}
     for node in graph:
         layers[node.height_mm].append(node)
@@ -135,16 +134,8 @@ def _link_layers(slicer: MeshSlicer, heights: Array) -> nx.DiGraph[_Node]:
             labels = cut_at_necks(loop)
             for label in range(int(labels.max()) + 1):
                 piece = loop.segments[labels == label, 0].astype(np.float32)
-                nodes.append(
-                    _Node(
-                        float(height),
-                        loop,
-                        labels,
-                        label,
-                        cv2.contourArea(piece),
-                        piece[:, 1].mean(),
-                    )
-                )
+                area, y = cv2.contourArea(piece), piece[:, 1].mean()
+                nodes.append(_Node(float(height), loop, labels, label, area, y))
                 corners = np.rint((piece - low) / cell_mm).astype(np.int32)
                 cv2.fillPoly(canvas, [corners], len(nodes))
         graph.add_nodes_from(nodes)
@@ -161,11 +152,8 @@ def _link_layers(slicer: MeshSlicer, heights: Array) -> nx.DiGraph[_Node]:
 
 def cut_at_necks(loop: Loop) -> Indices:
     """Cut a loop at all its necks: the number (N,), from 0, of the piece of each segment."""
-    labels, uncut, count = (
-        np.zeros(len(loop.segments), np.int64),
-        [np.arange(len(loop.segments))],
-        0,
-    )
+    labels, count = np.zeros(len(loop.segments), np.int64), 0
+    uncut = [np.arange(len(loop.segments))]
     while uncut:
         index = uncut.pop()
         outline = loop.segments[index, 0].astype(np.float32)
@@ -245,28 +233,17 @@ def _name_trunk_and_legs(graph: nx.DiGraph[_Node], top: float) -> None:
         trunk, height = legs, legs[0].height_mm if legs else 0.0
 
 
-@dataclass(frozen=True, eq=False)
-class _Limb:
-    """An arm, or a stretch of one that contacts leave: its nodes from the lowest up."""
-
-    part: str
-    nodes: list[_Node]
-
-    def overlaps(self, low_mm: float, high_mm: float, by_mm: float) -> bool:
-        """Whether it shares more than some height with what reaches from one height to another."""
-        top = min(self.nodes[-1].height_mm, high_mm)
-        return top - max(self.nodes[0].height_mm, low_mm) > by_mm
-
-
-def _name_limbs(graph: nx.DiGraph[_Node], top: float) -> list[_Limb]:
+def _name_limbs(graph: nx.DiGraph[_Node], top: float) -> dict[str, list[list[_Node]]]:
     """Name what is left: arms, and what hangs from another part for a little. What stands on the
-    floor, is as large as a trunk, or is one arm too many is something else."""
+    floor, is as large as a trunk, or is one arm too many is something else.
+
+    Also returns each arm's stretches that contacts leave: nodes from the lowest up."""
     rest = graph.subgraph([node for node in graph if node.part == "other"])
     trunk = [node for node in graph if node.part == "trunk"]
     axis = {node.height_mm: node.y_mm for node in trunk}
     middle = float(np.mean(list(axis.values()) or [0.0]))
     largest = max((node.area_mm2 for node in trunk), default=0.0)
-    limbs = list[_Limb]()
+    arms: dict[str, list[list[_Node]]] = {f"{side} arm": [] for side in SIDES}
     components = [
         sorted(c, key=lambda node: node.height_mm) for c in nx.weakly_connected_components(rest)
     ]
@@ -287,26 +264,26 @@ def _name_limbs(graph: nx.DiGraph[_Node], top: float) -> list[_Limb]:
             if (
                 low < 0.02 * top
                 or max(node.area_mm2 for node in nodes) > 0.35 * largest
-                or any(limb.part == part and limb.overlaps(low, high, 0.2 * top) for limb in limbs)
+                or any(
+                    min(other[-1].height_mm, high) - max(other[0].height_mm, low) > 0.2 * top
+                    for other in arms[part]
+                )
             ):
                 continue
-            limbs.append(_Limb(part, nodes))
+            arms[part].append(nodes)
         for node in nodes:
             node.part = part
-    return limbs
+    return arms
 
 
 def _find_hidden_arms(
-    graph: nx.DiGraph[_Node], limbs: Sequence[_Limb], top: float
+    graph: nx.DiGraph[_Node], arms: dict[str, list[list[_Node]]], top: float
 ) -> list[tuple[str, float, float]]:
     """Find heights, mm, at which an arm is part of another part's outline, and no neck divides them:
     between stretches of it, from a wrist down, and up to the armpit."""
     zones = []
-    for arm in (f"{side} arm" for side in SIDES):
-        stretches = sorted(
-            (limb.nodes for limb in limbs if limb.part == arm), key=lambda nodes: nodes[0].height_mm
-        )
-        ends = []
+    for arm, found in arms.items():
+        stretches, ends = sorted(found, key=lambda nodes: nodes[0].height_mm), []
         for nodes in stretches:
             low, high = nodes[0], nodes[-1]
             down = [graph.edges[low, n]["mm2"] for n in graph.succ[low] if n.part != arm]

@@ -14,7 +14,6 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from bodyscan.arrays import Array, Floats, Indices
-from bodyscan.compiled import compiled
 
 RIM = -1  # no face on the other side
 UNSOUND = -2  # several faces run along the edge the same way, or it has no length
@@ -22,7 +21,19 @@ UNSOUND = -2  # several faces run along the edge the same way, or it has no leng
 
 def find_twins(faces: Indices, vertex_count: int) -> Indices:
     """Find the opposite half-edge (F, 3) of each half-edge of faces (F, 3), or RIM or UNSOUND."""
-    return _twins(np.ascontiguousarray(faces, np.int64).ravel(), vertex_count).reshape(-1, 3)
+    start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    key = np.minimum(start, end) * vertex_count + np.maximum(start, end)
+    order = np.argsort(key)
+    first = np.flatnonzero(np.diff(key[order], prepend=-1))
+    size = np.diff(first, append=len(key))
+    one, other = order[first[size == 2]], order[first[size == 2] + 1]
+    opposite = (start[one] == end[other]) & (start[one] != end[one])
+    one, other = one[opposite], other[opposite]
+    twin = np.full(len(key), UNSOUND)
+    twin[order[first[size == 1]]] = RIM
+    twin[start == end] = UNSOUND
+    twin[one], twin[other] = other, one
+    return twin.reshape(-1, 3)
 
 
 def label_corner_fans(twin: Indices) -> tuple[Indices, int]:
@@ -31,61 +42,11 @@ def label_corner_fans(twin: Indices) -> tuple[Indices, int]:
     twin: (F, 3), from `find_twins`. The corners of a fan are connected across edges that two faces
     share in opposite directions.
     """
-    labels, count = _fans(np.ascontiguousarray(twin).ravel())
-    return labels.reshape(-1, 3), int(count)
-
-
-@compiled
-def _twins(corners: Indices, vertex_count: int) -> Indices:
-    """Find twins (3 F,) from the faces' corners (3 F,), by the half-edges that leave each vertex."""
-    size = len(corners)
-    start = np.zeros(vertex_count + 1, np.int64)
-    for vertex in corners:
-        start[vertex + 1] += 1
-    start = np.cumsum(start)
-    leaving, free = np.empty(size, np.int64), start.copy()
-    for edge in range(size):
-        leaving[free[corners[edge]]] = edge
-        free[corners[edge]] += 1
-    twin = np.full(size, -1, np.int64)
-    for edge in range(size):
-        a, b = corners[edge], corners[edge + 1 if edge % 3 < 2 else edge - 2]
-        along, against = 0, 0
-        for k in range(start[a], start[a + 1]):
-            other = leaving[k]
-            along += corners[other + 1 if other % 3 < 2 else other - 2] == b
-        for k in range(start[b], start[b + 1]):
-            other = leaving[k]
-            if corners[other + 1 if other % 3 < 2 else other - 2] == a:
-                against += 1
-                twin[edge] = other
-        if along > 1 or against > 1 or a == b:
-            twin[edge] = -2
-    return twin
-
-
-@compiled
-def _fans(twin: Indices) -> tuple[Indices, int]:
-    """Number the fans (3 F,) of the corners, by turning about each vertex."""
-    labels = np.full(len(twin), -1, np.int64)
-    count = 0
-    for first in range(len(twin)):
-        if labels[first] >= 0:
-            continue
-        corner = first
-        while corner >= 0 and labels[corner] < 0:
-            labels[corner] = count
-            corner = twin[corner - 1 if corner % 3 > 0 else corner + 2]
-        # At a rim, turn the other way from the first corner as well.
-        across = twin[first]
-        while across >= 0:
-            corner = across + 1 if across % 3 < 2 else across - 2
-            if labels[corner] >= 0:
-                break
-            labels[corner] = count
-            across = twin[corner]
-        count += 1
-    return labels, count
+    edge = np.flatnonzero(twin >= 0)
+    across = twin.ravel()[edge]
+    ends = across + np.where(across % 3 < 2, 1, -2)
+    count, labels = connect(np.stack([edge, ends], axis=-1), twin.size)
+    return labels.reshape(-1, 3).astype(np.int64), count
 
 
 def find_fault(vertices: Array, faces: Indices) -> str | None:
@@ -179,19 +140,8 @@ def face_areas(vertices: Array, faces: Indices) -> Array:
 
 def face_normals(vertices: Array, faces: Indices) -> Array:
     """Compute the normals (F, 3) of faces (F, 3), twice as long as their areas."""
-    normals = np.empty((len(faces), 3))
-    _cross(np.ascontiguousarray(vertices, float), np.ascontiguousarray(faces, np.int64), normals)
-    return normals
-
-
-@compiled
-def _cross(vertices: Array, faces: Indices, normals: Array) -> None:
-    for f in range(len(faces)):
-        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
-        for k in range(3):
-            i, j = (k + 1) % 3, (k + 2) % 3
-            normals[f, k] = (vertices[b, i] - vertices[a, i]) * (vertices[c, j] - vertices[a, j])
-            normals[f, k] -= (vertices[b, j] - vertices[a, j]) * (vertices[c, i] - vertices[a, i])
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    return np.cross(b - a, c - a)
 
 
 def vertex_normals(vertices: Array, faces: Indices) -> Floats:
