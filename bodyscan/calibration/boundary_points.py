@@ -260,6 +260,17 @@ def band_step(code: StripeCode, boxes: Sequence[Box]) -> int:
     return max(int(0.5 * code.stripes * pieces / FIT_BINS), 1)
 
 
+def keep_bands(
+    boundaries: BoardBoundaries, direction: Axis, every: int, turn: int
+) -> BoardBoundaries:
+    """Keep those in one of `every` bands of BIN_PX along the stripes."""
+    along, other = (0, "vertical") if direction == "horizontal" else (1, "horizontal")
+    kept = np.floor(boundaries.pixels[:, along] / BIN_PX) % every == turn % every
+    crossing = boundaries.crossing and keep_bands(boundaries.crossing, other, every, turn)
+    rest = boundaries.index[kept], boundaries.pixels[kept], boundaries.sigma_px[kept]
+    return BoardBoundaries(*rest, crossing)
+
+
 def max_band_step(boxes: Sequence[Box], camera: CameraSpec) -> int:
     """Compute the largest band step that leaves four bands across the visible part of every board:
     sheets bow across their width."""

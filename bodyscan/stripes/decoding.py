@@ -9,7 +9,6 @@ import numpy as np
 
 from bodyscan.arrays import Greys
 from bodyscan.errors import DecodingFailed, WrongDirection
-from bodyscan.stripes.scan_lines import LineBands
 from bodyscan.stripes.stripe_code import ImageKind, SequenceImages, StripeCode
 from bodyscan.stripes.stripe_limits import StripeLimits
 from bodyscan.stripes.stripe_map import StripeMap
@@ -22,7 +21,6 @@ def decode_stripes(
     coded: Greys,
     *,
     limits: StripeLimits | None = None,
-    bands: LineBands | None = None,
     where: str = "",
 ) -> StripeMap:
     """Compute the stripe coordinate of every pixel from one pair's images of one shot.
@@ -30,20 +28,19 @@ def decode_stripes(
     lit, dark: (H, W); None if the code can do without (see docs/formats.md).
     coded: (F, H, W) in the order of the code's `image_counts`, then those of the crossing stripes.
     limits: the stripes that matter; others get no s.
-    bands: the lines on which boundaries are wanted, and no s.
 
     Raises DecodingFailed for inconsistent images; the map's `crossing_fault` says so of crossing
     ones.
     """
     try:
         images, *crossing_images = images_by_kind(code, coded)
-        stripes = _decode_direction(code, lit, dark, images, limits, bands)
+        stripes = _decode_direction(code, lit, dark, images, limits)
         if code.crossing is None:
             return stripes
     except DecodingFailed as error:
         raise DecodingFailed(error.what, where=where, remedy=error.remedy) from error
     try:
-        crossing = _decode_direction(code.crossing, lit, dark, crossing_images[0], None, bands)
+        crossing = _decode_direction(code.crossing, lit, dark, crossing_images[0], None)
         return replace(stripes, crossing=crossing)
     except DecodingFailed as error:
         remedy = error.remedy
@@ -59,7 +56,6 @@ def _decode_direction(
     dark: Greys | None,
     coded: Mapping[ImageKind, Greys],
     limits: StripeLimits | None,
-    bands: LineBands | None,
 ) -> StripeMap:
     """Decode the stripes of one direction."""
     shape = next(iter(coded.values())).shape[1:]
@@ -69,7 +65,7 @@ def _decode_direction(
         raise DecodingFailed(f"images of {shape} px, lit frame of {lit.shape} px")
     if dark is not None and dark.shape != shape:
         raise DecodingFailed(f"dark frame of {dark.shape} px, lit frame of {lit.shape} px")
-    stripes = code.decode(SequenceImages(lit, dark, coded, bands), limits)
+    stripes = code.decode(SequenceImages(lit, dark, coded), limits)
     if limits is None or stripes.beyond is not None:
         return stripes
     return restrict(stripes, limits)

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import cast
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.arrays import Array, Bytes, Floats, Greys, Indices, Mask
+from bodyscan.arrays import Bytes, Floats, Greys, Indices, Mask
 from bodyscan.compiled import compiled
 
 Words = NDArray[np.uint16]
@@ -26,7 +25,6 @@ class ScanLines:
     patterns: (F, L, P), the images of the code.
     inverses: (F, L, P), None if none are projected. All of one type, see `Greys`.
     transposed: the lines are the camera image's columns (its stripes are horizontal).
-    bands: which of the camera image's lines these are, if not all.
     """
 
     lit: Greys
@@ -34,7 +32,6 @@ class ScanLines:
     patterns: Greys
     inverses: Greys | None
     transposed: bool
-    bands: BandLines | None = None
 
     @staticmethod
     def from_images(
@@ -99,63 +96,6 @@ class ScanLines:
     def _inverses(self) -> Greys:
         """Inverses (F, L, P), or (0, L, P) if none are projected."""
         return self.patterns[:0] if self.inverses is None else self.inverses
-
-
-@dataclass(frozen=True)
-class LineBands:
-    """One in `every` of the bands of `width` neighbouring lines: boards show more boundaries than
-    needed.
-
-    turn: which of the `every` bands.
-    corner: row and column of the camera's image at which the images begin; bands are counted from
-        the camera image's first line.
-    """
-
-    width: int
-    every: int
-    turn: int
-    corner: tuple[int, int]
-
-    def lines(self, count: int, *, transposed: bool) -> BandLines:
-        """Select the lines to decode out of `count`.
-
-        The correction at edges moves boundaries across up to 2 lines, and judging pixels takes 8
-        more.
-        """
-        band = (self.corner[transposed] + np.arange(count)) // self.width
-        inside = band % self.every == self.turn % self.every
-        near, wanted = (
-            np.convolve(inside, np.ones(2 * margin + 1), "same") > 0.0 for margin in (8, 2)
-        )
-        return BandLines(np.flatnonzero(near), wanted[near], inside)
-
-
-@dataclass(frozen=True, eq=False)
-class BandLines:
-    """Lines in and around bands.
-
-    number: (L,) of the lines to decode.
-    wanted: (L,) those whose boundaries may lie in a band.
-    inside: (count,) of all lines, those in a band.
-    """
-
-    number: Indices
-    wanted: Mask
-    inside: Mask
-
-    def locate(self, line: Indices, across: Array) -> tuple[Array, Mask]:
-        """Convert positions across these lines (N,), of boundaries on lines (N,), to positions
-        across all lines, px; also returns which of them lie in a band (N,)."""
-        across = across + (self.number - np.arange(len(self.number)))[line]
-        nearest = np.clip(np.floor(across).astype(np.int64), 0, len(self.inside) - 1)
-        return across, self.inside[nearest]
-
-    def cut(self, images: Greys, *, transposed: bool) -> Greys:
-        """Cut these rows, or columns if transposed, out of images (..., H, W)."""
-        ends = np.flatnonzero(np.diff(self.number) > 1) + 1
-        runs = [slice(run[0], run[-1] + 1) for run in np.split(self.number, ends)]
-        parts = [images[..., run] if transposed else images[..., run, :] for run in runs]
-        return cast(Greys, np.concatenate(parts, axis=-1 if transposed else -2))
 
 
 def transpose(images: Greys) -> Greys:

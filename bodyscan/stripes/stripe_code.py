@@ -24,7 +24,6 @@ from bodyscan.files.model import Model, Problem
 
 if TYPE_CHECKING:
     from bodyscan.arrays import Array, Bytes, Greys
-    from bodyscan.stripes.scan_lines import LineBands
     from bodyscan.stripes.stripe_limits import StripeLimits
     from bodyscan.stripes.stripe_map import StripeMap
 
@@ -53,13 +52,11 @@ class SequenceImages:
 
     lit, dark: (H, W); dark is None if not taken.
     coded: (n, H, W) of each kind.
-    bands: the lines on which boundaries are wanted, and no s; codes may ignore it.
     """
 
     lit: Greys
     dark: Greys | None
     coded: Mapping[ImageKind, Greys]
-    bands: LineBands | None = None
 
 
 Shift = Literal["forward", "backward"]

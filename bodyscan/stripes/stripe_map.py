@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -39,7 +39,7 @@ class StripeMap:
     """The stripe coordinate of every lit pixel, and the stripe boundaries between them.
 
     s, sigma: (height, width) float32, in [0, S], and its standard deviation, stripes; NaN where
-        there is none; (0, 0) if only boundaries were wanted.
+        there is none.
     lit: (height, width) uint8, the fully lit image (grey).
     boundary_index: (N,) int64: boundary i lies between stripes i - 1 and i, that is s = i.
     boundary_pixels: (N, 2) float64, its position, px, sub-pixel.
@@ -79,27 +79,16 @@ def assemble_map(
     if images.transposed:
         s, sigma = cv2.transpose(s), cv2.transpose(sigma)
         beyond = None if beyond is None else beyond.T
-    only_boundaries = assemble_boundaries(images, lit, boundaries, stripes)
-    return replace(only_boundaries, s=s, sigma=sigma, beyond=beyond)
-
-
-def assemble_boundaries(
-    images: ScanLines, lit: Greys, boundaries: Boundaries, stripes: int
-) -> StripeMap:
-    """Make a map of boundaries alone, in the camera's own layout."""
-    across, kept = boundaries.line_position, np.ones(len(boundaries.line), bool)
-    if images.bands is not None:
-        across, kept = images.bands.locate(boundaries.line, across)
-    axes = (across, boundaries.position) if images.transposed else (boundaries.position, across)
-    empty = np.empty((0, 0), np.float32)
+    axes = boundaries.position, boundaries.line_position
     return StripeMap(
-        s=empty,
-        sigma=empty,
+        s=s,
+        sigma=sigma,
         lit=whole_grey(lit),
-        boundary_index=boundaries.index[kept],
-        boundary_pixels=np.stack(axes, axis=-1)[kept],
-        boundary_sigma_px=boundaries.sigma_px[kept].astype(np.float32),
+        boundary_index=boundaries.index,
+        boundary_pixels=np.stack(axes[::-1] if images.transposed else axes, axis=-1),
+        boundary_sigma_px=boundaries.sigma_px.astype(np.float32),
         stripes=stripes,
+        beyond=beyond,
     )
 
 

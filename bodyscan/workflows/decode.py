@@ -12,7 +12,6 @@ from bodyscan.arrays import WHOLE, Crop
 from bodyscan.boards.view import BoardView, ViewKey
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.calibration.boundary_points import (
-    BIN_PX,
     BoardBoundaries,
     Box,
     StripedView,
@@ -21,6 +20,7 @@ from bodyscan.calibration.boundary_points import (
     box_around,
     box_of_print,
     crop_around,
+    keep_bands,
     max_band_step,
     on_print,
 )
@@ -34,7 +34,6 @@ from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.templates import fill
 from bodyscan.stripes.decoding import decode_stripes
-from bodyscan.stripes.scan_lines import LineBands
 from bodyscan.stripes.stripe_code import StripeCode
 from bodyscan.stripes.stripe_limits import StripeLimits
 from bodyscan.stripes.stripe_map import ResponseShare, StripeMap
@@ -51,12 +50,11 @@ def decode_sequence(
     *,
     limits: StripeLimits | None = None,
     crop: Crop = WHOLE,
-    bands: LineBands | None = None,
     workers: int = 1,
 ) -> StripeMap:
     """Read and decode what `pair` took in one shot.
 
-    limits, bands: see `decode_stripes`.
+    limits: see `decode_stripes`.
     crop: rows and columns of the images to decode; the map covers these alone.
 
     Raises ImageError for bad files; DecodingFailed (naming pair and shot) for frames that do not
@@ -75,7 +73,6 @@ def decode_sequence(
             images.dark,
             images.coded,
             limits=limits,
-            bands=bands,
             where=where,
         )
 
@@ -140,11 +137,14 @@ class PrintAreas:
         camera, board = self.cameras[view.pair].camera, self.rig.board(view.board)
         return box_of_print(camera, board, self.located[view.key])
 
-    def select(self, view: BoardView, boundaries: BoardBoundaries) -> BoardBoundaries:
-        """The boundaries on the print of a view's board."""
-        shot = StripedView(self.located[view.key], self.rig.board(view.board), boundaries)
+    def select(
+        self, view: BoardView, boundaries: BoardBoundaries, bands: tuple[int, int]
+    ) -> BoardBoundaries:
+        """The boundaries on the print of a view's board, in one of so many bands (see `keep_bands`)."""
         code = self.rig.pair(view.pair).projector
         assert code is not None
+        boundaries = keep_bands(boundaries, code.direction, *bands)
+        shot = StripedView(self.located[view.key], self.rig.board(view.board), boundaries)
         camera = self.cameras[view.pair].camera
         return on_print(camera, code, shot.board, shot.camera_from_face, boundaries)
 
@@ -181,16 +181,15 @@ def decode_pairs(
         pair, group = rig.pair(sequence.pair), wanted[sequence.pair, sequence.shot]
         boxes = [box(view) for view in group]
         crop = crop_around(boxes)
-        corner = crop[0].start, crop[1].start
         every = min(step[pair.name], max_band_step(boxes, pair.camera))
-        bands = LineBands(BIN_PX, every, turn[sequence], corner)
-        stripes = decode_sequence(sequence, pair, crop=crop, bands=bands)
+        stripes = decode_sequence(sequence, pair, crop=crop)
         near = {
             view.key: boundaries_near(stripes, around, crop)
             for view, around in zip(group, boxes, strict=True)
         }
         if prints:
-            near = {view.key: prints.select(view, near[view.key]) for view in group}
+            bands = every, turn[sequence]
+            near = {view.key: prints.select(view, near[view.key], bands) for view in group}
         return BoardStripes(near, tuple(responses_in(stripes)), stripes.crossing_fault)
 
     decoded = iterate_threads(

@@ -18,6 +18,7 @@ from bodyscan.calibration.boundary_points import (
     boundaries_on_boards,
     box_around,
     box_of_print,
+    keep_bands,
     max_band_step,
     on_board,
 )
@@ -129,6 +130,19 @@ def test_more_boards_need_fewer_bands_of_each() -> None:
     box = np.array([100.0, 300.0]), np.array([580.0, 700.0])
     # 30 bins along each of 320 boundaries, and a fit takes 25,000.
     assert [band_step(code, [box] * boards) for boards in (3, 10, 20)] == [1, 3, 7]
+
+
+def test_shots_take_turns_in_bands_along_the_stripes_of_either_direction() -> None:
+    pixels = np.argwhere(np.ones((96, 96))).astype(float)
+    every = np.arange(len(pixels)), pixels, np.ones(len(pixels))
+    boundaries = BoardBoundaries(*every, BoardBoundaries(*every))
+    parts = [keep_bands(boundaries, "horizontal", 3, turn) for turn in (4, 2, 3)]
+    for along, found in enumerate((parts, [part.crossing for part in parts])):
+        index = np.concatenate([part.index for part in found if part])
+        assert np.array_equal(np.sort(index), every[0])
+        part = found[0]
+        assert part is not None
+        assert np.array_equal(np.unique(part.pixels[:, along]), [*range(16, 32), *range(64, 80)])
 
 
 def test_small_boards_and_those_half_outside_are_not_missed_between_bands() -> None:

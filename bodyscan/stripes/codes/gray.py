@@ -99,8 +99,7 @@ class _NumberedStripes(StripeCode):
         from bodyscan.stripes.gray.bit_patterns import decode_bits, lay_out
 
         patterns, inverses = images.coded[PATTERN], images.coded.get(INVERSE)
-        frames = images.lit, images.dark, patterns, inverses
-        lines = lay_out(*frames, self.direction, images.bands)
+        lines = lay_out(images.lit, images.dark, patterns, inverses, self.direction)
         return decode_bits(self.word_code, lines, images.lit, self.stripes, limits)
 
 

@@ -16,14 +16,14 @@ from bodyscan.stripes.boundaries import find_boundaries
 from bodyscan.stripes.gray.bit_words import WordCode
 from bodyscan.stripes.gray.sequence_checks import check_exposure, check_words
 from bodyscan.stripes.grey_noise import measure_noise
-from bodyscan.stripes.scan_lines import LineBands, ScanLines
+from bodyscan.stripes.scan_lines import ScanLines
 from bodyscan.stripes.stripe_coordinates import (
     correlation_along_lines,
     estimate_scatter,
     interpolate_stripes,
 )
 from bodyscan.stripes.stripe_limits import StripeLimits
-from bodyscan.stripes.stripe_map import StripeMap, assemble_boundaries, assemble_map
+from bodyscan.stripes.stripe_map import StripeMap, assemble_map
 from bodyscan.stripes.usable_pixels import MIN_CONTRAST, find_usable_pixels
 
 
@@ -43,14 +43,10 @@ def decode_bits(
         usable, beyond = limits.split(codes, usable, transposed=images.transposed)
         coded, _ = limits.split(codes, coded, transposed=images.transposed)
     brightness = Brightness.from_images(images, variance, usable)
-    if images.bands is not None:
-        usable = usable & images.bands.wanted[:, None]
     boundaries = find_boundaries(images, brightness, codes, usable, variance, code.first)
     sigma_px = np.hypot(boundaries.sigma_px, code.blur_sigma_px)
     boundaries = replace(boundaries, sigma_px=sigma_px)
     boundaries = replace(boundaries, sigma_px=estimate_scatter(boundaries) * sigma_px)
-    if images.bands is not None:
-        return assemble_boundaries(images, lit, boundaries, stripes)
     s, sigma = interpolate_stripes(boundaries, codes, usable)
     if code.single:  # in other codes words at boundaries may be wrong by any number
         fill_from_codes(s, sigma, codes, coded)
@@ -66,22 +62,12 @@ def lay_out(
     patterns: Greys,
     inverses: Greys | None,
     direction: str,
-    bands: LineBands | None = None,
 ) -> ScanLines:
-    """Lay out patterns (bits, H, W), and inverses if any, as scan lines: all, or those near
-    `bands`.
+    """Lay out patterns (bits, H, W), and inverses if any, as scan lines.
 
     A missing dark frame is made from the patterns and their inverses, and so are both lit and dark
     if they were exposed differently. Raises DecodingFailed if there are neither inverses nor dark.
     """
-    transposed, selected = direction == "horizontal", None
-    if bands is not None:
-        selected = bands.lines(lit.shape[1 if transposed else 0], transposed=transposed)
-        lit, patterns = (selected.cut(each, transposed=transposed) for each in (lit, patterns))
-        dark, inverses = (
-            None if each is None else selected.cut(each, transposed=transposed)
-            for each in (dark, inverses)
-        )
     if dark is None:
         if inverses is None:
             raise DecodingFailed(
@@ -92,8 +78,7 @@ def lay_out(
     if inverses is not None and not _is_equally_exposed(lit, dark, patterns, inverses):
         lit = np.maximum(patterns, inverses).max(axis=0)
         dark = np.minimum(patterns, inverses).min(axis=0)
-    lines = ScanLines.from_images(lit, dark, patterns, inverses, direction)
-    return replace(lines, bands=selected)
+    return ScanLines.from_images(lit, dark, patterns, inverses, direction)
 
 
 def _is_equally_exposed(lit: Greys, dark: Greys, patterns: Greys, inverses: Greys) -> bool:
