@@ -24,25 +24,16 @@ class Markers:
 
 
 def detect_markers(
-    image: Bytes,
-    board: Board,
-    *,
-    border_bits: int = 1,
-    first: int | None = None,
-    quick: bool = False,
+    image: Bytes, board: Board, *, border_bits: int = 1, first: int | None = None
 ) -> Markers:
     """Detect markers of the board's dictionary in the image (H, W).
 
     border_bits: width of their black rim in bits.
     first: look only for so many, from the dictionary's first. Identifying one of a thousand markers
         takes most of the time.
-    quick: use the middle one of OpenCV's three thresholds only. It finds all markers of nine images
-        in ten in less than half the time.
     """
     parameters = cv2.aruco.DetectorParameters()
     parameters.minMarkerPerimeterRate = 0.01
-    if quick:
-        parameters.adaptiveThreshWinSizeMin = parameters.adaptiveThreshWinSizeMax = 13
     parameters.markerBorderBits = border_bits
     dictionary = board_layout.marker_dictionary(board)
     codes = np.ascontiguousarray(dictionary.bytesList[:first])
@@ -78,13 +69,6 @@ class FacePosition:
     def valid(self) -> bool:
         """Whether most markers agree; with other columns or rows only those of some rows do."""
         return self.agreeing > 0.6 * self.detected
-
-    def complete(self, shape: tuple[int, ...]) -> bool:
-        """Whether all markers that lie wholly within an image (H, W) were detected."""
-        _, printed = board_layout.marker_corners(self.board, self.face)
-        pixels, last = self.board_map.apply(printed), np.array(shape[::-1]) - 1
-        inside = np.all((pixels >= 0.0) & (pixels <= last), axis=(1, 2))
-        return int(inside.sum()) <= self.agreeing
 
 
 def locate_charuco(

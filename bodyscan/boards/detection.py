@@ -26,8 +26,8 @@ OTHER_APPEARANCES = (
     Appearance(mirrored=True),
     Appearance(inverted=True, mirrored=True),
 )
-MarkerCache = dict[tuple[str, Appearance, bool], Markers]
-"""Markers by dictionary, appearance, and quick or thorough search."""
+MarkerCache = dict[tuple[str, Appearance], Markers]
+"""Markers by dictionary and appearance."""
 
 
 def find_boards(image: Bytes, boards: Sequence[Board], *, pair: str, shot: str) -> list[BoardView]:
@@ -68,7 +68,10 @@ def _find_marked(
         if board.kind == "aprilgrid":
             found = find_aprilgrid(picture, board, thorough=appearance == AS_PRINTED)
         else:
-            found = _find_charuco(picture, board, appearance, cache, first)
+            key = board.dictionary, appearance
+            if key not in cache:
+                cache[key] = detect_markers(picture, board, first=first)
+            found = locate_charuco(picture, board, locate_face(board, cache[key]))
         if found is not None and _determines_plane(found, board):
             pixels = appearance.original_pixels(found.pixels, image.shape[1])
             combined = replace(
@@ -76,26 +79,6 @@ def _find_marked(
             )
             return replace(found, pixels=pixels, appearance=combined)
     return None
-
-
-def _find_charuco(
-    picture: Bytes, board: Board, appearance: Appearance, cache: MarkerCache, first: int
-) -> DetectedCorners | None:
-    """Find a board by a quick search, followed by a thorough one if markers are missing."""
-
-    def detect(quick: bool) -> Markers:
-        key = board.dictionary, appearance, quick
-        if key not in cache:
-            cache[key] = detect_markers(picture, board, first=first, quick=quick)
-        return cache[key]
-
-    if appearance == AS_PRINTED:  # true of nearly all
-        markers = detect(quick=True)
-        position = locate_face(board, markers)
-        if position is not None and position.valid and position.complete(picture.shape):
-            return locate_charuco(picture, board, position)
-    markers = detect(quick=False)
-    return locate_charuco(picture, board, locate_face(board, markers))
 
 
 def _determines_plane(found: DetectedCorners, board: Board) -> bool:

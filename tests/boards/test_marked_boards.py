@@ -9,9 +9,8 @@ import pytest
 from board_rendering import render, true_corners, view_of
 
 from bodyscan.arrays import Array, Bytes
-from bodyscan.boards import detection
 from bodyscan.boards.board_layout import corner_points
-from bodyscan.boards.charuco import Markers, detect_markers, locate_face
+from bodyscan.boards.charuco import detect_markers
 from bodyscan.boards.detection import find_boards
 from bodyscan.boards.unfound import describe_unfound
 from bodyscan.boards.view import BoardView
@@ -69,37 +68,6 @@ def test_looking_for_few_markers_finds_those_as_well(dictionary: str) -> None:
     assert 10 < len(some.ids) < len(every.ids)
     np.testing.assert_array_equal(every.ids[concerned][order[0]], some.ids[order[1]])
     np.testing.assert_array_equal(every.corners[concerned][order[0]], some.corners[order[1]])
-
-
-@pytest.mark.parametrize("missed", [0, 1])
-def test_a_quick_search_suffices_where_it_misses_no_marker(
-    picture: Bytes, missed: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """One threshold in place of three; markers that it misses cost a corner each at a board's rim."""
-    quick_searches: list[bool] = []
-
-    def detect(image: Bytes, board: Board, *, quick: bool = False, **how: int) -> Markers:
-        quick_searches.append(quick)
-        markers = detect_markers(image, board, quick=quick, **how)
-        kept = slice(missed if quick else 0, None)
-        return Markers(markers.ids[kept], markers.corners[kept])
-
-    monkeypatch.setattr(detection, "detect_markers", detect)
-    (view,) = found(picture, MARKED)
-    assert quick_searches == ([True] if not missed else [True, False])
-    assert len(view.corner_ids) == len(true_corners(MARKED, PLACE))
-    assert rms(view, true_corners(MARKED, PLACE)) < 0.012
-
-
-def test_markers_that_a_picture_cuts_off_are_not_missing(picture: Bytes) -> None:
-    """Half of a board seen whole needs no second search."""
-    half = np.ascontiguousarray(picture[:, : int(true_corners(MARKED, PLACE)[:, 0].mean())])
-    markers = detect_markers(half, MARKED, quick=True)
-    position = locate_face(MARKED, markers)
-    assert position is not None
-    assert 5 < len(markers.ids) < 25
-    assert position.complete(half.shape)
-    assert not position.complete(picture.shape)
 
 
 @pytest.mark.slow
