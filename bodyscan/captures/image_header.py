@@ -11,8 +11,9 @@ import warnings
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
-from typing import Any, BinaryIO, cast
+from typing import BinaryIO
 
 from bodyscan.errors import BadInput, ImageError
 from bodyscan.files.reading import open_regular
@@ -28,7 +29,7 @@ NO_INVERSES = (
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """Width and height in pixels, bits per sample, and whether the end of the image is there.
+    """Width and height in pixels, bits per sample; complete: whether a PNG or JPEG has its end.
 
     rounding_error: of JPEG, RMS in grey levels, for an image with sharp edges everywhere, such as
         stripes.
@@ -89,37 +90,18 @@ def _read_png_header(start: bytes) -> tuple[int, int, int]:
 
 def _read_by_pillow(stream: BinaryIO, kind: str) -> ImageHeader:
     # The classes themselves: Image.open refuses large images before it says how large they are.
-    if kind == "JPEG":
-        from PIL.JpegImagePlugin import JpegImageFile
-
-        jpeg = JpegImageFile(stream)
-        # A coefficient rounded to multiples of q errs by q / sqrt(12); the transform preserves
-        # squares. Table 0 is that of brightness.
-        squares = [step**2 for step in jpeg.quantization.get(0, [0])]
-        rounding_error = (sum(squares) / len(squares) / 12) ** 0.5
-        complete = _ends_with(stream, stream.tell(), b"\xff\xd9")
-        return ImageHeader(*jpeg.size, 8, complete, rounding_error)
-    if kind == "BMP":
-        from PIL.BmpImagePlugin import BmpImageFile
-
-        bmp = BmpImageFile(stream)
-        decoder, _, offset, layout = cast(tuple[str, Any, int, Any], bmp.tile[0])
-        # Of an uncompressed image the layout is mode, bytes per row, direction.
-        end = offset + layout[1] * bmp.height if decoder == "raw" else 0
-        return ImageHeader(*bmp.size, 8, stream.seek(0, 2) >= end)
-    from PIL.TiffImagePlugin import TiffImageFile
-
-    tags = TiffImageFile(stream).tag_v2
-    size = stream.seek(0, 2)
-    # Offsets and byte counts, of strips or tiles (TIFF 6.0).
-    starts, lengths = (tags.get(k) or tags.get(m) or () for k, m in ((273, 324), (279, 325)))
-    ends = [first + length for first, length in zip(starts, lengths, strict=False)]
-    stream.seek(0)
-    order, first = struct.unpack("2s2x4s", stream.read(8))
-    directory = int.from_bytes(first, "little" if order == b"II" else "big")
-    # Of a directory that is cut short, the next one is said to be itself.
-    complete = tags.next != directory and max(ends, default=0) <= size
-    return ImageHeader(tags[256], tags[257], max(tags.get(258, (1,))), complete)
+    image = getattr(import_module(f"PIL.{kind.title()}ImagePlugin"), f"{kind.title()}ImageFile")(
+        stream
+    )
+    if kind != "JPEG":  # OpenCV decodes no BMP or TIFF that is cut short
+        depths = image.tag_v2.get(258, (1,)) if kind == "TIFF" else (8,)
+        return ImageHeader(*image.size, max(depths), True)
+    # A coefficient rounded to multiples of q errs by q / sqrt(12); the transform preserves squares.
+    # Table 0 is that of brightness.
+    squares = [step**2 for step in image.quantization.get(0, [0])]
+    rounding_error = (sum(squares) / len(squares) / 12) ** 0.5
+    complete = _ends_with(stream, stream.tell(), b"\xff\xd9")
+    return ImageHeader(*image.size, 8, complete, rounding_error)
 
 
 def _ends_with(stream: BinaryIO, start: int, mark: bytes) -> bool:
