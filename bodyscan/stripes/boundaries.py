@@ -94,22 +94,15 @@ def find_boundaries(
     )
 
 
-@compiled
 def join_runs(
     line: Indices, before: Indices, position: Array, index: Indices, usable: Mask
 ) -> Mask:
     """Find whether each boundary's stripe ends at the next boundary, (N - 1,), with all pixels
     between usable (L, P): else another surface that happens to show the next stripe may begin
     there."""
-    joined = np.zeros(max(line.size - 1, 0), np.bool_)
-    for k in range(joined.size):
-        if line[k + 1] != line[k] or abs(index[k + 1] - index[k]) != 1:
-            continue
-        whole = position[k + 1] - position[k] > MIN_STRIPE_PX
-        for x in range(before[k] + 1, before[k + 1] + 1):
-            whole &= usable[line[k], x]
-        joined[k] = whole
-    return joined
+    unusable = np.cumsum(~usable.ravel(), dtype=np.int32)[line * usable.shape[1] + before]
+    joined = (np.diff(line) == 0) & (np.abs(np.diff(index)) == 1) & (np.diff(unusable) == 0)
+    return np.asarray(joined & (np.diff(position) > MIN_STRIPE_PX))
 
 
 @compiled

@@ -23,10 +23,14 @@ from scipy.special import ndtri
 
 from bodyscan.arrays import Floats, Greys, Mask
 from bodyscan.errors import DecodingFailed
-from bodyscan.stripes.boundaries import Boundaries, join_runs
 from bodyscan.stripes.scan_lines import ScanLines
 from bodyscan.stripes.stripe_coordinates import interpolate_stripes
-from bodyscan.stripes.stripe_map import StripeMap, assemble_from_pixels, assemble_map
+from bodyscan.stripes.stripe_map import (
+    StripeMap,
+    assemble_from_pixels,
+    assemble_map,
+    find_whole_numbers,
+)
 from bodyscan.stripes.usable_pixels import (
     MIN_CONTRAST,
     MIN_CONTRAST_TO_NOISE,
@@ -175,30 +179,13 @@ def decode_index(lit: Greys, numbers: Greys, direction: str, stripes: int) -> St
     check_order(np.where(numbered, codes, 0), numbered, images.transposed, 256)
     usable = numbered & (codes < stripes)
     usable &= ~find_code_jumps(codes, usable)
-    boundaries = _find_number_changes(codes, usable)
+    middle = np.where(usable, codes + np.float32(0.5), np.float32(np.nan))
+    # Of a mean of two pixels the standard deviation is less by the root of 2.
+    boundaries = find_whole_numbers(middle, np.full_like(middle, 2.0**0.5 * UNIFORM_SIGMA), 0.0)
     s, sigma = interpolate_stripes(boundaries, codes, usable)
     alone = usable & np.isnan(s)
-    s[alone] = codes[alone] + 0.5
-    sigma[alone] = UNIFORM_SIGMA
+    s[alone], sigma[alone] = middle[alone], UNIFORM_SIGMA
     return assemble_map(images, lit, s, sigma, boundaries, stripes)
-
-
-def _find_number_changes(codes: NDArray[np.int32], usable: Mask) -> Boundaries:
-    """Boundaries halfway between neighbours on a line whose numbers differ by one."""
-    change = np.abs(np.diff(codes, axis=1)) == 1
-    line, before = np.nonzero(change & usable[:, 1:] & usable[:, :-1])
-    index = np.maximum(codes[line, before], codes[line, before + 1]).astype(np.int64)
-    position = before.astype(np.float64) + 0.5
-    return Boundaries(
-        line=line,
-        before=before,
-        position=position,
-        line_position=line.astype(np.float64),
-        sigma_px=np.full(len(line), UNIFORM_SIGMA),
-        index=index,
-        joined=join_runs(line, before, position, index, usable),
-        blur2=0.0,
-    )
 
 
 def check_order(numbers: Numbers, good: Mask, transposed: bool, stripes: int) -> None:

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyscan.arrays import Floats, Mask
-from bodyscan.compiled import compiled
 from bodyscan.errors import DecodingFailed, WrongDirection
 from bodyscan.stripes.scan_lines import WHOLE_SHARE, ScanLines
 
@@ -83,37 +82,11 @@ def find_direct_pixels(images: ScanLines, usable: Mask, bit: int, variance: Floa
 def find_code_jumps(codes: NDArray[np.int32], usable: Mask) -> Mask:
     """Find pixels (L, P) whose code differs from a usable neighbour's by more than one."""
     jumps = np.zeros(codes.shape, bool)
-    _mark_jumps(codes, usable, jumps)
+    for one, other in ((np.s_[1:], np.s_[:-1]), (np.s_[:, 1:], np.s_[:, :-1])):
+        jump = (cv2.absdiff(codes[one], codes[other]) > 1) & usable[one] & usable[other]
+        jumps[one] |= jump
+        jumps[other] |= jump
     return jumps
-
-
-@compiled
-def _mark_jumps(codes: NDArray[np.int32], usable: Mask, jumps: Mask) -> None:
-    # Without a branch inside: on a noisy image a processor mispredicts every other one.
-    lines, width = codes.shape
-    for line in range(lines):
-        jump = _compare(codes[line, 1:], codes[line, :-1], usable[line, 1:], usable[line, :-1])
-        for x in range(width - 1):
-            jumps[line, x] |= jump[x]
-        for x in range(width - 1):
-            jumps[line, x + 1] |= jump[x]
-        if line + 1 == lines:
-            break
-        jump = _compare(codes[line + 1], codes[line], usable[line + 1], usable[line])
-        for x in range(width):
-            jumps[line, x] |= jump[x]
-            jumps[line + 1, x] |= jump[x]
-
-
-@compiled
-def _compare(
-    first: NDArray[np.int32], second: NDArray[np.int32], usable: Mask, usable_second: Mask
-) -> Mask:
-    """Whether two rows' codes, both usable, differ by more than one, (P,)."""
-    jump = np.empty(first.size, np.bool_)
-    for x in range(first.size):
-        jump[x] = (abs(first[x] - second[x]) > 1) & usable[x] & usable_second[x]
-    return jump
 
 
 def check_illumination(bright: Mask, lit: NDArray[Any]) -> None:

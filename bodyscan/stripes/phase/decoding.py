@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from itertools import combinations
 
 import cv2
@@ -174,78 +175,58 @@ def decode_waves(
     """
     transposed = direction == "horizontal"
     lines = transpose(images) if transposed else images
-    read = WaveReading.from_images(lines, waves, stripes)
-    check_illumination(read.bright, read.brightest)
-    check_several_waves(read, stripes)
-    check_agreement(read.order)
-    order, finest = read.order, read.waves[0]
-    halves = np.floor(2.0 * np.nan_to_num(order.s) / finest.wave.period).astype(np.int32)
+    both = sorted(
+        zip(waves, split_waves(lines, waves), strict=True), key=lambda each: each[0].period
+    )
+    stacks = [stack for _, stack in both]
+    measured = [measure_wave(stack, wave) for wave, stack in both]
+    brightest = lines.max(axis=0)
+    contrast = np.min([2.0 * wave.amplitude for wave in measured], axis=0)
+    bright = contrast >= min_contrast(lines.dtype)
+    variance = measure_wave_noise(measured, stacks, bright & (brightest < SATURATED))
+    noise = np.sqrt(variance[np.clip(np.rint(measured[0].mean), 0, 255).astype(np.uint8)])
+    bright = bright & (contrast >= np.float32(2.0 * MIN_CONTRAST_TO_NOISE) * noise)
+    check_illumination(bright, brightest)
+    good = bright & (brightest < SATURATED)
+    check_several_waves(measured, stacks, good, stripes)
+    usable = good & ~find_half_covered_pixels(contrast, bright)
+    corrected, error = _correct_waves(measured, usable, stripes)
+    order = find_phase_order(corrected, [wave.sigma(noise) for wave in corrected], usable, stripes)
+    check_agreement(order)
+    halves = np.floor(2.0 * np.nan_to_num(order.s) / corrected[0].wave.period).astype(np.int32)
     check_direction(halves, order.certain, transposed)
     usable = order.certain & ~find_code_jumps(halves, order.certain)
     s = np.where(usable, order.s, np.float32(np.nan))
-    sigma = np.where(usable, order.sigma, np.float32(np.nan))
-    s, sigma = smooth_phase(s, sigma)
-    light = ScanLines(read.white, read.black, lines[:0], None, transposed)
-    result = assemble_from_pixels(light, lit, s, sigma, read.variance, stripes)
-    response = compute_response_share(read.errors[0], finest, result.sigma)
+    s, sigma = smooth_phase(s, np.where(usable, order.sigma, np.float32(np.nan)))
+    white, black = (convert_like(grey, lines) for grey in estimate_white_and_black(measured))
+    light = ScanLines(white, black, lines[:0], None, transposed)
+    result = assemble_from_pixels(light, lit, s, sigma, variance, stripes)
+    response = compute_response_share(error, corrected[0], result.sigma)
     return replace(result, response=response, correlation_px=(CORRELATION_PX, CORRELATION_PX))
 
 
-@dataclass(frozen=True, eq=False)
-class WaveReading:
-    """Waves measured along scan lines (L, P), the finest first, with their errors removed.
-
-    images, errors: of each wave.
-    bright: clearly lit. brightest: of all images.
-    variance: (256,) of each grey level.
-    """
-
-    waves: list[MeasuredWave]
-    images: list[Greys]
-    errors: list[PhaseError | None]
-    bright: Mask
-    brightest: Greys
-    white: Greys
-    black: Greys
-    variance: Floats
-    order: PhaseOrder
-
-    @staticmethod
-    def from_images(lines: Greys, waves: tuple[Wave, ...], stripes: int) -> WaveReading:
-        """Measure waves in images (F, L, P), correct them for the projector's response and find s."""
-        stacks = split_waves(lines, waves)
-        both = sorted(zip(waves, stacks, strict=True), key=lambda each: each[0].period)
-        images = [stack for _, stack in both]
-        measured = [measure_wave(stack, wave) for wave, stack in both]
-        brightest = lines.max(axis=0)
-        white, black = estimate_white_and_black(measured)
-        contrast = np.min([2.0 * wave.amplitude for wave in measured], axis=0)
-        bright = contrast >= min_contrast(lines.dtype)
-        variance = measure_wave_noise(measured, images, bright & (brightest < SATURATED))
-        noise = np.sqrt(variance[np.clip(np.rint(measured[0].mean), 0, 255).astype(np.uint8)])
-        bright = bright & (contrast >= np.float32(2.0 * MIN_CONTRAST_TO_NOISE) * noise)
-        usable = bright & (brightest < SATURATED)
-        usable &= ~find_half_covered_pixels(contrast, bright)
-        errors = [estimate_error(wave, usable, stripes) for wave in measured]
-        corrected = [correct_wave(*each) for each in zip(measured, errors, strict=True)]
-        for k in range(1, len(corrected)):
-            if errors[k] is None:
-                errors[k] = estimate_error_against(corrected[k], corrected[0], usable, stripes)
-                corrected[k] = correct_wave(corrected[k], errors[k])
-        sigmas = [wave.sigma(noise) for wave in corrected]
-        order = find_phase_order(corrected, sigmas, usable, stripes)
-        light = convert_like(white, lines), convert_like(black, lines)
-        return WaveReading(corrected, images, errors, bright, brightest, *light, variance, order)
+def _correct_waves(
+    waves: list[MeasuredWave], usable: Mask, stripes: int
+) -> tuple[list[MeasuredWave], PhaseError | None]:
+    """Correct waves, the finest first, for the projector's response; also the finest's error."""
+    errors = [estimate_error(wave, usable, stripes) for wave in waves]
+    corrected = [correct_wave(*each) for each in zip(waves, errors, strict=True)]
+    for k, wave in enumerate(corrected):
+        if k and errors[k] is None:
+            error = estimate_error_against(wave, corrected[0], usable, stripes)
+            corrected[k] = correct_wave(wave, error)
+    return corrected, errors[0]
 
 
-def check_several_waves(read: WaveReading, stripes: int) -> None:
+def check_several_waves(
+    waves: Sequence[MeasuredWave], images: Sequence[Greys], good: Mask, stripes: int
+) -> None:
     """Raise DecodingFailed if an image is missing, taken twice or exposed differently: all waves
-    have the same mean at each pixel to 15 %, and no two images of a wave are the same."""
-    good = read.bright & (read.brightest < SATURATED)
+    have the same mean at each `good` pixel to 15 %, and no two images of a wave are the same."""
     if not good.any():
         return
-    finest = read.waves[0]
-    for wave, images in zip(read.waves, read.images, strict=True):
+    finest = waves[0]
+    for wave, stack in zip(waves, images, strict=True):
         ratio = float(np.median(wave.mean[good] / finest.mean[good]))
         if abs(ratio - 1.0) > 0.15:
             raise DecodingFailed(
@@ -256,7 +237,7 @@ def check_several_waves(read: WaveReading, stripes: int) -> None:
         if wave.wave.period * MIN_PERIODS <= stripes:  # on a small subject longer ones may be alike
             message = f"images {{}} and {{}} of the wave of {wave.wave.period:g} stripes look alike"
             strength = float(np.median(wave.amplitude[good]))
-            _check_distinct(images[:, good].astype(np.float32), strength, message)
+            _check_distinct(stack[:, good].astype(np.float32), strength, message)
 
 
 def check_agreement(order: PhaseOrder) -> None:
