@@ -24,10 +24,6 @@ def describe_unfound(image: Bytes, board: Board) -> str:
     """Describe what the image (H, W) shows instead of the board, to follow the board's name."""
     if board.kind == "checkerboard":
         return _describe_grids(image, board)
-    return _describe_markers(image, board)
-
-
-def _describe_markers(image: Bytes, board: Board) -> str:
     markers, appearance = max(
         ((_detect(image, board, look), look) for look in (AS_PRINTED, *OTHER_APPEARANCES)),
         key=lambda found: len(found[0].ids),
@@ -86,11 +82,8 @@ def _describe_other_dictionary(image: Bytes, board: Board) -> str:
 
 def _fit_other_sizes(board: Board, markers: Markers) -> Iterator[tuple[int, int, int]]:
     """Yield other board sizes on which markers agree: their number, minus the rows, the columns."""
-    sizes = [
-        (board.columns + more, board.rows + taller)
-        for more, taller in product((0, -2, -1, 1, 2), repeat=2)
-    ]
-    for columns, rows in [*sizes, (board.rows, board.columns)]:
+    near = product(*(range(size - 2, size + 3) for size in (board.columns, board.rows)))
+    for columns, rows in [*near, (board.rows, board.columns)]:
         if min(columns, rows) < 3:
             continue
         other = board.model_copy(update={"columns": columns, "rows": rows})
@@ -104,14 +97,10 @@ def _describe_grids(image: Bytes, board: Board) -> str:
     wanted = f"{board.columns - 1} x {board.rows - 1} inner corners"
     if find_checkerboard(255 - image, board, quick=True):
         return f"a grid of {wanted}, but white on black"
-    sizes = [(board.columns, board.rows), (board.columns + 1, board.rows + 1)]
-    sizes += [
-        (board.columns + more, board.rows + taller)
-        for more, taller in product((-1, 0, 1), repeat=2)
-        if more or taller
-    ]
-    for columns, rows in dict.fromkeys(sizes):
-        if min(columns, rows) < MIN_SQUARES or (columns, rows) == (board.columns, board.rows):
+    # First the likeliest mistake: corners counted in place of squares.
+    for more, taller in ((1, 1), (-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0)):
+        columns, rows = board.columns + more, board.rows + taller
+        if min(columns, rows) < MIN_SQUARES:
             continue
         other = board.model_copy(update={"columns": columns, "rows": rows})
         if find_checkerboard(image, other, quick=True):
