@@ -129,7 +129,6 @@ def parse_yaml(text: str, max_nodes: int = MAX_NODES, *, foreign: bool = False) 
         raise _error(Place(1, 1), f"is not YAML: {error}".splitlines()[0]) from None
     document = Document()
     if node is not None:
-        _refuse_many(node, {}, max_nodes)
         document.data = _Builder(document, max_nodes, foreign).build(node, (), 0)
     return document
 
@@ -169,7 +168,8 @@ class _Builder:
         self.nodes += 1
         place = _place(node.start_mark)
         if self.nodes > self.max_nodes:
-            raise _too_many(place, self.max_nodes)
+            text = f"has more than {self.max_nodes:,} values once aliases are followed"
+            raise _error(place, text)
         if depth > MAX_DEPTH:
             raise _error(place, f"is nested more than {MAX_DEPTH} deep")
         self.document.values[where] = place
@@ -258,29 +258,6 @@ def _refuse_deep(text: str, *, only_first: bool) -> None:
             raise _error(_place(event.start_mark), f"is nested more than {MAX_DEPTH} deep")
         if only_first and isinstance(event, yaml.DocumentEndEvent):
             return
-
-
-def _refuse_many(node: yaml.Node, sizes: dict[int, int], max_nodes: int) -> int:
-    """Count the values of a node once aliases are followed, and raise if there are too many.
-
-    Each node is counted once: building an alias bomb until it is too large takes half a second.
-    """
-    if id(node) in sizes:
-        return sizes[id(node)]
-    sizes[id(node)] = 1  # one that contains itself is too deep, and reported when it is built
-    parts: list[yaml.Node] = []
-    if isinstance(node, yaml.MappingNode):
-        parts = [value for key, value in node.value if key.value != "<<"]
-    elif isinstance(node, yaml.SequenceNode):
-        parts = node.value
-    sizes[id(node)] += sum(_refuse_many(part, sizes, max_nodes) for part in parts)
-    if sizes[id(node)] > max_nodes:
-        raise _too_many(_place(node.start_mark), max_nodes)
-    return sizes[id(node)]
-
-
-def _too_many(place: Place, max_nodes: int) -> YamlError:
-    return _error(place, f"has more than {max_nodes:,} values once aliases are followed")
 
 
 def _place(mark: Any) -> Place:
