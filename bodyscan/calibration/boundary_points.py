@@ -264,8 +264,9 @@ def keep_bands(
     boundaries: BoardBoundaries, direction: Axis, every: int, turn: int
 ) -> BoardBoundaries:
     """Keep those in one of `every` bands of BIN_PX along the stripes."""
-    along, other = (0, "vertical") if direction == "horizontal" else (1, "horizontal")
-    kept = np.floor(boundaries.pixels[:, along] / BIN_PX) % every == turn % every
+    along = boundaries.pixels[:, 0 if direction == "horizontal" else 1]
+    kept = np.floor(along / BIN_PX) % every == turn % every
+    other: Axis = "vertical" if direction == "horizontal" else "horizontal"
     crossing = boundaries.crossing and keep_bands(boundaries.crossing, other, every, turn)
     rest = boundaries.index[kept], boundaries.pixels[kept], boundaries.sigma_px[kept]
     return BoardBoundaries(*rest, crossing)

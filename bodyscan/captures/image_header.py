@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from bodyscan.errors import BadInput, ImageError
 from bodyscan.files.reading import open_regular
@@ -63,7 +63,7 @@ def read_header(path: Path) -> ImageHeader:
             width, height, bits = _read_png_header(start)
             complete = _ends_with(stream, 33, b"\x00\x00\x00\x00IEND\xaeB`\x82")
             return ImageHeader(width, height, bits, complete)
-        kinds = {b"\xff\xd8\xff": "JPEG", b"BM": "BMP", b"II*\0": "TIFF", b"MM\0*": "TIFF"}
+        kinds = {b"\xff\xd8\xff": "Jpeg", b"BM": "Bmp", b"II*\0": "Tiff", b"MM\0*": "Tiff"}
         kind = next((kind for magic, kind in kinds.items() if start.startswith(magic)), None)
         if kind is None:
             raise NotAnImage("is not a PNG, JPEG, BMP or TIFF image")
@@ -75,7 +75,7 @@ def read_header(path: Path) -> ImageHeader:
                 raise
         except Exception:  # Pillow raises what its parsers run into
             pass
-    raise NotAnImage(f"is cut short or damaged (its {kind} header cannot be read)")
+    raise NotAnImage(f"is cut short or damaged (its {kind.upper()} header cannot be read)")
 
 
 def _read_png_header(start: bytes) -> tuple[int, int, int]:
@@ -90,18 +90,18 @@ def _read_png_header(start: bytes) -> tuple[int, int, int]:
 
 def _read_by_pillow(stream: BinaryIO, kind: str) -> ImageHeader:
     # The classes themselves: Image.open refuses large images before it says how large they are.
-    image = getattr(import_module(f"PIL.{kind.title()}ImagePlugin"), f"{kind.title()}ImageFile")(
-        stream
-    )
-    if kind != "JPEG":  # OpenCV decodes no BMP or TIFF that is cut short
-        depths = image.tag_v2.get(258, (1,)) if kind == "TIFF" else (8,)
-        return ImageHeader(*image.size, max(depths), True)
+    plugin = import_module(f"PIL.{kind}ImagePlugin")
+    image: Any = getattr(plugin, f"{kind}ImageFile")(stream)
+    width, height = image.size
+    if kind != "Jpeg":  # OpenCV decodes no BMP or TIFF that is cut short
+        depths = image.tag_v2.get(258, (1,)) if kind == "Tiff" else (8,)
+        return ImageHeader(width, height, max(depths), True)
     # A coefficient rounded to multiples of q errs by q / sqrt(12); the transform preserves squares.
     # Table 0 is that of brightness.
     squares = [step**2 for step in image.quantization.get(0, [0])]
     rounding_error = (sum(squares) / len(squares) / 12) ** 0.5
     complete = _ends_with(stream, stream.tell(), b"\xff\xd9")
-    return ImageHeader(*image.size, 8, complete, rounding_error)
+    return ImageHeader(width, height, 8, complete, rounding_error)
 
 
 def _ends_with(stream: BinaryIO, start: int, mark: bytes) -> bool:

@@ -74,10 +74,11 @@ def test_phases_lie_in_their_half_periods_and_do_not_jump_between_them() -> None
         check_phase(np.float32(1.0) - turn, COARSE, EVERY)
 
 
-def reading(bright: float = 1.0, copied: float | None = None, period: float = 20.0) -> Any:
-    """Waves of 8 and of `period` stripes; of the second the mean is so bright, and its second image
-    the first plus so many grey levels."""
-    waves, images = [], []
+def check_waves(bright: float = 1.0, copied: float | None = None, period: float = 20.0) -> None:
+    """Check waves of 8 and of `period` stripes; of the second the mean is so bright, and its
+    second image the first plus so many grey levels."""
+    waves: list[Any] = []
+    images: list[Floats] = []
     for length, times in ((8.0, 1.0), (period, bright)):
         turns = S / length - np.arange(STEPS)[:, None, None] / STEPS
         stack: Floats = (times * (120.0 + 100.0 * np.cos(2.0 * np.pi * turns))).astype(np.float32)
@@ -86,22 +87,22 @@ def reading(bright: float = 1.0, copied: float | None = None, period: float = 20
         images.append(stack)
     if copied is not None:
         images[1][1] = images[1][0] + copied
-    return waves, images, EVERY
+    check_several_waves(waves, images, EVERY, 64)
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_waves_are_as_bright_as_each_other_to_a_seventh(sign: float) -> None:
-    check_several_waves(*reading(1.0 + sign * 0.14), 64)
+    check_waves(1.0 + sign * 0.14)
     with pytest.raises(DecodingFailed, match=r"of 20 stripes are on average (1\.16|0\.84) times"):
-        check_several_waves(*reading(1.0 + sign * 0.16), 64)
+        check_waves(1.0 + sign * 0.16)
 
 
 def test_images_of_a_wave_that_differ_by_next_to_nothing_look_alike() -> None:
-    check_several_waves(*reading(copied=7.5, period=16.0), 64)
+    check_waves(copied=7.5, period=16.0)
     with pytest.raises(DecodingFailed, match="images 0 and 1 of the wave of 16 stripes look alike"):
-        check_several_waves(*reading(copied=6.5, period=16.0), 64)
+        check_waves(copied=6.5, period=16.0)
     # A small subject may show less than a period of a wave of which there are not four.
-    check_several_waves(*reading(copied=0.0, period=16.5), 64)
+    check_waves(copied=0.0, period=16.5)
 
 
 @pytest.mark.parametrize(

@@ -143,7 +143,7 @@ def test_any_subset_of_images_with_stripes_does_too(
         for name in names:
             yield PairStripes(name, {
                 sequence: BoardStripes({
-                    view.key: prints.select(view, striped[view.key])
+                    view.key: prints.select(view, striped[view.key], (1, 0))
                     for view in wanted
                     if (view.pair, view.shot) == (name, sequence.shot) and view.key in striped
                 })
