@@ -19,7 +19,6 @@ from bodyscan.alignment.matching import (
     sample_points,
 )
 from bodyscan.arrays import Array, Mask
-from bodyscan.compiled import compiled
 from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
 from bodyscan.geometry.robust import robust_scale
 from bodyscan.geometry.transforms import RigidTransform
@@ -110,10 +109,9 @@ def linearize(matches: Matches, correlated: float) -> LinearGaussianSystem:
 
     correlated: number of neighbouring matches that count as one.
     """
-    information, gradient = np.zeros((6, 6)), np.zeros(6)
-    surface = (matches.points, matches.normals, matches.distances)
-    _accumulate(*surface, cauchy_weights(matches), information, gradient)
-    return LinearGaussianSystem(information / correlated, -gradient / correlated)
+    jacobian = np.hstack([np.cross(matches.points, matches.normals), matches.normals])
+    weights = cauchy_weights(matches) / correlated
+    return LinearGaussianSystem.from_observations(jacobian, -matches.distances, weights)
 
 
 def cauchy_weights(matches: Matches) -> Array:
@@ -151,39 +149,12 @@ def _joint_system(
     overlaps: Mapping[tuple[int, int], LinearGaussianSystem], motion: Array, covariance: Array
 ) -> LinearGaussianSystem:
     """The prior and all overlaps, as one system of all twists."""
-    information = np.asarray(np.linalg.inv(covariance), np.float64)
-    vector = np.zeros(motion.size)
+    parts = []
     for (a, b), overlap in overlaps.items():
-        i, j = slice(6 * a, 6 * a + 6), slice(6 * b, 6 * b + 6)
-        information[i, i] += overlap.information
-        information[j, j] += overlap.information
-        information[i, j] -= overlap.information
-        information[j, i] -= overlap.information
         # Linearized distance: d + J (x_a - m_a) - J (x_b - m_b).
         offset = overlap.information @ (motion[a] - motion[b]) + overlap.vector
-        vector[i] += offset
-        vector[j] -= offset
-    return LinearGaussianSystem(information, vector)
-
-
-@compiled
-def _accumulate(
-    points: Array,
-    normals: Array,
-    distances: Array,
-    weights: Array,
-    information: Array,
-    gradient: Array,
-) -> None:
-    """Add M point-to-plane distances to the normal equations (6, 6), (6,)."""
-    jacobian = np.empty(6)
-    for n in range(len(distances)):
-        x, y, z = points[n, 0], points[n, 1], points[n, 2]
-        a, b, c = normals[n, 0], normals[n, 1], normals[n, 2]
-        jacobian[0], jacobian[1], jacobian[2] = y * c - z * b, z * a - x * c, x * b - y * a
-        jacobian[3], jacobian[4], jacobian[5] = a, b, c
-        for i in range(6):
-            weighted = weights[n] * jacobian[i]
-            gradient[i] += weighted * distances[n]
-            for j in range(6):
-                information[i, j] += weighted * jacobian[j]
+        information = np.kron([[1.0, -1.0], [-1.0, 1.0]], overlap.information)
+        system = LinearGaussianSystem(information, np.hstack([offset, -offset]))
+        parts.append((np.hstack([6 * a + np.arange(6), 6 * b + np.arange(6)]), system))
+    prior = LinearGaussianSystem.from_prior(np.linalg.inv(covariance))
+    return prior + LinearGaussianSystem.assemble(parts, motion.size)

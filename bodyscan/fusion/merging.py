@@ -94,10 +94,9 @@ def average(
         normals, sigma_mm = samples.normals[some], samples.sigma_mm[some]
         sums = _start_sums(normals, sigma_mm, samples.weight[some], grey.samples[some])
         for surface, one, levels in zip(surfaces, consistency, grey.surfaces, strict=True):
-            fields = (surface.normals, surface.sigma_mm, surface.weight, levels)
             here = slice(*np.searchsorted(one.index, (some.start, some.stop)))
-            agreed = one.index[here] - start, one.at[here], one.shift_mm[here]
-            _add_surface(fields, *agreed, sums)
+            agreed = one.at[here], one.index[here] - start, one.shift_mm[here]
+            _add_surface(surface, levels, *agreed, sums)
             here = slice(*np.searchsorted(one.against_index, (some.start, some.stop)))
             weights = surface.weight[one.against_at[here]]
             sums.against[one.against_index[here] - start] += weights
@@ -181,27 +180,18 @@ def _start_sums(normals: Floats, sigma_mm: Floats, weights: Floats, grey: Floats
     )
 
 
-@compiled
 def _add_surface(
-    surface: tuple[Floats, Floats, Floats, Floats],
-    index: Numbers,
-    at: Numbers,
-    shifts: Floats,
-    sums: _Sums,
+    surface: SmoothSurface, grey: Floats, at: Numbers, here: Numbers, shift: Floats, sums: _Sums
 ) -> None:
-    """Add points `at` of a surface (normals, sigmas, weights, greys) to the sums at `index`."""
-    normals, sigma_mm, weights, levels = surface
-    for n in range(len(index)):
-        here, there = index[n], at[n]
-        weight, shift = float(weights[there]), shifts[n]
-        sums.weight[here] += weight
-        sums.shift[here] += weight * shift
-        sums.square[here] += weight * shift * shift
-        sums.grey[here] += weight * levels[there]
-        sums.variance[here] += (weight * sigma_mm[there]) ** 2
-        for k in range(3):
-            sums.normal[here, k] += weight * normals[there, k]
-        sums.pairs[here] += 1
+    """Add a surface's points `at` to the sums of the samples `here`, each of which comes once."""
+    weight = surface.weight[at].astype(np.float64)
+    sums.weight[here] += weight
+    sums.shift[here] += weight * shift
+    sums.square[here] += weight * shift * shift
+    sums.grey[here] += weight * grey[at]
+    sums.variance[here] += (weight * surface.sigma_mm[at]) ** 2
+    sums.normal[here] += weight[:, None] * surface.normals[at]
+    sums.pairs[here] += 1
 
 
 @compiled

@@ -14,8 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from bodyscan.arrays import Array, Bytes, Crop, Floats, Indices, Mask, crop_bounds, find_crop
-from bodyscan.compiled import compiled
+from bodyscan.arrays import Array, Bytes, Crop, Floats, Indices, Mask, find_crop
 from bodyscan.fusion.brightness import MIN_GREY
 from bodyscan.fusion.quadratic_fit import fit_full_windows, window_basis
 from bodyscan.fusion.smoothing import estimate_pixel_size, inverse_depths, window_reach
@@ -168,11 +167,11 @@ def _measure_texture(
     window_mm: float,
 ) -> _Texture:
     """Texture of dark cells and of the head; elsewhere it is not known."""
-    mask = (dark | head).reshape(cells.shape)
+    wanted = dark | head
 
     def measure(image: RangeImage) -> Roughness | None:
-        pose, inside = rig_from_camera[image.pair], np.zeros(image.sigma_mm.shape, np.bool_)
-        find_in_cells(image.points, image.sigma_mm, pose.matrix[:3], cells.origin, mask, inside)
+        pose, inside = rig_from_camera[image.pair], image.valid
+        inside[inside] = wanted[cells.find(pose.apply(image.points[inside].astype(np.float64)))]
         box = find_crop(inside)
         return None if box is None else measure_roughness(image, pose, box, window_mm)
 
@@ -184,61 +183,22 @@ def _measure_texture(
     return _summarize_by_cell(cells, found)
 
 
-@compiled
-def find_in_cells(
-    points: Floats,
-    sigma_mm: Floats,
-    rig_from_camera: Array,
-    origin: Array,
-    cells: Mask,
-    inside: Mask,
-) -> None:
-    """Write inside (H, W): which points (H, W, 3) with a sigma lie in the cells of a mask (a, b,
-    c).
-
-    origin: lowest corner of the cells, (3,) mm; points outside count for the nearest cell.
-    """
-    m, low = rig_from_camera, origin
-    for v in range(inside.shape[0]):
-        for u in range(inside.shape[1]):
-            if not np.isfinite(sigma_mm[v, u]):
-                continue
-            x, y, z = points[v, u, 0], points[v, u, 1], points[v, u, 2]
-            a = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3] - low[0]) / CELL_MM
-            b = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3] - low[1]) / CELL_MM
-            c = (m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3] - low[2]) / CELL_MM
-            i = min(max(int(np.floor(a)), 0), cells.shape[0] - 1)
-            j = min(max(int(np.floor(b)), 0), cells.shape[1] - 1)
-            k = min(max(int(np.floor(c)), 0), cells.shape[2] - 1)
-            inside[v, u] = cells[i, j, k]
-
-
 def _summarize_by_cell(cells: _Grid, found: Sequence[Roughness]) -> _Texture:
     """Texture of each cell with 50 pixels or more, by the medians of their residuals."""
     cell = np.concatenate([cells.find(one.points) for one in found])
     residual = np.concatenate([one.residual_mm for one in found])
     expected_mm = np.concatenate([one.expected_mm for one in found])
     known = np.bincount(cell, minlength=cells.count) >= 50
-    scatter_mm = SIGMAS_PER_MEDIAN * _group_medians(residual, cell, cells.count)
-    sigmas = SIGMAS_PER_MEDIAN * _group_medians(residual / expected_mm, cell, cells.count)
-    noise_mm = _group_medians(expected_mm, cell, cells.count)
+    medians, some = np.zeros((3, cells.count)), np.unique(cell)
+    for row, values in zip(medians, (residual, residual / expected_mm, expected_mm), strict=True):
+        row[some] = ndimage.median(values, cell, some)
+    scatter_mm, sigmas = SIGMAS_PER_MEDIAN * medians[:2]
+    noise_mm = medians[2]
     relief_mm = np.sqrt(np.maximum(scatter_mm**2 - noise_mm**2, 0.0))
     # Sigmas of dark cloth are right to a third; where several exposures show relief they include
     # it, so that only what is coarser than the stripes counts.
     rough = known & (sigmas > 3.0) & (scatter_mm > ROUGH_MM)
     return _Texture(known, rough, known & (scatter_mm < ROUGH_MM), relief_mm)
-
-
-def _group_medians(values: Floats, group: Indices, count: int) -> Array:
-    """Median of each group's values (N,), none of them negative; 0 for an empty group."""
-    # The bits of non-negative floats sort like the floats: one sort of plain integers.
-    bits = np.asarray(values, np.float32).view(np.uint32)
-    keys = np.sort((group.astype(np.uint64) << np.uint64(32)) | bits)
-    sizes = np.bincount(group, minlength=count)
-    middle = (np.cumsum(sizes) - sizes + sizes // 2)[sizes > 0]
-    found = np.zeros(count)
-    found[sizes > 0] = keys[middle].astype(np.uint32).view(np.float32)
-    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,14 +215,12 @@ def measure_roughness(
     image: RangeImage, rig_from_camera: RigidTransform, box: Crop, window_mm: float
 ) -> Roughness:
     """Compare the pixels in a box with quadratics in windows of about `window_mm`."""
-    sigma_mm, points = image.sigma_mm[box], image.points[box]
-    common = np.zeros_like(sigma_mm) if image.common_mm is None else image.common_mm[box]
-    whole = (slice(0, sigma_mm.shape[0]), slice(0, sigma_mm.shape[1]))
-    inverse, noise = inverse_depths(points, sigma_mm, common, crop_bounds(whole))
+    image = image.crop(box)
+    inverse, noise = inverse_depths(image)
     reach = window_reach(estimate_pixel_size(inverse, image.camera), window_mm)
     fit, full = fit_full_windows(inverse, noise, reach)
     residual = (inverse - fit.value)[full]
-    points = points[full]
+    points = image.points[full]
     # Along the ray a point moves by its length over z times dz, and dz is z squared times d(1/z).
     length = np.linalg.norm(points, axis=1) * points[:, 2]
     basis = window_basis(reach)

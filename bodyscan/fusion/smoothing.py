@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.arrays import Array, Bytes, Floats, Mask, crop_bounds, find_crop
+from bodyscan.arrays import Array, Bytes, Floats, Mask, find_crop
 from bodyscan.compiled import compiled
 from bodyscan.fusion.quadratic_fit import QuadraticFit, fit_quadratics
 from bodyscan.geometry.camera import Camera
@@ -59,13 +59,12 @@ def smooth(
     box = find_crop(image.valid)
     if box is None:
         return None
-    common = np.zeros((1, 1), np.float32) if image.common_mm is None else image.common_mm
-    common = np.broadcast_to(common, image.sigma_mm.shape)
-    inverse, noise = inverse_depths(image.points, image.sigma_mm, common, crop_bounds(box))
+    image = image.crop(box)
+    inverse, noise = inverse_depths(image)
     pixel_mm = estimate_pixel_size(inverse, image.camera)
     reach = window_reach(pixel_mm, window_mm)
     fit, fitted = fit_quadratics(inverse, noise, reach, pixel_mm, image.correlation_px)
-    return _build_surface(image, common, rig_from_camera, box, fit, fitted, reach)
+    return _build_surface(image, rig_from_camera, fit, fitted, reach)
 
 
 def estimate_pixel_size(inverse: Floats, camera: Camera) -> float:
@@ -81,9 +80,7 @@ def window_reach(pixel_mm: float, window_mm: float) -> int:
 
 def _build_surface(
     image: RangeImage,
-    common: Floats,
     rig_from_camera: RigidTransform,
-    box: tuple[slice, slice],
     fit: QuadraticFit,
     fitted: Mask,
     reach: int,
@@ -93,8 +90,7 @@ def _build_surface(
     points, normals = np.empty((size, 3), np.float32), np.empty((size, 3), np.float32)
     sigma = np.empty(size, np.float32)
     count = _compute_points(
-        (image.points, common),
-        crop_bounds(box),
+        (image.points, _common_sigmas(image)),
         (fit.value, fit.slope_u, fit.slope_v, fit.sigma),
         fitted,
         projection_table(image.camera),
@@ -110,14 +106,14 @@ def _build_surface(
         image.pair,
         image.camera,
         rig_from_camera,
-        (image.corner[1] + box[1].start, image.corner[0] + box[0].start),
+        image.corner[::-1],
         number,
         points[:count],
         normals[:count],
         sigma,
         rim,
         rim / (sigma * sigma),
-        image.colours[box][there],
+        image.colours[there],
         image.warped,
     )
 
@@ -132,35 +128,27 @@ def distance_to_rim(depth: Floats, jump: float) -> Floats:
     return cv2.distanceTransform(padded, cv2.DIST_L2, 3)[1:-1, 1:-1] + np.float32(1.0)
 
 
-@compiled
-def inverse_depths(
-    points: Floats, sigma_mm: Floats, common_mm: Floats, ends: tuple[int, int, int, int]
-) -> tuple[Floats, Floats]:
-    """Inverse depth 1/z and its sigma (h, w) within `ends`, without the part common to
-    neighbours; 0 where nothing was measured."""
-    top, bottom, left, right = ends
-    inverse = np.zeros((bottom - top, right - left), np.float32)
-    noise = np.zeros_like(inverse)
-    for row in range(top, bottom):
-        for column in range(left, right):
-            sigma = sigma_mm[row, column]
-            if np.isfinite(sigma):
-                x, y, z = points[row, column, 0], points[row, column, 1], points[row, column, 2]
-                # Along the ray a point moves by its length over z times dz.
-                # A hundredth of sigma is left at least: rounding.
-                variance = max(
-                    sigma**2 - common_mm[row, column] ** 2, (np.float32(0.01) * sigma) ** 2
-                )
-                share = np.sqrt(variance / (x * x + y * y + z * z))
-                inverse[row - top, column - left] = 1.0 / z
-                noise[row - top, column - left] = share / z
-    return inverse, noise
+def inverse_depths(image: RangeImage) -> tuple[Floats, Floats]:
+    """Inverse depth 1/z and its sigma (h, w), without the part common to neighbours; 0 where
+    nothing was measured."""
+    sigma_mm, valid = image.sigma_mm, image.valid
+    depth = np.where(valid, image.points[..., 2], np.float32(1.0))
+    # A hundredth of sigma is left at least: rounding.
+    smallest = np.float32(0.01) * sigma_mm
+    variance = np.maximum(sigma_mm**2 - _common_sigmas(image) ** 2, smallest**2)
+    # Along the ray a point moves by its length over z times dz.
+    length2 = np.einsum("hwc,hwc->hw", image.points, image.points)
+    noise = np.sqrt(np.where(valid, variance / length2, np.float32(0.0))) / depth
+    return np.where(valid, np.float32(1.0) / depth, np.float32(0.0)), noise
+
+
+def _common_sigmas(image: RangeImage) -> Floats:
+    return np.zeros_like(image.sigma_mm) if image.common_mm is None else image.common_mm
 
 
 @compiled
 def _compute_points(
     measured: tuple[Floats, Floats],
-    ends: tuple[int, int, int, int],
     fit: tuple[Floats, Floats, Floats, Floats],
     fitted: Mask,
     projection: Table,
@@ -170,7 +158,7 @@ def _compute_points(
 ) -> int:
     """Fill in depth and number (h, w), and points, normals and sigmas; return how many there are.
 
-    measured: points (height, width, 3), camera frame, and the shared part of their sigmas.
+    measured: points (h, w, 3), camera frame, and the shared part of their sigmas.
     fit: value, slopes and sigma of 1/z. rig_from_camera: rotation and translation.
     """
     value, slope_u, slope_v, fit_sigma = fit
@@ -183,9 +171,8 @@ def _compute_points(
         for column in range(fitted.shape[1]):
             if not fitted[row, column]:
                 continue
-            i, j, inverse = ends[0] + row, ends[2] + column, value[row, column]
-            x = measured_points[i, j, 0] / measured_points[i, j, 2]
-            y, z = measured_points[i, j, 1] / measured_points[i, j, 2], 1.0 / inverse
+            inverse, there = value[row, column], measured_points[row, column]
+            x, y, z = there[0] / there[2], there[1] / there[2], 1.0 / inverse
             a, b, c = _normal(x, y, inverse, slope_u[row, column], slope_v[row, column], projection)
             length = np.sqrt(x * x + y * y + 1.0)
             cosine = -(a * x + b * y + c) / length
@@ -197,7 +184,7 @@ def _compute_points(
                 points[n, k] = along * z + translation[k]
                 normals[n, k] = rotation[k, 0] * a + rotation[k, 1] * b + rotation[k, 2] * c
             # Along the ray a point moves by length * dz, along the normal by the cosine of that.
-            noise, common = fit_sigma[row, column] * z * z * length, common_mm[i, j]
+            noise, common = fit_sigma[row, column] * z * z * length, common_mm[row, column]
             sigma[n] = np.sqrt(noise * noise + common * common) * cosine
             n += 1
     return n
