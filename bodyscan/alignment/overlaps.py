@@ -151,10 +151,11 @@ def _joint_system(
     """The prior and all overlaps, as one system of all twists."""
     parts = []
     for (a, b), overlap in overlaps.items():
+        h = overlap.information
         # Linearized distance: d + J (x_a - m_a) - J (x_b - m_b).
-        offset = overlap.information @ (motion[a] - motion[b]) + overlap.vector
-        information = np.kron([[1.0, -1.0], [-1.0, 1.0]], overlap.information)
+        offset = h @ (motion[a] - motion[b]) + overlap.vector
+        information = np.block([[h, -h], [-h, h]])
         system = LinearGaussianSystem(information, np.hstack([offset, -offset]))
         parts.append((np.hstack([6 * a + np.arange(6), 6 * b + np.arange(6)]), system))
-    prior = LinearGaussianSystem.from_prior(np.linalg.inv(covariance))
+    prior = LinearGaussianSystem.from_prior(np.asarray(np.linalg.inv(covariance), np.float64))
     return prior + LinearGaussianSystem.assemble(parts, motion.size)

@@ -139,7 +139,7 @@ def inverse_depths(image: RangeImage) -> tuple[Floats, Floats]:
     # Along the ray a point moves by its length over z times dz.
     length2 = np.einsum("hwc,hwc->hw", image.points, image.points)
     noise = np.sqrt(np.where(valid, variance / length2, np.float32(0.0))) / depth
-    return np.where(valid, np.float32(1.0) / depth, np.float32(0.0)), noise
+    return np.where(valid, np.float32(1.0) / depth, np.float32(0.0)), np.asarray(noise, np.float32)
 
 
 def _common_sigmas(image: RangeImage) -> Floats:
