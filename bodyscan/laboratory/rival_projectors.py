@@ -11,8 +11,9 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.optimize import least_squares
+from scipy.sparse import csr_array, diags_array, hstack
 
-from bodyscan.arrays import Array, Indices
+from bodyscan.arrays import Array
 from bodyscan.calibration.boundary_points import BoundaryPoints
 from bodyscan.calibration.sheet_fit import fit_pinhole
 from bodyscan.geometry.light_planes import Axis, LightPlanes
@@ -33,52 +34,33 @@ def fit_baseline(
     # one pixel moves x; points that disagree lose their weight (Cauchy).
     x, y, z = _axes(data.points, direction)
     across = np.abs(_axes(data.per_pixel, direction)[0])
-    one = np.ones_like(z)
-    per_stripe = np.stack([z, -one] if variable else [z], axis=1)
-    shared = [] if variable else [-one]
-    shared += [y] if fit_tilt else []
-    common = np.stack(shared, axis=1) if shared else np.zeros((len(x), 0))
+    count, one = stripes + 1, np.ones_like(z)
+    rows = np.arange(len(x))
+    columns = [csr_array((z, (rows, data.index)), shape=(len(x), count))]
+    shared = data.index if variable else np.zeros_like(data.index)
+    columns += [csr_array((-one, (rows, shared)), shape=(len(x), count if variable else 1))]
+    columns += [csr_array(y[:, None])] if fit_tilt else []
+    design = hstack(columns).tocsr()
     sigma = np.maximum(across, 1e-6) * data.sigma_px
-    robust = np.ones(len(x))
+    robust = one
     for _ in range(4):
         weights = robust / sigma**2
-        each, all_ = _solve(per_stripe, common, x, weights, data.index, stripes + 1)
-        residuals = x - np.sum(per_stripe * each[data.index], axis=1) - common @ all_
-        scaled = residuals / sigma
+        normal = (design.T @ (diags_array(weights) @ design)).toarray()
+        # Of least norm: 0 for stripes that no board shows.
+        right = np.asarray(design.T @ (weights * x))
+        solved = np.linalg.lstsq(normal, right, rcond=None)[0]
+        scaled = (x - design @ solved) / sigma
         robust = cauchy_weights(scaled, 1, 3.0 * robust_scale(scaled))
-    observed = np.bincount(data.index, minlength=stripes + 1) >= 12
-    baseline = each[:, 1] if variable else np.full(stripes + 1, all_[0])
-    tilt = all_[-1] if fit_tilt else 0.0
-    return _planes(np.where(observed, each[:, 0], np.nan), baseline, float(tilt), direction)
+    observed = np.bincount(data.index, minlength=count) >= 12
+    baseline = solved[count : 2 * count] if variable else np.full(count, solved[count])
+    tilt = float(solved[-1]) if fit_tilt else 0.0
+    return _planes(np.where(observed, solved[:count], np.nan), baseline, tilt, direction)
 
 
 def _axes(vectors: Array, direction: Axis) -> tuple[Array, Array, Array]:
     """Split vectors into coordinates across the stripes, along them, and forward."""
     x, y, z = vectors.T
     return (y, x, z) if direction == "horizontal" else (x, y, z)
-
-
-def _solve(
-    per_stripe: Array, common: Array, right: Array, weights: Array, group: Indices, groups: int
-) -> tuple[Array, Array]:
-    """Least squares with K unknowns for each group and M common ones: (groups, K), (M,).
-
-    The groups' per_stripe unknowns are eliminated first (Schur complement), so that no large system is
-    solved.
-    """
-    k = per_stripe.shape[1]
-    whole = np.column_stack([per_stripe, common, right])
-    size = whole.shape[1]
-    gram = np.empty((groups, size, size))
-    for i in range(size):
-        for j in range(i, size):
-            products = np.bincount(group, weights * whole[:, i] * whole[:, j], groups)
-            gram[:, i, j] = gram[:, j, i] = products
-    taken_out = np.linalg.pinv(gram[:, :k, :k], hermitian=True) @ gram[:, :k, k:]
-    rest = (gram[:, k:, k:] - gram[:, k:, :k] @ taken_out).sum(axis=0)
-    shared = np.linalg.solve(rest[:-1, :-1], rest[:-1, -1]) if size > k + 1 else np.zeros(0)
-    each = taken_out[..., -1] - taken_out[..., :-1] @ shared
-    return each, shared
 
 
 def _planes(slope: Array, baseline: Array, tilt: float, direction: Axis) -> LightPlanes:

@@ -109,13 +109,15 @@ def make_board(board: Board, making: BoardMaking, rng: np.random.Generator) -> M
     sheet = _draw_sheet(making, rng)
     for face in range(board.faces):
         error = _print_error(board, making, rng)
-        positions = _mesh_positions(board, flat=sheet.flat and making.print_error_mm == 0)
+        positions = _mesh_positions(board, flat=not sheet.any() and making.print_error_mm == 0)
         vertices = _on_sheet(positions.reshape(-1, 2), board, face, error, sheet)
         triangles = grid_triangles(positions.shape[1] - 1, positions.shape[0] - 1)
         printed = make_print(board, face, making)
         on_print = positions.reshape(-1, 2)
         surfaces.append(
-            Surface(vertices, triangles, printed=printed, print_xy=on_print, open_to_light=True)
+            Surface(
+                vertices, triangles, printed=printed.albedo, print_xy=on_print, open_to_light=True
+            )
         )
         c, r = np.meshgrid(np.arange(1, board.columns), np.arange(1, board.rows))
         inner = np.stack([c.ravel(), r.ravel()], axis=1).astype(float) * board.square_mm
@@ -138,39 +140,28 @@ def _mesh_positions(board: Board, flat: bool) -> Array:
     return np.stack(np.meshgrid(line(board.columns), line(board.rows)), axis=-1)
 
 
-@dataclass(frozen=True)
-class _Sheet:
-    """Deviation from a plane, mm, of the sheet to which a print is glued: a bowl, a bend along each
-    side, and a twist."""
-
-    bowl: float
-    across: float = 0.0
-    down: float = 0.0
-    twist: float = 0.0
-
-    @property
-    def flat(self) -> bool:
-        return not any((self.bowl, self.across, self.down, self.twist))
-
-    def height(self, across: Array, down: Array) -> Array:
-        """Compute the height towards the front, at positions from -1/2 to 1/2 along each side."""
-        bowl = self.bowl * (1.0 - 2.0 * (across**2 + down**2))
-        return bowl + self.across * across**2 + self.down * down**2 + self.twist * across * down
-
-
-def _draw_sheet(making: BoardMaking, rng: np.random.Generator) -> _Sheet:
-    """Draw the shape of the sheet, its range of height log-uniform in `warp_mm`."""
+def _draw_sheet(making: BoardMaking, rng: np.random.Generator) -> Array:
+    """Draw the shape (4,), mm, of the sheet to which a print is glued: a bowl, a bend along each
+    side, and a twist; the range of height of the last three log-uniform in `warp_mm`."""
+    sheet = np.array([making.bow_mm, 0.0, 0.0, 0.0])
     low, high = making.warp_mm
-    if high <= 0:
-        return _Sheet(making.bow_mm)
-    size = float(np.exp(rng.uniform(*np.log([max(low, 1e-3), high]))))
-    shape = _Sheet(0.0, *(float(value) for value in rng.standard_normal(3)))
-    heights = shape.height(*np.meshgrid(np.linspace(-0.5, 0.5, 21), np.linspace(-0.5, 0.5, 21)))
-    grown = size / float(np.ptp(heights))
-    return _Sheet(making.bow_mm, grown * shape.across, grown * shape.down, grown * shape.twist)
+    if high > 0:
+        size = float(np.exp(rng.uniform(*np.log([max(low, 1e-3), high]))))
+        shape = np.append(0.0, rng.standard_normal(3))
+        heights = _height(
+            shape, *np.meshgrid(np.linspace(-0.5, 0.5, 21), np.linspace(-0.5, 0.5, 21))
+        )
+        sheet += size / float(np.ptp(heights)) * shape
+    return sheet
 
 
-def _on_sheet(positions: Array, board: Board, face: int, error: Array, sheet: _Sheet) -> Array:
+def _height(sheet: Array, across: Array, down: Array) -> Array:
+    """Compute the height towards the front, at positions from -1/2 to 1/2 along each side."""
+    bowl = sheet[0] * (1.0 - 2.0 * (across**2 + down**2))
+    return bowl + sheet[1] * across**2 + sheet[2] * down**2 + sheet[3] * across * down
+
+
+def _on_sheet(positions: Array, board: Board, face: int, error: Array, sheet: Array) -> Array:
     """Map positions on the print (N, 2) to the board frame (N, 3): print error, flip, bow."""
     square = board.square_mm
     grid = np.clip(positions / square, 0.0, [board.columns, board.rows])[:, ::-1].T
@@ -179,7 +170,7 @@ def _on_sheet(positions: Array, board: Board, face: int, error: Array, sheet: _S
     if face == 1:
         x = board.columns * square - x
     across, down = x / (board.columns * square) - 0.5, y / (board.rows * square) - 0.5
-    height = sheet.height(across, down)
+    height = _height(sheet, across, down)
     return np.stack([x, y, face * board.thickness_mm - height], axis=1)
 
 

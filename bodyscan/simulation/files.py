@@ -25,7 +25,7 @@ from bodyscan.rig.frame_names import CaptureFolder
 from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig import Rig
 from bodyscan.simulation.board import MadeBoard
-from bodyscan.simulation.layout import AnyProjector, TruePair
+from bodyscan.simulation.layout import TruePair
 from bodyscan.simulation.lens import TrueCamera
 from bodyscan.simulation.living import LivingBody, describe_motion
 from bodyscan.simulation.plan import BoardShot
@@ -198,7 +198,10 @@ def _pair(pair: TruePair, sway: RigidTransform | None) -> dict[str, Any]:
     document: dict[str, Any] = {
         "camera": describe_camera(pair.camera),
         "rig_from_camera": pair.rig_from_camera.matrix,
-        "projector": _projector(pair.projector),
+        "projector": {
+            "kind": "mirror" if isinstance(pair.projector, MirrorProjector) else "pinhole",
+            **{f.name: getattr(pair.projector, f.name) for f in fields(pair.projector)},
+        },
     }
     if isinstance(pair.projector, MirrorProjector):
         planes = pair.projector.plane(np.arange(pair.projector.stripes + 1.0))
@@ -214,9 +217,3 @@ def describe_camera(camera: TrueCamera) -> dict[str, Any]:
     if any(values[name] for name in more):
         return {"lens": "brown"} | values
     return {name: value for name, value in values.items() if name not in more}
-
-
-def _projector(projector: AnyProjector) -> dict[str, Any]:
-    kind = "mirror" if isinstance(projector, MirrorProjector) else "pinhole"
-    values = {f.name: getattr(projector, f.name) for f in fields(projector)}
-    return {"kind": kind} | values

@@ -13,11 +13,9 @@ from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.rig.pair import NominalPose, Pair
 from bodyscan.rig.rig import Rig
 from bodyscan.simulation.lens import TrueCamera
-from bodyscan.simulation.projector import MirrorProjector, PinholeProjector
+from bodyscan.simulation.projector import MirrorProjector, PinholeProjector, Projector
 from bodyscan.simulation.scene import Surface, grid_surface
 from bodyscan.simulation.settings import Optics, Projection, Room, SimulationSettings
-
-AnyProjector = MirrorProjector | PinholeProjector
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +29,7 @@ class TruePair:
     name: str
     camera: TrueCamera
     rig_from_camera: RigidTransform
-    projector: AnyProjector
+    projector: Projector
     reach_mm: float
     has_stripes: bool
 

@@ -217,16 +217,11 @@ def _breath_modes(vertices: Array, trunk: Array, height: float) -> Array:
 
 def describe_motion(body: LivingBody, moment_ms: float) -> dict[str, Any]:
     """Describe for truth.json the moment of the truth's surface and the motion's parameters."""
-
-    def signal_fields(one: RandomSignal) -> dict[str, Any]:
-        return {"hz": one.hz, "sizes": one.sizes, "phases": one.phases}
-
     return {
         "moment_ms": moment_ms,
         "breath": asdict(body.breath),
         "joints": [
-            {"pivot": joint.pivot, **signal_fields(joint.turn)}
-            for joint in (*body.limbs, body.ankles)
+            {"pivot": joint.pivot, **asdict(joint.turn)} for joint in (*body.limbs, body.ankles)
         ],
     }
 
@@ -248,17 +243,13 @@ def load_body(motion: dict[str, Any], path: Path) -> LivingBody:
     """Load a simulated body from `motion` in truth.json and truth/body.npz, for any time."""
     with np.load(path) as stored:
         kept = {name: stored[name] for name in stored.files}
-    joints = [
-        Joint(weights.astype(float), np.array(one["pivot"]), _signal_from_fields(one))
-        for one, weights in zip(motion["joints"], kept["weights"], strict=True)
-    ]
+    joints = []
+    for one, weights in zip(motion["joints"], kept["weights"], strict=True):
+        turn = RandomSignal(*(np.array(one[name], float) for name in ("hz", "sizes", "phases")))
+        joints.append(Joint(weights.astype(float), np.array(one["pivot"]), turn))
     breath = Breath(**{**motion["breath"], "phases": tuple(motion["breath"]["phases"])})
     rest = Surface(kept["vertices"], kept["triangles"].astype(np.int64))
     return LivingBody(rest, tuple(joints[:-1]), kept["swells"].astype(float), breath, joints[-1])
-
-
-def _signal_from_fields(fields: dict[str, Any]) -> RandomSignal:
-    return RandomSignal(*(np.array(fields[name], float) for name in ("hz", "sizes", "phases")))
 
 
 def load_moving_body(truth: Path) -> LivingBody | None:

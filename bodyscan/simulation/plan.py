@@ -64,8 +64,14 @@ def plan_boards(
     names = (name for i in range(10_000) if (name := f"b{i + 1:02d}") not in taken)
     poses = _candidates(board, list(pairs.values()), rng)
     sights = {name: look(pair, poses, board) for name, pair in pairs.items()}
-    for pose in _choose_poses(*_merits(sights, pairs, board), shots):
-        stripes, lit = _pairs_of_shot(board, sights, pairs, pose)
+    striped = {
+        name: _mask_visible(board, sight, True) & pairs[name].has_stripes
+        for name, sight in sights.items()
+    }
+    visible = {name: _mask_visible(board, sight, False) for name, sight in sights.items()}
+    for pose in _choose_poses(*_merits(sights, striped, visible), shots):
+        stripes = tuple(name for name in pairs if striped[name][pose])
+        lit = tuple(name for name in pairs if visible[name][pose] and name not in stripes)
         plan.append(BoardShot(next(names), board.name, poses[pose], stripes, lit))
     return plan
 
@@ -126,22 +132,6 @@ def _mask_visible(board: Board, sight: Sight, stripes: bool) -> Mask:
     max_angle_deg = 50.0 if stripes else 70.0
     printed = ~sight.back if board.faces == 1 else np.ones_like(sight.back)
     return (sight.inside >= share) & (sight.angle_deg <= max_angle_deg) & printed
-
-
-def _pairs_of_shot(
-    board: Board, sights: Mapping[str, Sight], pairs: Mapping[str, TruePair], pose: int
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    stripes = tuple(
-        name
-        for name, sight in sights.items()
-        if _mask_visible(board, sight, True)[pose] and pairs[name].has_stripes
-    )
-    lit = tuple(
-        name
-        for name, sight in sights.items()
-        if _mask_visible(board, sight, False)[pose] and name not in stripes
-    )
-    return stripes, lit
 
 
 def _floor_shot(rig: Rig, pairs: Mapping[str, TruePair]) -> BoardShot:
@@ -235,23 +225,23 @@ def _choose_poses(offered: Mask, worth: Array, needed: Array, shots: int) -> lis
 
 
 def _merits(
-    sights: Mapping[str, Sight], pairs: Mapping[str, TruePair], board: Board
+    sights: Mapping[str, Sight], striped: Mapping[str, Mask], visible: Mapping[str, Mask]
 ) -> tuple[Mask, Array, Array]:
     """Every cell of every image three times, near and far; tilts to all sides; six boards per pair;
-    two pairs on one face of a board, or on both, three times."""
+    two pairs on one face of a board, or on both, three times.
+
+    striped, visible: (poses,) in which each pair takes stripes, or at least the lit image.
+    """
     parts: list[tuple[Mask, float, float]] = []
-    striped = {n: _mask_visible(board, s, True) & pairs[n].has_stripes for n, s in sights.items()}
-    lit_visible = {name: _mask_visible(board, sight, False) for name, sight in sights.items()}
     for name, sight in sights.items():
         split = sight.cells & striped[name][:, None]
         near, far = np.split(split, 2, axis=1)
-        leans = (sight.lean[:, None] == np.arange(8)) & (
-            lit_visible[name] & (sight.angle_deg > 15)
-        )[:, None]
+        tilted = visible[name] & (sight.angle_deg > 15)
+        leans = (sight.lean[:, None] == np.arange(8)) & tilted[:, None]
         parts += [(near | far, 3.0, 3.0), (split, 0.7, 1.0), (leans, 3.0, 1.0)]
         parts += [(striped[name][:, None], 5.0, 6.0)]
     for first, second in combinations(sights, 2):
-        both = lit_visible[first] & lit_visible[second]
+        both = visible[first] & visible[second]
         same = sights[first].back == sights[second].back
         parts += [((both & same)[:, None], 3.0, 3.0), ((both & ~same)[:, None], 2.0, 3.0)]
     sizes = [part.shape[1] for part, _, _ in parts]

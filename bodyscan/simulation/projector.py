@@ -1,13 +1,13 @@
 """Projectors as they are built: a laser sheet on a rotating mirror, or a lens.
 
 Written for the simulator alone: calibration never sees these models, only their light. All vectors
-are in the frame of the pair's camera, mm.
+are in the frame of the pair's camera, mm. Points (..., 3) keep their float type.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,19 +15,6 @@ from numpy.typing import NDArray
 from bodyscan.arrays import Array
 
 Reals = NDArray[Any]
-
-
-class Projector(Protocol):
-    """What the renderer needs from a projector. Points (..., 3) keep their float type."""
-
-    @property
-    def stripes(self) -> int: ...
-
-    def stripe(self, points: Reals) -> Reals:
-        """Stripe coordinate s (...) of the light that reaches points; NaN where none does."""
-
-    def source(self, s: Reals) -> Reals:
-        """The point (..., 3) from which the light of stripe coordinate s seems to come."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +67,7 @@ class MirrorProjector:
         return theta
 
     def stripe(self, points: Reals) -> Reals:
+        """Compute s (...) of the light that reaches points; NaN where none does."""
         theta = self.angle(points)
         s = (theta - self.first_angle) * (self.stripes / self.sweep_angle)
         fan_tangent = self.fan_tangent(points, theta) / self.fan
@@ -110,6 +98,7 @@ class MirrorProjector:
         return np.divide(mirrored(edge), forward, out=np.full_like(forward, np.inf), where=lit)
 
     def source(self, s: Reals) -> Reals:
+        """Compute the point (..., 3) from which the light of s seems to come."""
         theta = self.first_angle + s * (self.sweep_angle / self.stripes)
         cos, sin = np.cos(theta), np.sin(theta)
         zero, side = self._normals
@@ -172,6 +161,9 @@ class PinholeProjector:
 
     def source(self, s: Reals) -> Reals:
         return np.broadcast_to(self.centre.astype(s.dtype), (*s.shape, 3))
+
+
+Projector = MirrorProjector | PinholeProjector
 
 
 def _project(points: Reals, vector: Array, origin: Array) -> Reals:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -244,38 +243,19 @@ def _tables(
     frames: FrameNames,
     sequence: bool,
 ) -> dict[str, Floats]:
-    """Tabulate the light of each frame that the laser lights."""
-    if projection.jitter_stripes <= 0:
-        steady = _steady_tables(code, frames, projection)
-        return dict(steady if sequence else steady[:1])
-    lights = _lights(code, frames, projection.gamma)
-    lights = lights if sequence else lights[:1]
-    strays = projection.jitter_stripes * rng.standard_normal((len(lights), code.stripes + 1))
+    """Tabulate the light of each frame that the laser lights: lit, and the code's images."""
+    lights = {frames.lit or "lit": np.ones(code.stripes)}
+    if sequence:
+        lights |= make_patterns(code, frames)
+    strays: Array | list[None] = [None] * len(lights)
+    if projection.jitter_stripes > 0:
+        drawn = rng.standard_normal((len(lights), code.stripes + 1))
+        strays = projection.jitter_stripes * drawn
     blurs = _blurs(projection)
     return {
-        name: make_light_table(light, blurs, stray, len(light) // code.stripes)
-        for (name, light), stray in zip(lights, strays, strict=True)
+        name: make_light_table(light**projection.gamma, blurs, stray, len(light) // code.stripes)
+        for (name, light), stray in zip(lights.items(), strays, strict=True)
     }
-
-
-@lru_cache(maxsize=8)
-def _steady_tables(
-    code: StripeCode, frames: FrameNames, projection: Projection
-) -> tuple[tuple[str, Floats], ...]:
-    """Tabulate lit and the code's images without jitter."""
-    blurs = _blurs(projection)
-    return tuple(
-        (name, make_light_table(light, blurs, parts=len(light) // code.stripes))
-        for name, light in _lights(code, frames, projection.gamma)
-    )
-
-
-def _lights(code: StripeCode, frames: FrameNames, gamma: float) -> list[tuple[str, Array]]:
-    """List name and light along the sweep of lit and the code's images."""
-    coded = make_patterns(code, frames)
-    if gamma != 1.0:
-        coded = {name: light**gamma for name, light in coded.items()}
-    return [(frames.lit or "lit", np.ones(code.stripes)), *coded.items()]
 
 
 def _blurs(projection: Projection) -> Array:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import open3d as o3d
@@ -16,11 +16,8 @@ from bodyscan.geometry.transforms import RigidTransform
 Tensor = o3d.core.Tensor
 
 
-class Print(Protocol):
-    """Something printed on a surface."""
-
-    def albedo(self, positions: Floats) -> Floats:
-        """Albedo (N,) at positions (N, 2) on the print."""
+Print = Callable[[Floats], Floats]
+"""Something printed on a surface: albedo (N,) at positions (N, 2) on it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +116,7 @@ class Scene:
         for number, one in enumerate(self.surfaces):
             if one.printed is not None:
                 on = surface == number
-                albedo[on] = one.printed.albedo(np.stack([across[on], down[on]], axis=1))
+                albedo[on] = one.printed(np.stack([across[on], down[on]], axis=1))
 
     def is_shadowed(self, points: Floats, towards: Floats, surface: NDArray[np.uint32]) -> Mask:
         """Test whether something is between points (N, 3) on surfaces and the source of their light.

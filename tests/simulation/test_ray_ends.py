@@ -31,7 +31,7 @@ def furnished() -> Scene:
     sheet = Surface(
         slanting.vertices,
         slanting.triangles,
-        printed=make_print(board, 0, BoardMaking()),
+        printed=make_print(board, 0, BoardMaking()).albedo,
         print_xy=places,
     )
     return Scene([wall(1500.0), ball, sheet])
