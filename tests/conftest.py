@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING
 import pytest
 from hypothesis import settings
 from made_once import value_made_once
-from processor_seconds import ProcessorSeconds
 from required import IN_CI, missing
 from slow_files import SLOW
 
@@ -38,17 +37,6 @@ settings.register_profile("quick", settings.get_profile("bodyscan"), max_example
 settings.load_profile("bodyscan")
 
 PROJECT = Path(__file__).parents[1]
-
-
-def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption(
-        "--processor-seconds", action="store_true", help="say at the end what tests cost"
-    )
-
-
-def pytest_configure(config: pytest.Config) -> None:
-    if config.getoption("processor_seconds"):
-        config.pluginmanager.register(ProcessorSeconds())
 
 
 @pytest.hookimpl(wrapper=True)

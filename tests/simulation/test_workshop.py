@@ -9,20 +9,13 @@ import pytest
 from small_view import CAMERA, CRISP, LAMPS, projector, view, wall
 
 from bodyscan.errors import BadInput
-from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lenses.opencv import Brown
 from bodyscan.rig.board import Board
 from bodyscan.simulation import SimulationSettings, settings_for
 from bodyscan.simulation.board import make_board
-from bodyscan.simulation.lens import TrueCamera
 from bodyscan.simulation.render import render_pair
 from bodyscan.simulation.scene import Scene
 from bodyscan.simulation.sensor import Brightness, draw_flicker, expose, fixed_pattern
 from bodyscan.simulation.settings import BoardMaking, Lighting, Noise, Pace
-
-DECENTRED = TrueCamera(
-    1510.0, 1512.0, -0.5, 645.0, 508.0, -0.1, 0.05, 1280, 1024, 4e-4, -3e-4, 0.01
-)
 
 
 def test_a_workshop_is_not_ideal_and_every_number_stays_free() -> None:
@@ -36,26 +29,6 @@ def test_a_workshop_is_not_ideal_and_every_number_stays_free() -> None:
     assert changed.projection.gamma == 2.2
     with pytest.raises(BadInput, match="no preset 'garage' to simulate"):
         settings_for("mirror", preset="garage")
-
-
-def test_a_lens_off_centre_is_browns() -> None:
-    """Two independent writings of one formula, and its inverse."""
-    rng = np.random.default_rng(0)
-    points = np.append(rng.uniform([-0.4, -0.32], [0.4, 0.32], (200, 2)), np.ones((200, 1)), 1)
-    lens = Brown(-0.1, 0.05, 4e-4, -3e-4, 0.01)
-    camera = Camera(1510.0, 1512.0, -0.5, 645.0, 508.0, lens, 1280, 1024)
-    pixels = DECENTRED.image(points)
-    np.testing.assert_allclose(pixels, camera.project(points), atol=1e-9)
-    np.testing.assert_allclose(DECENTRED.directions(pixels), points, atol=1e-12)
-    straight = replace(DECENTRED, p1=0.0, p2=0.0, k3=0.0)
-    np.testing.assert_allclose(DECENTRED.image(points), straight.image(points), atol=3.0)
-    assert np.abs(DECENTRED.image(points) - straight.image(points)).max() > 0.3
-
-
-def test_a_lens_off_centre_that_folds_is_refused() -> None:
-    folding = replace(DECENTRED, k1=-3.0, k2=0.0)
-    with pytest.raises(ValueError, match="folds"):
-        folding.directions(folding.grid())
 
 
 def test_boards_are_bent_and_twisted_by_what_is_asked() -> None:
