@@ -33,71 +33,24 @@ class Link:
     sigma_mm: float
 
 
-@dataclass(frozen=True)
-class ShotSuggestion:
-    """How far `shots` more of the board near where it was in a shot reduce the sigma of `pair`.
-
-    target: that shot and board.
-    visible_to: pairs that saw it there.
-    before_mm, after_mm: the sigma without and with them.
-    """
-
-    pair: str
-    shots: int
-    target: Target
-    visible_to: tuple[str, ...]
-    before_mm: float
-    after_mm: float
-
-
-@dataclass(frozen=True)
-class Advice:
-    """What ties a rig together, and what would improve it.
-
-    weak: links far less known than usual, where no other link ties their sides better.
-    crucial: shots (with board) without which the rig is disconnected.
-    worst, worst_sigma_mm: the pair least known in the rig frame, and its sigma over all axes.
-    more: the most useful further shots; None if no two pairs share a shot.
-    """
-
-    weak: tuple[Link, ...]
-    crucial: tuple[Target, ...]
-    worst: str
-    worst_sigma_mm: float
-    more: ShotSuggestion | None
-
-    @property
-    def lines(self) -> list[str]:
-        """The advice, for the builder of the rig."""
-        lines = []
-        if self.crucial:
-            names = ", ".join(f"{shot} ({board})" for shot, board in self.crucial)
-            lines.append(f"without any one of these shots the rig is disconnected: {names}")
-        lines += [
-            f"weak link: sigma of {link.second} relative to {link.first} is {link.sigma_mm:.3f} mm "
-            f"({_shots(link.shots)} in common), and no other link between their parts is better"
-            for link in self.weak
-        ]
-        lines.append(
-            f"{self.worst} has the largest sigma in the rig frame: {self.worst_sigma_mm:.3f} mm"
-        )
-        return lines + ([_sentence(self.more)] if self.more else [])
-
-
-def advise(rig: Rig, solution: RigSolution) -> Advice:
-    """Weak spots and the most useful further shots of a solved rig."""
+def advise(rig: Rig, solution: RigSolution) -> list[str]:
+    """What ties a rig together, where it is weak, and the most useful further shots, in words."""
+    lines = []
+    if shots := find_articulation_shots(solution):
+        names = ", ".join(f"{shot} ({board})" for shot, board in shots)
+        lines.append(f"without any one of these shots the rig is disconnected: {names}")
     chain = minimum_spanning_links(find_links(solution))
     median = float(np.median([link.sigma_mm for link in chain])) if chain else 0.0
+    lines += [
+        f"weak link: sigma of {link.second} relative to {link.first} is {link.sigma_mm:.3f} mm "
+        f"({_count_shots(link.shots)} in common), and no other link between their parts is better"
+        for link in chain
+        if link.sigma_mm > 2.0 * median
+    ]
     sigmas = {name: _sigma(solution, name) for name in solution.rig_from_camera}
     worst = max(sorted(sigmas), key=lambda name: sigmas[name])
-    # A link is weak at twice the median sigma of the chain.
-    return Advice(
-        tuple(link for link in chain if link.sigma_mm > 2.0 * median),
-        find_articulation_shots(solution),
-        worst,
-        sigmas[worst],
-        suggest_shots(rig, solution, worst),
-    )
+    lines.append(f"{worst} has the largest sigma in the rig frame: {sigmas[worst]:.3f} mm")
+    return lines + suggest_shots(rig, solution, worst)
 
 
 def _sigma(solution: RigSolution, name: str) -> float:
@@ -133,10 +86,10 @@ def find_articulation_shots(solution: RigSolution) -> tuple[Target, ...]:
     return tuple(sorted(what for kind, what in nx.articulation_points(graph) if kind == "shot"))
 
 
-def suggest_shots(rig: Rig, solution: RigSolution, pair: str) -> ShotSuggestion | None:
-    """Find the shot that, repeated, reduces the sigma of `pair`'s position most.
+def suggest_shots(rig: Rig, solution: RigSolution, pair: str) -> list[str]:
+    """Find the shot that, repeated, reduces the sigma of `pair`'s position most; a line that says so.
 
-    As many repetitions as halve it, or MAX_SHOTS. None if no two pairs share a shot.
+    As many repetitions as halve it, or MAX_SHOTS. No line if no two pairs share a shot.
     """
     equations = normal_equations(
         solution.views,
@@ -145,16 +98,15 @@ def suggest_shots(rig: Rig, solution: RigSolution, pair: str) -> ShotSuggestion 
         solution.rig_from_board,
         fixed_pair=rig.frame_pair.name if rig.frame_pair else None,
         fixed_target=frame_target(rig),
-        cameras_free=True,
     )
     visible_to = {
-        target: tuple(sorted({view.pair for view in views}))
+        target: sorted({view.pair for view in views})
         for target, views in by_target(solution.views).items()
     }
     # A board that holds the frame is no unknown: its part is not that of another shot there.
     candidates = [t for t, pairs in visible_to.items() if len(pairs) > 1 and t != frame_target(rig)]
     if not candidates:
-        return None
+        return []
     system, first = equations.system, 6 * equations.names.index(pair)
     jacobian = np.zeros((3, equations.prior.size))
     position = solution.rig_from_camera[pair].translation
@@ -171,27 +123,20 @@ def suggest_shots(rig: Rig, solution: RigSolution, pair: str) -> ShotSuggestion 
     after = [variance(best, shots) for shots in range(1, MAX_SHOTS + 1)]
     shots = next((k for k, one in enumerate(after, start=1) if one <= before / 4.0), MAX_SHOTS)
     # The sigma as boards have shown it; the gain as if corners erred independently.
-    sigma = _sigma(solution, pair)
-    gained = float(np.sqrt(after[shots - 1] / before))
-    return ShotSuggestion(pair, shots, best, visible_to[best], sigma, gained * sigma)
+    gain = float(np.sqrt(after[shots - 1] / before))
+    (shot, board), sigma = best, _sigma(solution, pair)
+    effect = f"{sigma:.3f} to {gain * sigma:.3f} mm"
+    if gain > 0.8:  # not worth taking
+        return [
+            f"further shots of these boards would improve {pair} little: of all shots, {shots} more "
+            f"like {shot} help most, from {effect}"
+        ]
+    return [
+        f"{shots} more {'shot' if shots == 1 else 'shots'} like {shot} (board {board} about there, "
+        f"tilted differently each time, seen by {', '.join(visible_to[best])}) would "
+        f"{'halve' if gain <= 0.5 else 'improve'} the sigma of {pair}: {effect}"
+    ]
 
 
-def _shots(count: int) -> str:
+def _count_shots(count: int) -> str:
     return "1 shot" if count == 1 else f"{count} shots"
-
-
-def _sentence(more: ShotSuggestion) -> str:
-    shot, board = more.target
-    effect = f"{more.before_mm:.3f} to {more.after_mm:.3f} mm"
-    # Not worth taking: they leave more than 80 % of the sigma.
-    if more.after_mm > 0.8 * more.before_mm:
-        return (
-            f"further shots of these boards would improve {more.pair} little: of all shots, "
-            f"{more.shots} more like {shot} help most, from {effect}"
-        )
-    halves = more.after_mm <= 0.5 * more.before_mm
-    return (
-        f"{more.shots} more {'shot' if more.shots == 1 else 'shots'} like {shot} (board {board} about "
-        f"there, tilted differently each time, seen by {', '.join(more.visible_to)}) would "
-        f"{'halve' if halves else 'improve'} the sigma of {more.pair}: {effect}"
-    )

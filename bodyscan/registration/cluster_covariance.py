@@ -32,7 +32,7 @@ class NormalEquations:
     The unknowns are motions of the pairs `names` (6 each), the parameters of each pair's camera,
     then the corners of boards whose shape was estimated (3 each, board frame, mm).
 
-    cameras: indices of each camera's parameters; empty if cameras are fixed.
+    cameras: indices of each camera's parameters.
     free: indices of the unknowns that the definition of the rig frame does not fix.
     prior: the priors on cameras and corners, px2 per unit of either unknown.
     parts: by target, indices (C,) of the unknowns that its views involve, and the system of these:
@@ -66,7 +66,6 @@ def normal_equations(
     *,
     fixed_pair: str | None,
     fixed_target: Target | None,
-    cameras_free: bool,
     shapes: Mapping[str, BoardShape] | None = None,
 ) -> NormalEquations:
     """Build the joint solve's normal equations, with Cauchy weights and each view's noise.
@@ -76,7 +75,7 @@ def normal_equations(
     """
     names, shapes = sorted(rig_from_camera), shapes or {}
     sizes = [6] * len(names)
-    sizes += [len(cameras[name].parameters) if cameras_free else 0 for name in names]
+    sizes += [len(cameras[name].parameters) for name in names]
     sizes += [3 * len(shape.points) for shape in shapes.values()]
     size, columns = sum(sizes), np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
     of_motion, of_camera, of_shape = (
@@ -84,7 +83,7 @@ def normal_equations(
         for keys, first in ((names, 0), (names, len(names)), (shapes, 2 * len(names)))
     )
     poses = cameras, rig_from_camera, rig_from_board
-    errors = [reprojection_errors([view], *poses, cameras_free=cameras_free) for view in views]
+    errors = [reprojection_errors([view], *poses, cameras_free=True) for view in views]
     sigmas = view_sigmas([residuals for residuals, _ in errors])
     whitened = [residuals / sigma for (residuals, _), sigma in zip(errors, sigmas, strict=True)]
     scale = CORNERS.estimate_scale(np.concatenate(whitened))
@@ -108,8 +107,7 @@ def normal_equations(
     degrees = max(float(np.sum(weight)) - (size + 6 * len(parts) - 6), 1.0)
     variance = max(float(np.sum(weight * everything**2)) / degrees, 1e-12)
     known = [(of_shape[name], shape.prior_information) for name, shape in shapes.items()]
-    if cameras_free:
-        known += [(of_camera[name], np.diag(cameras[name].prior_sigmas ** -2)) for name in names]
+    known += [(of_camera[name], np.diag(cameras[name].prior_sigmas ** -2)) for name in names]
     priors = [(block, LinearGaussianSystem.from_prior(variance * each)) for block, each in known]
     prior = LinearGaussianSystem.assemble(priors, size)
     free = np.arange(size)
@@ -149,7 +147,7 @@ class ClusterRobustCovariance:
     """Covariance of the joint solve's unknowns.
 
     poses: of the pairs.
-    cameras: (P, P) of each camera's parameters, where they were free.
+    cameras: (P, P) of each camera's parameters.
     variance_inflation: factor on the variances that independent corners predict, over all clusters.
     """
 
@@ -176,11 +174,7 @@ def cluster_robust_covariance(
     full = np.zeros(equations.prior.information.shape)
     full[np.ix_(free, free)] = 0.5 * (covariance + covariance.T)
     pairs = slice(0, 6 * len(equations.names))
-    cameras = {
-        name: full[np.ix_(columns, columns)]
-        for name, columns in equations.cameras.items()
-        if len(columns)
-    }
+    cameras = {name: full[np.ix_(columns, columns)] for name, columns in equations.cameras.items()}
     return ClusterRobustCovariance(
         PoseCovariance(equations.names, full[pairs, pairs]), cameras, pooled
     )

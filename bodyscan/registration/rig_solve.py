@@ -18,7 +18,7 @@ from bodyscan.arrays import Array
 from bodyscan.boards.view import ViewKey
 from bodyscan.calibration.board_views import LocatedView, PlanarView
 from bodyscan.calibration.boundary_points import BoardBoundaries, StripedView
-from bodyscan.calibration.camera import CameraCalibration, LensTrial, locate_board
+from bodyscan.calibration.camera import LensTrial, locate_board
 from bodyscan.calibration.pair import LocatedPair, PairCalibration
 from bodyscan.errors import RigDisconnected
 from bodyscan.geometry.camera import Camera
@@ -77,7 +77,7 @@ class RigSolution:
     views: those used, with points where the boards' corners really lie.
     board_shapes: of boards that differ from their description, confirmed by held-out boards.
     lenses: by camera whose lens was open, those tried on held-out boards.
-    camera_covariances: covariance (P, P) of each camera's parameters, where the solve refined them.
+    camera_covariances: (P, P) of each camera's parameters.
     variance_inflation: factor by which variances exceed those of independent corners, estimated
         from clusters of board poses.
     rays: by camera, how well each pixel's ray is known.
@@ -233,7 +233,6 @@ def _transfer_to_rig_frame(rig: Rig, solved: _Solved) -> RigSolution:
         {target: to_rig @ t for target, t in shaped.solution.root_from_board.items()},
         fixed_pair=rig.frame_pair.name if rig.frame_pair else None,
         fixed_target=frame_target(rig),
-        cameras_free=True,
         shapes=shaped.shapes,
     )
     covariance = cluster_robust_covariance(equations, cluster_board_poses(kept, rig_from_board))
@@ -330,12 +329,10 @@ def solved_pair(
     rig: Rig,
     solution: RigSolution,
     name: str,
-    single: CameraCalibration,
     boundaries: Mapping[ViewKey, BoardBoundaries],
 ) -> LocatedPair:
     """A pair with the camera, and the poses and shapes of its boards, of the joint solve.
 
-    single: its camera as calibrated by itself.
     boundaries: of stripes on the boards, by view; views without any take part with their corners.
     """
     views = [view for view in solution.views if view.pair == name]
@@ -343,7 +340,7 @@ def solved_pair(
     return LocatedPair(
         name,
         solution.cameras[name],
-        solution.camera_covariances.get(name, single.covariance),
+        solution.camera_covariances[name],
         solution.rays.get(name),
         solution.lenses.get(name, ()),
         solution.rms_px[name],

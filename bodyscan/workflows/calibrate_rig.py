@@ -169,13 +169,13 @@ def _solve_and_fit(
                 if solving.done():
                     solving.result()  # once the solve has failed, nothing more is decoded
                 decoded[pair.name] = pair
-                fits[pair.name] = other.submit(_fit_light, solving, cameras.value, pair)
+                fits[pair.name] = other.submit(_fit_light, solving, pair)
         stripes = collect_stripes(rig, captures, views, decoded.values())
         with step(progress, "joining the pairs"):
             solved = solving.result()
         joined = solved.solution.value.rig_from_camera.keys()
         for name in joined - fits.keys():  # no stripes were to be decoded
-            fits[name] = other.submit(_fit_light, solving, cameras.value, PairStripes(name, {}))
+            fits[name] = other.submit(_fit_light, solving, PairStripes(name, {}))
         pairs, errors = attempt_each(
             lambda name: fits[name].result(),
             sorted(joined - stripes.failures.keys()),
@@ -226,14 +226,10 @@ def _solve_rig(
         raise BadInput(error.what, where=error.where, remedy=remedy) from error
 
 
-def _fit_light(
-    solving: Future[_Adjusted], cameras: Mapping[str, CameraCalibration], stripes: PairStripes
-) -> Outcome[PairCalibration]:
+def _fit_light(solving: Future[_Adjusted], stripes: PairStripes) -> Outcome[PairCalibration]:
     """Fit a pair's light sheets, once the joint solve is done."""
     solved, name = solving.result(), stripes.name
-    return calibrate_pair(
-        solved_pair(solved.rig, solved.solution.value, name, cameras[name], stripes.boundaries)
-    )
+    return calibrate_pair(solved_pair(solved.rig, solved.solution.value, name, stripes.boundaries))
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,7 +262,7 @@ def add_remarks(solved: SolvedRig, progress: Progress = silent) -> RigCalibratio
     if len(solved.solution.rig_from_camera) > 1 and not found.failed:
         with step(progress, "advice"):
             with optional("advice", notes.append):
-                advice += advise(found.rig, solved.solution).lines
+                advice += advise(found.rig, solved.solution)
             with optional("halves of the shots", notes.append):
                 advice.append(compare_halves(found.rig, solved.solution).summary)
     with optional("boards by the stripes", notes.append):
