@@ -71,8 +71,7 @@ def locate_spheres(
 
 
 def read_sphere(points: Array, normals: Array, near: Sphere, radius_mm: float) -> SphereReading:
-    """Read the sphere near a given one from points (N, 3). Raises FailedWork if too few belong
-    to it."""
+    """Read the sphere near one from points (N, 3). Raises FailedWork if too few belong to it."""
     arm = points - near.centre
     length = np.linalg.norm(arm, axis=1)
     inliers = np.abs(length - radius_mm) < 0.15 * radius_mm

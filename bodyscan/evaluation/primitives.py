@@ -33,8 +33,7 @@ class Sphere:
 
 @dataclass(frozen=True, eq=False)
 class SphereAccuracy:
-    """One measured sphere of known radius: the fits with its radius held and free, and Eq. 19
-    for each, mm^2."""
+    """One sphere of known radius: the fits with radius held and free, and Eq. 19 of each, mm^2."""
 
     points: int
     given: Sphere
@@ -53,8 +52,7 @@ SURFACE = Noise("distance from the surface", cauchy=4.0)
 
 
 def fit_sphere(points: Array, radius: float | None = None) -> Sphere:
-    """Fit a sphere to points (N, 3): least distances from the surface, Cauchy loss; radius: held if
-    given.
+    """Fit a sphere to points (N, 3) by their distances, Cauchy loss; radius: held if given.
 
     Raises FailedWork for fewer than 50 points.
     """
@@ -182,8 +180,7 @@ def find_spheres(points: Array, normals: Array, radius: float, count: int) -> li
 
     points, normals: (H, W, 3), normals towards the camera, NaN where nothing was measured.
 
-    Every point votes for the position one radius behind it (Hough transform). Raises FailedWork if
-    fewer are found.
+    Points vote for the place one radius behind them (Hough). Raises FailedWork if fewer are found.
     """
     flat, votes = points.reshape(-1, 3), (points - radius * normals).reshape(-1, 3)
     known = np.isfinite(votes).all(axis=1)

@@ -35,8 +35,7 @@ class Deviation:
 def signed_distances(points: Array, vertices: Array, faces: Indices) -> Array:
     """Distances (N,) mm of points (N, 3) from a closed triangle mesh, positive outside it.
 
-    The sign is that of the angle-weighted pseudo-normal at the nearest spot (Baerentzen and Aanaes
-    2005).
+    The sign is that of the angle-weighted pseudo-normal at the nearest spot (Baerentzen, Aanaes 2005).
     """
     scene, centre = _build_centred_scene(vertices, faces)
     centred = (points - centre).astype(np.float32)
@@ -199,8 +198,7 @@ def _name(path: Path) -> str:
 
 
 def _surface(path: Path, sides_mm: Array) -> tuple[Array, Indices]:
-    """Vertices (V, 3) mm and faces (F, 3) of what may be the same subject as a scan with these sides
-    (3,)."""
+    """Vertices (V, 3) mm and faces (F, 3) of what may be the subject of a scan of these sides (3,)."""
     if _is_scan(path):
         mesh = load_scan(path if path.is_dir() else path.parent).mesh
         return mesh.vertices, mesh.faces

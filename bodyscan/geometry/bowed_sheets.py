@@ -11,8 +11,7 @@ bow, which is small, is extended radially from the frame's origin, shifted along
 
 To measure, the coefficients, their derivatives by s and their covariance, which are smooth in s, are
 tabulated: interpolated linearly between nodes an eighth of a stripe apart they are good to less than
-a micrometre. Along a ray the equation times Z is linear but for the bow, so Newton's method needs a
-step or two.
+a micrometre. Along a ray the equation times Z is linear but for the bow: Newton needs a step or two.
 """
 
 from __future__ import annotations
@@ -38,8 +37,7 @@ polynomial is expected to be FALL times as large as coefficient m - 1."""
 
 
 class SheetsAtStripe(NamedTuple):
-    """Coefficients (..., K) at s, their derivatives by s, and the Chebyshev polynomials (...,
-    M)."""
+    """Coefficients (..., K) at s, their derivatives by s, and Chebyshev polynomials (..., M)."""
 
     value: Array
     slope: Array

@@ -16,13 +16,11 @@ from bodyscan.geometry.lenses.opencv import Radial
 
 MATRIX = ("alpha", "beta", "gamma", "u0", "v0")
 MATRIX_PRIOR_PX = (50.0, 50.0, 5.0, 50.0, 50.0)
-"""Standard deviations of A's entries before the rig's own shots: at worst, what the few boards of
-one pair leave open."""
+"""Standard deviations of A's entries before the rig's own shots: at worst a pair's few boards'."""
 
 
 class CameraPrior(NamedTuple):
-    """Parameters (P,) of a camera and their standard deviations (P,), known before any board was
-    seen."""
+    """Parameters (P,) of a camera and their sigmas (P,), known before any board was seen."""
 
     parameters: Array
     sigmas: Array
@@ -107,8 +105,7 @@ class Camera:
         return self.rays(np.stack([u, v], axis=-1))
 
     def jacobians(self, points: Array) -> tuple[Array, Array]:
-        """d(pixels)/d(parameters) (N, 2, P) and d(pixels)/d(points) (N, 2, 3) at points (N, 3),
-        mm."""
+        """d(pixels)/d(parameters) (N, 2, P) and d(pixels)/d(points) (N, 2, 3), points (N, 3) mm."""
         z = points[:, 2]
         ideal = points[:, :2] / z[:, None]
         real, a = self.lens.distort(ideal), self.matrix[:2, :2]
@@ -133,8 +130,7 @@ class Camera:
         return np.stack([u, self.beta * y + self.v0], axis=-1)
 
     def normalized_from_pixels(self, pixels: Array) -> Array:
-        """Invert A (Eq. 5; Eq. 11 and 12 divided by z): px (..., 2) to normalised coordinates (...,
-        2)."""
+        """Invert A (Eq. 5; Eq. 11 and 12 over z): px (..., 2) to normalised coordinates (..., 2)."""
         y = (pixels[..., 1] - self.v0) / self.beta
         x = (pixels[..., 0] - self.u0 - self.gamma * y) / self.alpha
         return np.stack([x, y], axis=-1)

@@ -1,8 +1,7 @@
 """A camera as two lookup tables, independent of its lens, for compiled loops; rays of many pixels;
 which points lie in the image.
 
-A table holds a smooth map from the plane to the plane, pixels to rays or rays to pixels, as one
-quadratic per cell.
+A table holds a smooth map between planes, pixels to rays or rays to pixels, a quadratic per cell.
 """
 
 from __future__ import annotations
@@ -62,8 +61,7 @@ def fit_table(
 def look_up(table: Table, x: float, y: float) -> tuple[float, float]:
     """The two values at (x, y).
 
-    Without a branch: with one, Numba counts references to the arrays, which takes longer than all
-    the rest.
+    Without a branch: with one, Numba counts references to the arrays, which takes longest.
     """
     cells = table[0]
     row, column, x, y = _locate_cell(table, x, y)
@@ -111,8 +109,7 @@ CELLS_PX = (32, 16, 8)
 """Cell widths; the widest that keeps the tolerance is used. The first is enough for a scanner's
 lens; the last holds one that nearly folds within its image to about 1e-3 px."""
 MARGIN_PX = 1.5
-"""Extent of the table beyond the outermost pixel centres: outside the table is outside the
-image."""
+"""Extent of the table beyond the outermost pixel centres: outside it is outside the image."""
 OUTSIDE = -2.0
 """Both values of the projection table where it has none: no pixel has these coordinates."""
 CAMERAS = 64  # cached: enough for a few rigs

@@ -6,8 +6,7 @@ points to triangulate) with stacked normal equations.
 
 Both use the same stopping rule. Costs are in units of a residual's variance; a problem has settled
 when the last step lowered its cost, or the next one can lower it, by less than `tolerance` variances.
-Then no combination of unknowns is farther from the minimum than about sqrt(`tolerance`) of its own
-standard deviation.
+Then no combination of unknowns is farther off than about sqrt(`tolerance`) of its own sigma.
 
 Source: Madsen, Nielsen, Tingleff, Methods for Non-Linear Least Squares Problems, 2004; robust
 weights: Triggs et al., Bundle Adjustment - A Modern Synthesis, 2000, section 3.
@@ -87,8 +86,7 @@ class Block:
     linearize: returns the Jacobian (N, C); called once, and never for a step that is refused.
     sigma: of each residual (N,), or of all; held fixed while steps from here are tried.
     runs: (G,) lengths of runs of residuals, each with its own row of `columns` (G, C), such as the
-        boards of one camera, each with its pose. With one block each, calls would cost more than
-        sums.
+        boards of one camera, each with its pose: one block each would cost more in calls than sums.
 
     A prior is a block too: its residuals are in standard deviations (`EXACT`).
     """
@@ -134,8 +132,7 @@ class Solution(Generic[State]):
         return invert_scaled(_equations(parts, self.unknowns)[0])
 
     def normal(self, kinds: Collection[Noise]) -> Array:
-        """Normal matrix (P, P), J^T W J over variances, of the blocks with these kinds of noise
-        alone."""
+        """Normal matrix (P, P), J^T W J over variances, of the blocks of these kinds alone."""
         parts = zip(self.blocks, self.weights, self.scales, strict=True)
         return _equations([part for part in parts if part[0].noise in kinds], self.unknowns)[0]
 

@@ -9,8 +9,7 @@ which is OpenCV's lens (Brown 1966, or rational) for the one coordinate that str
 boards use k1, k2, p1, p2; the others occur in projectors calibrated elsewhere. Without k and p this
 is the 2 x 4 matrix of Bolles 1981, which leaves the centre's position along the stripes unknown.
 
-Compiled functions take frame, projector_from_camera (3, 4), and lens, (10,): f, c, k1, k2, p1, p2,
-k3, k4, k5, k6.
+Compiled functions take frame, projector_from_camera (3, 4), and lens: f, c, k1, k2, p1, p2, k3 to k6.
 """
 
 from __future__ import annotations
@@ -50,8 +49,7 @@ class LensSheets(SmoothSheets):
     @staticmethod
     def from_matrix(matrix: Array, middle: Array, stripes: int, direction: Axis) -> LensSheets:
         """A projector without a lens: s = (row 0 . X) / (row 1 . X), matrix (2, 4), X homogeneous,
-        camera frame. The matrix leaves the centre's place along the stripes open: it is put
-        opposite `middle`."""
+        camera frame. It leaves the centre's place along the stripes open: opposite `middle`."""
         frame, scale = _frame_and_scale(matrix[0], matrix[1], 0.0)
         opposite = frame.translation - [frame.apply(middle)[0], 0.0, 0.0]
         frame, size = RigidTransform(frame.rotation, opposite), FRAME + SCALE
@@ -61,8 +59,7 @@ class LensSheets(SmoothSheets):
     @property
     def only_centre_uncertain(self) -> bool:
         """Whether only c is uncertain, which moves all sheets together: true of a projector
-        calibrated elsewhere and not fitted to boards, so that no place far from boards would be a
-        guess."""
+        calibrated elsewhere and not fitted to boards, for which no place is far from boards."""
         others = np.delete(np.delete(self.covariance, CENTRE, 0), CENTRE, 1)
         return not others.any()
 
@@ -257,8 +254,7 @@ def _distort(lens: Array, x: float, y: float) -> Vector:
 
 @compiled
 def _radial(lens: Array, r2: float) -> Vector:
-    """The lens's radial factor at squared radius r2, its derivative by r2, and 1 / (1 + k4 r2 +
-    ...)."""
+    """The lens's radial factor at r2, its derivative by r2, and 1 / (1 + k4 r2 + ...)."""
     k1, k2, k3 = lens[2], lens[3], lens[6]
     above, rise = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3)), k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3)
     k4, k5, k6 = lens[7], lens[8], lens[9]

@@ -52,8 +52,7 @@ class LightSheets(Protocol):
         ...
 
     def tangent_planes(self, s: Array) -> Array:
-        """Planes (..., 4) of Eq. 6 that touch the sheets at s (...): a, b, c (unit vector), d >=
-        0."""
+        """Planes (..., 4) of Eq. 6 that touch the sheets at s (...): unit (a, b, c), d >= 0."""
         ...
 
 
@@ -137,8 +136,7 @@ class LightPlanes:
 def baseline_angle_tilt(planes: Array, direction: Axis) -> tuple[Array, Array, Array]:
     """Eq. 7-9: baseline (mm), projection angle and tilt angle (radians) of planes (N, 4).
 
-    The equations divide by a, which is 0 for horizontal stripes; for those the roles of x and y are
-    exchanged.
+    The equations divide by a, which is 0 for horizontal stripes; for those x and y are exchanged.
     """
     a, b, c, d = np.moveaxis(planes, -1, 0)
     if direction == "horizontal":

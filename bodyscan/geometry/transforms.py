@@ -40,8 +40,7 @@ class RigidTransform:
 
     @staticmethod
     def from_matrix(matrix: ArrayLike) -> RigidTransform:
-        """From a (4, 4) or (3, 4) matrix, whose rotation part is replaced by the nearest
-        rotation."""
+        """From a (4, 4) or (3, 4) matrix, its rotation part replaced by the nearest rotation."""
         matrix = np.asarray(matrix, float)
         u, _, vt = np.linalg.svd(matrix[:3, :3])
         rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
@@ -88,8 +87,7 @@ class RigidTransform:
         return directions @ self.rotation.T
 
     def retract(self, twist: ArrayLike) -> RigidTransform:
-        """Apply a small motion in frame a on the left: exp(twist) @ self, to first order in
-        coupling.
+        """Apply a small motion in frame a on the left: exp(twist) @ self, to first order.
 
         twist: (6,) rotation vector (radians), then translation (mm).
         """
@@ -106,8 +104,7 @@ def cross_matrix(vectors: Array) -> Array:
 
 
 def adjoint(a_from_b: RigidTransform) -> Array:
-    """Matrix (6, 6) that carries a twist (rotation, translation) expressed in b to the same motion
-    in a."""
+    """Matrix (6, 6) that carries a twist (rotation, translation) in b to the same motion in a."""
     rotation = a_from_b.rotation
     matrix = np.zeros((6, 6))
     matrix[:3, :3] = matrix[3:, 3:] = rotation

@@ -71,8 +71,7 @@ ROWS, COLUMNS = 17, 21
 
 @dataclass(frozen=True, eq=False)
 class RayUncertainty:
-    """Standard deviations of a coordinate, px, at ROWS x COLUMNS nodes from the first pixel to the
-    last.
+    """Standard deviations of a coordinate, px, at ROWS x COLUMNS nodes from first to last pixel.
 
     noise_px: due to the corners' noise.
     lens_px: due to the choice of lens model.

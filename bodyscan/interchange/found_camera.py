@@ -62,8 +62,7 @@ class FoundCamera:
         return self.projector(width, height)
 
     def projector(self, width: int, height: int) -> Camera:
-        """Make the projector with an image of that size, px; its axis may be outside it, as many shine
-        upwards.
+        """Make the projector with an image of that size, px; many shine upwards, their axis outside it.
 
         Raises CalibrationFileError if the lens folds within it.
         """
@@ -87,8 +86,7 @@ class FoundCamera:
 
 
 FoundCameras: TypeAlias = Mapping[str, Callable[[], FoundCamera]]
-"""What reads each of a file's cameras, by name, or raises CalibrationFileError: one that cannot be
-used hinders no other."""
+"""What reads each camera by its name, or raises CalibrationFileError, which hinders no other."""
 
 
 def find_camera(cameras: FoundCameras, name: str, where: str) -> FoundCamera:

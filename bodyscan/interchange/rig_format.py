@@ -20,8 +20,7 @@ RigCameras: TypeAlias = "Mapping[str, tuple[Camera, RigidTransform]]"
 Unit = Literal["mm", "cm", "m"]
 MILLIMETRES: dict[Unit, float] = {"mm": 1.0, "cm": 10.0, "m": 1000.0}  # per unit
 Nodes: TypeAlias = Mapping[str, str]
-"""Names of a file's nodes, by what they hold: matrix, distortion, size or width and height,
-rotation, translation."""
+"""Names of a file's nodes by what they hold: matrix, distortion, size, width, height, rotation ..."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +49,7 @@ def projector_name(pair: str) -> str:
 
 
 def opencv_lens(camera: Camera) -> tuple[bool, Array]:
-    """Return whether a camera's lens is OpenCV's fisheye, and OpenCV's coefficients of it: four, or
-    else five or more."""
+    """Return whether the lens is OpenCV's fisheye, and its coefficients: four, or else five or more."""
     is_fisheye = camera.lens.kind == "fisheye"
     return is_fisheye, camera.lens.coefficients if is_fisheye else camera.lens.opencv()
 

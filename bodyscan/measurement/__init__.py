@@ -1,5 +1,4 @@
 """Measure a body mesh.
 
-measurements: stature, girths, volume, area (outline: girths across filled surface). head: its top
-under hair.
+measurements: stature, girths, volume, area (outline: across filled surface). head: its top.
 """

@@ -17,8 +17,7 @@ from bodyscan.geometry.least_squares import EXACT, Block, Noise, Solution, minim
 BRAINCASE_MM = 85.0
 """Below the top of the hair: brows begin 95 to 125 mm below the top of an adult's head."""
 AXES_MM = np.array([97.0, 76.0, 97.0])
-"""Half the length and breadth of heads (ANSUR II, both sexes: 195 and 151 mm), and the height from
-the brows to the top."""
+"""Half the length and breadth of heads (ANSUR II: 195 and 151 mm), and height of the top over brows."""
 SKIN = Noise("skin from a braincase", cauchy=2.5, known=1.0)
 
 
@@ -61,8 +60,7 @@ def estimate_head_top(skin: Array, hair_top_mm: float) -> HeadTop | None:
 
     skin: points (N, 3) mm in the body frame (x forward, z up).
 
-    None if no skin shows. If forehead and temples are covered, only that the head ends between skin
-    and hair is known.
+    None if no skin shows. Under a covered forehead the head ends anywhere between skin and hair.
     """
     if not len(skin):
         return None

@@ -136,8 +136,7 @@ def compute_cover_shares(regions: Bytes | None) -> dict[str, float]:
 
 
 def select_regions(regions: Bytes | None, indices: Indices) -> Bytes | None:
-    """Select regions (M,) by indices (M,) into regions (N,): unsure where an index is -1, None if
-    regions are unknown."""
+    """Select regions by indices (M,) into regions (N,): unsure at -1; None if they are unknown."""
     if regions is None:
         return None
     return np.where(indices >= 0, regions[indices], np.uint8(UNSURE))

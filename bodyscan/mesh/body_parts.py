@@ -119,8 +119,7 @@ def find_parts(slicer: MeshSlicer, heights_mm: Sequence[float] = ()) -> BodyPart
 
 
 def _link_layers(slicer: MeshSlicer, heights: Array) -> nx.DiGraph[_Node]:
-    """Graph of all pieces, with edges from each to those below that it lies above, and the area of
-    that."""
+    """Graph of all pieces, with edges from each to those below it, and the area that they share."""
     cell_mm = 5.0
     low = slicer.vertices[:, :2].min(axis=0) - cell_mm
     shape = np.ceil((slicer.vertices[:, :2].max(axis=0) - low) / cell_mm).astype(int) + 1

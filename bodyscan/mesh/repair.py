@@ -83,8 +83,7 @@ def extract_largest_piece(
 def collapse_slivers(mesh: BodyMesh) -> BodyMesh:
     """Collapse every edge whose ends are one point in a text file; a closed mesh stays closed.
 
-    Faces without area trip up other programs. Four decimals of a millimetre are written, far below
-    any sigma.
+    Faces without area trip up other programs. Four decimals of a mm are written: far below sigmas.
     """
     written, edges = np.round(mesh.vertices, 4), directed_edges(mesh.faces)
     edges = edges[(written[edges[:, 0]] == written[edges[:, 1]]).all(axis=1)]

@@ -52,8 +52,7 @@ def refuse_size(
 
     unit: of `UNITS_MM`.
     sizes_mm: what the longest side is at least, usually, and at most.
-    along: number of the axis along which it is at least half as long as its longest side: z for a
-        person who stands.
+    along: the axis along which it is at least half as long as its longest side: z, who stands.
     """
     sides = np.ptp(vertices, axis=0)
     lowest, expected, highest = sizes_mm

@@ -67,8 +67,7 @@ def volume_interval(
     """Depths z (...) mm at which rays (..., 3), camera frame, z = 1, enter and leave the volume.
 
     The volume is taken 30 mm wider and higher, with its bottom raised. A ray that misses it
-    leaves before it enters, or does both where it is nearest to the axis, so that depths are smooth
-    across rays.
+    leaves before it enters, or does both where it is nearest to the axis: depths are smooth.
     """
     direction, start = rig_from_camera.rotate(rays), rig_from_camera.translation
     radius = volume.radius_mm + 30.0
@@ -98,8 +97,7 @@ def _nonlinearity(
 
     Limits are interpolated linearly between corners, but have a kink where the volume's wall meets
     its bottom inside a block. The margin covers that, except for a camera so low that it looks along
-    the bottom. The middle of a block, where inverse depth is nearly linear in s, shows at least half
-    of it.
+    the bottom. Inverse depth is nearly linear in s: a block's middle shows at least half of it.
     """
     near, far = ends
     stripes = np.where(near < far, limits[1] - limits[0], 0.0)

@@ -172,8 +172,7 @@ def _triangulate(
 ) -> tuple[Floats, Floats, Floats]:
     """`triangulate_image` with the uncertainty of the pair's rays.
 
-    An error of a ray in pixels acts as an error of s, by the stripes per pixel there, and equally on
-    neighbouring pixels.
+    An error of a ray in pixels acts as one of s, by the stripes per pixel there, on neighbours alike.
     """
     camera, ray_sigma = pair.camera, None
     if pair.rays is not None:

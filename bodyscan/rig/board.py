@@ -82,8 +82,7 @@ class Board(Model):
 
     @property
     def marker_count(self) -> int:
-        """Number of markers on all faces: one per second square of a charuco board, one per square
-        of an aprilgrid."""
+        """Number of markers on all faces: one per second square of a charuco board, else per square."""
         squares = self.columns * self.rows
         each = {"checkerboard": 0, "charuco": squares // 2, "aprilgrid": squares}[self.kind]
         return self.faces * each

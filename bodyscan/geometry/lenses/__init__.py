@@ -12,8 +12,7 @@ FAMILY: tuple[type[Lens], ...] = (Radial, Brown, Rational, Fisheye)
 more; a fisheye has a picture where theirs, which go by the tangent, run out of range."""
 
 LENSES: dict[str, type[Lens]] = {lens.kind: lens for lens in FAMILY}
-"""By name in files, the simplest first: the first that has all of the given OpenCV coefficients is
-chosen."""
+"""By name in files, the simplest first: the first that has all given coefficients is chosen."""
 
 
 def lens_from_opencv(coefficients: Array) -> Lens:

@@ -20,8 +20,7 @@ class Fisheye(Lens):
 
         theta_d = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8).
 
-    All coefficients 0 is the equidistant lens. Only what lies in front of the camera, z > 0, is
-    imaged here.
+    All coefficients 0 is the equidistant lens. Only what lies ahead of the camera is imaged here.
 
     Source: Kannala and Brandt, A Generic Camera Model and Calibration Method, PAMI 28(8), 2006;
     OpenCV's fisheye, COLMAP's OPENCV_FISHEYE, Kalibr's equidistant.

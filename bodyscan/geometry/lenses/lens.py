@@ -1,5 +1,4 @@
-"""What a camera needs from its lens: mapping ideal to real image points and back, before the matrix
-A.
+"""What a camera needs from its lens: ideal to real image points and back, before the matrix A.
 
 Points are normalised: x = X/Z and y = Y/Z in the camera frame. Ideal points are where a pinhole
 would image them, real points where the lens does.
@@ -89,11 +88,9 @@ class Lens(ABC):
         return _fold_radius(self)
 
     def undistort(self, real: Array) -> Array:
-        """Ideal points (..., 2) of real ones (..., 2), by Newton's method started at the real
-        points.
+        """Ideal points (..., 2) of real ones (..., 2), by Newton's method from the real points.
 
-        Accurate to rounding within `fold_radius`; NaN where no ideal point within it maps to the
-        real one.
+        Accurate to rounding within `fold_radius`; NaN where no ideal point within it maps there.
         """
         real = np.asarray(real, float)
         with np.errstate(all="ignore"):

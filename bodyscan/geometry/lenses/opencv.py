@@ -120,8 +120,7 @@ class Brown(Radial):
 class Rational(Brown):
     """Brown's lens divided by a polynomial: it can level out at large radii, as wide lenses do.
 
-    Source: Claus and Fitzgibbon, A Rational Function Lens Distortion Model, CVPR 2005; OpenCV's
-    CALIB_RATIONAL_MODEL.
+    Source: Claus and Fitzgibbon, A Rational Function Lens Distortion Model, CVPR 2005.
     """
 
     k4: float = 0.0

@@ -1,7 +1,6 @@
 """Kalibr's camchain.yaml: a chain of cameras, each with its pose in the frame of the one before.
 
-Metres, as Kalibr's targets are. The format has no frame of its entry: the first camera's is the
-world.
+Metres, as Kalibr's targets are. The first camera's frame is the world.
 """
 
 from __future__ import annotations
@@ -30,8 +29,7 @@ NOTE = """\
 def write_kalibr(cameras: RigCameras, path: Path) -> Path:
     """Write cam0, cam1, ... in the order of the pairs; returns `path`.
 
-    Raises BadInput for a lens that is neither a fisheye, Kalibr's equidistant, nor of k1, k2, p1,
-    p2 alone, its radtan.
+    Raises BadInput for a lens that is neither a fisheye (equidistant) nor of k1, k2, p1, p2 (radtan).
     """
     content: dict[str, Any] = {}
     before: RigidTransform | None = None

@@ -1,5 +1,4 @@
-"""mrcal's .cameramodel: one file per camera, a Python literal; rt_cam_ref, formerly extrinsics, is
-rotation and shift.
+"""mrcal's .cameramodel: one file per camera, a Python literal; rt_cam_ref was once extrinsics.
 
 Lengths are in the unit in which its board was given.
 """
