@@ -381,7 +381,9 @@ def _stripe_jacobian(state: _State[Sheets], k: int, board: StripedBoard, rays: A
         twist = step * np.eye(6)[column]
         return residuals(rays, pose.retract(twist)) - residuals(rays, pose.retract(-twist))
 
-    camera_steps, twist_steps = state.camera.difference_steps, [1e-6] * 3 + [1e-3] * 3  # rad, mm
+    # Rays turn by a microradian, about 1e-3 px; radians and mm of a pose.
+    camera_steps = 1e-6 / np.abs(by_camera.reshape(-1, by_camera.shape[-1])).max(axis=0)
+    twist_steps = [1e-6] * 3 + [1e-3] * 3
     differences = [
         *(by_parameter(c, step) / (2.0 * step) for c, step in enumerate(camera_steps)),
         *(by_twist(c, step) / (2.0 * step) for c, step in enumerate(twist_steps)),

@@ -68,11 +68,6 @@ class Camera:
             return self.prior.sigmas
         return np.array([*MATRIX_PRIOR_PX, *self.lens.prior_sigmas])
 
-    @property
-    def difference_steps(self) -> Array:
-        """Parameter steps (P,) for numerical derivatives."""
-        return np.array([*[1e-2] * len(MATRIX), *self.lens.difference_steps])
-
     def retract(self, step: Array) -> Camera:
         """The camera after a step (P,) is added to its parameters."""
         matrix = {

@@ -79,7 +79,9 @@ def extract_surface(bricks: Bricks, values: Floats) -> tuple[Array, Indices]:
     while _resolve_ambiguous_faces(bricks.table, bricks.indices, values):
         pass  # terminates: nodes only ever leave the inside
     sheets, counts = tabulate_sheets()
-    cases, first, total = _number_vertices(bricks.table, bricks.indices, values, counts)
+    cases = _classify_cells(bricks.table, bricks.indices, values)
+    ends = np.cumsum(counts[cases], dtype=np.int32).reshape(cases.shape)
+    first, total = ends - counts[cases], int(ends.max(initial=0))
     vertices = _compute_vertices(bricks.table, bricks.indices, values, cases, first, sheets, total)
     faces = _make_faces(bricks.table, bricks.indices, cases, first, sheets, vertices)
     return bricks.origin + bricks.cell_mm * vertices, faces
@@ -171,27 +173,22 @@ def _resolve_ambiguous_faces(table: Numbers, indices: Numbers, values: Floats) -
 
 
 @compiled
-def _number_vertices(
-    table: Numbers, indices: Numbers, values: Floats, counts: NDArray[np.int8]
-) -> tuple[NDArray[np.uint8], Numbers, int]:
-    """Compute case and first vertex of each cell, and the number of vertices."""
-    cases, first = np.zeros(values.shape, np.uint8), np.zeros(values.shape, np.int32)
+def _classify_cells(table: Numbers, indices: Numbers, values: Floats) -> NDArray[np.uint8]:
+    """Compute the case of each cell, 0 where the surface does not cross it or a corner is unknown."""
+    cases = np.zeros(values.shape, np.uint8)
     block = np.empty((SIDE + 1, SIDE + 1, SIDE + 1), np.float32)
-    total = 0
     for brick in range(len(values)):
         _gather(table, indices[brick], values, block)
-        for i in range(SIDE):
-            for j in range(SIDE):
-                for k in range(SIDE):
-                    case, known = 0, True
-                    for corner in range(8):
-                        value = block[i + (corner & 1), j + (corner >> 1 & 1), k + (corner >> 2)]
-                        known &= value == value
-                        case |= int(value < 0.0) << corner
-                    if known and 0 < case < 255:
-                        cases[brick, i, j, k], first[brick, i, j, k] = case, total
-                        total += counts[case]
-    return cases, first, total
+        for number in range(SIDE**3):
+            i, j, k = number // SIDE**2, number // SIDE % SIDE, number % SIDE
+            case, known = 0, True
+            for corner in range(8):
+                value = block[i + (corner & 1), j + (corner >> 1 & 1), k + (corner >> 2)]
+                known &= value == value
+                case |= int(value < 0.0) << corner
+            if known and case < 255:
+                cases[brick, i, j, k] = case
+    return cases
 
 
 @compiled
@@ -212,28 +209,24 @@ def _compute_vertices(
         if not cases[brick].any():
             continue
         _gather(table, indices[brick], values, block)
-        for i in range(SIDE):
-            for j in range(SIDE):
-                for k in range(SIDE):
-                    case = cases[brick, i, j, k]
-                    if case == 0:
-                        continue
-                    for edge in range(12):
-                        sheet = sheets[case, edge]
-                        if sheet < 0:
-                            continue
-                        axis = edge // 4
-                        low[0], low[1], low[2] = i, j, k
-                        low[(axis + 1) % 3] += edge & 1
-                        low[(axis + 2) % 3] += edge >> 1 & 1
-                        high[0], high[1], high[2] = low[0], low[1], low[2]
-                        high[axis] += 1
-                        a, b = block[low[0], low[1], low[2]], block[high[0], high[1], high[2]]
-                        vertex = first[brick, i, j, k] + sheet
-                        for c in range(3):
-                            sums[vertex, c] += SIDE * indices[brick, c] + low[c]
-                        sums[vertex, axis] += a / (a - b)
-                        crossings[vertex] += 1.0
+        for number in range(SIDE**3):
+            i, j, k = number // SIDE**2, number // SIDE % SIDE, number % SIDE
+            for edge in range(12):
+                sheet = sheets[cases[brick, i, j, k], edge]
+                if sheet < 0:
+                    continue
+                axis = edge // 4
+                low[0], low[1], low[2] = i, j, k
+                low[(axis + 1) % 3] += edge & 1
+                low[(axis + 2) % 3] += edge >> 1 & 1
+                high[0], high[1], high[2] = low[0], low[1], low[2]
+                high[axis] += 1
+                a, b = block[low[0], low[1], low[2]], block[high[0], high[1], high[2]]
+                vertex = first[brick, i, j, k] + sheet
+                for c in range(3):
+                    sums[vertex, c] += SIDE * indices[brick, c] + low[c]
+                sums[vertex, axis] += a / (a - b)
+                crossings[vertex] += 1.0
     return sums / crossings.reshape(-1, 1)
 
 

@@ -96,41 +96,31 @@ class Board(Model):
         return keys
 
     def problems(self) -> Iterator[Problem]:
-        return _problems(self)
-
-
-def _problems(board: Board) -> Iterator[Problem]:
-    if board.faces == 1 and board.thickness_mm > 0:
-        yield ("thickness_mm",), "is for a board with faces: 2 (it is between the two prints)"
-    if board.kind == "checkerboard":
-        if board.marker_mm is not None:
-            yield ("marker_mm",), "is for boards with markers; a checkerboard has none"
-        return
-    if board.marker_mm is None:
-        yield (
-            ("marker_mm",),
-            f"is missing: a board of kind {board.kind} needs the side of its markers",
-        )
-    elif board.marker_mm >= board.square_mm:
-        wrong = f"must be less than square_mm ({board.square_mm:g}) (got {board.marker_mm:g})"
-        yield ("marker_mm",), wrong
-    if board.kind == "aprilgrid" and board.faces == 2:
-        yield ("faces",), "must be 1: an aprilgrid's back is a board of its own"
-    if board.kind == "aprilgrid" and not board.dictionary.startswith("DICT_APRILTAG"):
-        wrong = f"must be one of AprilTags, such as DICT_APRILTAG_36h11 (got {board.dictionary!r})"
-        yield ("dictionary",), wrong
-    if board.dictionary not in MARKERS_IN:
-        hint = did_you_mean(board.dictionary, MARKERS_IN)
-        yield (
-            ("dictionary",),
-            f"is not one of OpenCV's dictionaries{hint} (got {board.dictionary!r})",
-        )
-    elif board.first_marker + board.marker_count > MARKERS_IN[board.dictionary]:
-        last, end = MARKERS_IN[board.dictionary] - 1, board.first_marker + board.marker_count - 1
-        yield (
-            ("dictionary",),
-            f"holds markers 0 to {last}, but this board needs {board.first_marker} to {end}",
-        )
+        if self.faces == 1 and self.thickness_mm > 0:
+            yield ("thickness_mm",), "is for a board with faces: 2 (it is between the two prints)"
+        if self.kind == "checkerboard":
+            if self.marker_mm is not None:
+                yield ("marker_mm",), "is for boards with markers; a checkerboard has none"
+            return
+        if self.marker_mm is None:
+            wrong = f"is missing: a board of kind {self.kind} needs the side of its markers"
+            yield ("marker_mm",), wrong
+        elif self.marker_mm >= self.square_mm:
+            wrong = f"must be less than square_mm ({self.square_mm:g}) (got {self.marker_mm:g})"
+            yield ("marker_mm",), wrong
+        if self.kind == "aprilgrid" and self.faces == 2:
+            yield ("faces",), "must be 1: an aprilgrid's back is a board of its own"
+        if self.kind == "aprilgrid" and not self.dictionary.startswith("DICT_APRILTAG"):
+            wrong = f"must be of AprilTags, such as DICT_APRILTAG_36h11 (got {self.dictionary!r})"
+            yield ("dictionary",), wrong
+        if self.dictionary not in MARKERS_IN:
+            hint = did_you_mean(self.dictionary, MARKERS_IN)
+            wrong = f"is not one of OpenCV's dictionaries{hint} (got {self.dictionary!r})"
+            yield ("dictionary",), wrong
+        elif self.first_marker + self.marker_count > MARKERS_IN[self.dictionary]:
+            last, end = MARKERS_IN[self.dictionary] - 1, self.first_marker + self.marker_count - 1
+            wrong = f"holds markers 0 to {last}, but this board needs {self.first_marker} to {end}"
+            yield ("dictionary",), wrong
 
 
 def dictionary_family(dictionary: str) -> str:

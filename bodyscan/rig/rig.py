@@ -32,10 +32,8 @@ class Volume(Model):
 
     def problems(self) -> Iterator[Problem]:
         if self.bottom_mm >= self.top_mm:
-            yield (
-                ("bottom_mm",),
-                f"must lie below top_mm ({self.top_mm:g}) (got {self.bottom_mm:g})",
-            )
+            wrong = f"must lie below top_mm ({self.top_mm:g}) (got {self.bottom_mm:g})"
+            yield ("bottom_mm",), wrong
 
 
 ExposureName = Annotated[str, Field(pattern=r"^[\w.+-]+$", max_length=64)]
@@ -146,12 +144,8 @@ def find_unusual_lengths(rig: Rig) -> Iterator[str]:
 
 
 def _find_repeated_names(rig: Rig) -> Iterator[Problem]:
-    for key, parts in (
-        ("boards", rig.boards),
-        ("pairs", rig.pairs),
-        ("references", rig.references),
-    ):
-        for index, name in find_duplicates([part.name for part in parts]):
+    for key in ("boards", "pairs", "references"):
+        for index, name in find_duplicates([part.name for part in getattr(rig, key)]):
             yield (key, index, "name"), f"is given to two {key}: every name once (got {name!r})"
     for index, name in find_duplicates(rig.exposures):
         yield ("exposures", index), f"is named twice (got {name!r})"
@@ -211,12 +205,9 @@ def _find_wrong_counts(
             count = code.image_counts.get(kind, len(given))
             if count != len(given):
                 first = getattr(code, "first_code", 0)
-                since = f" from {first}" if first else ""
-                yield (
-                    (*where, kind.name),
-                    f"has {len(given)} names, but the {code.stripes} stripes of pair"
-                    f" {pair}{since} take {count} {kind.number}s",
-                )
+                of = f"{code.stripes} stripes of pair {pair}{f' from {first}' if first else ''}"
+                wrong = f"has {len(given)} names, but the {of} take {count} {kind.number}s"
+                yield (*where, kind.name), wrong
                 break
 
 
@@ -227,14 +218,11 @@ def _find_template_problems(rig: Rig) -> Iterator[Problem]:
         yield ("exposures",), "names one exposure: name two or more, the shortest first, or none"
     templates: list[tuple[tuple[str | int, ...], str, bool]] = [(("files",), rig.files, stripes)]
     for index, folder in enumerate(rig.calibration):
-        templates += (
-            [(("calibration", index, "files"), folder.files, False)] if folder.files else []
-        )
+        if folder.files:
+            templates.append((("calibration", index, "files"), folder.files, False))
     for where, template, needs_frame in templates:
-        faults = template_faults(
-            template, many_pairs=many, needs_frame=needs_frame, exposures=bool(rig.exposures)
-        )
-        yield from ((where, fault) for fault in faults)
+        for fault in template_faults(template, many, needs_frame, bool(rig.exposures)):
+            yield where, fault
 
 
 def _find_unknown_references(rig: Rig) -> Iterator[Problem]:
@@ -257,18 +245,14 @@ def _find_wrong_references(rig: Rig) -> Iterator[Problem]:
         if len(set(reference.boards)) < len(reference.boards):
             yield where, f"names a board twice (got {reference.boards[0]!r})"
         for k, name in enumerate(reference.boards):
+            wrong = ""
             if name not in boards:
-                hint = did_you_mean(name, boards)
-                yield (*where, k), f"names no board of this file{hint} (got {name!r})"
+                wrong = f"names no board of this file{did_you_mean(name, boards)} (got {name!r})"
             elif boards[name].kind == "checkerboard":
-                yield (
-                    (*where, k),
-                    f"must have markers, which tell its corners apart from every side: board {name} "
-                    "is a plain checkerboard",
-                )
+                wrong = "must have markers, which tell its corners apart from every side: board "
+                wrong += f"{name} is a plain checkerboard"
             elif name == rig.rig_frame.board and len(rig.boards) > len(reference.boards):
-                yield (
-                    (*where, k),
-                    f"must not fix the rig frame as well: board {name} of a reference takes no part "
-                    "in placing the rig",
-                )
+                wrong = f"must not fix the rig frame as well: board {name} of a reference takes no "
+                wrong += "part in placing the rig"
+            if wrong:
+                yield (*where, k), wrong

@@ -42,7 +42,7 @@ def shot_pattern(template: str, pair: str, frame: str) -> tuple[re.Pattern[str],
 
 
 def template_faults(
-    template: str, *, many_pairs: bool, needs_frame: bool, exposures: bool = False
+    template: str, many_pairs: bool, needs_frame: bool, exposures: bool = False
 ) -> Iterator[str]:
     """Find what is wrong with a file-name template, as messages that follow its key."""
     try:

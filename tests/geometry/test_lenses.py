@@ -120,7 +120,8 @@ def test_jacobians_are_derivatives(camera: Camera) -> None:
         numeric = (camera.project(points + shift) - camera.project(points - shift)) / 2e-2
         # Central differences of 0.01 mm: curvature leaves 1e-8 px/mm, rounding 1e-10.
         assert np.allclose(by_point[:, :, k], numeric, rtol=0.0, atol=1e-7)
-    for k, step in enumerate(np.diag(camera.difference_steps)):
+    steps = np.where(np.arange(len(camera.parameters)) < 5, 1e-2, 1e-5)
+    for k, step in enumerate(np.diag(steps)):
         numeric = camera.retract(step).project(points) - camera.retract(-step).project(points)
         # Pixels of 1e3 are rounded to 1e-13, over steps of at least 1e-5.
         expected = 2.0 * step[k] * by_parameter[:, :, k]
@@ -134,7 +135,7 @@ def test_parameters_are_read_and_moved_by_name(camera: Camera) -> None:
     step = np.zeros(len(named))
     step[camera.parameter_names.index("gamma")] = 0.25
     assert camera.retract(step) == replace(camera, gamma=camera.gamma + 0.25)
-    assert len(camera.prior_sigmas) == len(camera.difference_steps) == len(named)
+    assert len(camera.prior_sigmas) == len(named)
 
 
 @given(cameras)

@@ -37,10 +37,6 @@ class Fisheye(Lens):
     def prior_sigmas(self) -> Array:
         return np.array([0.5, 0.5, 0.2, 0.1])
 
-    @property
-    def difference_steps(self) -> Array:
-        return np.array([1e-5, 1e-5, 1e-4, 1e-4])
-
     def distort(self, ideal: Array) -> Array:
         return ideal * self._factor(np.sum(ideal**2, axis=-1))[0][..., None]
 

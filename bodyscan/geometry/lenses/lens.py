@@ -50,11 +50,6 @@ class Lens(ABC):
     def prior_sigmas(self) -> Array:
         """Standard deviations (K,) of the coefficients before any image is seen."""
 
-    @property
-    @abstractmethod
-    def difference_steps(self) -> Array:
-        """Steps (K,) for numerical derivatives: about 1e-3 px at the rim of a scanner's image."""
-
     @abstractmethod
     def distort(self, ideal: Array) -> Array:
         """Real points (..., 2) of ideal ones (..., 2)."""

@@ -33,10 +33,6 @@ class OpenCVLens(Lens):
     def prior_sigmas(self) -> Array:
         return np.array(PRIOR_SIGMAS[: len(self.names)])
 
-    @property
-    def difference_steps(self) -> Array:
-        return np.array([1e-5, 1e-5, 1e-5, 1e-5, 1e-4, 1e-5, 1e-5, 1e-4])[: len(self.names)]
-
     def distort(self, ideal: Array) -> Array:
         x, y = ideal[..., 0], ideal[..., 1]
         r2, p1, p2 = x * x + y * y, *self._eight[2:4]
