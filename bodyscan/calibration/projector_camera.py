@@ -11,20 +11,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
-from bodyscan.arrays import Array, Indices
+from bodyscan.arrays import Array
 from bodyscan.errors import BadInput
 from bodyscan.geometry.camera import MATRIX, Camera
-from bodyscan.geometry.least_squares import EXACT, Block, minimize
 from bodyscan.geometry.lens_sheets import CENTRE, FRAME, SCALE, LensSheets
 from bodyscan.geometry.lenses import lens_from_opencv
 from bodyscan.geometry.lenses.opencv import Brown
 from bodyscan.geometry.light_planes import Axis, LightSheets
 from bodyscan.geometry.robust import rms
-from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
+from bodyscan.geometry.transforms import RigidTransform
 
 
 def sheets_from_projector(
@@ -233,32 +231,23 @@ def _refine(
     """
     size, first_term = POSE + len(projector.parameters), POSE + len(MATRIX)
     free = np.setdiff1d(np.arange(first_term + terms), [POSE + MATRIX.index("gamma")])
-    start, sigmas = projector.lens.coefficients[:terms], projector.lens.prior_sigmas[:terms]
-    lens = slice(len(free) - terms, len(free))
-    State = tuple[Camera, RigidTransform]
+    priors = projector.lens.prior_sigmas[:terms]
 
-    def blocks(state: State) -> list[Block]:
-        stripes = [
-            Block(
-                _residuals(*state, samples),
-                partial(_jacobian, *state, samples, free),
-                slice(0, len(free)),
-                EXACT,
-                samples.sigma,
-            )
-            for samples in both
-        ]
-        known = (state[0].lens.coefficients[:terms] - start) / sigmas
-        return [*stripes, Block(known, lambda: np.diag(1.0 / sigmas), lens, EXACT)]
-
-    def retract(state: State, step: Array) -> State:
+    def moved(step: Array) -> tuple[Camera, RigidTransform]:
         whole = np.zeros(size)
         whole[free] = step
-        return state[0].retract(whole[POSE:]), state[1].retract(whole[:POSE])
+        return projector.retract(whole[POSE:]), from_camera.retract(whole[:POSE])
 
-    solution = minimize((projector, from_camera), blocks, retract, unknowns=len(free))
+    def errors(step: Array) -> Array:
+        """In sigmas: of the sheets across the stripes, then of the lens from its prior."""
+        light, pose = moved(step)
+        return np.concatenate([*(_errors(light, pose, s) for s in both), step[-terms:] / priors])
+
+    from scipy.optimize import least_squares  # imported here because scans do not need it
+
+    solved = least_squares(errors, np.zeros(len(free)), x_scale="jac", xtol=1e-12, ftol=1e-12)
     sigma = np.concatenate([samples.sigma for samples in both])
-    misfit = rms(np.concatenate([block.residuals for block in solution.blocks[:2]]) / sigma)
+    misfit = rms(solved.fun[:-terms])
     predicted = float(np.sqrt(len(sigma) / np.sum(sigma**-2.0)))
     if not misfit < 3.0:
         raise BadInput(
@@ -266,22 +255,12 @@ def _refine(
             f"{predicted * misfit:.2g} of its pixels, the noise of the sheets explains "
             f"{predicted:.2g}"
         )
-    return FittedProjector(*solution.state, predicted * misfit, predicted)
+    return FittedProjector(*moved(solved.x), predicted * misfit, predicted)
 
 
-def _residuals(light: Camera, from_camera: RigidTransform, samples: _Samples) -> Array:
-    """Reprojection errors across the stripes (N,) px; NaN behind the projector."""
+def _errors(light: Camera, from_camera: RigidTransform, samples: _Samples) -> Array:
+    """Reprojection errors across the stripes (N,) in sigmas; far off behind the projector."""
     points = from_camera.apply(samples.points)
-    error = light.project(points)[:, samples.axis] - (samples.s - 0.5)
-    return np.where(points[:, 2] > 0.0, error, np.nan)
-
-
-def _jacobian(
-    light: Camera, from_camera: RigidTransform, samples: _Samples, free: Indices
-) -> Array:
-    """Derivatives (N, F) of `_residuals` by those of the pose's and the projector's parameters that
-    are free."""
-    points = from_camera.apply(samples.points)
-    by_parameter, by_point = light.jacobians(points)
-    by_pose = by_point[:, samples.axis, None, :] @ twist_jacobian(points)
-    return np.concatenate([by_pose[:, 0], by_parameter[:, samples.axis]], axis=1)[:, free]
+    with np.errstate(all="ignore"):
+        error = (light.project(points)[:, samples.axis] - (samples.s - 0.5)) / samples.sigma
+    return np.where(points[:, 2] > 0.0, error, 1e6)
