@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-
 import networkx as nx
 import numpy as np
 
@@ -20,32 +17,20 @@ MAX_SHOTS = 10
 """More are not suggested: nobody takes them."""
 
 
-@dataclass(frozen=True)
-class Link:
-    """Two pairs that saw boards at the same moments, in so many shots.
-
-    sigma_mm: of the second pair's position relative to the first, by all boards of the rig.
-    """
-
-    first: str
-    second: str
-    shots: int
-    sigma_mm: float
-
-
 def advise(rig: Rig, solution: RigSolution) -> list[str]:
     """What ties a rig together, where it is weak, and the most useful further shots, in words."""
     lines = []
     if shots := find_articulation_shots(solution):
         names = ", ".join(f"{shot} ({board})" for shot, board in shots)
         lines.append(f"without any one of these shots the rig is disconnected: {names}")
-    chain = minimum_spanning_links(find_links(solution))
-    median = float(np.median([link.sigma_mm for link in chain])) if chain else 0.0
+    chain = list(best_links(solution).edges(data=True))
+    median = float(np.median([link["sigma_mm"] for _, _, link in chain])) if chain else 0.0
     lines += [
-        f"weak link: sigma of {link.second} relative to {link.first} is {link.sigma_mm:.3f} mm "
-        f"({_count_shots(link.shots)} in common), and no other link between their parts is better"
-        for link in chain
-        if link.sigma_mm > 2.0 * median
+        f"weak link: sigma of {second} relative to {first} is {link['sigma_mm']:.3f} mm "
+        f"({_count_shots(len(link['targets']))} in common), and no other link between their parts is "
+        "better"
+        for first, second, link in sorted(chain, key=lambda edge: -edge[2]["sigma_mm"])
+        if link["sigma_mm"] > 2.0 * median
     ]
     sigmas = {name: _sigma(solution, name) for name in solution.rig_from_camera}
     worst = max(sorted(sigmas), key=lambda name: sigmas[name])
@@ -59,23 +44,15 @@ def _sigma(solution: RigSolution, name: str) -> float:
     return float(np.linalg.norm(position_sigma(solution.covariance, name, position)))
 
 
-def find_links(solution: RigSolution) -> tuple[Link, ...]:
-    """Every two pairs that share a shot, least known first."""
+def best_links(solution: RigSolution) -> nx.Graph:
+    """The `view_graph`'s minimum spanning tree by sigma: the links that tie all pairs together best.
+
+    Edge attribute sigma_mm: of the second pair's position relative to the first, by all boards.
+    """
     graph = view_graph(solution.views, sorted(solution.rig_from_camera))
-    found = [
-        Link(first, second, len(targets), solution.relative_sigma_mm(first, second))
-        for first, second, targets in graph.edges(data="targets")
-    ]
-    return tuple(sorted(found, key=lambda link: (-link.sigma_mm, link.first, link.second)))
-
-
-def minimum_spanning_links(links: Sequence[Link]) -> tuple[Link, ...]:
-    """The links that tie all pairs together best, a minimum spanning tree by sigma; least known
-    first."""
-    graph = nx.Graph()
-    graph.add_edges_from((link.first, link.second, {"link": link, **vars(link)}) for link in links)
-    tree = nx.minimum_spanning_edges(graph, weight="sigma_mm", data=True)
-    return tuple(sorted((data["link"] for _, _, data in tree), key=lambda link: -link.sigma_mm))
+    for first, second, link in graph.edges(data=True):
+        link["sigma_mm"] = solution.relative_sigma_mm(first, second)
+    return nx.minimum_spanning_tree(graph, weight="sigma_mm")
 
 
 def find_articulation_shots(solution: RigSolution) -> tuple[Target, ...]:

@@ -178,7 +178,7 @@ def _solve(
     # The graph's poses alone are rough: 30 px.
     gross = find_inconsistent_views(
         [view for view in resolved if view.target in inconsistent], solution, 30.0
-    ).wrong
+    ).value
     kept = [view for view in resolved if view not in gross]
     for loss_px in LOSSES_PX:
         solution = solve_poses(kept, solution, root=root, loss_px=loss_px)

@@ -20,19 +20,12 @@ from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.least_squares import Block, Noise, minimize
 from bodyscan.geometry.robust import rms_length
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.outcome import Outcome
 from bodyscan.registration.joint_solve import JointSolution, refine_solution, reprojection_errors
 from bodyscan.registration.view_graph import by_target
 
 MIN_ERROR_PX = 0.2
 CORNERS = Noise("corners", group=2, min_scale=0.1 * MIN_ERROR_PX)
-
-
-@dataclass(frozen=True, eq=False)
-class InconsistentViews:
-    """Views that contradict the others; one note for each cause, naming shot and pairs."""
-
-    wrong: tuple[LocatedView, ...]
-    notes: tuple[str, ...]
 
 
 def single_view_errors(views: Iterable[LocatedView], cameras: Mapping[str, Camera]) -> Array:
@@ -47,8 +40,9 @@ def error_limit(errors: Array) -> float:
 
 def find_inconsistent_views(
     views: Sequence[LocatedView], solution: JointSolution, limit_px: float
-) -> InconsistentViews:
-    """Find the wrong views among those of each board at each moment."""
+) -> Outcome[list[LocatedView]]:
+    """Find the views that contradict the others of their board at their moment; one note for each
+    cause, naming shot and pairs."""
     found = []
     for group in by_target(views).values():
         root_from_board = _board_pose(group, solution)
@@ -62,15 +56,15 @@ def find_inconsistent_views(
         ]
         if max(errors) > limit_px:
             found.append(_examine_board(group, solution, root_from_board, limit_px))
-    return InconsistentViews(
-        tuple(view for one in found for view in one.wrong),
+    return Outcome(
+        [view for one in found for view in one.value],
         tuple(note for one in found for note in one.notes),
     )
 
 
 def _examine_board(
     group: list[LocatedView], solution: JointSolution, start: RigidTransform, limit_px: float
-) -> InconsistentViews:
+) -> Outcome[list[LocatedView]]:
     """Find which of one board's views at one moment are wrong, given that not all can be true."""
     shot, board = group[0].target
     bad, notes = [], []
@@ -94,7 +88,7 @@ def _examine_board(
             f"{limit_px:.2f}, with any lens); not used. Possible causes: the board moved, the "
             "pictures were not taken at the same moment, or its square_mm is not that of the rig file"
         )
-    return InconsistentViews(tuple(bad), tuple(notes))
+    return Outcome(bad, tuple(notes))
 
 
 def _largest_agreement(
@@ -198,7 +192,7 @@ def solve_consistently(
         kept = at.select_consistent(views)
         solved = refine_solution(kept, _with_boards_of(kept, at.solution), root=root)
         found = find_inconsistent_views(views, solved, limit_px)
-        now = frozenset(view.key for view in found.wrong)
+        now = frozenset(view.key for view in found.value)
         if now == at.wrong:
             return ConsistentSolve(solved, now, found.notes)
         whole_cameras = 2 * len(now) > len(views)  # see `rig_solve`

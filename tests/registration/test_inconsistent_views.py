@@ -8,9 +8,9 @@ from bodyscan.calibration.board_views import LocatedView
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.outcome import Outcome
 from bodyscan.registration.joint_solve import JointSolution
 from bodyscan.registration.view_consistency import (
-    InconsistentViews,
     find_inconsistent_views,
     single_view_errors,
 )
@@ -39,33 +39,33 @@ def view(
     return LocatedView(pair, shot, "board", POINTS, pixels, located)
 
 
-def judged(*views: LocatedView) -> InconsistentViews:
+def judged(*views: LocatedView) -> Outcome[list[LocatedView]]:
     boards = {one.target: BOARD for one in views}
     return find_inconsistent_views(views, JointSolution(PLACED, boards, CAMERAS), 0.2)
 
 
 def test_views_that_agree_are_all_right() -> None:
     found = judged(*(view(pair, noise_px=0.05) for pair in "abcd"))
-    assert (found.wrong, found.notes) == ((), ())
+    assert (found.value, found.notes) == ([], ())
     errors = single_view_errors([view(pair) for pair in "abcd"], CAMERAS)
     np.testing.assert_allclose(errors, 0.0, atol=1e-9)
 
 
 def test_a_board_that_stood_elsewhere_for_one_camera_costs_that_view() -> None:
     found = judged(*(view(pair, aside_mm=5.0 if pair == "c" else 0.0) for pair in "abcd"))
-    assert [one.pair for one in found.wrong] == ["c"]
+    assert [one.pair for one in found.value] == ["c"]
     assert "shot s1: the pose of board board differs for c" in found.notes[0]
     # A tenth of a millimetre is a tenth of a pixel.
-    assert not judged(*(view(pair, aside_mm=0.1 if pair == "c" else 0.0) for pair in "abcd")).wrong
+    assert not judged(*(view(pair, aside_mm=0.1 if pair == "c" else 0.0) for pair in "abcd")).value
 
 
 def test_corners_that_fit_no_pose_are_not_used_and_the_others_are() -> None:
     found = judged(view("a"), view("b"), view("c", noise_px=0.6), view("d"))
-    assert [one.pair for one in found.wrong] == ["c"]
+    assert [one.pair for one in found.value] == ["c"]
     assert "c: board board in shot s1 fits no pose" in found.notes[0]
 
 
 def test_a_board_with_other_squares_is_not_used() -> None:
     found = judged(*(view(pair, size=1.02) for pair in "abcd"))
-    assert len(found.wrong) == 4
+    assert len(found.value) == 4
     assert "or its square_mm is not that of the rig file" in found.notes[0]

@@ -13,6 +13,7 @@ from bodyscan.boards.view import ViewKey
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.calibration.camera import LensTrial
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.outcome import Outcome
 from bodyscan.registration import view_consistency
 from bodyscan.registration.joint_solve import JointSolution
 from bodyscan.registration.rig_lenses import (
@@ -58,7 +59,7 @@ def solve(
         assert list(views) == VIEWS, "those that are out are judged as well"
         assert limit_px == 0.7
         out = next(rounds)
-        return SimpleNamespace(wrong=[VIEWS[k] for k in sorted(out)], notes=(f"{sorted(out)}",))
+        return Outcome([VIEWS[k] for k in sorted(out)], (f"{sorted(out)}",))
 
     monkeypatch.setattr(view_consistency, "refine_solution", fully)
     monkeypatch.setattr(view_consistency, "find_inconsistent_views", judge)
