@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 
 from bodyscan.arrays import Bytes, Floats, Mask, find_crop, pad_crop
-from bodyscan.compiled import compiled
 from bodyscan.errors import ScanFailed
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.progress import THREADS
@@ -109,9 +108,12 @@ def drop_flying_pixels(depth: Floats, step_mm: float, *, supporters: int = 13) -
     """
     distances_px = np.hypot(*np.mgrid[-2:3, -2:3])
     limits = np.where(distances_px > 0, step_mm * distances_px, -1.0).astype(np.float32)
+    rows, columns = depth.shape
     for _ in range(2):
-        padded, depth = np.pad(depth, 2, constant_values=np.nan), np.empty_like(depth)
-        _keep_supported(padded, limits, supporters, depth)
+        padded, count = np.pad(depth, 2, constant_values=np.nan), np.zeros(depth.shape, np.uint8)
+        for (down, right), limit in np.ndenumerate(limits):
+            count += np.abs(padded[down : down + rows, right : right + columns] - depth) < limit
+        depth = np.where(count >= supporters, depth, np.float32(np.nan))
     return depth
 
 
@@ -135,21 +137,3 @@ def find_dark_gaps(grey: Bytes) -> Mask:
     # Less than 30 grey levels may be noise on a dark surface.
     dark = (around > 2.0 * grey) & (around >= grey + np.float32(30))
     return cv2.dilate(dark.view(np.uint8), np.ones((3, 3), np.uint8)).view(bool)
-
-
-@compiled
-def _keep_supported(padded: Floats, limits: Floats, supporters: int, kept: Floats) -> None:
-    """Set kept (h, w): depths, padded by two pixels, that differ from at least `supporters`
-    neighbours' by less than limits (5, 5); NaN elsewhere."""
-    height, width = kept.shape
-    count = np.empty(width, np.uint8)
-    for v in range(height):
-        here = padded[v + 2, 2:]
-        count[:] = 0
-        for row in range(5):
-            for column in range(5):
-                there, limit = padded[v + row, column:], limits[row, column]
-                for u in range(width):
-                    count[u] += abs(there[u] - here[u]) < limit
-        for u in range(width):
-            kept[v, u] = here[u] if count[u] >= supporters else np.float32(np.nan)

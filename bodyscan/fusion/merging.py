@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyscan.arrays import Array, Bytes, Floats
-from bodyscan.compiled import compiled
 from bodyscan.fusion.brightness import EqualizedGrey, equalize_brightness
 from bodyscan.fusion.consistency import Consistency, Contradictions, compare_with_surface
 from bodyscan.fusion.quadratic_fit import NORMAL_MEDIAN
@@ -163,7 +162,7 @@ class _Sums(NamedTuple):
     normal: Array
     variance: Array
     against: Array
-    pairs: Bytes
+    pairs: Array
 
 
 def _start_sums(normals: Floats, sigma_mm: Floats, weights: Floats, grey: Floats) -> _Sums:
@@ -176,7 +175,7 @@ def _start_sums(normals: Floats, sigma_mm: Floats, weights: Floats, grey: Floats
         (weights[:, None] * normals).astype(np.float64),
         ((weights * sigma_mm) ** 2).astype(np.float64),
         against,
-        np.ones(len(weights), np.uint8),
+        np.ones(len(weights)),
     )
 
 
@@ -194,7 +193,6 @@ def _add_surface(
     sums.pairs[here] += 1
 
 
-@compiled
 def _average(
     points: Floats, normals: Floats, sums: _Sums, inflation: float
 ) -> tuple[Array, Floats, Floats, Bytes, Bytes]:
@@ -203,20 +201,17 @@ def _average(
     inflation: variance of the pairs' differences over the predicted one. It enlarges sigmas, and
         differences of more than three sigmas enlarge them more.
     """
-    kept = np.flatnonzero(sums.against < sums.weight)
-    position, normal = np.empty((len(kept), 3)), np.empty((len(kept), 3), np.float32)
-    sigma, grey = np.empty(len(kept), np.float32), np.empty((len(kept), 3), np.uint8)
-    for n in range(len(kept)):
-        here = kept[n]
-        weight = sums.weight[here]
-        mean = sums.shift[here] / weight
-        squares = sums.square[here] - weight * mean * mean
-        chi2 = squares / max(sums.pairs[here] - 1, 1)
-        sigma[n] = np.sqrt(sums.variance[here] * max(inflation, chi2 / 9.0)) / weight
-        x, y, z = sums.normal[here, 0], sums.normal[here, 1], sums.normal[here, 2]
-        length = np.sqrt(x * x + y * y + z * z)
-        for k in range(3):
-            position[n, k] = points[here, k] + mean * normals[here, k]
-            normal[n, k] = sums.normal[here, k] / length
-            grey[n, k] = min(max(np.rint(sums.grey[here] / weight), 0.0), 255.0)
-    return position, normal, sigma, grey, sums.pairs[kept]
+    kept = sums.against < sums.weight
+    sums = _Sums(*(field[kept] for field in sums))
+    mean = sums.shift / sums.weight
+    chi2 = (sums.square - sums.weight * mean**2) / np.maximum(sums.pairs - 1.0, 1.0)
+    sigma_mm = np.sqrt(sums.variance * np.maximum(inflation, chi2 / 9.0)) / sums.weight
+    normal = sums.normal / np.linalg.norm(sums.normal, axis=1, keepdims=True)
+    grey = np.clip(np.rint(sums.grey / sums.weight), 0.0, 255.0).astype(np.uint8)
+    return (
+        points[kept] + mean[:, None] * normals[kept],
+        normal.astype(np.float32),
+        sigma_mm.astype(np.float32),
+        np.repeat(grey[:, None], 3, axis=1),
+        sums.pairs.astype(np.uint8),
+    )

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 
 from bodyscan.arrays import Array, Floats, Mask
 from bodyscan.compiled import compiled
 from bodyscan.mesh.body import BodyCloud
 from bodyscan.mesh.surface_nets import SIDE, Bricks
+from bodyscan.progress import map_threads, split_range
 
 REACH_CELLS = 1.3
 """Reach of a point: an edge that crosses the surface ends within one cell."""
@@ -36,8 +39,8 @@ def splat_planes(
     """Signed distances (B, SIDE, SIDE, SIDE) mm, negative inside, and their weights.
 
     Each point contributes its tangent plane to the nodes within `reach` cells, with a weight that
-    falls
-    with distance and sigma: 1 for one point right at the node, 0 (and distance 0) without points.
+    falls with distance and sigma: 1 for one point right at the node, 0 (and distance 0) without
+    points.
     """
     median = float(np.median(cloud.sigma_mm))
     relative = np.clip(cloud.sigma_mm / max(median, 1e-6), 1.0 / 3.0, 3.0)
@@ -52,21 +55,11 @@ def splat_planes(
 
 def find_near_bricks(points: Array, origin: Array, cell_mm: float, shape: tuple[int, ...]) -> Mask:
     """Find the bricks (a, b, c) with nodes within, or next to, a point's reach."""
-    near = np.zeros(shape, np.bool_)
-    _mark_near((points - origin) / cell_mm, near)
+    near, margin = np.zeros(shape, np.bool_), REACH_CELLS + 2.0
+    cells = (points - origin) / cell_mm
+    for corner in product((-margin, margin), repeat=3):
+        near[tuple(((cells + corner) // SIDE).astype(int).T)] = True
     return near
-
-
-@compiled
-def _mark_near(points: Array, near: Mask) -> None:
-    margin = REACH_CELLS + 2.0
-    for n in range(len(points)):
-        x, y, z = points[n, 0], points[n, 1], points[n, 2]
-        for corner in range(8):
-            a = np.int64(x + (margin if corner & 1 else -margin)) // SIDE
-            b = np.int64(y + (margin if corner & 2 else -margin)) // SIDE
-            c = np.int64(z + (margin if corner & 4 else -margin)) // SIDE
-            near[a, b, c] = True
 
 
 @compiled
@@ -117,33 +110,16 @@ def find_crossed_bricks(distances: Distances, cell_mm: float, shape: tuple[int, 
 
 
 def interpolate_distances(distances: Distances, bricks: Bricks) -> Floats:
-    """Interpolate distances at the nodes of a finer grid with the same origin."""
+    """Interpolate distances linearly at the nodes of a finer grid with the same origin; beyond the
+    grid as at its rim."""
+    nodes = SIDE * bricks.indices[..., None] + np.arange(SIDE)
+    x, y, z = np.moveaxis(nodes * (bricks.cell_mm / distances.cell_mm), 1, 0)
     found = np.empty(bricks.shape, np.float32)
-    _interpolate(distances.values, bricks.cell_mm / distances.cell_mm, bricks.indices, found)
+
+    def fill(part: slice) -> None:
+        at = x[part, :, None, None], y[part, None, :, None], z[part, None, None, :]
+        places = np.stack(np.broadcast_arrays(*at))
+        map_coordinates(distances.values, places, found[part], order=1, mode="nearest")
+
+    map_threads(fill, split_range(len(found)), stage="distances")
     return found
-
-
-@compiled
-def _interpolate(values: Floats, ratio: float, indices: NDArray[np.int32], found: Floats) -> None:
-    """Trilinear; beyond the grid as at its rim."""
-    last = np.array(values.shape) - 1.0
-    for brick in range(len(indices)):
-        for i in range(SIDE):
-            x = min((SIDE * indices[brick, 0] + i) * ratio, last[0] - 1e-6)
-            for j in range(SIDE):
-                y = min((SIDE * indices[brick, 1] + j) * ratio, last[1] - 1e-6)
-                for k in range(SIDE):
-                    z = min((SIDE * indices[brick, 2] + k) * ratio, last[2] - 1e-6)
-                    found[brick, i, j, k] = _trilinear(values, x, y, z)
-
-
-@compiled
-def _trilinear(values: Floats, x: float, y: float, z: float) -> float:
-    a, b, c = int(x), int(y), int(z)
-    p, q, r = x - a, y - b, z - c
-    total = 0.0
-    for corner in range(8):
-        i, j, k = corner & 1, corner >> 1 & 1, corner >> 2
-        share = (p if i else 1.0 - p) * (q if j else 1.0 - q) * (r if k else 1.0 - r)
-        total += share * values[a + i, b + j, c + k]
-    return total
