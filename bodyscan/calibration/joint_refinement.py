@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -24,48 +24,53 @@ from bodyscan.geometry.least_squares import EXACT, Block, Noise, minimize
 from bodyscan.geometry.light_planes import SmoothSheets
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 
-Sheets = TypeVar("Sheets", bound=SmoothSheets)
-
 WARP_POWERS = ((2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
 CORNERS = Noise("corners, px", group=2, cauchy=4.0, min_scale=1e-3)
-STRIPES = Noise("stripes, in sigmas", cauchy=4.0, min_scale=1e-2)
+STRIPES = tuple(
+    Noise(f"{which} stripes, in sigmas", cauchy=4.0, min_scale=1e-2)
+    for which in ("own", "crossing")
+)
 
 
 @dataclass(frozen=True, eq=False)
-class StripedBoard:
-    """One observation of a board: its corners, and the stripe boundaries on it, if any.
+class BoardStripes:
+    """Stripe boundaries of one direction on a board.
 
     pixels: of boundary points, (N, 2) px.
     index: their boundaries, s = i, (N,).
     sigma_px: (N,).
     across: unit vector across the stripes in the image, (2,).
-    face: the face that was seen, if corners alone already gave it a shape.
     """
 
-    board: str
-    view: PlanarView
     pixels: Array
     index: Array
     sigma_px: Array
     across: Array
-    face: BoardFace | None = None
 
     @staticmethod
-    def from_points(
-        board: str,
-        view: PlanarView,
-        camera: Camera,
-        points: BoundaryPoints,
-        face: BoardFace | None = None,
-    ) -> StripedBoard:
-        """Turn the boundary points of one board, on it by `camera`, into pixels again."""
+    def from_points(camera: Camera, points: BoundaryPoints) -> BoardStripes:
+        """Turn boundary points, on their board by `camera`, into pixels again."""
         pixels = camera.project(points.points)
         across = np.array([1.0, 0.0])
         if len(pixels):
             across = np.median(camera.project(points.points + points.per_pixel) - pixels, axis=0)
             across /= np.linalg.norm(across)
         sigma_px = np.hypot(points.sigma_px, 0.02)  # no lens is known better than that
-        return StripedBoard(board, view, pixels, points.index.astype(float), sigma_px, across, face)
+        return BoardStripes(pixels, points.index.astype(float), sigma_px, across)
+
+
+@dataclass(frozen=True, eq=False)
+class StripedBoard:
+    """One observation of a board: its corners, and the stripe boundaries on it.
+
+    stripes: of each direction, in the order of the sheets; without points where none were seen.
+    face: the face that was seen, if corners alone already gave it a shape.
+    """
+
+    board: str
+    view: PlanarView
+    stripes: tuple[BoardStripes, ...]
+    face: BoardFace | None = None
 
     @cached_property
     def board_from_face(self) -> RigidTransform:
@@ -155,17 +160,18 @@ class BoardWarp:
 
 
 @dataclass(frozen=True, eq=False)
-class JointFit(Generic[Sheets]):
+class JointFit:
     """The fit to corners and stripes together.
 
     camera_from_board: of each board, in the order given.
+    sheets: of each direction.
     camera_covariance: (P, P).
     corners_rms_px: robustly weighted.
     """
 
     camera: Camera
     camera_from_board: tuple[RigidTransform, ...]
-    sheets: Sheets
+    sheets: tuple[SmoothSheets, ...]
     camera_covariance: Array
     corners_rms_px: float
     warps: dict[str, BoardWarp]
@@ -174,15 +180,16 @@ class JointFit(Generic[Sheets]):
 def refine_jointly(
     camera: Camera,
     camera_from_board: Sequence[RigidTransform],
-    sheets: Sheets,
+    sheets: Sequence[SmoothSheets],
     boards: Sequence[StripedBoard],
     flatness_mm: Mapping[str, float],
     *,
     print_mm: float = 0.05,
-) -> JointFit[Sheets]:
+) -> JointFit:
     """Refine camera, board poses and shapes, and sheets by maximum a posteriori estimation.
 
-    camera, camera_from_board, sheets: found one after the other, where the solve starts.
+    camera, camera_from_board, sheets: found one after the other, where the solve starts; sheets of
+        one direction or of two.
     boards: every observation that the camera is calibrated from, with stripes or without.
     flatness_mm: prior standard deviation of the warp of each board, by name.
     print_mm: of each printed corner, per axis: what office printers and plotters do.
@@ -192,7 +199,7 @@ def refine_jointly(
         for name in flatness_mm
     }
     warps = {name: BoardWarp.flat(points[name], mm, print_mm) for name, mm in flatness_mm.items()}
-    start = _State(camera, tuple(camera_from_board), sheets, warps)
+    start = _State(camera, tuple(camera_from_board), tuple(sheets), warps)
     solution = minimize(
         start,
         lambda state: _blocks(state, boards),
@@ -207,7 +214,10 @@ def refine_jointly(
     return JointFit(
         state.camera,
         state.poses,
-        replace(state.sheets, covariance=_depth_covariance(state, boards, covariance)),
+        tuple(
+            replace(one, covariance=_depth_covariance(state, boards, covariance, direction))
+            for direction, one in enumerate(state.sheets)
+        ),
         covariance[: state.first_pose, : state.first_pose],
         float(np.sqrt(CORNERS.mean_square(corners)) * np.sqrt(2.0)),
         state.warps,
@@ -215,12 +225,12 @@ def refine_jointly(
 
 
 @dataclass(frozen=True, eq=False)
-class _State(Generic[Sheets]):
+class _State:
     """Camera, poses, sheets and warps; their unknowns follow one another in this order."""
 
     camera: Camera
     poses: tuple[RigidTransform, ...]
-    sheets: Sheets
+    sheets: tuple[SmoothSheets, ...]
     warps: dict[str, BoardWarp]
 
     @property
@@ -233,11 +243,17 @@ class _State(Generic[Sheets]):
 
     @property
     def first_warp(self) -> int:
-        return self.first_sheet + self.sheets.prior()[1].shape[1]
+        return self.first_sheet + sum(one.prior()[1].shape[1] for one in self.sheets)
 
     @property
     def count(self) -> int:
         return self.first_warp + sum(warp.count for warp in self.warps.values())
+
+    @property
+    def sheet_columns(self) -> list[Indices]:
+        """Indices of each direction's sheets among the unknowns."""
+        ends = np.cumsum([one.prior()[1].shape[1] for one in self.sheets])
+        return np.split(np.arange(self.first_sheet, self.first_warp), ends[:-1])
 
     @property
     def warp_columns(self) -> dict[str, Indices]:
@@ -246,22 +262,24 @@ class _State(Generic[Sheets]):
         parts = np.split(np.arange(self.first_warp, self.count), ends[:-1])
         return dict(zip(self.warps, parts, strict=True))
 
-    def retract(self, step: Array) -> _State[Sheets]:
+    def retract(self, step: Array) -> _State:
         """Move the state by a step (count,) of the unknowns."""
         twists = step[self.first_pose : self.first_sheet].reshape(-1, 6)
         columns = self.warp_columns
         return _State(
             self.camera.retract(step[: self.first_pose]),
             tuple(pose.retract(twist) for pose, twist in zip(self.poses, twists, strict=True)),
-            self.sheets.retract(step[self.first_sheet : self.first_warp]),
+            tuple(
+                one.retract(step[own])
+                for one, own in zip(self.sheets, self.sheet_columns, strict=True)
+            ),
             {name: warp.retract(step[columns[name]]) for name, warp in self.warps.items()},
         )
 
 
-def _blocks(state: _State[Sheets], boards: Sequence[StripedBoard]) -> Iterator[Block]:
+def _blocks(state: _State, boards: Sequence[StripedBoard]) -> Iterator[Block]:
     """Residuals of each board's corners and stripes, then the priors of camera, sheets, warps."""
-    camera, sheets = np.arange(state.first_pose), np.arange(state.first_sheet, state.first_warp)
-    columns = state.warp_columns
+    camera, sheets, columns = np.arange(state.first_pose), state.sheet_columns, state.warp_columns
     with np.errstate(all="ignore"):
         for k, board in enumerate(boards):
             pose, warp = state.first_pose + 6 * k + np.arange(6), columns[board.board]
@@ -271,18 +289,20 @@ def _blocks(state: _State[Sheets], boards: Sequence[StripedBoard]) -> Iterator[B
                 np.concatenate([camera, pose, warp]),
                 CORNERS,
             )
-            rays = _boundary_rays(state.camera, board)
             heights = warp[: len(WARP_POWERS)]
-            yield Block(
-                _stripe_residuals(state, k, board, rays),
-                partial(_stripe_jacobian, state, k, board, rays),
-                np.concatenate([camera, pose, sheets, heights]),
-                STRIPES,
-            )
+            for direction, own in enumerate(sheets):
+                rays = _boundary_rays(state.camera, board.stripes[direction])
+                yield Block(
+                    _stripe_residuals(state, k, board, direction, rays),
+                    partial(_stripe_jacobian, state, k, board, direction, rays),
+                    np.concatenate([camera, pose, own, heights]),
+                    STRIPES[direction],
+                )
     yield camera_prior(state.camera, camera)
-    yield _prior_block(state.sheets.prior(), sheets)
-    for name, one in state.warps.items():
-        yield _prior_block(one.prior, columns[name])
+    for one, own in zip(state.sheets, sheets, strict=True):
+        yield _prior_block(one.prior(), own)
+    for name, shape in state.warps.items():
+        yield _prior_block(shape.prior, columns[name])
 
 
 def _prior_block(prior: tuple[Array, Array], columns: Indices) -> Block:
@@ -290,16 +310,16 @@ def _prior_block(prior: tuple[Array, Array], columns: Indices) -> Block:
     return Block(residuals, lambda: jacobian, columns, EXACT)
 
 
-def _corner_points(state: _State[Sheets], k: int, board: StripedBoard) -> Array:
+def _corner_points(state: _State, k: int, board: StripedBoard) -> Array:
     """Corners of the k-th board as warped, camera frame, (N, 3) mm."""
     return state.poses[k].apply(state.warps[board.board].apply(board.view.points))
 
 
-def _corner_residuals(state: _State[Sheets], k: int, board: StripedBoard) -> Array:
+def _corner_residuals(state: _State, k: int, board: StripedBoard) -> Array:
     return (state.camera.project(_corner_points(state, k, board)) - board.view.pixels).ravel()
 
 
-def _corner_jacobian(state: _State[Sheets], k: int, board: StripedBoard) -> Array:
+def _corner_jacobian(state: _State, k: int, board: StripedBoard) -> Array:
     """Derivatives (2N, ...) by camera, this board's pose, and its warp."""
     points, warp = _corner_points(state, k, board), state.warps[board.board]
     by_parameter, by_point = state.camera.jacobians(points)
@@ -313,9 +333,9 @@ def _corner_jacobian(state: _State[Sheets], k: int, board: StripedBoard) -> Arra
     return jacobian.reshape(-1, jacobian.shape[2])
 
 
-def _boundary_rays(camera: Camera, board: StripedBoard) -> Array:
+def _boundary_rays(camera: Camera, stripes: BoardStripes) -> Array:
     """Rays (2, N, 3), z = 1: through boundary pixels, and half a pixel across from them."""
-    return camera.rays(np.stack([board.pixels, board.pixels + 0.5 * board.across]))
+    return camera.rays(np.stack([stripes.pixels, stripes.pixels + 0.5 * stripes.across]))
 
 
 def _rays_by_camera(camera: Camera, rays: Array) -> Array:
@@ -325,43 +345,49 @@ def _rays_by_camera(camera: Camera, rays: Array) -> Array:
     return -(camera.rays_by_pixels(rays) @ by_parameter)
 
 
-def _height(state: _State[Sheets], board: StripedBoard, xy: Array) -> Array:
+def _height(state: _State, board: StripedBoard, xy: Array) -> Array:
     """Height of a board's surface above the plane of its face at (..., 2) mm."""
     height = state.warps[board.board].height(xy)
     return height + board.face.height(xy) if board.face else height
 
 
-def _stripe_residuals(state: _State[Sheets], k: int, board: StripedBoard, rays: Array) -> Array:
-    """Offsets of the k-th board's boundaries from their sheets, in sigmas, (N,)."""
+def _stripe_residuals(
+    state: _State, k: int, board: StripedBoard, direction: int, rays: Array
+) -> Array:
+    """Offsets of the k-th board's boundaries of one direction from their sheets, in sigmas, (N,)."""
+    sheets, stripes = state.sheets[direction], board.stripes[direction]
     camera_from_face = state.poses[k] @ board.board_from_face
     points = rays_on_board(rays, camera_from_face, partial(_height, state, board))
-    return _whitened_offsets(state.sheets, state.sheets.at(board.index), board, points)
+    return _whitened_offsets(sheets, sheets.at(stripes.index), stripes, points)
 
 
-def _whitened_offsets(sheets: SmoothSheets, at: Any, board: StripedBoard, points: Array) -> Array:
+def _whitened_offsets(sheets: SmoothSheets, at: Any, stripes: BoardStripes, points: Array) -> Array:
     offset = sheets.offset(points[0], at)
-    return np.asarray(offset.value / _offset_sigma(board, points, offset.by_point), np.float64)
+    return np.asarray(offset.value / _offset_sigma(stripes, points, offset.by_point), np.float64)
 
 
-def _offset_sigma(board: StripedBoard, points: Array, by_point: Array) -> Array:
+def _offset_sigma(stripes: BoardStripes, points: Array, by_point: Array) -> Array:
     """Standard deviation of the offsets for that of the pixels, (N,), in the offsets' unit."""
     per_pixel = np.abs(np.sum(by_point * (points[1] - points[0]), axis=1)) / 0.5
-    return np.maximum(per_pixel, 1e-12) * board.sigma_px
+    return np.maximum(per_pixel, 1e-12) * stripes.sigma_px
 
 
-def _stripe_jacobian(state: _State[Sheets], k: int, board: StripedBoard, rays: Array) -> Array:
+def _stripe_jacobian(
+    state: _State, k: int, board: StripedBoard, direction: int, rays: Array
+) -> Array:
     """Derivatives (N, ...) by camera, board pose, sheets and board heights.
 
     Camera and pose by finite differences, because the sigma changes too: without its derivative,
     noise would push the focal lengths up.
     """
+    sheets, stripes = state.sheets[direction], board.stripes[direction]
     pose, by_camera = state.poses[k], _rays_by_camera(state.camera, rays)
     camera_from_face = pose @ board.board_from_face
     points = rays_on_board(rays, camera_from_face, partial(_height, state, board))
-    at = state.sheets.at(board.index)
-    offset = state.sheets.offset(points[0], at, parameters=True)
+    at = sheets.at(stripes.index)
+    offset = sheets.offset(points[0], at, parameters=True)
     assert offset.by_parameter is not None
-    sigma = _offset_sigma(board, points, offset.by_point)
+    sigma = _offset_sigma(stripes, points, offset.by_point)
     # The height of a board changes by a thousandth of a step along it: it is held constant here.
     height = _height(state, board, camera_from_face.inverse().apply(points)[..., :2])
 
@@ -370,7 +396,7 @@ def _stripe_jacobian(state: _State[Sheets], k: int, board: StripedBoard, rays: A
         points = rays_on_board(rays, camera_from_face) + lift_along_rays(
             rays, camera_from_face, height
         )
-        return _whitened_offsets(state.sheets, at, board, points)
+        return _whitened_offsets(sheets, at, stripes, points)
 
     def by_parameter(column: int, step: float) -> Array:
         turn = np.zeros_like(rays)
@@ -395,33 +421,44 @@ def _stripe_jacobian(state: _State[Sheets], k: int, board: StripedBoard, rays: A
 
 
 def _depth_covariance(
-    state: _State[Sheets], boards: Sequence[StripedBoard], covariance: Array
+    state: _State, boards: Sequence[StripedBoard], covariance: Array, direction: int
 ) -> Array:
-    """Covariance (P, P) of the sheets together with the rays that meet them, as it affects depths.
+    """Covariance (P, P) of one direction's sheets together with the rays that meet them, as it
+    affects shapes.
 
-    A camera error turns rays and sheets together. The rays' part is expressed as the change of the
-    sheets that changes depths on the boards equally (by least squares), so that both add with their
-    signs. What no such change expresses, a lens, is in the rays' own sigma.
+    A camera error turns rays and sheets together, and moves all boards nearly alike: a motion of
+    everything, which a pair by itself cannot see and nobody else can measure. So the rigid motion
+    that explains most of how the boards' points move is removed (an S-transformation to the frame of
+    the boards: Baarda 1973). What remains along the rays is expressed as the change of the sheets
+    that changes depths equally (by least squares). What no such change expresses, a lens, is in the
+    rays' own sigma.
     """
-    index = np.concatenate([board.index for board in boards])
-    rays = state.camera.rays(np.concatenate([board.pixels for board in boards]))
+    sheets, stripes = state.sheets[direction], [board.stripes[direction] for board in boards]
+    index = np.concatenate([one.index for one in stripes])
+    rays = state.camera.rays(np.concatenate([one.pixels for one in stripes]))
     with np.errstate(all="ignore"):
-        depth = state.sheets.measure(rays, index).depth[:, None]
-        offset = state.sheets.offset(rays * depth, state.sheets.at(index), parameters=True)
+        depth = sheets.measure(rays, index).depth[:, None]
+        points = rays * depth
+        offset = sheets.offset(points, sheets.at(index), parameters=True)
         assert offset.by_parameter is not None
         along_ray = np.sum(offset.by_point * rays, axis=1)[:, None]
-        # Relative changes of depth by the sheets' unknowns, and by the camera's parameters.
-        by_sheets = -offset.by_parameter / along_ray / depth
-        by_rays = _rays_by_camera(state.camera, rays)
+        by_rays = depth[..., None] * _rays_by_camera(state.camera, rays)
         by_camera = -np.einsum("nk,nkp->np", offset.by_point[:, :2], by_rays) / along_ray
-    valid = np.isfinite(by_sheets).all(axis=1) & np.isfinite(by_camera).all(axis=1)
+        by_sheets = -offset.by_parameter / along_ray
+    # How points move, (N, 3, P), by the unknowns of the camera and of the sheets.
+    moved = rays[..., None] * np.concatenate([by_camera, by_sheets], axis=1)[:, None]
+    moved[:, :2, : state.first_pose] += by_rays
+    valid = np.isfinite(moved).all(axis=(1, 2))
+    moved, rays, depth = moved[valid], rays[valid], depth[valid]
+    motion = twist_jacobian(points[valid])
+    common = np.linalg.lstsq(motion.reshape(-1, 6), moved.reshape(len(motion) * 3, -1), rcond=None)
+    remaining = np.einsum("ni,nip->np", rays, moved - motion @ common[0])
+    remaining /= np.sum(rays**2, axis=1)[:, None] * depth
     # A weak prior, at relative changes of 1e-7, keeps unobserved directions of the sheets at zero.
-    prior = 1e-7 * np.sqrt(np.count_nonzero(valid)) * state.sheets.prior()[1]
-    matrix = np.concatenate([by_sheets[valid], prior])
-    right = np.concatenate([by_camera[valid], np.zeros((len(prior), by_camera.shape[1]))])
-    equivalent = np.linalg.lstsq(matrix, right, rcond=None)[0]
-    columns = np.arange(state.first_sheet, state.first_warp)
-    transfer = np.concatenate([equivalent, np.eye(len(columns))], axis=1)
-    columns = np.concatenate([np.arange(state.first_pose), columns])
+    prior = 1e-7 * np.sqrt(len(depth)) * sheets.prior()[1]
+    matrix = np.concatenate([by_sheets[valid] / depth, prior])
+    right = np.concatenate([remaining, np.zeros((len(prior), remaining.shape[1]))])
+    transfer = np.linalg.lstsq(matrix, right, rcond=None)[0]
+    columns = np.concatenate([np.arange(state.first_pose), state.sheet_columns[direction]])
     total = transfer @ covariance[np.ix_(columns, columns)] @ transfer.T
     return np.asarray(0.5 * (total + total.T), np.float64)

@@ -17,7 +17,7 @@ from bodyscan.calibration.boundary_points import (
     subsample,
 )
 from bodyscan.calibration.camera import LensTrial
-from bodyscan.calibration.joint_refinement import JointFit, StripedBoard, refine_jointly
+from bodyscan.calibration.joint_refinement import BoardStripes, StripedBoard, refine_jointly
 from bodyscan.calibration.light_sheets import fit_light_sheets
 from bodyscan.calibration.model_selection import HeldOutModel
 from bodyscan.calibration.sheet_fit import fit_pinhole, fit_sheets
@@ -149,31 +149,20 @@ def calibrate_pair(pair: LocatedPair) -> Outcome[PairCalibration]:
         held_out=fit.held_out,
         boards_mm=(float(offsets.mean()), rms(offsets)) if offsets.size else None,
     )
+    lights = [_Light(fit.sheets, shots, points)]
+    crossing = _fit_crossing(pair, code, shots)
+    if crossing.value is not None:
+        lights.append(crossing.value)
     calibration = replace(calibration, sheets=fit.sheets, quality=quality)
-    if pair.alone and isinstance(fit.sheets, SmoothSheets):
+    if pair.alone:
         # In a rig of several pairs all cameras together constrain the boards, far better than the
         # stripes of one pair could.
-        joint = _refine(pair, fit.sheets, shots, points)
-        quality = replace(
-            quality,
-            refinement="joint solve of corners and stripes",
-            corners_rms_px=joint.corners_rms_px,
-            bent_mm={name: warp.out_of_plane_mm for name, warp in joint.warps.items()},
-        )
-        calibration = replace(
-            calibration,
-            camera=joint.camera,
-            camera_covariance=joint.camera_covariance,
-            sheets=joint.sheets,
-            quality=quality,
-        )
-        poses = dict(zip((view.key for view in pair.views), joint.camera_from_board, strict=True))
-        shots = tuple(
-            replace(shot, view=replace(shot.view, camera_from_board=poses[shot.view.key]))
-            for shot in shots
-        )
-    crossing = _fit_crossing(calibration, code, shots)
-    return replace(crossing, notes=(*notes, *crossing.notes))
+        calibration, lights = _refine(pair, calibration, lights)
+    own, *across = (light.sheets for light in lights)
+    return Outcome(
+        replace(calibration, sheets=own, crossing=across[0] if across else None),
+        (*notes, *crossing.notes),
+    )
 
 
 def drop_inconsistent(
@@ -207,40 +196,73 @@ def drop_inconsistent(
     return Outcome(tuple(shot for k, shot in enumerate(shots) if k not in split.others), (note,))
 
 
+@dataclass(frozen=True, eq=False)
+class _Light:
+    """Sheets of one direction and what they were fitted to: shots, and their boundary points."""
+
+    sheets: LightSheets
+    shots: Sequence[StripedView]
+    points: BoundaryPoints
+
+
 def _refine(
-    pair: LocatedPair, sheets: SmoothSheets, shots: Sequence[StripedView], points: BoundaryPoints
-) -> JointFit[SmoothSheets]:
-    """Refine camera, boards and sheets jointly, from all corners and a subset of the stripes."""
+    pair: LocatedPair, calibration: PairCalibration, lights: Sequence[_Light]
+) -> tuple[PairCalibration, list[_Light]]:
+    """Refine camera, boards and the sheets of both directions jointly, from all corners and a subset
+    of the stripes. Sheets that are not smooth in s stay as they are."""
+    smooth = [light for light in lights if isinstance(light.sheets, SmoothSheets)]
+    if not smooth:
+        return calibration, list(lights)
+    faces = {shot.view.key: shot.face for light in lights for shot in light.shots}
     # 6000 bins determine camera, boards and sheets to a tenth as well as all bins do.
-    points = subsample(points, 6000)
-    number = {shot.view.key: k for k, shot in enumerate(shots)}
-    boards = []
-    for view in pair.views:
-        k = number.get(view.key, -1)
-        boards.append(
-            StripedBoard.from_points(
-                view.board,
-                PlanarView(view.shot, view.points, view.pixels),
-                pair.camera,
-                select(points, points.board == k),
-                shots[k].face if k >= 0 else None,
-            )
+    points = [subsample(light.points, 6000) for light in smooth]
+    number = [{shot.view.key: k for k, shot in enumerate(light.shots)} for light in smooth]
+
+    def stripes_on(view: LocatedView) -> tuple[BoardStripes, ...]:
+        return tuple(
+            BoardStripes.from_points(pair.camera, select(own, own.board == k.get(view.key, -1)))
+            for own, k in zip(points, number, strict=True)
         )
+
+    boards = [
+        StripedBoard(
+            view.board,
+            PlanarView(view.shot, view.points, view.pixels),
+            stripes_on(view),
+            faces.get(view.key),
+        )
+        for view in pair.views
+    ]
     observed = {view.board for view in pair.views}
-    flatness = {
-        board.name: board.flatness_sigma_mm for board in pair.boards if board.name in observed
-    }
-    poses = [view.camera_from_board for view in pair.views]
-    return refine_jointly(pair.camera, poses, sheets, boards, flatness)
+    joint = refine_jointly(
+        pair.camera,
+        [view.camera_from_board for view in pair.views],
+        [light.sheets for light in smooth if isinstance(light.sheets, SmoothSheets)],
+        boards,
+        {board.name: board.flatness_sigma_mm for board in pair.boards if board.name in observed},
+    )
+    refined = iter(joint.sheets)
+    quality = replace(
+        calibration.quality,
+        refinement="joint solve of corners and stripes",
+        corners_rms_px=joint.corners_rms_px,
+        bent_mm={name: warp.out_of_plane_mm for name, warp in joint.warps.items()},
+    )
+    return replace(
+        calibration,
+        camera=joint.camera,
+        camera_covariance=joint.camera_covariance,
+        quality=quality,
+    ), [replace(light, sheets=next(refined)) if light in smooth else light for light in lights]
 
 
 def _fit_crossing(
-    pair: PairCalibration, code: StripeCode, shots: Sequence[StripedView]
-) -> Outcome[PairCalibration]:
-    """Add sheets of the crossing stripes, if any were projected; if they give none, say so."""
+    pair: LocatedPair, code: StripeCode, shots: Sequence[StripedView]
+) -> Outcome[_Light | None]:
+    """Fit sheets of the crossing stripes, if any were projected; if they give none, say so."""
     across = code.crossing
     if across is None:
-        return Outcome(pair)
+        return Outcome(None)
     crossed = [
         replace(shot, boundaries=shot.boundaries.crossing)
         for shot in shots
@@ -250,9 +272,9 @@ def _fit_crossing(
         points = boundaries_on_boards(pair.name, pair.camera, across, crossed)
         fit = fit_light_sheets(points, across.stripes, across.direction)
     except PairFailed as error:
-        return Outcome(pair, (f"{pair.name}: crossing stripes are not used: {error.what}",))
+        return Outcome(None, (f"{pair.name}: crossing stripes are not used: {error.what}",))
     note = f"{pair.name}: crossing stripes: {fit.model}, {fit.rms_mm:.3f} mm from their sheets"
-    return Outcome(replace(pair, crossing=fit.sheets), (note,))
+    return Outcome(_Light(fit.sheets, crossed, points), (note,))
 
 
 MAX_MISFIT_PX = 0.4

@@ -26,7 +26,7 @@ from bodyscan.calibration.boundary_points import (
     subsample,
 )
 from bodyscan.calibration.camera import CameraCalibration, calibrate_camera, locate_board
-from bodyscan.calibration.joint_refinement import StripedBoard, refine_jointly
+from bodyscan.calibration.joint_refinement import BoardStripes, StripedBoard, refine_jointly
 from bodyscan.calibration.light_sheets import fit_light_sheets
 from bodyscan.calibration.sheet_fit import PlaneFit, fit_light_planes, fit_pinhole
 from bodyscan.geometry.camera import Camera
@@ -269,10 +269,14 @@ def calibrate_ours(
         return approach, reference.covariance, fit.model, "corners, then stripes"
     data = subsample(bins, 6000)
     striped = [
-        StripedBoard.from_points(BOARD.name, view, camera, select(data, data.board == number))
+        StripedBoard(
+            BOARD.name,
+            view,
+            (BoardStripes.from_points(camera, select(data, data.board == number)),),
+        )
         for number, view in enumerate(_planar_views(shots))
     ]
     flatness = {BOARD.name: BOARD.flatness_sigma_mm}
-    refined = refine_jointly(camera, reference.poses, fit.sheets, striped, flatness)
-    approach = Approach("ours", refined.camera, refined.sheets)
+    refined = refine_jointly(camera, reference.poses, [fit.sheets], striped, flatness)
+    approach = Approach("ours", refined.camera, *refined.sheets)
     return approach, refined.camera_covariance, fit.model, "joint solve"

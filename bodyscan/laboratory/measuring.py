@@ -21,6 +21,7 @@ from bodyscan.geometry.camera import camera_from_fields
 from bodyscan.geometry.light_planes import Axis, RayDepths, towards_camera
 from bodyscan.geometry.light_sheets import intersect_rays
 from bodyscan.geometry.robust import rms
+from bodyscan.geometry.transforms import fit_rigid_transform
 from bodyscan.laboratory import apparatus
 from bodyscan.laboratory.apparatus import ChapterCaptures, ChapterSetup, SceneCapture
 from bodyscan.laboratory.approaches import Approach
@@ -149,7 +150,8 @@ def _drop_unknown(points: Array) -> Array:
 
 @dataclass(frozen=True)
 class PointSigma:
-    """Errors of depth over their sigma.
+    """Errors along the rays over their sigma, after the rigid motion that fits best: a pair by itself
+    has no frame but that of its boards.
 
     spheres, plate: root mean square on these (1 if the sigmas are right).
     beyond_three: share of all errors beyond three sigmas (0.0027 if Gaussian).
@@ -164,29 +166,37 @@ class PointSigma:
 
 
 def compare_point_sigmas(approach: Approach, captures: ChapterCaptures) -> PointSigma:
-    """Compare depth errors with their sigmas from decoding noise and the sheets' covariance."""
+    """Compare errors with their sigmas from decoding noise and the sheets' covariance."""
     parts = (
-        _depth_errors(approach, captures.spheres, captures.owner >= 0),
-        _depth_errors(approach, captures.plate, captures.on_plate),
+        _measure_points(approach, captures.spheres, captures.owner >= 0),
+        _measure_points(approach, captures.plate, captures.on_plate),
     )
-    spheres, plate = (error / sigma for error, sigma in parts)
-    every = np.concatenate([spheres, plate])
+    measured, true = (np.concatenate([part[k] for part in parts]) for k in (0, 1))
+    sigma = np.concatenate([part[2] for part in parts])
+    aligned = fit_rigid_transform(measured, true).apply(measured)
+    every = (aligned - true)[:, 2] / sigma
+    spheres, plate = np.split(every, [len(parts[0][2])])
     return PointSigma(
         approach.name,
         rms(spheres),
         rms(plate),
         float(np.mean(np.abs(every) > 3.0)),
-        float(np.median(np.concatenate([sigma for _, sigma in parts]))),
+        float(np.median(sigma)),
     )
 
 
-def _depth_errors(approach: Approach, capture: SceneCapture, where: Mask) -> tuple[Array, Array]:
-    """Compute errors of depth and their sigmas, mm, of measured pixels in `where` (H, W)."""
+def _measure_points(
+    approach: Approach, capture: SceneCapture, where: Mask
+) -> tuple[Array, Array, Array]:
+    """Measured pixels in `where` (H, W): points (N, 3), true points, sigmas of the depths (N,), mm."""
     rows, columns = np.nonzero(where & np.isfinite(capture.stripes.s))
-    rays = approach.camera.rays(np.column_stack([columns, rows]).astype(float))
+    pixels = np.column_stack([columns, rows]).astype(float)
+    rays = approach.camera.rays(pixels)
     measured = intersect_rays(approach.sheets, rays, capture.stripes.s[rows, columns].astype(float))
     decoding = measured.per_stripe * capture.stripes.sigma[rows, columns]
     sigma = np.sqrt(decoding**2 + measured.variance_mm2)
-    error = measured.depth - capture.truth.depth[rows, columns]
-    known = np.isfinite(error) & np.isfinite(sigma)
-    return error[known], sigma[known]
+    true_camera = camera_from_fields(describe_camera(apparatus.CAMERA))
+    true = true_camera.rays(pixels) * capture.truth.depth[rows, columns][:, None]
+    points = rays * measured.depth[:, None]
+    known = np.isfinite(points[:, 2]) & np.isfinite(true[:, 2]) & np.isfinite(sigma)
+    return points[known], true[known], sigma[known]

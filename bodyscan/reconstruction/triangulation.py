@@ -51,9 +51,7 @@ def reconstruct_range_image(pair: PairCalibration, stripes: StripeMap) -> RangeI
         other = _triangulate(pair, pair.crossing, crossing.s, crossing.sigma)
         # Crossing stripes are decoded everywhere, not only in the scan volume.
         alone = np.full(sigma_mm.shape, stripes.beyond is None)
-        points, sigma_mm, agreement = combine_directions(*one[:2], *other[:2], alone=alone)
-        # The merged point gets the larger share of the two calibrations.
-        common_mm = sigma_mm * np.fmax(one[2] / one[1], other[2] / other[1])
+        (points, sigma_mm, common_mm), agreement = combine_directions(one, other, alone=alone)
         if agreement is not None:
             # Noise is correlated along another direction in each: in their mean it hardly is.
             correlation_px = (0.0, 0.0)
@@ -75,51 +73,66 @@ def reconstruct_range_image(pair: PairCalibration, stripes: StripeMap) -> RangeI
     )
 
 
+Depths = tuple[Floats, Floats, Floats]
+"""Points (H, W, 3), their sigmas along the rays (H, W), and the part of it that neighbours share."""
+
+
 def combine_directions(
-    points: Floats, sigma_mm: Floats, crossing: Floats, crossing_mm: Floats, *, alone: Mask
-) -> tuple[Floats, Floats, Agreement | None]:
-    """Combine points (H, W, 3) and sigmas (H, W) along their rays from both directions.
+    own: Depths, crossing: Depths, *, alone: Mask
+) -> tuple[Depths, Agreement | None]:
+    """Combine the depths of both directions.
 
     alone: where the crossing stripes may give a point by themselves, (H, W).
 
-    NaN where there are none; the agreement is None if fewer than 100 pixels have both. Depths are
-    weighted by their variances. If the sigmas are too small (an imported calibration may have none),
-    all pixels disagree equally: then only those far beyond the others are dropped, and the better
-    direction alone gives the depth, the other being a check.
+    NaN where there are none; the agreement is None if fewer than 100 pixels have both. Both directions
+    share a camera and boards, and their calibrations' errors are taken as one and the same. However
+    much less they have in common, the mean that follows is no worse than the better of the two: its
+    variance is convex in the weight of the worse, and the best weight is larger. If the sigmas are too
+    small (an imported calibration may have none), all pixels disagree equally: then only those far
+    beyond the others are dropped, and the better direction alone gives the depth, the other being a
+    check.
     """
-    points, sigma_mm = points.copy(), sigma_mm.copy()
-    both = np.isfinite(sigma_mm) & np.isfinite(crossing_mm)
-    alone = alone & ~np.isfinite(sigma_mm) & np.isfinite(crossing_mm)
-    points[alone], sigma_mm[alone] = crossing[alone], crossing_mm[alone]
+    points, sigma_mm, common_mm = (part.copy() for part in own)
+    both = np.isfinite(sigma_mm) & np.isfinite(crossing[1])
+    alone = alone & ~np.isfinite(sigma_mm) & np.isfinite(crossing[1])
+    for part, other in zip((points, sigma_mm, common_mm), crossing, strict=True):
+        part[alone] = other[alone]
     pixels = int(np.count_nonzero(both))
     if pixels < 100:
-        return points, sigma_mm, None
-    one, other = points[both], crossing[both]
-    variance, crossing_variance = sigma_mm[both] ** 2, crossing_mm[both] ** 2
+        return (points, sigma_mm, common_mm), None
+    one, other = points[both], crossing[0][both]
+    variances = np.square([sigma_mm[both], crossing[1][both]])
+    commons = np.array([common_mm[both], crossing[2][both]])
     difference = np.linalg.norm(one, axis=1) - np.linalg.norm(other, axis=1)
-    normalized = difference / np.sqrt(variance + crossing_variance)
+    normalized = difference / np.sqrt(variances.sum(axis=0))
     sigmas = SIGMAS_PER_MEDIAN * float(np.median(np.abs(normalized)))
     # Noise alone does not reach five sigmas; a wrong code does, or a pixel that saw two surfaces.
     wrong = np.abs(normalized) > 5.0 * max(sigmas, 1.0)
-    share = variance / (variance + crossing_variance)  # of the crossing direction
+    shared = commons[0] * commons[1]
+    separate = variances - shared
+    share = np.clip(
+        separate[0] / np.maximum(separate.sum(axis=0), 1e-30), 0.0, 1.0
+    )  # of the crossing
     if sigmas > MAX_RATIO:
         share = np.full_like(share, float(np.median(share) > 0.5))
+    shares = np.stack([1.0 - share, share])
     points[both] = one + share[:, None] * (other - one)
-    merged = np.sqrt((1.0 - share) ** 2 * variance + share**2 * crossing_variance)
+    merged = np.sqrt(np.sum(shares**2 * separate, axis=0) + shared)
     sigma_mm[both] = np.where(wrong, np.float32(np.nan), merged)
+    common_mm[both] = np.sum(shares * commons, axis=0)
     offset = SIGMAS_PER_MEDIAN * float(np.median(np.abs(difference)))
-    return points, sigma_mm, Agreement(pixels, offset, sigmas, int(np.count_nonzero(wrong)))
+    agreement = Agreement(pixels, offset, sigmas, int(np.count_nonzero(wrong)))
+    return (points, sigma_mm, common_mm), agreement
 
 
 def _measure_offset(
-    one: tuple[Floats, Floats, Floats],
-    other: tuple[Floats, Floats, Floats],
+    one: Depths,
+    other: Depths,
     sigmas: Sequence[Floats],
 ) -> tuple[float, bool]:
     """Robust sigma of the directions' difference, in stripes of the less depth-sensitive one, and
     whether that is the other.
 
-    one, other: points, sigma_mm and common_mm of both directions.
     sigmas: of their stripe coordinates.
     """
     both = np.isfinite(one[1]) & np.isfinite(other[1])

@@ -16,7 +16,11 @@ from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.light_planes import Axis, LightPlanes
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
-from bodyscan.reconstruction.triangulation import combine_directions, reconstruct_range_image
+from bodyscan.reconstruction.triangulation import (
+    Depths,
+    combine_directions,
+    reconstruct_range_image,
+)
 from bodyscan.stripes.stripe_map import StripeMap
 
 WIDTH, HEIGHT = 160, 120
@@ -146,12 +150,14 @@ def test_ways_that_differ_by_more_than_their_sigmas_are_not_averaged() -> None:
     wrong = points * np.float32(1.005)
     fine, rough = np.full(shape, 0.1, np.float32), np.full(shape, 0.9, np.float32)
     nowhere = np.zeros(shape, bool)
-    found, sigma_mm, agreement = combine_directions(points, fine, wrong, rough, alone=nowhere)
+    none = np.zeros(shape, np.float32)
+    better, worse = (points, fine, none), (wrong, rough, none)
+    (found, sigma_mm, _), agreement = combine_directions(better, worse, alone=nowhere)
     np.testing.assert_array_equal(found, points)
     np.testing.assert_array_equal(sigma_mm, fine)
     assert agreement is not None
     assert agreement.offset_mm > 1.0
-    swapped, sigma_mm, _ = combine_directions(wrong, rough, points, fine, alone=nowhere)
+    (swapped, sigma_mm, _), _ = combine_directions(worse, better, alone=nowhere)
     np.testing.assert_allclose(swapped, points, rtol=1e-6)
     np.testing.assert_allclose(sigma_mm, fine, rtol=1e-6)
 
@@ -235,11 +241,43 @@ def test_a_way_off_by_five_sigmas_is_dropped_where_most_agree_better_than_they_c
     crossing[3, 4] = rays[3, 4] * (700.0 + 4.9 * np.sqrt(2.0))
     crossing[5, 6] = rays[5, 6] * (700.0 - 5.1 * np.sqrt(2.0))
     nowhere = np.zeros((10, 20), bool)
-    _, sigma_mm, agreement = combine_directions(rays * 700.0, sigma, crossing, sigma, alone=nowhere)
+    none = np.zeros_like(sigma)
+    own, other = (rays * np.float32(700.0), sigma, none), (crossing, sigma, none)
+    (_, sigma_mm, _), agreement = combine_directions(own, other, alone=nowhere)
     assert agreement is not None
     assert agreement.dropped == 1
     assert np.isnan(sigma_mm[5, 6])
     np.testing.assert_allclose(sigma_mm[np.isfinite(sigma_mm)], np.sqrt(0.5), rtol=1e-6)
     assert (agreement.pixels, agreement.offset_sigmas < 0.2) == (200, True)
     few = np.where(np.arange(200).reshape(10, 20) < 99, sigma, np.float32(np.nan))
-    assert combine_directions(rays * 700.0, few, crossing, sigma, alone=nowhere)[2] is None
+    assert combine_directions((own[0], few, none), other, alone=nowhere)[1] is None
+
+
+@pytest.mark.parametrize("alike", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize(("noise_mm", "rows_mm"), [(0.3, 0.6), (0.3, 5.0), (2.0, 1.5), (0.01, 1.1)])
+def test_two_ways_are_never_worse_than_the_better_however_much_they_share(
+    alike: float, noise_mm: float, rows_mm: float
+) -> None:
+    """Columns have 0.3 mm of noise and 1 mm of calibration error, rows as given; of the calibration
+    errors `alike` is one and the same."""
+    rng, shape = np.random.default_rng(0), (10, 20)
+    error, stated = [], []
+    for _ in range(1000):
+        same, *own = rng.standard_normal(3)
+
+        def measured(noise: float, common: float, one: float, same: float = same) -> Depths:
+            shared = common * (np.sqrt(alike) * same + np.sqrt(1.0 - alike) * one)
+            off = shared + noise * rng.standard_normal(shape)
+            points = np.stack([0.0 * off, 0.0 * off, 1000.0 + off], axis=-1).astype(np.float32)
+            flat = np.ones(shape, np.float32)
+            return points, np.float32(np.hypot(noise, common)) * flat, np.float32(common) * flat
+
+        ways = measured(0.3, 1.0, own[0]), measured(noise_mm, rows_mm, own[1])
+        (points, sigma_mm, _), _ = combine_directions(*ways, alone=np.zeros(shape, bool))
+        error.append(np.nanmean((points[..., 2] - 1000.0) ** 2))
+        stated.append(np.nanmean(sigma_mm**2))
+    better = min(np.hypot(0.3, 1.0), np.hypot(noise_mm, rows_mm))
+    assert np.sqrt(np.mean(error)) < 1.02 * better
+    # The sigma holds for errors that are all alike, and is never too small.
+    assert np.sqrt(np.mean(error) / np.mean(stated)) < 1.1
+    assert np.sqrt(np.mean(error) / np.mean(stated)) > (0.9 if alike == 1.0 else 0.7)
