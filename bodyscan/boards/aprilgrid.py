@@ -16,9 +16,9 @@ import numpy as np
 
 from bodyscan.arrays import Array, Bytes, Mask
 from bodyscan.boards import board_layout
-from bodyscan.boards.board_map import BoardMap, fit_board_map
+from bodyscan.boards.board_map import BoardMap, refine_predicted
 from bodyscan.boards.charuco import Markers, detect_markers, fit_markers
-from bodyscan.boards.corners import WINDOW_SQUARES, DetectedCorners, refine_corners
+from bodyscan.boards.corners import WINDOW_SQUARES, DetectedCorners
 from bodyscan.rig.board import Board
 
 BORDER_BITS = (2, 1)
@@ -95,26 +95,13 @@ def locate_grid(board: Board, tags: Markers, border_bits: int = 2) -> GridPositi
 
 
 def _refine(image: Bytes, board: Board, position: GridPosition) -> tuple[Array, Mask]:
-    """Refine all corners (N,) of the grid; return pixels (N, 2) and which are good.
-
-    Corners are looked for where the tags predict them, then where the corners found predict them.
-    """
+    """Refine all corners (N,) of the grid; return pixels (N, 2) and which are good."""
     printed = board_layout.printed_corners(board)
     reach = _clear_radius_mm(board, position.border_bits) / WINDOW_SQUARES
     # Tags are black: at their upper left and lower right corners the other two squares are white.
     row, column = np.divmod(np.arange(len(printed)), 2 * board.columns)
     bright_diagonal = np.asarray((row + column) % 2 == 1)
-    pixels, good = np.zeros_like(printed), np.zeros(len(printed), bool)
-    board_map = position.board_map
-    for _ in range(3):
-        along = reach * board_map.jacobian(printed)
-        again, found = refine_corners(image, board_map.apply(printed), along, bright_diagonal)
-        pixels = np.where((found & ~good)[:, None], again, pixels)
-        good = good | found
-        if good.all() or good.sum() < 4 * MIN_TAGS:
-            break
-        board_map = fit_board_map(printed[good], pixels[good])
-    return pixels, good
+    return refine_predicted(image, position.board_map, printed, reach, bright_diagonal)
 
 
 def _clear_radius_mm(board: Board, border_bits: int) -> float:

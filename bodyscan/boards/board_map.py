@@ -1,4 +1,5 @@
-"""Map a flat print into an image: a homography plus a polynomial for the lens."""
+"""Map a flat print into an image (a homography plus a polynomial for the lens), and refine the
+corners that it predicts."""
 
 from __future__ import annotations
 
@@ -7,7 +8,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from bodyscan.arrays import Array
+from bodyscan.arrays import Array, Bytes, Mask
+from bodyscan.boards.corners import refine_corners
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +62,32 @@ def fit_board_map(printed: Array, pixels: Array) -> BoardMap:
     ridge = 1e-3 * len(printed) * np.eye(design.shape[1])
     solved = np.linalg.solve(design.T @ design + ridge, design.T @ residual)
     return BoardMap(homography, np.asarray(solved, np.float64), middle, size, degree)
+
+
+def refine_predicted(
+    image: Bytes,
+    board_map: BoardMap,
+    printed: Array,
+    square_mm: float,
+    bright_diagonal: Mask,
+    *,
+    marker_gap: float | None = None,
+) -> tuple[Array, Mask]:
+    """Refine the corners printed at points (N, 2) mm; return pixels (N, 2) and which are good.
+
+    Corners are looked for where the map predicts them, then where the corners found do, which are
+    more accurate than markers. square_mm, bright_diagonal, marker_gap: see `refine_corners`.
+    """
+    pixels, good = np.zeros_like(printed), np.zeros(len(printed), bool)
+    for _ in range(3):
+        start, along = board_map.apply(printed), square_mm * board_map.jacobian(printed)
+        again, found = refine_corners(image, start, along, bright_diagonal, marker_gap=marker_gap)
+        more = found & ~good
+        pixels, good = np.where(more[:, None], again, pixels), good | more
+        if good.all() or not more.any() or good.sum() < 12:
+            break
+        board_map = fit_board_map(printed[good], pixels[good])
+    return pixels, good
 
 
 def _project(homography: Array, points: Array) -> Array:

@@ -9,8 +9,8 @@ import numpy as np
 
 from bodyscan.arrays import Array, Bytes, Indices, Mask
 from bodyscan.boards import board_layout
-from bodyscan.boards.board_map import BoardMap, fit_board_map
-from bodyscan.boards.corners import DetectedCorners, refine_corners
+from bodyscan.boards.board_map import BoardMap, fit_board_map, refine_predicted
+from bodyscan.boards.corners import DetectedCorners
 from bodyscan.boards.view import Appearance
 from bodyscan.rig.board import Board
 
@@ -113,27 +113,15 @@ def _fit_face(board: Board, face: int, markers: Markers) -> FacePosition | None:
 def _refine(
     image: Bytes, board: Board, board_map: BoardMap, corner_ids: Indices, markers: Array
 ) -> tuple[Array, Mask]:
-    """Refine corners (N,) where the markers predict them; return pixels (N, 2) and which are good.
-
-    Those not found are tried once more where the other corners, which are more accurate than
-    markers, predict them.
-    """
+    """Refine corners (N,) where the markers predict them; return pixels (N, 2) and which are good."""
     points = board_layout.printed_corners(board)[corner_ids]
     gap = (1.0 - (board.marker_mm or 0.0) / board.square_mm) / 2.0
     marked = np.floor(markers[0].mean(axis=0) / board.square_mm).astype(int).sum()
     row, column = np.divmod(corner_ids, board.columns - 1)
     bright_diagonal = (row + column + marked) % 2 == 0
-
-    def refine(at: BoardMap) -> tuple[Array, Mask]:
-        along = board.square_mm * at.jacobian(points)
-        return refine_corners(image, at.apply(points), along, bright_diagonal, marker_gap=gap)
-
-    pixels, good = refine(board_map)
-    if 12 <= good.sum() < len(good):
-        again, good_again = refine(fit_board_map(points[good], pixels[good]))
-        pixels = np.where(good[:, None], pixels, again)
-        good = good | good_again
-    return pixels, good
+    return refine_predicted(
+        image, board_map, points, board.square_mm, bright_diagonal, marker_gap=gap
+    )
 
 
 def fit_markers(printed: Array, corners: Array, board: Board) -> tuple[BoardMap, Mask] | None:

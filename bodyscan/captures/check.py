@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from itertools import groupby
 from pathlib import Path
 
 from bodyscan.captures.folder import (
@@ -126,7 +126,7 @@ def check(rig_path: Path, known_errors: Iterable[str] = ()) -> CheckReport:
         empty = [shot for shot in captures.shots if shot not in taken]
         errors += [f"{captures.folders[0]}: shot {shot}: no image" for shot in empty]
         errors += _find_frame_errors(captures, good)
-        errors += _find_separate_groups(rig, good)
+        errors += _find_separate_groups(good)
         if not rig.is_known:
             errors += filter(None, (count.explain_too_few() for count in counts))
     return CheckReport(
@@ -143,7 +143,7 @@ def check(rig_path: Path, known_errors: Iterable[str] = ()) -> CheckReport:
 
 
 def format_report(report: CheckReport) -> list[str]:
-    """Format the report as lines of text, with bad images grouped by pair, shot and fault."""
+    """Format the report as lines of text, with bad images grouped by pair and fault."""
     rig = report.rig
     counts = f"{_count(len(rig.pairs), 'pair')}, {_count(len(rig.boards), 'board')}"
     lines = [f"{report.rig_path}: rig {rig.name}: {counts}", *map(str, report.folders)]
@@ -204,7 +204,10 @@ def _warn_of_jpeg(sequences: Iterable[ImageSequence]) -> Iterator[str]:
     them by 0.1 px, several times the effect of a camera's own noise.
     """
     firsts = {s.pair: path for s in reversed(tuple(sequences)) for path in s.paths[:1]}
-    errors = {pair: _read_rounding_error(path) for pair, path in firsts.items()}
+    errors = {}
+    for pair, path in firsts.items():
+        with suppress(NotAnImage, BadInput, OSError):  # reported elsewhere
+            errors[pair] = read_header(path).rounding_error
     coarse = [pair for pair, grey in errors.items() if grey > 4.0]
     if coarse:
         yield (
@@ -212,14 +215,6 @@ def _warn_of_jpeg(sequences: Iterable[ImageSequence]) -> Iterator[str]:
             f"{max(errors.values()):.0f} grey levels, and stripes' boundaries with them; save PNG, "
             "or JPEG of a quality of 95 or more"
         )
-
-
-def _read_rounding_error(path: Path) -> float:
-    """Read a JPEG's error in grey levels; 0 if it cannot be read, which is reported elsewhere."""
-    try:
-        return read_header(path).rounding_error
-    except (NotAnImage, BadInput, OSError):
-        return 0.0
 
 
 def _describe_symmetry(board: Board) -> str:
@@ -232,21 +227,16 @@ def _describe_symmetry(board: Board) -> str:
     )
 
 
-def _find_separate_groups(rig: Rig, good: list[ImageSequence]) -> list[str]:
+def _find_separate_groups(good: list[ImageSequence]) -> list[str]:
     """The error if there are groups of pairs without a common shot: nothing can join them."""
-    groups: list[tuple[set[str], set[str]]] = []  # pairs and their shots
-    for pair in rig.pairs:
-        pairs, shots = {pair.name}, {s.shot for s in good if s.pair == pair.name}
-        if not shots:
-            continue
-        connected = [group for group in groups if group[1] & shots]
-        for group in connected:
-            groups.remove(group)
-            pairs, shots = pairs | group[0], shots | group[1]
-        groups.append((pairs, shots))
+    groups: list[set[str]] = []
+    for shot in {sequence.shot for sequence in good}:
+        pairs = {sequence.pair for sequence in good if sequence.shot == shot}
+        connected = [group for group in groups if group & pairs]
+        groups = [group for group in groups if not group & pairs] + [pairs.union(*connected)]
     if len(groups) < 2:
         return []
-    named = " | ".join(", ".join(sorted(pairs)) for pairs, _ in groups)
+    named = " | ".join(sorted(", ".join(sorted(group)) for group in groups))
     return [
         f"these groups of pairs have no shot in common, so that nothing joins them: {named}; take "
         "shots in which cameras of both see a board"
@@ -264,22 +254,16 @@ def _find_frame_errors(captures: Captures, good: list[ImageSequence]) -> list[st
 
 
 def _format_bad_images(bad: tuple[BadImage, ...]) -> list[str]:
-    """Format one line per pair, shot and fault, with the first file of each; one per pair and fault if
-    more than three shots have it."""
-    shots_of: dict[tuple[str, str], set[str]] = {}
+    """Format one line per pair and fault, with its shots and the first file."""
+    found: dict[tuple[str, str], list[BadImage]] = {}
     for image in bad:
-        shots_of.setdefault((image.pair, image.what), set()).add(image.shot)
-
-    def key(image: BadImage) -> tuple[str, str, str]:
-        shots = shots_of[image.pair, image.what]
-        where = f"{len(shots)} shots" if len(shots) > 3 else f"shot {image.shot}"
-        return image.pair, where, image.what
-
+        found.setdefault((image.pair, image.what), []).append(image)
     lines = []
-    for (pair, where, what), group in groupby(sorted(bad, key=key), key=key):
-        files = [image.path for image in group]
-        rest = f" (and {len(files) - 1} more)" if len(files) > 1 else ""
-        lines.append(f"error: pair {pair}, {where}: {files[0]}: {what}{rest}")
+    for (pair, what), images in found.items():
+        shots = list(dict.fromkeys(image.shot for image in images))
+        where = f"{len(shots)} shots" if len(shots) > 3 else f"shot {', '.join(shots)}"
+        rest = f" (and {len(images) - 1} more)" if len(images) > 1 else ""
+        lines.append(f"error: pair {pair}, {where}: {images[0].path}: {what}{rest}")
     return lines
 
 

@@ -85,22 +85,10 @@ def _split(
     for line in range(s.shape[0]):
         row = line // block_px
         share = np.float32((line + 0.5) / block_px - row)
-        near, far, low = (
-            _blend(limits[0, row], limits[0, row + 1], share),
-            _blend(limits[1, row], limits[1, row + 1], share),
-            _blend(limits[2, row], limits[2, row + 1], share),
-        )
-        _split_line(s[line], sign, offset, usable[line], (near, far, low), there[line], deep[line])
+        here = limits[:, row] + share * (limits[:, row + 1] - limits[:, row])
+        _split_line(s[line], sign, offset, usable[line], here, there[line], deep[line])
         for x in range(s.shape[1]):
             standing[line, x] = there[line, x] & (not deep[line, x])
-
-
-@compiled
-def _blend(upper: Floats, lower: Floats, share: np.float32) -> Floats:
-    between = np.empty(upper.size, np.float32)
-    for x in range(upper.size):
-        between[x] = upper[x] + share * (lower[x] - upper[x])
-    return between
 
 
 @compiled
@@ -109,12 +97,12 @@ def _split_line(
     sign: np.float32,
     offset: np.float32,
     usable: Mask,
-    limits: tuple[Floats, Floats, Floats],
+    limits: Floats,
     there: Mask,
     deep: Mask,
 ) -> None:
     # One array filled per loop: otherwise the compiler does not vectorise.
-    near, far, low = limits
+    near, far, low = limits[0], limits[1], limits[2]
     depth = np.empty(s.size, np.float32)
     for x in range(s.size):
         depth[x] = sign * np.float32(s[x]) + offset

@@ -51,7 +51,9 @@ def find_phase_order(
     errors = np.stack([sigma[usable] for sigma in sigmas])
     some = slice(None, None, max(1, turns.shape[1] // 100_000))
     sample = turns[:, some], errors[:, some].copy()
-    decidable = find_order_gap(sample[1], periods, float(stripes)) >= 3.0 * MIN_GAIN
+    # Of waves without error the best order has a chi squared of 0.
+    gap = find_best_orders(np.zeros_like(sample[0]), sample[1], periods, float(stripes))[2]
+    decidable = gap >= 3.0 * MIN_GAIN
     orders, _, _ = find_best_orders(*sample, periods, float(stripes))
     errors *= _estimate_growth(*sample, periods, orders)[:, None]
     orders, best, second = find_best_orders(turns, errors, periods, float(stripes))
@@ -105,26 +107,6 @@ def _average_waves(
     total = np.sum(weights, axis=0)
     s = (turns[0] + orders) * periods[0] + moved / total
     return s.astype(np.float32), (1.0 / np.sqrt(total)).astype(np.float32)
-
-
-@compiled
-def find_order_gap(sigmas: Floats, periods: Array, stripes: float) -> Array:
-    """Find how much greater (M,) chi squared of any other order is if waves (W, M) have no error."""
-    count = sigmas.shape[1]
-    gap = np.full(count, np.inf)
-    ratios = periods[0] / periods
-    for pixel in range(count):
-        order = 1
-        while order * periods[0] < stripes:
-            cost = 0.0
-            for wave in range(1, periods.size):
-                residual = order * ratios[wave]
-                residual -= math.floor(residual + 0.5)
-                variance = sigmas[wave, pixel] ** 2 + (sigmas[0, pixel] * ratios[wave]) ** 2
-                cost += residual * residual / variance
-            gap[pixel] = min(gap[pixel], cost)
-            order += 1
-    return gap
 
 
 @compiled

@@ -45,9 +45,7 @@ class MeasuredWave:
 
 def measure_wave(images: Greys, wave: Wave) -> MeasuredWave:
     """Measure a wave in its images (steps, L, P)."""
-    angle = 2.0 * np.pi * np.arange(len(images)) / len(images)
-    if wave.shift == "backward":
-        angle = -angle
+    angle = wave.sign * 2.0 * np.pi * np.arange(len(images)) / len(images)
     sine, cosine, mean = (
         np.einsum("nlp,n->lp", images, weight.astype(np.float32))
         for weight in (np.sin(angle), np.cos(angle), np.full(len(images), 1.0 / len(images)))
