@@ -76,7 +76,7 @@ def locate_grid(board: Board, tags: Markers, border_bits: int = 2) -> GridPositi
     """
     ids, printed = board_layout.marker_corners(board)
     rows = printed.reshape(board.rows, board.columns, 4, 2)
-    best: GridPosition | None = None
+    found = []
     _, detected, of_grid = np.intersect1d(tags.ids, ids, return_indices=True)
     if len(detected) < MIN_TAGS:
         return None
@@ -87,11 +87,9 @@ def locate_grid(board: Board, tags: Markers, border_bits: int = 2) -> GridPositi
             if fit is None:
                 continue
             agreeing = int(fit[1].sum())
-            if agreeing >= max(MIN_TAGS, 0.6 * len(detected)) and (
-                best is None or agreeing > best.agreeing
-            ):
-                best = GridPosition(fit[0], agreeing, border_bits)
-    return best
+            if agreeing >= max(MIN_TAGS, 0.6 * len(detected)):
+                found.append(GridPosition(fit[0], agreeing, border_bits))
+    return max(found, key=lambda position: position.agreeing, default=None)
 
 
 def _refine(image: Bytes, board: Board, position: GridPosition) -> tuple[Array, Mask]:

@@ -38,9 +38,11 @@ def corner_points(board: Board) -> Array:
     back's corners, numbered likewise on its own print, follow the front's. An aprilgrid has the
     corners of all tags, row by row: id r * 2 * columns + c.
     """
-    x, y = np.meshgrid(*(_lines(board, count) for count in (board.columns, board.rows)))
-    printed = np.stack([x.ravel(), y.ravel()], axis=-1)
-    return np.concatenate([points_from_print(board, printed, face) for face in range(board.faces)])
+    grid = np.meshgrid(*(_lines(board, count) for count in (board.columns, board.rows)))
+    x, y = (lines.ravel() for lines in grid)
+    front = np.stack([x, y, np.zeros_like(x)], axis=-1)
+    back = np.stack([board.size_mm[0] - x, y, np.full_like(x, board.thickness_mm)], axis=-1)
+    return np.concatenate([front, back]) if board.faces == 2 else front
 
 
 def printed_corners(board: Board) -> Array:
@@ -55,14 +57,6 @@ def _lines(board: Board, count: int) -> Array:
     gap = (board.square_mm - (board.marker_mm or 0.0)) / 2.0
     starts = board.square_mm * np.arange(count)
     return np.stack([starts + gap, starts + board.square_mm - gap], axis=-1).ravel()
-
-
-def points_from_print(board: Board, printed: Array, face: int) -> Array:
-    """Map points (..., 2) mm of a face's print (0 front, 1 back) to the board frame, (..., 3)."""
-    x, y = printed[..., 0], printed[..., 1]
-    if face == 0:
-        return np.stack([x, y, np.zeros_like(x)], axis=-1)
-    return np.stack([board.size_mm[0] - x, y, np.full_like(x, board.thickness_mm)], axis=-1)
 
 
 def marker_dictionary(board: Board) -> cv2.aruco.Dictionary:

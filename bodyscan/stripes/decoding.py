@@ -68,11 +68,6 @@ def _decode_direction(
     stripes = code.decode(SequenceImages(lit, dark, coded), limits)
     if limits is None or stripes.beyond is not None:
         return stripes
-    return restrict(stripes, limits)
-
-
-def restrict(stripes: StripeMap, limits: StripeLimits) -> StripeMap:
-    """Remove s beyond the limits from a stripe map."""
     kept, beyond = limits.split(stripes.s, np.isfinite(stripes.s))
     s, sigma = (np.where(kept, each, np.float32(np.nan)) for each in (stripes.s, stripes.sigma))
     return replace(stripes, s=s, sigma=sigma, beyond=beyond)

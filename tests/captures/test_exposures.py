@@ -13,8 +13,7 @@ from small_captures import encoded, write
 from stripe_rendering import code_light, render
 
 from bodyscan.captures.folder import open_scan
-from bodyscan.captures.grey_levels import merge_exposures
-from bodyscan.captures.images import read_sequence
+from bodyscan.captures.images import merge_exposures, read_sequence
 from bodyscan.errors import ImageError, RigFileError
 from bodyscan.geometry.robust import robust_scale
 from bodyscan.rig.rig import load_rig

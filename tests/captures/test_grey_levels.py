@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from small_captures import encoded, write
 
-from bodyscan.captures.grey_levels import convert_to_greys, find_full_scale
-from bodyscan.captures.images import read_image
+from bodyscan.captures.images import convert_to_greys, find_full_scale, read_image
 from bodyscan.errors import ImageError
 from bodyscan.rig.pair import CameraSpec
 from bodyscan.rig.templates import template_faults

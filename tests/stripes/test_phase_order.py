@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bodyscan.stripes.phase.phase_order import (
+from bodyscan.stripes.phase.decoding import (
     PhaseOrder,
     find_phase_order,
 )
