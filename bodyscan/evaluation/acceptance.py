@@ -87,9 +87,8 @@ def limit_from(text: str) -> tuple[str, float]:
     try:
         return name.strip(), float(value)
     except ValueError:
-        raise AcceptanceError(
-            f"{text!r} is not a limit", remedy="write it as --limit flatness_mm=0.5"
-        ) from None
+        remedy = "write it as --limit flatness_mm=0.5"
+        raise AcceptanceError(f"{text!r} is not a limit", remedy=remedy) from None
 
 
 ALL = "all pairs"

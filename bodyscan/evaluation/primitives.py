@@ -79,14 +79,9 @@ def fit_sphere(points: Array, radius: float | None = None) -> Sphere:
 
 def measure_sphere(points: Array, radius: float) -> SphereAccuracy:
     """Measure a sphere of known radius from all points (N, 3) on it."""
-    given, fitted = fit_sphere(points, radius), fit_sphere(points)
-    return SphereAccuracy(
-        len(points),
-        given,
-        fitted,
-        mean_square_distance(points, given),
-        mean_square_distance(points, fitted),
-    )
+    spheres = fit_sphere(points, radius), fit_sphere(points)
+    errors = [mean_square_distance(points, sphere) for sphere in spheres]
+    return SphereAccuracy(len(points), *spheres, *errors)
 
 
 @dataclass(frozen=True)
@@ -233,6 +228,4 @@ def _sort_in_reading_order(spheres: list[Sphere]) -> list[Sphere]:
             rows[-1].append(sphere)
         else:
             rows.append([sphere])
-    return [
-        sphere for row in rows for sphere in sorted(row, key=lambda sphere: float(sphere.centre[0]))
-    ]
+    return [one for row in rows for one in sorted(row, key=lambda one: float(one.centre[0]))]

@@ -71,9 +71,8 @@ def _corner_normals(count: int, faces: Indices, sides: Array, unit: Array) -> Ar
     along = sides / np.maximum(np.linalg.norm(sides, axis=-1, keepdims=True), 1e-300)
     cosine = -np.einsum("fkc,fkc->fk", along, np.roll(along, 1, axis=1))
     weighted = np.arccos(cosine.clip(-1.0, 1.0))[..., None] * unit[:, None]
-    return np.stack(
-        [np.bincount(faces.ravel(), weighted[..., k].ravel(), count) for k in range(3)], axis=-1
-    )
+    columns = weighted.reshape(-1, 3).T
+    return np.stack([np.bincount(faces.ravel(), column, count) for column in columns], axis=-1)
 
 
 def deviation(signed_mm: Array) -> Deviation:
@@ -215,8 +214,5 @@ def _build_centred_scene(
     """Build a scene of vertices (V, 3) less their mean, as it is float32; also return the mean (3,)."""
     centre = vertices.mean(axis=0)
     scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(
-        o3d.core.Tensor((vertices - centre).astype(np.float32)),
-        o3d.core.Tensor(faces.astype(np.uint32)),
-    )
+    scene.add_triangles((vertices - centre).astype(np.float32), faces.astype(np.uint32))
     return scene, centre

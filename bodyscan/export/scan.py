@@ -57,10 +57,8 @@ def export_scan(
                 remedy=f"Choose from {', '.join(known)}.",
             )
     pose = find_body_frame(scan.mesh.vertices).rig_from_body if frame == "body" else None
-    facts = scan.facts
-    origin = Provenance(
-        facts.get("subject"), facts["calibration_id"], deface, scan_facts(facts), pose
-    )
+    subject, identity = scan.facts.get("subject"), scan.facts["calibration_id"]
+    origin = Provenance(subject, identity, deface, scan_facts(scan.facts), pose)
     neck = find_neck(scan.mesh.vertices, scan.mesh.faces) if deface else None
     written = []
     for version in versions:

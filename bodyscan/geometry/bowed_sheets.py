@@ -61,14 +61,9 @@ class BowedSheets(SmoothSheets):
         parameters, half = np.zeros(size), pinhole.stripes / 2.0
         focal, centre = pinhole.parameters[:2]
         parameters[:2] = (half - centre) / focal, half / focal
-        return BowedSheets(
-            pinhole.projector_from_camera,
-            pinhole.middle,
-            pinhole.stripes,
-            pinhole.direction,
-            parameters,
-            np.full((size, size), np.nan),
-        )
+        frame, unknown = pinhole.projector_from_camera, np.full((size, size), np.nan)
+        where = frame, pinhole.middle, pinhole.stripes, pinhole.direction
+        return BowedSheets(*where, parameters, unknown)
 
     @property
     def bow_terms(self) -> int:
@@ -132,9 +127,8 @@ class BowedSheets(SmoothSheets):
     def _polynomials(self) -> Array:
         """Coefficients (3 + bow_terms, PLANE_DEGREE + 1), one row per polynomial."""
         rows = np.zeros((3 + self.bow_terms, PLANE_DEGREE + 1))
-        for row, part in zip(
-            rows, np.split(self.parameters, np.cumsum(self._sizes))[:-2], strict=True
-        ):
+        parts = np.split(self.parameters, np.cumsum(self._sizes))[:-2]
+        for row, part in zip(rows, parts, strict=True):
             row[: len(part)] = part
         return rows
 
@@ -205,11 +199,8 @@ def _measure(frame: Array, rows: Array, terms: int, rays: Array, s: Array, found
 def _depth(frame: Array, row: Array, terms: int, x: float, y: float) -> tuple[float, float]:
     """z where the ray (x, y, 1) meets the sheet whose coefficients begin the row, and dG/dz there;
     NaN where Newton's method does not settle."""
-    along, across, forward = (
-        _rotate_direction(frame, 0, x, y),
-        _rotate_direction(frame, 1, x, y),
-        _rotate_direction(frame, 2, x, y),
-    )
+    along, across = _rotate_direction(frame, 0, x, y), _rotate_direction(frame, 1, x, y)
+    forward = _rotate_direction(frame, 2, x, y)
     aside, behind = frame[3] + frame[12], frame[11]
     rise = (row[0] - row[2]) * forward + row[1] * along - across
     start = (row[0] - row[2]) * behind + row[1] * aside - frame[7] + row[2] * frame[13]

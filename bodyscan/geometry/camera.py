@@ -47,9 +47,8 @@ class Camera:
     @property
     def matrix(self) -> Array:
         """The matrix A of Eq. 1, (3, 3)."""
-        return np.array(
-            [[self.alpha, self.gamma, self.u0], [0.0, self.beta, self.v0], [0.0, 0.0, 1.0]]
-        )
+        above = [self.alpha, self.gamma, self.u0], [0.0, self.beta, self.v0]
+        return np.array([*above, [0.0, 0.0, 1.0]])
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
@@ -108,11 +107,9 @@ class Camera:
         by_parameter[:, 0, 0], by_parameter[:, 1, 1] = real[:, 0], real[:, 1]
         by_parameter[:, 0, 2] = real[:, 1]
         by_parameter[:, 0, 3] = by_parameter[:, 1, 4] = 1.0
-        by_coefficient = self.lens.by_coefficients(ideal)
-        by_parameter[:, 0, len(MATRIX) :] = (
-            self.alpha * by_coefficient[:, 0] + self.gamma * by_coefficient[:, 1]
-        )
-        by_parameter[:, 1, len(MATRIX) :] = self.beta * by_coefficient[:, 1]
+        by_x, by_y = np.moveaxis(self.lens.by_coefficients(ideal), 1, 0)
+        by_parameter[:, 0, len(MATRIX) :] = self.alpha * by_x + self.gamma * by_y
+        by_parameter[:, 1, len(MATRIX) :] = self.beta * by_y
         perspective = np.zeros((len(points), 2, 3))
         perspective[:, 0, 0] = perspective[:, 1, 1] = 1.0 / z
         perspective[:, :, 2] = -ideal / z[:, None]
@@ -163,11 +160,8 @@ def camera_from_fields(content: Mapping[str, Any]) -> Camera:
         odd = sorted(numbers.keys() ^ expected)
         raise ValueError(f"a camera with a {kind} lens lacks or does not have {', '.join(odd)}")
     for name, value in numbers.items():
-        if (
-            isinstance(value, bool)
-            or not isinstance(value, int | float)
-            or not math.isfinite(value)
-        ):
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not is_number or not math.isfinite(value):
             raise ValueError(f"{name} of a camera is {value!r}, not a number")
     coefficients = {name: numbers.pop(name) for name in lens.names}
     return Camera(lens=type(lens)(**coefficients), **numbers)

@@ -268,9 +268,8 @@ def minimize_each(
         gained = at.cost - tried.cost
         better = gained > 0.0
         # A small predicted gain that is due to damping is no sign of convergence.
-        converged |= (better & (gained < enough)) | (
-            (promised < enough) & (strength <= EFFECTIVE_DAMPING)
-        )
+        converged |= (promised < enough) & (strength <= EFFECTIVE_DAMPING)
+        converged |= better & (gained < enough)
         state = np.where(better[:, None], trial, state)
         at = tried.where(better, at)
         eased = np.maximum(strength / FACTOR, MIN_DAMPING)

@@ -221,9 +221,8 @@ def _depth(frame: Array, lens: Array, distance: float, x: float, y: float, s: fl
         point = _to_projector(frame, x * depth, y * depth, depth)
         image = _distort(lens, point[0], point[1])
         reach, rise, residual = point[2], image[2], lens[0] * image[0] + lens[1] - s
-        step = (
-            residual * reach / (_slope_times_reach(frame, point, image, x, y) + residual * forward)
-        )
+        slope_reach = _slope_times_reach(frame, point, image, x, y)
+        step = residual * reach / (slope_reach + residual * forward)
         depth -= step
         if not abs(step) > EXACT * abs(depth):
             break

@@ -50,9 +50,8 @@ def sheets_from_arrays(kind: str, arrays: Mapping[str, Any], direction: Axis) ->
         covariance = np.pad(covariance, (0, BOW_DEGREE + 2))
     bow, over = divmod(len(parameters) - 3 * (PLANE_DEGREE + 1) - 1, BOW_DEGREE + 1)
     if bow < 1 or over or (bow > 1 and kind == "smooth-planes"):
-        raise ValueError(
-            f"{len(arrays['parameters'])} parameters do not make {kind} sheets of light"
-        )
+        count = len(arrays["parameters"])
+        raise ValueError(f"{count} parameters do not make {kind} sheets of light")
     return BowedSheets(frame, middle, stripes, direction, parameters, covariance)
 
 
@@ -82,8 +81,7 @@ def stripes_per_pixel(sheets: LightSheets, camera: Camera, s: Floats) -> float:
     sampled = s[rows[some], columns[some]].astype(float)
     here = intersect_rays(sheets, camera.rays(pixels), sampled)
     neighbours = [intersect_rays(sheets, camera.rays(pixels + step), sampled) for step in np.eye(2)]
-    # Along its sheet a neighbouring ray meets another depth: as if s had changed by this much
-    # here.
+    # Along its sheet a neighbouring ray meets another depth, as if s had changed here.
     changes = [(one.depth - here.depth) / here.per_stripe for one in neighbours]
     found = np.hypot(*changes)
     found = found[np.isfinite(found)]
@@ -118,10 +116,8 @@ def triangulate_image(
         known = (found.variance_mm2 <= (limit * found.depth) ** 2) & np.isfinite(along)
         wanted[wanted] = known
         points[rows][wanted] = (rays * found.depth[:, None])[known]
-        sigma_mm[rows][wanted], common_mm[rows][wanted] = (
-            along[known],
-            np.sqrt(common * longer)[known],
-        )
+        sigma_mm[rows][wanted] = along[known]
+        common_mm[rows][wanted] = np.sqrt(common * longer)[known]
     return points, sigma_mm, common_mm
 
 

@@ -43,10 +43,8 @@ class LinearGaussianSystem:
         jacobian: (..., N, P). observed, weights: (..., N).
         """
         weighted = jacobian * weights[..., None]
-        return LinearGaussianSystem(
-            np.swapaxes(jacobian, -1, -2) @ weighted,
-            (np.swapaxes(weighted, -1, -2) @ observed[..., None])[..., 0],
-        )
+        vector = (np.swapaxes(weighted, -1, -2) @ observed[..., None])[..., 0]
+        return LinearGaussianSystem(np.swapaxes(jacobian, -1, -2) @ weighted, vector)
 
     @staticmethod
     def from_prior(information: Array) -> LinearGaussianSystem:
@@ -74,16 +72,14 @@ class LinearGaussianSystem:
 
     def __add__(self, other: LinearGaussianSystem) -> LinearGaussianSystem:
         """Combine independent observations of the same unknowns."""
-        return LinearGaussianSystem(
-            self.information + other.information, self.vector + other.vector
-        )
+        information = self.information + other.information
+        return LinearGaussianSystem(information, self.vector + other.vector)
 
     def __mul__(self, weight: Array | float) -> LinearGaussianSystem:
         """Multiply the weight of all observations, for a stack by a factor (...) each."""
         factor = np.asarray(weight)
-        return LinearGaussianSystem(
-            self.information * factor[..., None, None], self.vector * factor[..., None]
-        )
+        information = self.information * factor[..., None, None]
+        return LinearGaussianSystem(information, self.vector * factor[..., None])
 
     def project(self, basis: Array) -> LinearGaussianSystem:
         """The system of z where x = B z: B^T H B, B^T b.
@@ -107,9 +103,8 @@ class LinearGaussianSystem:
 
     def select(self, columns: Indices) -> LinearGaussianSystem:
         """The system of the unknowns `columns` if all others are known to be 0."""
-        return LinearGaussianSystem(
-            self.information[..., columns[:, None], columns], self.vector[..., columns]
-        )
+        information = self.information[..., columns[:, None], columns]
+        return LinearGaussianSystem(information, self.vector[..., columns])
 
     def marginalize(self, columns: Indices) -> LinearGaussianSystem:
         """Eliminate the unknowns `columns` (Schur complement); the others stay in their order.
@@ -121,10 +116,9 @@ class LinearGaussianSystem:
         kept, eliminated = self.select(rest), self.select(columns)
         cross = self.information[..., rest[:, None], columns]
         gain = cross @ invert_scaled(eliminated.information)
-        return LinearGaussianSystem(
-            kept.information - gain @ np.swapaxes(cross, -1, -2),
-            kept.vector - (gain @ eliminated.vector[..., None])[..., 0],
-        )
+        information = kept.information - gain @ np.swapaxes(cross, -1, -2)
+        vector = kept.vector - (gain @ eliminated.vector[..., None])[..., 0]
+        return LinearGaussianSystem(information, vector)
 
     def solve(self, damping: Array | float = 0.0) -> Array:
         """The mode H^-1 b, (..., P); damping as in `solve_scaled`."""

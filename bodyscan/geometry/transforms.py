@@ -71,9 +71,8 @@ class RigidTransform:
         return float(2.0 * np.arcsin(min(half, 1.0)))
 
     def __matmul__(self, other: RigidTransform) -> RigidTransform:
-        return RigidTransform(
-            self.rotation @ other.rotation, self.rotation @ other.translation + self.translation
-        )
+        translation = self.rotation @ other.translation + self.translation
+        return RigidTransform(self.rotation @ other.rotation, translation)
 
     def inverse(self) -> RigidTransform:
         return RigidTransform(self.rotation.T, -self.rotation.T @ self.translation)

@@ -93,9 +93,7 @@ class RayUncertainty:
         """sigma_px (height, width) of every pixel, linear between nodes."""
         v = np.linspace(0.0, ROWS - 1.0, height, dtype=np.float32)
         u = np.linspace(0.0, COLUMNS - 1.0, width, dtype=np.float32)
-        return cv2.remap(
-            self.sigma_px.astype(np.float32), *np.meshgrid(u, v), interpolation=cv2.INTER_LINEAR
-        )
+        return cv2.remap(self.sigma_px.astype(np.float32), *np.meshgrid(u, v), cv2.INTER_LINEAR)
 
 
 def node_pixels(width: int, height: int) -> Array:

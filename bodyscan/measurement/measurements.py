@@ -197,9 +197,8 @@ def heights_from(text: str) -> list[float]:
     try:
         return [float(word) for word in text.split(",")]
     except ValueError as error:
-        raise BadInput(
-            f"{text!r} is not a list of heights", remedy="Write mm with commas between: 800,1050."
-        ) from error
+        remedy = "Write mm with commas between: 800,1050."
+        raise BadInput(f"{text!r} is not a list of heights", remedy=remedy) from error
 
 
 def _share(areas: Array, which: Mask, among: Mask) -> float:
@@ -211,10 +210,10 @@ def _girth(piece: Piece, mesh: BodyMesh, breath: BreathAt | None) -> Girth:
     known = loop.faces >= 0
     corners = mesh.faces[loop.faces]
     noise = np.where(known, mesh.sigma_mm[corners].mean(axis=1), np.nan)
-    sigma = girth_sigma(loop, noise, sectors=4)
-    lean = (
-        None if breath is None else np.where(known, breath.sigma_mm[corners].mean(axis=1), np.nan)
-    )
+    sigma, breath_sigma = girth_sigma(loop, noise, sectors=4), None
+    if breath is not None:
+        lean = np.where(known, breath.sigma_mm[corners].mean(axis=1), np.nan)
+        breath_sigma = girth_sigma(loop, lean, sectors=1)
     lows, highs = bound_girths(loop)
     depth, width = np.ptp(loop.segments[:, 0], axis=0)
     x, y = loop.centre
@@ -234,7 +233,7 @@ def _girth(piece: Piece, mesh: BodyMesh, breath: BreathAt | None) -> Girth:
         loop.measured_share,
         girths,
         tapes,
-        None if lean is None else girth_sigma(loop, lean, sectors=1),
+        breath_sigma,
         None if shares is None else compute_region_shares(shares, loop.lengths),
         piece.touches,
     )

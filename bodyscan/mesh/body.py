@@ -168,8 +168,6 @@ def find_filled_patches(mesh: BodyMesh) -> list[FilledPatch]:
     area = face_areas(mesh.vertices, filled)
     total = np.bincount(patch, area)
     weighted = mesh.vertices[filled].mean(axis=1) * area[:, None]
-    centre = (
-        np.stack([np.bincount(patch, column) for column in weighted.T], axis=1) / total[:, None]
-    )
+    centre = np.stack([np.bincount(patch, column) / total for column in weighted.T], axis=1)
     order = np.argsort(-total, kind="stable")
     return [FilledPatch(float(total[k]), centre[k]) for k in order]

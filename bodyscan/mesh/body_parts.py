@@ -243,9 +243,8 @@ def _name_limbs(graph: nx.DiGraph[_Node], top: float) -> dict[str, list[list[_No
     middle = float(np.mean(list(axis.values()) or [0.0]))
     largest = max((node.area_mm2 for node in trunk), default=0.0)
     arms: dict[str, list[list[_Node]]] = {f"{side} arm": [] for side in SIDES}
-    components = [
-        sorted(c, key=lambda node: node.height_mm) for c in nx.weakly_connected_components(rest)
-    ]
+    found_pieces = nx.weakly_connected_components(rest)
+    components = [sorted(piece, key=lambda node: node.height_mm) for piece in found_pieces]
     for nodes in sorted(components, key=lambda nodes: nodes[0].height_mm - nodes[-1].height_mm):
         found = set(nodes)
         areas: dict[str, float] = {}

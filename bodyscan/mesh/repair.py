@@ -109,9 +109,8 @@ def decimate(mesh: BodyMesh, *, faces: int = 50_000) -> BodyMesh:
         return mesh
     import open3d as o3d  # takes seconds to load
 
-    full = o3d.t.geometry.TriangleMesh(
-        o3d.core.Tensor(mesh.vertices), o3d.core.Tensor(mesh.faces.astype(np.int32))
-    )
+    corners_of = o3d.core.Tensor(mesh.faces.astype(np.int32))
+    full = o3d.t.geometry.TriangleMesh(o3d.core.Tensor(mesh.vertices), corners_of)
     reduced = full.simplify_quadric_decimation(1.0 - faces / len(mesh.faces))
     vertices = reduced.vertex.positions.numpy().astype(np.float64)
     corners = reduced.triangle.indices.numpy().astype(np.int64)

@@ -85,15 +85,13 @@ def _mend(vertices: Array, faces: Indices) -> tuple[Array, Indices, list[str]]:
     notes = []
     places, same = np.unique(vertices, axis=0, return_inverse=True)
     if len(places) < len(vertices):
-        notes.append(
-            f"{len(vertices) - len(places)} vertices lie where another does, and are joined"
-        )
+        doubled = len(vertices) - len(places)
+        notes.append(f"{doubled} vertices lie where another does, and are joined")
         vertices, faces = places, same.reshape(-1)[faces]
     flat = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
     if flat.any():
-        notes.append(
-            f"{flat.sum()} faces name a vertex twice (the first is {flat.argmax()}): dropped"
-        )
+        first = flat.argmax()
+        notes.append(f"{flat.sum()} faces name a vertex twice (the first is {first}): dropped")
         faces = faces[~flat]
     count = len(vertices)
     vertices, faces, _ = drop_unused_vertices(vertices, faces)

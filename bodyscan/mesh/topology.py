@@ -53,9 +53,7 @@ def find_fault(vertices: Array, faces: Indices) -> str | None:
     """Say what makes vertices (V, 3) and faces (F, 3) no mesh, and where; None if nothing does."""
     bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
     if bad.size:
-        return (
-            f"vertex {bad[0]} has a coordinate that is not a number (of {bad.size} such vertices)"
-        )
+        return f"vertex {bad[0]} has a coordinate that is not a number (of {bad.size} such)"
     wrong = np.argwhere((faces < 0) | (faces >= len(vertices)))
     if wrong.size:
         face, named = wrong[0, 0], faces[tuple(wrong[0])]

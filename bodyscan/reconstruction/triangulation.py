@@ -16,10 +16,7 @@ from bodyscan.arrays import Floats, Mask, find_crop
 from bodyscan.calibration.pair import PairCalibration
 from bodyscan.errors import BadInput
 from bodyscan.geometry.light_planes import LightSheets
-from bodyscan.geometry.light_sheets import (
-    stripes_per_pixel,
-    triangulate_image,
-)
+from bodyscan.geometry.light_sheets import stripes_per_pixel, triangulate_image
 from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
 from bodyscan.reconstruction.range_image import MAX_RATIO, Agreement, RangeImage
 from bodyscan.stripes.stripe_map import StripeMap
@@ -219,9 +216,8 @@ def grid_normals(points: Floats, measured: Mask | None = None) -> Floats:
         p, q = inverse_u * y_v - inverse_v * y_u, inverse_v * x_u - inverse_u * x_v
         r = determinant * planes[2] - p * planes[0] - q * planes[1]
         length = np.sqrt(p * p + q * q + r * r)
-        found = (
-            np.stack([p, q, r], axis=-1) / np.where(determinant > 0.0, -length, length)[..., None]
-        )
+        signed = np.where(determinant > 0.0, -length, length)
+        found = np.stack([p, q, r], axis=-1) / signed[..., None]
     border = {"borderType": cv2.BORDER_CONSTANT, "borderValue": 0}
     inner = cv2.erode(measured[box].view(np.uint8), np.ones((5, 5), np.uint8), **border) > 0
     normals[box][inner] = found[inner]

@@ -154,12 +154,8 @@ class FrameNames(ImageNames):
         import numpy as np
 
         counts = code.image_counts.items()
-        return code.moment(
-            {
-                kind.name: np.array([frame_ms[name] for name in self.kind_names(kind, count)])
-                for kind, count in counts
-            }
-        )
+        names = {kind.name: self.kind_names(kind, count) for kind, count in counts}
+        return code.moment({k: np.array([frame_ms[n] for n in some]) for k, some in names.items()})
 
     def sequence_names(self, code: StripeCode | None) -> tuple[str, ...]:
         """Return the names of all images of a sequence in the default order of taking them; for a

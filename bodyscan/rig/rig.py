@@ -72,9 +72,7 @@ class Rig(Model):
     @property
     def is_known(self) -> bool:
         """Whether another program calibrated all of it, including the projectors."""
-        return all(
-            pair.known and (pair.known.projector or not pair.projector) for pair in self.pairs
-        )
+        return all(one.known and (one.known.projector or not one.projector) for one in self.pairs)
 
     @property
     def poles(self) -> dict[str, str]:

@@ -40,9 +40,8 @@ def read_mrcal(path: Path) -> FoundCameras:
     """Read the cameras of one file, or of all in a folder, by the files' names without suffix."""
     files = sorted(path.glob(f"*{SUFFIX}")) if path.is_dir() else [path]
     if not files:
-        raise CalibrationFileError(
-            f"holds no {SUFFIX} files", where=str(path), remedy="give a file or their folder"
-        )
+        remedy = "give a file or their folder"
+        raise ForeignFile(path).error(f"holds no {SUFFIX} files", remedy=remedy)
     return {file.stem: partial(_read_model, file) for file in files}
 
 
