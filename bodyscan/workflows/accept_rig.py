@@ -27,7 +27,6 @@ from bodyscan.evaluation.acceptance import (
     grade_acceptance,
 )
 from bodyscan.files.atomic import write_json, write_text
-from bodyscan.files.messages import require_writable
 from bodyscan.fusion.cleaning import clean
 from bodyscan.fusion.merging import merge
 from bodyscan.optional import optional
@@ -60,8 +59,7 @@ class Acceptance:
 
 
 def refuse_existing_test(folder: Path, overwrite: bool) -> None:
-    """Raise BadInput if `folder` holds a test that may not be replaced, or cannot be written to."""
-    require_writable(folder)
+    """Raise BadInput if `folder` holds a test that may not be replaced."""
     if (folder / FILE_NAME).exists() and not overwrite:
         raise BadInput(
             "holds an acceptance test already",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 
@@ -40,8 +40,6 @@ from bodyscan.stripes.stripe_map import ResponseShare, StripeMap
 
 NUMBER = re.compile(r"\d[\d.]*%?(, \d[\d.]*%?)*")
 """Figures in an error's text, left out to tell whether two shots failed for the same reason."""
-
-Failure = tuple[ImageSequence, BodyscanError]
 
 
 def decode_sequence(
@@ -218,21 +216,20 @@ def collect_stripes(
     wanted = _by_sequence(views)
     every = {sequence: found for pair in pairs for sequence, found in pair.sequences.items()}
     boundaries: dict[ViewKey, BoardBoundaries] = {}
-    failures: list[Failure] = []
+    failures: dict[ImageSequence, BodyscanError] = {}
     faults: dict[ImageSequence, str] = {}
     responses: dict[str, list[ResponseShare]] = defaultdict(list)
     for sequence in filter(every.__contains__, captures.sequences):
         found = every[sequence]
         if isinstance(found, BodyscanError):
-            failures.append((sequence, found))
+            failures[sequence] = found
             continue
         boundaries |= found.boundaries
         faults[sequence] = found.crossing_fault
         responses[sequence.pair] += found.responses
-    failed = failed_pairs(failures, {pair for pair, _, _ in boundaries})
+    failed, failure_notes = describe_failures(failures, {pair for pair, _, _ in boundaries})
     failed |= _without_stripes(rig, wanted, {sequence.pair for sequence in every})
-    partial = [failure for failure in failures if failure[0].pair not in failed]
-    notes = (*failure_notes(partial), *crossing_notes(faults), *response_notes(responses))
+    notes = (*failure_notes, *crossing_notes(faults), *response_notes(responses))
     return Outcome(boundaries, notes, failed)
 
 
@@ -296,24 +293,25 @@ def response_notes(responses: Mapping[str, Sequence[ResponseShare]]) -> Iterator
             yield f"{pair}: {max(shares, key=lambda share: share.response_rms)}"
 
 
-def failed_pairs(failures: Sequence[Failure], good: set[str]) -> dict[str, str]:
-    """Pairs that failed in every shot, with the reason, or the first few of several reasons."""
+def describe_failures(
+    failures: Mapping[ImageSequence, BodyscanError], good: Collection[str]
+) -> tuple[dict[str, str], list[str]]:
+    """Pairs that failed in every shot, with the reason or the first few of several; and, of pairs
+    that are good in some shot, one line for each reason."""
     reasons: dict[str, list[str]] = defaultdict(list)
-    for pair, reason in _group_faults((s, format_error(error)) for s, error in failures):
+    notes = []
+    groups = _group_faults((sequence, format_error(error)) for sequence, error in failures.items())
+    for (pair, reason), group in groups.items():
         if pair not in good:
             reasons[pair].append(reason)
+        elif len(group) == 1:
+            notes.append(str(failures[group[0]]))
+        else:
+            shots = ", ".join(sequence.shot for sequence in group)
+            notes.append(f"{pair}: {reason}\n  in {len(group)} shots: {shots}")
     several = "no stripe sequence can be decoded: "
-    return {
+    failed = {
         pair: found[0] if len(found) == 1 else several + "\n  or: ".join(found[:3])
         for pair, found in reasons.items()
     }
-
-
-def failure_notes(failures: Sequence[Failure]) -> Iterator[str]:
-    """One line for each pair and each reason."""
-    errors = dict(failures)
-    groups = _group_faults((sequence, format_error(error)) for sequence, error in failures)
-    for (pair, reason), group in groups.items():
-        shots = ", ".join(sequence.shot for sequence in group)
-        several = f"{pair}: {reason}\n  in {len(group)} shots: {shots}"
-        yield several if len(group) > 1 else str(errors[group[0]])
+    return failed, notes

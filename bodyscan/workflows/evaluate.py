@@ -56,14 +56,6 @@ class RigDeviation:
     rotations_deg: Array
     sigmas_mm: Array
 
-    @property
-    def centres_rms_mm(self) -> float:
-        return rms_length(self.centres_mm)
-
-    @property
-    def rotations_rms_deg(self) -> float:
-        return rms(self.rotations_deg)
-
 
 @dataclass(frozen=True, eq=False)
 class Truth:
@@ -135,8 +127,8 @@ def evaluate_workspace(workspace: Path, body_at: BodyAt | None = None) -> str:
     rig = compare_rig(calibration, truth)
     lines = [
         "against the truth (synthetic):",
-        f"  camera centres          {rig.centres_rms_mm:.3f} mm RMS, rotations "
-        f"{rig.rotations_rms_deg:.4f} degrees RMS, {len(rig.names)} pairs",
+        f"  camera centres          {rms_length(rig.centres_mm):.3f} mm RMS, rotations "
+        f"{rms(rig.rotations_deg):.4f} degrees RMS, {len(rig.names)} pairs",
     ]
     folder = workspace / "scan"
     if not (folder / "scan.json").exists() or truth.vertices is None or truth.faces is None:

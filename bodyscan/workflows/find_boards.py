@@ -72,31 +72,23 @@ def find_all_boards(rig: Rig, captures: Captures, progress: Progress = silent) -
     Images that cannot be read, or that show no board, become notes.
     """
 
-    def find(sequence: ImageSequence) -> tuple[list[BoardView], BodyscanError | None]:
-        try:
-            if sequence.board_path in captures.corners:
-                return _given_view(rig, captures, sequence), None
-            image = read_board_image(sequence, rig.pair(sequence.pair))
-            found = find_boards(image, rig.boards, pair=sequence.pair, shot=sequence.shot)
-        except BodyscanError as error:
-            return [], error
-        return found, None
+    def find(sequence: ImageSequence) -> list[BoardView]:
+        if sequence.board_path in captures.corners:
+            return _given_view(rig, captures, sequence)
+        image = read_board_image(sequence, rig.pair(sequence.pair))
+        return find_boards(image, rig.boards, pair=sequence.pair, shot=sequence.shot)
 
-    results = map_threads(find, captures.sequences, stage="finding boards", progress=progress)
-    views = [view for found, _ in results for view in found]
-    without = [
-        sequence
-        for sequence, (found, error) in zip(captures.sequences, results, strict=True)
-        if not found and error is None and sequence.board_path not in captures.corners
-    ]
+    found, refused = attempt_each(
+        find, captures.sequences, BodyscanError, stage="finding boards", progress=progress
+    )
+    views = [view for each in found.values() for view in each]
+    without = [s for s, each in found.items() if not each and s.board_path not in captures.corners]
     described = _look_closer(rig, views, without)
     missing = [
         f"{s.board_path} (pair {s.pair}, shot {s.shot}): no board found"
         + (f": {described[s]}" if s in described else "")
         for s in without
     ]
-    errors = zip(captures.sequences, (error for _, error in results), strict=True)
-    refused = {sequence: error for sequence, error in errors if error is not None}
     notes = (*map(str, refused.values()), *missing, *appearance_notes(rig, views))
     return FoundBoards(views, notes, refused=refused)
 

@@ -19,7 +19,7 @@ from bodyscan.fusion.regions import label_regions
 from bodyscan.fusion.storage import Made, Scan, no_use
 from bodyscan.fusion.verdict import grade_scan
 from bodyscan.fusion.verdict.coverage import measure_coverage
-from bodyscan.fusion.verdict.evidence import Coverage, ImageEvidence, RigEvidence, ScanEvidence
+from bodyscan.fusion.verdict.evidence import ImageEvidence, RigEvidence, ScanEvidence
 from bodyscan.fusion.verdict.overlaps import find_seams
 from bodyscan.fusion.verdict.rig import find_floor, find_misplaced, find_silent_poles
 from bodyscan.geometry.transforms import RigidTransform
@@ -108,7 +108,10 @@ def fuse(
         announce(grade_scan(evidence), final=False)
     with step(progress, "meshing"):
         cloud, mesh = _mesh(merged.cloud, measured.value, subject, settings, made)
-        coverage = _coverage(mesh, cleaned, subject)
+        # Also by the images of pairs that saw nothing of the subject.
+        carried = {image.pair: image for image in subject.images}
+        images = [carried.get(image.pair, image) for image in cleaned]
+        coverage = measure_coverage(mesh, images, subject.rig_from_camera)
         verdict = grade_scan(replace(evidence, mesh=mesh, coverage=coverage))
     return Scan(
         cloud,
@@ -204,10 +207,3 @@ def _mesh(
         mesh = subject.motion.add_breath(mesh)
     made(mesh)
     return known, mesh
-
-
-def _coverage(mesh: BodyMesh, cleaned: Sequence[RangeImage], subject: _Subject) -> Coverage:
-    """Check the mesh against the images of all pairs, including those that saw nothing."""
-    carried = {image.pair: image for image in subject.images}
-    images = [carried.get(image.pair, image) for image in cleaned]
-    return measure_coverage(mesh, images, subject.rig_from_camera)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Collection, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
@@ -110,10 +111,7 @@ def reconstruct_range_images(
     return Outcome(images, (*notes, *response_notes(responses)), failed)
 
 
-Stamp = tuple[int, int]
-
-
-_Made = tuple[Reconstructed, tuple[Stamp, ...]]
+_Made = tuple[Reconstructed, tuple[tuple[int, int], ...]]
 """A range image and the stamps (size, time of change) of the files it was made from."""
 
 
@@ -136,7 +134,11 @@ class Preparation:
             captures = open_scan(self.calibration.rig, folder)
         except BodyscanError:
             return
-        wanted = [s for s in captures.sequences if s.pair in pairs and self._is_whole(s)]
+        wanted = [
+            s
+            for s in captures.sequences
+            if s.pair in self.calibration.pairs.keys() & pairs and s.has_stripes and not s.missing
+        ]
 
         def make(sequence: ImageSequence) -> _Made | None:
             stamps = _stamps(captures, sequence)
@@ -164,20 +166,14 @@ class Preparation:
             if one is not None and _stamps(captures, sequence) == one[1]
         }
 
-    def _is_whole(self, sequence: ImageSequence) -> bool:
-        calibrated = sequence.pair in self.calibration.pairs
-        return calibrated and sequence.has_stripes and not sequence.missing
 
-
-def _stamps(captures: Captures, sequence: ImageSequence) -> tuple[Stamp, ...]:
+def _stamps(captures: Captures, sequence: ImageSequence) -> tuple[tuple[int, int], ...]:
     """Stamps of the images and of captures.yaml, which says when they were taken; (0, 0) for a
     missing file."""
     stamps = []
     for path in (*(folder / FILE_NAME for folder in captures.folders), *sequence.paths):
-        try:
+        stamps.append((0, 0))
+        with suppress(OSError):
             found = path.stat()
-        except OSError:
-            stamps.append((0, 0))
-        else:
-            stamps.append((found.st_size, found.st_mtime_ns))
+            stamps[-1] = found.st_size, found.st_mtime_ns
     return tuple(stamps)

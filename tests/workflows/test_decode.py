@@ -14,15 +14,10 @@ from bodyscan.arrays import Array
 from bodyscan.boards.view import BoardView
 from bodyscan.calibration.boundary_points import boundaries_near, box_around, crop_around
 from bodyscan.captures.folder import ImageSequence, open_scan
-from bodyscan.errors import DecodingFailed, ImageError
+from bodyscan.errors import BodyscanError, DecodingFailed, ImageError
 from bodyscan.rig.rig import Rig, load_rig
 from bodyscan.workflows import decode
-from bodyscan.workflows.decode import (
-    crossing_notes,
-    decode_sequence,
-    failed_pairs,
-    failure_notes,
-)
+from bodyscan.workflows.decode import crossing_notes, decode_sequence, describe_failures
 
 TWO_WAYS = """
 version: 1
@@ -37,38 +32,41 @@ frames: {crossing: {pattern: "row{bit}", inverse: "row{bit}-inverse"}}
 """
 
 
-def failures(pair: str, what: str, *shots: str) -> list[tuple[ImageSequence, DecodingFailed]]:
-    return [
-        (
-            ImageSequence(pair, shot, Path("lit.png"), None, (), ()),
-            DecodingFailed(what, where=f"pair {pair}, shot {shot}", remedy="do something"),
+def failures(pair: str, what: str, *shots: str) -> dict[ImageSequence, BodyscanError]:
+    return {
+        ImageSequence(pair, shot, Path("lit.png"), None, (), ()): DecodingFailed(
+            what, where=f"pair {pair}, shot {shot}", remedy="do something"
         )
         for shot in shots
-    ]
+    }
 
 
 def test_a_pair_whose_stripes_all_run_the_other_way_fails_for_that_reason() -> None:
     same = failures("p1", "the stripes run vertically", "a", "b", "c")
-    mixed = [*failures("p2", "one", "a"), *failures("p2", "other", "b")]
-    found = failed_pairs([*same, *mixed], good={"p3"})
+    mixed = failures("p2", "one", "a") | failures("p2", "other", "b")
+    found, notes = describe_failures(same | mixed, {"p3"})
     assert found["p1"] == "the stripes run vertically\n  do something"
     assert found["p2"].startswith("no stripe sequence can be decoded: one\n")
     assert "or: other" in found["p2"]
-    assert failed_pairs(same, good={"p1"}) == {}
+    assert notes == []
+    assert describe_failures(same, {"p1"})[0] == {}
 
 
 def test_a_fault_is_one_whatever_its_share_of_the_pixels() -> None:
-    shares = [failures("p1", f"{share}% of the codes lie beyond", "a") for share in (27, 31)]
-    assert failed_pairs([one for own in shares for one in own], set()) == {
+    one, other = (
+        failures("p1", f"{share}% of the codes lie beyond", shot)
+        for share, shot in ((27, "a"), (31, "b"))
+    )
+    assert describe_failures(one | other, ())[0] == {
         "p1": "27% of the codes lie beyond\n  do something"
     }
 
 
 def test_many_shots_with_one_fault_share_a_note() -> None:
-    (note,) = failure_notes(failures("p1", "too dark", "a", "b", "c", "d"))
+    _, (note,) = describe_failures(failures("p1", "too dark", "a", "b", "c", "d"), {"p1"})
     assert note.count("too dark") == 1
     assert "in 4 shots: a, b, c, d" in note
-    (note,) = failure_notes(failures("p1", "too dark", "a"))
+    _, (note,) = describe_failures(failures("p1", "too dark", "a"), {"p1"})
     assert note.startswith("pair p1, shot a: too dark")
 
 
