@@ -29,10 +29,8 @@ def compiled(function: Function) -> Function:
     try:
         kept = numba.njit(cache=True, **options)(function)
         _look_at_imports(kept, function)
-    except (
-        RuntimeError,
-        AttributeError,
-    ):  # nowhere to cache, or a Numba whose cache works differently
+    except (RuntimeError, AttributeError):
+        # Nowhere to cache, or a Numba whose cache works differently.
         return cast(Function, numba.njit(**options)(function))
     return cast(Function, kept)
 
@@ -50,8 +48,6 @@ def _look_at_imports(kept: Any, function: Any) -> None:
         if isinstance(value, type(kept))
     }
     files = kept._cache._cache_file
-    stamps = [
-        (file, os.stat(file).st_mtime, os.stat(file).st_size)
-        for file in sorted(called - {source_file})
-    ]
+    stats = [(file, os.stat(file)) for file in sorted(called - {source_file})]
+    stamps = [(file, stat.st_mtime, stat.st_size) for file, stat in stats]
     files._source_stamp = (*files._source_stamp, *stamps)

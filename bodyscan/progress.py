@@ -76,14 +76,12 @@ def map_threads(
     workers: int = THREADS,
 ) -> list[Result]:
     """Run `work` on every item in threads; return the results in the order of the items."""
-    todo: Sequence[Item] = list(items)
-    progress(stage, 0, len(todo))
-    results = []
-    with ThreadPoolExecutor(workers) as pool:
-        for done, result in enumerate(pool.map(work, todo), start=1):
-            results.append(result)
-            progress(stage, done, len(todo))
-    return results
+    found = iterate_threads(work, items, _Never, stage=stage, progress=progress, workers=workers)
+    return [cast(Result, result) for _, result in found]
+
+
+class _Never(Exception):
+    """Raised by nothing: no error counts as a result."""
 
 
 def attempt_each(

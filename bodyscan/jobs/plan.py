@@ -51,26 +51,20 @@ def plan(job: Job, stages: Sequence[Stage]) -> list[Step]:
     """Predict what a batch would do now, stage by stage."""
     steps: list[Step] = []
     for stage in stages:
+        read = read_record(job.folder / stage.name / STAGE).get("inputs")
+        was = read if isinstance(read, dict) else {}
+        again = {step.stage for step in steps if step.why}
+        before = sorted({name.split("/")[0] for name in was} & again)
         try:
-            again = [step.stage for step in steps if step.why]
-            steps.append(_step(job, origin_of(job, stage), again))
+            now = origin_of(job, stage)
+            # A stage that runs again often gives the same result.
+            why = reason_to_run(job, replace(now, inputs=was) if before else now)
         except (BodyscanError, OSError) as error:
             why = f"its inputs cannot be used as they are: {error}"
-            steps.append(Step(stage.name, why))
+        certain = bool(why) or not before
+        why = why if certain else f"{', '.join(before)} runs before it, and may give another result"
+        steps.append(Step(stage.name, why, certain))
     return steps
-
-
-def _step(job: Job, now: Origin, again: Sequence[str]) -> Step:
-    """again: stages that run before; made again, their results are often the same."""
-    read = read_record(job.folder / now.stage / STAGE).get("inputs")
-    was = read if isinstance(read, dict) else {}
-    before = {name.split("/")[0] for name in was}.intersection(again)
-    if not before:
-        return Step(now.stage, reason_to_run(job, now))
-    if why := reason_to_run(job, replace(now, inputs=was)):
-        return Step(now.stage, why)
-    why = f"{', '.join(sorted(before))} runs before it, and may give another result"
-    return Step(now.stage, why, certain=False)
 
 
 def reason_to_run(job: Job, now: Origin) -> str:
@@ -81,12 +75,13 @@ def reason_to_run(job: Job, now: Origin) -> str:
         version, settings = record["stage_version"], record["settings"]
         inputs, outputs = dict(record["inputs"]), dict(record["outputs"])
     except FileNotFoundError:
-        return _last_failure(job) or "there is no result yet"
+        reason = read_record(job.folder / STATE).get("reason")
+        return f"it failed last time: {reason}" if reason else "there is no result yet"
     except (OSError, ValueError, KeyError, TypeError):
         return "what its last result was made from cannot be read"
     if version != now.stage_version:
         return f"version {now.stage_version} of the stage, it was {version}"
-    if changes := _changes(_flat(settings), _flat(now.settings)):
+    if changes := _changes(settings, now.settings):
         return f"settings changed: {changes}"
     if changes := _difference(inputs, now.inputs):
         return f"inputs changed: {changes}"
@@ -107,21 +102,13 @@ def _difference(was: Mapping[str, str], now: Mapping[str, str]) -> str:
 
 
 def _changes(was: Mapping[str, Any], now: Mapping[str, Any]) -> str:
-    return ", ".join(
-        f"{key} {json.dumps(was.get(key))} -> {json.dumps(now.get(key))}"
-        for key in sorted({*was, *now})
-        if was.get(key) != now.get(key)
+    """List the settings that differ, by section and key, with both values."""
+    before, after = (
+        {f"{name}.{key}": value for name, each in sections.items() for key, value in each.items()}
+        for sections in (was, now)
     )
-
-
-def _flat(settings: Mapping[str, Any]) -> dict[str, Any]:
-    return {
-        f"{name}.{key}": value
-        for name, section in settings.items()
-        for key, value in section.items()
-    }
-
-
-def _last_failure(job: Job) -> str:
-    reason = read_record(job.folder / STATE).get("reason")
-    return f"it failed last time: {reason}" if reason else ""
+    return ", ".join(
+        f"{key} {json.dumps(before.get(key))} -> {json.dumps(after.get(key))}"
+        for key in sorted({*before, *after})
+        if before.get(key) != after.get(key)
+    )

@@ -36,7 +36,6 @@ COLUMNS = {
     ),
     "calibrate": ("pairs", "pairs_failed", "corners_rms_px", "sheets_rms_mm"),
 }
-Motions = dict[str, Array]
 
 
 def write_summary(jobs: Sequence[Job], outcomes: Sequence[JobResult], out: Path) -> Path:
@@ -135,7 +134,7 @@ def _facts(job: Job) -> dict[str, Any]:
     return read_record(job.folder / "scan" / "scan.json")
 
 
-def _motions(job: Job) -> Motions:
+def _motions(job: Job) -> dict[str, Array]:
     """Motion (3,) mm of every pair at the body's centre, from its calibrated to its aligned pose."""
     alignment = _facts(job).get("alignment")
     if not alignment or job.calibration is None:

@@ -1,7 +1,7 @@
 """What a person looks at: one HTML file about a scan, a calibration or an acceptance test.
 
 page holds what a report is made of, and result_page finds what a folder holds. scan_page,
-calibration_page (with calibration_charts) and acceptance_page make their
-reports. pictures shades bodies; charts and sigma_map use Matplotlib; body_model is a model
-to rotate, packed by model. measurements: a table on screen.
+calibration_page (with calibration_charts) and acceptance_page make their reports. pictures shades
+bodies; charts and sigma_map use Matplotlib; model packs what can be rotated.
+measurements: a table on screen.
 """

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
+
 import cv2
 import numpy as np
 from matplotlib import pyplot as plt
@@ -110,14 +112,14 @@ def shared_boards(calibration: RigCalibration) -> Array:
 
 def line_styles(calibration: RigCalibration) -> tuple[dict[str, str], dict[str, str]]:
     """A colour for the pairs of each pole, and a dash for each pair of a pole."""
-    pairs = calibration.rig.pairs
-    poles = list(dict.fromkeys(pair.pole or pair.name for pair in pairs))
-    colour, dash, used = {}, {}, dict.fromkeys(poles, 0)
-    for pair in pairs:
-        pole = pair.pole or pair.name
-        colour[pair.name] = POLES[poles.index(pole) % len(POLES)]
-        dash[pair.name] = DASHES[used[pole] % len(DASHES)]
-        used[pole] += 1
+    poles: dict[str, list[str]] = defaultdict(list)
+    for pair in calibration.rig.pairs:
+        poles[pair.pole or pair.name].append(pair.name)
+    colour, dash = {}, {}
+    for pole, names in enumerate(poles.values()):
+        for number, name in enumerate(names):
+            colour[name] = POLES[pole % len(POLES)]
+            dash[name] = DASHES[number % len(DASHES)]
     return colour, dash
 
 

@@ -15,6 +15,12 @@ from bodyscan.measurement.outline import Range
 from bodyscan.mesh.body import DARK_CLOTH, HAIR, REGION_NAMES, SKIN
 from bodyscan.version import __version__
 
+COPIED = (
+    *("stature_mm", "stature_measured", "crown", "regions", "volume_l", "area_m2", "measured"),
+    *("at_mean_breath", "facing_known"),
+)
+"""Fields of `Measurements` that `measurements.json` has as they are."""
+
 
 def tables(measured: Measurements) -> Iterator[Table]:
     """The whole body, then one row for each part of each slice, from the top down."""
@@ -86,18 +92,10 @@ def measurements_document(measured: Measurements, facts: Mapping[str, Any]) -> d
         "when": facts.get("when"),
         "calibration_id": facts.get("calibration_id"),
         "verdict": facts.get("verdict"),
-        "stature_mm": measured.stature_mm,
-        "stature_measured": measured.stature_measured,
-        "crown": measured.crown,
         "head_mm": measured.head and measured.head.height_mm,
         "head_sigma_mm": measured.head and measured.head.sigma_mm,
-        "regions": measured.regions,
-        "volume_l": measured.volume_l,
-        "area_m2": measured.area_m2,
-        "measured": measured.measured,
-        "at_mean_breath": measured.at_mean_breath,
+        **{name: getattr(measured, name) for name in COPIED},
         "rig_from_body": measured.rig_from_body.matrix,
-        "facing_known": measured.facing_known,
         "slices": [asdict(level) for level in measured.slices],
     }
 

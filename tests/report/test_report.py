@@ -26,10 +26,10 @@ from bodyscan.files.atomic import write_json
 from bodyscan.fusion.storage import Origin
 from bodyscan.jobs.forgetting import find_subject
 from bodyscan.mesh.body import HAIR, SKIN, BodyCloud, find_filled_patches
-from bodyscan.report.body_model import colour_layers
 from bodyscan.report.model import Layer, pack
 from bodyscan.report.page import Column, render
 from bodyscan.report.result_page import build_page
+from bodyscan.report.scan_page import colour_layers
 
 
 @pytest.fixture(scope="module")
