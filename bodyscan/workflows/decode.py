@@ -156,7 +156,7 @@ class PrintAreas:
 def decode_pairs(
     rig: Rig,
     captures: Captures,
-    views: Iterable[BoardView],
+    views: Sequence[BoardView],
     progress: Progress = silent,
     *,
     prints: PrintAreas | None = None,
@@ -165,13 +165,17 @@ def decode_pairs(
 
     prints: select the boundaries on the boards' prints; all within half a board's size if None.
     """
-    wanted = _by_sequence(views)
+    wanted: dict[tuple[str, str], list[BoardView]] = defaultdict(list)
+    for view in views:
+        wanted[view.pair, view.shot].append(view)
     sequences = [s for s in captures.sequences if s.has_stripes and (s.pair, s.shot) in wanted]
     box: Callable[[BoardView], Box] = prints.box if prints else box_around
-    step: dict[str, int] = {}
-    for name in {s.pair for s in sequences}:
-        of_pair = [v for (pair, _), group in wanted.items() if pair == name for v in group]
-        step[name] = prints.band_step(rig.pair(name), of_pair) if prints else 1
+    step = {
+        name: prints.band_step(rig.pair(name), [view for view in views if view.pair == name])
+        if prints
+        else 1
+        for name in {sequence.pair for sequence in sequences}
+    }
     # Shots take turns in bands.
     turn = {s: captures.pair_sequences(s.pair).index(s) for s in sequences}
 
@@ -213,12 +217,11 @@ def collect_stripes(
 ) -> Outcome[dict[ViewKey, BoardBoundaries]]:
     """The boundaries of all pairs; bad sequences become notes, and a pair none of whose sequences
     can be decoded is a failure."""
-    wanted = _by_sequence(views)
     every = {sequence: found for pair in pairs for sequence, found in pair.sequences.items()}
     boundaries: dict[ViewKey, BoardBoundaries] = {}
     failures: dict[ImageSequence, BodyscanError] = {}
     faults: dict[ImageSequence, str] = {}
-    responses: dict[str, list[ResponseShare]] = defaultdict(list)
+    responses: list[tuple[str, ResponseShare]] = []
     for sequence in filter(every.__contains__, captures.sequences):
         found = every[sequence]
         if isinstance(found, BodyscanError):
@@ -226,26 +229,16 @@ def collect_stripes(
             continue
         boundaries |= found.boundaries
         faults[sequence] = found.crossing_fault
-        responses[sequence.pair] += found.responses
+        responses += ((sequence.pair, share) for share in found.responses)
     failed, failure_notes = describe_failures(failures, {pair for pair, _, _ in boundaries})
-    failed |= _without_stripes(rig, wanted, {sequence.pair for sequence in every})
+    failed |= _without_stripes(rig, views, {sequence.pair for sequence in every})
     notes = (*failure_notes, *crossing_notes(faults), *response_notes(responses))
     return Outcome(boundaries, notes, failed)
 
 
-def _by_sequence(views: Iterable[BoardView]) -> dict[tuple[str, str], list[BoardView]]:
-    """Views by pair and shot."""
-    found: dict[tuple[str, str], list[BoardView]] = defaultdict(list)
-    for view in views:
-        found[view.pair, view.shot].append(view)
-    return found
-
-
-def _without_stripes(
-    rig: Rig, wanted: Iterable[tuple[str, str]], decoded: set[str]
-) -> dict[str, str]:
+def _without_stripes(rig: Rig, views: Iterable[BoardView], decoded: set[str]) -> dict[str, str]:
     """Pairs with a projector that saw the board but have no stripe sequence, with the reason."""
-    shots = dict(wanted)
+    shots = {view.pair: view.shot for view in views}
     return {
         pair.name: "no stripe sequence was found in any shot of the board: there is no image such as "
         + fill(
@@ -286,11 +279,11 @@ def responses_in(stripes: StripeMap) -> list[ResponseShare]:
     return [one.response for one in maps if one is not None and one.response is not None]
 
 
-def response_notes(responses: Mapping[str, Sequence[ResponseShare]]) -> Iterator[str]:
+def response_notes(responses: Iterable[tuple[str, ResponseShare]]) -> Iterator[str]:
     """One line for each pair with a corrected projector response, quoting its strongest shot."""
-    for pair, shares in sorted(responses.items()):
-        if shares:
-            yield f"{pair}: {max(shares, key=lambda share: share.response_rms)}"
+    strongest = dict(sorted(responses, key=lambda one: one[1].response_rms))
+    for pair, share in sorted(strongest.items()):
+        yield f"{pair}: {share}"
 
 
 def describe_failures(

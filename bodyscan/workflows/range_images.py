@@ -7,7 +7,6 @@ remain.
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Collection, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
@@ -103,11 +102,9 @@ def reconstruct_range_images(
     if not found:
         raise ScanFailed(f"no pair gave a range image:{format_list(failed)}")
     images = [image for image, *_ in found.values()]
-    responses: dict[str, list[ResponseShare]] = defaultdict(list)
-    for image, shares, _ in found.values():
-        responses[image.pair] += shares
     notes = [f"{image.pair}: {image.agreement}" for image in images if image.agreement is not None]
     notes += map(captures.relative, crossing_notes({one: made[-1] for one, made in found.items()}))
+    responses = ((image.pair, share) for image, shares, _ in found.values() for share in shares)
     return Outcome(images, (*notes, *response_notes(responses)), failed)
 
 
