@@ -28,6 +28,7 @@ from bodyscan.geometry.lenses import lens_from_opencv
 from bodyscan.geometry.light_sheets import triangulate_image
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.calibration_verdict import grade_calibration
+from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.storage import load_calibration
 from bodyscan.rig.rig import load_rig
 from bodyscan.workflows.check_rig import BoardCheck, check_rig
@@ -90,6 +91,10 @@ def write_rig_file(folder: Path, content: dict[str, Any]) -> Path:
     return path
 
 
+def imported(folder: Path, content: dict[str, Any]) -> RigCalibration:
+    return import_rig(load_rig(write_rig_file(folder, content)), folder)
+
+
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     write_storage(tmp_path / "foreign.yaml")
@@ -147,7 +152,7 @@ def test_a_lens_or_an_axis_that_is_not_the_cameras_is_named(
     known |= {"camera": {"matrix": "K", what: node}, "file": "odd.yaml"}
     known["projector"]["file"] = "foreign.yaml"
     with pytest.raises(CalibrationFileError, match=said):
-        import_rig(load_rig(write_rig_file(folder, content)), folder)
+        imported(folder, content)
 
 
 def test_python_users_import_too(folder: Path) -> None:
@@ -163,51 +168,47 @@ def test_units_and_inverse_poses(folder: Path) -> None:
     content = described("a", "b")
     for pair in content["pairs"]:
         pair["known"]["units"] = "cm"
-    there = import_rig(load_rig(write_rig_file(folder, content)), folder)
+    there = imported(folder, content)
     for name, pose in WORLD_FROM.items():
         np.testing.assert_allclose(there.rig_from_camera[name].matrix, pose.matrix, atol=1e-9)
         content["pairs"][0]["known"]["camera"]["inverse"] = True
-    back = import_rig(load_rig(write_rig_file(folder, content)), folder)
+    back = imported(folder, content)
     expected = WORLD_FROM["a"].inverse().matrix
     np.testing.assert_allclose(back.rig_from_camera["a"].matrix, expected, atol=1e-9)
     del content["pairs"][0]["known"]["units"]
     with pytest.raises(CalibrationFileError, match=r"unit") as caught:
-        import_rig(
-            load_rig(write_rig_file(folder, content | {"pairs": content["pairs"][:1]})), folder
-        )
+        imported(folder, content | {"pairs": content["pairs"][:1]})
     assert "units: mm" in caught.value.remedy
 
 
 def test_the_rig_frame_is_as_the_rig_file_says(folder: Path) -> None:
     content = described("a", "b", rig_frame={"pair": "b"})
-    found = import_rig(load_rig(write_rig_file(folder, content)), folder).rig_from_camera
-    np.testing.assert_allclose(found["b"].matrix, np.eye(4), atol=1e-12)
+    found = imported(folder, content)
+    np.testing.assert_allclose(found.rig_from_camera["b"].matrix, np.eye(4), atol=1e-12)
     relative = WORLD_FROM["b"].inverse() @ WORLD_FROM["a"]
-    np.testing.assert_allclose(found["a"].matrix, relative.matrix, atol=1e-9)
-    assert import_rig(load_rig(folder / "rig.yaml"), folder).axes.startswith(
-        "that of camera b: x to"
-    )
+    np.testing.assert_allclose(found.rig_from_camera["a"].matrix, relative.matrix, atol=1e-9)
+    assert found.axes.startswith("that of camera b: x to")
     content = described("a", "b")
     content["pairs"][0]["nominal"] = {"position_mm": [0, 0, 500], "look_at_mm": [100, 0, 500]}
-    found = import_rig(load_rig(write_rig_file(folder, content)), folder).rig_from_camera
-    np.testing.assert_allclose(found["a"].translation, [0, 0, 500])
-    assert import_rig(load_rig(folder / "rig.yaml"), folder).axes.startswith("origin on the floor")
+    found = imported(folder, content)
+    np.testing.assert_allclose(found.rig_from_camera["a"].translation, [0, 0, 500])
+    assert found.axes.startswith("origin on the floor")
     board = {"name": "b", "columns": 9, "rows": 6, "square_mm": 10}
     content = described("a", rig_frame={"shot": "floor"}, boards=[board])
     with pytest.raises(BadInput, match="the rig frame is to be fixed by a board"):
-        import_rig(load_rig(write_rig_file(folder, content)), folder)
+        imported(folder, content)
 
 
 def test_a_pair_that_cannot_be_read_costs_that_pair(folder: Path) -> None:
     content = described("a", "b")
     content["pairs"][1]["known"]["camera"]["matrix"] = "K_camera_c"
-    found = import_rig(load_rig(write_rig_file(folder, content)), folder)
+    found = imported(folder, content)
     assert list(found.pairs) == ["a"]
     assert "did you mean 'K_camera_" in found.failed["b"]
     assert grade_calibration(found).reasons[0].startswith("pair b failed")
     content["pairs"] = content["pairs"][1:]
     with pytest.raises(CalibrationFileError, match="K_camera_c"):
-        import_rig(load_rig(write_rig_file(folder, content)), folder)
+        imported(folder, content)
 
 
 def test_the_only_camera_without_a_pose_is_the_world(folder: Path) -> None:
@@ -217,14 +218,14 @@ def test_the_only_camera_without_a_pose_is_the_world(folder: Path) -> None:
         del pair["projector"], pair["known"]["projector"]
     first = content["pairs"][0]["known"]["camera"]
     pose = {key: first.pop(key) for key in ("rotation", "translation")}
-    found = import_rig(load_rig(write_rig_file(folder, content)), folder)
+    found = imported(folder, content)
     assert not found.failed
     np.testing.assert_array_equal(found.rig_from_camera["a"].matrix, np.eye(4))
     np.testing.assert_allclose(found.rig_from_camera["b"].matrix, WORLD_FROM["b"].matrix, atol=1e-9)
     for key in pose:
         del content["pairs"][1]["known"]["camera"][key]
     with pytest.raises(CalibrationFileError, match="all but one of a rig"):
-        import_rig(load_rig(write_rig_file(folder, content)), folder)
+        imported(folder, content)
 
 
 @pytest.mark.parametrize(
@@ -256,12 +257,11 @@ def test_what_is_wrong_is_named(
     for part in where[:-1]:
         inside = inside[part]
     inside[where[-1]] = value
-    rig = load_rig(write_rig_file(folder, content))
     if said is None:  # two numbers are a lens with k1 and k2: nobody can tell
-        assert import_rig(rig, folder).pairs["a"].camera.lens.opencv()[0] == 1024.0
+        assert imported(folder, content).pairs["a"].camera.lens.opencv()[0] == 1024.0
         return
     with pytest.raises(CalibrationFileError, match=said):
-        import_rig(rig, folder)
+        imported(folder, content)
 
 
 @pytest.mark.parametrize(("millimetres", "units"), [(1.0, "m"), (1000.0, "mm")])
@@ -272,11 +272,9 @@ def test_an_implausible_baseline_names_the_unit(
     write_storage(tmp_path / "foreign.yaml", millimetres=millimetres)
     content = described("a")
     content["pairs"][0]["known"]["units"] = units
-    rig_file = write_rig_file(tmp_path, content)
-    with pytest.raises(
-        CalibrationFileError, match=r"puts the projector (2.11e\+05|0.211) mm"
-    ) as found:
-        import_rig(load_rig(rig_file), tmp_path)
+    said = r"puts the projector (2.11e\+05|0.211) mm"
+    with pytest.raises(CalibrationFileError, match=said) as found:
+        imported(tmp_path, content)
     assert f"its lengths are not in {units}" in found.value.what
 
 
@@ -291,11 +289,11 @@ def test_a_mirrored_or_endless_pose_is_named(folder: Path) -> None:
     own = (folder / "mirrored.yaml").read_text().partition("---\n")[2]
     (folder / "mixed.yaml").write_text(text.replace("R_light_a:", "unused:") + own)
     with pytest.raises(CalibrationFileError, match=r"mixed.yaml:\d+: R_light_a: is a reflection"):
-        import_rig(load_rig(write_rig_file(folder, content)), folder)
+        imported(folder, content)
     number = re.compile(r"(T_light_a:.*?data: \[ )[^,]*", re.DOTALL)
     (folder / "mixed.yaml").write_text(number.sub(r"\1.Inf", text))
     with pytest.raises(CalibrationFileError, match=r"mixed.yaml:\d+: T_light_a: .* not finite"):
-        import_rig(load_rig(write_rig_file(folder, content)), folder)
+        imported(folder, content)
 
 
 @pytest.mark.parametrize(
