@@ -91,11 +91,13 @@ def attempt_each(
     *,
     stage: str,
     progress: Progress = silent,
+    workers: int = THREADS,
 ) -> tuple[dict[Item, Result], dict[Item, Error]]:
     """Run `work` on every item in threads; return results and errors of type `error`, by item."""
     good: dict[Item, Result] = {}
     bad: dict[Item, Error] = {}
-    for item, result in iterate_threads(work, items, error, stage=stage, progress=progress):
+    found = iterate_threads(work, items, error, stage=stage, progress=progress, workers=workers)
+    for item, result in found:
         if isinstance(result, error):
             bad[item] = result
         else:

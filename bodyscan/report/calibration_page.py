@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import astuple
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from bodyscan.calibration.camera import MIN_CLUSTERS
+from bodyscan.errors import BadInput
 from bodyscan.registration.calibration_verdict import LIMITS, figures_of, grade_calibration
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.storage import FILE_NAME, calibration_id, load_calibration
@@ -28,7 +28,7 @@ from bodyscan.report.page import (
     is_synthetic,
     make_sections,
 )
-from bodyscan.report.sigma_map import draw_sigma_map, why_no_sigma
+from bodyscan.report.sigma_map import draw_sigma_map
 
 TITLES = {
     "corners_rms_px": ("corners", "px RMS", "distance of corners from where camera and pose put them."),
@@ -60,15 +60,25 @@ def calibration_page(folder: Path) -> Page:
     """The report of the calibration in `folder`. Raises CalibrationFileError."""
     calibration = load_calibration(folder)
     shots = len({shot for shot, _ in calibration.rig_from_board})
-    parts = {
-        "The rig": _rig,
-        "Pairs": _pairs,
-        "How well the pairs are connected, and what would help": _advice,
-        "Boards in the pictures": _boards,
-        "Light sheets": _planes,
-        "Who shares boards with whom": _shared_boards,
-        "How well each place is known": _sigma,
-        "What was not used, and notes": _notes,
+    model = (
+        "Pyramids: cameras and what they see. Grey: boards, and the scan volume. Red, green and blue: "
+        "the rig's axes x, y and z."
+    )
+    imported = "another program calibrated the rig"
+    why = imported if calibration.is_import else "there is a single pair"
+    failed = [f"failed: {name}: {reason}" for name, reason in calibration.failed.items()]
+    notes = (*failed, *(calibration.notes or ("Every image and view was used.",)))
+    parts: dict[str, Callable[[], list[Block]]] = {
+        "The rig": lambda: [Viewer("Cameras in the rig frame", model, rig_model(calibration))],
+        "Pairs": lambda: _pairs(calibration),
+        "How well the pairs are connected, and what would help": lambda: [
+            Lines(calibration.advice or (f"No advice: {why}.",))
+        ],
+        "Boards in the pictures": lambda: _boards(calibration),
+        "Light sheets": lambda: _planes(calibration),
+        "Who shares boards with whom": lambda: _shared_boards(calibration),
+        "How well each place is known": lambda: _sigma(calibration),
+        "What was not used, and notes": lambda: [Lines(notes)],
     }
     return Page(
         f"Calibration of rig {calibration.rig.name}",
@@ -81,16 +91,8 @@ def calibration_page(folder: Path) -> Page:
             ("made by", str(json.loads((folder / FILE_NAME).read_text("utf-8"))["software"])),
         ),
         calibration.axes,
-        make_sections({title: partial(make, calibration) for title, make in parts.items()}),
+        make_sections(parts),
     )
-
-
-def _rig(calibration: RigCalibration) -> list[Block]:
-    caption = (
-        "Pyramids: cameras and what they see. Grey: boards, and the scan volume. Red, green and blue: "
-        "the rig's axes x, y and z."
-    )
-    return [Viewer("Cameras in the rig frame", caption, rig_model(calibration))]
 
 
 def _pairs(calibration: RigCalibration) -> list[Block]:
@@ -133,13 +135,6 @@ def _light_lines(calibration: RigCalibration) -> Iterator[str]:
 
 def _format_gain(gain: float | None) -> str:
     return "" if gain is None else f" ({gain:+z.1f} standard errors better)"
-
-
-def _advice(calibration: RigCalibration) -> list[Block]:
-    why = (
-        "another program calibrated the rig" if calibration.is_import else "there is a single pair"
-    )
-    return [Lines(calibration.advice or (f"No advice: {why}.",))]
 
 
 def _boards(calibration: RigCalibration) -> list[Block]:
@@ -197,19 +192,18 @@ def _shared_boards(calibration: RigCalibration) -> list[Block]:
         return ["There is nothing to share."]
     shared = draw.shared_boards(calibration)
     counts = np.where(shared > 0, shared, np.nan)
-    return [
-        Picture(
-            "View graph: boards in common",
-            "Number of boards that two pairs saw at the same moment, which connect them. Empty: none.",
-            charts.matrix(list(calibration.observed), counts, "boards", ".0f"),
-        )
-    ]
+    caption = (
+        "Number of boards that two pairs saw at the same moment, which connect them. Empty: none."
+    )
+    chart = charts.matrix(list(calibration.observed), counts, "boards", ".0f")
+    return [Picture("View graph: boards in common", caption, chart)]
 
 
 def _sigma(calibration: RigCalibration) -> list[Block]:
-    why = why_no_sigma(calibration)
-    if why is not None:
-        return [f"There is no map: {why[0]}; {why[1]}."]
+    try:
+        picture = draw_sigma_map(calibration)
+    except BadInput as error:
+        return [f"There is no map: {error.what}; {error.remedy}."]
     return [
         Picture(
             "Sigma over the scan volume",
@@ -217,11 +211,6 @@ def _sigma(calibration: RigCalibration) -> list[Block]:
             "mm), in two upright planes through the rig's axis. Stripe noise and the subject's sway "
             "are not in it. Light grey: nothing is measured there (no camera sees it, or a single one "
             "without a projector).",
-            draw_sigma_map(calibration),
+            picture,
         )
     ]
-
-
-def _notes(calibration: RigCalibration) -> list[Block]:
-    failed = tuple(f"failed: {name}: {why}" for name, why in calibration.failed.items())
-    return [Lines((*failed, *(calibration.notes or ("Every image and view was used.",))))]

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
@@ -55,14 +55,12 @@ class Numbers:
     """A list of figures that explain themselves."""
 
     items: tuple[tuple[Column, Value], ...]
-    kind: Literal["numbers"] = "numbers"
 
 
 @dataclass(frozen=True)
 class Table:
     columns: tuple[Column, ...]
     rows: tuple[tuple[Value, ...], ...]
-    kind: Literal["table"] = "table"
 
 
 @dataclass(frozen=True)
@@ -70,7 +68,6 @@ class Lines:
     """Sentences, one per line."""
 
     lines: tuple[str, ...]
-    kind: Literal["lines"] = "lines"
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +77,6 @@ class Picture:
     title: str
     caption: str
     data: bytes
-    kind: Literal["picture"] = "picture"
 
     @property
     def source(self) -> str:
@@ -95,7 +91,6 @@ class Viewer:
     title: str
     caption: str
     model: dict[str, Any]
-    kind: Literal["viewer"] = "viewer"
 
     @property
     def json(self) -> Markup:

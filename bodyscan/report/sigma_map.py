@@ -64,31 +64,25 @@ def sigma_at(
     return np.where(measured, np.sqrt(np.maximum(variance, 0.0)), np.nan), count
 
 
-def why_no_sigma(calibration: RigCalibration) -> tuple[str, str] | None:
-    """Why there is no sigma to draw, and the remedy; None if there is one."""
-    unknown = [name for name, pair in calibration.pairs.items() if pair.quality.unjudged]
-    if unknown:
-        return (
-            f"the accuracy of the imported calibration of {', '.join(unknown)} is not known",
-            "state it when importing (`import --sigma-px`), measure it with shots of a board "
-            "(`check-calibration`), or calibrate with bodyscan (`calibrate-rig`)",
-        )
-    if len(calibration.pairs) == 1:
-        return (
-            "a single pair defines the rig frame, so its pose has no error",
-            "its accuracy is in the report's table of pairs and in the sigmas of a scan",
-        )
-    return None
-
-
 def draw_sigma_map(calibration: RigCalibration) -> bytes:
     """Maps of `sigma_at` in the planes x = 0 (front) and y = 0 (side) on one colour scale, as PNG.
 
-    Light grey where nothing is measured. Raises BadInput if no sigma is known (`why_no_sigma`).
+    Light grey where nothing is measured. Raises BadInput if no sigma is known.
     """
-    why = why_no_sigma(calibration)
-    if why is not None:
-        raise BadInput(why[0], where=f"rig {calibration.rig.name}", remedy=why[1])
+    unknown = [name for name, pair in calibration.pairs.items() if pair.quality.unjudged]
+    if unknown:
+        raise BadInput(
+            f"the accuracy of the imported calibration of {', '.join(unknown)} is not known",
+            where=f"rig {calibration.rig.name}",
+            remedy="state it when importing (`import --sigma-px`), measure it with shots of a board "
+            "(`check-calibration`), or calibrate with bodyscan (`calibrate-rig`)",
+        )
+    if len(calibration.pairs) == 1:
+        raise BadInput(
+            "a single pair defines the rig frame, so its pose has no error",
+            where=f"rig {calibration.rig.name}",
+            remedy="its accuracy is in the report's table of pairs and in the sigmas of a scan",
+        )
     volume, poses = calibration.rig.volume, calibration.rig_from_camera
     cameras = {name: pair.camera for name, pair in calibration.pairs.items()}
     lit = {name for name, pair in calibration.pairs.items() if pair.sheets is not None}

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import Future
-from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,7 +16,7 @@ from bodyscan.captures.folder import Captures, open_captures
 from bodyscan.errors import BadInput, BodyscanError, FailedWork, format_error
 from bodyscan.optional import optional
 from bodyscan.outcome import Outcome
-from bodyscan.progress import Progress, attempt_each, background, silent, step
+from bodyscan.progress import Progress, attempt_each, silent, step
 from bodyscan.registration.advice import advise
 from bodyscan.registration.board_checks import boards_not_found
 from bodyscan.registration.halves import compare_halves
@@ -35,7 +33,7 @@ from bodyscan.registration.rig_solve import (
 from bodyscan.registration.soundness import find_faults
 from bodyscan.registration.storage import CORNERS_NAME, archive_previous, save_calibration
 from bodyscan.rig.rig import Rig, load_rig
-from bodyscan.workflows.decode import PairStripes, PrintAreas, collect_stripes, decode_pairs
+from bodyscan.workflows.decode import PrintAreas, decode_on_boards
 from bodyscan.workflows.find_boards import (
     HERE,
     FoundBoards,
@@ -101,7 +99,12 @@ def solve_boards(
     cameras = calibrate_cameras(rig, boards.value, progress, folder=folder)
     cameras = require_cameras(rig, captures, boards, cameras)
     located = locate_views(rig, select_solving_views(rig, boards.value), cameras.value)
-    solved, stripes, pairs = _solve_and_fit(rig, captures, boards, located, cameras, progress)
+    prints = PrintAreas(rig, cameras.value, {view.key: view for view in located.value})
+    with step(progress, "joining the pairs"):
+        solved = _bundle_adjust(rig, boards.value, located, cameras)
+    views = [view for view in boards.value if view.key in prints.located]
+    stripes = decode_on_boards(rig, captures, views, progress, prints=prints)
+    pairs = _fit_light(solved, stripes, progress)
     solution = solved.solution.value
     stages = (boards, cameras, solved.located, stripes, pairs, solved.solution)
     failed = {name: reason for stage in stages for name, reason in stage.failures.items()}
@@ -146,51 +149,6 @@ class _Adjusted:
     solution: Outcome[RigSolution]
 
 
-def _solve_and_fit(
-    rig: Rig,
-    captures: Captures,
-    boards: FoundBoards,
-    located: Outcome[list[LocatedView]],
-    cameras: Outcome[dict[str, CameraCalibration]],
-    progress: Progress,
-) -> tuple[_Adjusted, Outcome[dict[ViewKey, BoardBoundaries]], Outcome[dict[str, PairCalibration]]]:
-    """Solve, and fit the light sheets of each pair, while the stripes on the boards are decoded."""
-    prints = PrintAreas(rig, cameras.value, {view.key: view for view in located.value})
-    views = [view for view in boards.value if view.key in prints.located]
-    # Reading images takes one core and not the interpreter's lock; the other solves, and fits pair
-    # after pair. Fits are many small steps: two at once hand the lock to and fro 70,000 times a
-    # second, which costs more than it gains (12 pairs: 26 s instead of 19).
-    with background() as other:
-        solving = other.submit(_bundle_adjust, rig, boards.value, located, cameras)
-        decoded: dict[str, PairStripes] = {}
-        fits: dict[str, Future[Outcome[PairCalibration]]] = {}
-        with closing(decode_pairs(rig, captures, views, progress, prints=prints)) as decoding:
-            for pair in decoding:
-                if solving.done():
-                    solving.result()  # once the solve has failed, nothing more is decoded
-                decoded[pair.name] = pair
-                fits[pair.name] = other.submit(_fit_light, solving, pair)
-        stripes = collect_stripes(rig, captures, views, decoded.values())
-        with step(progress, "joining the pairs"):
-            solved = solving.result()
-        joined = solved.solution.value.rig_from_camera.keys()
-        for name in joined - fits.keys():  # no stripes were to be decoded
-            fits[name] = other.submit(_fit_light, solving, PairStripes(name, {}))
-        pairs, errors = attempt_each(
-            lambda name: fits[name].result(),
-            sorted(joined - stripes.failures.keys()),
-            BodyscanError,
-            stage="fitting light sheets",
-            progress=progress,
-        )
-    fitted = Outcome(
-        {name: pair.value for name, pair in pairs.items()},
-        tuple(note for pair in pairs.values() for note in pair.notes),
-        {name: format_error(error) for name, error in errors.items()},
-    )
-    return solved, stripes, fitted
-
-
 def _bundle_adjust(
     rig: Rig,
     boards: list[BoardView],
@@ -226,10 +184,33 @@ def _solve_rig(
         raise BadInput(error.what, where=error.where, remedy=remedy) from error
 
 
-def _fit_light(solving: Future[_Adjusted], stripes: PairStripes) -> Outcome[PairCalibration]:
-    """Fit a pair's light sheets, once the joint solve is done."""
-    solved, name = solving.result(), stripes.name
-    return calibrate_pair(solved_pair(solved.rig, solved.solution.value, name, stripes.boundaries))
+def _fit_light(
+    solved: _Adjusted,
+    stripes: Outcome[dict[ViewKey, BoardBoundaries]],
+    progress: Progress,
+) -> Outcome[dict[str, PairCalibration]]:
+    """Fit the light sheets of each pair whose stripes were decoded, or that has no projector."""
+    solution = solved.solution.value
+
+    def fit(name: str) -> Outcome[PairCalibration]:
+        own = {key: near for key, near in stripes.value.items() if key[0] == name}
+        return calibrate_pair(solved_pair(solved.rig, solution, name, own))
+
+    # One after another: fits are many small steps, and two at once hand the interpreter's lock to
+    # and fro 70,000 times a second, which costs more than it gains (12 pairs: 26 s instead of 19).
+    pairs, errors = attempt_each(
+        fit,
+        sorted(solution.rig_from_camera.keys() - stripes.failures.keys()),
+        BodyscanError,
+        stage="fitting light sheets",
+        progress=progress,
+        workers=1,
+    )
+    return Outcome(
+        {name: pair.value for name, pair in pairs.items()},
+        tuple(note for pair in pairs.values() for note in pair.notes),
+        {name: format_error(error) for name, error in errors.items()},
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import groupby
 
 from bodyscan.arrays import WHOLE, Crop
 from bodyscan.boards.view import BoardView, ViewKey
@@ -29,7 +28,7 @@ from bodyscan.captures.folder import Captures, ImageSequence
 from bodyscan.captures.images import read_sequence
 from bodyscan.errors import BodyscanError, DecodingFailed, ImageError, format_error
 from bodyscan.outcome import Outcome
-from bodyscan.progress import Progress, iterate_threads, silent
+from bodyscan.progress import Progress, attempt_each, silent
 from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.templates import fill
@@ -102,23 +101,6 @@ class BoardStripes:
 
 
 @dataclass(frozen=True, eq=False)
-class PairStripes:
-    """What the sequences of one pair show on boards, or why one could not be decoded."""
-
-    name: str
-    sequences: Mapping[ImageSequence, BoardStripes | BodyscanError]
-
-    @property
-    def boundaries(self) -> dict[ViewKey, BoardBoundaries]:
-        return {
-            key: near
-            for found in self.sequences.values()
-            if isinstance(found, BoardStripes)
-            for key, near in found.boundaries.items()
-        }
-
-
-@dataclass(frozen=True, eq=False)
 class PrintAreas:
     """Where the prints of boards lie in the images, by the pose that each camera finds by itself.
 
@@ -153,17 +135,19 @@ class PrintAreas:
         return band_step(pair.projector, [self.box(view) for view in views])
 
 
-def decode_pairs(
+def decode_on_boards(
     rig: Rig,
     captures: Captures,
     views: Sequence[BoardView],
     progress: Progress = silent,
     *,
     prints: PrintAreas | None = None,
-) -> Generator[PairStripes]:
-    """Decode stripe boundaries near each of these views, pair after pair in the order of names.
+) -> Outcome[dict[ViewKey, BoardBoundaries]]:
+    """Decode stripe boundaries near each of these views.
 
     prints: select the boundaries on the boards' prints; all within half a board's size if None.
+
+    Bad sequences become notes, and a pair none of whose sequences can be decoded is a failure.
     """
     wanted: dict[tuple[str, str], list[BoardView]] = defaultdict(list)
     for view in views:
@@ -194,44 +178,14 @@ def decode_pairs(
             near = {view.key: prints.select(view, near[view.key], bands) for view in group}
         return BoardStripes(near, tuple(responses_in(stripes)), stripes.crossing_fault)
 
-    decoded = iterate_threads(
-        decode,
-        sorted(sequences, key=lambda sequence: sequence.pair),
-        BodyscanError,
-        stage="decoding stripes",
-        progress=progress,
+    found, errors = attempt_each(
+        decode, sequences, BodyscanError, stage="decoding stripes", progress=progress
     )
-    for pair, found in groupby(decoded, key=lambda one: one[0].pair):
-        yield PairStripes(pair, dict(found))
-
-
-def decode_on_boards(
-    rig: Rig, captures: Captures, views: Sequence[BoardView], progress: Progress = silent
-) -> Outcome[dict[ViewKey, BoardBoundaries]]:
-    """Decode stripe boundaries near each of these views, as `collect_stripes` returns them."""
-    return collect_stripes(rig, captures, views, decode_pairs(rig, captures, views, progress))
-
-
-def collect_stripes(
-    rig: Rig, captures: Captures, views: Iterable[BoardView], pairs: Iterable[PairStripes]
-) -> Outcome[dict[ViewKey, BoardBoundaries]]:
-    """The boundaries of all pairs; bad sequences become notes, and a pair none of whose sequences
-    can be decoded is a failure."""
-    every = {sequence: found for pair in pairs for sequence, found in pair.sequences.items()}
-    boundaries: dict[ViewKey, BoardBoundaries] = {}
-    failures: dict[ImageSequence, BodyscanError] = {}
-    faults: dict[ImageSequence, str] = {}
-    responses: list[tuple[str, ResponseShare]] = []
-    for sequence in filter(every.__contains__, captures.sequences):
-        found = every[sequence]
-        if isinstance(found, BodyscanError):
-            failures[sequence] = found
-            continue
-        boundaries |= found.boundaries
-        faults[sequence] = found.crossing_fault
-        responses += ((sequence.pair, share) for share in found.responses)
-    failed, failure_notes = describe_failures(failures, {pair for pair, _, _ in boundaries})
-    failed |= _without_stripes(rig, views, {sequence.pair for sequence in every})
+    boundaries = {key: near for one in found.values() for key, near in one.boundaries.items()}
+    failed, failure_notes = describe_failures(errors, {pair for pair, _, _ in boundaries})
+    failed |= _without_stripes(rig, views, {sequence.pair for sequence in sequences})
+    faults = {sequence: one.crossing_fault for sequence, one in found.items()}
+    responses = ((s.pair, share) for s, one in found.items() for share in one.responses)
     notes = (*failure_notes, *crossing_notes(faults), *response_notes(responses))
     return Outcome(boundaries, notes, failed)
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import threading
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
 
@@ -16,9 +14,11 @@ from seen_boards import SeenBoards, seen_boards
 from small_workspace import Detected
 
 from bodyscan.arrays import Array
-from bodyscan.boards.view import BoardView
+from bodyscan.boards.view import BoardView, ViewKey
+from bodyscan.calibration.boundary_points import BoardBoundaries
 from bodyscan.captures.folder import Captures
 from bodyscan.errors import BodyscanError, FailedWork, RigDisconnected, format_list
+from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.storage import load_calibration, save_calibration
@@ -27,7 +27,7 @@ from bodyscan.rig.rig_frame import RigFrame
 from bodyscan.stripes.codes.gray import Gray
 from bodyscan.workflows import calibrate_rig, find_boards
 from bodyscan.workflows.calibrate_rig import add_remarks, solve_boards
-from bodyscan.workflows.decode import BoardStripes, PairStripes, PrintAreas
+from bodyscan.workflows.decode import PrintAreas
 from bodyscan.workflows.find_boards import FoundBoards
 
 Views = Sequence[BoardView]
@@ -138,20 +138,14 @@ def test_any_subset_of_images_with_stripes_does_too(
     }
 
     def decoded(
-        _rig: Rig, captures: Captures, wanted: Views, _: Progress, *, prints: PrintAreas
-    ) -> Iterator[PairStripes]:
-        for name in names:
-            yield PairStripes(name, {
-                sequence: BoardStripes({
-                    view.key: prints.select(view, striped[view.key], (1, 0))
-                    for view in wanted
-                    if (view.pair, view.shot) == (name, sequence.shot) and view.key in striped
-                })
-                for sequence in captures.pair_sequences(name)
-            })  # fmt: skip
+        _rig: Rig, _captures: Captures, wanted: Views, _: Progress, *, prints: PrintAreas
+    ) -> Outcome[dict[ViewKey, BoardBoundaries]]:
+        return Outcome(
+            {v.key: prints.select(v, striped[v.key], (1, 0)) for v in wanted if v.key in striped}
+        )
 
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(calibrate_rig, "decode_pairs", decoded)
+        patched.setattr(calibrate_rig, "decode_on_boards", decoded)
         try:
             joined = solve_boards(detected.rig, detected.captures, FoundBoards(views))
         except BodyscanError:
@@ -226,29 +220,6 @@ def test_too_few_shots_for_halves_are_said_to_be_so(shots: int, said: str | None
     found = calibrated(boards, views)
     assert not [line for line in found.advice if "half" in line and "differ" in line]
     assert any(f"{said} cannot be halved" in note for note in found.notes)
-
-
-def test_decoding_stops_when_the_joint_solve_has_failed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Images take seconds a pair, and the error is known long before."""
-    boards, solving = seen(4), threading.Event()
-    decoded: list[str] = []
-
-    def decode(*_: object, **__: object) -> Iterator[PairStripes]:
-        solving.set()
-        for name in sorted(boards.placings):
-            decoded.append(name)
-            yield PairStripes(name, {})
-            time.sleep(0.5)
-
-    def solve(*_: object) -> None:
-        assert solving.wait(60.0)
-        raise RigDisconnected("nothing joins them")
-
-    monkeypatch.setattr(calibrate_rig, "decode_pairs", decode)
-    monkeypatch.setattr(calibrate_rig, "solve_rig", solve)
-    with pytest.raises(RigDisconnected):
-        solve_boards(boards.rig, boards.captures(boards.views), boards.found(boards.views))
-    assert len(decoded) < len(boards.placings)
 
 
 def test_the_frame_passes_from_an_unusable_first_camera_to_the_best_connected() -> None:

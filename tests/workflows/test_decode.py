@@ -1,6 +1,5 @@
 """Sequences that cannot be decoded: each cause said once, a pair of which all fail by its cause."""
 
-import threading
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -134,11 +133,9 @@ def test_a_shot_without_its_crossing_images_keeps_the_others(tmp_path: Path) -> 
         decode_sequence(sequence, rig.pairs[0])
 
 
-def test_pairs_are_decoded_one_after_another_and_notes_are_in_the_order_of_shots(
+def test_a_sequence_that_fails_is_a_note_and_notes_are_in_the_order_of_shots(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Whichever shot's images are read first."""
-    done = threading.Event()
     pairs: Any = {name: SimpleNamespace(name=name, camera=None) for name in ("p1", "p2")}
     sequences = [
         ImageSequence(pair, shot, Path("lit.png"), None, (Path("a.png"),), ())
@@ -153,19 +150,14 @@ def test_pairs_are_decoded_one_after_another_and_notes_are_in_the_order_of_shots
     def decoded(sequence: ImageSequence, *_: object, **__: object) -> Any:
         if sequence.pair == "p2" and sequence.shot == "a":
             raise DecodingFailed("is bad", where="pair p2, shot a")
-        if (sequence.pair, sequence.shot) == ("p1", "a"):
-            assert done.wait(60.0)
-        done.set()
         return SimpleNamespace(crossing_fault="an image is missing", response=None, crossing=None)
 
     monkeypatch.setattr(decode, "decode_sequence", decoded)
     monkeypatch.setattr(decode, "boundaries_near", lambda *_: "boundaries")
     monkeypatch.setattr(decode, "max_band_step", lambda *_: 1)
     views = [BoardView(s.pair, s.shot, "board", np.arange(4), np.zeros((4, 2))) for s in sequences]
-    found = list(decode.decode_pairs(rig, captures, views))
-    assert [(one.name, sorted(shot for _, shot, _ in one.boundaries)) for one in found] == [
-        ("p1", ["a", "b"]), ("p2", ["b"]),
-    ]  # fmt: skip
-    every = decode.collect_stripes(rig, captures, views, found)
+    every = decode.decode_on_boards(rig, captures, views)
     assert list(every.value) == [("p1", "a", "board"), ("p2", "b", "board"), ("p1", "b", "board")]
+    assert every.notes[0].startswith("pair p2, shot a: is bad")
     assert "in shots a, b" in every.notes[1]
+    assert every.failures == {}
