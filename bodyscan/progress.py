@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import TypeVar, cast
+from typing import TypeVar
 
 THREADS = 2
 """Threads that a stage uses, and cores that a job of a batch takes. All times in docs/results.md
@@ -37,36 +37,6 @@ def background() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(1)
 
 
-def iterate_threads(
-    work: Callable[[Item], Result],
-    items: Iterable[Item],
-    error: type[Error],
-    *,
-    stage: str,
-    progress: Progress = silent,
-    workers: int = THREADS,
-) -> Iterator[tuple[Item, Result | Error]]:
-    """Run `work` on every item in threads; yield each item with its result, or its error of that
-    type, in the order of the items and as soon as it is there."""
-
-    def attempt(item: Item) -> Result | Error:
-        try:
-            return work(item)
-        except error as found:
-            return found
-
-    todo: Sequence[Item] = list(items)
-    progress(stage, 0, len(todo))
-    pool = ThreadPoolExecutor(workers)
-    try:
-        results = zip(todo, pool.map(attempt, todo), strict=True)
-        for done, (item, result) in enumerate(results, start=1):
-            progress(stage, done, len(todo))
-            yield item, result
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
 def map_threads(
     work: Callable[[Item], Result],
     items: Iterable[Item],
@@ -76,12 +46,14 @@ def map_threads(
     workers: int = THREADS,
 ) -> list[Result]:
     """Run `work` on every item in threads; return the results in the order of the items."""
-    found = iterate_threads(work, items, _Never, stage=stage, progress=progress, workers=workers)
-    return [cast(Result, result) for _, result in found]
-
-
-class _Never(Exception):
-    """Raised by nothing: no error counts as a result."""
+    todo: Sequence[Item] = list(items)
+    progress(stage, 0, len(todo))
+    results = []
+    with ThreadPoolExecutor(workers) as pool:
+        for done, result in enumerate(pool.map(work, todo), start=1):
+            results.append(result)
+            progress(stage, done, len(todo))
+    return results
 
 
 def attempt_each(
@@ -94,15 +66,19 @@ def attempt_each(
     workers: int = THREADS,
 ) -> tuple[dict[Item, Result], dict[Item, Error]]:
     """Run `work` on every item in threads; return results and errors of type `error`, by item."""
-    good: dict[Item, Result] = {}
     bad: dict[Item, Error] = {}
-    found = iterate_threads(work, items, error, stage=stage, progress=progress, workers=workers)
-    for item, result in found:
-        if isinstance(result, error):
-            bad[item] = result
-        else:
-            good[item] = cast(Result, result)
-    return good, bad
+
+    def attempt(item: Item) -> list[tuple[Item, Result]]:
+        try:
+            return [(item, work(item))]
+        except error as found:
+            bad[item] = found
+            return []
+
+    todo: Sequence[Item] = list(items)
+    found = map_threads(attempt, todo, stage=stage, progress=progress, workers=workers)
+    good = dict(one for each in found for one in each)
+    return good, {item: bad[item] for item in todo if item in bad}
 
 
 def split_range(count: int) -> list[slice]:
