@@ -45,7 +45,9 @@ def find_inconsistent_views(
     cause, naming shot and pairs."""
     found = []
     for group in by_target(views).values():
-        root_from_board = _board_pose(group, solution)
+        # A board of which no view took part in the solve is where the first view has it.
+        root_from_view = solution.root_from_camera[group[0].pair] @ group[0].camera_from_board
+        root_from_board = solution.root_from_board.get(group[0].target, root_from_view)
         errors = [
             _error(
                 view,
@@ -151,12 +153,6 @@ def _error(
     return rms_length(
         cameras[view.pair].project(camera_from_board.apply(view.points)) - view.pixels
     )
-
-
-def _board_pose(group: Sequence[LocatedView], solution: JointSolution) -> RigidTransform:
-    """Pose of the views' board; if none took part in the solve, that of the first view."""
-    root_from_view = solution.root_from_camera[group[0].pair] @ group[0].camera_from_board
-    return solution.root_from_board.get(group[0].target, root_from_view)
 
 
 @dataclass(frozen=True, eq=False)
