@@ -113,7 +113,8 @@ def scan_person(job: Job) -> Found:
 
 def of_arms(points: Array, vertices: Array, body: LivingBody) -> Mask:
     """Whether points (N, 3) lie on an arm, (N,). vertices: the body's at that time."""
-    return np.asarray((body.arms_share > MOSTLY)[cKDTree(vertices).query(points)[1]])
+    left, right = (limb.weights for limb in body.limbs[:2])
+    return np.asarray((np.maximum(left, right) > MOSTLY)[cKDTree(vertices).query(points)[1]])
 
 
 def _tapes(measured: Measurements) -> dict[int, float]:

@@ -118,14 +118,12 @@ def import_(
 
 def _calibration_folder(rig_file: Path, out: Path | None, overwrite: bool) -> Path:
     from bodyscan.captures.folder import capture_path
-    from bodyscan.registration.storage import refuse_existing
     from bodyscan.rig.rig import load_rig
 
     # A default beside the rig file may lie among its captures: their shots are told by name.
     folder = out or rig_file.parent / "calibration"
-    refuse_existing(folder, overwrite)
     named = load_rig(rig_file).calibration if out else ()
-    require_writable(folder, *(capture_path(rig_file, entry) for entry in named))
+    _require_writable(folder, overwrite, *(capture_path(rig_file, entry) for entry in named))
     return folder
 
 

@@ -14,15 +14,18 @@ from bodyscan.mesh.surface_file import read_surface, refuse_size
 from bodyscan.simulation.scene import Surface
 from bodyscan.simulation.settings import Person, Skin
 
+MATT = Skin()
+"""Skin all over, that lets no light in."""
+
 
 def load_subject(
-    path: Path, person: Person, rng: np.random.Generator, covered_by: Skin | None = None
+    path: Path, person: Person, rng: np.random.Generator, covered_by: Skin = MATT
 ) -> Surface:
     """Load a subject's PLY (metres, z up, facing -y) as a smooth surface, rig frame, mm.
 
     The mesh is read by `read_surface`, subdivided by Loop's rule, turned to face +x and centred over
     the rig's origin. The surface returned is itself the truth.
-    covered_by: skin, hair and cloth; matt skin all over if not given.
+    covered_by: skin, hair and cloth.
 
     Raises BadInput for what is no surface, or in another unit or axis.
     """
@@ -40,16 +43,11 @@ def load_subject(
     bare = Surface(
         vertices,
         np.asarray(mesh.triangles).astype(np.int64),
-        albedo=skin(vertices, person, rng),
+        albedo=person.skin
+        * (1.0 + person.skin_variation * sum_waves(vertices, 60.0, 400.0, rng) / 4.0),
         normals=np.asarray(mesh.vertex_normals) @ turn.T,
     )
-    return bare if covered_by is None else dress(bare, covered_by, rng)
-
-
-def skin(vertices: Array, person: Person, rng: np.random.Generator) -> Array:
-    """Draw the albedo (N,) of vertices (N, 3): a sum of waves 60 to 400 mm long."""
-    waves = sum_waves(vertices, 60.0, 400.0, rng)
-    return person.skin * (1.0 + person.skin_variation * waves / 4.0)
+    return dress(bare, covered_by, rng)
 
 
 def save_truth(surface: Surface, path: Path) -> None:

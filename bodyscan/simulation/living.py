@@ -107,12 +107,6 @@ class LivingBody:
     breath: Breath
     ankles: Joint
 
-    @property
-    def arms_share(self) -> Array:
-        """How far each vertex moves with an arm (N,): 1 beyond the shoulders, 0 on the trunk."""
-        left, right = (limb.weights for limb in self.limbs[:2])
-        return np.maximum(left, right)
-
     def vertices(self, ms: float, *, breathing: bool = True) -> Array:
         """Compute vertices (N, 3) mm, rig frame, at a time since the scan began, or at mean breath."""
         moved = self.rest.vertices
