@@ -33,12 +33,13 @@ from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.light_planes import Axis, LightPlanes, LightSheets, SmoothSheets
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.laboratory.apparatus import BOARD, CAMERA, PROJECTOR, ChapterCaptures, StripedShot
-from bodyscan.laboratory.rival_cameras import (
+from bodyscan.laboratory.rivals import (
     calibrate_tsai,
+    fit_baseline,
+    fit_remapped_pinhole,
     projection_matrix,
     split_projection_matrix,
 )
-from bodyscan.laboratory.rival_projectors import fit_baseline, fit_remapped_pinhole
 
 
 @dataclass(frozen=True, eq=False)

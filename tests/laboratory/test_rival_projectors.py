@@ -9,7 +9,7 @@ from mirror_points import STRIPES, mirror_points, systematic_mm
 from bodyscan.arrays import Array
 from bodyscan.geometry.light_planes import LightPlanes, baseline_angle_tilt
 from bodyscan.laboratory.approaches import PROJECTORS
-from bodyscan.laboratory.rival_projectors import fit_baseline, fit_remapped_pinhole
+from bodyscan.laboratory.rivals import fit_baseline, fit_remapped_pinhole
 
 ANGLES = np.radians(np.linspace(2.0, 38.0, STRIPES + 1))
 BASELINES = np.linspace(165.0, 150.0, STRIPES + 1)

@@ -9,7 +9,7 @@ from table_one import CAMERA
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.laboratory.rival_cameras import (
+from bodyscan.laboratory.rivals import (
     calibrate_tsai,
     projection_matrix,
     split_projection_matrix,
