@@ -70,10 +70,8 @@ def load_acceptance(path: Path | None, changes: Mapping[str, float] = {}) -> Acc
 
     Raises AcceptanceError that names every problem.
     """
-    file, remedy = (
-        AcceptanceFile(),
-        "Correct the acceptance file; docs/report.md explains every key.",
-    )
+    file = AcceptanceFile()
+    remedy = "Correct the acceptance file; docs/report.md explains every key."
     if path is not None:
         file = load_model(path, AcceptanceFile, AcceptanceError, remedy=remedy)
     limits: dict[tuple[str | int, ...], float]

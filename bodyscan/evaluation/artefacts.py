@@ -63,11 +63,11 @@ def locate_spheres(
     found = find_spheres(points[None], normals[None], radius_mm, len(centres_mm))
     wanted = pdist(centres_mm)
     centres = np.stack([sphere.centre for sphere in found])
-    order = min(
-        permutations(range(len(found))),
-        key=lambda some: float(np.sum((pdist(centres[list(some)]) - wanted) ** 2)),
-    )
-    return [found[k] for k in order]
+
+    def misfit(order: tuple[int, ...]) -> float:
+        return float(np.sum((pdist(centres[list(order)]) - wanted) ** 2))
+
+    return [found[k] for k in min(permutations(range(len(found))), key=misfit)]
 
 
 def read_sphere(points: Array, normals: Array, near: Sphere, radius_mm: float) -> SphereReading:
@@ -78,13 +78,8 @@ def read_sphere(points: Array, normals: Array, near: Sphere, radius_mm: float) -
     inliers &= np.einsum("nc,nc->n", arm, normals) > MIN_COSINE * length
     fitted = fit_sphere(points[inliers])
     residual = _drop_farthest(fitted.distances(points[inliers]))
-    return SphereReading(
-        fitted,
-        int(inliers.sum()),
-        float(np.ptp(residual)),
-        _shell_width(residual),
-        2.0 * (fitted.radius - radius_mm),
-    )
+    form_mm, size_mm = float(np.ptp(residual)), 2.0 * (fitted.radius - radius_mm)
+    return SphereReading(fitted, int(inliers.sum()), form_mm, _shell_width(residual), size_mm)
 
 
 def require_spheres(readings: Sequence[SphereReading], radius_mm: float, centres_mm: Array) -> None:

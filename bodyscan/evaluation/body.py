@@ -76,13 +76,9 @@ def girth_errors(mesh: BodyMesh, true: Measurements, *, mean_breath: bool = Fals
         if (error := _trunk_error(one, other)) is not None
     }
     sizes = np.abs(list(errors.values())) if errors else np.array([np.nan])
-    return GirthErrors(
-        len(errors),
-        rms(sizes),
-        float(sizes.max()),
-        list(errors)[int(np.argmax(sizes))] if errors else float("nan"),
-        ours.stature_mm - true.stature_mm,
-    )
+    worst_at = list(errors)[int(np.argmax(sizes))] if errors else float("nan")
+    stature_mm = ours.stature_mm - true.stature_mm
+    return GirthErrors(len(errors), rms(sizes), float(sizes.max()), worst_at, stature_mm)
 
 
 def _trunk_error(ours: Slice, true: Slice) -> float | None:
@@ -94,14 +90,9 @@ def _trunk_error(ours: Slice, true: Slice) -> float | None:
 
 def _as_measured(vertices: Array, faces: Indices) -> BodyMesh:
     count = len(vertices)
-    return BodyMesh(
-        vertices,
-        faces,
-        np.zeros((count, 3), np.float32),
-        np.zeros((count, 3), np.uint8),
-        np.zeros(count, np.float32),
-        np.zeros(len(faces), bool),
-    )
+    normals, colours = np.zeros((count, 3), np.float32), np.zeros((count, 3), np.uint8)
+    sigma_mm, filled = np.zeros(count, np.float32), np.zeros(len(faces), bool)
+    return BodyMesh(vertices, faces, normals, colours, sigma_mm, filled)
 
 
 def measure_visible_coverage(
@@ -116,11 +107,8 @@ def measure_visible_coverage(
     scene.add_triangles(vertices.astype(np.float32), faces.astype(np.uint32))
     visible = np.zeros(len(spots), bool)
     for pair in true_pairs.values():
-        swayed, pose = (
-            RigidTransform.from_matrix(pair[key])
-            for key in ("swayed_from_still", "rig_from_camera")
-        )
-        still_from_camera = swayed.inverse() @ pose
+        still_from_swayed = RigidTransform.from_matrix(pair["swayed_from_still"]).inverse()
+        still_from_camera = still_from_swayed @ RigidTransform.from_matrix(pair["rig_from_camera"])
         camera = camera_from_fields(pair["camera"])
         inside = is_in_image(camera, still_from_camera.inverse().apply(spots))
         index = np.flatnonzero(inside & ~visible)

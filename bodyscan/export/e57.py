@@ -48,13 +48,9 @@ def write_e57(
             data |= {"rowIndex": image.corner[0] + rows, "columnIndex": image.corner[1] + columns}
             data |= {f"color{name}": grey for name in ("Red", "Green", "Blue")}
             pose = rig_from_camera[image.pair]
-            qx, qy, qz, qw = Rotation.from_matrix(pose.rotation).as_quat()
-            file.write_scan_raw(
-                data,
-                name=image.pair,
-                rotation=np.array([qw, qx, qy, qz]),
-                translation=pose.translation / 1000.0,
-            )
+            turn = Rotation.from_matrix(pose.rotation).as_quat(scalar_first=True)
+            shift = pose.translation / 1000.0
+            file.write_scan_raw(data, name=image.pair, rotation=turn, translation=shift)
         file.close()
     return counts
 

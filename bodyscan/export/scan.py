@@ -87,8 +87,5 @@ def scan_facts(facts: Mapping[str, Any]) -> dict[str, Any]:
 
 def transform_mesh(mesh: BodyMesh, a_from_b: RigidTransform) -> BodyMesh:
     """Transform a mesh from frame b to frame a."""
-    return replace(
-        mesh,
-        vertices=a_from_b.apply(mesh.vertices),
-        normals=a_from_b.rotate(mesh.normals.astype(np.float64)).astype(np.float32),
-    )
+    normals = a_from_b.rotate(mesh.normals.astype(np.float64)).astype(np.float32)
+    return replace(mesh, vertices=a_from_b.apply(mesh.vertices), normals=normals)

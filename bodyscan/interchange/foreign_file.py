@@ -170,10 +170,8 @@ class ForeignFile:
 
         A matrix is replaced by the nearest rotation.
         """
-        given, shift = (
-            self.numbers(rotation, names[0], 3, 9),
-            self.numbers(translation, names[-1], 3),
-        )
+        given = self.numbers(rotation, names[0], 3, 9)
+        shift = self.numbers(translation, names[-1], 3)
         if len(given) == 3:
             return RigidTransform.from_rotation_vector(given, shift)
         matrix = given.reshape(3, 3)

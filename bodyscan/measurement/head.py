@@ -88,9 +88,8 @@ def _fit(points: Array, hair_top_mm: float) -> Solution[_Ellipsoid]:
         distances, rows = head.distances(points)
         deviation = np.concatenate([head.centre - middle, head.size])
         return [
-            Block(
-                distances, lambda: rows, slice(0, 7), SKIN, 4.0
-            ),  # mm, of a braincase from an ellipsoid
+            # 4 mm: of a braincase from an ellipsoid.
+            Block(distances, lambda: rows, slice(0, 7), SKIN, 4.0),
             Block(deviation, lambda: np.eye(7), slice(0, 7), EXACT, prior),
         ]
 

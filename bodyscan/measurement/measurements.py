@@ -136,17 +136,10 @@ def measure(
             f"there is no body at a height of {missing[0]:g} mm",
             remedy=f"Give heights between {low:.0f} and {high:.0f} mm.",
         )
-    slices = [
-        Slice(
-            height,
-            tuple(
-                _girth(piece, mesh, breath)
-                for piece in sorted(parts.slices[height], key=lambda piece: piece.part)
-            ),
-        )
-        for height in heights
-        if height not in missing
-    ]
+    slices = []
+    for height in (height for height in heights if height not in missing):
+        pieces = sorted(parts.slices[height], key=lambda piece: piece.part)
+        slices.append(Slice(height, tuple(_girth(piece, mesh, breath) for piece in pieces)))
     areas = face_areas(mesh.vertices, mesh.faces)
     crown = mesh.vertices[mesh.faces, 2].max(axis=1) > stature - CROWN_MM
     kinds, crown_measured = mesh.face_regions, _share(areas, ~mesh.filled, crown)

@@ -37,11 +37,10 @@ def bound_girths(loop: Loop) -> tuple[tuple[float, float], tuple[float, float]]:
         for k in np.flatnonzero(~measured)
     ]
     points = np.concatenate([closed.segments[:, 0], *bulges])
-    longer = sum(
-        float(np.linalg.norm(np.diff(bulge, axis=0), axis=1).sum())
-        - float(np.linalg.norm(bulge[-1] - bulge[0]))
-        for bulge in bulges
-    )
+    longer = 0.0
+    for bulge in bulges:
+        length = float(np.linalg.norm(np.diff(bulge, axis=0), axis=1).sum())
+        longer += length - float(np.linalg.norm(bulge[-1] - bulge[0]))
     lows = closed.girth_mm, closed.tape_mm
     return lows, (closed.girth_mm + longer, hull_perimeter(points))
 

@@ -109,15 +109,9 @@ class BodyMesh:
 
     def part(self, vertices: Array, faces: Indices, used: Indices, filled: Mask) -> BodyMesh:
         """Make a mesh with the attributes of vertices `used` (U,), new positions and faces."""
-        return BodyMesh(
-            vertices,
-            faces,
-            self.normals[used],
-            self.colours[used],
-            self.sigma_mm[used],
-            filled,
-            regions=select_regions(self.regions, used),
-        )
+        kept = self.normals[used], self.colours[used], self.sigma_mm[used]
+        regions = select_regions(self.regions, used)
+        return BodyMesh(vertices, faces, *kept, filled, regions=regions)
 
 
 def compute_region_shares(regions: Bytes, sizes: Array | None = None) -> dict[str, float]:

@@ -86,13 +86,8 @@ def compute_topology(vertices: Array, faces: Indices) -> Topology:
     if not closed:
         edge_count = len(np.unique(np.sort(directed_edges(faces), axis=1) @ [count, 1]))
     labels = label_components(faces, count)
-    return Topology(
-        closed,
-        manifold,
-        int(labels.max() + 1) if labels.size else 0,
-        int(used.size - edge_count + len(faces)),
-        signed_volume(vertices, faces),
-    )
+    components, euler = int(labels.max(initial=-1)) + 1, used.size - edge_count + len(faces)
+    return Topology(closed, manifold, components, int(euler), signed_volume(vertices, faces))
 
 
 def check_manifold(faces: Indices, vertex_count: int) -> tuple[bool, bool]:

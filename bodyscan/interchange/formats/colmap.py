@@ -70,11 +70,9 @@ def read_colmap(folder: Path) -> FoundCameras:
         names_of = {image.image_id: image.name for image in images}
     except (OSError, ValueError, RuntimeError, IndexError, MemoryError) as error:
         reason = str(error).strip().splitlines() or [type(error).__name__]
-        raise CalibrationFileError(
-            f"is not a COLMAP model ({reason[-1]})",
-            where=str(folder),
-            remedy="give the folder that holds cameras, images and points3D, .bin or .txt",
-        ) from error
+        remedy = "give the folder that holds cameras, images and points3D, .bin or .txt"
+        what = f"is not a COLMAP model ({reason[-1]})"
+        raise ForeignFile(folder).error(what, remedy=remedy) from error
     gammas = _read_gammas(folder)
     readers = {}
     for number, camera in sorted(model.cameras.items()):
@@ -89,11 +87,9 @@ def read_colmap(folder: Path) -> FoundCameras:
             readers[image.name] = partial(_read_camera, folder, camera, gamma, _image_pose(image))
     for name in gammas:
         if name not in readers:
-            raise CalibrationFileError(
-                f"names a pair {name!r} that the model does not have",
-                where=str(folder / SKEW_FILE),
-                remedy="give both as `bodyscan export-rig --format colmap` wrote them",
-            )
+            what = f"names a pair {name!r} that the model does not have"
+            remedy = "give both as `bodyscan export-rig --format colmap` wrote them"
+            raise ForeignFile(folder / SKEW_FILE).error(what, remedy=remedy)
     return readers
 
 

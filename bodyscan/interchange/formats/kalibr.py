@@ -72,10 +72,8 @@ def read_kalibr(path: Path) -> FoundCameras:
     chain = data if isinstance(data, dict) else {}
     cameras = {key: entry for key, entry in chain.items() if isinstance(entry, dict)}
     if "cam0" not in cameras:
-        raise file.error(
-            "is not a camchain of Kalibr's: it has no cam0",
-            remedy="give camchain-....yaml, which kalibr_calibrate_cameras wrote",
-        )
+        remedy = "give camchain-....yaml, which kalibr_calibrate_cameras wrote"
+        raise file.error("is not a camchain of Kalibr's: it has no cam0", remedy=remedy)
     readers = {}
     for number in range(len(cameras)):
         key = f"cam{number}"
