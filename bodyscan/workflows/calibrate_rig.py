@@ -193,8 +193,8 @@ def _fit_light(
     solution = solved.solution.value
 
     def fit(name: str) -> Outcome[PairCalibration]:
-        own = {key: near for key, near in stripes.value.items() if key[0] == name}
-        return calibrate_pair(solved_pair(solved.rig, solution, name, own))
+        boundaries = {key: near for key, near in stripes.value.items() if key[0] == name}
+        return calibrate_pair(solved_pair(solved.rig, solution, name, boundaries))
 
     # One after another: fits are many small steps, and two at once hand the interpreter's lock to
     # and fro 70,000 times a second, which costs more than it gains (12 pairs: 26 s instead of 19).
