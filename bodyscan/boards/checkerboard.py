@@ -176,19 +176,12 @@ def _number_as_printed(
     if across[0] * down[1] - across[1] * down[0] < 0:
         grid = grid[:, ::-1]
     pixels = grid.reshape(-1, 2)
-    first_is_black = _first_is_black(image, board, pixels, printed)
+    # By all squares between inner corners: uneven light does not matter.
+    even, odd = _greys(image, board, fit_board_map(printed, pixels), _inner_squares(board))
+    first_is_black = bool(even.mean() < odd.mean())
     if (board.columns + board.rows) % 2 and not first_is_black:
         pixels, first_is_black = pixels[::-1], True
     return np.ascontiguousarray(pixels), first_is_black
-
-
-def _first_is_black(image: Bytes, board: Board, pixels: Array, printed: Array) -> bool:
-    """Whether the squares with an even sum of column and row are darker than the others.
-
-    Judged by all squares between inner corners, so that uneven light does not matter.
-    """
-    even, odd = _greys(image, board, fit_board_map(printed, pixels), _inner_squares(board))
-    return bool(even.mean() < odd.mean())
 
 
 def _inner_squares(board: Board) -> Indices:

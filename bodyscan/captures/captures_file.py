@@ -7,6 +7,7 @@ all), in ms since the first pair began with that shot.
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime
 from functools import partial
@@ -292,19 +293,16 @@ def _find_row_fault(
     times = found.get((shot, pair), {})
     if frame in times:
         return f"gives frame {frame} of pair {pair} a second time"
-    if not _is_time(ms):
+    try:
+        time_ms = float(ms)
+    except ValueError:
+        time_ms = math.nan
+    if not 0.0 <= time_ms <= 1e13:
         return f"ms must be a number, 0 or more (got {ms!r})"
     last = max(times, key=lambda name: times[name], default="")
-    if times and float(ms) <= times[last]:
+    if times and time_ms <= times[last]:
         return (
             f"time runs backwards: frame {frame} of pair {pair} at {ms} ms, after {last} at"
             f" {times[last]:g} ms (rows of a pair are in the order in which it took its frames)"
         )
     return None
-
-
-def _is_time(text: str) -> bool:
-    try:
-        return 0.0 <= float(text) <= 1e13
-    except ValueError:
-        return False

@@ -74,7 +74,7 @@ def find_direct_pixels(images: ScanLines, usable: Mask, bit: int, variance: Floa
         share = images.direct_share(fine, variance)
         filled = cv2.morphologyEx(share, cv2.MORPH_CLOSE, window)
         sharp = np.count_nonzero((filled >= 0.8 * WHOLE_SHARE) & usable)
-        if sharp and sharp >= (1.0 - 90 / 100.0) * np.count_nonzero(usable):
+        if sharp and sharp >= 0.1 * np.count_nonzero(usable):
             return np.asarray(filled >= 0.5 * WHOLE_SHARE)
     return np.ones_like(usable)
 
