@@ -20,10 +20,10 @@ from scipy.linalg.lapack import dpotrf, dpotri, dtrtrs
 from bodyscan.arrays import Array, Indices
 from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
 from bodyscan.motion.body_cells import BodyCells
-from bodyscan.motion.breath import estimate_breath_covariance
+from bodyscan.motion.breath import BreathEstimate, estimate_breath
 from bodyscan.motion.cell_equations import CellEquations
 from bodyscan.motion.motion_kinds import MotionKind, build_kinds
-from bodyscan.motion.temporal_modes import breath_covariances
+from bodyscan.motion.temporal_modes import Breaths
 from bodyscan.progress import map_threads
 
 MODEL_ERROR_MM = 0.07
@@ -40,7 +40,7 @@ class BodyMotion:
     information, vector: normal equations of the overlaps without prior; the matrix's lower triangle,
         (n, n), and (n,).
     factor: lower Cholesky factor (n, n) of the posterior information in units of `units` (n,).
-    breaths: covariances of possible breaths and their priors, see `breath_covariances`.
+    breath: see `estimate_breath`; None at rest.
     """
 
     kinds: tuple[MotionKind, ...]
@@ -50,7 +50,8 @@ class BodyMotion:
     vector: Array
     factor: Array
     units: Array
-    breaths: tuple[Array, Array]
+    breaths: Breaths
+    breath: BreathEstimate | None = None
 
     @staticmethod
     def at_rest(
@@ -65,7 +66,7 @@ class BodyMotion:
         count = sum(kind.count for kind in kinds)
         matrix, vector = np.zeros((count, count)), np.zeros(count)
         fields = np.concatenate([kind.fields for kind in kinds], axis=2)
-        breaths = breath_covariances(kinds[-1].modes, seconds, middle_s)
+        breaths = Breaths.from_modes(kinds[-1].modes, seconds, middle_s)
         return BodyMotion(kinds, fields, vector, matrix, vector, matrix, np.ones(count), breaths)
 
     @cached_property
@@ -163,17 +164,6 @@ class BodyMotion:
         by_pair = np.arange(len(vector)).reshape(6, -1).T.ravel()
         return LinearGaussianSystem(information, vector).select(by_pair)
 
-    def error_factor(self, name: str, modes: Array, normals: Array) -> Array:
-        """Factor L (C, n) of the covariance L L^T of one kind's displacement along normals (C, 3).
-
-        modes: values (J,) of its temporal modes.
-        """
-        kind = self.kind(name)
-        block = self.slices[self.kinds.index(kind)]
-        rows = _along_normals(kind, np.arange(len(normals)), normals, modes)
-        eigenvalues, eigenvectors = np.linalg.eigh(self.covariance[block, block])
-        return np.asarray(rows @ (eigenvectors * np.sqrt(np.maximum(eigenvalues, 0.0))))
-
     def observation_matrix(self, pair: int, cells: Indices, normals: Array) -> Array:
         """Jacobian (c, n) of displacements along normals (c, 3) from the middle to a pair's moment."""
         return np.hstack(
@@ -204,7 +194,7 @@ class BodyMotion:
         return replace(self, amplitudes=amplitudes, factor=factor, units=units)
 
     def _estimate_breath(self) -> BodyMotion:
-        """Set the breath's prior covariance from the evidence, marginalized over all other motion.
+        """Estimate the breath, and set its prior covariance, marginalized over all other motion.
 
         Motions of limbs could explain most of a breath too, but none of them moves the whole trunk
         periodically.
@@ -215,13 +205,15 @@ class BodyMotion:
         unit[block] = np.diag(self.units[block])
         root = dtrtrs(self.factor, unit, lower=True, overwrite_b=True)[0]
         posterior = np.linalg.inv(np.asarray(root.T @ root, np.float64))
-        covariance = estimate_breath_covariance(
-            posterior - breath.prior_information,
-            posterior @ self.amplitudes[block],
-            *self.breaths,
+        system = LinearGaussianSystem(
+            posterior - breath.prior_information, posterior @ self.amplitudes[block]
         )
-        kinds = (replace(k, mode_covariance=covariance) if k is breath else k for k in self.kinds)
-        return replace(self, kinds=tuple(kinds))
+        found = estimate_breath(system, self.breaths, breath.modes.middle)
+        kinds = (
+            replace(k, mode_covariance=found.mode_covariance) if k is breath else k
+            for k in self.kinds
+        )
+        return replace(self, kinds=tuple(kinds), breath=found)
 
     def _update_prior_variances(self) -> BodyMotion:
         """Update each kind's prior variance by type-II maximum likelihood (MacKay 1992).

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.spatial.distance import cdist
+from scipy.special import log_ndtr
 
 from bodyscan.arrays import Array
 from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
@@ -14,16 +17,19 @@ from bodyscan.motion.body_cells import (
     rigid_fields,
 )
 from bodyscan.motion.body_parts import PARTS, leftward, name_parts
-from bodyscan.motion.temporal_modes import HARMONICS
-from bodyscan.progress import map_threads
+from bodyscan.motion.temporal_modes import Breaths
 
 SIZES_MM = np.array([0.7, 1.0, 1.4, 2.0, 2.8])
 """Standard deviations over time of the largest displacement: everyone's chest or belly moves by 2 to 8
 mm at rest, however little of a breath a scan saw; 4 mm are a standard deviation of 1.4."""
+COMMON = 3
+"""Fields of the whole trunk: as one; chest against belly; and its width, since upper ribs mostly move
+forward, lower ones mostly sideways."""
 
 
 def breath_fields(cells: BodyCells) -> Array:
-    """Displacement fields (C, 12, M): of the trunk as one, and of its places forward and sideways.
+    """Displacement fields (C, 12, M): of the trunk as one, of chest against belly, in width
+    alone, and of places forward and sideways.
 
     A breast, or the edge of the ribs, goes where the chest goes, whichever way its skin faces: the
     forward displacement is smoother than that along the normals. The fields are zero elsewhere.
@@ -31,12 +37,18 @@ def breath_fields(cells: BodyCells) -> Array:
     axes = _level_axes(cells)
     level = rigid_fields(cells, np.zeros(3), 1.0)[..., 3:5] @ axes
     both = []
+    # They meet between the navel and the end of the sternum.
+    chest = _smoothstep(cells.centres[:, 2:] / cells.centres[:, 2].max(), 0.60, 0.68)
     for k, shape in enumerate(_mean_shape(cells, axes).T[..., None]):
-        # From place to place breath varies by 0.35 of the front's common displacement.
-        functions = np.hstack([shape, 0.35 * _local_functions(cells.centres, shape)])
-        both.append(modulate_fields(level[..., k : k + 1], cells, functions))
-    common = sum(fields[..., :1] for fields in both)
-    return np.concatenate([common, *(fields[..., 1:] for fields in both)], axis=2)
+        wider = k * shape / 0.3
+        local = _local_functions(cells.centres, shape)
+        # By 0.35 of the front's common displacement; chest and belly breathe independently (Konno and
+        # Mead 1967): standing, the chest has 0.5 to 0.8 of a breath (Sharp et al. 1975, J. Appl.
+        # Physiol. 39), 1 to 4 times the belly's.
+        varying = 0.35 * np.hstack([(2.0 * chest - 1.0) * shape, wider, local])
+        both.append(modulate_fields(level[..., k : k + 1], cells, np.hstack([shape, varying])))
+    common = sum(fields[..., :COMMON] for fields in both)
+    return np.concatenate([common, *(fields[..., COMMON:] for fields in both)], axis=2)
 
 
 def _local_functions(centres: Array, shape: Array) -> Array:
@@ -57,39 +69,73 @@ def _local_functions(centres: Array, shape: Array) -> Array:
     return np.asarray(functions @ eigenvectors[:, eigenvalues > 0.02 * eigenvalues[-1]])
 
 
-def estimate_breath_covariance(
-    information: Array, vector: Array, covariances: Array, priors: Array
-) -> Array:
-    """Posterior mean (J, J) of the covariance of a breath's amplitudes over all breaths and sizes.
+@dataclass(frozen=True, eq=False)
+class BreathEstimate:
+    """What the overlaps tell of M breath fields along J temporal modes.
 
-    Each counts by its prior probability times its evidence.
-
-    information, vector: normal equations (M J, M J), (M J,) of M fields along J temporal modes,
-        marginalized over all other motion.
-    covariances: of the possible breaths, (K, J, J).
-    priors: their probabilities, (K,).
+    mode_covariance: of each field's amplitudes, (J, J).
+    at_middle, covariance: mean (M,) and covariance (M, M) of the fields in the middle of the scan.
     """
-    modes = covariances.shape[1]
-    eigenvalues, eigenvectors = np.linalg.eigh(covariances)
-    # Harmonics and less do not distinguish breaths, and cost most.
-    main = (eigenvalues > HARMONICS**2 * eigenvalues[:, -1:]).any(axis=0)
-    roots = eigenvectors[:, :, main] * np.sqrt(eigenvalues[:, None, main])
-    blocks = information.reshape(-1, modes, len(information) // modes, modes)
-    count = len(vector) // modes
 
-    def log_evidence(root: Array) -> Array:
-        """Log evidence (S,) of one breath in all sizes."""
-        projected = np.einsum("ai,manb,bj->minj", root, blocks, root, optimize=True)
-        system = LinearGaussianSystem(
-            projected.reshape(2 * (count * root.shape[1],)),
-            (vector.reshape(-1, modes) @ root).ravel(),
-        )
-        return system.log_evidence(SIZES_MM**2)
+    mode_covariance: Array
+    at_middle: Array
+    covariance: Array
 
-    log_evidences = np.array(map_threads(log_evidence, roots, stage="aligning"))
-    # Neighbouring cells share errors of non-rigid calibrations, so that three count as one.
-    weights = priors[:, None] * np.exp((log_evidences - log_evidences.max()) * 0.3)
-    return np.asarray(np.einsum("kij,ks,s->ij", covariances, weights / weights.sum(), SIZES_MM**2))
+
+def estimate_breath(
+    system: LinearGaussianSystem, breaths: Breaths, middle: Array
+) -> BreathEstimate:
+    """Posterior moments over all breaths and sizes, each by its prior probability times its evidence.
+
+    system: normal equations (M J,) of M fields along J modes, marginalized over all other motion.
+    middle: the modes in the middle of the scan, (J,).
+
+    How large a breath is shows in the common fields; what varies from place to place, and what is not
+    periodic, has its typical size.
+    """
+    system = system * 0.3  # neighbouring cells share errors of calibrations: three count as one
+    modes, fields = len(middle), system.size // len(middle)
+    variances, typical = SIZES_MM**2, float(np.mean(SIZES_MM**2))
+    any_wave = np.einsum("k,kai,kbi->ab", breaths.priors, breaths.waves, breaths.waves)
+    local = np.diag(np.arange(fields) >= COMMON)
+    other = typical * (np.kron(np.eye(fields), breaths.irregular) + np.kron(local, any_wave))
+    certain = np.linalg.inv(np.eye(system.size) + system.information @ other)
+    information, vector = certain @ system.information, certain @ system.vector
+    first = COMMON * modes
+    blocks = information[:first, :first].reshape(COMMON, modes, COMMON, modes)
+    by_field = vector[:first].reshape(COMMON, modes)
+    to_middle = np.kron(np.eye(fields), middle)
+    correction = to_middle @ other
+    remaining = correction @ (to_middle.T - information @ correction.T)
+    of_common = (to_middle - correction @ information)[:, :first].reshape(fields, COMMON, modes)
+
+    def fit(wave: Array) -> tuple[Array, Array, Array]:
+        """Log evidence (S,) of a breath of all sizes; mean (S, M) and covariance in the middle."""
+        projected = np.einsum("ai,manb,bj->minj", wave, blocks, wave, optimize=True)
+        determined, basis = np.linalg.eigh(projected.reshape(2 * (2 * COMMON,)))
+        along = basis.T @ (by_field @ wave).ravel()
+        carried = (of_common @ wave).reshape(fields, -1) @ basis
+        inflation = 1.0 + variances[:, None] * np.maximum(determined, 0.0)
+        gains = variances[:, None] / inflation
+        log_evidence = 0.5 * np.sum(gains * along**2 - np.log(inflation), axis=1)
+        # Whoever breathes in comes forward, and is carried back.
+        size, sigma = (gains * along) @ basis[0], np.sqrt(gains @ basis[0] ** 2)
+        log_evidence += log_ndtr(-size / sigma)
+        covariance = (carried * gains[:, None]) @ carried.T
+        return log_evidence, (gains * along) @ carried.T, covariance
+
+    log_evidences, means, covariances = (
+        np.array(each) for each in zip(*map(fit, breaths.waves), strict=True)
+    )
+    weights = breaths.priors[:, None] * np.exp(log_evidences - log_evidences.max())
+    weights /= weights.sum()
+    mean = np.einsum("ks,ksm->m", weights, means)
+    second = np.einsum("ks,ksmn->mn", weights, covariances)
+    second += np.einsum("ks,ksm,ksn->mn", weights, means - mean, means - mean, optimize=True)
+    periodic = np.einsum("ks,s,kai,kbi->ab", weights, variances, breaths.waves, breaths.waves)
+    return BreathEstimate(
+        periodic + typical * breaths.irregular, correction @ vector + mean, remaining + second
+    )
 
 
 def breath_along_normals(cells: BodyCells) -> Array:

@@ -262,12 +262,14 @@ def _offset_to_mean_breath(
 
     girth_sigma_mm: (C,) of the shape at the scan's moment.
     """
-    if not timed:
+    if motion.breath is None or not timed:
         breath = rms(SIZES_MM) * np.abs(breath_along_normals(cells))
         return BreathOffset(np.zeros((len(breath), 12)), np.hypot(breath, girth_sigma_mm))
-    middle = motion.kind("breath").modes.middle
-    field = motion.kind("breath").fields @ motion.amplitudes_at("breath", middle)
-    errors = motion.error_factor("breath", middle, cells.normals)
+    fields = motion.kind("breath").fields
+    field = fields @ motion.breath.at_middle
+    eigenvalues, eigenvectors = np.linalg.eigh(motion.breath.covariance)
+    outward = np.einsum("cim,ci->cm", fields[:, :3], cells.normals)
+    errors = outward @ (eigenvectors * np.sqrt(np.maximum(eigenvalues, 0.0)))
     sigma_mm = girth_sigmas(errors, cells.centres[:, 2])
     return BreathOffset(field, np.hypot(sigma_mm, girth_sigma_mm))
 

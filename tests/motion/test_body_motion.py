@@ -10,12 +10,14 @@ import pytest
 from scipy import sparse
 
 from bodyscan.arrays import Array
+from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
 from bodyscan.motion import body_motion
 from bodyscan.motion.body_cells import BodyCells
 from bodyscan.motion.body_motion import BodyMotion
 from bodyscan.motion.body_parts import ankles
+from bodyscan.motion.breath import BreathEstimate
 from bodyscan.motion.motion_kinds import MotionKind, build_kinds
-from bodyscan.motion.temporal_modes import TemporalModes
+from bodyscan.motion.temporal_modes import Breaths, TemporalModes
 
 PAIRS, CELLS = 2, 3
 RNG = np.random.default_rng(5)
@@ -110,16 +112,6 @@ def test_a_pairs_placing_and_bends_make_up_all_displacements() -> None:
     assert lean.fields[4, 0, 1] == pytest.approx(1.615)
 
 
-def test_what_is_not_known_of_one_kind_is_that_of_its_amplitudes() -> None:
-    motion, _ = seen()
-    course = COURSES.values[0] - COURSES.middle
-    errors = motion.error_factor("parts", course, NORMALS)
-    rows = np.einsum("cim,ci->cm", PARTS.fields[:, :3], NORMALS)[:, :, None] * course
-    rows = rows.reshape(CELLS, -1)
-    own = motion.covariance[12:, 12:]
-    np.testing.assert_allclose(errors @ errors.T, rows @ own @ rows.T, atol=1e-10)
-
-
 def test_a_kind_is_as_large_as_the_evidence_and_people_say() -> None:
     """MacKay's: amplitudes over as many of them as were told, and six of the usual size."""
     motion, _ = seen()
@@ -139,14 +131,14 @@ def test_a_breath_is_asked_of_what_other_motions_leave() -> None:
     np.testing.assert_allclose(breath.prior_information, prior, atol=1e-12)
     asked = []
 
-    def believe(information: Array, pull: Array, breaths: Array, likely: Array) -> Array:
-        asked.append((information, pull, breaths))
-        return 4.0 * alike
+    def believe(system: LinearGaussianSystem, breaths: Breaths, middle: Array) -> BreathEstimate:
+        asked.append((system.information, system.vector, middle))
+        return BreathEstimate(4.0 * alike, np.zeros(3), np.eye(3))
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(body_motion, "estimate_breath_covariance", believe)
-        found = replace(motion, breaths=(np.eye(2)[None], np.ones(1)))._estimate_breath()
-    [(information, pull, breaths)] = asked
+        patch.setattr(body_motion, "estimate_breath", believe)
+        found = motion._estimate_breath()
+    [(information, pull, middle)] = asked
     rest = np.linalg.inv(square[:12, :12] + KNOWN)
     np.testing.assert_allclose(
         information, square[12:, 12:] - square[12:, :12] @ rest @ square[:12, 12:], atol=1e-7
@@ -154,7 +146,8 @@ def test_a_breath_is_asked_of_what_other_motions_leave() -> None:
     np.testing.assert_allclose(
         pull, motion.vector[12:] - square[12:, :12] @ rest @ motion.vector[:12], atol=1e-7
     )
-    assert breaths.shape == (1, 2, 2)
+    np.testing.assert_array_equal(middle, COURSES.middle)
+    assert found.breath is not None
     np.testing.assert_allclose(found.kind("breath").prior_information, prior / 4.0, atol=1e-12)
     assert found._update_prior_variances().kind("breath") is found.kind("breath")
 

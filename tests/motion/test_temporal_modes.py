@@ -10,9 +10,10 @@ from bodyscan.alignment.sway_prior import stance_correlation
 from bodyscan.motion.temporal_modes import (
     BREATHS_S,
     PHASES,
+    SHARPNESSES,
+    Breaths,
     TemporalModes,
     breath_correlation,
-    breath_covariances,
 )
 
 
@@ -55,30 +56,26 @@ def test_each_breath_has_its_own_length_and_phase() -> None:
     """A tide of one of the lengths, at the moments and half way, is what one of them expects."""
     seconds = np.linspace(0.1, 2.1, 12)
     courses = TemporalModes.from_correlation(breath_correlation, seconds.tolist(), 1.1)
-    every, likely = breath_covariances(courses, seconds.tolist(), 1.1)
-    assert len(every) == len(BREATHS_S) * len(PHASES)
-    length, begun = 4, 3
-    turns = 2.0 * np.pi * np.append(seconds, 1.1) / BREATHS_S[length] + PHASES[begun]
-    amplitudes = np.linalg.pinv(np.vstack([courses.values, courses.middle])) @ np.cos(turns)
-    unlike = [amplitudes @ np.linalg.solve(one, amplitudes) for one in every]
-    assert np.argmin(unlike) == length * len(PHASES) + begun
-    # Its variance is that of the sine's middle and more: 1/2 of cos squared.
-    assert min(unlike) == pytest.approx(0.5, rel=0.05)
+    breaths = Breaths.from_modes(courses, seconds.tolist(), 1.1)
+    waves = breaths.waves.reshape(len(SHARPNESSES), len(BREATHS_S), len(PHASES), courses.count, 2)
+    length, begun, every = 4, 3, np.vstack([courses.values, courses.middle])
+    turn = 2.0 * np.pi * np.append(seconds, 1.1) / BREATHS_S[length] + PHASES[begun]
+    share = np.mod(turn / (2.0 * np.pi), 1.0)
+    # Breathed in at 0, out at 0.6 of it: cos^4 has a mean of 3/8 and a variance of 35/128 - 9/64.
+    half = np.where(share < 0.6, share / 0.6, 1.0 + (share - 0.6) / 0.4)
+    tide = (np.cos(0.5 * np.pi * half) ** 4 - 0.375) / np.sqrt(35.0 / 128.0 - 9.0 / 64.0)
+    np.testing.assert_allclose(every @ waves[1, length, begun, :, 0], tide, atol=0.05)
     # Sixteen a minute are likeliest, ten and twenty-four are not.
-    by_length = likely.reshape(len(BREATHS_S), -1)
-    assert likely.sum() == pytest.approx(1.0)
-    assert BREATHS_S[by_length[:, 0].argmax()] == pytest.approx(3.75, rel=0.05)
+    by_length = breaths.priors.reshape(waves.shape[:3]).sum(axis=(0, 2))
+    assert by_length.sum() == pytest.approx(1.0)
+    assert BREATHS_S[by_length.argmax()] == pytest.approx(3.75, rel=0.07)
     assert by_length[[0, -1]].max() < 0.15 * by_length.max()
-    # What is half a turn later is the same with the other sign, a quarter comes with the lag alone.
-    quarter = (begun + len(PHASES) // 2) % len(PHASES) + length * len(PHASES)
-    assert unlike[quarter] == pytest.approx(0.5 / 0.35**2, rel=0.15)
-    for one in every:
-        np.testing.assert_allclose(one, one.T, atol=1e-12)
-        assert np.linalg.eigvalsh(one).min() > 0.0
+    assert np.linalg.eigvalsh(breaths.irregular).min() > 0.0
 
 
 def test_where_a_moment_is_not_known_any_breath_is() -> None:
     courses = TemporalModes.from_correlation(breath_correlation, [0.2, None, 0.6], 0.4)
-    every, likely = breath_covariances(courses, [0.2, None, 0.6], 0.4)
-    np.testing.assert_array_equal(every, np.eye(courses.count)[None])
-    assert likely == 1.0
+    breaths = Breaths.from_modes(courses, [0.2, None, 0.6], 0.4)
+    assert not breaths.waves.any()
+    np.testing.assert_array_equal(breaths.irregular, np.eye(courses.count))
+    assert breaths.priors == 1.0
