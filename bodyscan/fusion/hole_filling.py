@@ -251,9 +251,9 @@ def find_free_points(
 ) -> Mask:
     """Find the points (N, 3), rig frame, that one camera saw through by at least `margin_mm`:
     something was measured behind them, or they lie in a gap (see `find_gaps`)."""
-    in_camera = _transform_points(points, rig_from_camera.inverse())
+    in_camera = rig_from_camera.inverse().apply(points.astype(np.float64))
     ahead = in_camera[:, 2] > 1.0
-    u, v = image.camera.project(np.where(ahead[:, None], in_camera, np.float32(1.0))).T
+    u, v = image.camera.project(np.where(ahead[:, None], in_camera, 1.0)).T
     columns, rows = np.rint(u).astype(np.intp), np.rint(v).astype(np.intp)
     inside = ahead & (columns >= 0) & (columns < image.camera.width)
     inside &= (rows >= 0) & (rows < image.camera.height)
@@ -314,9 +314,9 @@ def _project_to_blocks(
 ) -> Floats:
     """(V, 3): column and row of the block that shows each vertex, and depth; NaN behind the
     camera."""
-    points = _transform_points(vertices, rig_from_camera.inverse())
+    points = rig_from_camera.inverse().apply(vertices.astype(np.float64))
     points[points[:, 2] < 1.0] = np.nan
-    pixels = (image.camera.project(points.astype(float)) - stride // 2) / stride
+    pixels = (image.camera.project(points) - stride // 2) / stride
     first = blocks[1].start, blocks[0].start
     return np.concatenate([pixels - first, points[:, 2:]], axis=1).astype(np.float32)
 
@@ -326,12 +326,6 @@ def _has_left_neighbour(mask: Mask, reach: int) -> Mask:
     columns = np.arange(mask.shape[1])
     latest = np.maximum.accumulate(np.where(mask, columns, -reach - 1), axis=1)
     return columns - latest <= reach
-
-
-def _transform_points(points: Floats, a_from_b: RigidTransform) -> Floats:
-    """Points (..., 3) float32 in b to a; several times faster than numpy on triples."""
-    matrix = np.column_stack([a_from_b.rotation, a_from_b.translation])
-    return cv2.transform(points.reshape(1, -1, 3), matrix).reshape(points.shape)
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,6 +30,13 @@ def known_to(surface: SmoothSurface, sigma_mm: float, rim: float = 1.0) -> Smoot
     return replace(surface, sigma_mm=sigma, weight=np.float32(rim) / sigma**2)
 
 
+def compared(surfaces: list[SmoothSurface]) -> tuple[Samples, list[Consistency]]:
+    samples = take_samples(surfaces, 10**6)
+    return samples, [
+        compare_with_surface(samples, surface, k, 1.5, 6.0) for k, surface in enumerate(surfaces)
+    ]
+
+
 def fused(
     further_mm: float, sigmas: tuple[float, float], rim: float = 1.0
 ) -> tuple[BodyCloud, Samples, list[SmoothSurface], list[Consistency]]:
@@ -38,16 +45,9 @@ def fused(
         known_to(wall(WALL_MM, 100, RigidTransform.identity()), sigmas[0]),
         known_to(wall(WALL_MM + further_mm, 120, ASIDE), sigmas[1], rim),
     ]
-    samples = take_samples(surfaces, 10**6)
-    consistency = [
-        compare_with_surface(samples, surface, k, 1.5, 6.0) for k, surface in enumerate(surfaces)
-    ]
-    return (
-        average(samples, surfaces, consistency, as_seen(samples, surfaces), workers=1),
-        samples,
-        surfaces,
-        consistency,
-    )
+    samples, consistency = compared(surfaces)
+    cloud = average(samples, surfaces, consistency, as_seen(samples, surfaces), workers=1)
+    return cloud, samples, surfaces, consistency
 
 
 def test_two_that_agree_are_known_better_by_their_weights() -> None:
@@ -71,10 +71,7 @@ def test_at_a_rim_a_surface_counts_for_less_and_so_it_does_in_the_sigma() -> Non
 def test_where_a_surface_ends_there_is_no_step() -> None:
     """Its weight rises from near 0 at its rim to that of its sigma over a window."""
     surfaces = [wall(WALL_MM, 100, RigidTransform.identity()), wall(WALL_MM + 0.5, 100, ASIDE)]
-    samples = take_samples(surfaces, 10**6)
-    consistency = [
-        compare_with_surface(samples, surface, k, 1.5, 6.0) for k, surface in enumerate(surfaces)
-    ]
+    samples, consistency = compared(surfaces)
     cloud = average(samples, surfaces, consistency, as_seen(samples, surfaces), workers=1)
     left, right = surfaces[1].points[:, 0].min(), surfaces[0].points[:, 0].max()
     middle = np.abs(cloud.points[:, 1]) < 20.0
@@ -131,10 +128,7 @@ def test_a_place_where_pairs_disagree_by_more_than_elsewhere_is_less_certain() -
     some = np.arange(len(surfaces[1].points)) % 20 == 0
     moved = surfaces[1].points + np.where(some, 0.8, 0.0)[:, None] * np.array([0.0, 0.0, 1.0])
     surfaces[1] = replace(surfaces[1], points=moved.astype(np.float32))
-    samples = take_samples(surfaces, 10**6)
-    consistency = [
-        compare_with_surface(samples, surface, k, 1.5, 6.0) for k, surface in enumerate(surfaces)
-    ]
+    samples, consistency = compared(surfaces)
     assert estimate_sigma_inflation(samples, surfaces, consistency) == 1.0
     cloud = average(samples, surfaces, consistency, as_seen(samples, surfaces), workers=1)
     both = cloud.pairs_seen == 2
@@ -155,6 +149,6 @@ def test_surfaces_that_look_other_ways_are_not_one() -> None:
     ]
     turned = replace(surfaces[1], normals=-surfaces[1].normals)
     samples = take_samples([surfaces[0], turned], 10**6)
-    found = compare_with_surface(replace(samples, starts=samples.starts), turned, 1, 1.5, 6.0)
+    found = compare_with_surface(samples, turned, 1, 1.5, 6.0)
     own = found.index[found.index < samples.starts[1]]
     assert not own.size
