@@ -70,11 +70,9 @@ def girth_errors(mesh: BodyMesh, true: Measurements, *, mean_breath: bool = Fals
     true: see `true_girths`.
     """
     ours = measure(mesh, [one.height_mm for one in true.slices], mean_breath=mean_breath)
-    errors = {
-        one.height_mm: error
-        for one, other in zip(ours.slices, true.slices, strict=True)
-        if (error := _trunk_error(one, other)) is not None
-    }
+    both = zip(ours.slices, true.slices, strict=True)
+    found = {one.height_mm: _trunk_error(one, other) for one, other in both}
+    errors = {height: error for height, error in found.items() if error is not None}
     sizes = np.abs(list(errors.values())) if errors else np.array([np.nan])
     worst_at = list(errors)[int(np.argmax(sizes))] if errors else float("nan")
     stature_mm = ours.stature_mm - true.stature_mm

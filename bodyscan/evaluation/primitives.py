@@ -184,10 +184,8 @@ def find_spheres(points: Array, normals: Array, radius: float, count: int) -> li
     for _ in range(count):
         sphere = _find_sphere(flat, votes, radius)
         if sphere is None:
-            raise FailedWork(
-                f"{len(found)} spheres of radius {radius:g} mm found, {count} were expected",
-                remedy="see that all spheres are in the picture and lit",
-            )
+            what = f"{len(found)} spheres of radius {radius:g} mm found, {count} were expected"
+            raise FailedWork(what, remedy="see that all spheres are in the picture and lit")
         found.append(sphere)
         rest = np.linalg.norm(flat - sphere.centre, axis=1) > 1.15 * radius
         flat, votes = flat[rest], votes[rest]

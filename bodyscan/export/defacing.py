@@ -58,10 +58,8 @@ def find_neck(vertices: Array, faces: Indices) -> Neck:
     inside = 0 < narrowest < len(girths) - 1 and 180.0 < neck < 700.0
     # Wrists of arms held overhead are narrow too, but have no head above and no shoulders below.
     if not (inside and head > 400.0 and head > 1.1 * neck and shoulders > 1.5 * neck):
-        raise FailedWork(
-            "no neck was found, so the face cannot be removed",
-            remedy="look at the mesh: does the subject stand upright, arms not overhead?",
-        )
+        remedy = "look at the mesh: does the subject stand upright, arms not overhead?"
+        raise FailedWork("no neck was found, so the face cannot be removed", remedy=remedy)
     return Neck(float(heights[narrowest]), axis)
 
 

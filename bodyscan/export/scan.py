@@ -52,10 +52,8 @@ def export_scan(
         BODY_FORMATS.find(name)
     for name, known in [*((version, VERSIONS) for version in versions), (frame, ("rig", "body"))]:
         if name not in known:
-            raise BadInput(
-                f"there is no {name!r} to export{did_you_mean(name, known)}",
-                remedy=f"Choose from {', '.join(known)}.",
-            )
+            what = f"there is no {name!r} to export{did_you_mean(name, known)}"
+            raise BadInput(what, remedy=f"Choose from {', '.join(known)}.")
     pose = find_body_frame(scan.mesh.vertices).rig_from_body if frame == "body" else None
     subject, identity = scan.facts.get("subject"), scan.facts["calibration_id"]
     origin = Provenance(subject, identity, deface, scan_facts(scan.facts), pose)

@@ -69,10 +69,8 @@ class Camera:
 
     def retract(self, step: Array) -> Camera:
         """The camera after a step (P,) is added to its parameters."""
-        matrix = {
-            name: getattr(self, name) + float(change)
-            for name, change in zip(MATRIX, step[: len(MATRIX)], strict=True)
-        }
+        moved = (self.parameters + step)[: len(MATRIX)].tolist()
+        matrix = dict(zip(MATRIX, moved, strict=True))
         lens = self.lens.with_coefficients(self.lens.coefficients + step[len(MATRIX) :])
         return replace(self, **matrix, lens=lens)
 

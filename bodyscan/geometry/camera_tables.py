@@ -90,11 +90,8 @@ def _locate_cell(table: Table, x: float, y: float) -> tuple[int, int, float, flo
 
 @compiled
 def _quadratic(c: Array, i: int, j: int, k: int, x: float, y: float) -> float:
-    return (
-        c[i, j, k, 0]
-        + y * (c[i, j, k, 1] + y * c[i, j, k, 2])
-        + x * (c[i, j, k, 3] + y * c[i, j, k, 4] + x * c[i, j, k, 5])
-    )
+    by_x = c[i, j, k, 3] + y * c[i, j, k, 4] + x * c[i, j, k, 5]
+    return c[i, j, k, 0] + y * (c[i, j, k, 1] + y * c[i, j, k, 2]) + x * by_x
 
 
 @compiled

@@ -132,10 +132,8 @@ def measure(
     missing = [height for height in heights if not parts.slices[height]]
     if heights_mm is not None and missing:
         low, high = vertices[:, 2].min(), vertices[:, 2].max()
-        raise BadInput(
-            f"there is no body at a height of {missing[0]:g} mm",
-            remedy=f"Give heights between {low:.0f} and {high:.0f} mm.",
-        )
+        remedy = f"Give heights between {low:.0f} and {high:.0f} mm."
+        raise BadInput(f"there is no body at a height of {missing[0]:g} mm", remedy=remedy)
     slices = []
     for height in (height for height in heights if height not in missing):
         pieces = sorted(parts.slices[height], key=lambda piece: piece.part)

@@ -216,10 +216,8 @@ def _name_trunk_and_legs(graph: nx.DiGraph[_Node], top: float) -> None:
         below = sorted({n for at in trunk for n in graph.succ[at]}, key=lambda n: -n.area_mm2)
         legs = [node for node in below[:2] if node.area_mm2 > 0.4 * below[0].area_mm2]
         # What ends higher up is a hand that touches a leg.
-        standing = [
-            {node for node in nx.descendants(graph, leg) | {leg} if lowest[node] < 0.1 * top}
-            for leg in legs
-        ]
+        below_each = [nx.descendants(graph, leg) | {leg} for leg in legs]
+        standing = [{n for n in nodes if lowest[n] < 0.1 * top} for nodes in below_each]
         shared = set.intersection(*standing) if len(legs) == 2 else set()
         joined = max((node.height_mm for node in shared), default=0.0)
         # What joins again at once was the cleft above the crotch.

@@ -120,10 +120,8 @@ def decimate(mesh: BodyMesh, *, faces: int = 50_000) -> BodyMesh:
         vertices, corners = extract_largest_piece(vertices, corners)
         shape = compute_topology(vertices, corners)
     if not shape.manifold:
-        raise ScanFailed(
-            f"the mesh did not stay closed when reduced to {faces} faces ({shape})",
-            remedy="Ask for more faces.",
-        )
+        what = f"the mesh did not stay closed when reduced to {faces} faces ({shape})"
+        raise ScanFailed(what, remedy="Ask for more faces.")
     nearest = np.asarray(cKDTree(mesh.vertices).query(vertices, workers=THREADS)[1])
     filled = np.any(np.isnan(mesh.sigma_mm)[nearest[corners]], axis=1)
     small = mesh.part(vertices, corners, nearest, filled)

@@ -109,10 +109,8 @@ class Lens(ABC):
 
         Raises BadInput for a lens that OpenCV does not have.
         """
-        raise BadInput(
-            f"OpenCV and COLMAP have no lens like {self.kind!r}",
-            remedy="calibrate with another lens for programs that go by theirs",
-        )
+        remedy = "calibrate with another lens for programs that go by theirs"
+        raise BadInput(f"OpenCV and COLMAP have no lens like {self.kind!r}", remedy=remedy)
 
     @classmethod
     def from_opencv(cls, coefficients: Array) -> Self | None:

@@ -135,10 +135,9 @@ def _read_camera(
     file = ForeignFile(folder)
     name, model = f"camera {camera.camera_id}", camera.model.name
     if model not in PERSPECTIVE + FISHEYES:
-        raise file.error(
-            f"has a camera of COLMAP's model {model}, which is not supported",
-            remedy=f"calibrate it with one of {', '.join(PERSPECTIVE + FISHEYES)}",
-        )
+        what = f"has a camera of COLMAP's model {model}, which is not supported"
+        known = ", ".join(PERSPECTIVE + FISHEYES)
+        raise file.error(what, remedy=f"calibrate it with one of {known}")
     centre = camera.principal_point_x - PIXEL_CENTRE, camera.principal_point_y - PIXEL_CENTRE
     four = [camera.focal_length_x, camera.focal_length_y, *centre]
     matrix = file.pinhole_matrix(four, name)

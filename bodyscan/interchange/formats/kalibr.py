@@ -36,11 +36,11 @@ def write_kalibr(cameras: RigCameras, path: Path) -> Path:
     for number, (name, (camera, rig_from_camera)) in enumerate(cameras.items()):
         is_fisheye, coefficients = opencv_lens(camera)
         if np.any(coefficients[4:]):
-            raise BadInput(
-                f"Kalibr has no lens like {camera.lens.kind!r}: its radtan ends with k1, k2, p1, p2",
-                where=f"pair {name}",
-                remedy="choose another format, such as opencv, colmap or mrcal",
+            what = (
+                f"Kalibr has no lens like {camera.lens.kind!r}: its radtan ends with k1, k2, p1, p2"
             )
+            remedy = "choose another format, such as opencv, colmap or mrcal"
+            raise BadInput(what, where=f"pair {name}", remedy=remedy)
         entry: dict[str, Any] = {
             "camera_model": "pinhole",
             "intrinsics": [camera.alpha, camera.beta, camera.u0, camera.v0],
