@@ -77,9 +77,9 @@ def _corner_normals(count: int, faces: Indices, sides: Array, unit: Array) -> Ar
 
 def deviation(signed_mm: Array) -> Deviation:
     """Bias, median, RMS, 95th percentile and worst of signed distances (N,)."""
-    size, bias, spread = np.abs(signed_mm), float(np.mean(signed_mm)), rms(signed_mm)
+    size, bias, rms_mm = np.abs(signed_mm), float(np.mean(signed_mm)), rms(signed_mm)
     median, p95, worst = float(np.median(size)), float(np.percentile(size, 95)), float(size.max())
-    return Deviation(len(signed_mm), bias, median, spread, p95, worst)
+    return Deviation(len(signed_mm), bias, median, rms_mm, p95, worst)
 
 
 def normalized_errors(signed_mm: Array, sigma_mm: NDArray[np.floating[Any]]) -> tuple[float, float]:
