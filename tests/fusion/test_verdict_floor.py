@@ -10,9 +10,11 @@ import pytest
 
 from bodyscan.arrays import Array
 from bodyscan.fusion.verdict.rig import find_floor, find_misplaced
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.transforms import RigidTransform
 
-WITHIN: Any = SimpleNamespace(radius_mm=700.0)
+WITHIN: Any = SimpleNamespace(radius_mm=700.0, bottom_mm=0.0, top_mm=2200.0)
 STRAIGHT_UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -79,6 +81,15 @@ def test_heights_are_those_of_the_rig_wherever_the_camera_stands() -> None:
     assert find_floor(images, dict.fromkeys("ab", at), WITHIN) == pytest.approx(12.0)
 
 
+def stray(depth_mm: float, count: int, turned: float = 0.0) -> tuple[Any, RigidTransform]:
+    """Points of a pair 1.5 m from the middle, which it looks past by an angle; and its pose."""
+    image = seen("a", np.tile([0.0, 0.0, depth_mm], (count, 1)))
+    image.camera = Camera(1000.0, 1000.0, 0.0, 320.0, 240.0, Radial(), 640, 480)
+    level = RigidTransform(np.array([[0.0, 0, -1], [1, 0, 0], [0, -1, 0]]), np.zeros(3))
+    turn = RigidTransform.from_rotation_vector([0.0, 0.0, turned], [1500.0, 0.0, 900.0])
+    return image, turn @ level
+
+
 @pytest.mark.parametrize(
     ("depth_mm", "seeing", "named"),
     [(1400.0, (), True), (1400.0, ("a",), False), (3000.0, (), False)],
@@ -87,8 +98,15 @@ def test_a_pair_whose_points_all_lie_elsewhere_is_named(
     depth_mm: float, seeing: tuple[str, ...], named: bool
 ) -> None:
     """As far away as the subject, with a pose that is wrong; not a wall behind a child's head."""
-    image = seen("a", np.tile([0.0, 0.0, depth_mm], (1000, 1)))
-    pose = RigidTransform(np.eye(3), np.array([1500.0, 0.0, 900.0]))
+    image, pose = stray(depth_mm, 1000)
     found = find_misplaced([image], seeing, {"a": pose}, WITHIN)
     assert ("a" in found) == named
     assert not named or "none of its 4000 points" in found["a"]
+
+
+def test_a_pair_that_gave_nothing_is_named_if_its_pose_looks_past_the_volume() -> None:
+    for turned, named in ((0.0, False), (0.3, False), (1.2, True)):
+        image, pose = stray(1400.0, 0, turned)
+        found = find_misplaced([image], (), {"a": pose}, WITHIN)
+        assert ("a" in found) == named
+        assert not named or "looks past the scan volume" in found["a"]

@@ -11,6 +11,7 @@ from bodyscan.arrays import Array
 from bodyscan.fusion.verdict.evidence import Finding, ScanEvidence
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
+from bodyscan.reconstruction.scan_volume import volume_interval
 from bodyscan.rig.rig import Volume
 from bodyscan.verdict import LEFT_OUT
 
@@ -48,21 +49,32 @@ def find_misplaced(
     rig_from_camera: Mapping[str, RigidTransform],
     volume: Volume,
 ) -> dict[str, str]:
-    """Pairs that measured something as far away as the scan volume, and nothing of the subject in it;
-    with the reason. A pair that looks over a child's head measures nothing, or what is farther away.
+    """Pairs that saw nothing of the subject and, by their pose or their points, should have; with the
+    reason. A pair that looks over a child's head measures nothing, or what is farther away.
 
     images: as decoded. seeing: the pairs that saw the subject.
     """
     found = {}
     for image in images:
-        if image.pair in seeing or (count := int(np.count_nonzero(image.valid))) < 1000:
+        if image.pair in seeing:
             continue
-        axis_mm = float(np.linalg.norm(rig_from_camera[image.pair].translation[:2]))
-        depth_mm = float(np.median(image.points[image.valid][:, 2]))
+        pose, camera = rig_from_camera[image.pair], image.camera
+        axes = np.linspace(0.0, camera.width - 1.0, 20), np.linspace(0.0, camera.height - 1.0, 20)
+        rays = camera.rays(np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2))
+        enter, leave = volume_interval(rays, pose, volume, raised_mm=0.0)
+        causes = (
+            "Possible causes: its pose is wrong; its images are another pair's. Calibrate again"
+        )
+        if np.mean(enter < leave) < 0.2:
+            found[image.pair] = f"by its pose it looks past the scan volume. {causes}"
+            continue
+        count = int(np.count_nonzero(image.valid))
+        axis_mm = float(np.linalg.norm(pose.translation[:2]))
+        depth_mm = float(np.median(image.points[image.valid][:, 2])) if count >= 1000 else np.inf
         if abs(depth_mm - axis_mm) < volume.radius_mm:
             found[image.pair] = (
                 f"none of its {count} points is in the scan volume, though they are as far away. "
-                "Possible causes: its pose is wrong; its images are another pair's. Calibrate again"
+                f"{causes}"
             )
     return found
 
