@@ -28,7 +28,7 @@ from bodyscan.mesh.body import BodyMesh, BreathAt
 from bodyscan.motion.body_cells import BodyCells, evaluate_field
 from bodyscan.motion.body_motion import BodyMotion
 from bodyscan.motion.body_parts import LIMBS
-from bodyscan.motion.breath import SIZES_MM, breath_along_normals
+from bodyscan.motion.breath import SIZES_MM
 from bodyscan.motion.cell_equations import CellEquations
 from bodyscan.motion.motion_uncertainty import girth_sigmas, shape_sigmas
 from bodyscan.progress import THREADS
@@ -262,14 +262,14 @@ def _offset_to_mean_breath(
 
     girth_sigma_mm: (C,) of the shape at the scan's moment.
     """
-    if motion.breath is None or not timed:
-        breath = rms(SIZES_MM) * np.abs(breath_along_normals(cells))
-        return BreathOffset(np.zeros((len(breath), 12)), np.hypot(breath, girth_sigma_mm))
     fields = motion.kind("breath").fields
-    field = fields @ motion.breath.at_middle
-    eigenvalues, eigenvectors = np.linalg.eigh(motion.breath.covariance)
-    outward = np.einsum("cim,ci->cm", fields[:, :3], cells.normals)
-    errors = outward @ (eigenvectors * np.sqrt(np.maximum(eigenvalues, 0.0)))
+    errors = np.einsum("cim,ci->cm", fields[:, :3], cells.normals)
+    if motion.breath is None or not timed:
+        field, errors = np.zeros(fields.shape[:2]), rms(SIZES_MM) * errors
+    else:
+        field = fields @ motion.breath.at_middle
+        eigenvalues, eigenvectors = np.linalg.eigh(motion.breath.covariance)
+        errors = errors @ (eigenvectors * np.sqrt(np.maximum(eigenvalues, 0.0)))
     sigma_mm = girth_sigmas(errors, cells.centres[:, 2])
     return BreathOffset(field, np.hypot(sigma_mm, girth_sigma_mm))
 
