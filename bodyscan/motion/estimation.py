@@ -82,6 +82,12 @@ class EstimatedMotion:
     moment_ms: float | None
     breath: BreathOffset | None = None
 
+    @property
+    def significant(self) -> bool:
+        """Whether the motion is larger than its own error; if not, the object is taken as still."""
+        seen = self.observed.any(axis=0)
+        return rms_length(self.displacements[self.observed]) >= rms(self.sigma_mm[seen])
+
     def add_breath(self, surface: BodyMesh) -> BodyMesh:
         """Attach each vertex's displacement to mean breath, where it is known."""
         if self.breath is None:
@@ -158,9 +164,8 @@ def estimate_motion(
         if solution is None:
             return aligned, None, None
         motion = solution.motion
-        evidence = None
-        if None not in seconds:
-            evidence = PoseEvidence(tuple(names), motion.pose_equations())
+        poses = PoseEvidence(tuple(names), motion.pose_equations())
+        evidence = None if None in seconds else poses
         if solution.negligible:
             return aligned, None, evidence
         distances = _map_matches(
@@ -172,12 +177,13 @@ def estimate_motion(
             settings,
         )
     moved = _update_alignment(aligned, names, views, motion, distances)
-    # If non-rigid motion does not bring overlaps closer, they are apart because of the pairs' own
-    # calibrations, which warp with position and not with time.
+    # Overlaps that motion brings no closer are apart because of the pairs' own calibrations.
     no_closer = moved.rms_after_mm > 0.95 * aligned.rms_after_mm
-    if no_closer and _is_rigid_negligible(motion, observed, settings):
+    still = no_closer and _is_rigid_negligible(motion, observed, settings)
+    found = _from_middle(images, motion, cells, observed)
+    if still or not found.significant:
         return aligned, None, evidence
-    return moved, _from_middle(images, motion, cells, observed), evidence
+    return moved, found, evidence
 
 
 def _from_middle(

@@ -29,6 +29,7 @@ from bodyscan.motion.estimation import (
 )
 from bodyscan.motion.person_motion import PartMotion, PersonMotion
 from bodyscan.motion.warping import warp_to_middle
+from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.settings import AlignmentSettings
 
 SCALE = 0.25  # pixels of 4 mm
@@ -222,6 +223,21 @@ def test_a_mannequin_is_not_bent() -> None:
     assert alignment is aligned
     images = images_of(scan)
     assert warp_to_middle(images, aligned.rig_from_camera, None) == images
+
+
+@pytest.mark.parametrize("relief_mm", [1.0, 3.0])
+def test_a_figure_before_two_cameras_without_times_is_still(relief_mm: float) -> None:
+    """Each camera's calibration bends what it measures: that is no motion, and no breath."""
+    scan = cast_living(load_rig("four-pole-16"), STILL, seed=2, scale=SCALE)
+    settings, images = AlignmentSettings(), list[RangeImage]()
+    for image in (one for one in images_of(scan, timed=False) if one.pair in ("p1-2", "p2-2")):
+        x, y, z = np.moveaxis(image.points.astype(float), -1, 0)
+        bent = relief_mm * (8.0 * (x * x - y * y) + 6.0 * x * y) / z**2 * (-1) ** len(images)
+        points = (image.points * (1.0 + bent / z)[..., None]).astype(np.float32)
+        images.append(replace(image, points=points))
+    aligned = align(images, scan.rig_from_camera, boards(scan), settings)
+    found = estimate_motion(images, scan.rig_from_camera, aligned, boards(scan), settings)
+    assert found[:2] == (aligned, None)
 
 
 def test_who_only_sways_is_carried_along_time() -> None:
