@@ -165,10 +165,11 @@ def measure(
     path = out or result / "measurements.json"
     if path.suffix.lower() == ".csv":
         write_text(path, measurements_csv(content))
-        # As beside an export, so that `bodyscan forget` knows whose it is.
-        write_json(path.with_name(f"{path.name}.json"), {"subject": content["subject"]})
     else:
         write_json(path, content)
+    if path.suffix != ".json":
+        # As beside an export, so that `bodyscan forget` knows whose it is.
+        write_json(path.with_name(f"{path.name}.json"), {"subject": content["subject"]})
     output.show(*tables(measured))
     output.figures(**content)
     output.add_files("measurements", path)
@@ -429,13 +430,24 @@ def forget(
     from bodyscan.jobs.job import printable
 
     found = forgetting.find_subject(subject, workspace)
+    forgetting.require_found(found, subject, workspace)
     if not dry_run:
-        if not yes and (found.files or found.rows):
+        if not yes:
             _confirm_removal(f"{len(found.files)} files of {subject}", workspace)
         found = forgetting.forget_subject(subject, workspace)
     verb = "would remove" if dry_run else "removed"
-    output.say(*(f"{verb} {printable(str(path))}" for path in found.files))
+    listed = [str(path) for path in found.files]
+    if not output.verbose:
+        listed = list(forgetting.list_by_folder(found))
+    output.say(*(f"{verb} {printable(line)}" for line in listed))
     output.notes((printable(str(path)) for path in found.unreadable), "owner unknown")
+    output.notes(
+        (
+            printable(f"{path}: {count} images or bodies; look whether they show {subject}")
+            for path, count in found.unnamed.items()
+        ),
+        "names nobody",
+    )
     output.figures(files=len(found.files), removed=not dry_run)
     output.say(f"{verb} {len(found.files)} files of {subject}")
 

@@ -42,7 +42,8 @@ def export_scan(
 
     versions: full, light (50,000 faces), open (without filled faces). Each file has a JSON beside
         it.
-    deface: replace the subject's head by a plain one; below the neck nothing changes.
+    deface: replace the subject's head by a plain one; below the neck nothing changes. The JSON then
+        has neither pseudonym nor date.
     frame: rig, or body (origin under the body, x the way it faces).
 
     Raises BadInput for an unknown format, version or frame, FailedWork if no neck is found.
@@ -57,6 +58,8 @@ def export_scan(
     pose = find_body_frame(scan.mesh.vertices).rig_from_body if frame == "body" else None
     subject, identity = scan.facts.get("subject"), scan.facts["calibration_id"]
     origin = Provenance(subject, identity, deface, scan_facts(scan.facts), pose)
+    if deface:
+        origin = replace(origin, subject=None, found=_without_person(origin.found))
     neck = find_neck(scan.mesh.vertices, scan.mesh.faces) if deface else None
     written = []
     for version in versions:
@@ -81,6 +84,16 @@ def scan_facts(facts: Mapping[str, Any]) -> dict[str, Any]:
         "left_out": facts.get("failed", {}),
         "sway_mm": alignment["motion_mm"] if alignment else None,
     }
+
+
+def _without_person(found: Mapping[str, Any]) -> dict[str, Any]:
+    """What a file for sharing may say: no date, and no sentence, which may name a folder."""
+    grade = (found["verdict"] or {}).get("grade")
+    shared = {
+        "verdict": grade and {"grade": grade},
+        "left_out": dict.fromkeys(found["left_out"], ""),
+    }
+    return {"when": None, "sway_mm": found["sway_mm"], **shared}
 
 
 def transform_mesh(mesh: BodyMesh, a_from_b: RigidTransform) -> BodyMesh:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import secrets
-import socket
+import time
 import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -139,7 +139,8 @@ def lock_file(path: Path, *, wait: bool) -> Iterator[None]:
             ) from None
         with suppress(OSError):  # good to know who holds it, but a full disk is no obstacle
             os.ftruncate(handle, 0)
-            os.pwrite(handle, f"process {os.getpid()} on {socket.gethostname()}\n".encode(), 0)
+            since = time.strftime("%Y-%m-%d %H:%M:%S")
+            os.pwrite(handle, f"process {os.getpid()} since {since}\n".encode(), 0)
         yield
     finally:
         os.close(handle)

@@ -1,8 +1,10 @@
 """Every file of a subject in a workspace, found by the files' content and never by their names.
 
 A folder is a subject's if its captures.yaml, scan.json or job.json says so, together with
-everything below it that is not another subject's. Elsewhere an export is recognised by the JSON
-beside it. Rows of summaries and entries of manifests about the subject are removed too.
+everything below it that is not another subject's, and the images that the job was made from.
+Elsewhere an export or report is recognised by the JSON beside it, and measurements by their own
+content. Rows of summaries and entries of manifests about the subject are removed too. What may
+show a person and names none is listed.
 """
 
 from __future__ import annotations
@@ -11,7 +13,8 @@ import csv
 import io
 import json
 import os
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,12 +24,16 @@ from bodyscan.captures.captures_file import FILE_NAME as CAPTURES
 from bodyscan.errors import BadInput
 from bodyscan.files.atomic import lock_file, restrict_to_owner, write_text
 from bodyscan.files.yaml_file import YamlError, read_yaml
-from bodyscan.jobs.job import BATCH_LOCK, JOB, MANIFEST, SUMMARY
+from bodyscan.jobs.job import BATCH_LOCK, CALIBRATION, JOB, MANIFEST, SUMMARY
 from bodyscan.jobs.summary import write_out_manifest
 
 # Removed in this order, so that the file which names the owner goes last: an interrupted removal
 # can be continued.
 _MARKERS = ("scan.json", JOB, CAPTURES)
+
+_Folder = tuple[Path, list[str], str | bool | None]
+"""A folder, the names of its files (and links), and its owner: a subject; None if nothing says so;
+False for boards and calibrations, which are of nobody."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +45,7 @@ class SubjectFiles:
     tables: folders of batches, whose manifests are rewritten.
     rows: those of them whose summary has rows of the subject.
     unreadable: files that should name a folder's owner, and do not.
+    unnamed: folders whose images or bodies name nobody, with how many there are in and below them.
     """
 
     files: tuple[Path, ...]
@@ -45,25 +53,70 @@ class SubjectFiles:
     tables: tuple[Path, ...]
     rows: tuple[Path, ...]
     unreadable: tuple[Path, ...]
+    unnamed: dict[Path, int]
 
 
 def find_subject(subject: str, workspace: Path) -> SubjectFiles:
     """Find what `forget_subject` would remove. Raises BadInput if the workspace is not a folder."""
     if not workspace.is_dir():
         raise BadInput("there is no such folder", where=str(workspace), remedy="check --workspace")
-    lists: list[list[Path]] = [[], [], [], []]
-    files, folders, tables, unreadable = lists
-    for folder, names, owner in _walk(workspace, None, unreadable):
+    files: list[Path] = []
+    folders: list[Path] = []
+    tables: list[Path] = []
+    unreadable: list[Path] = []
+    unnamed: dict[Path, int] = {}
+    named = {workspace, *workspace.parents}
+    walked = list(_walk(workspace, None, unreadable))
+    sources = _sources_of(subject, walked)
+    for folder, names, owner in walked:
+        if owner is None and sources & {folder, *folder.parents}:
+            owner = subject
         found = set(names) if owner == subject else _exports(folder, names, subject)
         files += (folder / name for name in found)
         if owner == subject and folder != workspace:
             folders.append(folder)
         if BATCH_LOCK in names and owner is None:
             tables.append(folder)
+        if owner is not None:
+            named |= {folder, *folder.parents}
+        elif count := sum(_may_show_someone(name, names) for name in names if name not in found):
+            unnamed[folder] = count
     order = {name: rank for rank, name in enumerate(_MARKERS, start=1)}
     files.sort(key=lambda path: (order.get(path.name, 0), path))
     rows = [out for out in tables if _without(subject, out / SUMMARY) is not None]
-    return SubjectFiles(tuple(files), tuple(folders), tuple(tables), tuple(rows), tuple(unreadable))
+    return SubjectFiles(
+        *(tuple(files), tuple(folders), tuple(tables), tuple(rows), tuple(unreadable)),
+        _gather(unnamed, named),
+    )
+
+
+def _sources_of(subject: str, walked: Sequence[_Folder]) -> set[Path]:
+    """Folders of images that name nobody, from which the subject's jobs were made."""
+    owners = {folder.resolve(): (folder, owner) for folder, _, owner in walked}
+    sources = set()
+    for folder, names, owner in walked:
+        if owner == subject and JOB in names:
+            with suppress(OSError, ValueError, KeyError, TypeError):
+                content = json.loads((folder / JOB).read_text("utf-8"))
+                source, its = owners[(folder / content["source"]).resolve()]
+                sources |= {source} if its is None else set()
+    return sources
+
+
+def _may_show_someone(name: str, names: Sequence[str]) -> bool:
+    """Whether a file may be an image or a body, and has no JSON beside it."""
+    images = (".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg", ".pgm", ".exr", ".npy")
+    bodies = (".ply", ".obj", ".stl", ".glb", ".e57")
+    return name.lower().endswith((*images, *bodies)) and f"{name}.json" not in names
+
+
+def _gather(unnamed: Mapping[Path, int], named: Collection[Path]) -> dict[Path, int]:
+    """Count by the highest folder that holds nothing which is known to be of someone, or no one."""
+    counts: Counter[Path] = Counter()
+    for folder, count in unnamed.items():
+        highest = [path for path in (folder, *folder.parents) if path not in named]
+        counts[highest[-1] if highest else folder] += count
+    return dict(counts)
 
 
 def forget_subject(subject: str, workspace: Path) -> SubjectFiles:
@@ -76,12 +129,7 @@ def forget_subject(subject: str, workspace: Path) -> SubjectFiles:
         found = find_subject(subject, workspace)
         for out in found.tables:
             locks.enter_context(lock_file(out / BATCH_LOCK, wait=False))
-        if not found.files and not found.rows:
-            raise BadInput(
-                f"holds nothing of subject {subject!r}",
-                where=str(workspace),
-                remedy="give the pseudonym as captures.yaml has it, and the --workspace",
-            )
+        require_found(found, subject, workspace)
         for out in found.rows:
             write_text(out / SUMMARY, _without(subject, out / SUMMARY) or "")
         for path in found.files:
@@ -95,43 +143,77 @@ def forget_subject(subject: str, workspace: Path) -> SubjectFiles:
     return found
 
 
-def _walk(
-    folder: Path, owner: str | None, unreadable: list[Path]
-) -> Iterator[tuple[Path, list[str], str | None]]:
-    """Every folder with the names of its files (and links), and its owner."""
+def list_by_folder(found: SubjectFiles) -> Iterator[str]:
+    """What was found in lines: the subject's highest folders with their number of files, and files
+    elsewhere."""
+    highest = [one for one in found.folders if not {*one.parents} & {*found.folders}]
+    inside = {path: [one for one in highest if one in path.parents] for path in found.files}
+    counts = Counter(one for folders in inside.values() for one in folders)
+    yield from (f"{folder} ({counts[folder]} files)" for folder in highest)
+    yield from (str(path) for path, folders in inside.items() if not folders)
+    yield from (f"the subject's rows of {out / SUMMARY}" for out in found.rows)
+
+
+def require_found(found: SubjectFiles, subject: str, workspace: Path) -> None:
+    """Raise BadInput if there is nothing of that subject."""
+    if not found.files and not found.rows:
+        raise BadInput(
+            f"holds nothing of subject {subject!r}",
+            where=str(workspace),
+            remedy="give the pseudonym as captures.yaml has it, and the --workspace",
+        )
+
+
+def _walk(folder: Path, owner: str | bool | None, unreadable: list[Path]) -> Iterator[_Folder]:
+    """Every folder in and below `folder`, which is `owner`'s unless it says otherwise."""
     with os.scandir(folder) as entries:
         listed = sorted(entries, key=lambda entry: entry.name)
     names = [entry.name for entry in listed if not entry.is_dir(follow_symlinks=False)]
+    if CALIBRATION in names and owner is None:
+        owner = False
     for marker in _MARKERS:
         if marker in names:
             try:
-                owner = _subject(folder / marker) or owner
+                content = _content(folder / marker)
             except (OSError, ValueError, YamlError, RecursionError):
                 unreadable.append(folder / marker)
+                continue
+            is_boards = marker == CAPTURES and content.get("kind") == "calibration"
+            owner = _subject(content) or (False if is_boards else owner)
     yield folder, names, owner
     for entry in listed:
         if entry.is_dir(follow_symlinks=False):
             yield from _walk(Path(entry.path), owner, unreadable)
 
 
-def _subject(path: Path) -> str | None:
-    """The subject that a file names as its folder's owner."""
+def _content(path: Path) -> dict[str, Any]:
+    """The mapping in a JSON file or captures.yaml. Raises ValueError, YamlError."""
     is_yaml = path.name == CAPTURES
     content: Any = read_yaml(path).data if is_yaml else json.loads(path.read_text("utf-8"))
     if not isinstance(content, dict):
         raise ValueError("no mapping")
+    return content
+
+
+def _subject(content: Mapping[str, Any]) -> str | None:
+    """The subject that a file names as its folder's owner."""
     subject = content.get("subject")
     return subject if isinstance(subject, str) else None
 
 
 def _exports(folder: Path, names: list[str], subject: str) -> set[str]:
-    """The subject's exports in a folder of no one or another subject, with their JSON files."""
+    """The subject's exports, reports and measurements in a folder of no one or another subject."""
     found: set[str] = set()
     for name in names:
-        if name.endswith(".json") and name.removesuffix(".json") in names:
-            with suppress(OSError, ValueError):
-                if _subject(folder / name) == subject:
-                    found |= {name, name.removesuffix(".json")}
+        described = name.removesuffix(".json")
+        if not name.endswith(".json") or name in _MARKERS:
+            continue
+        with suppress(OSError, ValueError, RecursionError):
+            content = _content(folder / name)
+            is_ours = str(content.get("schema")).startswith("bodyscan-")
+            whose = (content.get("subject"), content.get("compared_with"))
+            if subject in whose and (described in names or is_ours):
+                found |= {name, described} & {*names}
     return found
 
 

@@ -31,7 +31,8 @@ class Job:
     source: the scan's folder, or the rig file's.
     calibration: what calibrate-rig wrote; None for a rig.
     until: the last stage wanted.
-    subject: the pseudonym in the scan's captures.yaml, never derived from a name.
+    subject: the pseudonym in the scan's captures.yaml; without one, the name of the scan's folder, so
+        that `bodyscan forget` finds every scan. None for a rig.
     """
 
     name: str
@@ -163,7 +164,8 @@ def find_jobs(
 def job_of(path: Path, pipeline: Pipeline, out: Path, calibration: Path | None, until: str) -> Job:
     """Make the job of one scan's (or rig's) folder."""
     name, subject = job_name(path.name), _captures_content(path).get("subject")
-    subject = subject if isinstance(subject, str) else None
+    if not isinstance(subject, str):
+        subject = path.name if pipeline.kind == "fuse" else None
     return Job(name, out.absolute() / name, path, calibration, pipeline, until, subject)
 
 

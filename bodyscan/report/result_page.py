@@ -31,10 +31,24 @@ def write_report(
         raise BadInput("is a folder", where=str(path), remedy="give --out the name of a file")
     page = build_page(result, other)
     write_text(path, render(page))
-    if page.subject is not None and path.parent.resolve() != folder.resolve():
-        # As beside an export, so that `bodyscan forget` knows whose it is.
-        write_json(path.with_name(f"{path.name}.json"), {"subject": page.subject})
+    # As beside an export, so that `bodyscan forget` knows whom it shows.
+    shown = {"subject": page.subject, "compared_with": _subject_of(other)}
+    is_inside = path.parent.resolve() == folder.resolve()
+    description = path.with_name(f"{path.name}.json")
+    if shown["compared_with"] or (page.subject and not is_inside):
+        write_json(description, {key: value for key, value in shown.items() if value})
+    else:
+        description.unlink(missing_ok=True)  # of an earlier comparison
     return path, page.verdict
+
+
+def _subject_of(scan: Path | None) -> str | None:
+    """The pseudonym that a scan's folder, or its file in it, names; None for a surface without."""
+    folder = scan if scan is None or scan.is_dir() else scan.parent
+    if folder is None or not (folder / scans.FILE_NAME).is_file():
+        return None
+    subject = scans.read_facts(folder).get("subject")
+    return subject if isinstance(subject, str) else None
 
 
 def build_page(result: Path, other: Path | None = None) -> Page:

@@ -152,10 +152,16 @@ def test_no_neck_no_export(body: BodyMesh) -> None:
 
 
 def test_exported_files_state_that_they_are_defaced(body: BodyMesh, tmp_path: Path) -> None:
-    scan = StoredScan(points(), body, {"subject": "s", "calibration_id": "c"})
+    verdict = {"grade": "usable", "reasons": ["scans/mallow/s01 moved"]}
+    facts = {"subject": "mallow", "when": "2026-11-21T10:00:00", "verdict": verdict}
+    scan = StoredScan(points(), body, facts | {"calibration_id": "c", "failed": {"a": "mallow/a"}})
     export_scan(scan, tmp_path, ["ply"], ["full", "light", "open"], deface=True)
     for name in ("body", "body-light", "body-open"):
-        assert json.loads((tmp_path / f"{name}.ply.json").read_text())["defaced"] is True
+        text = (tmp_path / f"{name}.ply.json").read_text()
+        assert json.loads(text)["defaced"] is True
+        assert json.loads(text)["verdict"] == {"grade": "usable"}
+        assert "mallow" not in text, "shared, it would say who and when"
+        assert "2026" not in text
         mesh = read_ply_mesh(tmp_path / f"{name}.ply")
         assert not set(map(bytes, mesh.vertices[mesh.vertices[:, 2] > 1430.0])) & set(
             map(bytes, body.vertices)

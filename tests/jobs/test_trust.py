@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import cheap_job
@@ -106,6 +107,45 @@ def test_forget_removes_a_subject_and_nothing_else(day: Path) -> None:
     assert verify(day / "out", cheap_job.kinds()).faults == ()
     with pytest.raises(BadInput, match="holds nothing of subject 'mallow'"):
         forget_subject("mallow", day)
+
+
+def test_what_was_written_elsewhere_and_into_others_results_goes_too(day: Path) -> None:
+    notes = day / "notes"
+    notes.mkdir()
+    measured = {"schema": "bodyscan-measurements", "subject": "mallow"}
+    (notes / "m.json").write_text(json.dumps(measured))
+    (notes / "own.json").write_text('{"subject": "mallow", "question": "of another program"}')
+    for place in (notes, day / "out" / "e1" / "scan"):  # elder, compared with mallow
+        (place / "r.html").write_text("r")
+        side = '{"subject": "elder", "compared_with": "mallow"}'
+        (place / "r.html.json").write_text(side)
+    found = set(forget_subject("mallow", day).files)
+    assert {notes / "m.json", notes / "r.html", notes / "r.html.json"} <= found
+    assert day / "out" / "e1" / "scan" / "r.html" in found
+    assert [path.name for path in notes.iterdir()] == ["own.json"]
+    assert (day / "out" / "e1" / "scan" / "0.bin").exists()
+
+
+def test_bodies_and_images_that_name_nobody_are_listed_for_the_operator(day: Path) -> None:
+    for name in ("half/mesh.ply", "shots/a/lit.png", "shots/b/lit.png", "board/c/lit.png"):
+        (day / name).parent.mkdir(parents=True)
+        (day / name).write_text("x")
+    (day / "board" / "captures.yaml").write_text("kind: calibration\n")
+    found = find_subject("mallow", day)
+    assert found.unnamed == {day / "half": 1, day / "shots": 2}
+    assert not set(found.unnamed) & {path.parent for path in found.files}
+
+
+def test_a_scan_without_captures_file_is_its_folders_name(
+    make_scans: Callable[..., Path], tmp_path: Path
+) -> None:
+    scans = make_scans(s4="nothing", s5="nothing")
+    assert run_cheap(scans, tmp_path / "out").code == 0
+    forget_subject("s4", tmp_path)
+    left = {path.relative_to(tmp_path).parts[:2] for path in list_files(tmp_path)}
+    assert ("scans", "s5") in left
+    assert ("out", "s5") in left
+    assert not left & {("scans", "s4"), ("out", "s4")}
 
 
 def test_a_forgetting_that_was_cut_short_can_be_taken_up(day: Path) -> None:
