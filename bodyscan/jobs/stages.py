@@ -141,7 +141,7 @@ def results_of(stage: str) -> Callable[[Job], dict[str, Path]]:
 
 KINDS: Kinds = {
     "fuse": (
-        Stage("scan", 6, ("alignment", "fusion", "mesh"), scan_inputs, run_scan),
+        Stage("scan", 7, ("alignment", "fusion", "mesh"), scan_inputs, run_scan),
         Stage("export", 4, ("export",), results_of("scan"), run_export),
         Stage("report", 1, (), results_of("scan"), run_report),
     ),
