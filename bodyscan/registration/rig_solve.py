@@ -20,7 +20,6 @@ from bodyscan.calibration.board_views import LocatedView, PlanarView
 from bodyscan.calibration.boundary_points import BoardBoundaries, StripedView
 from bodyscan.calibration.camera import LensTrial, locate_board
 from bodyscan.calibration.pair import LocatedPair, PairCalibration
-from bodyscan.errors import RigDisconnected
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance, RayUncertainty, point_covariance
@@ -132,9 +131,10 @@ def solve_rig(
 
     Pairs that agree with the others in too few shots are in `failures`. Raises RigDisconnected if
     groups of pairs share no view, only views whose board numbering leaves their poses open, or only
-    views that contradict each other; BadInput if nothing fixes the rig frame.
+    views that contradict each other by far; BadInput if nothing fixes the rig frame.
     """
     start, left_out = initial_poses(views, sorted(cameras))
+    loose: tuple[str, ...] = ()
     while True:
         names = sorted(start)
         shared = [view for view in views if view.pair in start]
@@ -143,11 +143,12 @@ def solve_rig(
         if not unsynchronised:
             break
         if 2 * len(unsynchronised) >= len(names):
-            raise RigDisconnected(
-                describe_unsynchronised(names),
-                remedy="synchronise the cameras, or hold the board still until all have taken "
-                "their picture; check the board's description in the rig file too",
+            solved = _solve(rig, shared, {n: cameras[n] for n in names}, start, choose, weigh=True)
+            loose = (
+                f"{describe_unsynchronised(names)}: all views are used, weighted by how well they "
+                "agree, with sigmas to match; synchronise the cameras, or hold the board still",
             )
+            break
         left_out |= {name: describe_unsynchronised([name]) for name in unsynchronised}
         start = {
             name: rig_from_camera
@@ -155,7 +156,7 @@ def solve_rig(
             if name not in unsynchronised
         }
     solution = _transfer_to_rig_frame(hold_frame(rig, solved.shaped.views, start), solved)
-    notes = (*solved.judged.notes, *solved.shaped.notes, *lens_notes(solution.lenses))
+    notes = (*loose, *solved.judged.notes, *solved.shaped.notes, *lens_notes(solution.lenses))
     return Outcome(solution, notes, left_out)
 
 
@@ -165,9 +166,11 @@ def _solve(
     cameras: dict[str, Camera],
     start: Mapping[str, RigidTransform],
     choose: bool,
+    *,
+    weigh: bool = False,
 ) -> _Solved:
     """Solve with the richest lenses, drop wrong views, choose the lenses, solve again, and take
-    back views that fit after all."""
+    back views that fit after all. weigh: drop none; robust weights and their spread are the noise."""
     names = sorted(start)
     graph = view_graph(views, names)
     root = max(names, key=lambda name: (graph.degree(name), name))
@@ -179,13 +182,14 @@ def _solve(
     gross = find_inconsistent_views(
         [view for view in resolved if view.target in inconsistent], solution, 30.0
     ).value
+    gross = [] if weigh else gross
     kept = [view for view in resolved if view not in gross]
     for loss_px in LOSSES_PX:
         solution = solve_poses(kept, solution, root=root, loss_px=loss_px)
     solve = partial(
         solve_consistently,
         root=root,
-        limit_px=error_limit(single_view_errors(kept, cameras)),
+        limit_px=np.inf if weigh else error_limit(single_view_errors(kept, cameras)),
     )
     judged = solve(resolved, solution, wrong=[view.key for view in gross])
     shaped = ShapedSolution(judged.solution, judged.select_consistent(resolved), {}, ())
