@@ -6,6 +6,7 @@ input on which the work did not succeed (exit 1).
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 
 
@@ -28,13 +29,26 @@ def format_error(error: BodyscanError) -> str:
     return f"{error.what}\n  {error.remedy}" if error.remedy else error.what
 
 
-def format_list(reasons: Mapping[str, str]) -> str:
-    """Format several failures: name and reason, one a line; a remedy stands once, after all those
-    that it helps."""
+def group_reasons(reasons: Mapping[str, str]) -> list[tuple[list[str], str]]:
+    """Names that failed for one reason, and that reason; most names first.
+
+    Reasons that differ only in the name and in figures are one, and the first is given.
+    """
     groups: dict[str, list[str]] = {}
     for name, reason in reasons.items():
+        kind = re.sub(r"\d[\d.]*", "", reason.replace(name, ""))
+        groups.setdefault(kind, []).append(name)
+    found = [(names, reasons[names[0]]) for names in groups.values()]
+    return sorted(found, key=lambda group: -len(group[0]))
+
+
+def format_list(reasons: Mapping[str, str]) -> str:
+    """Format several failures: names and reason, one a line; a remedy stands once, after all those
+    that it helps."""
+    groups: dict[str, list[str]] = {}
+    for names, reason in group_reasons(reasons):
         what, _, remedy = reason.partition("\n")
-        groups.setdefault(remedy, []).append(f"\n  {name}: {what}")
+        groups.setdefault(remedy, []).append(f"\n  {', '.join(names)}: {what}")
     return "".join(
         "".join(lines) + (f"\n{remedy}" if remedy else "") for remedy, lines in groups.items()
     )

@@ -198,11 +198,11 @@ def find_full_scale(images: Sequence[Raw], bits: int | None) -> float:
     low or the high end of the number. Nothing in the file says which; the numbers of a whole
     sequence do.
 
-    bits: how many the camera measures; None: judged by the numbers. Too few do no harm: a dim
-        sequence is taken for one of fewer bits, which changes only its unit of brightness.
+    bits: how many the camera measures; None: judged by the numbers, so that a dim sequence may be
+        taken for one of fewer bits, which changes only its unit of brightness.
 
-    Raises ImageError for 16-bit files that hold only 8 bits, unless `bits` says so, and for 8-bit
-    files if `bits` says more.
+    Raises ImageError for 16-bit files that hold only 8 bits, unless `bits` says so, for 8-bit files
+    if `bits` says more, and for numbers at the low end that need more bits than `bits`.
     """
     if images[0].dtype == np.uint8:
         if bits is not None and bits > 8:
@@ -225,6 +225,15 @@ def find_full_scale(images: Sequence[Raw], bits: int | None) -> float:
     if largest < 1 << bits:
         return float((1 << bits) - 1)
     low_end_is_empty = used & ((1 << spare) - 1) == 0
+    # A program that scales to 16 bits repeats the highest ones at the low end.
+    scaled = all(np.array_equal(v & ((1 << spare) - 1), v >> bits) for v in values)
+    if largest < 1 << 14 and not low_end_is_empty and not scaled:
+        needed = 12 if largest < 1 << 12 else 14
+        raise ImageError(
+            f"holds numbers up to {largest}: above {(1 << bits) - 1} they do not fit the rig file's "
+            f"`bits: {bits}`",
+            remedy=f"Write `bits: {needed}` below `camera` in the rig file, or leave `bits` out.",
+        )
     return float(65536 - (1 << spare)) if low_end_is_empty else 65535.0
 
 

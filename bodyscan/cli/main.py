@@ -9,7 +9,6 @@ from __future__ import annotations
 import logging
 import os
 import sys
-import warnings
 from typing import Annotated
 
 import typer
@@ -39,8 +38,6 @@ def main() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # Our own errors say what OpenCV warns of, with the line of the rig file.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
-    # NumPy warns of divisions by zero whose results are not used; what is wrong is an error of ours.
-    warnings.filterwarnings("ignore", category=RuntimeWarning)
     keep_freed_memory()
     collect_seldom()
     os.umask(0o077)  # images and models of people are for their owner alone

@@ -177,7 +177,8 @@ def save_failure(error: ScanFailed, folder: Path, origin: Origin) -> Path:
     """Write a scan.json that says why there is no model; files of an earlier try are removed."""
     for name in (FILE_NAME, CLOUD_NAME, MESH_NAME):
         (folder / name).unlink(missing_ok=True)
-    reasons = tuple(line.strip() for line in str(error).splitlines())
+    # A line that ends in a colon says less than the one that follows.
+    reasons = tuple(line.strip() for line in str(error).replace(":\n ", ":").splitlines())
     write_json(folder / FILE_NAME, origin.facts | {"verdict": asdict(Verdict("repeat", reasons))})
     return folder / FILE_NAME
 

@@ -64,6 +64,13 @@ def test_no_bit_is_lost_wherever_it_stands(
     assert len(np.unique(grey)) == len(np.unique(numbers))
 
 
+@pytest.mark.parametrize("numbers", [DEEP, DEEP * 4 + 1])
+def test_numbers_that_need_more_bits_than_stated_are_named(numbers: np.ndarray) -> None:
+    message = f"numbers up to {numbers.max()}: above 1023 they do not fit the rig file's `bits: 10`"
+    with pytest.raises(ImageError, match=message):
+        find_full_scale([numbers], 10)
+
+
 @pytest.mark.parametrize("kind", [".png", ".tif"])
 def test_deep_files_are_read_to_the_last_bit(tmp_path: Path, kind: str) -> None:
     path = write(tmp_path / f"x{kind}", encoded(DEEP, kind))

@@ -123,6 +123,16 @@ def test_exposures_that_cannot_be_read_are_refused(good: Sequence) -> None:
         read(replace(good, lit=good.dark, dark=good.lit))
 
 
+def test_frames_one_late_are_not_taken_for_exchanged_names(good: Sequence) -> None:
+    frames = [good.lit, good.dark]
+    for pattern, inverse in zip(good.patterns, good.inverses, strict=True):
+        frames += [pattern, inverse]
+    lit, dark, *coded = [good.dark, *frames[:-1]]
+    late = Sequence(lit, dark, np.array(coded[::2]), np.array(coded[1::2]), good.s)
+    with pytest.raises(DecodingFailed, match="out of step by one"):
+        read(late)
+
+
 @pytest.mark.parametrize("factor", [0.5, 1.25])
 def test_lit_and_dark_exposed_otherwise_are_made_from_the_patterns(
     good: Sequence, factor: float

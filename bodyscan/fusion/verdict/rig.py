@@ -8,6 +8,7 @@ from collections.abc import Container, Iterator, Mapping, Sequence
 import numpy as np
 
 from bodyscan.arrays import Array
+from bodyscan.errors import group_reasons
 from bodyscan.fusion.verdict.evidence import Finding, ScanEvidence
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
@@ -18,11 +19,8 @@ from bodyscan.verdict import LEFT_OUT
 
 def check_pairs(scan: ScanEvidence) -> Iterator[Finding]:
     """Pairs without a range image, and pairs that alignment refused."""
-    by_reason: dict[str, list[str]] = {}
-    for name, reason in scan.images.failed.items():
-        by_reason.setdefault(reason.replace(name, "*"), []).append(name)
-    for names in by_reason.values():
-        yield "usable", f"{LEFT_OUT}{', '.join(names)}: {scan.images.failed[names[0]]}"
+    for names, reason in group_reasons(scan.images.failed):
+        yield "usable", f"{LEFT_OUT}{', '.join(names)}: {reason}"
     for name in scan.alignment.refused if scan.alignment else ():
         yield (
             "repeat",

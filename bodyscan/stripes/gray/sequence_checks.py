@@ -32,7 +32,17 @@ def check_exposure(images: ScanLines) -> None:
     lit, dark = images.lit[some].astype(np.int16), images.dark[some].astype(np.int16)
     contrast = lit - dark
     bright = contrast >= MIN_CONTRAST
-    if np.mean(contrast <= -MIN_CONTRAST) > max(float(np.mean(bright)), 1e-3):
+    inverted = contrast <= -MIN_CONTRAST
+    if np.mean(inverted) > max(float(np.mean(bright)), 1e-3):
+        # Names exchanged, the first pattern would be bright in half of the picture.
+        first = (*images.patterns[:1], images.dark)[0][some].astype(np.int16) - lit
+        if np.mean(first[inverted] < -0.5 * contrast[inverted]) > 0.9:
+            raise DecodingFailed(
+                "the frames are out of step by one: the file of the dark frame shows the projector "
+                "full on, that of the first pattern shows it dark",
+                remedy="each file holds the frame before its own: let the camera begin one frame "
+                "later, or rename the files, and take this shot again if its last frame is lost",
+            )
         raise DecodingFailed(
             "the dark frame is brighter than the lit frame",
             remedy="check whether the names of the two are exchanged in the rig file",
