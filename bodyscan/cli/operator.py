@@ -9,7 +9,6 @@ from contextlib import contextmanager
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
@@ -26,6 +25,7 @@ from bodyscan.cli.options import (
     ScanFolder,
 )
 from bodyscan.errors import BadInput, FailedWork
+from bodyscan.files.atomic import scratch_folder, sweep_scratch
 from bodyscan.files.messages import require_writable
 from bodyscan.progress import step
 from bodyscan.settings import AlignmentSettings, ExportSettings, FusionSettings, ScanSettings
@@ -272,9 +272,9 @@ def batch(
             remedy="give a URL to each of --scans, --out and --calibration",
         )
     store = Store(scans, out, calibration if fuses else None)
-    with TemporaryDirectory(prefix="bodyscan-") as outline:
-        jobs = find_stored_jobs(store, settings, last, Path(outline))
-        _run(output, jobs, Path(outline) / "out", workers, cluster, store)
+    with scratch_folder() as outline:
+        jobs = find_stored_jobs(store, settings, last, outline)
+        _run(output, jobs, outline / "out", workers, cluster, store)
 
 
 def _explain(output: Output, jobs: Sequence[Job], stages: Sequence[Stage]) -> None:
@@ -339,6 +339,7 @@ def _listening(output: Output) -> Iterator[Listen]:
             yield listen
     except KeyboardInterrupt:
         sys.stdout.flush()
+        sweep_scratch(with_own=True)
         typer.secho("stopped; run the same command again to go on", err=True)
         os._exit(130)  # the jobs' processes end with this one
 

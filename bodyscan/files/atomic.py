@@ -5,6 +5,9 @@ from __future__ import annotations
 import json
 import os
 import secrets
+import shutil
+import stat
+import tempfile
 import time
 import zipfile
 from collections.abc import Iterator, Mapping
@@ -144,6 +147,36 @@ def lock_file(path: Path, *, wait: bool) -> Iterator[None]:
         yield
     finally:
         os.close(handle)
+
+
+@contextmanager
+def scratch_folder() -> Iterator[Path]:
+    """Make a folder for images of people below the system's temporary one (TMPDIR), and remove it
+    at the end; first remove what killed processes of this user left there."""
+    sweep_scratch()
+    folder = Path(tempfile.mkdtemp(prefix="bodyscan-scratch-"))
+    try:
+        with lock_file(folder / "lock", wait=True):
+            yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def sweep_scratch(*, with_own: bool = False) -> None:
+    """Remove scratch folders of this user that no process holds; with_own: and those of this one."""
+    for folder in Path(tempfile.gettempdir()).glob("bodyscan-scratch-*"):
+        with suppress(OSError, BadInput):
+            found = folder.lstat()
+            if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid():
+                continue
+            holder = folder / "lock"
+            is_own = holder.exists() and f"process {os.getpid()} " in holder.read_text("utf-8")
+            if not (with_own and is_own):
+                if time.time() - found.st_mtime < 60.0:
+                    continue  # perhaps not locked yet
+                with lock_file(holder, wait=False):
+                    pass
+            shutil.rmtree(folder)
 
 
 @contextmanager

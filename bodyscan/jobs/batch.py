@@ -4,16 +4,19 @@ final state."""
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
+from functools import partial
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
 from bodyscan.errors import BadInput, BodyscanError, FailedWork
 from bodyscan.files.atomic import lock_file, restrict_to_owner
 from bodyscan.jobs.job import BATCH_LOCK, Job, write_job
+from bodyscan.jobs.stages import KINDS
 from bodyscan.jobs.supervision import (
     COMMAND,
     JobProcess,
@@ -23,6 +26,7 @@ from bodyscan.jobs.supervision import (
     supervise_job,
 )
 from bodyscan.settings import Resources
+from bodyscan.version import __version__
 
 Run = Callable[[Sequence[Job]], Iterator[JobResult]]
 """Starts jobs and yields each result as soon as the job ends."""
@@ -139,31 +143,64 @@ def run_on_cluster(
             ) from error
         process = JobProcess(threads, tuple(command))
         with client:
-            futures = {
-                client.submit(_run_on_worker, work, job, process, pure=False): job.name
-                for job in jobs
-            }
+            task = partial(run_on_worker, work, process=process, versions=stage_versions())
+            futures = {client.submit(task, job, pure=False): job.name for job in jobs}
             for future in futures:
                 listen({"event": "job", "job": futures[future], "state": "sent"})
+            missing = set(futures.values())
             for future in as_ended(futures, loop=client.loop):
-                lost = future.exception()
-                if lost is None:
-                    yield future.result()
-                else:
-                    yield JobResult(futures[future], "set aside", reason=f"on the cluster: {lost}")
+                missing.remove(futures[future])
+                yield _result_of(future, futures[future])
+            for name in sorted(missing):
+                yield _cluster_lost(name, "")
 
     return run
 
 
-def _run_on_worker(work: Work, job: Job, process: JobProcess) -> JobResult:
-    """Do one job on a worker."""
+def _result_of(future: Any, job: str) -> JobResult:
+    """The result of a job that a cluster did, or lost."""
+    from concurrent.futures import CancelledError
+
+    try:
+        return future.result()
+    except CancelledError as lost:  # with the scheduler, or the connection to it
+        return _cluster_lost(job, str(lost))
+    except Exception as error:
+        return JobResult(job, "set aside", reason=f"on the cluster: {error}")
+
+
+def _cluster_lost(job: str, why: str) -> JobResult:
+    """The result of a job that was with a scheduler which is gone."""
+    reason = (
+        f"the cluster's scheduler no longer answers{f' ({why})' if why else ''}: start it, then "
+    )
+    return JobResult(job, "set aside", reason=f"{reason}start the same batch again")
+
+
+def stage_versions() -> dict[str, Any]:
+    """The version of bodyscan and of its stages, which decide what a result is made of."""
+    stages = {kind: {stage.name: stage.version for stage in each} for kind, each in KINDS.items()}
+    return {"bodyscan": __version__, "stages": stages}
+
+
+def run_on_worker(
+    work: Work, job: Job, process: JobProcess, versions: Mapping[str, Any]
+) -> JobResult:
+    """Do one job on a worker, which must have the versions of where the batch was started."""
     os.umask(0o077)
-    if work is supervise_job and not job.folder.is_dir():
-        return JobResult(
-            job.name,
-            "set aside",
-            reason=f"{job.folder} is not there on this worker: share folders under one path",
+    reason = ""
+    if (own := stage_versions()) != versions:
+        reason = (
+            f"this worker has bodyscan {own['bodyscan']}, stages {own['stages'][job.pipeline.kind]};"
+            f" the batch was started by {versions['bodyscan']}, stages "
+            f"{versions['stages'].get(job.pipeline.kind)}: install the same version on every machine"
         )
+    elif work is supervise_job:
+        read = [path for path in (job.folder, job.source, job.calibration) if path is not None]
+        if lost := [str(path) for path in read if not path.exists()]:
+            reason = f"{lost[0]} is not there on this worker: share folders under one path"
+    if reason:
+        return JobResult(job.name, "set aside", reason=reason)
     return work(job, process, ignore_events)
 
 

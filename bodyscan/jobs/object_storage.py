@@ -8,14 +8,15 @@ storage has no locks: running one batch at a time is up to the user.
 
 from __future__ import annotations
 
-import tempfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 from bodyscan.captures.captures_file import FILE_NAME as CAPTURES
-from bodyscan.errors import BadInput
+from bodyscan.errors import BadInput, BodyscanError, FailedWork
+from bodyscan.files.atomic import scratch_folder
 from bodyscan.files.hashing import list_files
 from bodyscan.jobs.job import KEPT, LOCK, MANIFEST, STAGE, SUMMARY, Job, find_jobs, write_job
 from bodyscan.jobs.pipeline import Pipeline
@@ -43,20 +44,48 @@ class Store:
 def find_stored_jobs(store: Store, pipeline: Pipeline, until: str, work: Path) -> list[Job]:
     """The jobs of a store; `work`, an empty local folder, receives an outline of it.
 
-    Raises BadInput as `find_jobs` does, or if fsspec cannot open the store.
+    Raises BadInput as `find_jobs` does, if nothing is there, or if fsspec cannot open the store;
+    FailedWork if it does not answer.
     """
-    files = _open(store.scans)
     (work / "scans").mkdir(parents=True)
-    for entry in files.ls("", detail=True) if files.exists("") else ():
-        if entry["type"] == "directory":
-            _inside(work / "scans", entry["name"]).mkdir()
-            for small in (f"{entry['name']}/{name}" for name in (CAPTURES, "rig.yaml")):
-                _fetch_one(files, small, work / "scans" / small)
+    with _answering(store.scans):
+        files = _open(store.scans)
+        for entry in files.ls("", detail=True) if files.exists("") else ():
+            if entry["type"] == "directory":
+                _inside(work / "scans", entry["name"]).mkdir()
+                for small in (f"{entry['name']}/{name}" for name in (CAPTURES, "rig.yaml")):
+                    _fetch_one(files, small, work / "scans" / small)
+    _require_some(store.scans, work / "scans")
     calibration = None
     if store.calibration is not None:
         calibration = work / "calibration"
-        _fetch(store.calibration, calibration)
+        with _answering(store.calibration):
+            _fetch(store.calibration, calibration)
+        _require_some(store.calibration, calibration)
     return find_jobs(pipeline, work / "scans", work / "out", calibration, until)
+
+
+def _require_some(url: str, fetched: Path) -> None:
+    if not any(fetched.iterdir()):
+        remedy = "check the URL: does the bucket exist, and may this account list it?"
+        raise BadInput("holds nothing, or is not there", where=url, remedy=remedy)
+
+
+@contextmanager
+def _answering(url: str) -> Iterator[None]:
+    """Raise FailedWork for whatever a store's library raises: as many kinds as there are stores."""
+    try:
+        yield
+    except (BodyscanError, MemoryError):
+        raise
+    except Exception as error:
+        first = str(error).strip().partition("\n")[0]
+        raise FailedWork(
+            f"the store does not answer ({type(error).__name__}: {first})",
+            where=url,
+            remedy="check the network, the server and the credentials, then start the same batch "
+            "again: jobs that are done stay done",
+        ) from error
 
 
 def work_on_stored(
@@ -64,8 +93,7 @@ def work_on_stored(
 ) -> JobResult:
     """Fetch a job, bring it up to date, and put back what is new; return failures, never raise them."""
     try:
-        with tempfile.TemporaryDirectory(prefix="bodyscan-") as folder:
-            work = Path(folder)
+        with _answering(store.job(job.name)), scratch_folder() as work:
             local = replace(
                 job,
                 folder=work / "out" / job.name,
@@ -81,23 +109,25 @@ def work_on_stored(
             outcome = supervise_job(local, process, listen)
             _put_back(local.folder, _open(store.job(job.name)), was, outcome.stages)
             return outcome
-    except Exception as error:  # a store fails in as many ways as there are stores
-        return JobResult(job.name, "set aside", reason=f"{type(error).__name__}: {error}")
+    except BodyscanError as error:
+        return JobResult(job.name, "set aside", reason=str(error))
 
 
 def fetch_figures(jobs: Sequence[Job], store: Store) -> None:
     """Fetch what the summary needs of every job into the outline."""
     for job in jobs:
-        files = _open(store.job(job.name))
-        for name in ("scan/scan.json", "calibration/calibration.json", MANIFEST):
-            _fetch_one(files, name, job.folder / name)
+        with _answering(store.job(job.name)):
+            files = _open(store.job(job.name))
+            for name in ("scan/scan.json", "calibration/calibration.json", MANIFEST):
+                _fetch_one(files, name, job.folder / name)
 
 
 def put_summary(out: Path, store: Store) -> str:
     """Put back the table and the manifest over all jobs; returns the table's URL."""
-    files = _open(store.out)
-    for name in (SUMMARY, MANIFEST):
-        _put(files, name, out / name)
+    with _answering(store.out):
+        files = _open(store.out)
+        for name in (SUMMARY, MANIFEST):
+            _put(files, name, out / name)
     return store.job(SUMMARY)
 
 

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
+import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
@@ -16,7 +20,8 @@ from fsspec.implementations.memory import MemoryFileSystem
 from typer.testing import CliRunner
 
 from bodyscan.cli.main import app
-from bodyscan.errors import BadInput
+from bodyscan.errors import BadInput, FailedWork
+from bodyscan.files.atomic import scratch_folder, sweep_scratch
 from bodyscan.jobs.batch import Allocation, finish, run_batch, run_locally
 from bodyscan.jobs.object_storage import (
     Store,
@@ -107,6 +112,64 @@ def test_the_command_takes_urls(memory: MemoryFileSystem) -> None:
     assert state["attempts"] == 2
     half = CliRunner().invoke(app, ["batch", str(cheap_job.PIPELINE), *places[:3], "out"])
     assert "either all in object storage or none" in str(half.exception)
+
+
+def test_what_a_killed_batch_left_in_the_temporary_folder_is_swept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    program = (
+        "import os, sys, tempfile; tempfile.tempdir = sys.argv[1]\n"
+        "from bodyscan.files.atomic import scratch_folder\n"
+        "with scratch_folder() as folder:\n"
+        "    (folder / 'lit.png').write_bytes(b'a person')\n"
+        "    os.kill(os.getpid(), 9)\n"
+    )
+    subprocess.run([sys.executable, "-c", program, tmp_path], check=False)
+    (left,) = tmp_path.iterdir()
+    os.utime(left, (0.0, 0.0))
+    (tmp_path / "bodyscan-mine").mkdir()  # somebody else's
+    with scratch_folder() as folder:
+        assert not left.exists()
+        with scratch_folder() as other:  # of another job at the same time
+            os.utime(folder, (0.0, 0.0))
+            sweep_scratch()
+            assert folder.exists()
+        assert not other.exists()
+        sweep_scratch(with_own=True)  # as on Ctrl-C, after which nothing is tidied up
+        assert not folder.exists()
+    assert [path.name for path in tmp_path.iterdir()] == ["bodyscan-mine"]
+
+
+def test_a_bucket_that_is_not_there_is_named_by_its_url(
+    memory: MemoryFileSystem, tmp_path: Path
+) -> None:
+    pipeline = load_pipeline(cheap_job.PIPELINE)
+    for part in ("scans", "calibration"):
+        store = replace(STORE, **{part: f"memory://nobucket/{part}"})
+        with pytest.raises(BadInput, match=rf"memory://nobucket/{part}: holds nothing"):
+            find_stored_jobs(store, pipeline, "export", tmp_path / part)
+
+
+def test_a_store_that_does_not_answer_is_a_sentence(
+    memory: MemoryFileSystem, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pipeline = load_pipeline(cheap_job.PIPELINE)
+    jobs = find_stored_jobs(STORE, pipeline, "export", tmp_path)
+
+    def fail(*_: object, **__: object) -> None:
+        raise RuntimeError("Could not connect to the endpoint\n  and much more")
+
+    for name in ("exists", "isfile", "put_file", "makedirs"):
+        monkeypatch.setattr(MemoryFileSystem, name, fail)
+    for ask in (
+        lambda: find_stored_jobs(STORE, pipeline, "export", tmp_path / "again"),
+        lambda: fetch_figures(jobs, STORE),
+        lambda: put_summary(tmp_path, STORE),
+    ):
+        with pytest.raises(FailedWork, match=r"memory://day/.*does not answer.*endpoint") as told:
+            ask()
+        assert "much more" not in str(told.value)
 
 
 def test_an_unknown_store_is_bad_input(tmp_path: Path) -> None:
