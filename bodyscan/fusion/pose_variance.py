@@ -8,12 +8,11 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from bodyscan.arrays import Array
+from bodyscan.arrays import Array, Bytes
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.mesh.body import BodyCloud
 from bodyscan.motion.estimation import EstimatedMotion
-from bodyscan.progress import map_threads
 
 
 def add_pose_variance(
@@ -27,31 +26,34 @@ def add_pose_variance(
     centres = np.array([pose.translation for pose in rig_from_camera.values()])
     size = len(centres)
     joint = prior.select(tuple(rig_from_camera)).reshape(size, 6, size, 6)
+    points, normals = cloud.points, cloud.normals.astype(np.float64)
+    towards = normals @ centres.T - np.sum(points * normals, axis=1)[:, None]
+    facing = towards > 0.2 * cdist(points, centres)
+    lever = np.hstack([np.cross(points, normals), normals])
+    variance = np.zeros(len(points))
+    # Many points face the same pairs.
+    code = facing @ (1 << np.arange(size, dtype=np.int64))
+    order = np.argsort(code, kind="stable")
+    for group in np.split(order, np.flatnonzero(np.diff(code[order])) + 1):
+        pairs = np.flatnonzero(facing[group[0]])
+        used = np.minimum(cloud.pairs_seen[group], len(pairs))
+        variance[group] = _mean_variance(lever[group], joint[pairs][:, :, pairs], used)
+    return replace(cloud, sigma_mm=np.sqrt(cloud.sigma_mm**2 + variance).astype(np.float32))
 
-    def compute(part: slice) -> Array:
-        points, normals = cloud.points[part], cloud.normals[part].astype(np.float64)
-        towards = normals @ centres.T - np.sum(points * normals, axis=1)[:, None]
-        facing = towards > 0.2 * cdist(points, centres)
-        groups, group = np.unique(facing, axis=0, return_inverse=True)  # the same pairs for many
-        shares = groups.astype(np.float64)
-        alone = np.einsum("gp,piqj,pq->gij", shares, joint, np.eye(size))
-        between = np.einsum("gp,gq,piqj->gij", shares, shares, joint, optimize=True) - alone
-        lever = np.hstack([np.cross(points, normals), normals])
-        variance, covariance = (
-            np.einsum("ni,nij,nj->n", lever, matrices[group.ravel()], lever)
-            for matrices in (alone, between)
-        )
-        count = facing.sum(axis=1)
-        share = 1.0 / np.clip(np.minimum(cloud.pairs_seen[part], count), 1, None)
-        mean = share * variance / np.maximum(count, 1)
-        mean += (1.0 - share) * covariance / np.maximum(count * (count - 1), 1)
-        return np.asarray(np.maximum(mean, 0.0))
 
-    block = 1 << 16  # points whose matrices fit into some tens of megabytes
-    parts = [slice(start, start + block) for start in range(0, len(cloud.points), block)]
-    variance = np.concatenate(map_threads(compute, parts, stage="sigmas of poses"))
-    sigma_mm = np.sqrt(cloud.sigma_mm**2 + variance).astype(np.float32)
-    return replace(cloud, sigma_mm=sigma_mm)
+def _mean_variance(lever: Array, joint: Array, used: Bytes) -> Array:
+    """Variance (N,) of the mean of some pairs' offsets along normals, `used` (N,) for each point.
+
+    lever: (N, 6), derivative of an offset by a pair's twist.
+    joint: (P, 6, P, 6), covariance of the twists of the pairs that the points face.
+    """
+    count = len(joint)
+    alone = np.einsum("pipj->ij", joint)
+    between = joint.sum(axis=(0, 2)) - alone
+    share = 1.0 / np.clip(used, 1, None)
+    mean = share * np.sum(lever @ alone * lever, axis=1) / max(count, 1)
+    mean += (1.0 - share) * np.sum(lever @ between * lever, axis=1) / max(count * (count - 1), 1)
+    return np.maximum(mean, 0.0)
 
 
 def add_motion_variance(

@@ -57,8 +57,9 @@ def find_near_bricks(points: Array, origin: Array, cell_mm: float, shape: tuple[
     """Find the bricks (a, b, c) with nodes within, or next to, a point's reach."""
     near, margin = np.zeros(shape, np.bool_), REACH_CELLS + 2.0
     cells = (points - origin) / cell_mm
-    for corner in product((-margin, margin), repeat=3):
-        near[tuple(((cells + corner) // SIDE).astype(int).T)] = True
+    ends = [((cells + step) // SIDE).astype(np.int32).T for step in (-margin, margin)]
+    for x, y, z in product(*zip(*ends, strict=True)):
+        near[x, y, z] = True
     return near
 
 

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.arrays import Bytes, Floats, Indices, Mask
+from bodyscan.arrays import Bytes, Floats, Mask
+from bodyscan.compiled import compiled
 from bodyscan.errors import ScanFailed
 from bodyscan.fusion.smoothing import SmoothSurface
+from bodyscan.progress import THREADS
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,11 +73,10 @@ def find_voxel_size(points: Floats, wanted: int) -> float:
     settle the rest. Of more than 300,000 points one layer of voxels in four is counted.
     """
     size, low = 1.2, points.min(axis=0)
-    layers = 4 if len(points) > 300_000 else 1  # each four voxels high
+    layers = 4 if len(points) > 300_000 else 1
+    equal = np.zeros(len(points), np.bool_)
     for _ in range(4):
-        layer = ((points[:, 2] - low[2]) * np.float32(1.0 / size)).astype(np.int32) >> 2
-        voxel, _ = _number_voxels(points[layer % layers == 0], low, size)
-        ratio = layers * len(np.unique(voxel)) / wanted
+        ratio = layers * len(_best_per_voxel(points, equal, low, size, layers, 0)) / wanted
         size *= float(np.clip(np.sqrt(ratio), 0.25, 4.0))
         if abs(ratio - 1.0) < 0.05:
             break
@@ -84,18 +86,49 @@ def find_voxel_size(points: Floats, wanted: int) -> float:
 def select_per_voxel(points: Floats, second_rate: Mask, voxel_mm: float) -> NDArray[np.intp]:
     """Select one point in each occupied voxel, the nearest to its centre, second-rate ones (N,)
     only where there is no other; return their indices, ascending."""
-    voxel, offset = _number_voxels(points, points.min(axis=0), voxel_mm)
-    bad = second_rate + np.einsum("nk,nk->n", offset, offset)  # at most 1.75
-    # Badness and index share one integer, so that the smallest of these is the best point.
-    rank = (bad * (1 << 29)).astype(np.int64) << 32 | np.arange(len(points))
-    order = np.argsort(voxel)
-    starts = np.flatnonzero(np.diff(voxel[order], prepend=-1))
-    return np.sort(np.minimum.reduceat(rank[order], starts) & 0xFFFFFFFF)
+    low = points.min(axis=0)
+    with ThreadPoolExecutor(THREADS) as pool:
+        parts = pool.map(
+            lambda layer: _best_per_voxel(points, second_rate, low, voxel_mm, THREADS, layer),
+            range(THREADS),
+        )
+    return np.sort(np.concatenate(list(parts)))
 
 
-def _number_voxels(points: Floats, low: Floats, voxel_mm: float) -> tuple[Indices, Floats]:
-    """Number (N,) of each point's voxel, and where in it the point lies, from -0.5 to 0.5, (N, 3)."""
-    position = (points - low) * np.float32(1.0 / voxel_mm)
-    cell = np.floor(position)
-    x, y, z = cell.astype(np.int64).T
-    return (x << 21 | y) << 21 | z, position - cell - np.float32(0.5)
+@compiled
+def _best_per_voxel(
+    points: Floats, second_rate: Mask, low: Floats, voxel_mm: float, layers: int, layer: int
+) -> NDArray[np.intp]:
+    """Index of the best point of each voxel, in every `layers`-th layer of blocks from `layer` on.
+
+    A hash table of voxels (Teschner et al. 2003), by blocks of 4 x 4 x 4 that stay together in
+    memory. Badness and index share one integer, so that the least of these is the best point.
+    """
+    scale = np.float32(1.0 / voxel_mm)
+    members, size = 0, 1
+    for n in range(len(points)):
+        members += (int((points[n, 2] - low[2]) * scale) >> 2) % layers == layer
+    while size < 2 * members:
+        size *= 2
+    keys, best = np.full(size, -1, np.int64), np.empty(size, np.int64)
+    for n in range(len(points)):
+        z = int((points[n, 2] - low[2]) * scale)
+        if (z >> 2) % layers != layer:
+            continue
+        x, y = int((points[n, 0] - low[0]) * scale), int((points[n, 1] - low[1]) * scale)
+        bad = np.float32(1.0) if second_rate[n] else np.float32(0.0)
+        for k in range(3):
+            position = (points[n, k] - low[k]) * scale
+            offset = position - np.floor(position) - np.float32(0.5)
+            bad += offset * offset  # at most 0.75 in all
+        rank = int(bad * np.float32(1 << 29)) << 32 | n
+        key = (x << 21 | y) << 21 | z
+        block = (x >> 2) * 73856093 ^ (y >> 2) * 19349663 ^ (z >> 2) * 83492791
+        slot = (block << 6 | (x & 3) << 4 | (y & 3) << 2 | z & 3) & (size - 1)
+        while keys[slot] >= 0 and keys[slot] != key:
+            slot = (slot + 1) & (size - 1)
+        if keys[slot] < 0:
+            keys[slot], best[slot] = key, rank
+        else:
+            best[slot] = min(best[slot], rank)
+    return best[keys >= 0] & 0xFFFFFFFF

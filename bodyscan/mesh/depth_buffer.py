@@ -44,18 +44,20 @@ def nearest_faces(pixels: Floats, faces: Indices, height: int, width: int) -> Nu
     return number
 
 
+@compiled
 def nearest_points(pixels: Floats, size: int, height: int, width: int) -> Numbers:
     """Find the index (height, width) of the nearest point at each pixel, -1 where there is none.
 
     pixels: (N, 3) column, row, depth.
     size: side of the square of pixels that a point covers around its own.
     """
-    farthest_first = np.argsort(pixels[:, 2], kind="stable")[::-1].astype(np.int32)
-    around = np.stack(np.meshgrid(range(size), range(size)), axis=-1).reshape(-1, 2) - size // 2
-    corner = np.floor(pixels[farthest_first, :2] + 0.5).astype(np.int64)
-    columns, rows = np.moveaxis(corner[:, None] + around, -1, 0)
-    inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
     number = np.full((height, width), -1, np.int32)
-    # Of all that is written to a pixel the last stays: the nearest.
-    number[rows[inside], columns[inside]] = np.repeat(farthest_first, size**2)[inside.ravel()]
+    depth = np.full((height, width), np.inf, np.float32)
+    for n in range(len(pixels)):
+        left = int(np.floor(pixels[n, 0] + 0.5)) - size // 2
+        top = int(np.floor(pixels[n, 1] + 0.5)) - size // 2
+        for r in range(max(0, top), min(height, top + size)):
+            for k in range(max(0, left), min(width, left + size)):
+                if pixels[n, 2] < depth[r, k]:
+                    number[r, k], depth[r, k] = n, pixels[n, 2]
     return number
