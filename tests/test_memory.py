@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import platform
 import subprocess
 import sys
@@ -42,3 +43,42 @@ def test_pages_are_fetched_once() -> None:
     # 65 MiB are 16640 pages of 4 KiB, or 32 of 2 MiB where the kernel hands those out.
     fetched, kept = faults("leave"), faults("keep")
     assert kept <= max(0.1 * fetched, 10)
+
+
+LIMITED = """
+import resource, sys
+import numpy as np
+from scipy.linalg.lapack import dpotrf
+from bodyscan.memory import reserve_blas_memory
+
+def used():
+    return int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
+
+def leave(megabytes):
+    resource.setrlimit(resource.RLIMIT_AS, (used() + int(megabytes * 1e6), -1))
+
+matrix = np.eye(600, order="F")
+leave(float(sys.argv[1]))
+reserve_blas_memory(1)
+leave(20.0)
+print(dpotrf(matrix, overwrite_a=True)[1])
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux limits address space so")
+@pytest.mark.parametrize(("megabytes", "expected"), [(400, "0"), (30, "MemoryError")])
+def test_a_small_address_space_ends_in_an_error_and_never_hangs(
+    megabytes: int, expected: str
+) -> None:
+    line = [sys.executable, "-c", LIMITED, str(megabytes)]
+    alone = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
+    done = subprocess.run(line, capture_output=True, text=True, check=False, timeout=60, env=alone)
+    assert expected in done.stdout + done.stderr
+
+
+def test_reports_without_a_comparison_import_no_window_system() -> None:
+    """Open3D asks for libEGL and libGL, which a server may not have."""
+    program = "import sys, bodyscan.report.scan_page; print('open3d' in sys.modules)"
+    line = [sys.executable, "-c", program]
+    done = subprocess.run(line, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["False"]

@@ -26,9 +26,11 @@ from rich.table import Table
 from rich.text import Text
 
 from bodyscan.cli.options import SHARED
-from bodyscan.errors import BodyscanError, FailedWork
-from bodyscan.files.messages import translate_os_error
+from bodyscan.errors import BodyscanError
+from bodyscan.files.messages import translate_failure
+from bodyscan.memory import reserve_blas_memory
 from bodyscan.optional import optional
+from bodyscan.progress import THREADS
 from bodyscan.verdict import STYLES, Verdict
 
 if TYPE_CHECKING:
@@ -129,6 +131,7 @@ class Output:
         from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
         from rich.progress import Progress as Bar
 
+        reserve_blas_memory(THREADS)
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
         with Bar(*columns, TimeElapsedColumn(), console=ERRORS, disable=self.quiet) as bar:
             clock = StageClock(bar)
@@ -221,7 +224,10 @@ class StageClock:
 
 def complain(text: str) -> None:
     """Print an error, in red unless NO_COLOR forbids it."""
-    ERRORS.print(text, style="red", highlight=False, markup=False, soft_wrap=True)
+    try:
+        ERRORS.print(text, style="red", highlight=False, markup=False, soft_wrap=True)
+    except MemoryError:  # which may be what the text is about
+        os.write(2, f"{text}\n".encode())
 
 
 def _fitting(table: RenderableType) -> RenderableType:
@@ -265,12 +271,13 @@ def add_command(app: typer.Typer, panel: str, function: Callable[..., None]) -> 
         with Output(name, json, quiet, verbose) as output:
             try:
                 function(output, **given)
-            except OSError as error:
-                raise translate_os_error(error) from error
-            except MemoryError as error:
-                raise FailedWork(
-                    "there is not enough memory", remedy="close other programs, or ask for less"
-                ) from error
+            except BodyscanError:
+                raise
+            except Exception as error:
+                known = translate_failure(error)
+                if known is None:
+                    raise
+                raise known from error
         raise typer.Exit(output.exit_code)
 
     # What typer reads is the wrapped function's parameters, without the Output, and the shared.

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import open3d as o3d
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
@@ -39,7 +38,7 @@ def signed_distances(points: Array, vertices: Array, faces: Indices) -> Array:
     """
     scene, centre = _build_centred_scene(vertices, faces)
     centred = (points - centre).astype(np.float32)
-    nearest = scene.compute_closest_points(o3d.core.Tensor(centred))
+    nearest = scene.compute_closest_points(centred)
     offset = centred.astype(np.float64) - nearest["points"].numpy()
     distance = np.linalg.norm(offset, axis=-1)
     face = nearest["primitive_ids"].numpy().astype(np.int64)
@@ -169,7 +168,7 @@ def fit_to_surface(points: Array, vertices: Array, faces: Indices) -> RigidTrans
     found = RigidTransform.from_translation(-centre)
     for reach in [40.0] * 10 + [10.0] * 4 + [3.0] * 4:  # mm
         moved = found.apply(some)
-        nearest = scene.compute_closest_points(o3d.core.Tensor(moved.astype(np.float32)))
+        nearest = scene.compute_closest_points(moved.astype(np.float32))
         normals = nearest["primitive_normals"].numpy().astype(np.float64)
         residual = np.sum((moved - nearest["points"].numpy()) * normals, axis=1)
         weight = np.maximum(1.0 - (residual / (0.5 * reach)) ** 2, 0.0)  # the root of Tukey's
@@ -202,10 +201,10 @@ def _surface(path: Path, sides_mm: Array) -> tuple[Array, Indices]:
     return vertices, faces
 
 
-def _build_centred_scene(
-    vertices: Array, faces: Indices
-) -> tuple[o3d.t.geometry.RaycastingScene, Array]:
+def _build_centred_scene(vertices: Array, faces: Indices) -> tuple[Any, Array]:
     """Build a scene of vertices (V, 3) less their mean, as it is float32; also return the mean (3,)."""
+    import open3d as o3d  # not for those who only read a report
+
     centre = vertices.mean(axis=0)
     scene = o3d.t.geometry.RaycastingScene()
     scene.add_triangles((vertices - centre).astype(np.float32), faces.astype(np.uint32))

@@ -31,6 +31,32 @@ def translate_os_error(error: OSError) -> BodyscanError:
     return FailedWork(what, where=where, remedy="check the disk or the network, then start again")
 
 
+def translate_failure(error: Exception) -> BodyscanError | None:
+    """Convert what the system refuses (files, memory, threads, libraries) to FailedWork or BadInput;
+    None for any other error, which is a mistake of ours."""
+    text = str(error)
+    if isinstance(error, ImportError | OSError):
+        missing = re.search(r"\blib[\w.+-]+\.so[\w.]*(?=: cannot open shared object)", text)
+        if missing:
+            return FailedWork(
+                f"the system library {missing[0]} is missing, which Open3D needs",
+                remedy="on Debian or Ubuntu: apt-get install libegl1 libgl1 libusb-1.0-0 libgomp1 "
+                "libx11-6",
+            )
+    if isinstance(error, ModuleNotFoundError) and not (error.name or "bodyscan").startswith(
+        "bodyscan"
+    ):
+        remedy = "install bodyscan again, with everything that it asks for"
+        return FailedWork(f"the Python package {error.name} is missing", remedy=remedy)
+    if isinstance(error, OSError):
+        return translate_os_error(error)
+    short = ("can't start new thread", "failed to map segment", "Cannot allocate memory")
+    if isinstance(error, MemoryError) or any(words in text for words in short):
+        remedy = "close other programs, raise the limit (`ulimit -v`), or ask for less"
+        return FailedWork("there is not enough memory", where=text, remedy=remedy)
+    return None
+
+
 def require_writable(folder: Path, *inputs: Path | None) -> None:
     """Raise BadInput or FailedWork if nothing can, or may, be written into `folder`, which need not
     exist.

@@ -35,11 +35,13 @@ from bodyscan.files.hashing import (
     list_files,
     list_relative_files,
 )
+from bodyscan.files.messages import translate_failure
 from bodyscan.jobs.job import KEPT, LOCK, LOG, MANIFEST, STAGE, Job, read_job, results_in
 from bodyscan.jobs.plan import Origin, origin_of, reason_to_run
 from bodyscan.jobs.stages import KINDS, Kinds, Stage, run_scan, stages_until
 from bodyscan.jobs.supervision import open_log
-from bodyscan.memory import keep_freed_memory
+from bodyscan.memory import keep_freed_memory, reserve_blas_memory
+from bodyscan.progress import THREADS
 from bodyscan.verdict import Verdict
 
 Emit = Callable[..., None]
@@ -92,16 +94,17 @@ def _attempt(folder: Path, kinds: Kinds, emit: Emit) -> tuple[str, int]:
     """Do the job; return why it failed, "" if it did not, and the exit code."""
     try:
         with restrict_to_owner():
+            reserve_blas_memory(THREADS)
             _work(folder, kinds, emit)
     except BodyscanError as error:
         return str(error), error.exit_code
     except Exception as error:
         with suppress(OSError):  # the log is on that same disk
             traceback.print_exc()
-        if not isinstance(error, OSError):
-            return f"{type(error).__name__}: {error}", 1
-        full = error.errno in (errno.ENOSPC, errno.EDQUOT)
-        return "the disk is full: make room, then start again" if full else str(error), 1
+        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+            return "the disk is full: make room, then start again", 1
+        known = translate_failure(error)
+        return str(known or f"{type(error).__name__}: {error}"), 1
     return "", 0
 
 

@@ -6,7 +6,6 @@ import math
 from pathlib import Path
 
 import numpy as np
-import open3d as o3d
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.errors import BadInput
@@ -30,6 +29,8 @@ def read_surface(path: Path) -> Outcome[tuple[Array, Indices]]:
     are dropped, and faces that all run inwards are turned; the notes say so. Raises BadInput, which
     names the vertex or face, counted from 0.
     """
+    import open3d as o3d  # takes a second to load
+
     read = o3d.io.read_triangle_mesh(str(path)) if path.is_file() else o3d.geometry.TriangleMesh()
     vertices, faces = np.asarray(read.vertices), np.asarray(read.triangles).astype(np.int64)
     fault = find_fault(vertices, faces) if faces.size else "no surface can be read here"

@@ -14,7 +14,12 @@ from small_workspace import run, small_rig
 
 from bodyscan.errors import BadInput, BodyscanError, FailedWork
 from bodyscan.files.atomic import write_text
-from bodyscan.files.messages import make_paths_relative, require_writable, translate_os_error
+from bodyscan.files.messages import (
+    make_paths_relative,
+    require_writable,
+    translate_failure,
+    translate_os_error,
+)
 
 STORED = Path(__file__).parents[1] / "data" / "stored-0.1.0"
 
@@ -116,6 +121,22 @@ def test_too_little_memory_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     result = run("measure", STORED / "scan")
     assert isinstance(result.exception, FailedWork)
     assert "memory" in result.exception.what
+
+
+@pytest.mark.parametrize(
+    ("error", "expected"),
+    [
+        (OSError("libEGL.so.1: cannot open shared object file: No such file"), "libEGL.so.1"),
+        (ImportError("libGL.so.1: cannot open shared object file"), "apt-get install"),
+        (ModuleNotFoundError("No module named 'open3d'", name="open3d"), "package open3d"),
+        (ImportError("_qhull.so: failed to map segment from shared object"), "not enough memory"),
+        (RuntimeError("can't start new thread"), "not enough memory"),
+        (OSError(errno.ENOMEM, "Cannot allocate memory"), "Cannot allocate memory"),
+    ],
+)
+def test_what_the_system_lacks_is_a_sentence(error: Exception, expected: str) -> None:
+    assert expected in str(translate_failure(error))
+    assert translate_failure(RuntimeError("a mistake of ours")) is None
 
 
 @pytest.mark.parametrize(
