@@ -10,12 +10,11 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bodyscan.arrays import Array, Bytes, Floats
+from bodyscan.arrays import Array, Floats
+from bodyscan.compiled import compiled
 from bodyscan.fusion.brightness import EqualizedGrey, equalize_brightness
 from bodyscan.fusion.consistency import Consistency, Contradictions, compare_with_surface
 from bodyscan.fusion.quadratic_fit import NORMAL_MEDIAN
@@ -68,7 +67,7 @@ def merge(
         )
         consistency = list(compared)
     grey = equalize_brightness(samples, surfaces, consistency)
-    cloud = average(samples, surfaces, consistency, grey, poses, workers)
+    cloud = average(samples, surfaces, consistency, grey, poses)
     pairs = [surface.pair for surface in surfaces]
     contradictions = Contradictions.count(
         pairs, consistency, samples, surfaces, settings.agreement_mm
@@ -82,28 +81,58 @@ def average(
     consistency: Sequence[Consistency],
     grey: EqualizedGrey,
     poses: PoseCovariance | None = None,
-    workers: int = THREADS,
 ) -> BodyCloud:
     """Average each sample with the surfaces that agree with it; outvoted samples are dropped."""
-    block = 1 << 16  # samples whose sums fit into a processor's cache
+    weight, sigma_mm = samples.weight, samples.sigma_mm
+    # Of weights, shifts, their squares, grey, normals, variances, surfaces, and contradictions.
+    sums = np.zeros((len(weight), 10))
+    sums[:, 0], sums[:, 3], sums[:, 8] = weight, weight * grey.samples, 1.0
+    sums[:, 4:7], sums[:, 7] = weight[:, None] * samples.normals, (weight * sigma_mm) ** 2
+    for surface, one, levels in zip(surfaces, consistency, grey.surfaces, strict=True):
+        seen = surface.weight, surface.sigma_mm, levels, surface.normals
+        _add_surface(one.index, one.at, one.shift_mm, seen, sums)
+        np.add.at(sums[:, 9], one.against_index, surface.weight[one.against_at])
+    kept = sums[:, 9] < sums[:, 0]
+    total, shift, square, brightness, *normal, variance, seen_by, _ = sums[kept].T
+    mean = shift / total
+    # Differences of more than three sigmas enlarge sigmas beyond the inflation of all.
+    chi2 = (square - total * mean**2) / np.maximum(seen_by - 1.0, 1.0)
     inflation = estimate_sigma_inflation(samples, surfaces, consistency, poses) ** 2
+    sigma_mm = np.sqrt(variance * np.maximum(inflation, chi2 / 9.0)) / total
+    normals = np.stack(normal, axis=1)
+    return BodyCloud(
+        samples.points[kept] + mean[:, None] * samples.normals[kept],
+        (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32),
+        sigma_mm.astype(np.float32),
+        np.repeat(np.clip(np.rint(brightness / total), 0.0, 255.0).astype(np.uint8)[:, None], 3, 1),
+        seen_by.astype(np.uint8),
+    )
 
-    def part(start: int) -> tuple[NDArray[Any], ...]:
-        some = slice(start, start + block)
-        normals, sigma_mm = samples.normals[some], samples.sigma_mm[some]
-        sums = _start_sums(normals, sigma_mm, samples.weight[some], grey.samples[some])
-        for surface, one, levels in zip(surfaces, consistency, grey.surfaces, strict=True):
-            here = slice(*np.searchsorted(one.index, (some.start, some.stop)))
-            agreed = one.at[here], one.index[here] - start, one.shift_mm[here]
-            _add_surface(surface, levels, *agreed, sums)
-            here = slice(*np.searchsorted(one.against_index, (some.start, some.stop)))
-            weights = surface.weight[one.against_at[here]]
-            sums.against[one.against_index[here] - start] += weights
-        return _average(samples.points[some], normals, sums, inflation)
 
-    with ThreadPoolExecutor(workers) as pool:
-        parts = list(pool.map(part, range(0, len(samples.points), block)))
-    return BodyCloud(*(np.concatenate(fields) for fields in zip(*parts, strict=True)))
+@compiled
+def _add_surface(
+    index: Numbers,
+    at: Numbers,
+    shift_mm: Floats,
+    surface: tuple[Floats, Floats, Floats, Floats],
+    sums: Array,
+) -> None:
+    """Add a surface's points `at`, shifted from the samples `index`, to the sums (N, 10).
+
+    surface: weights, sigmas, grey levels and normals of its points.
+    """
+    weights, sigma_mm, grey, normals = surface
+    for n in range(len(index)):
+        into, k, shift = sums[index[n]], at[n], np.float64(shift_mm[n])
+        weight = np.float64(weights[k])
+        into[0] += weight
+        into[1] += weight * shift
+        into[2] += weight * shift * shift
+        into[3] += weight * grey[k]
+        for c in range(3):
+            into[4 + c] += weight * normals[k, c]
+        into[7] += (weight * sigma_mm[k]) ** 2
+        into[8] += 1.0
 
 
 def estimate_sigma_inflation(
@@ -144,74 +173,3 @@ def _pose_variance(
         lever = np.hstack([np.cross(points, normals), normals])
         variance[first:last] = np.sum(lever @ poses.relative(surface.pair, other) * lever, axis=1)
     return variance
-
-
-class _Sums(NamedTuple):
-    """Sums (N,) over the pairs that show each of N samples, the sample's own pair included.
-
-    weight, against: of weights, and of those of surfaces that contradict the sample.
-    shift, square, grey, normal: of weights times shift, its square, grey level and normal (N, 3).
-    variance: of the squares of weights times sigmas.
-    pairs: their number.
-    """
-
-    weight: Array
-    shift: Array
-    square: Array
-    grey: Array
-    normal: Array
-    variance: Array
-    against: Array
-    pairs: Array
-
-
-def _start_sums(normals: Floats, sigma_mm: Floats, weights: Floats, grey: Floats) -> _Sums:
-    shift, square, against = np.zeros((3, len(weights)))
-    return _Sums(
-        weights.astype(np.float64),
-        shift,
-        square,
-        (weights * grey).astype(np.float64),
-        (weights[:, None] * normals).astype(np.float64),
-        ((weights * sigma_mm) ** 2).astype(np.float64),
-        against,
-        np.ones(len(weights)),
-    )
-
-
-def _add_surface(
-    surface: SmoothSurface, grey: Floats, at: Numbers, here: Numbers, shift: Floats, sums: _Sums
-) -> None:
-    """Add a surface's points `at` to the sums of the samples `here`, each of which comes once."""
-    weight = surface.weight[at].astype(np.float64)
-    sums.weight[here] += weight
-    sums.shift[here] += weight * shift
-    sums.square[here] += weight * shift * shift
-    sums.grey[here] += weight * grey[at]
-    sums.variance[here] += (weight * surface.sigma_mm[at]) ** 2
-    sums.normal[here] += weight[:, None] * surface.normals[at]
-    sums.pairs[here] += 1
-
-
-def _average(
-    points: Floats, normals: Floats, sums: _Sums, inflation: float
-) -> tuple[Array, Floats, Floats, Bytes, Bytes]:
-    """Points, normals, sigmas, colours and number of pairs of the samples that were not outvoted.
-
-    inflation: variance of the pairs' differences over the predicted one. It enlarges sigmas, and
-        differences of more than three sigmas enlarge them more.
-    """
-    kept = sums.against < sums.weight
-    sums = _Sums(*(field[kept] for field in sums))
-    mean = sums.shift / sums.weight
-    chi2 = (sums.square - sums.weight * mean**2) / np.maximum(sums.pairs - 1.0, 1.0)
-    sigma_mm = np.sqrt(sums.variance * np.maximum(inflation, chi2 / 9.0)) / sums.weight
-    normal = sums.normal / np.linalg.norm(sums.normal, axis=1, keepdims=True)
-    grey = np.clip(np.rint(sums.grey / sums.weight), 0.0, 255.0).astype(np.uint8)
-    return (
-        points[kept] + mean[:, None] * normals[kept],
-        normal.astype(np.float32),
-        sigma_mm.astype(np.float32),
-        np.repeat(grey[:, None], 3, axis=1),
-        sums.pairs.astype(np.uint8),
-    )

@@ -46,7 +46,7 @@ def fused(
         known_to(wall(WALL_MM + further_mm, 120, ASIDE), sigmas[1], rim),
     ]
     samples, consistency = compared(surfaces)
-    cloud = average(samples, surfaces, consistency, as_seen(samples, surfaces), workers=1)
+    cloud = average(samples, surfaces, consistency, as_seen(samples, surfaces))
     return cloud, samples, surfaces, consistency
 
 
@@ -72,7 +72,7 @@ def test_where_a_surface_ends_there_is_no_step() -> None:
     """Its weight rises from near 0 at its rim to that of its sigma over a window."""
     surfaces = [wall(WALL_MM, 100, RigidTransform.identity()), wall(WALL_MM + 0.5, 100, ASIDE)]
     samples, consistency = compared(surfaces)
-    cloud = average(samples, surfaces, consistency, as_seen(samples, surfaces), workers=1)
+    cloud = average(samples, surfaces, consistency, as_seen(samples, surfaces))
     left, right = surfaces[1].points[:, 0].min(), surfaces[0].points[:, 0].max()
     middle = np.abs(cloud.points[:, 1]) < 20.0
     x, z = cloud.points[middle, 0], cloud.points[middle, 2]
@@ -130,7 +130,7 @@ def test_a_place_where_pairs_disagree_by_more_than_elsewhere_is_less_certain() -
     surfaces[1] = replace(surfaces[1], points=moved.astype(np.float32))
     samples, consistency = compared(surfaces)
     assert estimate_sigma_inflation(samples, surfaces, consistency) == 1.0
-    cloud = average(samples, surfaces, consistency, as_seen(samples, surfaces), workers=1)
+    cloud = average(samples, surfaces, consistency, as_seen(samples, surfaces))
     both = cloud.pairs_seen == 2
     apart = np.isclose(np.abs(cloud.points[:, 2] - WALL_MM), 0.4, atol=0.01) & both
     assert apart.sum() > 50
