@@ -411,7 +411,8 @@ def verify(
         raise FailedWork(
             f"{len(verified.faults)} of {verified.files} files have changed",
             where=str(folder),
-            remedy="restore them, or start the batch again: it redoes what was changed",
+            remedy="restore them; or start `bodyscan batch` again with the same scans and --out, which "
+            "redoes what was changed",
         )
     output.say(f"{verified.files} files, every byte unchanged")
 

@@ -31,7 +31,16 @@ from bodyscan.errors import BadInput, CaptureError, FailedWork
 from bodyscan.files.atomic import write_bytes
 from bodyscan.files.hashing import list_files
 from bodyscan.jobs.batch import finish, hold_output, write_or_refuse
-from bodyscan.jobs.job import RESULTS, STATE, Job, job_name, job_of, read_record
+from bodyscan.jobs.job import (
+    RESULTS,
+    STAGE,
+    STATE,
+    Job,
+    job_name,
+    job_of,
+    read_record,
+    results_in,
+)
 from bodyscan.jobs.pipeline import Pipeline
 from bodyscan.jobs.stages import KINDS, rig_of
 from bodyscan.jobs.supervision import (
@@ -70,10 +79,14 @@ class _File:
 
 
 class IncomingScan:
-    """One scan's folder, examined repeatedly."""
+    """One scan's folder, examined repeatedly.
 
-    def __init__(self, folder: Path, rig: Rig) -> None:
-        self.folder, self.rig = folder, rig
+    since_ns: when the folder's earlier job ended, 0 if there was none. Images of a retake replace
+        those of before one by one: a pair is whole once all its images are newer.
+    """
+
+    def __init__(self, folder: Path, rig: Rig, since_ns: int = 0) -> None:
+        self.folder, self.rig, self._since_ns = folder, rig, since_ns
         self._files: dict[Path, _File] = {}
         self._changed_s: float | None = None
 
@@ -95,7 +108,8 @@ class IncomingScan:
             expected = {sequence.pair for sequence in striped}
         else:
             expected = {pair.name for pair in self.rig.pairs if pair.projector is not None}
-        is_marked = (self.folder / "done").exists()
+        mark = self._files.get(self.folder / "done")
+        is_marked = mark is not None and mark.changed_ns > self._since_ns
         complete = is_marked or (bool(whole) and expected <= whole)
         complete |= now_s - self._changed_s >= quiet_s
         return Arrival(tuple(sorted(whole)), complete)
@@ -104,7 +118,10 @@ class IncomingScan:
         if sequence.missing:
             return False
         there = [self._files[path] for path in sequence.paths if path in self._files]
-        whole = [one.whole or now_s - one.since_s >= STABLE_S for one in there]
+        whole = [
+            one.changed_ns > self._since_ns and (one.whole or now_s - one.since_s >= STABLE_S)
+            for one in there
+        ]
         return len(there) == len(sequence.paths) and all(whole)
 
     def _look_for_changes(self, now_s: float) -> bool:
@@ -115,7 +132,7 @@ class IncomingScan:
                 found = os.stat(path)
             except OSError:
                 continue
-            stamp = (found.st_size, found.st_mtime_ns)
+            stamp = (found.st_size, found.st_ctime_ns)  # a copy may keep the time of its original
             known = before.get(path)
             if known is None or stamp != (known.size, known.changed_ns):
                 known = _File(*stamp, now_s, _has_end_mark(path, found.st_size))
@@ -203,7 +220,10 @@ def watch(
             process.start()
             while True:
                 for folder in watching.folders():
-                    watching.look_at(watching.scans.setdefault(folder, IncomingScan(folder, rig)))
+                    if folder not in watching.scans:
+                        since_ns = retaken_since(folder, watching.state_file(folder))
+                        watching.scans[folder] = IncomingScan(folder, rig, since_ns)
+                    watching.look_at(watching.scans[folder])
                 for outcome in watching.take_ended():
                     listen({"event": "job", **asdict(outcome)})
                     listen(watching.summary())
@@ -227,18 +247,34 @@ class _Watching:
     running: dict[Path, Future[JobResult]] = field(default_factory=dict)
     jobs: dict[Path, Job] = field(default_factory=dict)
     ended: dict[Path, JobResult] = field(default_factory=dict)
+    _turn: int = 0
+
+    def state_file(self, path: Path) -> Path:
+        """Where it stands how a scan's job ended."""
+        return self.watched.out / job_name(path.name) / STATE
 
     def folders(self) -> list[Path]:
-        """Folders of scans that are not done: what an earlier watch or batch did stays done."""
+        """Folders of scans that are not done: what an earlier watch or batch did stays done.
+
+        One that is done is done again if images come to it: one of them is looked at in each call.
+        """
         watched = self.watched
         found = []
+        done = [path for path in self.ended if path not in self.scans]
+        self._turn += 1
+        retaken = done[self._turn % len(done)] if done else None
+        if retaken and not retaken_since(retaken, self.state_file(retaken)):
+            retaken = None
         for path in sorted(watched.inbox.absolute().iterdir()):
             is_folder = path.is_dir() and path != watched.out.absolute()
-            if path.name.startswith(".") or not is_folder or path in self.ended:
+            if path.name.startswith(".") or not is_folder:
+                continue
+            if path in self.ended and path not in self.scans and path != retaken:
                 continue
             if any((path / name).exists() for name in RESULTS):
                 continue
-            if path not in self.scans and (outcome := self._earlier(path)):
+            is_new = path not in self.scans and path not in self.ended
+            if is_new and (outcome := find_earlier(path, self.state_file(path))):
                 self.jobs[path], self.ended[path] = self._job(path), outcome
                 continue
             found.append(path)
@@ -278,18 +314,34 @@ class _Watching:
         last = KINDS["fuse"][-1].name
         return job_of(path, watched.pipeline, watched.out, watched.calibration.absolute(), last)
 
-    def _earlier(self, path: Path) -> JobResult | None:
-        """How the scan's job ended before this watch began, unless its folder has changed since."""
-        folder = self.watched.out / job_name(path.name)
-        state = read_record(folder / STATE)
-        if state.get("state") not in ("done", "set aside"):
-            return None
-        since = (folder / STATE).stat().st_mtime_ns
-        if any(p.stat().st_mtime_ns > since for p in (path, *path.iterdir())):
-            return None
-        names = ("job", "state", "attempts", "stages", "seconds", "reason")
-        known = {name: state[name] for name in names if name in state}
-        return JobResult(**{**known, "stages": tuple(known.get("stages", ()))})
+
+def retaken_since(source: Path, state: Path) -> int:
+    """When (ns) a scan's job ended, if a file of its folder is newer; 0 otherwise."""
+    with suppress(OSError):
+        since = state.stat().st_mtime_ns
+        if any(os.stat(path).st_ctime_ns > since for path in list_files(source)):
+            return since
+    return 0
+
+
+def find_earlier(source: Path, state: Path) -> JobResult | None:
+    """How a scan's job ended before this watch began; None if its images, or a file of its results,
+    have changed or gone since."""
+    content = read_record(state)
+    if content.get("state") not in ("done", "set aside") or retaken_since(source, state):
+        return None
+    folder, since = state.parent, state.stat().st_mtime_ns
+    if content["state"] == "done":
+        for stage in KINDS["fuse"]:
+            named = read_record(folder / stage.name / STAGE).get("outputs")
+            there = results_in(folder / stage.name)
+            if not isinstance(named, dict) or there.keys() != named.keys():
+                return None
+            if any(os.stat(path).st_ctime_ns > since for path in there.values()):
+                return None
+    names = ("job", "state", "attempts", "stages", "seconds", "reason")
+    known = {name: content[name] for name in names if name in content}
+    return JobResult(**{**known, "stages": tuple(known.get("stages", ()))})
 
 
 class ResidentProcess:

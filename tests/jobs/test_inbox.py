@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from bodyscan.errors import BadInput
-from bodyscan.jobs.watching import STABLE_S, IncomingScan, put_image
+from bodyscan.files.atomic import write_json
+from bodyscan.jobs.supervision import JobResult
+from bodyscan.jobs.watching import (
+    STABLE_S,
+    Arrival,
+    IncomingScan,
+    find_earlier,
+    put_image,
+    retaken_since,
+)
 from bodyscan.rig.rig import Rig
 
 QUIET_S = 30.0
@@ -85,6 +95,48 @@ def test_a_scan_with_images_missing_is_taken_when_marked_or_quiet(rig: Rig, tmp_
     assert not other.look(0.0, QUIET_S).complete
     (tmp_path / "bert" / "done").touch()
     assert other.look(0.0, QUIET_S).complete
+
+
+def test_a_retake_waits_until_every_image_is_new(rig: Rig, tmp_path: Path) -> None:
+    """Half of each would be two persons in one."""
+    for pair in ("a", "b"):
+        for frame in frames(rig):
+            put_image(tmp_path, rig, "anna", pair, frame, IMAGE)
+    state = tmp_path / "out" / "anna" / "state.json"
+    write_json(state, {"state": "set aside", "job": "anna"})
+    assert retaken_since(tmp_path / "anna", state) == 0
+    assert find_earlier(tmp_path / "anna", state) == JobResult("anna", "set aside")
+    time.sleep(0.02)
+    *first, last = frames(rig)
+    for pair, some in {"a": frames(rig), "b": first}.items():
+        for frame in some:
+            put_image(tmp_path, rig, "anna", pair, frame, IMAGE)
+    since = retaken_since(tmp_path / "anna", state)
+    assert since > 0
+    assert find_earlier(tmp_path / "anna", state) is None
+    scan = IncomingScan(tmp_path / "anna", rig, since)
+    assert scan.look(0.0, QUIET_S) == Arrival(("a",), False)
+    put_image(tmp_path, rig, "anna", "b", last, IMAGE)
+    assert scan.look(0.1, QUIET_S) == Arrival(("a", "b"), True)
+
+
+def test_a_result_that_is_gone_or_was_changed_is_made_again(tmp_path: Path) -> None:
+    source, job = tmp_path / "anna", tmp_path / "out" / "anna"
+    source.mkdir()
+    for stage in ("scan", "export", "report"):
+        write_json(job / stage / "stage.json", {"outputs": {"a.ply": "sha"}})
+        (job / stage / "a.ply").write_text("x")
+    (job / "scan" / "measurements.json").write_text("{}")  # a person's
+    write_json(job / "state.json", {"state": "done", "job": "anna"})
+    assert find_earlier(source, job / "state.json") == JobResult("anna", "done")
+    time.sleep(0.02)
+    (job / "scan" / "measurements.json").write_text("{ }")
+    assert find_earlier(source, job / "state.json") is not None
+    (job / "export" / "a.ply").write_text("y")
+    assert find_earlier(source, job / "state.json") is None
+    write_json(job / "state.json", {"state": "done", "job": "anna"})
+    (job / "export" / "a.ply").unlink()
+    assert find_earlier(source, job / "state.json") is None
 
 
 def test_pairs_that_captures_yaml_leaves_out_are_not_waited_for(rig: Rig, tmp_path: Path) -> None:
