@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from bodyscan.jobs.display import ending, json_lines, screen
+from bodyscan.jobs.display import json_lines, screen
 
 EVENTS: list[dict[str, Any]] = [
     {"event": "shares", "workers": 2, "threads": 1, "why": "2 cores"},
@@ -82,11 +82,3 @@ def test_a_verdict_names_every_pair_that_was_lost(
         listen(event | {"final": True})
     told = capsys.readouterr()
     assert said in told.out + told.err
-
-
-@pytest.mark.parametrize(
-    ("seconds", "said"), [(40.2, "40 s"), (600.0, "10 min"), (7200.0, "2.0 h")]
-)
-def test_times_are_said_in_words(seconds: float, said: str) -> None:
-    event = {"job": "a", "state": "done", "stages": ["scan"], "seconds": seconds}
-    assert ending(event) == f"a: scan in {said}"
