@@ -73,29 +73,14 @@ def fill_distances(
     dark = _dilate(dark, 2)
     free = _find_free_nodes(guess, measured, dark, bricks, range_images, rig_from_camera, workers)
     bound[free] = 0.5 * cell_mm
-    _bound_crown(bound, guess, measured, bricks, Crown.from_cloud(cloud.points, cloud.normals))
-    if np.isfinite(bound).any():
+    if free.any():
         _mirror(bound, below, ~measured)
         guess = np.maximum(fill_harmonically(values, fixed, bound, certain), -height)
+    node = np.argwhere(~measured & (guess < cell_mm))
+    crown, at = Crown.from_cloud(cloud.points, cloud.normals), tuple(node.T)
+    above = crown.compute_heights_above(bricks.origin + cell_mm * node)
+    guess[at] = np.maximum(guess[at], above - Crown.NOISE_MM)
     return Distances(guess, bricks.origin, cell_mm)
-
-
-def _bound_crown(
-    bound: Floats, guess: Floats, measured: Mask, bricks: Bricks, crown: Crown
-) -> None:
-    """Bound the nodes around which the guessed surface exceeds a crown's planes."""
-    inside, cell_mm = guess < 0.0, bricks.cell_mm
-    ends = inside[..., :-1] & ~inside[..., 1:] & ~(measured[..., :-1] & measured[..., 1:])
-    node = np.argwhere(ends)
-    below, above = guess[..., :-1][ends], guess[..., 1:][ends]
-    low = bricks.origin + cell_mm * node
-    up = np.array([0.0, 0.0, cell_mm])
-    crossing = low + up * (below / np.minimum(below - above, -1e-6))[:, None]
-    bulges = crown.compute_heights_above(crossing) > Crown.NOISE_MM
-    for position, at in ((low, node), (low + up, node + [0, 0, 1])):
-        chosen = tuple(at[bulges].T)
-        height = crown.compute_heights_above(position[bulges])
-        bound[chosen] = np.where(height > 0.0, np.maximum(height, bound[chosen]), bound[chosen])
 
 
 def _mirror(values: Floats | Mask, below: int, where: Mask) -> None:
@@ -380,10 +365,9 @@ class Crown:
         return 0.0 if found.x is None else float(found.x[2])
 
     def compute_heights_above(self, points: Array) -> Array:
-        """Height (N,) mm, at least 0, of points (N, 3) at the top of the head above its planes."""
+        """Height (N,) mm of points (N, 3) at the top of the head above its planes; -inf elsewhere."""
         near = points[:, 2] > self.highest[2] - 60.0 / 3.0
         near &= np.hypot(*(points[:, :2] - self.highest[:2]).T) < CROWN_RADIUS_MM
-        above = np.zeros(len(points))
-        if len(self.offsets):
-            above[near] = np.max(points[near] @ self.normals.T - self.offsets, axis=1)
-        return np.maximum(above, 0.0)
+        above = np.full(len(points), -np.inf)
+        above[near] = np.max(points[near] @ self.normals.T - self.offsets, axis=1, initial=-np.inf)
+        return above

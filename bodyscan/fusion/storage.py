@@ -5,6 +5,7 @@ These are `cloud.ply`, `mesh.ply`, and `scan.json`, written last.
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
@@ -214,19 +215,6 @@ class _Alignment(_Part):
     overlaps: list[_Overlap] = []
 
 
-class _PartMotion(_Part):
-    name: str
-    moved_mm: float
-    left_mm: float
-    seen_once: float
-
-
-class _Person(_Part):
-    parts: list[_PartMotion]
-    breathed_mm: float | None
-    moment_ms: float | None
-
-
 class _Hashes(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True)
     cloud: str = Field(alias="cloud.ply")
@@ -248,7 +236,7 @@ class _Facts(_Part):
     measured: dict[str, int] = {}
     failed: dict[str, str] = {}
     alignment: _Alignment | None = None
-    person: _Person | None = None
+    person: PersonMotion | None = None
 
 
 def read_facts(folder: Path) -> dict[str, Any]:
@@ -259,7 +247,7 @@ def read_facts(folder: Path) -> dict[str, Any]:
     file = folder / FILE_NAME
     try:
         facts = read_json_object(file)
-        _Facts.model_validate(facts)
+        _Facts.model_validate_json(json.dumps(facts))
     except FileNotFoundError:
         raise ResultError("there is no such file", where=str(file), remedy=REMEDY) from None
     except (OSError, ValueError) as error:

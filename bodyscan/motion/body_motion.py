@@ -209,10 +209,9 @@ class BodyMotion:
             posterior - breath.prior_information, posterior @ self.amplitudes[block]
         )
         found = estimate_breath(system, self.breaths, breath.modes.middle)
-        kinds = (
-            replace(k, mode_covariance=found.mode_covariance) if k is breath else k
-            for k in self.kinds
-        )
+        fields = breath.fields.shape[2]
+        precision = np.kron(np.eye(fields), np.linalg.inv(found.mode_covariance))
+        kinds = (replace(k, precision=precision) if k is breath else k for k in self.kinds)
         return replace(self, kinds=tuple(kinds), breath=found)
 
     def _update_prior_variances(self) -> BodyMotion:
@@ -223,7 +222,7 @@ class BodyMotion:
         """
         kinds, variances = [], np.diag(self.covariance)
         for kind, block in zip(self.kinds, self.slices, strict=True):
-            if kind.precision is None and kind.mode_covariance is None:
+            if kind.precision is None:
                 determined = kind.count - np.sum(variances[block]) / kind.size**2
                 square = np.sum(self.amplitudes[block] ** 2) + 6.0 * kind.standing_size**2
                 kind = replace(kind, size=float(np.sqrt(square / (max(determined, 0.0) + 6.0))))

@@ -27,7 +27,6 @@ class MotionKind:
     fields: (C, 12, M) mm, see `rigid_fields`.
     size: prior standard deviation of the amplitudes.
     precision: prior information (M J, M J) of the amplitudes, instead of `size`.
-    mode_covariance: prior covariance (J, J) of each field's amplitudes, instead of `size`.
     twists: (6, M) about the rig's origin, if the body moves as a whole.
     remainder: fields less twists, (C, 12, M), if the feet stay.
     standing_size: in people who stand, mm; it holds as far as the overlaps determine nothing.
@@ -38,7 +37,6 @@ class MotionKind:
     modes: TemporalModes
     size: float = 1.0
     precision: Array | None = None
-    mode_covariance: Array | None = None
     twists: Array | None = None
     remainder: Array | None = None
     standing_size: float = 1.0
@@ -51,11 +49,7 @@ class MotionKind:
     @property
     def prior_information(self) -> Array:
         """(M J, M J)."""
-        if self.precision is not None:
-            return self.precision
-        if self.mode_covariance is not None:
-            return np.kron(np.eye(self.fields.shape[2]), np.linalg.inv(self.mode_covariance))
-        return np.eye(self.count) / self.size**2
+        return np.eye(self.count) / self.size**2 if self.precision is None else self.precision
 
     def modes_from_middle(self, pair: int) -> Array:
         """Change (J,) of the modes from the middle of the scan to a pair's moment."""
@@ -81,11 +75,12 @@ def build_kinds(
     breathing = TemporalModes.from_correlation(breath_correlation, seconds, middle_s)
     pairs = len(seconds)
     by_freedom = np.arange(6 * pairs).reshape(pairs, 6).T.ravel()
-    pose = _whole_body("pose", cells, np.eye(6), TemporalModes.constant_per_pair(pairs))
+    constant = TemporalModes(np.eye(pairs), np.zeros(pairs))
+    pose = _whole_body("pose", cells, np.eye(6), constant)
     any_twist = adjoint(RigidTransform.from_translation(BODY_CENTRE)) * sway
     translations = rigid_fields(cells, np.zeros(3), LEVER_MM)[:, :, 3:]
     parts = modulate_fields(translations, cells, cells.covariance_factor(PART_MM, 0.02))
-    identity = np.eye(breathing.count)
+    breath = MotionKind("breath", breath_fields(cells), breathing)
     return (
         replace(pose, precision=invert_scaled(boards)[np.ix_(by_freedom, by_freedom)]),
         _lean(cells, stance),
@@ -95,7 +90,7 @@ def build_kinds(
             for name, field in limb_fields(cells, LEVER_MM).items()
         ),
         MotionKind("parts", parts, stance),
-        MotionKind("breath", breath_fields(cells), breathing, mode_covariance=identity),
+        replace(breath, precision=np.eye(breath.count)),
     )
 
 

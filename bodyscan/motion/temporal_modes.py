@@ -74,11 +74,6 @@ class TemporalModes:
         rows[timed] = modes[:-1]
         return TemporalModes(np.hstack([rows, independent]), np.concatenate([modes[-1], middle]))
 
-    @staticmethod
-    def constant_per_pair(count: int) -> TemporalModes:
-        """Modes of what differs from pair to pair and does not change with time."""
-        return TemporalModes(np.eye(count), np.zeros(count))
-
 
 @dataclass(frozen=True, eq=False)
 class Breaths:

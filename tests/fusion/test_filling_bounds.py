@@ -239,8 +239,8 @@ def test_what_lies_above_the_planes_of_a_crown_is_outside() -> None:
          [0, 60, -21], [98, 0, 5], [102, 0, 5]], float,
     )  # fmt: skip
     # Of planes (0, 0.6, 0.8); 20 mm below the top and 100 mm aside the head ends.
-    wanted = [0.0, 2.4, 0.0, 4.0, 4.0, 0.0, 20.8, 0.0, 4.0, 0.0]
+    wanted = [0.0, 2.4, 0.0, 4.0, 4.0, -4.0, 20.8, -np.inf, 4.0, -np.inf]
     np.testing.assert_allclose(crown.compute_heights_above(highest + off), wanted, atol=1e-9)
     np.testing.assert_array_equal(
-        Crown(highest, normals[:0], offsets[:0]).compute_heights_above(highest + off), 0.0
+        Crown(highest, normals[:0], offsets[:0]).compute_heights_above(highest + off), -np.inf
     )

@@ -39,14 +39,9 @@ def test_a_girth_is_uncertain_by_what_all_around_it_shares() -> None:
 
 def certain(motion: BodyMotion) -> BodyMotion:
     """With amplitudes that are known."""
-    kinds = []
-    for kind in motion.kinds:
-        breath = kind.mode_covariance
-        small = None if breath is None else 1e-8 * np.eye(kind.modes.count)
-        kinds.append(
-            kind if kind.precision is not None else replace(kind, size=1e-4, mode_covariance=small)
-        )
-    return replace(motion, kinds=tuple(kinds))
+    pose, *others = motion.kinds
+    known = (replace(kind, precision=1e8 * np.eye(kind.count)) for kind in others)
+    return replace(motion, kinds=(pose, *known))
 
 
 def test_a_place_that_two_saw_alike_is_as_uncertain_as_one_and_one_that_errs_by_itself_less(
