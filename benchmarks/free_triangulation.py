@@ -10,10 +10,9 @@ import numpy as np
 from benchmarks.triangulation import triangulate
 from bodyscan.arrays import Array
 from bodyscan.boards.view import BoardView
-from bodyscan.calibration.board_views import LocatedView
+from bodyscan.calibration.board_views import BoardShape, LocatedView
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform, fit_rigid_transform
-from bodyscan.registration.board_shape import BoardShape
 from bodyscan.registration.rig_solve import RigSolution, solve_rig
 from bodyscan.rig.rig import Rig
 from bodyscan.workflows.find_boards import calibrate_cameras, locate_views

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -11,7 +11,8 @@ import numpy as np
 from bodyscan.arrays import Array, Indices
 from bodyscan.boards.board_layout import corner_grid, corner_points, corners_per_face
 from bodyscan.boards.view import BoardView, ViewKey
-from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.robust import rms, rms_length
+from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 from bodyscan.rig.board import Board
 from bodyscan.rig.rig import Rig
 
@@ -92,6 +93,99 @@ class BoardFace:
         """Heights (...) mm above the plane at (..., 2) mm of the board."""
         x, y = np.moveaxis((xy - self.middle) / self.half, -1, 0)
         return np.asarray(np.polynomial.polynomial.polyval2d(x, y, self.coefficients))
+
+
+PRIOR = 4e-3
+"""Prior sigma of a corner's place, as a share of the board's diagonal (a millimetre in 250),
+because boards may be given in any unit."""
+
+
+@dataclass(frozen=True, eq=False)
+class BoardShape:
+    """Where a board's corners lie: nominal points (N, 3) and offsets (N, 3), board frame, mm.
+
+    The offsets contain no common motion, and on average keep the size that the rig file gives,
+    since images alone cannot tell a larger board farther away.
+    """
+
+    points: Array
+    offsets: Array
+
+    @property
+    def diagonal(self) -> float:
+        """Distance from the first corner to the last, mm."""
+        return float(np.linalg.norm(np.ptp(self.points, axis=0)))
+
+    @property
+    def rms_mm(self) -> float:
+        return rms_length(self.offsets)
+
+    @property
+    def out_of_plane_mm(self) -> float:
+        """Height from the lowest to the highest corner of a face, mm."""
+        return max(
+            float(np.ptp(self.offsets[self.points[:, 2] == z, 2]))
+            for z in np.unique(self.points[:, 2])
+        )
+
+    @property
+    def stretch(self) -> tuple[float, float]:
+        """Relative excess length of the board along its columns and along its rows."""
+        along = (np.polyfit(self.points[:, axis], self.offsets[:, axis], 1)[0] for axis in range(2))
+        x, y = (float(value) for value in along)
+        return x, y
+
+    @property
+    def size_sigma(self) -> float:
+        """Standard deviation of the size as a whole, relative, which images cannot tell.
+
+        What stretches a print one way only, or shears it, is seen. Errors that know no direction
+        change its size as much: each face shows two such strains, as large as the third is unseen.
+        """
+        strains = []
+        for z in np.unique(self.points[:, 2]):
+            face = self.points[:, 2] == z
+            arms = self.points[face, :2] - self.points[face, :2].mean(axis=0)
+            (xx, xy), (yx, yy) = np.linalg.lstsq(arms, self.offsets[face, :2], rcond=None)[0]
+            strains += [0.5 * (xx - yy), 0.5 * (xy + yx)]
+        return rms(np.array(strains))
+
+    def prior(self, size_sigma: float = 0.0) -> Array:
+        """What is known of the offsets before any view, as rows (3N + 7, 3N) that give residuals in
+        standard deviations: the prior on each coordinate, the gauge constraint that the shape has no
+        motion (the board has it), and the prior on its size, which is off by `size_sigma`."""
+        arms, sigma_mm = self.points - self.points.mean(axis=0), PRIOR * self.diagonal
+        motions, _ = np.linalg.qr(twist_jacobian(arms).reshape(-1, 6))
+        gauge_mm = 1e-4 * sigma_mm  # a thousandth of what views determine
+        radius = float(np.linalg.norm(arms))
+        size_mm = max(size_sigma * radius, gauge_mm)
+        known = (
+            np.eye(arms.size) / sigma_mm,
+            motions.T / gauge_mm,
+            arms.ravel() / (radius * size_mm),
+        )
+        return np.vstack(known)
+
+    def face(self, points: Array) -> BoardFace:
+        """The face on which a view saw corners (M, 3), through every corner of it in any view."""
+        away = np.abs(self.points[:, 2] - np.median(points[:, 2]))
+        return BoardFace.fit((self.points + self.offsets)[away <= away.min() + 1e-3])
+
+    def numbers(self, points: Array) -> Indices:
+        """Indices (M,) of nominal points (M, 3) among its corners, -1 for unknown ones."""
+        return match_corners(points, self.points)
+
+    def apply(self, points: Array) -> Array:
+        """Where nominal points (M, 3) of this board lie; unknown ones stay."""
+        chosen = self.numbers(points)
+        return points + np.where(chosen[:, None] >= 0, self.offsets[chosen], 0.0)
+
+
+def apply_shape(view: LocatedView, shapes: Mapping[str, BoardShape]) -> LocatedView:
+    """The view with its corners where they lie on a board of that shape."""
+    if view.board not in shapes:
+        return view
+    return replace(view, points=shapes[view.board].apply(view.points))
 
 
 def planar_view(view: BoardView, board: Board) -> PlanarView:

@@ -15,12 +15,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodyscan.arrays import Array, Indices
-from bodyscan.calibration.board_views import LocatedView, max_displacement_mm
+from bodyscan.calibration.board_views import (
+    BoardShape,
+    LocatedView,
+    apply_shape,
+    max_displacement_mm,
+)
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance
-from bodyscan.registration.board_shape import BoardShape
 from bodyscan.registration.joint_solve import CORNERS, reprojection_errors, view_sigmas
 from bodyscan.registration.view_graph import Target
 
@@ -71,6 +75,7 @@ def normal_equations(
     """Build the joint solve's normal equations, with Cauchy weights and each view's noise.
 
     fixed_pair, fixed_target: what fixes the rig frame: a pair, or a board, which then has no motion.
+    views: of boards as described where there are shapes.
     shapes: of boards whose corners were unknowns too.
     """
     names, shapes = sorted(rig_from_camera), shapes or {}
@@ -83,7 +88,7 @@ def normal_equations(
         for keys, first in ((names, 0), (names, len(names)), (shapes, 2 * len(names)))
     )
     poses = cameras, rig_from_camera, rig_from_board
-    errors = [reprojection_errors([view], *poses, cameras_free=True) for view in views]
+    errors = [reprojection_errors([apply_shape(view, shapes)], *poses) for view in views]
     sigmas = view_sigmas([residuals for residuals, _ in errors])
     whitened = [residuals / sigma for (residuals, _), sigma in zip(errors, sigmas, strict=True)]
     scale = CORNERS.estimate_scale(np.concatenate(whitened))
@@ -92,11 +97,12 @@ def normal_equations(
     systems: dict[Target, list[tuple[Indices, LinearGaussianSystem]]] = defaultdict(list)
     for k, view in enumerate(views):
         jacobian = errors[k][1]() / sigmas[k]
+        jacobian, by_corner = jacobian[:, :-3], jacobian[:, -3:]
         unknowns = [of_motion[view.pair], board, of_camera[view.pair]]
         if view.board in shapes:
-            corners = shapes[view.board].nearest(view.points)
+            corners = shapes[view.board].numbers(view.points)
             unknowns.append(of_shape[view.board].reshape(-1, 3)[corners].ravel())
-            jacobian = _append_corners(jacobian, rig_from_board[view.target].rotation)
+            jacobian = np.hstack([jacobian, _by_every_corner(by_corner)])
         system = LinearGaussianSystem.from_observations(jacobian, -whitened[k], weights[k])
         systems[view.target].append((np.concatenate(unknowns), system))
     parts = {
@@ -106,7 +112,7 @@ def normal_equations(
     everything, weight = np.concatenate(whitened), np.concatenate(weights)
     degrees = max(float(np.sum(weight)) - (size + 6 * len(parts) - 6), 1.0)
     variance = max(float(np.sum(weight * everything**2)) / degrees, 1e-12)
-    known = [(of_shape[name], shape.prior_information) for name, shape in shapes.items()]
+    known = [(of_shape[name], _information(shape)) for name, shape in shapes.items()]
     known += [(of_camera[name], np.diag(cameras[name].prior_sigmas ** -2)) for name in names]
     priors = [(block, LinearGaussianSystem.from_prior(variance * each)) for block, each in known]
     prior = LinearGaussianSystem.assemble(priors, size)
@@ -129,17 +135,17 @@ def _eliminate_board(
     return others, whole.select(involved).marginalize(np.arange(len(others), len(involved)))
 
 
-def _append_corners(jacobian: Array, rotation: Array) -> Array:
-    """Append derivatives (2N, 3N) by the corners' positions on the board to a view's Jacobian
-    (2N, C), whose columns 9 to 11 are by the board's translation.
-
-    rotation: that of `rig_from_board`.
-    """
-    count = len(jacobian) // 2
-    by_corner = jacobian[:, 9:12] @ rotation
+def _by_every_corner(by_corner: Array) -> Array:
+    """Derivatives (2N, 3N) by all corners of a view, from those (2N, 3) by each one's own place."""
+    count = len(by_corner) // 2
     blocks = np.zeros((count, 2, count, 3))
     blocks[range(count), :, range(count)] = by_corner.reshape(count, 2, 3)
-    return np.hstack([jacobian, blocks.reshape(2 * count, 3 * count)])
+    return blocks.reshape(2 * count, 3 * count)
+
+
+def _information(shape: BoardShape) -> Array:
+    known = shape.prior(shape.size_sigma)
+    return known.T @ known
 
 
 @dataclass(frozen=True, eq=False)

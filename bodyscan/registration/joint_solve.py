@@ -8,13 +8,13 @@ this runs again after views are dropped or boards found bent.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
 
 from bodyscan.arrays import Array, Indices
-from bodyscan.calibration.board_views import LocatedView
+from bodyscan.calibration.board_views import BoardShape, LocatedView, apply_shape
 from bodyscan.calibration.camera import camera_prior
 from bodyscan.geometry.camera import MATRIX, Camera, CameraPrior
 from bodyscan.geometry.least_squares import EXACT, Block, Noise, minimize
@@ -26,11 +26,15 @@ CORNERS = Noise("corners", group=2, cauchy=4.0)
 
 @dataclass(frozen=True, eq=False)
 class JointSolution:
-    """Cameras, and all poses in the root camera's frame, mm: the start or the result of a solve."""
+    """Cameras, and all poses in the root camera's frame, mm: the start or the result of a solve.
+
+    shapes: of all boards if their corners are unknowns, none if they lie as described.
+    """
 
     root_from_camera: dict[str, RigidTransform]
     root_from_board: dict[Target, RigidTransform]
     cameras: dict[str, Camera]
+    shapes: dict[str, BoardShape] = field(default_factory=dict)
 
 
 def solve_poses(
@@ -58,8 +62,10 @@ def refine_solution(
     equal_noise: bool = False,
     noise: Noise = CORNERS,
 ) -> JointSolution:
-    """Solve for all poses and cameras from poses that nearly fit, in the root camera's frame.
+    """Solve for all poses, cameras and board shapes from poses that nearly fit, in the root camera's
+    frame.
 
+    views: of boards as described.
     equal_noise: whether all views are taken to be as noisy as each other.
     noise: of the corners.
     """
@@ -81,7 +87,7 @@ def refine_solution(
 
 
 class _Unknowns:
-    """Columns of the unknowns: motions of all pairs but the root, of boards, then cameras."""
+    """Columns of the unknowns: motions of all pairs but the root, of boards, cameras, then corners."""
 
     def __init__(self, solution: JointSolution, root: str) -> None:
         names = sorted(solution.root_from_camera)
@@ -90,6 +96,10 @@ class _Unknowns:
         self.of_pair[root] = np.zeros(0, np.int64)
         self.of_board = {target: self._next(6) for target in sorted(solution.root_from_board)}
         self.of_camera = {n: self._next(len(solution.cameras[n].parameters)) for n in names}
+        self.of_corners = {
+            name: self._next(shape.points.size).reshape(-1, 3)
+            for name, shape in solution.shapes.items()
+        }
 
     def _next(self, size: int) -> Indices:
         self.count += size
@@ -108,7 +118,21 @@ class _Unknowns:
             name: solution.cameras[name].retract(step[columns])
             for name, columns in self.of_camera.items()
         }
-        return JointSolution(root_from_camera, boards, cameras)
+        shapes = {
+            name: replace(shape, offsets=shape.offsets + step[self.of_corners[name]])
+            for name, shape in solution.shapes.items()
+        }
+        return JointSolution(root_from_camera, boards, cameras, shapes)
+
+    def of_view(self, view: LocatedView, shapes: Mapping[str, BoardShape]) -> Indices:
+        """Columns of a view, or of each of its corners if these are unknowns, (1 or N, C)."""
+        of_view = np.concatenate(
+            [self.of_pair[view.pair], self.of_board[view.target], self.of_camera[view.pair]]
+        )
+        if not shapes:
+            return of_view[None]
+        corners = self.of_corners[view.board][shapes[view.board].numbers(view.points)]
+        return np.hstack([np.tile(of_view, (len(corners), 1)), corners])
 
 
 def _blocks(
@@ -118,9 +142,12 @@ def _blocks(
     equal_noise: bool,
     noise: Noise,
 ) -> Iterator[Block]:
-    """The corners of each pair's views, then the priors on the cameras."""
+    """The corners of each pair's views, then the priors on cameras and shapes."""
     poses = solution.cameras, solution.root_from_camera, solution.root_from_board
-    errors = [reprojection_errors(views, *poses, cameras_free=True) for views in of_pair]
+    errors = [
+        reprojection_errors([apply_shape(view, solution.shapes) for view in views], *poses)
+        for views in of_pair
+    ]
     runs = [np.array([2 * len(view.points) for view in views]) for views in of_pair]
     by_view = [
         np.split(residuals, np.cumsum(lengths)[:-1])
@@ -129,17 +156,19 @@ def _blocks(
     every = [one for views in by_view for one in views]
     sigmas = iter(np.ones(len(every)) if equal_noise else view_sigmas(every))
     for views, (residuals, linearize), lengths in zip(of_pair, errors, runs, strict=True):
-        pair = views[0].pair
-        of_motion, of_camera = unknowns.of_pair[pair], unknowns.of_camera[pair]
-        columns = [
-            np.concatenate([of_motion, unknowns.of_board[view.target], of_camera]) for view in views
-        ]
-        if not len(of_motion):
-            linearize = partial(_drop_motion, linearize)  # the root camera fixes the frame
+        columns = np.concatenate([unknowns.of_view(view, solution.shapes) for view in views])
+        # The root camera fixes the frame: it has no motion.
+        first = 0 if len(unknowns.of_pair[views[0].pair]) else 6
+        jacobian = partial(_take_columns, linearize, first, columns.shape[1])
         sigma = np.repeat([next(sigmas) for _ in views], lengths)
-        yield Block(residuals, linearize, np.array(columns), noise, sigma, runs=lengths)
+        each = np.full(len(columns), 2) if solution.shapes else lengths
+        yield Block(residuals, jacobian, columns, noise, sigma, runs=each)
     for name, parameters in unknowns.of_camera.items():
         yield from camera_priors(solution.cameras[name], parameters)
+    for name, shape in solution.shapes.items():
+        known = shape.prior()
+        deviation = known @ shape.offsets.ravel()
+        yield Block(deviation, partial(np.asarray, known), unknowns.of_corners[name].ravel(), EXACT)
 
 
 def camera_priors(camera: Camera, columns: Indices) -> Iterator[Block]:
@@ -154,9 +183,8 @@ def camera_priors(camera: Camera, columns: Indices) -> Iterator[Block]:
     yield camera_prior(camera, columns)
 
 
-def _drop_motion(linearize: Callable[[], Array]) -> Array:
-    """Derivatives without those by the camera's motion."""
-    return linearize()[:, 6:]
+def _take_columns(linearize: Callable[[], Array], first: int, count: int) -> Array:
+    return linearize()[:, first : first + count]
 
 
 def view_sigmas(residuals: Sequence[Array]) -> Array:
@@ -182,14 +210,14 @@ def reprojection_errors(
     cameras: Mapping[str, Camera],
     rig_from_camera: Mapping[str, RigidTransform],
     rig_from_board: Mapping[Target, RigidTransform],
-    *,
-    cameras_free: bool,
 ) -> tuple[Array, Callable[[], Array]]:
     """Reprojection errors (2N,) px of one pair's views, and a function for their Jacobian.
 
-    The Jacobian (2N, 12 + P) is by the camera's motion, each board's motion, and the camera's
-    parameters if free. A corner q in the rig frame is observed at R^T (q - t): a motion of the board
-    and the opposite motion of the camera have the same effect on it.
+    views: with points where the boards' corners really lie.
+
+    The Jacobian (2N, 12 + P + 3) is by the camera's motion, each board's motion, the camera's
+    parameters, and the corner's place on its board. A corner q in the rig frame is observed at
+    R^T (q - t): a motion of the board and the opposite motion of the camera have the same effect.
     """
     pair = views[0].pair
     camera = cameras[pair]
@@ -200,9 +228,11 @@ def reprojection_errors(
 
     def linearize() -> Array:
         by_parameter, by_point = camera.jacobians(points)
-        by_motion = by_point @ camera_from_rig.rotation @ twist_jacobian(in_rig)
-        parts = [-by_motion, by_motion, *([by_parameter] if cameras_free else [])]
-        jacobian = np.concatenate(parts, axis=2)
+        in_rig_frame = by_point @ camera_from_rig.rotation
+        by_motion = in_rig_frame @ twist_jacobian(in_rig)
+        rotations = [rig_from_board[view.target].rotation for view in views]
+        by_corner = in_rig_frame @ np.repeat(rotations, [len(v.points) for v in views], axis=0)
+        jacobian = np.concatenate([-by_motion, by_motion, by_parameter, by_corner], axis=2)
         return jacobian.reshape(-1, jacobian.shape[2])
 
     return (camera.project(points) - pixels).ravel(), linearize

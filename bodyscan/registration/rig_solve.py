@@ -8,7 +8,7 @@ found to be bent.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -16,7 +16,7 @@ import numpy as np
 
 from bodyscan.arrays import Array
 from bodyscan.boards.view import ViewKey
-from bodyscan.calibration.board_views import LocatedView, PlanarView
+from bodyscan.calibration.board_views import BoardShape, LocatedView, PlanarView, apply_shape
 from bodyscan.calibration.boundary_points import BoardBoundaries, StripedView
 from bodyscan.calibration.camera import LensTrial, locate_board
 from bodyscan.calibration.pair import LocatedPair, PairCalibration
@@ -24,13 +24,7 @@ from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance, RayUncertainty, point_covariance
 from bodyscan.outcome import Outcome
-from bodyscan.registration.board_shape import (
-    BoardShape,
-    ShapedSolution,
-    apply_shape,
-    estimate_board_shapes,
-    reestimate_board_shapes,
-)
+from bodyscan.registration.board_shape import estimate_board_shapes
 from bodyscan.registration.cluster_covariance import (
     cluster_board_poses,
     cluster_robust_covariance,
@@ -72,7 +66,6 @@ class RigSolution:
 
     rig_from_camera, covariance: poses of the pairs.
     cameras: as the joint solve left them.
-    rms_px: RMS error of corners, by pair.
     views: those used, with points where the boards' corners really lie.
     board_shapes: of boards that differ from their description, confirmed by held-out boards.
     lenses: by camera whose lens was open, those tried on held-out boards.
@@ -86,13 +79,32 @@ class RigSolution:
     rig_from_board: dict[Target, RigidTransform]
     cameras: dict[str, Camera]
     covariance: PoseCovariance
-    rms_px: dict[str, float]
     views: tuple[LocatedView, ...]
     board_shapes: dict[str, BoardShape]
     lenses: dict[str, tuple[LensTrial, ...]] = field(default_factory=dict)
     camera_covariances: dict[str, Array] = field(default_factory=dict)
     variance_inflation: float = 1.0
     rays: dict[str, RayUncertainty] = field(default_factory=dict)
+
+    def residuals(self, name: str) -> Array:
+        """Projected less seen corners (N, 2) px of a pair's views."""
+        camera, camera_from_rig = self.cameras[name], self.rig_from_camera[name].inverse()
+        parts = [
+            camera.project((camera_from_rig @ self.rig_from_board[view.target]).apply(view.points))
+            - view.pixels
+            for view in self.views
+            if view.pair == name
+        ]
+        return np.concatenate(parts) if parts else np.empty((0, 2))
+
+    @property
+    def rms_px(self) -> dict[str, float]:
+        """RMS distance of corners, by pair, with the weights of the solve's loss against outliers."""
+        residuals = {name: self.residuals(name).ravel() for name in sorted(self.rig_from_camera)}
+        return {
+            name: float(np.sqrt(2.0 * CORNERS.mean_square(one))) if one.size else float("nan")
+            for name, one in residuals.items()
+        }
 
     def relative_position(self, first: str, second: str) -> Array:
         """Position (3,) mm of the second camera in the frame of the first."""
@@ -107,12 +119,12 @@ class RigSolution:
 
 @dataclass(frozen=True, eq=False)
 class _Solved:
-    """judged: the last solve of boards as described or in shape.  shaped: that solve with the board
-    shapes found, and its views.  dropped: views left out.  lenses: None if not chosen."""
+    """judged: the last solve.  views: all, of boards as described.  notes: on the boards' shapes.
+    lenses: None if not chosen."""
 
     judged: ConsistentSolve
-    shaped: ShapedSolution
-    dropped: list[LocatedView]
+    views: list[LocatedView]
+    notes: tuple[str, ...]
     lenses: ChosenLenses | None
 
 
@@ -139,7 +151,7 @@ def solve_rig(
         names = sorted(start)
         shared = [view for view in views if view.pair in start]
         solved = _solve(rig, shared, {n: cameras[n] for n in names}, start, choose)
-        unsynchronised = _find_unsynchronised(solved.shaped.views, solved.dropped)
+        unsynchronised = _find_unsynchronised(solved.views, solved.judged.wrong)
         if not unsynchronised:
             break
         if 2 * len(unsynchronised) >= len(names):
@@ -155,8 +167,8 @@ def solve_rig(
             for name, rig_from_camera in start.items()
             if name not in unsynchronised
         }
-    solution = _transfer_to_rig_frame(hold_frame(rig, solved.shaped.views, start), solved)
-    notes = (*loose, *solved.judged.notes, *solved.shaped.notes, *lens_notes(solution.lenses))
+    solution = _transfer_to_rig_frame(rig, solved)
+    notes = (*loose, *solved.judged.notes, *solved.notes, *lens_notes(solution.lenses))
     return Outcome(solution, notes, left_out)
 
 
@@ -192,72 +204,62 @@ def _solve(
         limit_px=np.inf if weigh else error_limit(single_view_errors(kept, cameras)),
     )
     judged = solve(resolved, solution, wrong=[view.key for view in gross])
-    shaped = ShapedSolution(judged.solution, judged.select_consistent(resolved), {}, ())
     lenses: ChosenLenses | None = None
     # If pairs are to be left out, the others are solved again anyway.
-    if not _find_unsynchronised(shaped.views, _select_rejected(resolved, judged)):
-        shaped = estimate_board_shapes(shaped.views, judged.solution, root=root)
-        solution = shaped.solution
-        if choose:
-            lenses = choose_lenses(rig, shaped.views, solution)
-            solution = lenses.solution
-        if shaped.shapes or solution.cameras != shaped.solution.cameras:
-            true = [apply_shape(view, shaped.shapes) for view in resolved]
-            judged = solve(true, solution, wrong=judged.wrong)
-            shaped = reestimate_board_shapes(
-                judged.select_consistent(resolved), judged.solution, shaped, root=root
-            )
-    return _Solved(judged, shaped, _select_rejected(resolved, judged), lenses)
+    if _find_unsynchronised(resolved, judged.wrong):
+        return _Solved(judged, resolved, (), lenses)
+    shaped = estimate_board_shapes(resolved, judged, root=root)
+    solution = shaped.value
+    if choose:
+        true = [apply_shape(v, solution.shapes) for v in judged.select_consistent(resolved)]
+        lenses = choose_lenses(rig, true, solution)
+        solution = lenses.solution
+    if solution.shapes or solution.cameras != judged.solution.cameras:
+        judged = solve(resolved, solution, wrong=judged.wrong)
+    return _Solved(judged, resolved, shaped.notes, lenses)
 
 
-def _select_rejected(views: Sequence[LocatedView], judged: ConsistentSolve) -> list[LocatedView]:
-    return [view for view in views if view.key in judged.wrong]
-
-
-def _find_unsynchronised(kept: Sequence[LocatedView], dropped: Sequence[LocatedView]) -> list[str]:
-    """Pairs most of whose shared views had to be dropped."""
-    everything = [*kept, *dropped]
-    count = Counter(view.target for view in everything)
-    shared = Counter(view.pair for view in everything if count[view.target] > 1)
-    dropped_count = Counter(view.pair for view in dropped if count[view.target] > 1)
-    return sorted(name for name, number in shared.items() if 2 * dropped_count[name] > number)
+def _find_unsynchronised(views: Sequence[LocatedView], wrong: Collection[ViewKey]) -> list[str]:
+    """Pairs most of whose shared views are wrong."""
+    count = Counter(view.target for view in views)
+    shared = [view for view in views if count[view.target] > 1]
+    dropped = Counter(view.pair for view in shared if view.key in wrong)
+    number = Counter(view.pair for view in shared)
+    return sorted(name for name in number if 2 * dropped[name] > number[name])
 
 
 def _transfer_to_rig_frame(rig: Rig, solved: _Solved) -> RigSolution:
     """The solution carried into the rig frame, with its covariance there."""
-    shaped = solved.shaped
-    solution, kept = _orient_frame_board(rig, shaped.solution, shaped.views)
-    to_rig = rig_from_root(rig, solution.root_from_camera, solution.root_from_board)
+    solution, kept = solved.judged.solution, solved.judged.select_consistent(solved.views)
+    rig = hold_frame(rig, kept, solution.cameras)
+    fixed = frame_target(rig)
+    turn = frame_board_turn(rig, solution.root_from_camera, solution.root_from_board)
+    oriented = {
+        target: root_from_board @ turn.inverse() if target == fixed else root_from_board
+        for target, root_from_board in solution.root_from_board.items()
+    }
+    to_rig = rig_from_root(rig, solution.root_from_camera, oriented)
     rig_from_camera = {name: to_rig @ t for name, t in solution.root_from_camera.items()}
-    rig_from_board = {target: to_rig @ t for target, t in solution.root_from_board.items()}
+    rig_from_board = {target: to_rig @ t for target, t in oriented.items()}
     equations = normal_equations(
-        shaped.views,  # a turned board's motion is the same, but its shape would be turned
+        kept,  # a turned board's motion is the same, but its shape would be turned
         solution.cameras,
         rig_from_camera,
-        {target: to_rig @ t for target, t in shaped.solution.root_from_board.items()},
+        {target: to_rig @ t for target, t in solution.root_from_board.items()},
         fixed_pair=rig.frame_pair.name if rig.frame_pair else None,
-        fixed_target=frame_target(rig),
-        shapes=shaped.shapes,
+        fixed_target=fixed,
+        shapes=solution.shapes,
     )
-    covariance = cluster_robust_covariance(equations, cluster_board_poses(kept, rig_from_board))
-    rms = {
-        name: _robust_rms(
-            [
-                corner_residuals(v, solution.cameras, rig_from_camera, rig_from_board)
-                for v in kept
-                if v.pair == name
-            ]
-        )
-        for name in sorted(rig_from_camera)
-    }
+    true = [apply_shape(view, solution.shapes) for view in kept]
+    views = [view.resolve(turn) if view.target == fixed else view for view in true]
+    covariance = cluster_robust_covariance(equations, cluster_board_poses(views, rig_from_board))
     return RigSolution(
         rig_from_camera,
         rig_from_board,
         solution.cameras,
         covariance.poses,
-        rms,
-        tuple(kept),
-        shaped.shapes,
+        tuple(views),
+        solution.shapes,
         solved.lenses.trials if solved.lenses else {},
         covariance.cameras,
         covariance.variance_inflation,
@@ -268,59 +270,19 @@ def _transfer_to_rig_frame(rig: Rig, solved: _Solved) -> RigSolution:
     )
 
 
-def _orient_frame_board(
-    rig: Rig, solution: JointSolution, views: list[LocatedView]
-) -> tuple[JointSolution, list[LocatedView]]:
-    target = frame_target(rig)
-    turn = frame_board_turn(rig, solution.root_from_camera, solution.root_from_board)
-    boards = {
-        key: root_from_board @ turn.inverse() if key == target else root_from_board
-        for key, root_from_board in solution.root_from_board.items()
-    }
-    rotated = [view.resolve(turn) if view.target == target else view for view in views]
-    return replace(solution, root_from_board=boards), rotated
-
-
-def corner_residuals(
-    view: LocatedView,
-    cameras: Mapping[str, Camera],
-    rig_from_camera: Mapping[str, RigidTransform],
-    rig_from_board: Mapping[Target, RigidTransform],
-) -> Array:
-    """(N, 2) px: projected less seen corners of a view."""
-    camera_from_board = rig_from_camera[view.pair].inverse() @ rig_from_board[view.target]
-    return cameras[view.pair].project(camera_from_board.apply(view.points)) - view.pixels
-
-
-def _robust_rms(parts: Sequence[Array]) -> float:
-    """RMS distance of corners, px, with the weights of the solve's loss against outliers."""
-    if not parts:
-        return float("nan")
-    residuals = np.concatenate(parts).ravel()
-    return float(np.sqrt(2.0 * CORNERS.mean_square(residuals)))
-
-
 def collect_corners(solution: RigSolution, names: Iterable[str]) -> dict[str, ObservedCorners]:
     """The corners by pair, for those of `names` that were solved."""
     number = {target: k for k, target in enumerate(sorted(solution.rig_from_board))}
     corners = {}
-    for name in sorted(set(names) & set(solution.rig_from_camera)):
+    for name in names:
         of_pair = [view for view in solution.views if view.pair == name]
-        if not of_pair:
-            continue
-        residuals = [
-            corner_residuals(
-                view, solution.cameras, solution.rig_from_camera, solution.rig_from_board
+        if of_pair:
+            targets = [np.full(len(v.pixels), number[v.target], np.int16) for v in of_pair]
+            corners[name] = ObservedCorners(
+                np.concatenate([view.pixels for view in of_pair]).astype(np.float32),
+                solution.residuals(name).astype(np.float32),
+                np.concatenate(targets),
             )
-            for view in of_pair
-        ]
-        corners[name] = ObservedCorners(
-            np.concatenate([view.pixels for view in of_pair]).astype(np.float32),
-            np.concatenate(residuals).astype(np.float32),
-            np.repeat([number[v.target] for v in of_pair], [len(v.pixels) for v in of_pair]).astype(
-                np.int16
-            ),
-        )
     return corners
 
 

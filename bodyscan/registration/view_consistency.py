@@ -15,7 +15,7 @@ import numpy as np
 
 from bodyscan.arrays import Array
 from bodyscan.boards.view import ViewKey
-from bodyscan.calibration.board_views import LocatedView
+from bodyscan.calibration.board_views import LocatedView, apply_shape
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.least_squares import Block, Noise, minimize
 from bodyscan.geometry.robust import rms_length
@@ -44,7 +44,7 @@ def find_inconsistent_views(
     """Find the views that contradict the others of their board at their moment; one note for each
     cause, naming shot and pairs."""
     found = []
-    for group in by_target(views).values():
+    for group in by_target(apply_shape(view, solution.shapes) for view in views).values():
         # A board of which no view took part in the solve is where the first view has it.
         root_from_view = solution.root_from_camera[group[0].pair] @ group[0].camera_from_board
         root_from_board = solution.root_from_board.get(group[0].target, root_from_view)
@@ -142,8 +142,8 @@ def fit_board(
 def _corners(view: LocatedView, solution: JointSolution, root_from_board: RigidTransform) -> Block:
     """Reprojection errors, px; derivatives by the board's motion."""
     poses = solution.cameras, solution.root_from_camera, {view.target: root_from_board}
-    residuals, linearize = reprojection_errors([view], *poses, cameras_free=False)
-    return Block(residuals, lambda: linearize()[:, 6:], slice(0, 6), CORNERS)
+    residuals, linearize = reprojection_errors([view], *poses)
+    return Block(residuals, lambda: linearize()[:, 6:12], slice(0, 6), CORNERS)
 
 
 def _error(

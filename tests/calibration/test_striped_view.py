@@ -9,7 +9,7 @@ import pytest
 from lit_boards import CHAPTER_POSES, chapter_scene
 
 from bodyscan.arrays import Array
-from bodyscan.calibration.board_views import BoardFace, LocatedView
+from bodyscan.calibration.board_views import BoardFace, BoardShape, LocatedView
 from bodyscan.calibration.boundary_points import (
     BIN_PX,
     BoardBoundaries,
@@ -23,7 +23,6 @@ from bodyscan.calibration.boundary_points import (
     on_board,
 )
 from bodyscan.geometry.lenses.opencv import Radial
-from bodyscan.registration.board_shape import BoardShape
 from bodyscan.rig.board import Board
 from bodyscan.rig.pair import CameraSpec
 from bodyscan.stripes.codes.gray import Gray

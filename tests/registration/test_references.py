@@ -56,7 +56,7 @@ def placed(scale: float) -> RigSolution:
         name: RigidTransform(at.rotation, scale * at.translation) for name, at in PLACINGS.items()
     }
     unknown = PoseCovariance(tuple(poses), np.zeros((6 * len(poses),) * 2))
-    return RigSolution(poses, {}, CAMERAS, unknown, {}, (), {})
+    return RigSolution(poses, {}, CAMERAS, unknown, (), {})
 
 
 def bar_views(rng: np.random.Generator, shots: int = 4, noise_px: float = 0.05) -> list[BoardView]:

@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 
 from bodyscan.arrays import Array
-from bodyscan.calibration.board_views import LocatedView
+from bodyscan.calibration.board_views import PRIOR, BoardShape, LocatedView
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
-from bodyscan.registration.board_shape import PRIOR, BoardShape
 from bodyscan.registration.cluster_covariance import NormalEquations, normal_equations
 from bodyscan.registration.joint_solve import view_sigmas
 from bodyscan.registration.view_graph import Target
@@ -151,7 +150,8 @@ def test_of_a_shape_motion_is_known_and_size_as_little_as_its_strains_say() -> N
     points = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
     arms = points - points.mean(axis=0)
     shape = BoardShape(points, arms * [1e-4, -1e-4, 0.0])
-    covariance = np.linalg.inv(shape.prior_information)
+    known = shape.prior(shape.size_sigma)
+    covariance = np.linalg.inv(known.T @ known)
     size = arms.ravel() / np.linalg.norm(arms)
     expected = shape.size_sigma * float(np.linalg.norm(arms))
     assert shape.size_sigma == pytest.approx(1e-4 / np.sqrt(2.0), rel=1e-6)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence, Set
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,13 +12,14 @@ from bodyscan.boards.view import ViewKey
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.calibration.camera import LensTrial
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.outcome import Outcome
 from bodyscan.registration import view_consistency
 from bodyscan.registration.joint_solve import JointSolution
 from bodyscan.registration.rig_lenses import (
     lens_notes,
 )
-from bodyscan.registration.rig_solve import collect_corners
+from bodyscan.registration.rig_solve import RigSolution, collect_corners
 from bodyscan.registration.view_consistency import (
     ConsistentSolve,
     solve_consistently,
@@ -136,12 +136,11 @@ def test_what_a_camera_saw_is_told_corner_by_corner_with_its_targets_number() ->
         LocatedView("p", "s0", "b", points[:2], there[:2] + [0.25, -0.5], one),
         LocatedView("q", "s0", "a", points[:1], there[:1], one),
     ]
-    placed: Any = SimpleNamespace(
-        rig_from_board=boards, views=views, cameras={"p": PinholeOfOne(), "q": PinholeOfOne()},
-        rig_from_camera={"p": one, "q": one, "r": one},
-    )  # fmt: skip
+    cameras: Any = {"p": PinholeOfOne(), "q": PinholeOfOne()}
+    unknown = PoseCovariance((), np.zeros((0, 0)))
+    placed = RigSolution(dict.fromkeys("pqr", one), boards, cameras, unknown, tuple(views), {})
     found = collect_corners(placed, ["q", "p", "r", "unplaced"])
-    assert list(found) == ["p", "q"], "r saw nothing"
+    assert set(found) == {"p", "q"}, "r saw nothing"
     assert found["p"].target.tolist() == [1, 1]  # of (s0, a), (s0, b), (s1, b)
     assert found["q"].target.tolist() == [2, 2, 2, 0]
     np.testing.assert_allclose(found["p"].residuals_px, [[-0.25, 0.5]] * 2, atol=1e-6)
