@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -109,17 +109,22 @@ def normal_equations(
         target: _eliminate_board(of_target, board, target == fixed_target)
         for target, of_target in sorted(systems.items())
     }
-    everything, weight = np.concatenate(whitened), np.concatenate(weights)
-    degrees = max(float(np.sum(weight)) - (size + 6 * len(parts) - 6), 1.0)
-    variance = max(float(np.sum(weight * everything**2)) / degrees, 1e-12)
     known = [(of_shape[name], _information(shape)) for name, shape in shapes.items()]
     known += [(of_camera[name], np.diag(cameras[name].prior_sigmas ** -2)) for name in names]
-    priors = [(block, LinearGaussianSystem.from_prior(variance * each)) for block, each in known]
+    priors = [(block, LinearGaussianSystem.from_prior(each)) for block, each in known]
     prior = LinearGaussianSystem.assemble(priors, size)
     free = np.arange(size)
     if fixed_target is None:
         free = np.setdiff1d(free, of_motion[fixed_pair or names[0]])
-    return NormalEquations(tuple(names), of_camera, free, prior, parts, variance)
+    everything, weight = np.concatenate(whitened), np.concatenate(weights)
+    squares, total = float(weight @ everything**2), float(np.sum(weight))
+    rough = max(squares / total, 1e-12)
+    found = NormalEquations(tuple(names), of_camera, free, prior * rough, parts, rough)
+    # What a prior knows of an unknown, residuals do not spend on it: not a degree of freedom.
+    spent = float(np.sum(found.sum_parts(list(parts)).information * found.system.covariance()))
+    spent += 6 * len(parts.keys() - {fixed_target})
+    variance = max(squares / max(total - spent, 1.0), 1e-12)
+    return replace(found, prior=prior * variance, variance_px2=variance)
 
 
 def _eliminate_board(

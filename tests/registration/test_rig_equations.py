@@ -9,7 +9,7 @@ import pytest
 
 from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import PRIOR, BoardShape, LocatedView
-from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.camera import Camera, CameraPrior
 from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
@@ -127,6 +127,19 @@ def test_what_is_known_of_cameras_beforehand_is_added_to_their_own_unknowns() ->
     expected = np.zeros(found.prior.size)
     expected[own] = found.variance_px2 / sigmas**2
     np.testing.assert_allclose(found.prior.information, np.diag(expected))
+
+
+def test_cameras_that_are_known_take_no_degrees_of_freedom() -> None:
+    exact = {
+        name: replace(camera, prior=CameraPrior(camera.parameters, 1e-9 * camera.prior_sigmas))
+        for name, camera in CAMERAS.items()
+    }
+    seen = views(1e-3)
+    found = normal_equations(seen, exact, PLACED, BOARDS, fixed_pair="a", fixed_target=None)
+    # Of 200 residuals, whose weights are 0.9 on average, three boards and a pair take 24, and
+    # cameras that are not known 14.
+    ratio = found.variance_px2 / equations(seen).variance_px2
+    assert ratio == pytest.approx((180 - 24 - 14) / (180 - 24), rel=5e-3)
 
 
 def test_a_view_at_a_slant_counts_by_its_own_noise() -> None:
