@@ -204,12 +204,13 @@ def refine_jointly(
         start,
         lambda state: _blocks(state, boards),
         lambda state, step: state.retract(step),
-        unknowns=start.count,
+        unknowns=sum(start.sizes),
         steps=20,
         tolerance=1e-2,  # within a tenth of a sigma in every unknown
         damping=1e-6,
     )
     state, covariance = solution.state, solution.covariance
+    camera_columns = state.columns[0]
     corners = np.concatenate([_corner_residuals(state, k, one) for k, one in enumerate(boards)])
     return JointFit(
         state.camera,
@@ -218,7 +219,7 @@ def refine_jointly(
             replace(one, covariance=_depth_covariance(state, boards, covariance, direction))
             for direction, one in enumerate(state.sheets)
         ),
-        covariance[: state.first_pose, : state.first_pose],
+        covariance[np.ix_(camera_columns, camera_columns)],
         float(np.sqrt(CORNERS.mean_square(corners)) * np.sqrt(2.0)),
         state.warps,
     )
@@ -234,55 +235,37 @@ class _State:
     warps: dict[str, BoardWarp]
 
     @property
-    def first_pose(self) -> int:
-        return len(self.camera.parameters)
+    def sizes(self) -> list[int]:
+        """Number of unknowns of the camera, each pose, each direction's sheets, each board's warp."""
+        sheets = [one.prior()[1].shape[1] for one in self.sheets]
+        warps = [warp.count for warp in self.warps.values()]
+        return [len(self.camera.parameters), *([6] * len(self.poses)), *sheets, *warps]
 
     @property
-    def first_sheet(self) -> int:
-        return self.first_pose + 6 * len(self.poses)
-
-    @property
-    def first_warp(self) -> int:
-        return self.first_sheet + sum(one.prior()[1].shape[1] for one in self.sheets)
-
-    @property
-    def count(self) -> int:
-        return self.first_warp + sum(warp.count for warp in self.warps.values())
-
-    @property
-    def sheet_columns(self) -> list[Indices]:
-        """Indices of each direction's sheets among the unknowns."""
-        ends = np.cumsum([one.prior()[1].shape[1] for one in self.sheets])
-        return np.split(np.arange(self.first_sheet, self.first_warp), ends[:-1])
-
-    @property
-    def warp_columns(self) -> dict[str, Indices]:
-        """Indices of each board's warp among the unknowns."""
-        ends = np.cumsum([warp.count for warp in self.warps.values()])
-        parts = np.split(np.arange(self.first_warp, self.count), ends[:-1])
-        return dict(zip(self.warps, parts, strict=True))
+    def columns(self) -> tuple[Indices, list[Indices], list[Indices], dict[str, Indices]]:
+        """Indices of the unknowns of the camera, each pose, each direction's sheets, each warp."""
+        camera, *rest = np.split(np.arange(sum(self.sizes)), np.cumsum(self.sizes)[:-1])
+        first_warp = len(self.poses) + len(self.sheets)
+        warps = dict(zip(self.warps, rest[first_warp:], strict=True))
+        return camera, rest[: len(self.poses)], rest[len(self.poses) : first_warp], warps
 
     def retract(self, step: Array) -> _State:
-        """Move the state by a step (count,) of the unknowns."""
-        twists = step[self.first_pose : self.first_sheet].reshape(-1, 6)
-        columns = self.warp_columns
+        """Move the state by a step of the unknowns."""
+        camera, poses, sheets, warps = self.columns
         return _State(
-            self.camera.retract(step[: self.first_pose]),
-            tuple(pose.retract(twist) for pose, twist in zip(self.poses, twists, strict=True)),
-            tuple(
-                one.retract(step[own])
-                for one, own in zip(self.sheets, self.sheet_columns, strict=True)
-            ),
-            {name: warp.retract(step[columns[name]]) for name, warp in self.warps.items()},
+            self.camera.retract(step[camera]),
+            tuple(pose.retract(step[k]) for pose, k in zip(self.poses, poses, strict=True)),
+            tuple(one.retract(step[k]) for one, k in zip(self.sheets, sheets, strict=True)),
+            {name: warp.retract(step[warps[name]]) for name, warp in self.warps.items()},
         )
 
 
 def _blocks(state: _State, boards: Sequence[StripedBoard]) -> Iterator[Block]:
     """Residuals of each board's corners and stripes, then the priors of camera, sheets, warps."""
-    camera, sheets, columns = np.arange(state.first_pose), state.sheet_columns, state.warp_columns
+    camera, poses, sheets, warps = state.columns
     with np.errstate(all="ignore"):
         for k, board in enumerate(boards):
-            pose, warp = state.first_pose + 6 * k + np.arange(6), columns[board.board]
+            pose, warp = poses[k], warps[board.board]
             yield Block(
                 _corner_residuals(state, k, board),
                 partial(_corner_jacobian, state, k, board),
@@ -302,7 +285,7 @@ def _blocks(state: _State, boards: Sequence[StripedBoard]) -> Iterator[Block]:
     for one, own in zip(state.sheets, sheets, strict=True):
         yield _prior_block(one.prior(), own)
     for name, shape in state.warps.items():
-        yield _prior_block(shape.prior, columns[name])
+        yield _prior_block(shape.prior, warps[name])
 
 
 def _prior_block(prior: tuple[Array, Array], columns: Indices) -> Block:
@@ -447,7 +430,7 @@ def _depth_covariance(
         by_sheets = -offset.by_parameter / along_ray
     # How points move, (N, 3, P), by the unknowns of the camera and of the sheets.
     moved = rays[..., None] * np.concatenate([by_camera, by_sheets], axis=1)[:, None]
-    moved[:, :2, : state.first_pose] += by_rays
+    moved[:, :2, : by_camera.shape[1]] += by_rays
     valid = np.isfinite(moved).all(axis=(1, 2))
     moved, rays, depth = moved[valid], rays[valid], depth[valid]
     motion = twist_jacobian(points[valid])
@@ -459,6 +442,7 @@ def _depth_covariance(
     matrix = np.concatenate([by_sheets[valid] / depth, prior])
     right = np.concatenate([remaining, np.zeros((len(prior), remaining.shape[1]))])
     transfer = np.linalg.lstsq(matrix, right, rcond=None)[0]
-    columns = np.concatenate([np.arange(state.first_pose), state.sheet_columns[direction]])
+    camera, _, own, _ = state.columns
+    columns = np.concatenate([camera, own[direction]])
     total = transfer @ covariance[np.ix_(columns, columns)] @ transfer.T
     return np.asarray(0.5 * (total + total.T), np.float64)
