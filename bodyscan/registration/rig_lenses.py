@@ -7,8 +7,9 @@ may prove together.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -16,11 +17,9 @@ from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import LocatedView, PlanarView
 from bodyscan.calibration.camera import ChosenLens, LensTrial, choose_lens
 from bodyscan.calibration.model_selection import MIN_GAIN
-from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses import FAMILY
 from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.lenses.opencv import Brown, Radial
-from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import RayUncertainty
 from bodyscan.progress import map_threads
 from bodyscan.registration.joint_solve import JointSolution
@@ -60,71 +59,47 @@ def choose_lenses(rig: Rig, views: Sequence[LocatedView], solution: JointSolutio
     views: with points where the boards' corners really lie.
     """
     open_lens = {pair.name for pair in rig.pairs if pair.camera.lens == AUTO}
-    candidates = {
-        name: _Candidate.from_solution(name, views, solution)
-        for name in sorted(solution.cameras)
+    cameras = {
+        name: solution.cameras[name]
+        for name in sorted({view.pair for view in views})
         if solution.cameras[name].prior is None  # otherwise another program gave it
-        and any(view.pair == name for view in views)
     }
-    kinds = {
-        name: FAMILY if name in open_lens and candidate.kind in FAMILY else (candidate.kind,)
-        for name, candidate in candidates.items()
+    kinds: dict[str, tuple[type[Lens], ...]] = {
+        name: FAMILY if name in open_lens and type(camera.lens) in FAMILY else (type(camera.lens),)
+        for name, camera in cameras.items()
     }
-    names = list(candidates)
+
+    def choose(name: str, tried: Sequence[type[Lens]]) -> ChosenLens:
+        of_pair = [view for view in views if view.pair == name]
+        camera_from_root = solution.root_from_camera[name].inverse()
+        poses = [camera_from_root @ solution.root_from_board[view.target] for view in of_pair]
+        planar = [PlanarView(view.shot, view.points, view.pixels) for view in of_pair]
+        return choose_lens(tried, cameras[name], poses, planar)
+
     lenses = map_threads(
-        lambda name: candidates[name].choose(kinds[name]), names, stage="choosing lenses"
+        lambda name: choose(name, kinds[name]), list(kinds), stage="choosing lenses"
     )
-    chosen = dict(zip(names, lenses, strict=True))
-    sizes = {name: (one.camera.width, one.camera.height) for name, one in candidates.items()}
+    chosen = dict(zip(kinds, lenses, strict=True))
+    sizes = {name: (camera.width, camera.height) for name, camera in cameras.items()}
     for size in sorted(set(sizes.values())):  # all that images show of which are of one make
         make = {name: lens for name, lens in chosen.items() if sizes[name] == size}
-        chosen |= _pool_decentring(make, candidates, kinds)
-    cameras = {
+        for name in _find_decentred(make):
+            chosen[name] = _begin_with_brown(chosen[name], partial(choose, name), kinds[name])
+    changed = {
         name: lens.fit.camera
         for name, lens in chosen.items()
-        if type(lens.fit.camera.lens) is not candidates[name].kind
+        if type(lens.fit.camera.lens) is not type(cameras[name].lens)
     }
     return ChosenLenses(
-        replace(solution, cameras=solution.cameras | cameras),
+        replace(solution, cameras=solution.cameras | changed),
         {name: lens.trials for name, lens in chosen.items() if lens.trials},
         {name: lens.rays for name, lens in chosen.items()},
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Candidate:
-    """A camera solved with the richest lens, its views and their `camera_from_board`."""
-
-    camera: Camera
-    poses: list[RigidTransform]
-    views: list[PlanarView]
-
-    @staticmethod
-    def from_solution(
-        name: str, views: Sequence[LocatedView], solution: JointSolution
-    ) -> _Candidate:
-        of_pair = [view for view in views if view.pair == name]
-        camera_from_root = solution.root_from_camera[name].inverse()
-        return _Candidate(
-            solution.cameras[name],
-            [camera_from_root @ solution.root_from_board[view.target] for view in of_pair],
-            [PlanarView(view.shot, view.points, view.pixels) for view in of_pair],
-        )
-
-    @property
-    def kind(self) -> type[Lens]:
-        return type(self.camera.lens)
-
-    def choose(self, kinds: Sequence[type[Lens]]) -> ChosenLens:
-        return choose_lens(kinds, self.camera, self.poses, self.views)
-
-
-def _pool_decentring(
-    chosen: Mapping[str, ChosenLens],
-    candidates: Mapping[str, _Candidate],
-    kinds: Mapping[str, Sequence[type[Lens]]],
-) -> dict[str, ChosenLens]:
-    """Brown's lens in place of the chapter's, if the cameras together are decentred beyond chance.
+def _find_decentred(chosen: Mapping[str, ChosenLens]) -> list[str]:
+    """Cameras of one make that get Brown's lens in place of the chapter's, if together they are
+    decentred beyond chance.
 
     A camera's own boards must not clearly speak against it. A decentring too small for one camera to
     prove is not zero: left out, it hides in the principal point, whose sigma does not account for
@@ -139,15 +114,19 @@ def _pool_decentring(
     ]
     decentring = np.array([_decentring(chosen[name]) for name in open_]).ravel()
     if not open_ or np.mean(decentring**2) < 1.0 + MIN_GAIN * np.sqrt(2.0 / len(decentring)):
-        return {}
-    found = {}
-    for name in open_:
-        again = candidates[name].choose(kinds[name][kinds[name].index(Brown) :])
-        simple, brown = chosen[name].trials[:2]
-        first = replace(brown, chosen=again.trials[0].chosen)
-        trials = (replace(simple, chosen=False), first, *again.trials[1:])
-        found[name] = replace(again, trials=trials)
-    return found
+        return []
+    return open_
+
+
+def _begin_with_brown(
+    lens: ChosenLens,
+    choose: Callable[[Sequence[type[Lens]]], ChosenLens],
+    kinds: Sequence[type[Lens]],
+) -> ChosenLens:
+    """Choose again, with Brown's lens as the simplest."""
+    again, (simple, brown) = choose(kinds[kinds.index(Brown) :]), lens.trials[:2]
+    first = replace(brown, chosen=again.trials[0].chosen)
+    return replace(again, trials=(replace(simple, chosen=False), first, *again.trials[1:]))
 
 
 def _decentring(lens: ChosenLens) -> Array:
