@@ -116,15 +116,25 @@ def normal_equations(
     free = np.arange(size)
     if fixed_target is None:
         free = np.setdiff1d(free, of_motion[fixed_pair or names[0]])
-    everything, weight = np.concatenate(whitened), np.concatenate(weights)
-    squares, total = float(weight @ everything**2), float(np.sum(weight))
-    rough = max(squares / total, 1e-12)
-    found = NormalEquations(tuple(names), of_camera, free, prior * rough, parts, rough)
-    # What a prior knows of an unknown, residuals do not spend on it: not a degree of freedom.
-    spent = float(np.sum(found.sum_parts(list(parts)).information * found.system.covariance()))
-    spent += 6 * len(parts.keys() - {fixed_target})
+    of_boards = 6 * len(parts.keys() - {fixed_target})
+    found = NormalEquations(tuple(names), of_camera, free, prior, parts, 1.0)
+    return _scale_prior(found, np.concatenate(whitened), np.concatenate(weights), of_boards)
+
+
+def _scale_prior(
+    equations: NormalEquations, residuals: Array, weights: Array, eliminated: int
+) -> NormalEquations:
+    """Estimate the variance, in which the prior of the equations is given.
+
+    eliminated: number of unknowns of the boards.
+    """
+    squares, total, prior = float(weights @ residuals**2), float(np.sum(weights)), equations.prior
+    rough = replace(equations, prior=prior * max(squares / total, 1e-12))
+    # What a prior knows of an unknown takes no degree of freedom from the residuals.
+    by_views = rough.sum_parts(list(rough.parts)).information
+    spent = float(np.sum(by_views * rough.system.covariance())) + eliminated
     variance = max(squares / max(total - spent, 1.0), 1e-12)
-    return replace(found, prior=prior * variance, variance_px2=variance)
+    return replace(equations, prior=prior * variance, variance_px2=variance)
 
 
 def _eliminate_board(

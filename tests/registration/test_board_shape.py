@@ -14,6 +14,7 @@ from bodyscan.calibration.camera import locate_board
 from bodyscan.outcome import Outcome
 from bodyscan.registration.rig_solve import RigSolution, solve_rig
 
+Placed = tuple[Outcome[RigSolution], Outcome[RigSolution]]
 PLACINGS, CAMERAS = ring_of_cameras(heights=(700, 1200))
 
 
@@ -41,7 +42,7 @@ def bent_views(shots: int = 30) -> tuple[list[LocatedView], list[LocatedView]]:
 
 
 @pytest.fixture(scope="module")
-def placed() -> tuple[Outcome[RigSolution], Outcome[RigSolution]]:
+def placed() -> Placed:
     bent, flat = bent_views()
     rig = ring_rig(PLACINGS)
     return solve_rig(rig, bent, CAMERAS), solve_rig(rig, flat, CAMERAS)
@@ -55,9 +56,7 @@ def rms(placed: Outcome[RigSolution]) -> float:
     return float(np.sqrt(np.mean(np.sum(np.square(errors), axis=1))))
 
 
-def test_the_bend_and_the_stretch_are_measured(
-    placed: tuple[Outcome[RigSolution], Outcome[RigSolution]],
-) -> None:
+def test_the_bend_and_the_stretch_are_measured(placed: Placed) -> None:
     bent, _ = placed
     shape = bent.value.board_shapes[CHARUCO.name]
     found = shape.points + shape.offsets
@@ -73,18 +72,14 @@ def test_the_bend_and_the_stretch_are_measured(
     assert any("used, boards held out" in note and "mm out of plane" in note for note in bent.notes)
 
 
-def test_the_rig_is_as_good_as_with_a_flat_board(
-    placed: tuple[Outcome[RigSolution], Outcome[RigSolution]],
-) -> None:
+def test_the_rig_is_as_good_as_with_a_flat_board(placed: Placed) -> None:
     bent, flat = placed
     # The size of the board is 0.3 per mille off on average, so are the distances of the cameras.
     assert rms(bent) < 2.0 * rms(flat) + 1e-3 * 1300.0
     assert max(bent.value.rms_px.values()) < 1.1 * max(flat.value.rms_px.values())
 
 
-def test_a_flat_board_is_left_alone(
-    placed: tuple[Outcome[RigSolution], Outcome[RigSolution]],
-) -> None:
+def test_a_flat_board_is_left_alone(placed: Placed) -> None:
     _, flat = placed
     assert not flat.value.board_shapes
     assert not flat.notes

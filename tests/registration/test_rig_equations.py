@@ -130,14 +130,11 @@ def test_what_is_known_of_cameras_beforehand_is_added_to_their_own_unknowns() ->
 
 
 def test_cameras_that_are_known_take_no_degrees_of_freedom() -> None:
-    exact = {
-        name: replace(camera, prior=CameraPrior(camera.parameters, 1e-9 * camera.prior_sigmas))
-        for name, camera in CAMERAS.items()
-    }
+    priors = {n: CameraPrior(c.parameters, np.full(7, 1e-9)) for n, c in CAMERAS.items()}
+    exact = {name: replace(camera, prior=priors[name]) for name, camera in CAMERAS.items()}
     seen = views(1e-3)
     found = normal_equations(seen, exact, PLACED, BOARDS, fixed_pair="a", fixed_target=None)
-    # Of 200 residuals, whose weights are 0.9 on average, three boards and a pair take 24, and
-    # cameras that are not known 14.
+    # Of 200 residuals with weights of 0.9, three boards and a pair take 24, unknown cameras 14.
     ratio = found.variance_px2 / equations(seen).variance_px2
     assert ratio == pytest.approx((180 - 24 - 14) / (180 - 24), rel=5e-3)
 
