@@ -28,19 +28,23 @@ class Verdict:
     grade: of a scan good, usable or repeat; of a calibration good, usable or recalibrate; of an
         acceptance test accepted, not accepted or not judged.
     reasons: worst first; () if there is nothing to report.
+    consequences: what the reasons explain, and what therefore is none.
     """
 
     grade: Grade
     reasons: tuple[str, ...] = ()
+    consequences: tuple[str, ...] = ()
 
     @property
     def mark(self) -> Mark:
         return MARKS.get(self.grade, "bad")
 
     def __str__(self) -> str:
-        return "\n  ".join(
-            [f"verdict: {self.grade}", *(r.replace("\n", "\n  ") for r in self.reasons)]
-        )
+        lines = [f"verdict: {self.grade}", *self.reasons]
+        if self.consequences:
+            more = f"; and {len(self.consequences) - 4} more" if len(self.consequences) > 4 else ""
+            lines.append(f"this explains: {'; '.join(self.consequences[:4])}{more}")
+        return "\n  ".join(line.replace("\n", "\n  ") for line in lines)
 
 
 class Announce(Protocol):

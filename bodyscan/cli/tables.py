@@ -81,7 +81,10 @@ def scan_table(scan: Scan) -> Table:
         table.add_row("points not on skin", shares)
     if scan.alignment is not None:
         before, after = scan.alignment.rms_before_mm, scan.alignment.rms_after_mm
-        table.add_row("overlaps before, after alignment", f"{before:.3f}, {after:.3f} mm RMS")
+        known = (
+            f"{before:.3f}, {after:.3f} mm RMS" if np.isfinite([before, after]).all() else "none"
+        )
+        table.add_row("overlaps before, after alignment", known)
         for name, motion in sorted(scan.alignment.motion_mm.items(), key=lambda item: -item[1])[:1]:
             table.add_row("farthest moved", f"{name}, {motion:.2f} mm")
         for name, sigmas in scan.alignment.refused.items():

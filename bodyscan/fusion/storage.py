@@ -195,6 +195,7 @@ class _Part(BaseModel):
 class _Verdict(_Part):
     grade: Literal["good", "usable", "repeat"]
     reasons: list[str]
+    consequences: list[str] = []
 
 
 class _Overlap(_Part):
@@ -261,7 +262,10 @@ def read_facts(folder: Path) -> dict[str, Any]:
 def stored_verdict(facts: dict[str, Any]) -> Verdict | None:
     """The stored verdict; None for scans from before there were verdicts."""
     verdict = facts.get("verdict")
-    return Verdict(verdict["grade"], tuple(verdict["reasons"])) if verdict else None
+    if not verdict:
+        return None
+    consequences = tuple(verdict.get("consequences", ()))
+    return Verdict(verdict["grade"], tuple(verdict["reasons"]), consequences)
 
 
 def load_scan(folder: Path) -> StoredScan:

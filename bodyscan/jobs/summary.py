@@ -95,7 +95,7 @@ def _scan_figures(facts: Mapping[str, Any]) -> dict[str, Any]:
     verdict = facts.get("verdict") or {}
     figures = {
         "verdict": verdict.get("grade"),
-        "verdict_reasons": "; ".join(" ".join(r.split()) for r in verdict.get("reasons", ())),
+        "verdict_reasons": "; ".join(r.partition("\n")[0] for r in verdict.get("reasons", ())),
         "when": facts["when"],
         "points": counts["points"],
         "faces": counts["faces"],

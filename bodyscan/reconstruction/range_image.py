@@ -86,6 +86,7 @@ class RangeImage:
         calibration: it does not shrink when they are averaged. None if there is none.
     warped: whether points were displaced to another moment, off the rays of their pixels.
     corner: row and column of the camera's image at which the kept part begins.
+    saturated: share of the pixels lit by stripes of the scan volume that are white.
     whole_depth, whole_colours: `open_depth` and `lit` from before cropping.
     correlation_px: distance along rows and columns within which noise is correlated, because depths
         come from the same stripe boundaries; 0 if it is independent.
@@ -107,11 +108,17 @@ class RangeImage:
     whole_depth: Floats | None = None
     whole_colours: Bytes | None = None
     correlation_px: tuple[float, float] = (0.0, 0.0)
+    saturated: float = 0.0
 
     @property
     def valid(self) -> Mask:
         """(h, w): where a point was measured."""
         return np.isfinite(self.sigma_mm)
+
+    @property
+    def overexposed(self) -> bool:
+        """Whether what is left are rims and folds, and many of those are wrong."""
+        return self.saturated > 0.3
 
     @property
     def open_depth(self) -> Floats:

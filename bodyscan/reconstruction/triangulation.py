@@ -67,6 +67,7 @@ def reconstruct_range_image(pair: PairCalibration, stripes: StripeMap) -> RangeI
         agreement,
         common_mm=common_mm,
         correlation_px=correlation_px,
+        saturated=stripes.saturated,
     )
 
 

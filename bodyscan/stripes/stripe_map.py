@@ -50,6 +50,7 @@ class StripeMap:
     crossing, crossing_fault: the map of the stripes that run the other way, or why there is none.
     response: error due to the projector's response; None if not measured or noise explains it.
     correlation_px: distance along rows and along columns within which pixels share noise.
+    saturated: share of the pixels lit by wanted stripes that are white; 0 if not counted.
     """
 
     s: Floats
@@ -64,6 +65,7 @@ class StripeMap:
     response: ResponseShare | None = None
     crossing_fault: str = ""
     correlation_px: tuple[float, float] = (0.0, 0.0)
+    saturated: float = 0.0
 
 
 def assemble_map(

@@ -111,7 +111,7 @@ def fuse(
         # Also by the images of pairs that saw nothing of the subject.
         carried = {image.pair: image for image in subject.images}
         images = [carried.get(image.pair, image) for image in cleaned]
-        coverage = measure_coverage(mesh, images, subject.rig_from_camera)
+        coverage = measure_coverage(mesh, images, subject.rig_from_camera, calibration.pairs)
         verdict = grade_scan(replace(evidence, mesh=mesh, coverage=coverage))
     return Scan(
         cloud,
@@ -164,13 +164,17 @@ def _image_evidence(
     contradictions: Contradictions,
 ) -> ImageEvidence:
     poles = calibration.rig.poles
-    tried = [*(image.pair for image in cleaned), *measured.failures]
+    seeing = [image.pair for image in subject.images]
+    # What is said of pairs that failed explains why they saw nobody.
+    tried = [image.pair for image in cleaned if image.pair not in measured.failures]
     displaced = subject.aligned.displaced if subject.aligned else ()
     moved = {name for one in displaced for name in one.pairs}
     unmoved = [image for image in measured.value if image.pair not in moved]
     return ImageEvidence(
         measured.failures,
-        find_silent_poles(poles, tried, [image.pair for image in subject.images]),
+        find_silent_poles(poles, tried, seeing),
+        {image.pair: image.saturated for image in measured.value if image.overexposed},
+        frozenset(calibration.rig_from_camera.keys() - set(seeing)),
         {image.pair: image.agreement for image in measured.value if image.agreement},
         find_seams(subject.images, subject.image_poses, poles),
         contradictions,

@@ -113,7 +113,7 @@ def fused(
 
 
 def said(scan: Scan) -> str:
-    return " | ".join(scan.verdict.reasons)
+    return " | ".join((*scan.verdict.reasons, *scan.verdict.consequences))
 
 
 def test_a_good_scan(images: list[RangeImage]) -> None:

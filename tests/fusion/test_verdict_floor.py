@@ -23,6 +23,7 @@ def seen(pair: str, points: Array, normal: Array = STRAIGHT_UP) -> Any:
     spread = np.repeat(points, 4, axis=0)[None]
     return SimpleNamespace(
         pair=pair,
+        overexposed=False,
         subsample=lambda step: np.s_[::step, ::step],
         valid=np.ones(spread.shape[:2], bool),
         points=spread,

@@ -123,6 +123,13 @@ def test_exposures_that_cannot_be_read_are_refused(good: Sequence) -> None:
         read(replace(good, lit=good.dark, dark=good.lit))
 
 
+def test_a_flash_in_one_frame_is_named_by_its_bit(good: Sequence) -> None:
+    patterns = good.patterns.copy()
+    patterns[3] = np.minimum(patterns[3].astype(int) + 200, 255)
+    with pytest.raises(DecodingFailed, match="the frames of bit 3 are brighter"):
+        read(replace(good, patterns=patterns))
+
+
 def test_frames_one_late_are_not_taken_for_exchanged_names(good: Sequence) -> None:
     frames = [good.lit, good.dark]
     for pattern, inverse in zip(good.patterns, good.inverses, strict=True):

@@ -8,30 +8,55 @@ from bodyscan.optional import optional
 from bodyscan.verdict import Grade, Verdict
 
 CHECKS: tuple[Check, ...] = (
-    *(rig.check_pairs, rig.check_silent_poles, rig.check_calibration, rig.check_nominal_size),
-    *(rig.check_stripe_directions, overlaps.check_seams, motion.check_displaced_poles),
-    *(motion.check_size, rig.check_floor, motion.check_displaced_pairs),
+    *(rig.check_pairs, rig.check_calibration, rig.check_nominal_size, rig.check_stripe_directions),
+    *(motion.check_size, rig.check_floor, coverage.check_brightness),
+    *(coverage.check_exposure, coverage.check_views, rig.check_silent_poles),
+    *(
+        motion.check_displaced_poles,
+        rig.check_refused,
+        overlaps.check_seams,
+        motion.check_displaced_pairs,
+    ),
     *(overlaps.check_disagreement, motion.check_motion, overlaps.check_contradictions),
     *(shape.check_pieces, shape.check_limbs, shape.check_posture, shape.check_volume),
     *(shape.check_omissions, shape.check_contacts),
-    *(coverage.check_yields, coverage.check_gaps, coverage.check_crown),
+    *(coverage.check_yields, coverage.check_rings, coverage.check_gaps, coverage.check_crown),
 )
-"""Of equally bad findings the first check's come first."""
+"""Causes before what may be their consequence."""
 WORST_FIRST: tuple[Grade, ...] = ("repeat", "usable", "good")
 
 
 def grade_scan(scan: ScanEvidence) -> Verdict:
-    """Grade a scan by the worst of all findings; the reasons come worst first.
+    """Grade a scan by the worst of all findings.
 
-    A check that itself fails leaves the scan usable at best, and is reported.
+    The reasons come worst first, of equally bad ones those that explain others. A cause is as bad as
+    the worst of its consequences, which are no reasons of their own. A check that itself fails leaves
+    the scan usable at best, and is reported.
     """
-    findings: list[Finding] = []
+    causes: list[Finding] = []
+    followers: dict[Finding, list[Finding]] = {}
     failures: list[str] = []
     for check in CHECKS:
         subject = check.__name__.removeprefix("check_").replace("_", " ")
         with optional(f"verdict on {subject}", failures.append):
-            findings += check(scan)
-    findings += [("usable", line) for line in failures]
-    findings.sort(key=lambda finding: WORST_FIRST.index(finding[0]))
-    grade = findings[0][0] if findings else "good"
-    return Verdict(grade, tuple(reason for _, reason in findings))
+            for found in check(scan):
+                cause = next((c for c in causes if c.explains_finding(found)), found)
+                if cause is found:
+                    causes.append(found)
+                followers.setdefault(cause, []).append(found)
+    causes += [Finding("usable", line) for line in failures]
+
+    def grade(cause: Finding) -> int:
+        return min(WORST_FIRST.index(found.grade) for found in followers.get(cause, [cause]))
+
+    causes = sorted(causes, key=lambda cause: (grade(cause), not cause.explains))
+    # Their own possible causes would be read as causes.
+    consequences = [
+        found.words.partition(". Possible causes")[0].partition(": ")[0]
+        for cause in causes
+        for found in followers.get(cause, ())
+        if found is not cause
+    ]
+    worst = WORST_FIRST[grade(causes[0])] if causes else "good"
+    reasons = tuple(cause.words for cause in causes)
+    return Verdict(worst, reasons, tuple(dict.fromkeys(consequences)))

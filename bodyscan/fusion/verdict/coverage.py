@@ -7,12 +7,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 
-from bodyscan.arrays import Array, Mask
+from bodyscan.arrays import Array, Indices, Mask
+from bodyscan.calibration.pair import PairCalibration
+from bodyscan.fusion.brightness import MIN_GREY
 from bodyscan.fusion.hole_filling import Crown
+from bodyscan.fusion.regions import DARK
 from bodyscan.fusion.verdict.evidence import Coverage, Finding, ScanEvidence
+from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import SKIN, BodyMesh
 from bodyscan.mesh.topology import face_normals
@@ -25,9 +30,15 @@ MAX_SATURATED = 0.05
 
 
 def measure_coverage(
-    mesh: BodyMesh, images: Sequence[RangeImage], rig_from_camera: Mapping[str, RigidTransform]
+    mesh: BodyMesh,
+    images: Sequence[RangeImage],
+    rig_from_camera: Mapping[str, RigidTransform],
+    pairs: Mapping[str, PairCalibration] = MappingProxyType({}),
 ) -> Coverage:
-    """Compare a sample of the mesh's faces with range images: cleaned, of all pairs that gave some."""
+    """Compare a sample of the mesh's faces with range images: cleaned, of all pairs that gave some.
+
+    pairs: all calibrated ones.
+    """
     sample = slice(None, None, max(1, len(mesh.faces) // 20_000))
     points = mesh.vertices[mesh.faces[sample]].mean(axis=1)
     cross = face_normals(mesh.vertices, mesh.faces[sample])
@@ -39,13 +50,19 @@ def measure_coverage(
     kinds = mesh.face_regions
     skin = np.ones(len(points), bool) if kinds is None else kinds[sample] == SKIN
     yields, saturated = {}, {}
+    missed = np.zeros(len(points), bool)
+    for name in pairs.keys() - {image.pair for image in images}:
+        missed |= _look(points, normals, pairs[name].camera, rig_from_camera[name])[0]
     for image, view in zip(images, views, strict=True):
         # What a pair alone measured is no evidence against it.
         expected = view.visible & skin & (count - view.measured > 0)
         if np.count_nonzero(expected) >= 50:
             yields[image.pair] = float(np.mean(view.valid[expected]))
             saturated[image.pair] = float(np.mean(view.white[expected]))
-    return Coverage(points[:, 2], 0.5 * doubled_area, count == 0, yields, saturated)
+        if not image.valid.any():
+            missed |= view.visible
+    area, filled = 0.5 * doubled_area, count == 0
+    return Coverage(points[:, 2], area, filled, yields, saturated, filled & missed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,10 +80,12 @@ class _View:
     white: Mask
 
 
-def _view_points(
-    points: Array, normals: Array, image: RangeImage, rig_from_camera: RigidTransform
-) -> _View:
-    camera_from_rig, camera = rig_from_camera.inverse(), image.camera
+def _look(
+    points: Array, normals: Array, camera: Camera, rig_from_camera: RigidTransform
+) -> tuple[Mask, Mask, Indices]:
+    """Which of the points a camera sees at 60 degrees or less, which lie in its image, and at which
+    row and column (N, 2); what stands in between is not asked."""
+    camera_from_rig = rig_from_camera.inverse()
     points, normals = camera_from_rig.apply(points), camera_from_rig.rotate(normals)
     ahead = points[:, 2] > 1.0
     u, v = camera.project(np.where(ahead[:, None], points, 1.0)).T
@@ -75,14 +94,78 @@ def _view_points(
     column = np.where(inside, np.rint(u), 0).astype(np.intp)
     row = np.where(inside, np.rint(v), 0).astype(np.intp)
     facing = -np.sum(points * normals, axis=1) > 0.5 * np.linalg.norm(points, axis=1)
-    index = np.stack([row, column], axis=-1) - image.corner
+    return inside & facing, inside, np.stack([row, column], axis=-1)
+
+
+def _view_points(
+    points: Array, normals: Array, image: RangeImage, rig_from_camera: RigidTransform
+) -> _View:
+    visible, inside, place = _look(points, normals, image.camera, rig_from_camera)
+    index = place - image.corner
     kept = inside & ((index >= 0) & (index < image.sigma_mm.shape)).all(axis=1)
     pixel = tuple(np.where(kept[:, None], index, 0).T)
     valid = kept & image.valid[pixel]
+    camera_from_rig = rig_from_camera.inverse()
+    points, normals = camera_from_rig.apply(points), camera_from_rig.rotate(normals)
     distance = np.abs(np.sum((image.points[pixel] - points) * normals, axis=1))
-    white = inside & (image.lit[row, column] >= 254)
+    white = inside & (image.lit[tuple(place.T)] >= 254)
     # A mesh of few points may be 10 mm off what was measured; webs and soles are farther off.
-    return _View(inside & facing, valid, valid & (distance < 10.0), white)
+    return _View(visible, valid, valid & (distance < 10.0), white)
+
+
+def check_exposure(scan: ScanEvidence) -> Iterator[Finding]:
+    """Pairs whose lit images are white where they show the subject."""
+    shares = dict(scan.coverage.saturated) if scan.coverage else {}
+    for name, share in scan.images.saturated.items():
+        shares[name] = max(share, shares.get(name, 0.0))
+    over = {name: share for name, share in shares.items() if share > MAX_SATURATED}
+    if not over:
+        return
+    low, high = f"{min(over.values()):.0%}", f"{max(over.values()):.0%}"
+    pairs = (
+        f"pair {next(iter(over))} is" if len(over) == 1 else f"pairs {', '.join(sorted(over))} are"
+    )
+    # As `RangeImage.overexposed`.
+    spoiled = frozenset(name for name, share in over.items() if share > 0.3)
+    yield Finding(
+        "usable",
+        f"{pairs} overexposed: {low if low == high else f'{low} to {high}'} of the skin in view "
+        "is white in the lit image. Shorten the exposure or dim the projector",
+        frozenset(over),
+        spoiled,
+        spoils=bool(spoiled),
+    )
+
+
+def check_brightness(scan: ScanEvidence) -> Iterator[Finding]:
+    """Images so dark that hair and cloth cannot be told from skin, whose relief sigmas then lack."""
+    grey = float(np.median(scan.cloud.colours[:, 0]))
+    if 0.0 < grey * DARK < MIN_GREY:
+        yield Finding(
+            "usable",
+            f"the images are dark: half of the body has grey levels below {grey:.0f} of 255, so that "
+            "hair and dark cloth cannot be told from skin. Lengthen the exposure",
+        )
+
+
+def check_views(scan: ScanEvidence) -> Iterator[Finding]:
+    """Pairs that measured something else than the others where they look as well."""
+    coverage, report = scan.coverage, scan.images.seams
+    if coverage is None or report is None:
+        return
+    alone = [names[0] for names in report.isolated if len(names) == 1]
+    for name in alone:
+        share = coverage.yields.get(name, 1.0)
+        if share < 0.3 and name not in scan.images.saturated:
+            yield Finding(
+                "usable",
+                f"pair {name} shows something else than the others: it measured {share:.0%} of the "
+                "skin that they measured in its view, and no surface is common to both. Possible "
+                "causes: its images are upside down, or another pair's (cables, folders); a wrong pose",
+                frozenset([name]),
+                frozenset([name]),
+                spoils=True,
+            )
 
 
 def check_yields(scan: ScanEvidence) -> Iterator[Finding]:
@@ -90,40 +173,71 @@ def check_yields(scan: ScanEvidence) -> Iterator[Finding]:
     coverage = scan.coverage
     if coverage is None:
         return
-    for name, share in coverage.saturated.items():
-        if share > MAX_SATURATED:
-            yield (
-                "usable",
-                f"pair {name} is overexposed: {share:.0%} of the skin that it sees is white in its lit "
-                "image. Shorten its exposure or dim its projector",
-            )
     for name, share in coverage.yields.items():
         # Shadows of arms and chin leave 85 % and more.
         if share < 0.6 and coverage.saturated[name] <= MAX_SATURATED:
-            yield (
+            yield Finding(
                 "usable",
                 f"pair {name} measured {share:.0%} of the skin that it sees and others measured. "
                 "Possible causes: an object blocks its view; its images are too dark or out of focus; "
                 "it is mounted in the wrong place or upside down",
+                frozenset([name]),
             )
+
+
+def check_rings(scan: ScanEvidence) -> Iterator[Finding]:
+    """A surface next to none of which was measured, or too little round the body for want of pairs."""
+    coverage = scan.coverage
+    if coverage is None:
+        return
+    measured_mm2 = coverage.areas_mm2[~coverage.filled].sum()
+    if measured_mm2 < 2000.0:  # three fingers
+        yield Finding(
+            "repeat", f"next to nothing was measured: {measured_mm2 / 100.0:.1f} cm2 in all"
+        )
+    if coverage.missed is None:
+        return
+    band = np.maximum(coverage.heights_mm / 50.0, 0.0).astype(np.int64)
+    area = np.bincount(band, coverage.areas_mm2)
+    # Closed flat, a gap of 15 % costs 4 mm of a girth of 800: its arc less its chord.
+    gaping = np.bincount(band, coverage.areas_mm2 * coverage.missed) > 0.15 * area
+    share = float(np.sum(gaping) / np.count_nonzero(area))
+    if share > 0.5:
+        absent = ", ".join(sorted(scan.images.absent))
+        yield Finding(
+            "repeat",
+            f"no girth is measured all round at {share:.0%} of the heights: 15 % of it or more lies "
+            f"where {absent} look, which measured nothing",
+            scan.images.absent,
+        )
 
 
 def check_gaps(scan: ScanEvidence) -> Iterator[Finding]:
     """The filled share of the whole surface, and of bands of 50 mm in height."""
+    coverage = scan.coverage
+    measured_mm2 = np.inf if coverage is None else coverage.areas_mm2[~coverage.filled].sum()
+    if measured_mm2 < 2000.0:  # less than three fingers
+        yield Finding(
+            "repeat", f"next to nothing was measured: {measured_mm2 / 100.0:.1f} cm2 in all"
+        )
     if scan.mesh and _sees_one_side(scan):
-        yield (
+        yield Finding(
             "usable",
             "one side only was seen, as the cameras stand: the mesh's other side is filled "
             f"({scan.mesh.filled_share:.0%} of its surface)",
         )
         return
-    coverage = scan.coverage
     if coverage is None:
         return
+    missed = np.zeros(len(coverage.filled), bool) if coverage.missed is None else coverage.missed
+    missed_mm2 = coverage.areas_mm2[missed].sum()
+    mostly = 2.0 * missed_mm2 > coverage.areas_mm2[coverage.filled].sum()
+    lost = scan.images.absent if mostly else frozenset()
     if coverage.filled_share > MAX_FILLED:
-        yield (
+        yield Finding(
             "repeat" if coverage.filled_share > 0.5 else "usable",
             f"{coverage.filled_share:.0%} of the surface is filled: nothing was measured there",
+            lost,
         )
     band_mm = 50.0
     band = np.maximum(coverage.heights_mm / band_mm, 0.0).astype(np.int64)
@@ -136,10 +250,11 @@ def check_gaps(scan: ScanEvidence) -> Iterator[Finding]:
     starts = np.flatnonzero(empty & ~np.roll(empty, 1))
     ends = np.flatnonzero(empty & ~np.roll(empty, -1)) + 1
     for low, high in zip(starts, ends, strict=True):
-        yield (
+        yield Finding(
             "usable",
             f"next to nothing was measured from {band_mm * low:.0f} to {band_mm * high:.0f} mm. "
             "Possible causes: hair; black cloth; out of view",
+            lost,
         )
 
 
@@ -153,7 +268,7 @@ def check_crown(scan: ScanEvidence) -> Iterator[Finding]:
         return
     crown = Crown.from_cloud(scan.cloud.points, scan.cloud.normals)
     if crown.unknown_mm > 4.0:
-        yield (
+        yield Finding(
             "usable",
             f"nothing was measured of the crown, and perhaps of all above {crown.highest[2]:.0f} mm: "
             "the stature is a guess. Possible causes: hair; a cap; out of view",

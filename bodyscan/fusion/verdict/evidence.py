@@ -26,7 +26,28 @@ from bodyscan.verdict import Grade
 GIRTH_PER_MM = 2.0 * np.pi
 """mm by which a girth is wrong if its surface is displaced by 1 mm all round."""
 
-Finding = tuple[Grade, str]
+
+@dataclass(frozen=True)
+class Finding:
+    """A fault of a scan.
+
+    pairs: those that it is about, by name; none: the whole body.
+    explains: pairs whose own faults are a consequence of it.
+    spoils: whether it puts wrong points into the cloud, so that what the whole body looks like may be
+        a consequence as well.
+    """
+
+    grade: Grade
+    words: str
+    pairs: frozenset[str] = frozenset()
+    explains: frozenset[str] = frozenset()
+    spoils: bool = False
+
+    def explains_finding(self, other: Finding) -> bool:
+        """Whether the other one is a consequence, if it is none of a cause by itself."""
+        if not other.pairs:
+            return self.spoils
+        return 2 * len(other.pairs & self.explains) >= len(other.pairs)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,6 +107,8 @@ class ImageEvidence:
 
     failed: pairs that gave none, with the reason.
     silent: poles of which no pair saw anybody, see `find_silent_poles`.
+    saturated: of overexposed pairs, the share of their pixels in the volume that are white.
+    absent: calibrated pairs that measured nothing of the subject.
     agreements: of pairs that project stripes of two directions.
     seams: see `find_seams`.
     contradictions: see `merge`.
@@ -94,6 +117,8 @@ class ImageEvidence:
 
     failed: Mapping[str, str] = field(default_factory=dict)
     silent: tuple[str, ...] = ()
+    saturated: Mapping[str, float] = field(default_factory=dict)
+    absent: frozenset[str] = frozenset()
     agreements: Mapping[str, Agreement] = field(default_factory=dict)
     seams: SeamReport | None = None
     contradictions: Contradictions | None = None
@@ -105,7 +130,8 @@ class Coverage:
     """A sample of N faces of the mesh, and how much of them each pair measured.
 
     heights_mm, areas_mm2: heights of the faces, and areas that they stand for, (N,).
-    filled: whether no pair measured them, (N,).
+    filled, missed: whether no pair measured them, and whether besides one looks there that gave no
+        range image, (N,).
     yields, saturated: by pair, shares that it measured, and that are white in its lit image, of the
         faces that it sees and others measured.
     """
@@ -115,6 +141,7 @@ class Coverage:
     filled: Mask
     yields: Mapping[str, float]
     saturated: Mapping[str, float]
+    missed: Mask | None = None
 
     @property
     def filled_share(self) -> float:

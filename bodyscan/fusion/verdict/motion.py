@@ -30,14 +30,17 @@ def check_displaced_poles(scan: ScanEvidence) -> Iterator[Finding]:
         # that, and 5 degrees are too large for a bump, it was the body that turned.
         lever_mm = np.radians(step.rotation_deg) * 1000.0
         if step.rotation_deg > 5.0 and step.shift_mm < 0.25 * lever_mm:
-            yield (
+            yield Finding(
                 "repeat",
                 f"the person turned by {step.rotation_deg:.0f} degrees before or after {step.name} "
                 f"fired: a pole that turned as much would have displaced the body by {lever_mm:.0f} "
                 f"mm, not by {step.shift_mm:.0f} mm",
+                step.pairs,
+                step.pairs,
+                spoils=True,
             )
             continue
-        yield (
+        yield Finding(
             "repeat" if len(step.pairs) == 1 or len(steps) > 1 or step.all_moved else "usable",
             f"{step.name} is displaced by {step.shift_mm:.1f} mm and {step.rotation_deg:.2f} degrees "
             "from its calibrated pose, alone and in one step, which no motion of a person explains; it "
@@ -52,7 +55,7 @@ def check_size(scan: ScanEvidence) -> Iterator[Finding]:
         return
     girth_mm = abs(size.outward_mm) * GIRTH_PER_MM
     where, wrong = ("farther from", "small") if size.outward_mm > 0.0 else ("nearer to", "large")
-    yield (
+    yield Finding(
         "repeat" if girth_mm > scan.use.usable_girth_mm else "usable",
         f"all poles are {abs(size.outward_mm):.1f} mm (sigma {size.sigma_mm:.1f} mm) {where} the body "
         f"than calibrated, which no motion of a person explains. Girths would be {girth_mm:.0f} mm too "
@@ -71,7 +74,7 @@ def check_displaced_pairs(scan: ScanEvidence) -> Iterator[Finding]:
     if girth_mm <= scan.use.good_girth_mm:
         return
     sways = search.sway_mm > STILL_MM
-    yield (
+    yield Finding(
         "repeat" if girth_mm > scan.use.usable_girth_mm and not sways else "usable",
         f"the pairs are displaced by {search.offset_mm:.1f} mm RMS from their calibrated poses, and no "
         f"sway explains it. Possible causes: {'head or arms moved; ' if sways else ''}the rig was "
@@ -87,7 +90,7 @@ def check_motion(scan: ScanEvidence) -> Iterator[Finding]:
     for part in scan.person.parts if scan.person else ():
         girth_mm = part.left_mm * GIRTH_PER_MM
         if girth_mm > usable_mm:
-            yield (
+            yield Finding(
                 "repeat" if girth_mm > 3.0 * usable_mm else "usable",
                 f"the {part.name} moved by {part.moved_mm:.1f} mm during the scan, of which "
                 f"{part.left_mm:.1f} mm are left after correction: repeat if you need it better",
@@ -102,7 +105,7 @@ def check_motion(scan: ScanEvidence) -> Iterator[Finding]:
     name = max(beyond_mm, key=lambda one: beyond_mm[one])
     girth_mm = beyond_mm[name] * UNCORRECTED_SHARE * GIRTH_PER_MM
     if girth_mm > usable_mm:
-        yield (
+        yield Finding(
             "repeat" if girth_mm > 2.0 * usable_mm else "usable",
             f"the person moved by {alignment.motion_mm[name]:.1f} mm between the pairs' captures "
             f"(pair {name})",

@@ -161,18 +161,22 @@ def check_seams(scan: ScanEvidence) -> Iterator[Finding]:
         return
     limit_mm = scan.use.good_girth_mm / GIRTH_PER_MM
     for group in find_misaligned(report.seams, report.groups, limit_mm):
-        yield (
+        yield Finding(
             "repeat" if group.step_mm * GIRTH_PER_MM > scan.use.usable_girth_mm else "usable",
             f"{group.name} does not fit the others: its surface is displaced by {group.step_mm:.2g} mm "
             "where it meets theirs. Possible causes: the person turned or stepped aside meanwhile; it "
             "was moved since the calibration; its images are of another scan or person; cables or "
             "folders were exchanged",
+            report.groups[group.name],
+            report.groups[group.name],
+            spoils=group.step_mm * GIRTH_PER_MM > scan.use.usable_girth_mm,
         )
     for names in report.isolated:
-        yield (
+        yield Finding(
             "usable",
             f"{', '.join(names)} shares no surface with the others: if the person, or a pole, moved in "
             "between, nothing would show it",
+            frozenset(names),
         )
 
 
@@ -182,7 +186,7 @@ def check_disagreement(scan: ScanEvidence) -> Iterator[Finding]:
         return
     rms_mm, expected_mm = scan.alignment.rms_after_mm, scan.alignment.expected_mm
     if rms_mm > max(MAX_DISAGREEMENT_MM, 2.0 * expected_mm):
-        yield (
+        yield Finding(
             "usable",
             f"the pairs disagree by {rms_mm:.2f} mm RMS where they overlap; their sigmas predict "
             f"{expected_mm:.2f} mm. Possible causes: the calibration is another rig's; something was "
@@ -199,7 +203,7 @@ def check_contradictions(scan: ScanEvidence) -> Iterator[Finding]:
     if found is None or found.beyond_noise <= 0.005:
         return
     if scan.poses_corrected:
-        yield (
+        yield Finding(
             "repeat",
             f"the pairs contradict each other at {found.share:.1%} of their common points, even with "
             "the displaced poles aligned. Possible causes: a lens or a projector was touched; the "
@@ -207,7 +211,7 @@ def check_contradictions(scan: ScanEvidence) -> Iterator[Finding]:
         )
         return
     outlier = found.find_outlier(report.groups) if report else ""
-    yield (
+    yield Finding(
         "repeat" if found.beyond_noise > 0.02 else "usable",
         f"{f'{outlier} and the others' if outlier else 'the pairs'} contradict each other: at "
         f"{found.share:.1%} of the pairs' common points one sees no surface where the other does. "
@@ -219,4 +223,5 @@ def check_contradictions(scan: ScanEvidence) -> Iterator[Finding]:
             else "the calibration is another rig's; something was moved since; "
         )
         + "cables or folders were exchanged",
+        report.groups[outlier] if report and outlier else frozenset(),
     )

@@ -18,14 +18,20 @@ from bodyscan.verdict import LEFT_OUT
 
 
 def check_pairs(scan: ScanEvidence) -> Iterator[Finding]:
-    """Pairs without a range image, and pairs that alignment refused."""
+    """Pairs without a range image."""
     for names, reason in group_reasons(scan.images.failed):
-        yield "usable", f"{LEFT_OUT}{', '.join(names)}: {reason}"
+        lost = frozenset(names)
+        yield Finding("usable", f"{LEFT_OUT}{', '.join(names)}: {reason}", lost, lost)
+
+
+def check_refused(scan: ScanEvidence) -> Iterator[Finding]:
+    """Pairs that alignment refused."""
     for name in scan.alignment.refused if scan.alignment else ():
-        yield (
+        yield Finding(
             "repeat",
             f"pair {name} does not fit the others. Possible causes: it was moved since the "
             "calibration; the person moved far between the captures",
+            frozenset([name]),
         )
 
 
@@ -54,7 +60,7 @@ def find_misplaced(
     """
     found = {}
     for image in images:
-        if image.pair in seeing:
+        if image.overexposed or image.pair in seeing:
             continue
         pose, camera = rig_from_camera[image.pair], image.camera
         axes = np.linspace(0.0, camera.width - 1.0, 20), np.linspace(0.0, camera.height - 1.0, 20)
@@ -80,17 +86,18 @@ def find_misplaced(
 def check_silent_poles(scan: ScanEvidence) -> Iterator[Finding]:
     """Poles that saw nobody; `check_gaps` reports how much of the body is missing."""
     for name in scan.images.silent:
-        yield (
+        yield Finding(
             "usable",
             f"pole {name} saw nobody where the others saw a person. Possible causes: the person left, "
             "or came, while poles took turns; the pole's projector was off",
+            explains=scan.images.absent.difference(scan.images.failed),
         )
 
 
 def check_calibration(scan: ScanEvidence) -> Iterator[Finding]:
     """Imported calibrations, whose accuracy is unknown."""
     if scan.rig.unjudged:
-        yield (
+        yield Finding(
             "usable",
             f"the calibration of {', '.join(scan.rig.unjudged)} was imported, and its accuracy is "
             "unknown: sigmas include the decoding alone",
@@ -102,7 +109,7 @@ def check_nominal_size(scan: ScanEvidence) -> Iterator[Finding]:
     size = scan.rig.nominal
     if size is None or size.mark == "good":
         return
-    yield (
+    yield Finding(
         "repeat" if size.mark == "bad" else "usable",
         f"{size.words}, and every girth may be wrong by the same share: {size.remedy}",
     )
@@ -112,7 +119,7 @@ def check_stripe_directions(scan: ScanEvidence) -> Iterator[Finding]:
     """Depths from stripes of two directions that differ by more than noise."""
     for name, agreement in scan.images.agreements.items():
         if agreement.moderate:
-            yield (
+            yield Finding(
                 "usable",
                 f"pair {name}: depths from the two stripe directions differ by "
                 f"{agreement.description}. Its calibration is wrong by as much, which sigmas do "
@@ -156,7 +163,7 @@ def check_floor(scan: ScanEvidence) -> Iterator[Finding]:
     floor_mm = scan.images.floor_mm
     if floor_mm is None or abs(floor_mm) <= 4.0:
         return
-    yield (
+    yield Finding(
         "repeat" if scan.person_alignment and scan.person_alignment.displaced else "usable",
         f"the floor is at {floor_mm:.0f} mm, not at 0: the stature is wrong by as much, and girths are "
         f"taken {abs(floor_mm):.0f} mm too {'low' if floor_mm > 0.0 else 'high'}. Possible causes: "

@@ -33,9 +33,11 @@ def check_pieces(scan: ScanEvidence) -> Iterator[Finding]:
     for k, (bottom, top) in zip(order[1:4], extents[1:], strict=True):
         overlap = min(top, high) - max(bottom, low)
         if overlap > SECOND_BODY * (high - low):
-            yield "repeat", f"two bodies stand in the scan volume ({share[k]:.0%} in the second)"
+            yield Finding(
+                "repeat", f"two bodies stand in the scan volume ({share[k]:.0%} in the second)"
+            )
         elif share[k] > 0.01:
-            yield (
+            yield Finding(
                 "usable",
                 f"a piece between {bottom:.0f} and {top:.0f} mm ({share[k]:.0%} of the points) is "
                 "not joined to the rest by anything measured",
@@ -61,13 +63,13 @@ def check_limbs(scan: ScanEvidence) -> Iterator[Finding]:
     bodies = [height for height, area in other.items() if area > 0.35 * largest[height]]
     things = [height for height, area in other.items() if area > 300.0]
     if bodies and max(bodies) - min(bodies) > SECOND_BODY * max(largest):
-        yield (
+        yield Finding(
             "repeat",
             f"more than one person: at heights from {min(bodies):.0f} to {max(bodies):.0f} mm there "
             "are more trunks or legs than one has",
         )
     elif len(things) > 3:  # 50 mm of an adult
-        yield (
+        yield Finding(
             "usable",
             f"more than one person's trunk, legs and arms at heights from {min(things):.0f} to "
             f"{max(things):.0f} mm. Possible causes: a stick, a rail, a chair or an animal; somebody's "
@@ -82,7 +84,7 @@ def check_posture(scan: ScanEvidence) -> Iterator[Finding]:
     width = float(np.ptp(scan.shape.vertices[:, :2], axis=0).max())
     height = float(scan.shape.vertices[:, 2].max())
     if height < 0.8 * width:
-        yield (
+        yield Finding(
             "usable",
             f"the body is {width:.0f} mm wide and {height:.0f} mm tall. Possible causes: the person "
             "lies or bends. Girths are of level sections",
@@ -94,9 +96,11 @@ def check_volume(scan: ScanEvidence) -> Iterator[Finding]:
     x, y, z = scan.cloud.points.T
     volume = scan.rig.volume
     if np.mean(z > volume.top_mm - 10.0) > 3e-4:
-        yield "usable", f"cut off at the scan volume's top, {volume.top_mm:.0f} mm: no stature"
+        yield Finding(
+            "usable", f"cut off at the scan volume's top, {volume.top_mm:.0f} mm: no stature"
+        )
     if np.mean(np.hypot(x, y) > volume.radius_mm - 10.0) > 3e-4:
-        yield "usable", f"cut off at the scan volume's side, {volume.radius_mm:.0f} mm"
+        yield Finding("usable", f"cut off at the scan volume's side, {volume.radius_mm:.0f} mm")
 
 
 def check_omissions(scan: ScanEvidence) -> Iterator[Finding]:
@@ -111,7 +115,7 @@ def check_omissions(scan: ScanEvidence) -> Iterator[Finding]:
     if share > 0.01:
         low, high = np.percentile(points[outside, 2], [1, 99])
         tall = high - low > SECOND_BODY * float(mesh.vertices[:, 2].max())
-        yield (
+        yield Finding(
             "repeat" if share > 0.2 else "usable",
             f"{share:.0%} of the points, between {low:.0f} and {high:.0f} mm, are not in the mesh, "
             f"which is one piece. Possible causes: {'two people in the volume; ' if tall else ''}"
@@ -129,7 +133,7 @@ def check_contacts(scan: ScanEvidence) -> Iterator[Finding]:
         other = next((part for part in contact.parts if part != arm), None)
         at_armpit = contact.high_mm > (ARMPIT - 0.06) * top
         if arm and other and contact.high_mm - contact.low_mm > (0.06 if at_armpit else 0.01) * top:
-            yield (
+            yield Finding(
                 "usable",
                 f"the {arm} touches the {other} from {contact.low_mm:.0f} to {contact.high_mm:.0f} mm: "
                 "hold the arms off. Girths there are given as a range, or of both parts together",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,7 +25,7 @@ from bodyscan.stripes.stripe_coordinates import (
 )
 from bodyscan.stripes.stripe_limits import StripeLimits
 from bodyscan.stripes.stripe_map import StripeMap, assemble_map
-from bodyscan.stripes.usable_pixels import MIN_CONTRAST, find_usable_pixels
+from bodyscan.stripes.usable_pixels import MIN_CONTRAST, SATURATED, find_usable_pixels
 
 
 def decode_bits(
@@ -38,8 +39,12 @@ def decode_bits(
     codes = code.stripes(read_words(code, images, stripes, variance))
     fine_bit = code.bit_two_wide(len(images.patterns))
     usable, coded = find_usable_pixels(images, codes, variance, stripes, fine_bit)
+    white = cv2.subtract(images.lit, images.dark) >= np.float32(MIN_CONTRAST)
+    white &= (images.lit >= SATURATED) & (codes >= 0) & (codes < stripes)
     beyond = None
     if limits is not None:
+        if white.any():
+            white, _ = limits.split(codes, white, transposed=images.transposed)
         usable, beyond = limits.split(codes, usable, transposed=images.transposed)
         coded, _ = limits.split(codes, coded, transposed=images.transposed)
     brightness = Brightness.from_images(images, variance, usable)
@@ -53,7 +58,12 @@ def decode_bits(
     s, sigma = correct_across_lines(s, sigma, brightness, boundaries.blur2)
     result = assemble_map(images, lit, s, sigma, boundaries, stripes, beyond)
     along = correlation_along_lines(boundaries)
-    return replace(result, correlation_px=(0.0, along) if images.transposed else (along, 0.0))
+    seen = int(np.count_nonzero(white) + np.count_nonzero(coded))
+    return replace(
+        result,
+        correlation_px=(0.0, along) if images.transposed else (along, 0.0),
+        saturated=int(np.count_nonzero(white)) / max(seen, 1),
+    )
 
 
 def lay_out(

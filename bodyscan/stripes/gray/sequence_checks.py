@@ -77,6 +77,12 @@ def check_words(
     of the coarsest pattern and its inverse shows only in codes beyond the last stripe.
     """
     fault = _find_fault(images, words, code, stripes, variance)
+    flash = _find_flash(images) if fault else ""
+    if flash:
+        raise DecodingFailed(
+            f"{flash}, so that no stripe can be read",
+            remedy="a flash, a lamp or automatic exposure? Take the shot again",
+        )
     if fault:
         raise DecodingFailed(
             f"the patterns do not make a stripe code: frames are exchanged, lost or moved ({fault})",
@@ -123,6 +129,28 @@ def _find_fault(
     opposite = _measure_folds(code.stripes(words[:: 2 * step]), good[:: 2 * step])
     if opposite > 0.15:
         return f"{opposite:.0%} of the pixels count stripes the other way, as without bit 0"
+    return ""
+
+
+def _find_flash(images: ScanLines) -> str:
+    """Describe the bit whose pattern and inverse together are brighter or darker than the others
+    all over; "" if none are."""
+    if images.inverses is None:
+        return ""
+    step = max(1, round(math.sqrt(images.lit.size / 50_000)))
+    some = (..., slice(None, None, step), slice(None, None, step))
+    contrast = images.lit[some].astype(np.float32) - images.dark[some]
+    bright = contrast >= np.median(contrast[contrast >= MIN_CONTRAST])
+    both = images.patterns[some][:, bright].astype(np.float32) + images.inverses[some][:, bright]
+    away = (both - np.median(both, axis=0)) / contrast[bright]
+    for bit, share in enumerate(np.median(away, axis=1)):
+        # A frame taken twice is brighter in one half of the picture and darker in the other.
+        same = np.mean(np.sign(share) * away[bit] > 0.15)
+        # The optics of a projector may darken the finest.
+        if same > 0.9 and (share > 0.0 or bit < len(away) - FINE_BITS):
+            kind = "brighter" if share > 0.0 else "darker"
+            by = f"by {abs(share):.0%} of their contrast"
+            return f"the frames of bit {bit} are {kind} than the others {by}"
     return ""
 
 
