@@ -327,23 +327,3 @@ def test_alignment_takes_no_part_if_not_wanted(images: list[RangeImage]) -> None
     assert scan.notes == ("as it was said",)
     assert scan.alignment is None
     assert scan.verdict.grade == "good"
-
-
-def test_a_pair_that_gives_less_than_it_looks_at_is_named(images: list[RangeImage]) -> None:
-    """Half of its picture is dark; white where it was overexposed."""
-    rng = np.random.default_rng(2)
-    for white, words in ((False, "pair p1-2 measured"), (True, "pair p1-2 is overexposed")):
-        half = [_half(image, rng, white) for image in images]
-        scan = fused(half, settings=NOT_FOLLOWED)
-        assert scan.verdict.grade == "usable"
-        assert words in said(scan)
-        assert "p1-3" not in said(scan)
-
-
-def _half(image: RangeImage, rng: np.random.Generator, white: bool) -> RangeImage:
-    if image.pair != "p1-2":
-        return image
-    gone = np.kron(rng.random((16, 20)) < 0.5, np.ones((16, 16))) > 0
-    sigma = np.where(gone, np.float32(np.nan), image.sigma_mm)
-    grey = np.where(gone & white, np.uint8(255), image.colours).astype(np.uint8)
-    return replace(image, sigma_mm=sigma, colours=grey)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -11,6 +13,7 @@ import numpy as np
 import pytest
 from small_workspace import COARSER, Workspace, copy_pairs, run
 
+from bodyscan.arrays import Array
 from bodyscan.errors import ResultError
 from bodyscan.fusion.storage import load_scan
 from bodyscan.registration.storage import load_calibration
@@ -71,30 +74,53 @@ def test_a_scan_of_another_image_size_is_refused(workspace: Workspace, copy: Pat
     assert "320 x 256" in str(result.exception)
 
 
-def test_a_scan_of_nobody_ends_in_a_verdict(workspace: Workspace, copy: Path) -> None:
-    """All images black but for the lit ones' noise: no pair can be read, and the JSON says so."""
-    for path in (copy / "captures" / "person").rglob("*.png"):
-        cv2.imwrite(str(path), np.full_like(cv2.imread(str(path), 0), 12))
-    arguments = (copy / "captures" / "person", "--calibration", workspace.folder / "calibration")
-    result = run("scan", *arguments, "--out", copy / "scan")
-    assert result.exit_code == 1
-    verdict = json.loads((copy / "scan" / "scan.json").read_text())["verdict"]
-    assert verdict["grade"] == "repeat"
-    assert any("p1-2" in reason for reason in verdict["reasons"])
-    with pytest.raises(ResultError, match="gave no model"):
-        load_scan(copy / "scan")
+def changed(shot: Path, change: Callable[[Array], Array], names: str = "*/*") -> None:
+    """Change the grey levels of images of a scan."""
+    for path in shot.glob(f"{names}.png"):
+        grey = change(cv2.imread(str(path), 0).astype(float))
+        cv2.imwrite(str(path), np.clip(np.rint(grey), 0, 255).astype(np.uint8))
 
 
-def test_a_scan_without_a_pair_or_a_frame_goes_on_and_names_it(
-    workspace: Workspace, copy: Path
-) -> None:
-    (copy / "captures" / "person" / "s01" / "p1-3" / "bit04-inverse.png").unlink()
-    shutil.rmtree(copy / "captures" / "person" / "s01" / "p2-3")
-    arguments = (copy / "captures" / "person", "--calibration", workspace.folder / "calibration")
-    result = run("scan", *arguments, "--out", copy / "scan", *COARSER)
-    assert result.exit_code == 0, result.output
-    said = " ".join(result.output.split())
-    for part in ("left out: p1-3", "bit04-inverse.png", "left out: p2-3"):
-        assert part in said
-    reasons = json.loads((copy / "scan" / "scan.json").read_text())["verdict"]["reasons"]
-    assert any("p2-3" in reason for reason in reasons)
+def delete(shot: Path, names: str) -> None:
+    for path in shot.glob(f"{names}.png"):
+        path.unlink()
+
+
+def one_late(shot: Path) -> None:
+    frames = ["lit", "dark", *(f"bit{n:02d}{k}" for n in range(7) for k in ("", "-inverse"))]
+    for pair in shot.iterdir():
+        taken = [(pair / f"{frame}.png").read_bytes() for frame in ("dark", *frames[:-1])]
+        for frame, content in zip(frames, taken, strict=True):
+            (pair / f"{frame}.png").write_bytes(content)
+
+
+FAULTS: dict[str, tuple[Callable[[Path], None], str, str]] = {
+    "all overexposed": (lambda s: changed(s, lambda i: 4.0 * i), "repeat", "are overexposed"),
+    "all dark": (lambda s: changed(s, lambda i: 0.12 * i), "usable", "the images are dark"),
+    "nobody": (lambda s: changed(s, lambda i: 0.0 * i + 12.0), "repeat", "p1-2, p1-3, p2-2, p2-3: "),
+    "a pole lost": (lambda s: delete(s, "p2-*/*"), "repeat", "left out: p2-2, p2-3: .*is missing"),
+    "a frame lost": (lambda s: delete(s, "p1-3/bit04-inverse"), "usable", "out: p1-3: .*bit04-inverse.png"),
+    "frames one late": (one_late, "repeat", "out of step by one"),
+    "a projector off": (
+        lambda s: changed(s, lambda i: 0.0 * i + 12.0, "p2-2/*"), "usable", "out: p2-2: .*lights only"),
+    "upside down": (
+        lambda s: changed(s, lambda i: i[::-1, ::-1], "p2-2/*"), "repeat", "p2-2 .*upside down"),
+    "a flash": (
+        lambda s: changed(s, lambda i: i + 200.0, "p2-2/bit03"), "usable", "out: p2-2: .*of bit 3 are"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_the_first_reason_is_the_cause(workspace: Workspace, tmp_path: Path, name: str) -> None:
+    damage, grade, words = FAULTS[name]
+    shutil.copytree(workspace.folder / "captures" / "person", tmp_path / "person")
+    damage(tmp_path / "person" / "s01")
+    at = ("--calibration", workspace.folder / "calibration")
+    result = run("scan", tmp_path / "person", *at, "--out", tmp_path / "scan", *COARSER)
+    verdict = json.loads((tmp_path / "scan" / "scan.json").read_text())["verdict"]
+    assert re.search(words, verdict["reasons"][0].partition("\n")[0]), verdict
+    assert verdict["grade"] == grade, verdict
+    assert result.exit_code == (grade == "repeat")
+    if name == "nobody":
+        with pytest.raises(ResultError, match="gave no model"):
+            load_scan(tmp_path / "scan")

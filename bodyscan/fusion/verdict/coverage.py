@@ -158,7 +158,7 @@ def check_views(scan: ScanEvidence) -> Iterator[Finding]:
         share = coverage.yields.get(name, 1.0)
         if share < 0.3 and name not in scan.images.saturated:
             yield Finding(
-                "usable",
+                "repeat",
                 f"pair {name} shows something else than the others: it measured {share:.0%} of the "
                 "skin that they measured in its view, and no surface is common to both. Possible "
                 "causes: its images are upside down, or another pair's (cables, folders); a wrong pose",
