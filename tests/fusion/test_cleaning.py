@@ -9,6 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from made_bodies import mesh_of
 from ray_cast_scan import Scan, load_rig
 
 from bodyscan.evaluation.surface import signed_distances
@@ -22,7 +23,6 @@ from bodyscan.fusion.cleaning import (
     find_inside,
 )
 from bodyscan.fusion.verdict.coverage import measure_coverage
-from bodyscan.mesh.body import BodyMesh
 from bodyscan.reconstruction.range_image import RangeImage
 
 NOISE_MM = 0.3
@@ -120,16 +120,8 @@ def test_what_is_cut_to_the_volume_is_cleaned_and_checked_alike(
         np.testing.assert_array_equal(one.sigma_mm[other.part], other.sigma_mm)
         assert one.valid.sum() == other.valid.sum()
     vertices, faces = scan.truth.vertices, scan.truth.faces
-    none = np.zeros(vertices.shape)
-    mesh = BodyMesh(
-        vertices,
-        faces,
-        none.astype(np.float32),
-        none.astype(np.uint8),
-        none[:, 0].astype(np.float32),
-        np.zeros(len(faces), bool),
-    )
-    checks = [measure_coverage(mesh, images, there) for images in (cleaned, alike)]
+    body = mesh_of(vertices, faces)
+    checks = [measure_coverage(body, images, there) for images in (cleaned, alike)]
     assert len(checks[0].yields) == len(cleaned)
     assert checks[0].yields == checks[1].yields
     first = scan.range_images[0]

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import open3d as o3d
 import pytest
+from made_bodies import cloud_of
 from ray_cast_scan import looking, nominal_camera
 
 from bodyscan.arrays import Array, Mask
@@ -160,13 +161,7 @@ def head(seen: Callable[[Array], Mask], noise_mm: float = 0.1, tilt: float = 0.0
     points = points + noise_mm * rng.normal(size=(count, 1)) * ways
     normals = ways + tilt * rng.normal(size=(count, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    return BodyCloud(
-        points,
-        normals.astype(np.float32),
-        np.full(count, 0.1, np.float32),
-        np.full((count, 3), 128, np.uint8),
-        np.ones(count, np.uint8),
-    )
+    return cloud_of(points, normals)
 
 
 def unknown_mm(cloud: BodyCloud) -> float:

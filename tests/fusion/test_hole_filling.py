@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from made_bodies import cloud_of
 from ray_cast_scan import looking, nominal_camera
 
 from bodyscan.arrays import Array
@@ -27,17 +28,6 @@ from bodyscan.mesh.topology import compute_topology
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.rig.pair import NominalPose
 from bodyscan.settings import MeshSettings
-
-
-def cloud_of(points: np.ndarray, normals: np.ndarray) -> BodyCloud:
-    count = len(points)
-    return BodyCloud(
-        np.ascontiguousarray(points, np.float64),
-        np.ascontiguousarray(normals, np.float32),
-        np.full(count, 0.1, np.float32),
-        np.full((count, 3), 128, np.uint8),
-        np.ones(count, np.uint8),
-    )
 
 
 def ball(centre: tuple[float, float, float], radius: float, count: int) -> BodyCloud:

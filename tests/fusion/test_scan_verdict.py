@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import open3d as o3d
 import pytest
-from ray_cast_scan import Truth, cast_scan, load_body, load_rig, nominal_placings, without
+from ray_cast_scan import Truth, cast_scan, load_body, load_rig, nominal_placings
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.errors import ScanFailed
@@ -46,18 +46,6 @@ def joined(*truths: Truth) -> Truth:
     return Truth(
         np.concatenate([truth.vertices for truth in truths]),
         np.concatenate([t.faces + start for t, start in zip(truths, starts, strict=False)]),
-    )
-
-
-def bar(start: list[float], end: list[float], radius: float) -> Truth:
-    """A round bar between two places."""
-    made = o3d.geometry.TriangleMesh.create_cylinder(radius, 1.0, resolution=40)
-    way = np.subtract(end, start)
-    vertices = np.asarray(made.vertices) * [1.0, 1.0, np.linalg.norm(way)]
-    turn = o3d.geometry.get_rotation_matrix_from_axis_angle([-np.pi / 2, 0.0, 0.0])
-    assert np.allclose(way / np.linalg.norm(way), turn @ [0.0, 0.0, 1.0])  # along y alone
-    return Truth(
-        vertices @ turn.T + np.asarray(start) + way / 2, np.asarray(made.triangles).astype(np.int64)
     )
 
 
@@ -267,22 +255,6 @@ def test_what_no_camera_of_the_rig_could_see_is_no_reason_to_repeat(
     assert "one side only was seen" in said(scan)
     assert "of the surface is filled" not in said(scan)
     assert "stature" not in said(scan)
-
-
-def test_hair_that_gives_no_data(images: list[RangeImage]) -> None:
-    placed = placings()
-    bald = [without(image, placed[image.pair], 1500.0, 2000.0) for image in images]
-    scan = fused(bald, settings=NOT_FOLLOWED)
-    assert scan.verdict.grade == "usable"
-    assert "the stature is a guess" in said(scan)
-
-
-def test_a_hand_that_touches_the_hip(person: Truth) -> None:
-    touching = joined(person, bar([-10.0, 120.0, 850.0], [-10.0, 400.0, 850.0], 25.0))
-    scan = fused(photographed(touching), settings=NOT_FOLLOWED)
-    assert scan.verdict.grade == "usable"
-    assert "the left arm touches the trunk" in said(scan)
-    assert "right arm" not in said(scan)
 
 
 def test_the_calibration_of_another_rig(images: list[RangeImage]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import open3d as o3d
 import pytest
+from made_bodies import cloud_of
 
 from bodyscan.fusion.support import Support, fit_to_points, measure_support
 from bodyscan.mesh.body import BodyCloud
@@ -12,17 +13,6 @@ from bodyscan.mesh.topology import vertex_normals
 
 REACH_MM = 4.0
 UP = np.array([0.0, 0.0, 1.0])
-
-
-def cloud_of(points: np.ndarray, normals: np.ndarray, sigma_mm: float = 0.1) -> BodyCloud:
-    count = len(points)
-    return BodyCloud(
-        points.astype(float),
-        np.broadcast_to(normals, points.shape).astype(np.float32),
-        np.full(count, sigma_mm, np.float32),
-        np.full((count, 3), 128, np.uint8),
-        np.ones(count, np.uint8),
-    )
 
 
 def sheet(spacing: float = 1.3, size: int = 20) -> np.ndarray:

@@ -21,13 +21,13 @@ from scipy.spatial import cKDTree
 
 from bodyscan.alignment.icp import Alignment, align
 from bodyscan.arrays import Array
-from bodyscan.motion.body_parts import PARTS, name_parts
+from bodyscan.motion.body_parts import PARTS
 from bodyscan.motion.breath import breath_along_normals
 from bodyscan.motion.estimation import (
     EstimatedMotion,
     estimate_motion,
 )
-from bodyscan.motion.person_motion import PartMotion, PersonMotion
+from bodyscan.motion.person_motion import PersonMotion
 from bodyscan.motion.warping import warp_to_middle
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.settings import AlignmentSettings
@@ -125,35 +125,6 @@ def test_a_pair_has_seen_what_faces_it_and_not_what_faces_away(
         # A cell's points face as it does, but a cell of a hand may have points of its other side.
         assert 0.1 < seen.mean() < 0.3
         assert seen[facing < -0.2].mean() < 0.01
-
-
-def test_who_needs_a_part_better_is_told_so() -> None:
-    parts = PartMotion("trunk", 3.0, 0.1, 0.2), PartMotion("left arm", 8.6, 0.4, 0.5)
-    person = PersonMotion(parts, None, 900.0)
-    assert person.summary == (
-        "moved 9 mm while being scanned; corrected to 0.29 mm; repeat if you need the left arm "
-        "(0.4 mm)"
-    )
-    assert "repeat" not in replace(person, parts=parts[:1]).summary
-
-
-def test_parts_are_named_whichever_way_a_person_faces(
-    standing: LivingScan, found: tuple[Alignment, Alignment, EstimatedMotion | None]
-) -> None:
-    _, _, followed = found
-    assert followed is not None
-    cells = followed.cells
-    turned = replace(
-        cells,
-        centres=cells.centres * [-1.0, -1.0, 1.0],
-        normals=cells.normals * [-1.0, -1.0, 1.0],
-    )
-    for one in (cells, turned):
-        part, way = name_parts(one), np.sign(one.centres @ [0.0, 1.0, 0.0])
-        left = part == PARTS.index("left arm")
-        assert abs(np.mean(way[left]) - (1.0 if one is cells else -1.0)) < 0.01
-        head = part == PARTS.index("head")
-        assert one.centres[head, 2].min() > one.centres[part == 0, 2].mean()
 
 
 def test_without_a_trunk_there_is_no_breath(

@@ -57,7 +57,7 @@ def exchanged(first: int, second: int) -> Change:
     return change
 
 
-def replaced(place: int, by: int | str) -> Change:
+def replaced(place: int | slice, by: int | str) -> Change:
     def change(images: Images) -> None:
         images["coded"][place] = images[by] if isinstance(by, str) else images["coded"][by]
 
@@ -70,11 +70,6 @@ def plain_gray() -> Read:
 
 
 @pytest.fixture(scope="module")
-def binary() -> Read:
-    return rendered(code="binary")
-
-
-@pytest.fixture(scope="module")
 def section() -> Read:
     return rendered(code="light-section")
 
@@ -84,34 +79,11 @@ def phase() -> Read:
     return rendered(code="phase-shift", steps=4, period=8)
 
 
-def test_exchanged_bits_without_inverses_are_refused(plain_gray: Read) -> None:
-    with pytest.raises(DecodingFailed, match="frames are exchanged") as caught:
-        plain_gray(exchanged(1, 3))
-    assert caught.value.where == "pair a"
-
-
 @pytest.mark.parametrize("bit", range(6))
 def test_a_missing_pattern_without_inverse_is_noticed(plain_gray: Read, bit: int) -> None:
-    with pytest.raises(DecodingFailed, match="do not make a stripe code"):
+    with pytest.raises(DecodingFailed, match="do not make a stripe code") as caught:
         plain_gray(replaced(bit, "dark"))
-
-
-def test_a_pattern_exposed_otherwise_is_named(plain_gray: Read) -> None:
-    def brighter(images: Images) -> None:
-        images["coded"][2] = np.minimum(images["coded"][2].astype(int) * 2, 255)
-
-    with pytest.raises(DecodingFailed, match="the pattern of bit 2 is brighter than the lit frame"):
-        plain_gray(brighter)
-
-
-@pytest.mark.parametrize(("one", "other"), [(0, 1), (2, 5)])
-def test_exchanged_bits_of_the_plain_code_are_refused(binary: Read, one: int, other: int) -> None:
-    def change(images: Images) -> None:
-        exchanged(one, other)(images)
-        exchanged(6 + one, 6 + other)(images)
-
-    with pytest.raises(DecodingFailed, match=r"frames are exchanged|look alike"):
-        binary(change)
+    assert caught.value.where == "pair a"
 
 
 @pytest.mark.parametrize(("one", "other"), [(10, 30), (5, 50)])
@@ -125,19 +97,8 @@ def test_images_of_a_sweep_that_are_missing_or_double_are_named(section: Read) -
         section(replaced(25, "dark"))
     with pytest.raises(DecodingFailed, match="stripe 26 shows no line"):
         section(replaced(26, 25))
-
-
-def test_a_sweep_that_is_dark_or_too_bright_is_refused(section: Read) -> None:
-    def dark(images: Images) -> None:
-        images["coded"][:] = images["dark"]
-
-    def bright(images: Images) -> None:
-        images["coded"] = np.minimum(images["coded"].astype(int) * 3, 255).astype(np.uint8)
-
     with pytest.raises(DecodingFailed, match="lights only"):
-        section(dark)
-    with pytest.raises(DecodingFailed, match="saturated"):
-        section(bright)
+        section(replaced(slice(None), "dark"))
 
 
 @pytest.mark.parametrize("order", [[2, 1, 0, 3], [0, 2, 1, 3], [3, 2, 1, 0], [1, 2, 3, 0]])
@@ -147,13 +108,6 @@ def test_phase_images_in_another_order_are_refused(phase: Read, order: list[int]
 
     with pytest.raises(DecodingFailed, match="the phase does not match the Gray code"):
         phase(change)
-
-
-def test_phase_images_that_are_missing_or_double_are_named(phase: Read) -> None:
-    with pytest.raises(DecodingFailed, match="phase images 1 and 2 look alike"):
-        phase(replaced(-2, -3))
-    with pytest.raises(DecodingFailed, match="phase image 3 is 0% as bright as lit"):
-        phase(replaced(-1, "dark"))
 
 
 def test_a_wrong_period_is_noticed(phase: Read) -> None:

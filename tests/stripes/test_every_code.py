@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from stripe_rendering import Field, checkered, code_light, render
+from stripe_rendering import Field, boundary_errors, checkered, code_light, render, robust, wavy
 
 from bodyscan.arrays import Array, Bytes, Indices
 from bodyscan.geometry.light_planes import Axis
@@ -39,13 +39,6 @@ def spec_of(code: Code, stripes: int, direction: Axis = "horizontal") -> StripeC
     return parse_stripe_code({**code, "stripes": stripes, "direction": direction})
 
 
-def wavy(stripe_px: float) -> Field:
-    def s_at(u: Array | Indices, v: Array | Indices) -> Array:
-        return 3.3 + (v + 0.1 * u + 2.5 * np.sin(u / 23) + 1.5 * np.sin(v / 31)) / stripe_px
-
-    return s_at
-
-
 def captured(
     code: Code, s_at: Field, stripes: int, **scene: Any
 ) -> tuple[Bytes, Bytes, Bytes, Array]:
@@ -65,17 +58,6 @@ def read(code: Code, images: tuple[Bytes, Bytes, Bytes, Array], stripes: int) ->
 
 def rms(values: Array) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
-
-
-def robust(errors: Array) -> float:
-    return np.median(np.abs(errors)) / 0.6745
-
-
-def boundary_errors(seen: StripeMap, s_at: Field) -> Array:
-    """How far boundaries lie from where they should be, across the stripes, px."""
-    u, v = seen.boundary_pixels.T
-    slope = s_at(u, v + 0.5) - s_at(u, v - 0.5)
-    return (s_at(u, v) - seen.boundary_index) / slope
 
 
 # Noise of 1 in 180 grey levels, stripes of 2.2 px blurred by 0.25 stripes and 0.6 px. Tolerances

@@ -111,22 +111,9 @@ BROKEN = {
         (("00-07-00", "00-06-00"), ("00-07-01", "00-06-01")),
         said="frames are exchanged",
     ),
-    "coarsest bits exchanged": Broken(
-        (("00-10-00", "00-09-00"), ("00-10-01", "00-09-01")),
-        said="frames are exchanged",
-    ),
-    "finest bits exchanged": Broken(
-        (("00-01-00", "00-00-00"), ("00-01-01", "00-00-01")), said="bit"
-    ),
     "pattern exchanged with another bit's": Broken(
         (("00-08-00", "00-05-00"),),
         said="bit 2 is faint where finer ones are clear",
-    ),
-    "pattern exchanged with its inverse": Broken(
-        (("00-06-00", "00-06-01"),), said="frames are exchanged"
-    ),
-    "inverse taken twice": Broken(
-        copied=(("00-04-00", "00-04-01"),), said="bit 6"
     ),
     "first bit lost, the others moved up": Broken(
         copied=tuple(

@@ -231,30 +231,16 @@ def changed(change: str, coded: np.ndarray) -> np.ndarray:
         order[3:6] = [3, 5, 4]
     elif change == "waves":
         order = [3, 4, 5, 0, 1, 2]
-    elif change == "twice":
-        order[1] = 0
     result: np.ndarray = coded[order].copy()
-    if change == "black":
-        result[1] = 0
     return result
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        ("exchanged", "agree at only"),
-        ("reversed", "agree at only"),
-        ("waves", "agree at only"),
-        ("twice", "images 0 and 1 of the wave of 20 stripes look alike"),
-        ("black", "check whether one of them is missing, or was exposed differently"),
-    ],
-)
-def test_images_in_another_order_are_refused(change: str, said: str) -> None:
+@pytest.mark.parametrize("change", ["exchanged", "reversed", "waves"])
+def test_images_in_another_order_are_refused(change: str) -> None:
     lit, coded, _ = captured(HIERARCHICAL)
-    with pytest.raises(DecodingFailed) as refused:
+    with pytest.raises(DecodingFailed, match="agree at only"):
         read(HIERARCHICAL, lit, changed(change, coded))
-    assert said in str(refused.value)
 
 
 def test_wrong_periods_are_refused() -> None:

@@ -179,12 +179,6 @@ def test_a_pattern_with_the_inverse_of_another_bit_is_refused() -> None:
         check_pairs(patterns[1:], np.vstack([inverses[:1], inverses[2:]]))
 
 
-def test_a_pattern_that_is_its_own_inverse_is_refused() -> None:
-    patterns, inverses = frame_pairs()
-    with pytest.raises(DecodingFailed, match="bit 5 look alike"):
-        check_pairs(patterns, np.vstack([inverses[:5], patterns[5:]]))
-
-
 def test_the_finest_bits_may_be_blurred_to_an_even_grey() -> None:
     patterns, inverses = frame_pairs(b5=0.0)
     patterns[5] += np.random.default_rng(0).normal(0.0, 0.5, UP.shape).astype(np.float32)

@@ -7,22 +7,21 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from stripe_rendering import Field, Sequence, checkered, decode_gray, render_sequence
+from stripe_rendering import (
+    Sequence,
+    boundary_errors,
+    checkered,
+    decode_gray,
+    render_sequence,
+    robust,
+    wavy,
+)
 
-from bodyscan.arrays import Array, Bytes, Indices
+from bodyscan.arrays import Array, Bytes
 from bodyscan.boards.detection import find_boards
 from bodyscan.geometry.light_planes import Axis
 from bodyscan.rig.board import Board
 from bodyscan.stripes.stripe_map import StripeMap
-
-
-def wavy(stripe_px: float, *, slant: float = 0.1, first: float = 3.3) -> Field:
-    """A smooth, uneven field of s with stripes about `stripe_px` wide."""
-
-    def s_at(u: Array | Indices, v: Array | Indices) -> Array:
-        return first + (v + slant * u + 2.5 * np.sin(u / 23) + 1.5 * np.sin(v / 31)) / stripe_px
-
-    return s_at
 
 
 def read(sequence: Sequence, stripes: int, direction: Axis = "horizontal") -> StripeMap:
@@ -34,17 +33,6 @@ def read(sequence: Sequence, stripes: int, direction: Axis = "horizontal") -> St
 
 def contrast(sequence: Sequence) -> Bytes:
     return cv2.subtract(sequence.lit, sequence.dark)
-
-
-def boundary_errors(seen: StripeMap, s_at: Field) -> Array:
-    """How far boundaries lie from where they should be, across the stripes, px."""
-    u, v = seen.boundary_pixels.T
-    slope = s_at(u, v + 0.5) - s_at(u, v - 0.5)
-    return (s_at(u, v) - seen.boundary_index) / slope
-
-
-def robust(errors: Array) -> float:
-    return np.median(np.abs(errors)) / 0.6745
 
 
 # Tolerances are about 1.5 times what was measured, with noise of 1 in 180 grey levels.

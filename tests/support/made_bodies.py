@@ -6,8 +6,20 @@ import numpy as np
 import open3d as o3d
 
 from bodyscan.arrays import Array, Indices
-from bodyscan.mesh.body import BodyMesh
+from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.mesh.topology import vertex_normals
+
+
+def cloud_of(points: np.ndarray, normals: np.ndarray, sigma_mm: float = 0.1) -> BodyCloud:
+    """Grey points (N, 3) with normals (N, 3) or (3,), each seen by one pair."""
+    count = len(points)
+    return BodyCloud(
+        np.ascontiguousarray(points, np.float64),
+        np.broadcast_to(normals, points.shape).astype(np.float32),
+        np.full(count, sigma_mm, np.float32),
+        np.full((count, 3), 128, np.uint8),
+        np.ones(count, np.uint8),
+    )
 
 
 def mesh_of(vertices: np.ndarray, faces: np.ndarray, filled: np.ndarray | None = None) -> BodyMesh:

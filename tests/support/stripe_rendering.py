@@ -32,6 +32,26 @@ class Sequence:
 Field = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
+def wavy(stripe_px: float, *, slant: float = 0.1, first: float = 3.3) -> Field:
+    """A smooth, uneven field of s with stripes about `stripe_px` wide."""
+
+    def s_at(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        return first + (v + slant * u + 2.5 * np.sin(u / 23) + 1.5 * np.sin(v / 31)) / stripe_px
+
+    return s_at
+
+
+def boundary_errors(seen: StripeMap, s_at: Field) -> np.ndarray:
+    """How far boundaries lie from where they should be, across the stripes, px."""
+    u, v = seen.boundary_pixels.T
+    slope = s_at(u, v + 0.5) - s_at(u, v - 0.5)
+    return (s_at(u, v) - seen.boundary_index) / slope
+
+
+def robust(errors: np.ndarray) -> float:
+    return float(np.median(np.abs(errors))) / 0.6745
+
+
 def white(u: np.ndarray, v: np.ndarray) -> np.ndarray:
     return np.ones_like(u)
 
