@@ -37,7 +37,6 @@ class SheetsFit:
     model: its name in `held_out`.
     held_out: figures of all models tried, simplest first.
     rms_mm: distance of boundary points from their sheets, robustly weighted RMS.
-    board_error_mm: estimated error of the boards' poses, from the held-out distances.
     board_counts: number of boards on which each boundary was found, (S + 1,).
     """
 
@@ -45,7 +44,6 @@ class SheetsFit:
     model: str
     held_out: tuple[HeldOutModel, ...]
     rms_mm: float
-    board_error_mm: float
     board_counts: Indices
 
     @property
@@ -106,7 +104,7 @@ def fit_light_sheets(bins: BoundaryPoints, stripes: int, direction: Axis) -> She
         fit = fit_planes(bins, error)
         sheets = fit.planes
     return SheetsFit(
-        sheets, candidates[chosen].name, figures, fit.rms_mm, error, count_boards(bins, stripes)
+        sheets, candidates[chosen].name, figures, fit.rms_mm, count_boards(bins, stripes)
     )
 
 

@@ -14,7 +14,7 @@ weights: Triggs et al., Bundle Adjustment - A Modern Synthesis, 2000, section 3.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Generic, Literal, TypeVar
@@ -130,11 +130,6 @@ class Solution(Generic[State]):
         """Covariance (P, P) of the unknowns, with the residuals' spread as their noise."""
         parts = zip(self.blocks, self.weights, self.scales, strict=True)
         return invert_scaled(_equations(parts, self.unknowns)[0])
-
-    def normal(self, kinds: Collection[Noise]) -> Array:
-        """Normal matrix (P, P), J^T W J over variances, of the blocks of these kinds alone."""
-        parts = zip(self.blocks, self.weights, self.scales, strict=True)
-        return _equations([part for part in parts if part[0].noise in kinds], self.unknowns)[0]
 
     @property
     def variance(self) -> float:

@@ -13,11 +13,11 @@ import numpy as np
 
 from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import BoardShape, LocatedView, apply_shape, corner_keys
+from bodyscan.calibration.camera import CORNERS
 from bodyscan.calibration.model_selection import MIN_GAIN, ResidualPair, gain
 from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
 from bodyscan.outcome import Outcome
 from bodyscan.registration.joint_solve import (
-    CORNERS,
     JointSolution,
     refine_solution,
     reprojection_errors,

@@ -21,11 +21,12 @@ from bodyscan.calibration.board_views import (
     apply_shape,
     max_displacement_mm,
 )
+from bodyscan.calibration.camera import CORNERS
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance
-from bodyscan.registration.joint_solve import CORNERS, reprojection_errors, view_sigmas
+from bodyscan.registration.joint_solve import reprojection_errors, view_sigmas
 from bodyscan.registration.view_graph import Target
 
 

@@ -15,13 +15,11 @@ import numpy as np
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.calibration.board_views import BoardShape, LocatedView, apply_shape
-from bodyscan.calibration.camera import camera_prior
+from bodyscan.calibration.camera import CORNERS, camera_prior
 from bodyscan.geometry.camera import MATRIX, Camera, CameraPrior
 from bodyscan.geometry.least_squares import EXACT, Block, Noise, minimize
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 from bodyscan.registration.view_graph import Target
-
-CORNERS = Noise("corners", group=2, cauchy=4.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,23 +162,17 @@ def _blocks(
         each = np.full(len(columns), 2) if solution.shapes else lengths
         yield Block(residuals, jacobian, columns, noise, sigma, runs=each)
     for name, parameters in unknowns.of_camera.items():
-        yield from camera_priors(solution.cameras[name], parameters)
+        camera = solution.cameras[name]
+        if camera.prior is None:
+            # Around the current values: no gradient, but it keeps what no view shows from running away.
+            known = np.diag(1.0 / camera.prior_sigmas[: len(MATRIX)])
+            matrix = parameters[: len(MATRIX)]
+            yield Block(np.zeros(len(MATRIX)), partial(np.asarray, known), matrix, EXACT)
+        yield camera_prior(camera, parameters)
     for name, shape in solution.shapes.items():
         known = shape.prior()
         deviation = known @ shape.offsets.ravel()
         yield Block(deviation, partial(np.asarray, known), unknowns.of_corners[name].ravel(), EXACT)
-
-
-def camera_priors(camera: Camera, columns: Indices) -> Iterator[Block]:
-    """Yield the priors on a camera whose parameters have those columns.
-
-    Its prior, or one on its matrix around the current values, which has no gradient but keeps
-    what no view shows from running away; and the lens as in `lens_prior`.
-    """
-    if camera.prior is None:
-        known = np.diag(1.0 / camera.prior_sigmas[: len(MATRIX)])
-        yield Block(np.zeros(len(MATRIX)), lambda: known, columns[: len(MATRIX)], EXACT)
-    yield camera_prior(camera, columns)
 
 
 def _take_columns(linearize: Callable[[], Array], first: int, count: int) -> Array:

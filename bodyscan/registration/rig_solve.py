@@ -18,7 +18,7 @@ from bodyscan.arrays import Array
 from bodyscan.boards.view import ViewKey
 from bodyscan.calibration.board_views import BoardShape, LocatedView, PlanarView, apply_shape
 from bodyscan.calibration.boundary_points import BoardBoundaries, StripedView
-from bodyscan.calibration.camera import LensTrial, locate_board
+from bodyscan.calibration.camera import CORNERS, LensTrial, locate_board
 from bodyscan.calibration.pair import LocatedPair, PairCalibration
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform
@@ -30,7 +30,7 @@ from bodyscan.registration.cluster_covariance import (
     cluster_robust_covariance,
     normal_equations,
 )
-from bodyscan.registration.joint_solve import CORNERS, JointSolution, solve_poses
+from bodyscan.registration.joint_solve import JointSolution, solve_poses
 from bodyscan.registration.rig_calibration import ObservedCorners
 from bodyscan.registration.rig_frame import (
     frame_board_turn,

@@ -227,7 +227,7 @@ def test_boundaries_between_two_stripes_count_and_not_those_at_the_pictures_ends
     seen = np.array([3, 0, 1, 2, 0, 0, 3, 0, 0, 1, 2])
 
     def count(sheets: LightPlanes | LensSheets) -> int:
-        return SheetsFit(sheets, "", (), 0.1, 0.0, seen).stripes_calibrated
+        return SheetsFit(sheets, "", (), 0.1, seen).stripes_calibrated
 
     assert count(LightPlanes(planes, np.zeros((11, 4, 4)), "vertical")) == 3
     assert count(PINHOLE) == 4
