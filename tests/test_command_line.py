@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import json
 import os
+import re
 import runpy
 import subprocess
 import sys
@@ -14,7 +15,8 @@ from pathlib import Path
 import pytest
 
 from bodyscan.cli.main import app, main
-from bodyscan.cli.options import SHARED
+from bodyscan.jobs.pipeline import load_pipeline
+from bodyscan.rig.rig import load_rig
 from bodyscan.settings import ExportSettings, RigExportSettings, ScanSettings
 
 RIGS = Path(__file__).parents[1] / "rigs"
@@ -103,12 +105,6 @@ def test_commands_stand_in_three_groups(bodyscan: Command) -> None:
     assert "--install-completion" in said
 
 
-@pytest.mark.parametrize("name", COMMANDS)
-def test_every_command_takes_the_shared_options(name: str) -> None:
-    own = parameters(name)
-    assert [own[shared.name] for shared in SHARED] == SHARED
-
-
 def test_defaults_are_those_of_the_settings() -> None:
     scan = ScanSettings()
     assert parameters("scan")["points"].default == scan.fusion.points
@@ -193,3 +189,15 @@ def test_rows_of_a_summary_are_not_forgotten_unasked(tmp_path: Path, bodyscan: C
     done = bodyscan("forget", "mallow", "--workspace", tmp_path)
     assert (done.returncode, "--yes" in done.stderr) == (2, True)
     assert "mallow" in (tmp_path / "summary.csv").read_text()
+
+
+def test_a_new_folder_has_a_rig_and_the_first_commands(tmp_path: Path, bodyscan: Command) -> None:
+    made = bodyscan("init", tmp_path / "new", "--rig", "one-pair")
+    assert made.returncode == 0, made.stderr
+    assert load_rig(tmp_path / "new" / "rig.yaml").name == "one-pair"
+    assert load_pipeline(tmp_path / "new" / "fuse.yaml").kind == "fuse"
+    text = (tmp_path / "new" / "first-commands.txt").read_text("utf-8")
+    typed = re.findall(r"^    bodyscan (\S+)", text, re.MULTILINE)
+    assert {"simulate", "check", "calibrate-rig", "scan", "batch"} <= set(typed) <= set(COMMANDS)
+    again = bodyscan("init", tmp_path / "new")
+    assert (again.returncode, "holds rig.yaml" in again.stderr) == (2, True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -17,6 +17,7 @@ from bodyscan.cli.options import (
     OverwriteCalibration,
     RigFile,
 )
+from bodyscan.errors import BadInput
 from bodyscan.files.messages import require_writable
 from bodyscan.settings import RigExportSettings
 
@@ -29,6 +30,7 @@ PANEL = "Builder: calibrate a rig"
 def register(app: typer.Typer) -> None:
     """Add these commands to the command line, in the order in which a rig needs them."""
     for command in (
+        init,
         check,
         patterns,
         calibrate_rig,
@@ -40,6 +42,35 @@ def register(app: typer.Typer) -> None:
         export_rig,
     ):
         add_command(app, PANEL, command)
+
+
+def init(
+    output: Output,
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder to write into.")],
+    rig: Annotated[
+        Literal["three-pole-12", "four-pole-16", "one-pair"],
+        typer.Option(help="The example that becomes rig.yaml."),
+    ] = "three-pole-12",
+) -> None:
+    """Write an example rig file, pipelines, a body to simulate, and the first commands to type."""
+    from importlib.resources import files
+
+    from bodyscan.files.atomic import write_bytes
+
+    own = ("first-commands.txt", "fuse.yaml", "calibrate.yaml", "woman_average.ply")
+    sources = {"rig.yaml": f"{rig}.yaml"} | {name: name for name in own}
+    require_writable(folder)
+    there = [name for name in sources if (folder / name).exists()]
+    if there:
+        raise BadInput(
+            f"holds {', '.join(there)} already, which would be replaced",
+            where=str(folder),
+            remedy="give another folder",
+        )
+    for name, source in sources.items():
+        write_bytes(folder / name, (files("bodyscan") / "starter" / source).read_bytes())
+    output.add_files("written", *(folder / name for name in sources))
+    output.say(f"read {folder / 'first-commands.txt'}: what to type, in order")
 
 
 def check(output: Output, rig_file: RigFile) -> None:
