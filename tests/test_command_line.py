@@ -197,7 +197,6 @@ def test_a_new_folder_has_a_rig_and_the_first_commands(tmp_path: Path, bodyscan:
     assert load_rig(tmp_path / "new" / "rig.yaml").name == "one-pair"
     assert load_pipeline(tmp_path / "new" / "fuse.yaml").kind == "fuse"
     text = (tmp_path / "new" / "first-commands.txt").read_text("utf-8")
-    typed = re.findall(r"^    bodyscan (\S+)", text, re.MULTILINE)
+    typed = re.findall(r"\n    bodyscan (\S+)", text)
     assert {"simulate", "check", "calibrate-rig", "scan", "batch"} <= set(typed) <= set(COMMANDS)
-    again = bodyscan("init", tmp_path / "new")
-    assert (again.returncode, "holds rig.yaml" in again.stderr) == (2, True)
+    assert "holds rig.yaml" in bodyscan("init", tmp_path / "new").stderr
