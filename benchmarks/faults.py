@@ -28,8 +28,8 @@ from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.outcome import Outcome
 from bodyscan.progress import THREADS
 from bodyscan.settings import FusionSettings, MeshSettings, ScanSettings
-from bodyscan.workflows.fuse_range_images import fuse
 from bodyscan.workflows.range_images import reconstruct_range_images
+from bodyscan.workflows.scan_person import fuse
 
 FOLDER = PROJECT / "bench" / "faults"
 RIGS = ("three-pole-12", "four-pole-16")

@@ -20,7 +20,7 @@ from bodyscan.outcome import Outcome
 from bodyscan.progress import THREADS
 from bodyscan.settings import ScanSettings
 from bodyscan.simulation.living import LivingBody
-from bodyscan.workflows.fuse_range_images import fuse
+from bodyscan.workflows.scan_person import fuse
 
 WOMAN, MAN = "woman_average", "man_average"
 THREE, FOUR = "three-pole-12", "four-pole-16"

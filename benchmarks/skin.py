@@ -32,8 +32,8 @@ from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.settings import ScanSettings
 from bodyscan.simulation.body import mask_hair, mask_shorts
 from bodyscan.workflows.evaluate import Truth, load_truth
-from bodyscan.workflows.fuse_range_images import fuse
 from bodyscan.workflows.range_images import reconstruct_range_images
+from bodyscan.workflows.scan_person import fuse
 
 FOLDER = PROJECT / "bench" / "skin"
 LONGER = 6

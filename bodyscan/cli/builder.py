@@ -190,8 +190,7 @@ def check_calibration(
     ],
     calibration: Calibration,
     repair: Annotated[
-        Path | None,
-        typer.Option(help="Folder for a calibration in which the moves are corrected."),
+        Path | None, typer.Option(help="Folder for a calibration in which the moves are corrected.")
     ] = None,
     follow_links: FollowLinks = False,
     overwrite: OverwriteCalibration = False,
@@ -258,7 +257,7 @@ def sigma_map(
     ] = None,
 ) -> None:
     """Map the sigma that the poses of the pairs cause in the scan volume."""
-    from bodyscan.report.sigma_map import write_sigma_map
+    from bodyscan.report.calibration_charts import write_sigma_map
 
     output.add_files("picture", write_sigma_map(calibration, out))
 

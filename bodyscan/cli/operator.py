@@ -64,8 +64,7 @@ def scan(
     ] = DEFAULTS.fusion.points,
     align: Matching = DEFAULTS.alignment.matching,
     empty: Annotated[
-        Path | None,
-        typer.Option(help="Captures of the empty rig; whatever they show is removed."),
+        Path | None, typer.Option(help="Captures of the empty rig; whatever they show is removed.")
     ] = None,
     changes: Changes = None,
     follow_links: FollowLinks = False,

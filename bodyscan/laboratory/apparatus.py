@@ -260,11 +260,7 @@ class ChapterCaptures:
 
 
 def take_captures(
-    setup: ChapterSetup,
-    *,
-    boards: int = 3,
-    stage_stops: int = 7,
-    progress: Progress = silent,
+    setup: ChapterSetup, *, boards: int = 3, stage_stops: int = 7, progress: Progress = silent
 ) -> ChapterCaptures:
     """Render, expose and decode everything. Raises BoardNotFound if a board is not found."""
     readings = stage_readings(stage_stops)

@@ -66,10 +66,10 @@ def calibrate_by_slide_stage(
 
     readings: (shots,) mm, of the stage.
     """
-    middle = (np.array([CAMERA.width, CAMERA.height]) - 1.0) / 2.0
-    tsai = calibrate_tsai(*_stage_points(shots, readings), middle, skewed=skewed)
-    poses = _stage_poses(tsai.camera_from_points, readings)
-    return locate_boundaries(shots, tsai.camera(CAMERA.width, CAMERA.height), poses)
+    camera, camera_from_stage = calibrate_tsai(
+        *_stage_points(shots, readings), CAMERA.width, CAMERA.height, skewed=skewed
+    )
+    return locate_boundaries(shots, camera, _stage_poses(camera_from_stage, readings))
 
 
 def calibrate_by_matrix(shots: Sequence[StripedShot], readings: Array) -> LocatedBoards:

@@ -16,7 +16,7 @@ is assumed to be the camera's x axis. The pinhole is a 2 x 4 matrix (Bolles et a
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 from scipy.linalg import rq
@@ -33,69 +33,46 @@ from bodyscan.geometry.robust import cauchy_weights, robust_scale
 from bodyscan.geometry.transforms import RigidTransform
 
 
-@dataclass(frozen=True, eq=False)
-class TsaiCamera:
-    """Tsai's camera model.
-
-    focal: px, vertical.
-    aspect: horizontal over vertical focal length.
-    centre: (2,) px.
-    kappa: for coordinates in units of the focal length.
-    camera_from_points: the camera's pose.
-    rms_px: of the residuals.
-    skew: px, gamma of Eq. 1, which Tsai's own model lacks.
-    """
-
-    focal: float
-    aspect: float
-    centre: Array
-    kappa: float
-    camera_from_points: RigidTransform
-    rms_px: float
-    skew: float = 0.0
-
-    def camera(self, width: int, height: int) -> Camera:
-        """Fit the chapter's camera whose radial lens undoes kappa best over the image."""
-        corners = np.array([[0.0, 0.0], [width, 0.0], [0.0, height], [width, height]])
-        scale = np.array([self.focal * self.aspect, self.focal])
-        real = np.linspace(0.0, 1.0, 201)[1:] * np.linalg.norm(
-            (corners - self.centre) / scale, axis=1
-        ).max(initial=0.0)
-        ideal = real * (1.0 + self.kappa * real**2)
-        # Weighted by the radius, as more of the image lies there.
-        rows = np.stack([ideal**3, ideal**5], axis=1) * np.sqrt(real)[:, None]
-        coefficients = np.linalg.lstsq(rows, (real - ideal) * np.sqrt(real), rcond=None)[0]
-        u0, v0 = self.centre.tolist()
-        lens = Radial().with_coefficients(coefficients)
-        alpha = self.focal * self.aspect
-        return Camera(alpha, self.focal, self.skew, u0, v0, lens, width, height)
-
-
 def calibrate_tsai(
-    points: Array, pixels: Array, centre: Array, *, skewed: bool = False
-) -> TsaiCamera:
-    """Calibrate from points (N, 3) mm, not in one plane, their pixels (N, 2) and a rough centre
-    (2,).
+    points: Array, pixels: Array, width: int, height: int, *, skewed: bool = False
+) -> tuple[Camera, RigidTransform]:
+    """Calibrate from points (N, 3) mm, not in one plane, and their pixels (N, 2): the chapter's camera
+    whose radial lens is nearest to Tsai's, and camera_from_points.
 
-    skewed: estimate a skew as well.
+    skewed: estimate a skew as well, which Tsai's own model lacks.
 
     The centre is chosen where radial alignment is best (Lenz and Tsai 1988), then everything is
     refined.
     """
 
-    def misalignment(pose: Array) -> Array:
-        return _solve_alignment(points, pixels - pose)[1]
+    def misalignment(centre: Array) -> Array:
+        return _solve_alignment(points, pixels - centre)[1]
 
-    found = least_squares(misalignment, centre).x
-    rotation, across, aspect = _align(points, pixels - found)
-    focal, depth = _focal_and_depth(points, pixels - found, rotation, across)
+    centre = least_squares(misalignment, (np.array([width, height]) - 1.0) / 2.0).x
+    rotation, across, aspect = _align(points, pixels - centre)
+    focal, depth = _focal_and_depth(points, pixels - centre, rotation, across)
     turn = RigidTransform(rotation, np.zeros(3)).rotation_vector
-    start = np.array([*turn, *across, depth, focal, aspect, *found, 0.0, *[0.0] * skewed])
-    solved = least_squares(_residuals, start, x_scale="jac", args=(points, pixels))
-    pose = RigidTransform.from_rotation_vector(solved.x[:3], solved.x[3:6])
-    focal, aspect, u0, v0, kappa, *skew = solved.x[6:].tolist()
-    rms = float(np.sqrt(2.0 * np.mean(solved.fun**2)))
-    return TsaiCamera(focal, aspect, np.array([u0, v0]), kappa, pose, rms, *skew)
+    start = np.array([*turn, *across, depth, focal, aspect, *centre, 0.0, *[0.0] * skewed])
+    solved = least_squares(_residuals, start, x_scale="jac", args=(points, pixels)).x
+    focal, aspect, u0, v0, kappa, *skew = solved[6:].tolist()
+    camera = Camera(
+        focal * aspect, focal, skew[0] if skew else 0.0, u0, v0, Radial(), width, height
+    )
+    lens = Radial().with_coefficients(_undo_kappa(camera, kappa))
+    pose = RigidTransform.from_rotation_vector(solved[:3], solved[3:6])
+    return replace(camera, lens=lens), pose
+
+
+def _undo_kappa(camera: Camera, kappa: float) -> Array:
+    """Fit k1 and k2 (2,) that undo kappa best over the camera's image."""
+    width, height = camera.width, camera.height
+    corners = np.array([[0.0, 0.0], [width, 0.0], [0.0, height], [width, height]])
+    away = (corners - [camera.u0, camera.v0]) / [camera.alpha, camera.beta]
+    real = np.linspace(0.0, 1.0, 201)[1:] * np.linalg.norm(away, axis=1).max(initial=0.0)
+    ideal = real * (1.0 + kappa * real**2)
+    # Weighted by the radius, as more of the image lies there.
+    rows = np.stack([ideal**3, ideal**5], axis=1) * np.sqrt(real)[:, None]
+    return np.linalg.lstsq(rows, (real - ideal) * np.sqrt(real), rcond=None)[0]
 
 
 def _solve_alignment(points: Array, image: Array) -> tuple[Array, Array]:

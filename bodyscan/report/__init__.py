@@ -2,6 +2,6 @@
 
 page holds what a report is made of, and result_page finds what a folder holds. scan_page,
 calibration_page (with calibration_charts) and acceptance_page make their reports. pictures shades
-bodies; charts and sigma_map use Matplotlib; model packs what can be rotated.
+bodies; charts uses Matplotlib; model packs what can be rotated.
 measurements: a table on screen.
 """

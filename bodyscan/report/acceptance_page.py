@@ -8,15 +8,7 @@ from rich.table import Table as ScreenTable
 
 from bodyscan.evaluation.acceptance import ALL, Figure, Readings, grade_acceptance
 from bodyscan.registration.rig_calibration import RigCalibration
-from bodyscan.report.page import (
-    Column,
-    Lines,
-    Numbers,
-    Page,
-    Section,
-    Table,
-    format_value,
-)
+from bodyscan.report.page import Column, Lines, Numbers, Page, Section, Table, format_value
 
 NO_STANDARD = (
     "Modelled on VDI/VDE 2634 parts 2 and 3 and ISO 20685-2; it is no test by these standards, "

@@ -16,7 +16,6 @@ from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.storage import FILE_NAME, calibration_id, load_calibration
 from bodyscan.report import calibration_charts as draw
 from bodyscan.report import charts
-from bodyscan.report.calibration_charts import rig_model
 from bodyscan.report.page import (
     Block,
     Column,
@@ -28,7 +27,6 @@ from bodyscan.report.page import (
     is_synthetic,
     make_sections,
 )
-from bodyscan.report.sigma_map import draw_sigma_map
 
 TITLES = {
     "corners_rms_px": ("corners", "px RMS", "distance of corners from where camera and pose put them."),
@@ -69,7 +67,7 @@ def calibration_page(folder: Path) -> Page:
     failed = [f"failed: {name}: {reason}" for name, reason in calibration.failed.items()]
     notes = (*failed, *(calibration.notes or ("Every image and view was used.",)))
     parts: dict[str, Callable[[], list[Block]]] = {
-        "The rig": lambda: [Viewer("Cameras in the rig frame", model, rig_model(calibration))],
+        "The rig": lambda: [Viewer("Cameras in the rig frame", model, draw.rig_model(calibration))],
         "Pairs": lambda: _pairs(calibration),
         "How well the pairs are connected, and what would help": lambda: [
             Lines(calibration.advice or (f"No advice: {why}.",))
@@ -201,7 +199,7 @@ def _shared_boards(calibration: RigCalibration) -> list[Block]:
 
 def _sigma(calibration: RigCalibration) -> list[Block]:
     try:
-        picture = draw_sigma_map(calibration)
+        picture = draw.sigma_chart(calibration)
     except BadInput as error:
         return [f"There is no map: {error.what}; {error.remedy}."]
     return [

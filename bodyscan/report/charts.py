@@ -96,11 +96,11 @@ def matrix(names: Sequence[str], values: Array, label: str, form: str = ".2f") -
     return svg(figure)
 
 
-def grid_of(count: int, columns: int, cell: tuple[float, float]) -> tuple[Figure, list[Axes]]:
-    """`count` axes in rows of `columns`, each `cell` inches in size; surplus ones are hidden."""
-    rows = -(-count // columns)
-    size = (cell[0] * columns, cell[1] * rows)
-    figure, axes = plt.subplots(rows, columns, figsize=size, constrained_layout=True, squeeze=False)
+def grid_of(count: int) -> tuple[Figure, list[Axes]]:
+    """`count` axes in rows of four; surplus ones are hidden."""
+    rows = -(-count // 4)
+    size = (4 * 2.6, rows * 2.3)  # inches
+    figure, axes = plt.subplots(rows, 4, figsize=size, constrained_layout=True, squeeze=False)
     flat = list(axes.ravel())
     for axis in flat[count:]:
         axis.set_visible(False)

@@ -2,5 +2,5 @@
 
 Calibrating a rig: find_boards (boards, cameras, board poses), decode, calibrate_rig,
 import_rig. Checking it: check_rig, accept_rig, evaluate. Scanning: range_images,
-fuse_range_images, scan_person.
+scan_person.
 """

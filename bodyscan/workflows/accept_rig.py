@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import combinations, product
@@ -75,7 +75,7 @@ def read_captures(
     file: AcceptanceFile,
     progress: Progress = silent,
 ) -> Readings:
-    """Read captured artefacts, one folder a place."""
+    """Read captured artefacts, one folder a place; a shot that fails is listed as a problem."""
     # Open them all before reading the first, so that a wrong folder fails before any work is done.
     sites = [
         (folder, open_scan(calibration.rig, folder), read)
@@ -84,7 +84,13 @@ def read_captures(
     ]
     total = Readings()
     for folder, captures, read in sites:
-        total += read(calibration, captures, folder.name, file, progress)
+        for shot in captures.shots:
+            try:
+                clouds = _clouds(calibration, captures, shot, progress)
+                total += read(file, folder.name, shot, clouds)
+            except BodyscanError as error:
+                problem = "; ".join(filter(None, (error.what, error.remedy)))
+                total += Readings(problems=(f"{folder.name}, {shot}: {problem}",))
     return total
 
 
@@ -124,83 +130,46 @@ _Cloud = tuple[str, Array, Array]
 """The points of all pairs, or of one: its name, points and normals (N, 3), rig frame."""
 
 
-def read_spheres(
-    calibration: RigCalibration,
-    captures: Captures,
-    site: str,
-    file: AcceptanceFile,
-    progress: Progress = silent,
-) -> Readings:
-    """Read every shot of a folder of the spheres at one place."""
+def read_spheres(file: AcceptanceFile, site: str, shot: str, clouds: Sequence[_Cloud]) -> Readings:
+    """Read the spheres at one place in one shot."""
     centres, radius = np.array(file.spheres.centres_mm), file.spheres.radius_mm
+    (_, points, normals), *single = clouds
 
-    def row(shot: str, view: str, k: int, one: artefacts.SphereReading) -> SphereRow:
+    def row(view: str, k: int, one: artefacts.SphereReading) -> SphereRow:
         return SphereRow(site, shot, view, k, one.points, one.form_mm, one.shell_mm, one.size_mm)
 
-    def read(shot: str, clouds: Sequence[_Cloud]) -> Readings:
-        (_, points, normals), *single = clouds
-        near = artefacts.locate_spheres(points, normals, radius, centres)
-        spheres = [artefacts.read_sphere(points, normals, each, radius) for each in near]
-        artefacts.require_spheres(spheres, radius, centres)
-        rows = [row(shot, ALL, k, one) for k, one in enumerate(spheres, start=1)]
-        for (view, points, normals), (k, sphere) in product(single, enumerate(spheres, start=1)):
-            with suppress(BodyscanError):  # this pair does not see it
-                one = artefacts.read_sphere(points, normals, sphere.fitted, radius)
-                rows += [row(shot, view, k, one)] if one.points >= MIN_POINTS else []
-        pairs = combinations(range(1, len(centres) + 1), 2)
-        errors = artefacts.spacing_errors(spheres, centres)
-        spacings = tuple(
-            SpacingRow(site, shot, f"{a}-{b}", float(error))
-            for (a, b), error in zip(pairs, errors, strict=True)
-        )
-        return Readings(tuple(rows), spacings)
-
-    return _each_shot(calibration, captures, site, read, progress)
+    near = artefacts.locate_spheres(points, normals, radius, centres)
+    spheres = [artefacts.read_sphere(points, normals, each, radius) for each in near]
+    artefacts.require_spheres(spheres, radius, centres)
+    rows = [row(ALL, k, one) for k, one in enumerate(spheres, start=1)]
+    for (view, points, normals), (k, sphere) in product(single, enumerate(spheres, start=1)):
+        with suppress(BodyscanError):  # this pair does not see it
+            one = artefacts.read_sphere(points, normals, sphere.fitted, radius)
+            rows += [row(view, k, one)] if one.points >= MIN_POINTS else []
+    pairs = combinations(range(1, len(centres) + 1), 2)
+    errors = artefacts.spacing_errors(spheres, centres)
+    spacings = tuple(
+        SpacingRow(site, shot, f"{a}-{b}", float(error))
+        for (a, b), error in zip(pairs, errors, strict=True)
+    )
+    return Readings(tuple(rows), spacings)
 
 
-def read_plates(
-    calibration: RigCalibration,
-    captures: Captures,
-    site: str,
-    file: AcceptanceFile,
-    progress: Progress = silent,
-) -> Readings:
-    """Read every shot of a folder of the plate at one place."""
+def read_plates(file: AcceptanceFile, site: str, shot: str, clouds: Sequence[_Cloud]) -> Readings:
+    """Read the plate at one place in one shot."""
     width, height = file.plate.size_mm
 
-    def row(shot: str, cloud: _Cloud) -> PlateRow:
-        view, points, normals = cloud
+    def row(view: str, points: Array, normals: Array) -> PlateRow:
         one = artefacts.read_plate(points, normals)
         share = 100.0 * one.area_mm2 / (width * height)
         return PlateRow(site, shot, view, one.points, one.flatness_mm, one.rms_mm, share)
 
-    def read(shot: str, clouds: Sequence[_Cloud]) -> Readings:
-        rows = [row(shot, clouds[0])]
-        for cloud in clouds[1:]:
-            if len(cloud[1]) >= MIN_POINTS:
-                with suppress(BodyscanError):  # this pair sees only an edge of it
-                    rows.append(row(shot, cloud))
-        return Readings(plates=tuple(rows))
-
-    return _each_shot(calibration, captures, site, read, progress)
-
-
-def _each_shot(
-    calibration: RigCalibration,
-    captures: Captures,
-    site: str,
-    read: Callable[[str, Sequence[_Cloud]], Readings],
-    progress: Progress,
-) -> Readings:
-    """Sum `read` over the clouds of every shot; a shot that fails is listed as a problem."""
-    total = Readings()
-    for shot in captures.shots:
-        try:
-            total += read(shot, _clouds(calibration, captures, shot, progress))
-        except BodyscanError as error:
-            problem = "; ".join(filter(None, (error.what, error.remedy)))
-            total += Readings(problems=(f"{site}, {shot}: {problem}",))
-    return total
+    rows = [row(*clouds[0])]
+    for cloud in clouds[1:]:
+        if len(cloud[1]) >= MIN_POINTS:
+            with suppress(BodyscanError):  # this pair sees only an edge of it
+                rows.append(row(*cloud))
+    return Readings(plates=tuple(rows))
 
 
 def _clouds(

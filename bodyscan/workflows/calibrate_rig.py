@@ -185,9 +185,7 @@ def _solve_rig(
 
 
 def _fit_light(
-    solved: _Adjusted,
-    stripes: Outcome[dict[ViewKey, BoardBoundaries]],
-    progress: Progress,
+    solved: _Adjusted, stripes: Outcome[dict[ViewKey, BoardBoundaries]], progress: Progress
 ) -> Outcome[dict[str, PairCalibration]]:
     """Fit the light sheets of each pair whose stripes were decoded, or that has no projector."""
     solution = solved.solution.value

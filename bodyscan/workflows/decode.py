@@ -65,12 +65,7 @@ def decode_sequence(
     def decode(sequence: ImageSequence, projector: StripeCode) -> StripeMap:
         images = read_sequence(sequence, pair.camera, crop=crop, workers=workers)
         return decode_stripes(
-            projector,
-            images.lit,
-            images.dark,
-            images.coded,
-            limits=limits,
-            where=where,
+            projector, images.lit, images.dark, images.coded, limits=limits, where=where
         )
 
     single_direction = pair.projector.model_copy(update={"crossing": None})

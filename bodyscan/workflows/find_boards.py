@@ -39,10 +39,7 @@ from bodyscan.geometry.robust import rms_length
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, attempt_each, map_threads, silent
-from bodyscan.registration.board_checks import (
-    appearance_notes,
-    describe_findings,
-)
+from bodyscan.registration.board_checks import appearance_notes, describe_findings
 from bodyscan.registration.soundness import camera_faults
 from bodyscan.rig.pair import AUTO, Pair
 from bodyscan.rig.rig import Rig
@@ -159,11 +156,7 @@ def _look_closer(
 
 
 def calibrate_cameras(
-    rig: Rig,
-    views: Sequence[BoardView],
-    progress: Progress = silent,
-    *,
-    folder: Path = HERE,
+    rig: Rig, views: Sequence[BoardView], progress: Progress = silent, *, folder: Path = HERE
 ) -> Outcome[dict[str, CameraCalibration]]:
     """Calibrate every pair's camera by itself; those that fail are in `failures`.
 

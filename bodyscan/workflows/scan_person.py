@@ -1,24 +1,50 @@
-"""Scan one person: images to range images, these to a cloud and a mesh; save them with pictures."""
+"""Scan one person: images to range images, these to a cloud and a mesh; save them with pictures.
+
+Range images are cleaned, aligned, merged, judged and meshed.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
 
+import numpy as np
+
+from bodyscan.alignment.icp import align
+from bodyscan.alignment.sway_prior import SwayPrior, select_tighter
 from bodyscan.captures.folder import Captures, ImageSequence, open_scan
 from bodyscan.errors import ScanFailed
+from bodyscan.fusion.cleaning import clean, require_subject
+from bodyscan.fusion.consistency import Contradictions
+from bodyscan.fusion.merging import MergedCloud, merge
+from bodyscan.fusion.meshing import attach_attributes, closed_surface
+from bodyscan.fusion.pose_variance import add_motion_variance, add_pose_variance
+from bodyscan.fusion.regions import label_regions
 from bodyscan.fusion.storage import Made, Origin, Scan, clear, no_use, save_failure, save_scan
+from bodyscan.fusion.verdict import grade_scan
+from bodyscan.fusion.verdict.coverage import measure_coverage
+from bodyscan.fusion.verdict.evidence import ImageEvidence, RigEvidence, ScanEvidence
+from bodyscan.fusion.verdict.overlaps import find_seams
+from bodyscan.fusion.verdict.rig import find_floor, find_misplaced, find_silent_poles
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.mesh.body import BodyCloud, BodyMesh
+from bodyscan.motion.estimation import EstimatedMotion
+from bodyscan.motion.person_alignment import PersonAlignment, align_person
+from bodyscan.motion.person_motion import PersonMotion
+from bodyscan.motion.warping import warp_to_middle
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, background, silent, step
+from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.storage import calibration_id, load_calibration
 from bodyscan.report.pictures import Pictures, draw_pictures, write_pictures
-from bodyscan.settings import ScanSettings
+from bodyscan.settings import AlignmentSettings, FusionSettings, ScanSettings
 from bodyscan.verdict import Announce, say_nothing
-from bodyscan.workflows.fuse_range_images import fuse
 from bodyscan.workflows.range_images import Preparation, Reconstructed, reconstruct_range_images
 
 
@@ -105,3 +131,179 @@ def scan_folder(
             announce(scan.verdict, final=True)
             pictures = write_pictures((each.result() for each in drawn), out)
     return scan, saved, pictures
+
+
+@dataclass(frozen=True, eq=False)
+class _Subject:
+    """Range images that show something of the subject, carried to one moment if it moved.
+
+    rig_from_camera: the pairs' poses after alignment; as calibrated for those that saw nothing.
+    covariance: of these poses.
+    aligned: what alignment found; None if it took no part.
+    """
+
+    images: Sequence[RangeImage]
+    rig_from_camera: dict[str, RigidTransform]
+    covariance: PoseCovariance
+    aligned: PersonAlignment | None = None
+
+    @property
+    def image_poses(self) -> dict[str, RigidTransform]:
+        """Poses of the images' own pairs."""
+        return {image.pair: self.rig_from_camera[image.pair] for image in self.images}
+
+    @property
+    def motion(self) -> EstimatedMotion | None:
+        return self.aligned.motion if self.aligned else None
+
+    @cached_property
+    def person(self) -> PersonMotion | None:
+        return PersonMotion.from_motion(self.motion) if self.motion else None
+
+
+def fuse(
+    calibration: RigCalibration,
+    measured: Outcome[Sequence[RangeImage]],
+    settings: ScanSettings,
+    progress: Progress = silent,
+    *,
+    empty: Sequence[RangeImage] = (),
+    announce: Announce = say_nothing,
+    made: Made = no_use,
+) -> Scan:
+    """Fuse range images of one person, background included, to a body model and mesh.
+
+    measured: with pairs that gave none as failures.
+    empty: as in `clean`.
+    announce: called with the verdict on the points alone, before the mesh is made.
+    made: called with the cloud while the mesh is made, and with the mesh while it is judged.
+
+    Raises ScanFailed if they show no body.
+    """
+    with step(progress, "cleaning"):
+        calibrated, volume = calibration.rig_from_camera, calibration.rig.volume
+        cleaned = clean(measured.value, calibrated, volume, empty=empty)
+        subject = _Subject(require_subject(cleaned), dict(calibrated), calibration.covariance)
+        seeing = {image.pair for image in subject.images}
+        misplaced = find_misplaced(measured.value, seeing, calibrated, volume)
+        measured = replace(measured, failures={**measured.failures, **misplaced})
+    if settings.alignment.matching != "none" and len(subject.images) > 1:
+        with step(progress, "aligning"):
+            subject = _align(subject, calibration, settings.alignment)
+    with step(progress, "merging"):
+        merged = _merge(subject, settings.fusion)
+    with step(progress, "judging"):
+        evidence = ScanEvidence(
+            merged.cloud,
+            RigEvidence.from_calibration(calibration),
+            _image_evidence(calibration, measured, cleaned, subject, merged.contradictions),
+            settings.use,
+            subject.aligned,
+            subject.person,
+        )
+        announce(grade_scan(evidence), final=False)
+    with step(progress, "meshing"):
+        cloud, mesh = _mesh(merged.cloud, measured.value, subject, settings, made)
+        # Also by the images of pairs that saw nothing of the subject.
+        carried = {image.pair: image for image in subject.images}
+        images = [carried.get(image.pair, image) for image in cleaned]
+        coverage = measure_coverage(mesh, images, subject.rig_from_camera, calibration.pairs)
+        verdict = grade_scan(replace(evidence, mesh=mesh, coverage=coverage))
+    return Scan(
+        cloud,
+        mesh,
+        subject.aligned.alignment if subject.aligned else None,
+        {image.pair: int(image.valid.sum()) for image in cleaned},
+        dict(measured.failures),
+        verdict,
+        tuple(subject.images),
+        subject.rig_from_camera,
+        subject.person,
+        measured.notes,
+    )
+
+
+def _align(
+    calibrated: _Subject, calibration: RigCalibration, settings: AlignmentSettings
+) -> _Subject:
+    """Align the images and carry them to one moment."""
+    images, start, boards = calibrated.images, calibrated.rig_from_camera, calibrated.covariance
+    found = align(images, start, boards, settings)
+    aligned = align_person(images, start, found, boards, calibration.rig.poles, settings)
+    rig_from_camera = start | aligned.alignment.rig_from_camera
+    images = warp_to_middle(images, rig_from_camera, aligned.motion)
+    moved, covariance = aligned.alignment.motion_mm, boards
+    if aligned.alignment.covariance is not None:
+        # As the boards left them, if nobody moved; as the overlaps left them, whoever moved.
+        covariance = select_tighter(boards, aligned.alignment.covariance, moved)
+    unaligned = {image.pair for image in images} - moved.keys()
+    covariance = SwayPrior.from_settings(settings).loosen(covariance, unaligned)
+    return _Subject(images, rig_from_camera, covariance, aligned)
+
+
+def _merge(subject: _Subject, settings: FusionSettings) -> MergedCloud:
+    """Merge to one cloud; its sigmas include those of the pairs' poses and the person's motion."""
+    # Following a person fits the pairs to each other: what it leaves between them is not the poses'.
+    poses = None if subject.motion else subject.covariance
+    merged = merge(subject.images, subject.rig_from_camera, settings, poses=poses)
+    cloud = add_pose_variance(merged.cloud, subject.image_poses, subject.covariance)
+    if subject.motion:
+        cloud = add_motion_variance(merged.cloud, cloud, subject.motion)
+    return replace(merged, cloud=cloud)
+
+
+def _image_evidence(
+    calibration: RigCalibration,
+    measured: Outcome[Sequence[RangeImage]],
+    cleaned: Sequence[RangeImage],
+    subject: _Subject,
+    contradictions: Contradictions,
+) -> ImageEvidence:
+    poles = calibration.rig.poles
+    seeing = [image.pair for image in subject.images]
+    # What is said of pairs that failed explains why they saw nobody.
+    tried = [image.pair for image in cleaned if image.pair not in measured.failures]
+    displaced = subject.aligned.displaced if subject.aligned else ()
+    moved = {name for one in displaced for name in one.pairs}
+    unmoved = [image for image in measured.value if image.pair not in moved]
+    return ImageEvidence(
+        measured.failures,
+        find_silent_poles(poles, tried, seeing),
+        {image.pair: image.saturated for image in measured.value if image.overexposed},
+        frozenset(calibration.rig_from_camera.keys() - set(seeing)),
+        {image.pair: image.agreement for image in measured.value if image.agreement},
+        find_seams(subject.images, subject.image_poses, poles),
+        contradictions,
+        find_floor(unmoved, calibration.rig_from_camera, calibration.rig.volume),
+    )
+
+
+def _mesh(
+    cloud: BodyCloud,
+    measured: Sequence[RangeImage],
+    subject: _Subject,
+    settings: ScanSettings,
+    made: Made,
+) -> tuple[BodyCloud, BodyMesh]:
+    """Label the cloud's regions, and mesh it; the mesh holds its displacement to mean breath."""
+
+    def label() -> BodyCloud:
+        regions = label_regions(
+            cloud, subject.images, subject.image_poses, settings.fusion.window_mm
+        )
+        # A smooth surface leaves out how far strands of hair stand off it.
+        sigma_mm = np.hypot(cloud.sigma_mm, regions.relief_mm)
+        known = replace(cloud, sigma_mm=sigma_mm, regions=regions.numbers)
+        made(known)
+        return known
+
+    with background() as other:
+        # Meshing mostly uses one core, so regions are labelled on the other meanwhile.
+        labelling = other.submit(label)
+        shape = closed_surface(cloud, settings.mesh, measured, subject.rig_from_camera)
+        known = labelling.result()
+    mesh = attach_attributes(*shape, known, settings.mesh.reach_mm)
+    if subject.motion:
+        mesh = subject.motion.add_breath(mesh)
+    made(mesh)
+    return known, mesh

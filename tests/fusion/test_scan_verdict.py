@@ -25,7 +25,7 @@ from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.rig.rig import Rig, Volume
 from bodyscan.settings import AlignmentSettings, FusionSettings, MeshSettings, ScanSettings
 from bodyscan.verdict import Announce, Verdict, say_nothing
-from bodyscan.workflows.fuse_range_images import fuse
+from bodyscan.workflows.scan_person import fuse
 
 RIG = load_rig()
 SETTINGS = ScanSettings(
@@ -130,7 +130,7 @@ def test_two_people_are_told_before_there_is_a_mesh(
         assert [verdict.grade for verdict in told] == ["repeat"]
         return closed_surface(*about)
 
-    monkeypatch.setattr("bodyscan.workflows.fuse_range_images.closed_surface", meshed)
+    monkeypatch.setattr("bodyscan.workflows.scan_person.closed_surface", meshed)
     scan = fused(photographed(both), settings=NOT_FOLLOWED, announce=listen)
     assert scan.verdict.grade == "repeat"
     assert "two bodies" in said(scan)

@@ -6,16 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from living_body import (
-    STANDING,
-    STILL,
-    LivingScan,
-    Motion,
-    boards,
-    cast_living,
-    errors_mm,
-    images_of,
-)
+from living_body import STILL, LivingScan, boards, cast_living, errors_mm, images_of
 from ray_cast_scan import load_rig
 from scipy.spatial import cKDTree
 
@@ -31,6 +22,7 @@ from bodyscan.motion.person_motion import PersonMotion
 from bodyscan.motion.warping import warp_to_middle
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.settings import AlignmentSettings
+from bodyscan.simulation.settings import Person
 
 SCALE = 0.25  # pixels of 4 mm
 
@@ -71,7 +63,7 @@ def test_one_body_comes_of_many_moments(
 ) -> None:
     aligned, alignment, followed = found
     assert followed is not None
-    truth = standing.body.at(standing.middle_s)
+    truth = standing.at(standing.middle_s)
     rigid = errors_mm(truth, surface(standing, aligned, None))
     carried = errors_mm(truth, surface(standing, alignment, followed))
     # 0.19 mm of 1.23; with pixels of 4 mm, fingers are a few pixels wide.
@@ -86,7 +78,7 @@ def test_sigmas_say_what_is_left(
 ) -> None:
     _, alignment, followed = found
     assert followed is not None
-    errors = errors_mm(standing.body.at(standing.middle_s), surface(standing, alignment, followed))
+    errors = errors_mm(standing.at(standing.middle_s), surface(standing, alignment, followed))
     # As much as they err, within what a single person's motion may be off by. Of both the
     # squares' mean: arms err, and are known, several times worse than legs. (0.66 here; of five people,
     # on three and four poles, 0.9.)
@@ -102,12 +94,10 @@ def test_the_operator_hears_what_each_part_did(
     assert [part.name for part in person.parts] == list(PARTS)
     assert person.moment_ms == pytest.approx(1e3 * standing.middle_s)
     moved = {part.name: part.moved_mm for part in person.parts}
-    truth, still = standing.body, standing.body.at(standing.middle_s).vertices
-    most = np.max(
-        [np.linalg.norm(truth.at(s).vertices - still, axis=1) for s in standing.seconds.values()],
-        axis=0,
-    )
-    arm = truth.arms[0] > 0.9
+    still = standing.at(standing.middle_s).vertices
+    times = standing.seconds.values()
+    most = np.max([np.linalg.norm(standing.at(s).vertices - still, axis=1) for s in times], axis=0)
+    arm = standing.body.limbs[1].weights > 0.9
     # Along the arm nothing shows how far it moved.
     assert 0.5 < moved["left arm"] / np.percentile(most[arm], 95) < 1.3
     assert "left arm: moved by" in person.lines[2]
@@ -150,9 +140,8 @@ def test_the_way_to_mean_breath_is_told(
     _, _, followed = found
     assert followed is not None
     assert followed.breath is not None
-    cells, body = followed.cells, standing.body
-    now = body.at(standing.middle_s).vertices
-    mean = replace(body, motion=replace(STANDING, breath_mm=0.0)).at(standing.middle_s).vertices
+    cells, now = followed.cells, standing.at(standing.middle_s).vertices
+    mean = standing.at(standing.middle_s, breathing=False).vertices
     near = cKDTree(now).query(cells.centres)[1]
     front = breath_along_normals(cells) > 0.5
     true = float(np.mean(np.sum((now - mean)[near] * cells.normals, axis=1)[front]))
@@ -213,9 +202,8 @@ def test_a_figure_before_two_cameras_without_times_is_still(relief_mm: float) ->
 
 def test_who_only_sways_is_carried_along_time() -> None:
     """The back, which on three poles no other pole sees, is put where a smooth sway had it."""
-    sway = Motion(sway_mm_s=10.0, breath_mm=0.0, arms_deg=0.0, head_deg=0.0)
-    scan = cast_living(load_rig(), sway, seed=1, scale=SCALE)
+    scan = cast_living(load_rig(), Person(sway_mm_s=10.0), seed=1, scale=SCALE)
     aligned, alignment, followed = together(scan)
-    truth = scan.body.at(scan.middle_s)
+    truth = scan.at(scan.middle_s)
     rigid = errors_mm(truth, surface(scan, aligned, None))
     assert rms(errors_mm(truth, surface(scan, alignment, followed))) < 0.6 * rms(rigid)

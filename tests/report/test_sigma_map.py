@@ -11,7 +11,7 @@ from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.registration.rig_calibration import RigCalibration
-from bodyscan.report.sigma_map import draw_sigma_map, sigma_at
+from bodyscan.report.calibration_charts import sigma_at, sigma_chart
 
 GOOD = PairQuality(0.05, 9)
 MIDDLE = np.array([[0.0, 0.0, 1000.0]])
@@ -79,7 +79,7 @@ def test_what_no_pair_sees_has_no_sigma() -> None:
     sigma, seen = sigma_at(above, placings, cameras, own, placings)
     assert seen[0] == 0
     assert np.isnan(sigma[0])
-    drawn, again = (draw_sigma_map(calibrated(placings, cameras, own)) for _ in range(2))
+    drawn, again = (sigma_chart(calibrated(placings, cameras, own)) for _ in range(2))
     assert drawn == again
     picture = cv2.imdecode(np.frombuffer(drawn, np.uint8), cv2.IMREAD_COLOR)
     height, width = picture.shape[:2]
@@ -107,11 +107,11 @@ def test_no_map_is_drawn_of_what_is_not_known() -> None:
     with pytest.raises(
         BadInput, match=r"accuracy of the imported calibration of p1-1, p2-1, p3-1 is not known"
     ) as caught:
-        draw_sigma_map(calibration)
+        sigma_chart(calibration)
     assert "--sigma-px" in caught.value.remedy
     one = {"p1-1": placings["p1-1"]}
     with pytest.raises(BadInput, match="a single pair defines the rig frame"):
-        draw_sigma_map(calibrated(one, cameras, shifts(one, 0.0)))
+        sigma_chart(calibrated(one, cameras, shifts(one, 0.0)))
 
 
 def test_points_that_the_lens_folds_back_are_not_seen() -> None:

@@ -60,6 +60,20 @@ def scene_of(truth: Truth) -> o3d.t.geometry.RaycastingScene:
     return scene
 
 
+def cast_rays(scene: RaycastingScene, origin: Array, ways: Array) -> dict[str, np.ndarray]:
+    """What Open3D tells of rays from one origin (3,) along `ways` (..., 3)."""
+    rays = np.concatenate([np.broadcast_to(origin, ways.shape), ways], axis=-1)
+    found = scene.cast_rays(rays.astype(np.float32))
+    return {name: values.numpy() for name, values in found.items()}
+
+
+def is_lit(scene: RaycastingScene, pair: Pair, points: Array) -> Mask:
+    """Whether nothing stands between points (..., 3) and a pair's projector."""
+    assert pair.projector_nominal is not None
+    lamp = np.array(pair.projector_nominal.position_mm)
+    return np.asarray(cast_rays(scene, lamp, points - lamp)["t_hit"] > 1.0 - 1e-3)
+
+
 def looking(placing: NominalPose) -> RigidTransform:
     """rig_from_camera of a camera that stands upright at a placing."""
     return looking_at(list(placing.position_mm), list(placing.look_at_mm))
@@ -115,24 +129,12 @@ def _cast(
     rng: np.random.Generator,
 ) -> RangeImage:
     rays = camera.pixel_rays()
-    directions = pose.rotate(rays)
-    origins = np.broadcast_to(pose.translation, directions.shape)
-    cast = scene.cast_rays(np.concatenate([origins, directions], axis=-1).astype(np.float32))
-    depth = cast["t_hit"].numpy().astype(float)
-    normals = cast["primitive_normals"].numpy() @ pose.rotation
+    cast = cast_rays(scene, pose.translation, pose.rotate(rays))
+    depth, normals = cast["t_hit"].astype(float), cast["primitive_normals"] @ pose.rotation
     seen = np.isfinite(depth)
     depth[~seen] = 0.0
-    hit = pose.apply(rays * depth[..., None])
-    assert pair.projector_nominal is not None
-    from_projector = hit - np.array(pair.projector_nominal.position_mm)
-    lit = scene.cast_rays(
-        np.concatenate(
-            [np.broadcast_to(pair.projector_nominal.position_mm, hit.shape), from_projector],
-            axis=-1,
-        ).astype(np.float32)
-    )["t_hit"].numpy()
-    facing = np.sum(normals * rays, axis=-1) < 0
-    valid = seen & facing & (lit > 1.0 - 1e-3)
+    lit = is_lit(scene, pair, pose.apply(rays * depth[..., None]))
+    valid = seen & (np.sum(normals * rays, axis=-1) < 0) & lit
     length = np.linalg.norm(rays, axis=-1)
     depth = depth + rng.normal(0.0, noise_mm, depth.shape) / length
     depth = _mix_silhouettes(depth, valid, flying, rng)

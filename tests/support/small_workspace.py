@@ -99,9 +99,7 @@ def simulate_subject(
     time, and the corners are found as well."""
     settings = settings_for("mirror")
     settings = replace(
-        settings,
-        optics=replace(settings.optics, samples=2),
-        person=person or settings.person,
+        settings, optics=replace(settings.optics, samples=2), person=person or settings.person
     )
     rig = small_rig(folder.parent)
     simulate(rig, folder, subject=subject, scale=SCALE, board_shots=board_shots, settings=settings)

@@ -15,7 +15,7 @@ from bodyscan.files.hashing import file_hash
 from bodyscan.fusion import verdict
 from bodyscan.fusion.storage import load_scan
 from bodyscan.registration.storage import load_calibration
-from bodyscan.report import calibration_page, pictures
+from bodyscan.report import calibration_charts, calibration_page, pictures
 from bodyscan.report.page import render
 from bodyscan.report.result_page import write_report
 from bodyscan.workflows import calibrate_rig
@@ -84,8 +84,8 @@ def test_a_remark_that_fails_costs_itself_alone(ring: SeenBoards, calibrated: Pa
 def test_a_report_goes_on_after_a_section_that_fails(
     calibrated: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(calibration_page, "rig_model", broken)
-    monkeypatch.setattr(calibration_page, "draw_sigma_map", broken)
+    monkeypatch.setattr(calibration_charts, "rig_model", broken)
+    monkeypatch.setattr(calibration_charts, "sigma_chart", broken)
     page = calibration_page.calibration_page(calibrated)
     told = {section.title: str(section.blocks) for section in page.sections}
     assert "KeyError" in told["The rig"]
