@@ -7,22 +7,18 @@ from pathlib import Path
 
 import matplotlib
 import numpy as np
-
-from bodyscan.arrays import Array
-from bodyscan.files.atomic import atomic_replacement
-from bodyscan.geometry.light_planes import baseline_angle_tilt
-from bodyscan.geometry.robust import robust_scale
-from bodyscan.laboratory.apparatus import PROJECTOR
-from bodyscan.report.charts import round_up
-
-matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")
-"""Okabe and Ito's colours, which the colour-blind can tell apart too."""
+from bodyscan.arrays import Array
+from bodyscan.files.atomic import write_bytes
+from bodyscan.geometry.light_planes import baseline_angle_tilt
+from bodyscan.geometry.robust import robust_scale
+from bodyscan.laboratory.apparatus import PROJECTOR
+from bodyscan.report.charts import COLOURS, png, round_up, style
 
 
+@style()
 def draw_projector(
     planes: Mapping[str, Array], s: Array, true: Array, residuals_mm: Array, path: Path
 ) -> None:
@@ -51,11 +47,11 @@ def draw_projector(
     axes[0, 0].legend(frameon=False, markerscale=4.0)
     _distribution(axes[1, 1], residuals_mm)
     for axis in axes.ravel():
-        axis.spines[["top", "right"]].set_visible(False)
         axis.grid(color="#999999", alpha=0.25, linewidth=0.6)
-    _save(figure, path)
+    write_bytes(path, png(figure, 750))
 
 
+@style()
 def draw_range_data(data: Mapping[str, tuple[Array, Array]], path: Path) -> None:
     """Draw Fig. 7: the spheres as measured, and their distance along the ray from the truth.
 
@@ -75,7 +71,7 @@ def draw_range_data(data: Mapping[str, tuple[Array, Array]], path: Path) -> None
         figure.colorbar(picture, ax=lower, shrink=0.8, label="off by, mm")
         for axis in (upper, lower):
             axis.set(xticks=[], yticks=[])
-    _save(figure, path)
+    write_bytes(path, png(figure, 750))
 
 
 def _baseline_angle_tilt(planes: Array) -> tuple[Array, Array, Array]:
@@ -99,10 +95,3 @@ def _distribution(axis: Axes, residuals_mm: Array) -> None:
     axis.set_xlabel("distance of a boundary point from its plane, mm")
     axis.set_ylabel("density, 1/mm")
     axis.legend(frameon=False, loc="upper right")
-
-
-def _save(figure: matplotlib.figure.Figure, path: Path) -> None:
-    # Without date and version the same figure gives the same bytes.
-    with atomic_replacement(path) as temporary:
-        figure.savefig(temporary, dpi=110, metadata={"Software": None})
-    plt.close(figure)

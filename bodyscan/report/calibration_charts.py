@@ -23,12 +23,10 @@ from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.registration.rig_calibration import ObservedCorners, RigCalibration
 from bodyscan.registration.storage import MAP_NAME, load_calibration
-from bodyscan.report.charts import BLUE, GREY, INK, RED, grid_of, png, style, svg
+from bodyscan.report.charts import BLUE, COLOURS, GREY, INK, RED, grid_of, png, style, svg
 from bodyscan.report.model import Strokes, pack
 from bodyscan.rig.rig import Volume
 
-POLES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#999999")
-"""Okabe and Ito's colours, which the colour-blind can tell apart too."""
 DASHES = ("-", "--", "-.", ":")
 PLANES = {
     "front: y to the right, z up": (0.0, 1.0, 0.0),
@@ -133,7 +131,7 @@ def line_styles(calibration: RigCalibration) -> tuple[dict[str, str], dict[str, 
     colour, dash = {}, {}
     for pole, names in enumerate(poles.values()):
         for number, name in enumerate(names):
-            colour[name] = POLES[pole % len(POLES)]
+            colour[name] = COLOURS[pole % len(COLOURS)]
             dash[name] = DASHES[number % len(DASHES)]
     return colour, dash
 

@@ -18,6 +18,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 INK, GREY, BLUE, RED = "#1d2430", "#8a93a0", "#0072b2", "#d55e00"
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#999999")
+"""Okabe and Ito's colours, which the colour-blind can tell apart too."""
 STYLE: Any = {
     "svg.hashsalt": "bodyscan",
     "font.size": 9.0,
@@ -44,8 +46,9 @@ def svg(figure: Figure) -> bytes:
 
 
 def png(figure: Figure, height_px: int) -> bytes:
-    """A figure as PNG of this height."""
-    return _save(figure, format="png", dpi=height_px / figure.get_figheight())
+    """A figure as PNG of this height; the same figure gives the same bytes."""
+    dpi = height_px / figure.get_figheight()
+    return _save(figure, format="png", dpi=dpi, metadata={"Software": None})
 
 
 def _save(figure: Figure, **options: Any) -> bytes:
