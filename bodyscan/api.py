@@ -18,11 +18,8 @@ faces, y to the subject's left, z up) unless a name says otherwise. Every error 
 no result; both say what went wrong, where, and what to do. `progress` is any function of a stage's
 name, the number of steps done and their total.
 
-**What is stable.** The names in `bodyscan.__all__`, their arguments, the fields of what they return
-and the files they write. Minor versions only add to them; a name to be removed raises a
-DeprecationWarning for one minor version first. Files stay readable, or are refused with a message
-that says what to do. Numerical results may improve from version to version: CHANGELOG.md says when.
-Any other module (`bodyscan.geometry`, say) may be imported too, but may change at any time.
+The names in `bodyscan.__all__` are stable, as docs/api.md says. Any other module (`bodyscan.geometry`,
+say) may be imported too, but may change at any time.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
 """The chapter's experiments repeated, and the rival models it is compared with.
 
-reproduce runs them: apparatus, approaches (rivals), measuring, figures.
+reproduce runs them: apparatus, approaches (rivals), measuring.
 """

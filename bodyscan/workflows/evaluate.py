@@ -146,14 +146,10 @@ def _scan_lines(stored: StoredScan, calibration: RigCalibration, truth: Truth) -
     assert truth.vertices is not None
     assert truth.faces is not None
     surface, pairs = (truth.vertices, truth.faces), truth.facts["pairs"]
-    rig_from_still, sway_mm = sway_residual(
-        _aligned_poses(stored, calibration), pairs, truth.vertices
-    )
+    _, sway_mm = sway_residual(_aligned_poses(stored, calibration), pairs, truth.vertices)
     still_from_rig = RigidTransform.identity()
     if "motion" in truth.facts:  # fit to the body as it was then
         still_from_rig = fit_to_surface(stored.cloud.points, *surface)
-    elif truth.facts["settings"]["person"].get("sway_mm"):
-        still_from_rig = rig_from_still.inverse()  # a swaying subject has no fixed pose
     in_rig, body = stored.mesh, transform_mesh(stored.mesh, still_from_rig)
     points = still_from_rig.apply(stored.cloud.points)
     cloud = signed_distances(points, *surface)
