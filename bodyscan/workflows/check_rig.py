@@ -43,44 +43,13 @@ from bodyscan.workflows.find_boards import find_all_boards, locate_views
 from bodyscan.workflows.range_images import reconstruct_range_images
 
 
-@dataclass(frozen=True, eq=False)
-class Findings:
-    """The result of either check, in words; the first of `lines` is the verdict."""
-
-    check: BoardCheck | ScanCheck
-    lines: tuple[str, ...]
-
-    @property
-    def valid(self) -> bool:
-        """Whether the rig is known to be unchanged; False if that is undecided."""
-        return self.check.valid
-
-    def repair(self, calibration: RigCalibration) -> RigCalibration:
-        """Correct the poses of what moved. Raises FailedWork if the check does not determine them."""
-        if isinstance(self.check, ScanCheck):
-            raise FailedWork(
-                "scans of people show that something moved, but not exactly where it is now",
-                remedy="take a few shots of the board and repair from those",
-            )
-        projectors = [offset.pair for offset in self.check.stripes if offset.moved]
-        if projectors:
-            raise FailedWork(
-                f"the projector of {', '.join(projectors)} moved against its camera",
-                remedy="capture the stripes on the board again and run calibrate-rig: only a new "
-                "calibration of that pair corrects this",
-            )
-        if not self.check.drift.moves:
-            raise FailedWork("nothing moved: there is nothing to repair")
-        return apply_moves(calibration, self.check.drift.moves)
-
-
 def check_rig(
     calibration: RigCalibration,
     folders: Sequence[Path],
     progress: Progress = silent,
     *,
     follow_links: bool = False,
-) -> Findings:
+) -> BoardCheck | ScanCheck:
     """Check a rig with folders of one kind: shots of the board, or scans of people.
 
     Raises CaptureError for folders without captures, BadInput for a mixture of kinds,
@@ -98,9 +67,8 @@ def check_rig(
             remedy="check one kind at a time",
         )
     if kinds == {"scan"}:
-        return describe_scan_check(check_scans(calibration, captures, progress))
-    shots = join_captures(tuple(number_shots(captures)))
-    return describe_board_check(calibration, check_boards(calibration, shots, progress))
+        return check_scans(calibration, captures, progress)
+    return check_boards(calibration, join_captures(tuple(number_shots(captures))), progress)
 
 
 def number_shots(folders: Sequence[Captures]) -> list[Captures]:
@@ -117,89 +85,6 @@ def number_shots(folders: Sequence[Captures]) -> list[Captures]:
     ]
 
 
-def describe_board_check(calibration: RigCalibration, check: BoardCheck) -> Findings:
-    """Put the check by boards into words."""
-    drift = check.drift
-    shared = bool(drift.rig_from_board)
-    agreed = "all that see the board agree" if shared else "the stripes lie on the board"
-    wrong = "the stripes do not lie on the board"
-    if drift.moves:
-        wrong = "something moved; --repair writes a corrected calibration"
-    lines = [f"valid: {agreed}" if check.valid else f"NOT valid: {wrong}"]
-    lines += [move_line(move) for move in drift.moves]
-    for offset in filter(lambda offset: offset.moved, check.stripes):
-        imported = calibration.pairs[offset.pair].quality.imported
-        other = f", or {imported} is not its calibration" if imported else ""
-        lines.append(
-            f"{offset.pair}: the stripes measure the board {offset.offset_mm:+z.2f} mm from its "
-            f"corners, tilted by {offset.tilt_mm:+z.2f} mm at its ends. Possible causes: the projector "
-            f"moved against its camera{other}"
-        )
-    if shared:
-        after = f", {drift.misfit:.1f} after the moves" if drift.moves else ""
-        lines.append(
-            f"{len(check.checked)} pairs saw a board; their views differ by "
-            f"{drift.misfit_before:.1f} sigmas RMS{after}"
-        )
-    if check.stripes:
-        worst = max(check.stripes, key=lambda offset: abs(offset.offset_mm))
-        lines.append(
-            f"stripes of {len(check.stripes)} pairs lie within {abs(worst.offset_mm):.2f} mm of the "
-            f"board (worst: {worst.pair})"
-        )
-    if check.unchecked:
-        lines.append(f"not checked, because they saw no board: {', '.join(check.unchecked)}")
-    if drift.lonely:
-        lonely = ", ".join(drift.lonely)
-        lines.append(f"not checked, because no other pair saw their board: {lonely}")
-    return Findings(check, (*lines, *(f"note: {note}" for note in check.notes)))
-
-
-def describe_scan_check(check: ScanCheck) -> Findings:
-    """Put the check by scans into words."""
-    step = check.search.found
-    count = len(check.before_mm)
-    scans = "1 scan" if count == 1 else f"{count} scans"
-    if check.moved:
-        verdict = "NOT valid: no motion of a person explains how the pairs differ"
-    elif check.groups:
-        groups = "; ".join(", ".join(group) for group in check.groups)
-        verdict = (
-            f"undecided: no surface is seen by more than one of these groups of pairs: {groups}. "
-            "Scans do not determine how these stand to each other: give shots of a board that they "
-            "share"
-        )
-    elif check.decided:
-        verdict = (
-            f"valid: a pole or pair that moved by {check.detectable_mm:.1f} mm would be noticed"
-        )
-    elif check.quiet:
-        verdict = "valid: all pairs see the same surface, and alignment moves none of them"
-    else:
-        known = np.isfinite(check.detectable_mm)
-        less = f" by less than {check.detectable_mm:.1f} mm" if known else ""
-        more = f"{MIN_SCANS} scans or more" if count < MIN_SCANS else "more scans"
-        verdict = (
-            f"undecided: in {scans}, a pair that moved{less} cannot be distinguished from a person's "
-            f"sway; give {more}, or a shot of the board (with `kind: calibration` in its captures.yaml)"
-        )
-    lines = [verdict]
-    if step is not None:
-        lines.append(
-            f"{step.name} is displaced by {step.shift_mm:.1f} mm and rotated by "
-            f"{step.rotation_deg:.2f} degrees"
-        )
-    for drift in check.pairs:
-        if drift.moved and (step is None or drift.pair not in step.name):
-            lines.append(f"{drift.pair}: {drift.shift_mm:.2f} mm (sigma {drift.sigma_mm:.2f})")
-    before, after = max(check.before_mm), max(check.after_mm)
-    if np.isfinite(before):
-        lines.append(f"overlaps in {scans}: {before:.2f} mm RMS at most, {after:.2f} aligned")
-    farthest = max(check.pairs, key=lambda drift: drift.shift_mm)
-    lines.append(f"moved most on average: {farthest.pair}, {farthest.shift_mm:.2f} mm")
-    return Findings(check, tuple(lines))
-
-
 @dataclass(frozen=True)
 class StripeOffset:
     """Distance of the surface that a pair's stripes measure from the board that its corners show.
@@ -207,22 +92,25 @@ class StripeOffset:
     offset_mm: median over all boards, positive away from the camera.
     tilt_mm: half the difference between the board's two ends.
     sigma_mm: the sigma that the calibration predicts.
+    imported: the file of another program that the pair's calibration is from, if any.
     """
 
     pair: str
     offset_mm: float
     tilt_mm: float
     sigma_mm: float
+    imported: str
 
     @staticmethod
-    def from_distances(pair: str, rows: Array) -> StripeOffset:
+    def from_distances(pair: PairCalibration, rows: Array) -> StripeOffset:
         """The medians of rows (N, 3) as `_stripe_distances` returns them."""
         away, across, sigma = rows.T
         low, high = across < -0.4, across > 0.4
         tilt = 0.0
         if min(low.sum(), high.sum()) > 20:
             tilt = 0.5 * float(np.median(away[high]) - np.median(away[low]))
-        return StripeOffset(pair, float(np.median(away)), tilt, float(np.median(sigma)))
+        away_mm, sigma_mm = float(np.median(away)), float(np.median(sigma))
+        return StripeOffset(pair.name, away_mm, tilt, sigma_mm, pair.quality.imported)
 
     @property
     def moved(self) -> bool:
@@ -246,6 +134,56 @@ class BoardCheck:
     @property
     def valid(self) -> bool:
         return not self.drift.moves and not any(offset.moved for offset in self.stripes)
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """The check in words; the first line is the verdict."""
+        drift = self.drift
+        shared = bool(drift.rig_from_board)
+        agreed = "all that see the board agree" if shared else "the stripes lie on the board"
+        wrong = "the stripes do not lie on the board"
+        if drift.moves:
+            wrong = "something moved; --repair writes a corrected calibration"
+        lines = [f"valid: {agreed}" if self.valid else f"NOT valid: {wrong}"]
+        lines += [move_line(move) for move in drift.moves]
+        for offset in filter(lambda offset: offset.moved, self.stripes):
+            other = f", or {offset.imported} is not its calibration" if offset.imported else ""
+            lines.append(
+                f"{offset.pair}: the stripes measure the board {offset.offset_mm:+z.2f} mm from its "
+                f"corners, tilted by {offset.tilt_mm:+z.2f} mm at its ends. Possible causes: the "
+                f"projector moved against its camera{other}"
+            )
+        if shared:
+            after = f", {drift.misfit:.1f} after the moves" if drift.moves else ""
+            lines.append(
+                f"{len(self.checked)} pairs saw a board; their views differ by "
+                f"{drift.misfit_before:.1f} sigmas RMS{after}"
+            )
+        if self.stripes:
+            worst = max(self.stripes, key=lambda offset: abs(offset.offset_mm))
+            lines.append(
+                f"stripes of {len(self.stripes)} pairs lie within {abs(worst.offset_mm):.2f} mm of the "
+                f"board (worst: {worst.pair})"
+            )
+        if self.unchecked:
+            lines.append(f"not checked, because they saw no board: {', '.join(self.unchecked)}")
+        if drift.lonely:
+            lonely = ", ".join(drift.lonely)
+            lines.append(f"not checked, because no other pair saw their board: {lonely}")
+        return (*lines, *(f"note: {note}" for note in self.notes))
+
+    def repair(self, calibration: RigCalibration) -> RigCalibration:
+        """Correct the poses of what moved. Raises FailedWork if that is nothing, or a projector."""
+        projectors = [offset.pair for offset in self.stripes if offset.moved]
+        if projectors:
+            raise FailedWork(
+                f"the projector of {', '.join(projectors)} moved against its camera",
+                remedy="capture the stripes on the board again and run calibrate-rig: only a new "
+                "calibration of that pair corrects this",
+            )
+        if not self.drift.moves:
+            raise FailedWork("nothing moved: there is nothing to repair")
+        return apply_moves(calibration, self.drift.moves)
 
 
 def check_boards(
@@ -336,7 +274,7 @@ def _stripe_offsets(
         parts[key[0]].append(_stripe_distances(calibration, known[key], boundaries))
     rows = {pair: np.concatenate(found) for pair, found in sorted(parts.items())}
     offsets = tuple(
-        StripeOffset.from_distances(pair, found)
+        StripeOffset.from_distances(calibration.pairs[pair], found)
         for pair, found in rows.items()
         if len(found) >= 100
     )
@@ -412,6 +350,59 @@ class ScanCheck:
     @property
     def valid(self) -> bool:
         return not self.moved and (self.decided or self.quiet)
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """The check in words; the first line is the verdict."""
+        step = self.search.found
+        count = len(self.before_mm)
+        scans = "1 scan" if count == 1 else f"{count} scans"
+        if self.moved:
+            verdict = "NOT valid: no motion of a person explains how the pairs differ"
+        elif self.groups:
+            groups = "; ".join(", ".join(group) for group in self.groups)
+            verdict = (
+                f"undecided: no surface is seen by more than one of these groups of pairs: {groups}. "
+                "Scans do not determine how these stand to each other: give shots of a board that they "
+                "share"
+            )
+        elif self.decided:
+            verdict = (
+                f"valid: a pole or pair that moved by {self.detectable_mm:.1f} mm would be noticed"
+            )
+        elif self.quiet:
+            verdict = "valid: all pairs see the same surface, and alignment moves none of them"
+        else:
+            known = np.isfinite(self.detectable_mm)
+            less = f" by less than {self.detectable_mm:.1f} mm" if known else ""
+            more = f"{MIN_SCANS} scans or more" if count < MIN_SCANS else "more scans"
+            verdict = (
+                f"undecided: in {scans}, a pair that moved{less} cannot be distinguished from a "
+                f"person's sway; give {more}, or a shot of the board (with `kind: calibration` in its "
+                "captures.yaml)"
+            )
+        lines = [verdict]
+        if step is not None:
+            lines.append(
+                f"{step.name} is displaced by {step.shift_mm:.1f} mm and rotated by "
+                f"{step.rotation_deg:.2f} degrees"
+            )
+        for drift in self.pairs:
+            if drift.moved and (step is None or drift.pair not in step.name):
+                lines.append(f"{drift.pair}: {drift.shift_mm:.2f} mm (sigma {drift.sigma_mm:.2f})")
+        before, after = max(self.before_mm), max(self.after_mm)
+        if np.isfinite(before):
+            lines.append(f"overlaps in {scans}: {before:.2f} mm RMS at most, {after:.2f} aligned")
+        farthest = max(self.pairs, key=lambda drift: drift.shift_mm)
+        lines.append(f"moved most on average: {farthest.pair}, {farthest.shift_mm:.2f} mm")
+        return tuple(lines)
+
+    def repair(self, calibration: RigCalibration) -> RigCalibration:
+        """Raises FailedWork: scans do not determine the poses well enough."""
+        raise FailedWork(
+            "scans of people show that something moved, but not exactly where it is now",
+            remedy="take a few shots of the board and repair from those",
+        )
 
 
 def check_scans(

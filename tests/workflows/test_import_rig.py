@@ -459,7 +459,7 @@ def test_the_other_real_calibration_is_read_and_held_against_a_board(
     (shots / "captures.yaml").write_text("version: 1\nkind: calibration\n")
     found = check_rig(calibration, [shots])
     assert not found.valid
-    assert isinstance(found.check, BoardCheck)
-    (offset,) = found.check.stripes
+    assert isinstance(found, BoardCheck)
+    (offset,) = found.stripes
     assert 0.4 < max(abs(offset.offset_mm), abs(offset.tilt_mm)) < 1.5
     assert "calibration.xml (opencv) is not its calibration" in " ".join(found.lines)
