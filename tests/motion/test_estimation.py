@@ -80,8 +80,8 @@ def test_sigmas_say_what_is_left(
     assert followed is not None
     errors = errors_mm(standing.at(standing.middle_s), surface(standing, alignment, followed))
     # As much as they err, within what a single person's motion may be off by. Of both the
-    # squares' mean: arms err, and are known, several times worse than legs. (Of five people, on three and four
-    # poles, 0.9.)
+    # squares' mean: arms err, and are known, several times worse than legs. (Of five
+    # people, on three and four poles, 0.9.)
     assert 0.6 < rms(errors) / rms(followed.sigma_mm) < 1.4
 
 
