@@ -115,7 +115,7 @@ def _shots(rig: Rig, captures: Captures, pair: str) -> tuple[CameraCalibration, 
         sequence = captures.sequence(pair, view.shot)
         if sequence is None or not sequence.has_stripes:
             continue
-        stripes = decode_sequence(sequence, spec, workers=2)
+        stripes = decode_sequence(sequence, spec)
         board = rig.board(view.board)
         pose = locate_board(camera.camera, planar_view(view, board))[0]
         corners = corner_points(board)[view.corner_ids]

@@ -31,14 +31,12 @@ class Column:
     at_least: bool = False
     digits: int = 3
 
-    def keeps_limit(self, value: Value) -> bool | None:
-        """Whether a value keeps the limit; None without a limit or a value."""
-        if self.limit is None or not isinstance(value, float | int):
-            return None
-        return value >= self.limit if self.at_least else value <= self.limit
-
     def mark(self, value: Value) -> str:
-        return {None: "", True: "good", False: "bad"}[self.keeps_limit(value)]
+        """Whether a value keeps the limit, good or bad; "" without a limit or a value."""
+        if self.limit is None or not isinstance(value, float | int):
+            return ""
+        kept = value >= self.limit if self.at_least else value <= self.limit
+        return "good" if kept else "bad"
 
     def text(self, value: Value) -> str:
         return format_value(value, self.digits)

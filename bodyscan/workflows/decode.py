@@ -47,7 +47,6 @@ def decode_sequence(
     *,
     limits: StripeLimits | None = None,
     crop: Crop = WHOLE,
-    workers: int = 1,
 ) -> StripeMap:
     """Read and decode what `pair` took in one shot.
 
@@ -63,7 +62,7 @@ def decode_sequence(
         raise DecodingFailed("this pair has no projector", where=where)
 
     def decode(sequence: ImageSequence, projector: StripeCode) -> StripeMap:
-        images = read_sequence(sequence, pair.camera, crop=crop, workers=workers)
+        images = read_sequence(sequence, pair.camera, crop=crop, workers=1)
         return decode_stripes(
             projector, images.lit, images.dark, images.coded, limits=limits, where=where
         )

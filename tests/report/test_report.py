@@ -215,10 +215,10 @@ def test_a_slip_of_the_pen_is_not_taken_for_the_folder_above(scan: MadeScan) -> 
 
 
 def test_limits_are_kept_or_not() -> None:
-    assert Column("n", "mm", "", 0.4).keeps_limit(0.4)
-    assert not Column("n", "mm", "", 0.4).keeps_limit(0.41)
-    assert Column("n", "", "", 6, at_least=True).keeps_limit(7)
-    assert Column("n", "", "", 6).keeps_limit(None) is None
+    assert Column("n", "mm", "", 0.4).mark(0.4) == "good"
+    assert Column("n", "mm", "", 0.4).mark(0.41) == "bad"
+    assert Column("n", "", "", 6, at_least=True).mark(7) == "good"
+    assert Column("n", "", "", 6).mark(None) == ""
     assert Column("n", "mm", "").limit_text == "–"
 
 
