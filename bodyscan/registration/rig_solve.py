@@ -43,7 +43,6 @@ from bodyscan.registration.view_consistency import (
     ConsistentSolve,
     error_limit,
     find_inconsistent_views,
-    single_view_errors,
     solve_consistently,
 )
 from bodyscan.registration.view_graph import (
@@ -201,7 +200,7 @@ def _solve(
     solve = partial(
         solve_consistently,
         root=root,
-        limit_px=np.inf if weigh else error_limit(single_view_errors(kept, cameras)),
+        limit_px=np.inf if weigh else error_limit(kept, cameras),
     )
     judged = solve(resolved, solution, wrong=[view.key for view in gross])
     lenses: ChosenLenses | None = None

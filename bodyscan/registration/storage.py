@@ -258,8 +258,9 @@ def _calibration(content: dict[str, Any], arrays: dict[str, Any]) -> RigCalibrat
         )
         for name, part in parts.items()
     }
+    read = TypeAdapter(tuple[str, str]).validate_python
     boards = {
-        (_text(part["shot"]), _text(part["board"])): _transform(part["rig_from_board"])
+        read((part["shot"], part["board"]), strict=True): _transform(part["rig_from_board"])
         for part in content["boards"]
     }
     if len(boards) < len(content["boards"]):
@@ -270,7 +271,7 @@ def _calibration(content: dict[str, Any], arrays: dict[str, Any]) -> RigCalibrat
         {name: _transform(part["rig_from_camera"]) for name, part in parts.items()},
         PoseCovariance(_texts(content["placing_covariance_order"]), arrays["placing_covariance"]),
         boards,
-        {name: _text(reason) for name, reason in content["failed"].items()},
+        TypeAdapter(dict[str, str]).validate_python(content["failed"], strict=True),
         _texts(content["notes"]),
         _texts(content.get("advice", [])),
         {
@@ -317,13 +318,5 @@ def _transform(matrix: Any) -> RigidTransform:
     return RigidTransform(array[:3, :3].copy(), array[:3, 3].copy())
 
 
-def _text(value: Any) -> str:
-    if not isinstance(value, str):
-        raise TypeError(f"{value!r} is not text")
-    return value
-
-
 def _texts(values: Any) -> tuple[str, ...]:
-    if not isinstance(values, list):
-        raise TypeError(f"{values!r} is not a list of texts")
-    return tuple(map(_text, values))
+    return tuple(TypeAdapter(list[str]).validate_python(values, strict=True))

@@ -28,13 +28,10 @@ MIN_ERROR_PX = 0.2
 CORNERS = Noise("corners", group=2, min_scale=0.1 * MIN_ERROR_PX)
 
 
-def single_view_errors(views: Iterable[LocatedView], cameras: Mapping[str, Camera]) -> Array:
-    """RMS error of each view at the pose it was located at by itself, (V,) px."""
-    return np.array([_error(view, cameras, view.camera_from_board) for view in views])
-
-
-def error_limit(errors: Array) -> float:
-    """Error in px above which a view is inconsistent; errors: (V,) from `single_view_errors`."""
+def error_limit(views: Iterable[LocatedView], cameras: Mapping[str, Camera]) -> float:
+    """Error in px above which a view is inconsistent, by those of views at the poses that each was
+    located at by itself."""
+    errors = [_error(view, cameras, view.camera_from_board) for view in views]
     return max(6.0 * float(np.median(errors)), MIN_ERROR_PX)
 
 
