@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from bodyscan.arrays import Array
 from bodyscan.export.formats import BODY_FORMATS, BodyFormat
 from bodyscan.files.atomic import write_json
 from bodyscan.files.registry import unknown_format_error
@@ -72,6 +73,7 @@ def describe_body(
         "frame": "rig" if in_body is None else "body",
         "origin": f"on the floor, {'at the rig centre' if in_body is None else 'under the body'}",
         "rig_from_frame": (in_body or RigidTransform.identity()).matrix,
+        "rig_from_file": _rig_from_file(format_, in_body or RigidTransform.identity()),
         "software": f"bodyscan {__version__}",
         "subject": origin.subject,
         "calibration_id": origin.calibration_id,
@@ -92,6 +94,16 @@ def describe_body(
         "coverage": float(areas[~body.filled].sum() / areas.sum()) if len(areas) else 0.0,
         "sigma_mm": _median(body.sigma_mm),
     }
+
+
+def _rig_from_file(format_: BodyFormat, rig_from_body: RigidTransform) -> Array:
+    """Matrix (4, 4) that takes coordinates as the file has them, in its unit and axes, to the rig
+    frame in mm."""
+    pointing = ("front", "left", "up")
+    body_from_file = np.eye(4)
+    scale = {"mm": 1.0, "m": 1000.0}[format_.unit]
+    body_from_file[:3, :3] = scale * np.eye(3)[:, [pointing.index(one) for one in format_.axes]]
+    return rig_from_body.matrix @ body_from_file
 
 
 def _median(sigma_mm: np.ndarray[Any, Any]) -> float | None:

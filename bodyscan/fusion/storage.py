@@ -250,7 +250,9 @@ def read_facts(folder: Path) -> dict[str, Any]:
         facts = read_json_object(file)
         _Facts.model_validate_json(json.dumps(facts))
     except FileNotFoundError:
-        raise ResultError("there is no such file", where=str(file), remedy=REMEDY) from None
+        inside = folder / "scan" / FILE_NAME  # of a batch's job, or a simulated workspace
+        remedy = f"give {inside.parent}, which holds one" if inside.exists() else REMEDY
+        raise ResultError("there is no such file", where=str(file), remedy=remedy) from None
     except (OSError, ValueError) as error:
         reason = describe_first_error(error) if isinstance(error, ValidationError) else str(error)
         raise ResultError(

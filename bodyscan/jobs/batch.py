@@ -276,8 +276,10 @@ def free_memory_mb() -> float:
         for line in Path("/proc/meminfo").read_text("ascii").splitlines():
             if line.startswith("MemAvailable:"):
                 free.append(int(line.split()[1]) * 1024 / 1e6)
-    with suppress(OSError, ValueError):
-        group = Path("/sys/fs/cgroup")
-        limit = int((group / "memory.max").read_text("ascii"))
-        free.append((limit - int((group / "memory.current").read_text("ascii"))) / 1e6)
+    group = Path("/sys/fs/cgroup")
+    version_1 = ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes")
+    for limit, used in (("memory.max", "memory.current"), version_1):
+        with suppress(OSError, ValueError):
+            left = int((group / limit).read_text("ascii")) - int((group / used).read_text("ascii"))
+            free.append(left / 1e6)
     return min(free) if len(free) > 1 else 4000.0

@@ -17,7 +17,7 @@ import numpy as np
 from bodyscan.alignment.icp import align
 from bodyscan.alignment.sway_prior import SwayPrior, select_tighter
 from bodyscan.captures.folder import Captures, ImageSequence, open_scan
-from bodyscan.errors import ScanFailed
+from bodyscan.errors import CaptureError, ScanFailed
 from bodyscan.fusion.cleaning import clean, require_subject
 from bodyscan.fusion.consistency import Contradictions
 from bodyscan.fusion.merging import MergedCloud, merge
@@ -65,8 +65,10 @@ def scan_person(
     reconstructed: see `reconstruct_range_images`.
     announce, made: see `fuse`.
 
-    Raises ScanFailed if no pair, or no part of a body inside the scan volume, is left.
+    Raises ScanFailed if no pair, or no part of a body inside the scan volume, is left; CaptureError
+    if a pair took stripes in two shots.
     """
+    require_one_moment(captures)
     images = reconstruct_range_images(
         calibration, captures, progress, made=reconstructed, volume_only=True
     )
@@ -75,6 +77,23 @@ def scan_person(
         calibration, images, settings, progress,
         empty=nobody.value if nobody else (), announce=announce, made=made,
     )  # fmt: skip
+
+
+def require_one_moment(captures: Captures) -> None:
+    """Raise CaptureError if a pair took its stripes twice: two poses, or two persons, would be one."""
+    shots: dict[str, list[str]] = {}
+    for sequence in captures.sequences:
+        if sequence.has_stripes:
+            shots.setdefault(sequence.pair, []).append(sequence.shot)
+    pair, taken = max(shots.items(), key=lambda one: len(one[1]), default=("", []))
+    if len(taken) > 1:
+        raise CaptureError(
+            f"pair {pair} took its stripes in {len(taken)} shots ({', '.join(taken[:3])}): a scan is "
+            "of one person at one moment",
+            where=str(captures.folders[0]),
+            remedy="put each shot into a folder of its own, or name the one that counts in its "
+            f"captures.yaml: `shots: [{{name: {taken[0]}}}]`",
+        )
 
 
 def scan_folder(

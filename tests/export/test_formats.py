@@ -209,7 +209,8 @@ def test_in_the_body_frame_the_body_faces_x_over_the_origin(tmp_path: Path) -> N
         "failed": {"p1-1": "is missing"},
         "alignment": {"motion_mm": {"p1-2": 1.25}},
     }
-    written = export_scan(StoredScan(points(), rotated, facts), tmp_path, ["ply"], frame="body")
+    scan = StoredScan(points(), rotated, facts)
+    written = export_scan(scan, tmp_path, ["ply", "glb"], frame="body")
     exported = read_ply_mesh(written[0])
     width, depth = np.ptp(exported.vertices[:, 1]), np.ptp(exported.vertices[:, 0])
     assert width == pytest.approx(np.ptp(straight[:, 1]), rel=1e-3)
@@ -221,9 +222,14 @@ def test_in_the_body_frame_the_body_faces_x_over_the_origin(tmp_path: Path) -> N
     np.testing.assert_allclose(
         exported.vertices @ back[:3, :3].T + back[:3, 3], rotated.vertices, atol=1e-6
     )
+    as_in_glb = exported.vertices[:, [1, 2, 0]] / 1000.0  # left, up, front, in metres
+    back = np.array(json.loads((tmp_path / "body.glb.json").read_text())["rig_from_file"])
+    np.testing.assert_allclose(
+        as_in_glb @ back[:3, :3].T + back[:3, 3], rotated.vertices, atol=1e-6
+    )
     assert info["verdict"]["grade"] == "usable"
     assert info["left_out"] == {"p1-1": "is missing"}
     assert info["sway_mm"] == {"p1-2": 1.25}
     assert info["coverage"] == pytest.approx(1.0 - info["filled_area_mm2"] / info["area_mm2"])
     with pytest.raises(BadInput, match="'room' to export"):
-        export_scan(StoredScan(points(), rotated, facts), tmp_path, ["ply"], frame="room")
+        export_scan(scan, tmp_path, ["ply"], frame="room")

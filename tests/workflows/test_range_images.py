@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bodyscan.errors import BadInput
+from bodyscan.errors import BadInput, CaptureError
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.reconstruction.range_image import RangeImage
@@ -16,6 +16,7 @@ from bodyscan.rig.frame_names import FrameNames
 from bodyscan.stripes.codes.gray import Gray
 from bodyscan.workflows import range_images
 from bodyscan.workflows.range_images import reconstruct_range_images, reconstruct_sequence
+from bodyscan.workflows.scan_person import require_one_moment
 
 STRIPES = SimpleNamespace(crossing=None, response=None, crossing_fault="")
 
@@ -55,3 +56,14 @@ def test_cameras_alone_are_told_what_they_lack() -> None:
     with pytest.raises(BadInput, match="rig stereo: no pair has a projector") as caught:
         reconstruct_range_images(calibration, captures)
     assert "export-rig" in caught.value.remedy
+
+
+def test_two_shots_of_a_pair_are_no_one_person() -> None:
+    def captured(*taken: tuple[str, str]) -> Any:
+        sequences = [SimpleNamespace(pair=p, shot=s, has_stripes=True) for p, s in taken]
+        return SimpleNamespace(sequences=sequences, folders=["scans/anna"])
+
+    require_one_moment(captured(("a", "s1"), ("b", "s2")))  # poles one after another
+    with pytest.raises(CaptureError, match=r"scans/anna: pair a .* 2 shots \(s1, s2\)") as caught:
+        require_one_moment(captured(("a", "s1"), ("b", "s1"), ("a", "s2")))
+    assert "name: s1" in caught.value.remedy
