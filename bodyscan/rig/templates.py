@@ -107,7 +107,12 @@ def _parse_fields(template: str) -> set[str]:
     for _, field, spec, conversion in Formatter().parse(template):
         if field is None:
             continue
-        if field not in known or spec or conversion:
+        if field in known and (spec or conversion):
+            raise ValueError(
+                f"write {{{field}}} without {f':{spec}' if spec else f'!{conversion}'}; names, such as "
+                "'007', are written out under `frames`, `exposures` and `shots`"
+            )
+        if field not in known:
             allowed = ", ".join(f"{{{name}}}" for name in known)
             raise ValueError(f"it may hold {allowed}, not {{{field}}}")
         fields.add(field)

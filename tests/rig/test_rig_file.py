@@ -135,6 +135,7 @@ def test_merge_keys_take_what_is_not_given(tmp_path: Path) -> None:
         ("version: 1", "version: 1\nfiles: '{shot}/{pair}.png'", "files: needs {frame}, since"),
         ("version: 1", "version: 1\nfiles: '{shot}/{pair}/{frame}.gif'", "must end in .png"),
         ("version: 1", "version: 1\nfiles: '../{shot}/{pair}/{frame}.png'", "must not climb out"),
+        ("version: 1", "version: 1\nfiles: '{shot}/{pair}/{frame:03d}.png'", "without :03d"),
         ("version: 1", "version: 1\nfiles: '/{shot}/{pair}/{frame}.png'", "must be relative"),
         ("version: 1", "version: 1\nfiles: 'C:/{shot}/{pair}/{frame}.png'", "nor a drive letter"),
         ("version: 1", "version: 1\nfiles: '{shot}/{pole}/{frame}.png'", "not {pole}"),
