@@ -12,6 +12,7 @@ from itertools import permutations
 
 import numpy as np
 from scipy import ndimage
+from scipy.linalg import null_space
 from scipy.spatial import ConvexHull
 from scipy.spatial.distance import pdist
 
@@ -127,7 +128,7 @@ def read_plate(points: Array, normals: Array) -> PlateReading:
             raise FailedWork("no plate is among the points")
         normal, offset = fit_plane(points[near])
     on_plate = points[near]
-    flat = on_plate @ _plane_axes(normal)
+    flat = on_plate @ null_space(normal[None])
     joined = _largest_piece(flat)
     inside, area = _within_rim(flat[joined])
     kept = on_plate[joined][inside]
@@ -173,13 +174,6 @@ def _largest_plane(points: Array, rng: np.random.Generator) -> tuple[Array, floa
     votes = np.sum(np.abs(some @ normals.T - offsets) < PLATE_REACH_MM, axis=0)
     best = int(np.argmax(votes))
     return normals[best], float(offsets[best])
-
-
-def _plane_axes(normal: Array) -> Array:
-    """(3, 2): two perpendicular unit vectors in the plane."""
-    right = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
-    right /= np.linalg.norm(right)
-    return np.stack([right, np.cross(normal, right)], axis=1)
 
 
 def _largest_piece(flat: Array) -> Mask:

@@ -167,7 +167,8 @@ def _translate(
             place = document.place(where, of_key=True)
             other.append(YamlProblem(place, dotted_path(where), f"is not a key known here{hint}"))
         elif e["type"] in _MUST_BE:
-            limits = {key: _plain(value) for key, value in e.get("ctx", {}).items()}
+            context = e.get("ctx", {}).items()
+            limits = {k: f"{v:g}" if isinstance(v, float) else v for k, v in context}
             wrong.setdefault(where, []).append(_MUST_BE[e["type"]].format(**limits))
         else:
             other.append(_locate((where, e["msg"]), document))
@@ -229,10 +230,6 @@ def _model_in(annotation: Any) -> type[BaseModel] | None:
         return annotation
     found = (_model_in(argument) for argument in get_args(annotation))
     return next((model for model in found if model), None)
-
-
-def _plain(limit: Any) -> Any:
-    return f"{limit:g}" if isinstance(limit, float) else limit
 
 
 def _got(where: Where, wanted: list[str], document: Document) -> str:

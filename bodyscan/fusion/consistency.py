@@ -92,7 +92,11 @@ class Contradictions:
     def find_outlier(self, groups: Mapping[str, frozenset[str]]) -> str:
         """The smallest of the groups without which the others agree best; "" unless less than
         half of the share of contradictions is left without it."""
-        left = {name: self._share_without(group) for name, group in groups.items()}
+        left = {}
+        for name, group in groups.items():
+            kept = np.flatnonzero([pair not in group for pair in self.pairs])
+            rows = np.ix_(kept, kept)
+            left[name] = float(self.against[rows].sum() / max(self.compared[rows].sum(), 1))
         outliers = [
             name
             for name, group in groups.items()
@@ -102,11 +106,6 @@ class Contradictions:
         # If a single pair is the outlier, leaving it out is as good as leaving out its pole.
         near = [name for name in outliers if left[name] <= lowest + 0.1 * (self.share - lowest)]
         return min(near, key=lambda name: (len(groups[name]), left[name]), default="")
-
-    def _share_without(self, group: frozenset[str]) -> float:
-        kept = np.flatnonzero([name not in group for name in self.pairs])
-        rows = np.ix_(kept, kept)
-        return float(self.against[rows].sum() / max(self.compared[rows].sum(), 1))
 
 
 def compare_with_surface(

@@ -166,7 +166,8 @@ def _measure_texture(
     rig_from_camera: Mapping[str, RigidTransform],
     window_mm: float,
 ) -> _Texture:
-    """Texture of dark cells and of the head; elsewhere it is not known."""
+    """Texture of dark cells and of the head with 50 pixels or more, by the medians of their
+    residuals; elsewhere it is not known."""
     wanted = dark | head
 
     def measure(image: RangeImage) -> Roughness | None:
@@ -176,15 +177,8 @@ def _measure_texture(
         return None if box is None else measure_roughness(image, pose, box, window_mm)
 
     each = map_threads(measure, range_images, stage="naming regions")
-    found = [one for one in each if one is not None]
-    if not found:
-        nowhere = np.zeros(cells.count, bool)
-        return _Texture(nowhere, nowhere, nowhere, np.zeros(cells.count))
-    return _summarize_by_cell(cells, found)
-
-
-def _summarize_by_cell(cells: _Grid, found: Sequence[Roughness]) -> _Texture:
-    """Texture of each cell with 50 pixels or more, by the medians of their residuals."""
+    nothing = np.zeros(0, np.float32)
+    found = [Roughness(np.zeros((0, 3)), nothing, nothing), *(one for one in each if one)]
     cell = np.concatenate([cells.find(one.points) for one in found])
     residual = np.concatenate([one.residual_mm for one in found])
     expected_mm = np.concatenate([one.expected_mm for one in found])

@@ -116,10 +116,6 @@ class _View:
     def points(self) -> SampledPoints:
         return self.sampled.inner
 
-    def with_cells(self, cell: Indices) -> _View:
-        """Set each point's cell; drop points that are in none."""
-        return replace(self, cell=cell).select(cell >= 0)
-
     def select(self, chosen: Mask | slice) -> _View:
         return _View(self.initial, self.sampled.select(chosen), self.cell[chosen].copy())
 
@@ -213,7 +209,8 @@ def _middle_of_scan(images: Sequence[RangeImage]) -> float | None:
 def _divide_into_cells(
     views: Sequence[_View], rig_from_camera: Sequence[RigidTransform]
 ) -> tuple[list[_View], BodyCells]:
-    """Divide the aligned points of all views into cells; returns views with each point's cell."""
+    """Divide the aligned points of all views into cells; returns views with each point's cell, without
+    those that are in none."""
     both = [(pose, view.points) for pose, view in zip(rig_from_camera, views, strict=True)]
     cells, cell = BodyCells.from_points(
         np.concatenate([pose.apply(cloud.points) for pose, cloud in both]),
@@ -221,7 +218,8 @@ def _divide_into_cells(
     )
     ends = np.cumsum([len(cloud.points) for _, cloud in both])[:-1]
     by_view = np.split(cell, ends)
-    return [view.with_cells(part) for view, part in zip(views, by_view, strict=True)], cells
+    parts = zip(views, by_view, strict=True)
+    return [replace(view, cell=part).select(part >= 0) for view, part in parts], cells
 
 
 @dataclass(frozen=True, eq=False)
