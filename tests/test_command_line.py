@@ -200,3 +200,10 @@ def test_a_new_folder_has_a_rig_and_the_first_commands(tmp_path: Path, bodyscan:
     typed = re.findall(r"\n    bodyscan (\S+)", text)
     assert {"simulate", "check", "calibrate-rig", "scan", "batch"} <= set(typed) <= set(COMMANDS)
     assert "holds rig.yaml" in bodyscan("init", tmp_path / "new").stderr
+
+
+def test_a_terminal_without_our_signs_ends_no_command(tmp_path: Path) -> None:
+    line = [sys.executable, "-m", "bodyscan", "init", str(tmp_path / "±")]
+    ascii_only = os.environ | {"PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0"}
+    done = subprocess.run(line, capture_output=True, check=False, timeout=60, env=ascii_only)
+    assert (done.returncode, b"\\xb1" in done.stdout) == (0, True), done.stderr

@@ -6,6 +6,7 @@ at once.
 
 from __future__ import annotations
 
+import io
 import logging
 import os
 import sys
@@ -38,6 +39,9 @@ def main() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # Our own errors say what OpenCV warns of, with the line of the rig file.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a terminal may lack a sign of ours, or of a path
+            stream.reconfigure(errors="backslashreplace")
     keep_freed_memory()
     collect_seldom()
     os.umask(0o077)  # images and models of people are for their owner alone
