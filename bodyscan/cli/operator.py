@@ -33,7 +33,6 @@ from bodyscan.settings import AlignmentSettings, ExportSettings, FusionSettings,
 if TYPE_CHECKING:
     from bodyscan.jobs.job import Job
     from bodyscan.jobs.object_storage import Store
-    from bodyscan.jobs.stages import Stage
     from bodyscan.jobs.supervision import Listen
 
 PANEL = "Operator: scan people"
@@ -236,9 +235,6 @@ def batch(
         int | None, typer.Option(min=1, help="Number of jobs at the same time.")
     ] = None,
     cluster: Cluster = None,
-    explain: Annotated[
-        bool, typer.Option("--explain", help="Say why each stage would run, and run nothing.")
-    ] = False,
 ) -> None:
     """Fuse every scan of a day (or calibrate every rig), each in its own process.
 
@@ -252,22 +248,18 @@ def batch(
     settings = load_pipeline(pipeline, changes or ())
     every = KINDS[settings.kind]
     last = until or every[-1].name
-    stages = stages_until(every, last)
+    stages_until(every, last)  # refuses an unknown stage before any folder is made
     if not is_url(scans) and not is_url(out):
         given = Path(calibration) if calibration else None
         jobs = find_jobs(settings, Path(scans), Path(out), given, last)
-        if explain:
-            _explain(output, jobs, stages)
-        else:
-            read = (path for job in jobs for path in (job.source, job.calibration))
-            require_writable(Path(out), *read)
-            _run(output, jobs, Path(out), workers, cluster)
+        read = (path for job in jobs for path in (job.source, job.calibration))
+        require_writable(Path(out), *read)
+        _run(output, jobs, Path(out), workers, cluster)
         return
     fuses = settings.kind == "fuse"
-    if explain or not (is_url(scans) and is_url(out)) or (fuses and not is_url(calibration or "")):
+    if not (is_url(scans) and is_url(out)) or (fuses and not is_url(calibration or "")):
         raise BadInput(
-            "scans, output and calibration are either all in object storage or none; "
-            "--explain works on folders only",
+            "scans, output and calibration are either all in object storage or none",
             where=f"{scans}, {out}, {calibration}",
             remedy="give a URL to each of --scans, --out and --calibration",
         )
@@ -275,20 +267,6 @@ def batch(
     with scratch_folder() as outline:
         jobs = find_stored_jobs(store, settings, last, outline)
         _run(output, jobs, outline / "out", workers, cluster, store)
-
-
-def _explain(output: Output, jobs: Sequence[Job], stages: Sequence[Stage]) -> None:
-    from concurrent.futures import ThreadPoolExecutor
-
-    from bodyscan.jobs.job import printable
-    from bodyscan.jobs.plan import plan
-
-    with ThreadPoolExecutor() as pool:
-        for job, steps in zip(jobs, pool.map(lambda job: plan(job, stages), jobs), strict=True):
-            for step in steps:
-                run = "will run" if step.certain else "may run"
-                action = f"{run}: {step.why}" if step.why else "up to date"
-                output.say(printable(f"{job.name}: {step.stage}: {action}"))
 
 
 def _run(

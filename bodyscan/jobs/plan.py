@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from typing import Any
 
-from bodyscan.errors import BodyscanError
 from bodyscan.files.hashing import file_hashes
 from bodyscan.jobs.job import STAGE, STATE, Job, read_record, results_in
 from bodyscan.jobs.stages import Stage
@@ -28,43 +27,10 @@ class Origin:
         return heading | asdict(self) | {"outputs": dict(outputs)}
 
 
-@dataclass(frozen=True)
-class Step:
-    """Whether a stage will run.
-
-    why: it has to run; "" if its results are up to date.
-    certain: False if it depends on the result of a stage before it.
-    """
-
-    stage: str
-    why: str
-    certain: bool = True
-
-
 def origin_of(job: Job, stage: Stage) -> Origin:
     """Origin of a stage if it ran now. Raises BodyscanError or OSError for unreadable inputs."""
     settings = {name: job.pipeline.section(name) for name in stage.sections}
     return Origin(stage.name, stage.version, settings, file_hashes(stage.inputs(job)))
-
-
-def plan(job: Job, stages: Sequence[Stage]) -> list[Step]:
-    """Predict what a batch would do now, stage by stage."""
-    steps: list[Step] = []
-    for stage in stages:
-        read = read_record(job.folder / stage.name / STAGE).get("inputs")
-        was = read if isinstance(read, dict) else {}
-        again = {step.stage for step in steps if step.why}
-        before = sorted({name.split("/")[0] for name in was} & again)
-        try:
-            now = origin_of(job, stage)
-            # A stage that runs again often gives the same result.
-            why = reason_to_run(job, replace(now, inputs=was) if before else now)
-        except (BodyscanError, OSError) as error:
-            why = f"its inputs cannot be used as they are: {error}"
-        certain = bool(why) or not before
-        why = why if certain else f"{', '.join(before)} runs before it, and may give another result"
-        steps.append(Step(stage.name, why, certain))
-    return steps
 
 
 def reason_to_run(job: Job, now: Origin) -> str:

@@ -180,6 +180,6 @@ def open_log(path: Path) -> Any:
 
 
 def _note_state(folder: Path, state: dict[str, Any]) -> None:
-    """Write state.json, for people and --explain; a full disk must not end the batch here."""
+    """Write state.json, for people and the next start; a full disk must not end the batch here."""
     with suppress(OSError):
         write_json(folder / STATE, state | {"when": time.strftime("%Y-%m-%dT%H:%M:%S%z")})

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import cheap_job
@@ -14,9 +12,8 @@ import pytest
 from cheap_batch import jobs_of, run_cheap
 
 from bodyscan.files.hashing import list_files
-from bodyscan.jobs.plan import Step, plan
-
-PERHAPS = "scan runs before it, and may give another result"
+from bodyscan.jobs.job import Job
+from bodyscan.jobs.plan import origin_of, reason_to_run
 
 
 @pytest.fixture
@@ -28,10 +25,14 @@ def day(batched: Path, tmp_path: Path) -> Path:
 def steps(day: Path, *changes: str, version: int = 1) -> list[str]:
     """Of Anna's job, why each stage would run now."""
     anna, bert = jobs_of(day / "scans", day / "out", *changes)
-    stages = cheap_job.kinds(version)["fuse"]
     if not changes and version == 1:
-        assert plan(bert, stages) == [Step("scan", ""), Step("export", "")]
-    return [step.why for step in plan(anna, stages)]
+        assert reasons(bert) == ["", ""]
+    return reasons(anna, version)
+
+
+def reasons(job: Job, version: int = 1) -> list[str]:
+    stages = cheap_job.kinds(version)["fuse"]
+    return [reason_to_run(job, origin_of(job, stage)) for stage in stages]
 
 
 def test_times_and_places_do_not_count(day: Path) -> None:
@@ -47,9 +48,7 @@ def test_times_and_places_do_not_count(day: Path) -> None:
 
 def test_another_content_counts(day: Path) -> None:
     (day / "scans" / "anna" / "image.txt").write_text("other")
-    scan, export = steps(day)
-    assert scan == "inputs changed: image.txt has other content"
-    assert export == PERHAPS
+    assert steps(day) == ["inputs changed: image.txt has other content", ""]
 
 
 def test_files_that_come_and_go_count(day: Path) -> None:
@@ -61,7 +60,7 @@ def test_files_that_come_and_go_count(day: Path) -> None:
 def test_settings_count_for_the_stages_that_obey_them(day: Path) -> None:
     assert steps(day, "fusion.points=2000") == [
         "settings changed: fusion.points 1000000 -> 2000",
-        PERHAPS,
+        "",
     ]
     assert steps(day, "export.formats=ply") == [
         "",
@@ -123,39 +122,12 @@ def test_files_that_a_person_added_outlive_a_kill(day: Path) -> None:
     assert not list(job.glob(".old-*"))
 
 
-def test_a_forecast_is_certain_only_of_what_cannot_turn_out_otherwise(day: Path) -> None:
-    """Bert's scan is made again with the same result, of which his export then is still true."""
-    (day / "out" / "bert" / "scan" / "1.bin").write_bytes(b"x")
-    stages = cheap_job.kinds()["fuse"]
-
-    def forecast(*changes: str) -> list[bool]:
-        _, bert = jobs_of(day / "scans", day / "out", *changes)
-        return [step.certain for step in plan(bert, stages)]
-
-    assert forecast() == [True, False]
-    assert forecast("export.formats=ply") == [True, True]
-    assert run_cheap(day / "scans", day / "out").endings()["bert"]["stages"] == ["scan"]
-    shutil.rmtree(day / "out" / "bert")
-    assert forecast() == [True, True]
-
-
-def test_a_stage_waits_for_those_alone_whose_results_it_reads(day: Path) -> None:
-    scan, export = cheap_job.kinds()["fuse"]
-    beside = replace(export, name="beside", sections=())
-    shutil.copytree(day / "out/anna/export", day / "out/anna/beside")
-    record = day / "out/anna/beside/stage.json"
-    record.write_text(json.dumps(json.loads(record.read_text()) | {"settings": {}}))
-    anna, _ = jobs_of(day / "scans", day / "out", "export.formats=ply")
-    assert [bool(step.why) for step in plan(anna, (scan, export, beside))] == [False, True, False]
-
-
 def test_a_failure_is_told_the_next_time(make_scans: Callable[..., Path], tmp_path: Path) -> None:
     scans = make_scans(a="raise")
     run_cheap(scans, tmp_path / "out")
     (job,) = jobs_of(scans, tmp_path / "out")
-    assert plan(job, cheap_job.kinds()["fuse"])[0].why == (
-        "it failed last time: ValueError: a bad day"
-    )
+    (scan, *_) = cheap_job.kinds()["fuse"]
+    assert reason_to_run(job, origin_of(job, scan)) == "it failed last time: ValueError: a bad day"
 
 
 def test_models_beside_scans_are_no_jobs(make_scans: Callable[..., Path], tmp_path: Path) -> None:
