@@ -153,7 +153,7 @@ def _corners_with_stripe(rig: Rig, shot: _Shot) -> tuple[Array, Array, Array]:
 
 def _measure(model: str, sheets: LightSheets, held: _Shot) -> HeldOutBoard:
     rays = held.points.points / held.points.points[:, 2:]
-    depth = sheets.measure(rays, held.points.index.astype(float)).depth
+    depth = sheets.intersect(rays, held.points.index.astype(float)).depth
     known = np.isfinite(depth)
     measured = rays[known] * depth[known, None]
     centre = held.points.points.mean(axis=0)

@@ -159,7 +159,7 @@ class _Measured:
 def _measured(pair: PairCalibration, facts: dict[str, Any], pixels: Array, s: Array) -> _Measured:
     assert pair.sheets is not None
     rays = pair.camera.rays(pixels)
-    ours = rays * pair.sheets.measure(rays, s).depth[:, None]
+    ours = rays * pair.sheets.intersect(rays, s).depth[:, None]
     true_rays = TrueCamera(**facts["camera"]).directions(pixels)
     true = true_rays * true_depth(true_projector(facts), true_rays, s)[:, None]
     known = np.isfinite(ours[:, 2]) & np.isfinite(true[:, 2])

@@ -120,7 +120,7 @@ def of_arms(points: Array, vertices: Array, body: LivingBody) -> Mask:
 def _tapes(measured: Measurements) -> dict[int, float]:
     """Tape girths of the trunk below the armpits, where it was measured."""
     below = [one for one in measured.slices if one.height_mm < ARMPITS * measured.stature_mm]
-    trunks = {number: one.of("trunk") for number, one in enumerate(below)}
+    trunks = {number: one.find_girth("trunk") for number, one in enumerate(below)}
     return {
         number: trunk.tape_mm
         for number, trunk in trunks.items()

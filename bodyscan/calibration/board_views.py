@@ -30,7 +30,7 @@ class PlanarView:
 class LocatedView:
     """Points (N, 3) mm of a board observed at pixels (N, 2) by `pair`, with the pose they give.
 
-    alternatives: every `board_from_seen` under which the board looks the same to the detector,
+    alternatives: every `board_from_observed` under which the board looks the same to the detector,
         identity first: a plain board may be numbered from its other end or seen from its back.
     """
 
@@ -55,12 +55,12 @@ class LocatedView:
     def ambiguous(self) -> bool:
         return len(self.alternatives) > 1
 
-    def resolve(self, board_from_seen: RigidTransform) -> LocatedView:
+    def resolve(self, board_from_observed: RigidTransform) -> LocatedView:
         """Take one of the alternatives as true."""
         return replace(
             self,
-            points=board_from_seen.apply(self.points),
-            camera_from_board=self.camera_from_board @ board_from_seen.inverse(),
+            points=board_from_observed.apply(self.points),
+            camera_from_board=self.camera_from_board @ board_from_observed.inverse(),
             alternatives=(RigidTransform.identity(),),
         )
 
@@ -150,10 +150,10 @@ class BoardShape:
             strains += [0.5 * (xx - yy), 0.5 * (xy + yx)]
         return rms(np.array(strains))
 
-    def prior(self, size_sigma: float = 0.0) -> Array:
-        """What is known of the offsets before any view, as rows (3N + 7, 3N) that give residuals in
-        standard deviations: the prior on each coordinate, the gauge constraint that the shape has no
-        motion (the board has it), and the prior on its size, which is off by `size_sigma`."""
+    def compute_prior_jacobian(self, size_sigma: float = 0.0) -> Array:
+        """Jacobian (3N + 7, 3N) of residuals of the prior on the offsets, in standard deviations:
+        each coordinate, the gauge constraint that the shape has no rigid motion (the board's pose
+        has it), and the size, which is off by `size_sigma`."""
         arms, sigma_mm = self.points - self.points.mean(axis=0), PRIOR * self.diagonal
         motions, _ = np.linalg.qr(twist_jacobian(arms).reshape(-1, 6))
         gauge_mm = 1e-4 * sigma_mm  # a thousandth of what views determine
@@ -219,7 +219,7 @@ def max_displacement_mm(a: RigidTransform, b: RigidTransform, radius_mm: float) 
 
 
 def board_symmetries(board: Board) -> tuple[RigidTransform, ...]:
-    """Every `board_from_seen` under which a plain board looks the same to the detector.
+    """Every `board_from_observed` under which a plain board looks the same to the detector.
 
     A plain board may be numbered from its other end, unless the colour of its first square shows
     which end it is, or from any corner if it has as many columns as rows; or be seen from its back.

@@ -28,7 +28,7 @@ WARP_POWERS = ((2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
 CORNERS = Noise("corners, px", group=2, cauchy=4.0, min_scale=1e-3)
 STRIPES = tuple(
     Noise(f"{which} stripes, in sigmas", cauchy=4.0, min_scale=1e-2)
-    for which in ("own", "crossing")
+    for which in ("sheet_columns", "crossing")
 )
 
 
@@ -237,7 +237,7 @@ class _State:
     @property
     def sizes(self) -> list[int]:
         """Number of unknowns of the camera, each pose, each direction's sheets, each board's warp."""
-        sheets = [one.prior()[1].shape[1] for one in self.sheets]
+        sheets = [one.linearize_prior()[1].shape[1] for one in self.sheets]
         warps = [warp.count for warp in self.warps.values()]
         return [len(self.camera.parameters), *([6] * len(self.poses)), *sheets, *warps]
 
@@ -273,17 +273,17 @@ def _blocks(state: _State, boards: Sequence[StripedBoard]) -> Iterator[Block]:
                 CORNERS,
             )
             heights = warp[: len(WARP_POWERS)]
-            for direction, own in enumerate(sheets):
+            for direction, sheet_columns in enumerate(sheets):
                 rays = _boundary_rays(state.camera, board.stripes[direction])
                 yield Block(
                     _stripe_residuals(state, k, board, direction, rays),
                     partial(_stripe_jacobian, state, k, board, direction, rays),
-                    np.concatenate([camera, pose, own, heights]),
+                    np.concatenate([camera, pose, sheet_columns, heights]),
                     STRIPES[direction],
                 )
     yield camera_prior(state.camera, camera)
-    for one, own in zip(state.sheets, sheets, strict=True):
-        yield _prior_block(one.prior(), own)
+    for one, sheet_columns in zip(state.sheets, sheets, strict=True):
+        yield _prior_block(one.linearize_prior(), sheet_columns)
     for name, shape in state.warps.items():
         yield _prior_block(shape.prior, warps[name])
 
@@ -341,7 +341,7 @@ def _stripe_residuals(
     sheets, stripes = state.sheets[direction], board.stripes[direction]
     camera_from_face = state.poses[k] @ board.board_from_face
     points = rays_on_board(rays, camera_from_face, partial(_height, state, board))
-    return _whitened_offsets(sheets, sheets.at(stripes.index), stripes, points)
+    return _whitened_offsets(sheets, sheets.evaluate(stripes.index), stripes, points)
 
 
 def _whitened_offsets(sheets: SmoothSheets, at: Any, stripes: BoardStripes, points: Array) -> Array:
@@ -367,7 +367,7 @@ def _stripe_jacobian(
     pose, by_camera = state.poses[k], _rays_by_camera(state.camera, rays)
     camera_from_face = pose @ board.board_from_face
     points = rays_on_board(rays, camera_from_face, partial(_height, state, board))
-    at = sheets.at(stripes.index)
+    at = sheets.evaluate(stripes.index)
     offset = sheets.offset(points[0], at, parameters=True)
     assert offset.by_parameter is not None
     sigma = _offset_sigma(stripes, points, offset.by_point)
@@ -414,15 +414,15 @@ def _depth_covariance(
     that explains most of how the boards' points move is removed (an S-transformation to the frame of
     the boards: Baarda 1973). What remains along the rays is expressed as the change of the sheets
     that changes depths equally (by least squares). What no such change expresses, a lens, is in the
-    rays' own sigma.
+    rays' sheet_columns sigma.
     """
     sheets, stripes = state.sheets[direction], [board.stripes[direction] for board in boards]
     index = np.concatenate([one.index for one in stripes])
     rays = state.camera.rays(np.concatenate([one.pixels for one in stripes]))
     with np.errstate(all="ignore"):
-        depth = sheets.measure(rays, index).depth[:, None]
+        depth = sheets.intersect(rays, index).depth[:, None]
         points = rays * depth
-        offset = sheets.offset(points, sheets.at(index), parameters=True)
+        offset = sheets.offset(points, sheets.evaluate(index), parameters=True)
         assert offset.by_parameter is not None
         along_ray = np.sum(offset.by_point * rays, axis=1)[:, None]
         by_rays = depth[..., None] * _rays_by_camera(state.camera, rays)
@@ -438,11 +438,11 @@ def _depth_covariance(
     remaining = np.einsum("ni,nip->np", rays, moved - motion @ common[0])
     remaining /= np.sum(rays**2, axis=1)[:, None] * depth
     # A weak prior, at relative changes of 1e-7, keeps unobserved directions of the sheets at zero.
-    prior = 1e-7 * np.sqrt(len(depth)) * sheets.prior()[1]
+    prior = 1e-7 * np.sqrt(len(depth)) * sheets.linearize_prior()[1]
     matrix = np.concatenate([by_sheets[valid] / depth, prior])
     right = np.concatenate([remaining, np.zeros((len(prior), remaining.shape[1]))])
     transfer = np.linalg.lstsq(matrix, right, rcond=None)[0]
-    camera, _, own, _ = state.columns
-    columns = np.concatenate([camera, own[direction]])
+    camera, _, sheet_columns, _ = state.columns
+    columns = np.concatenate([camera, sheet_columns[direction]])
     total = transfer @ covariance[np.ix_(columns, columns)] @ transfer.T
     return np.asarray(0.5 * (total + total.T), np.float64)

@@ -142,7 +142,7 @@ def hold_out(candidate: Candidate, data: BoundaryPoints, folds: Sequence[Mask]) 
     for left_out in folds:
         points, facing = data.points[left_out], errors.facing[left_out]
         sheets = candidate.fit(select(data, ~left_out))
-        found = sheets.measure(points / points[:, 2:], data.index[left_out].astype(float))
+        found = sheets.intersect(points / points[:, 2:], data.index[left_out].astype(float))
         distances[left_out] = (found.depth - points[:, 2]) * facing
         unit_variance[left_out] += found.variance_mm2 * facing**2
     return HeldOutErrors(distances, unit_variance)

@@ -158,9 +158,9 @@ def calibrate_pair(pair: LocatedPair) -> Outcome[PairCalibration]:
         # In a rig of several pairs all cameras together constrain the boards, far better than the
         # stripes of one pair could.
         calibration, lights = _refine(pair, calibration, lights)
-    own, *across = (light.sheets for light in lights)
+    sheets, *across = (light.sheets for light in lights)
     return Outcome(
-        replace(calibration, sheets=own, crossing=across[0] if across else None),
+        replace(calibration, sheets=sheets, crossing=across[0] if across else None),
         (*notes, *crossing.notes),
     )
 
@@ -220,8 +220,8 @@ def _refine(
 
     def stripes_on(view: LocatedView) -> tuple[BoardStripes, ...]:
         return tuple(
-            BoardStripes.from_points(pair.camera, select(own, own.board == k.get(view.key, -1)))
-            for own, k in zip(points, number, strict=True)
+            BoardStripes.from_points(pair.camera, select(some, some.board == k.get(view.key, -1)))
+            for some, k in zip(points, number, strict=True)
         )
 
     boards = [

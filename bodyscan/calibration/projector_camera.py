@@ -233,14 +233,14 @@ def _refine(
     free = np.setdiff1d(np.arange(first_term + terms), [POSE + MATRIX.index("gamma")])
     priors = projector.lens.prior_sigmas[:terms]
 
-    def moved(step: Array) -> tuple[Camera, RigidTransform]:
+    def perturb(step: Array) -> tuple[Camera, RigidTransform]:
         whole = np.zeros(size)
         whole[free] = step
         return projector.retract(whole[POSE:]), from_camera.retract(whole[:POSE])
 
     def errors(step: Array) -> Array:
         """In sigmas: of the sheets across the stripes, then of the lens from its prior."""
-        light, pose = moved(step)
+        light, pose = perturb(step)
         return np.concatenate([*(_errors(light, pose, s) for s in both), step[-terms:] / priors])
 
     from scipy.optimize import least_squares  # imported here because scans do not need it
@@ -255,7 +255,7 @@ def _refine(
             f"{predicted * misfit:.2g} of its pixels, the noise of the sheets explains "
             f"{predicted:.2g}"
         )
-    return FittedProjector(*moved(solved.x), predicted * misfit, predicted)
+    return FittedProjector(*perturb(solved.x), predicted * misfit, predicted)
 
 
 def _errors(light: Camera, from_camera: RigidTransform, samples: _Samples) -> Array:

@@ -82,7 +82,7 @@ def fit_sheets(
     board_error_mm: how well the boards' poses are known (see `BoardErrors`). It changes only the
         covariance: the errors of a board's points are correlated, however many they are.
     """
-    _, jacobian = start.prior()
+    _, jacobian = start.linearize_prior()
     solution = minimize(
         start,
         lambda sheets: _blocks(sheets, data),
@@ -93,7 +93,7 @@ def fit_sheets(
         damping=1e-6,
     )
     sheets, points = solution.state, solution.blocks[0]
-    by_point = sheets.offset(data.points, sheets.at(data.index.astype(float))).by_point
+    by_point = sheets.offset(data.points, sheets.evaluate(data.index.astype(float))).by_point
     covariance = solution.covariance
     if board_error_mm > 0.0:
         covariance = covariance + _board_covariance(solution, data, by_point, board_error_mm)
@@ -108,7 +108,7 @@ def fit_sheets(
 def _blocks(sheets: SmoothSheets, data: BoundaryPoints) -> tuple[Block, Block]:
     """Residuals: offsets of the points with the sigma that their pixel error gives, and the prior."""
     with np.errstate(all="ignore"):
-        at = sheets.at(data.index.astype(float))
+        at = sheets.evaluate(data.index.astype(float))
         offset = sheets.offset(data.points, at, parameters=True)
     by_parameter = offset.by_parameter
     assert by_parameter is not None
@@ -117,7 +117,7 @@ def _blocks(sheets: SmoothSheets, data: BoundaryPoints) -> tuple[Block, Block]:
     sigma = np.maximum(leverage, 1e-12) * np.hypot(data.sigma_px, 0.02)
     # Sheets that leave points behind the projector are invalid.
     value = np.where(offset.reach > 0.0, offset.value, np.nan)
-    known, jacobian = sheets.prior()
+    known, jacobian = sheets.linearize_prior()
     every = slice(0, jacobian.shape[1])
     return (
         Block(value, lambda: by_parameter, every, POINTS, sigma),

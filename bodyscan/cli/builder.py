@@ -57,8 +57,8 @@ def init(
 
     from bodyscan.files.atomic import write_bytes
 
-    own = ("first-commands.txt", "fuse.yaml", "calibrate.yaml", "woman_average.ply")
-    sources = {"rig.yaml": f"{rig}.yaml"} | {name: name for name in own}
+    starters = ("first-commands.txt", "fuse.yaml", "calibrate.yaml", "woman_average.ply")
+    sources = {"rig.yaml": f"{rig}.yaml"} | {name: name for name in starters}
     require_writable(folder)
     there = [name for name in sources if (folder / name).exists()]
     if there:

@@ -80,7 +80,7 @@ def girth_errors(mesh: BodyMesh, true: Measurements, *, mean_breath: bool = Fals
 
 
 def _trunk_error(ours: Slice, true: Slice) -> float | None:
-    one, other = ours.of("trunk"), true.of("trunk")
+    one, other = ours.find_girth("trunk"), true.find_girth("trunk")
     if one is None or other is None or one.measured_skin < WHOLE:
         return None
     return one.tape_mm - other.tape_mm

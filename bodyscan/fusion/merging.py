@@ -89,14 +89,14 @@ def average(
     sums[:, 0], sums[:, 3], sums[:, 8] = weight, weight * grey.samples, 1.0
     sums[:, 4:7], sums[:, 7] = weight[:, None] * samples.normals, (weight * sigma_mm) ** 2
     for surface, one, levels in zip(surfaces, consistency, grey.surfaces, strict=True):
-        seen = surface.weight, surface.sigma_mm, levels, surface.normals
-        _add_surface(one.index, one.at, one.shift_mm, seen, sums)
+        observed = surface.weight, surface.sigma_mm, levels, surface.normals
+        _add_surface(one.index, one.at, one.shift_mm, observed, sums)
         np.add.at(sums[:, 9], one.against_index, surface.weight[one.against_at])
     kept = sums[:, 9] < sums[:, 0]
-    total, shift, square, brightness, *normal, variance, seen_by, _ = sums[kept].T
+    total, shift, square, brightness, *normal, variance, count, _ = sums[kept].T
     mean = shift / total
     # Differences of more than three sigmas enlarge sigmas beyond the inflation of all.
-    chi2 = (square - total * mean**2) / np.maximum(seen_by - 1.0, 1.0)
+    chi2 = (square - total * mean**2) / np.maximum(count - 1.0, 1.0)
     inflation = estimate_sigma_inflation(samples, surfaces, consistency, poses) ** 2
     sigma_mm = np.sqrt(variance * np.maximum(inflation, chi2 / 9.0)) / total
     normals = np.stack(normal, axis=1)
@@ -105,7 +105,7 @@ def average(
         (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32),
         sigma_mm.astype(np.float32),
         np.repeat(np.clip(np.rint(brightness / total), 0.0, 255.0).astype(np.uint8)[:, None], 3, 1),
-        seen_by.astype(np.uint8),
+        count.astype(np.uint8),
     )
 
 

@@ -70,7 +70,7 @@ class BowedSheets(SmoothSheets):
         """Number of terms b2, b3, ..."""
         return (len(self.parameters) - 3 * (PLANE_DEGREE + 1) - 1) // (BOW_DEGREE + 1)
 
-    def prior(self) -> tuple[Array, Array]:
+    def linearize_prior(self) -> tuple[Array, Array]:
         fall = FALL ** np.arange(PLANE_DEGREE + 1)
         # A lens bows the sheets above and below its axis in opposite directions: b2 grows with s.
         late = FALL ** np.maximum(np.arange(BOW_DEGREE + 1) - 1, 0)
@@ -85,7 +85,7 @@ class BowedSheets(SmoothSheets):
     def retract(self, step: Array) -> BowedSheets:
         return replace(self, parameters=self.parameters + step)
 
-    def at(self, s: Array) -> SheetsAtStripe:
+    def evaluate(self, s: Array) -> SheetsAtStripe:
         u = 2.0 * np.asarray(s, float) / self.stripes - 1.0
         basis: Array = chebyshev.chebvander(u, PLANE_DEGREE).astype(np.float64)
         polynomials = self._polynomials()
@@ -136,7 +136,7 @@ class BowedSheets(SmoothSheets):
     def _table(self) -> Array:
         """Rows (K, 2 T + U) at s = 0, 1/8, 2/8, ...: the T coefficients p, q, r, b2, ..., their
         derivatives by s, and row by row the upper triangle of the covariance of them and x0."""
-        at = self.at(np.arange(NODES_PER_STRIPE * self.stripes + 1.0) / NODES_PER_STRIPE)
+        at = self.evaluate(np.arange(NODES_PER_STRIPE * self.stripes + 1.0) / NODES_PER_STRIPE)
         sizes = self._sizes
         parts = [slice(end - size, end) for size, end in zip(sizes, np.cumsum(sizes), strict=True)]
         # Chebyshev polynomials begin with 1, which is also what x0 is multiplied by.
@@ -150,17 +150,17 @@ class BowedSheets(SmoothSheets):
         ]
         return np.column_stack([at.value, at.slope, *covariances])
 
-    def _measure(self, rays: Array, s: Array, found: Array) -> None:
+    def _intersect(self, rays: Array, s: Array, found: Array) -> None:
         frame = self.projector_from_camera.matrix[:3].ravel()
         frame = np.append(frame, [self.parameters[-1], self.distance_mm])
-        _measure(frame, self._table, 3 + self.bow_terms, rays, s, found)
+        _intersect(frame, self._table, 3 + self.bow_terms, rays, s, found)
 
 
 NODES_PER_STRIPE = 8
 
 
 @compiled
-def _measure(frame: Array, rows: Array, terms: int, rays: Array, s: Array, found: Array) -> None:
+def _intersect(frame: Array, rows: Array, terms: int, rays: Array, s: Array, found: Array) -> None:
     """Fill `found` (3, N) with depth, dz/ds and variance of rays (N, 3) at s (N,).
 
     frame: (14,) the three rows of projector_from_camera, then x0 and D.

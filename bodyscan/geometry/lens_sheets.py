@@ -79,7 +79,7 @@ class LensSheets(SmoothSheets):
         parameters = np.append([focal, centre], self.parameters[SCALE:])
         return replace(self, projector_from_camera=frame, parameters=parameters)
 
-    def prior(self) -> tuple[Array, Array]:
+    def linearize_prior(self) -> tuple[Array, Array]:
         lens = self.parameters[SCALE:]
         x, y, z = self.projector_from_camera.apply(self.middle)
         sigmas = np.array(LENS_SIGMAS[: len(lens)])
@@ -101,7 +101,7 @@ class LensSheets(SmoothSheets):
         lens = self.parameters[SCALE:] + step[FRAME + SCALE :]
         return replace(self, projector_from_camera=frame, parameters=np.append(scale, lens))
 
-    def at(self, s: Array) -> Array:
+    def evaluate(self, s: Array) -> Array:
         return s
 
     def stripe(self, points: Array) -> Array:
@@ -131,7 +131,7 @@ class LensSheets(SmoothSheets):
             by_parameter,
         )
 
-    def _measure(self, rays: Array, s: Array, found: Array) -> None:
+    def _intersect(self, rays: Array, s: Array, found: Array) -> None:
         covariance = self.covariance[np.triu_indices(len(self.covariance))]
         lens = np.zeros(SCALE + len(LENS_SIGMAS))
         lens[: len(self.parameters)] = self.parameters

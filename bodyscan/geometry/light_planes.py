@@ -47,7 +47,7 @@ class LightSheets(Protocol):
     @property
     def stripes(self) -> int: ...
 
-    def measure(self, rays: Array, s: Array) -> RayDepths:
+    def intersect(self, rays: Array, s: Array) -> RayDepths:
         """Intersect rays (..., 3) with z = 1, camera frame, with the sheets at real s (...)."""
         ...
 
@@ -101,7 +101,7 @@ class LightPlanes:
         upper = np.where(share > 0.0, self.coefficients[below + 1], 0.0)
         return (1.0 - share) * lower + share * upper
 
-    def measure(self, rays: Array, s: Array) -> RayDepths:
+    def intersect(self, rays: Array, s: Array) -> RayDepths:
         """z by Eq. 13, -d / (a x/z + b y/z + c), and dz/ds from the two planes around s; at the last
         plane, from the two before it.
 
@@ -186,12 +186,12 @@ class SmoothSheets(ABC):
     covariance: Array
 
     @abstractmethod
-    def prior(self) -> tuple[Array, Array]:
-        """Prior knowledge: residuals (R,) in standard deviations, and their Jacobian (R, P)."""
+    def linearize_prior(self) -> tuple[Array, Array]:
+        """Compute the prior's residuals (R,) in standard deviations, and their Jacobian (R, P)."""
 
     @abstractmethod
     def retract(self: Sheets, step: Array) -> Sheets:
-        """The sheets after a step (P,)."""
+        """Return the sheets after a step (P,)."""
 
     @property
     def distance_mm(self) -> float:
@@ -199,23 +199,23 @@ class SmoothSheets(ABC):
         return float(self.projector_from_camera.apply(self.middle)[2])
 
     @abstractmethod
-    def at(self, s: Array) -> Any:
-        """Everything about the sheets at s (...) that `offset` needs."""
+    def evaluate(self, s: Array) -> Any:
+        """Evaluate the sheets at s (...), as `offset` needs them."""
 
     @abstractmethod
     def offset(self, points: Array, sheet: Any, *, parameters: bool = False) -> Offset:
-        """How far points (..., 3), camera frame, lie off the sheets `at(s)`."""
+        """Offset of points (..., 3), camera frame, from the sheets `evaluate(s)`."""
 
-    def measure(self, rays: Array, s: Array) -> RayDepths:
+    def intersect(self, rays: Array, s: Array) -> RayDepths:
         """Intersect rays (..., 3) with z = 1, camera frame, with the sheets at s (...)."""
         shape = rays.shape[:-1]
         found = np.empty((3, int(np.prod(shape))))
         flat = np.ascontiguousarray(rays.reshape(-1, 3)), np.broadcast_to(s, shape).ravel()
-        self._measure(*flat, found)
+        self._intersect(*flat, found)
         return RayDepths(*found.reshape(3, *shape))
 
     @abstractmethod
-    def _measure(self, rays: Array, s: Array, found: Array) -> None:
+    def _intersect(self, rays: Array, s: Array, found: Array) -> None:
         """Fill `found` (3, N) with depth, dz/ds and variance of rays (N, 3) at s (N,)."""
 
     def tangent_planes(self, s: Array) -> Array:
@@ -226,7 +226,7 @@ class SmoothSheets(ABC):
         position = np.zeros((*s.shape, 3))
         position[..., 2] = self.distance_mm
         across = camera_from_projector.rotation[:, 1]
-        sheet = self.at(s)
+        sheet = self.evaluate(s)
         for _ in range(5):
             offset = self.offset(camera_from_projector.apply(position), sheet)
             position[..., 1] -= offset.value / (offset.by_point @ across)

@@ -67,7 +67,7 @@ BAND = 16  # rows at a time: what fits into a processor's cache
 def intersect_rays(sheets: LightSheets, rays: Array, s: Array) -> RayDepths:
     """Intersect rays (..., 3) with z = 1, camera frame, with the sheets at real s (...); NaN where
     no depth can be trusted."""
-    found = sheets.measure(rays, s)
+    found = sheets.intersect(rays, s)
     unsure = found.variance_mm2 > (_max_relative_sigma(sheets) * found.depth) ** 2
     return RayDepths(*(np.where(unsure, np.nan, part) for part in found))
 
@@ -107,7 +107,7 @@ def triangulate_image(
         rows = slice(first, first + BAND)
         wanted = np.isfinite(s[rows])
         rays = look_up_rays(pixels, wanted, first)
-        found = sheets.measure(rays, s[rows][wanted].astype(np.float64))
+        found = sheets.intersect(rays, s[rows][wanted].astype(np.float64))
         common = found.variance_mm2
         if shared is not None:
             common = common + (found.per_stripe * shared[rows][wanted]) ** 2
@@ -129,7 +129,7 @@ def _max_relative_sigma(sheets: LightSheets) -> float:
     if not isinstance(sheets, SmoothSheets):
         return MAX_RELATIVE_SIGMA
     stripes, middle_mm = np.arange(sheets.stripes + 1.0), sheets.middle[2]
-    found = sheets.measure(np.tile(sheets.middle / middle_mm, (len(stripes), 1)), stripes)
+    found = sheets.intersect(np.tile(sheets.middle / middle_mm, (len(stripes), 1)), stripes)
     away = np.abs(found.depth - middle_mm)
     if not np.isfinite(away).any():
         return MAX_RELATIVE_SIGMA

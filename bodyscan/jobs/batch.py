@@ -119,7 +119,7 @@ def run_on_cluster(
     threads: per job. The cluster decides how many jobs run at once: one for each thread of each
         worker (`dask worker --nthreads`).
 
-    Raises BadInput if dask.distributed is not installed, FailedWork if nobody answers or there is
+    Raises BadInput if dask.distributed is not ours, FailedWork if nobody answers or there is
     no worker.
     """
     try:
@@ -127,7 +127,7 @@ def run_on_cluster(
         from distributed import as_completed as as_ended
     except ImportError:
         raise BadInput(
-            "--cluster needs dask.distributed, which is not installed",
+            "--cluster needs dask.distributed, which is not ours",
             remedy="pip install 'bodyscan[cluster]' here and on every worker",
         ) from None
 
@@ -189,9 +189,9 @@ def run_on_worker(
     """Do one job on a worker, which must have the versions of where the batch was started."""
     os.umask(0o077)
     reason = ""
-    if (own := stage_versions()) != versions:
+    if (ours := stage_versions()) != versions:
         reason = (
-            f"this worker has bodyscan {own['bodyscan']}, stages {own['stages'][job.pipeline.kind]};"
+            f"this worker has bodyscan {ours['bodyscan']}, stages {ours['stages'][job.pipeline.kind]};"
             f" the batch was started by {versions['bodyscan']}, stages "
             f"{versions['stages'].get(job.pipeline.kind)}: install the same version on every machine"
         )

@@ -62,7 +62,7 @@ def triangulate_pixels(approach: Approach, s: Stripes, where: Mask | None = None
     wanted = s[rows, columns].astype(float)
     known = np.isfinite(wanted)
     points = np.full(rays.shape, np.nan)
-    depth = approach.sheets.measure(rays[known], wanted[known]).depth
+    depth = approach.sheets.intersect(rays[known], wanted[known]).depth
     points[known] = rays[known] * depth[:, None]
     return points
 
@@ -111,7 +111,7 @@ class TrueSheets:
     def stripes(self) -> int:
         return self.setup.projector.stripes
 
-    def measure(self, rays: Array, s: Array) -> RayDepths:
+    def intersect(self, rays: Array, s: Array) -> RayDepths:
         """Intersect rays with the light; it is known exactly."""
         depth = self._depth(rays, s)
         per_stripe = (self._depth(rays, s + 1e-3) - depth) / 1e-3

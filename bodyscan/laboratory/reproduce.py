@@ -161,8 +161,8 @@ def draw_projector(
         values = _baseline_angle_tilt(true)[part]
         axis.plot(s, values, color="#333333", linewidth=3.0, alpha=0.35, label="true")
         for colour, (name, found) in zip(COLOURS, planes.items(), strict=False):
-            shown = _baseline_angle_tilt(found)[part]
-            axis.plot(s, shown, ".", color=colour, markersize=2.5, label=name)
+            fitted = _baseline_angle_tilt(found)[part]
+            axis.plot(s, fitted, ".", color=colour, markersize=2.5, label=name)
         room = 0.6 * float(np.ptp(values)) + 1e-3
         if part != 1:
             axis.set_ylim(values.min() - room, values.max() + room)

@@ -76,8 +76,8 @@ class Slice:
     height_mm: float
     girths: tuple[Girth, ...]
 
-    def of(self, part: str) -> Girth | None:
-        """The largest loop of that part, None if the slice has none."""
+    def find_girth(self, part: str) -> Girth | None:
+        """Find the largest loop of a part, None if the slice has none."""
         found = [girth for girth in self.girths if girth.part == part]
         return max(found, key=lambda girth: girth.area_mm2) if found else None
 

@@ -76,7 +76,7 @@ Depths = tuple[Floats, Floats, Floats]
 
 
 def combine_directions(
-    own: Depths, crossing: Depths, *, alone: Mask
+    primary: Depths, crossing: Depths, *, alone: Mask
 ) -> tuple[Depths, Agreement | None]:
     """Combine the depths of both directions.
 
@@ -90,7 +90,7 @@ def combine_directions(
     beyond the others are dropped, and the better direction alone gives the depth, the other being a
     check.
     """
-    points, sigma_mm, common_mm = (part.copy() for part in own)
+    points, sigma_mm, common_mm = (part.copy() for part in primary)
     both = np.isfinite(sigma_mm) & np.isfinite(crossing[1])
     alone = alone & ~np.isfinite(sigma_mm) & np.isfinite(crossing[1])
     for part, other in zip((points, sigma_mm, common_mm), crossing, strict=True):
@@ -163,7 +163,7 @@ def _require_fit(pair: PairCalibration, stripes: StripeMap, agreement: Agreement
             assert sheets is not None
             s = direction.s[decoded].astype(np.float64)
             exist = exist & np.isfinite(sheets.tangent_planes(s)[:, 3])
-            meet = meet & exist & np.isfinite(sheets.measure(rays, s).depth)
+            meet = meet & exist & np.isfinite(sheets.intersect(rays, s).depth)
         count, met = np.count_nonzero(exist), np.count_nonzero(exist & meet)
         if count < 1000 or met >= 0.01 * count:
             return

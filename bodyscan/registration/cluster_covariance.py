@@ -160,7 +160,7 @@ def _by_every_corner(by_corner: Array) -> Array:
 
 
 def _information(shape: BoardShape) -> Array:
-    known = shape.prior(shape.size_sigma)
+    known = shape.compute_prior_jacobian(shape.size_sigma)
     return known.T @ known
 
 

@@ -1,4 +1,4 @@
-"""The joint solve: all poses with the cameras held, then poses and cameras, by least squares.
+"""The joint solve: all poses with the cameras fixed, then poses and cameras, by least squares.
 
 The first brings everything together from a start that may be centimetres off, with a wide loss. Then
 every parameter of the cameras is free, with a Cauchy loss scaled by the corners' own robust sigma;
@@ -38,16 +38,16 @@ class JointSolution:
 def solve_poses(
     views: Sequence[LocatedView], start: JointSolution, *, root: str, loss_px: float
 ) -> JointSolution:
-    """Solve for all poses from a start that may be far off; the cameras are held.
+    """Solve for all poses from a start that may be far off; the cameras are fixed.
 
     loss_px: distance beyond which corners count less and less (Cauchy).
     """
-    held = {
+    fixed = {
         name: replace(camera, prior=CameraPrior(camera.parameters, 1e-6 * camera.prior_sigmas))
         for name, camera in start.cameras.items()
     }
     noise = Noise("corners", group=2, cauchy=loss_px, known=1.0)
-    solution = replace(start, cameras=held)
+    solution = replace(start, cameras=fixed)
     solution = refine_solution(views, solution, root=root, equal_noise=True, noise=noise)
     return replace(solution, cameras=start.cameras)
 
@@ -122,15 +122,15 @@ class _Unknowns:
         }
         return JointSolution(root_from_camera, boards, cameras, shapes)
 
-    def of_view(self, view: LocatedView, shapes: Mapping[str, BoardShape]) -> Indices:
-        """Columns of a view, or of each of its corners if these are unknowns, (1 or N, C)."""
-        of_view = np.concatenate(
+    def select_columns(self, view: LocatedView, shapes: Mapping[str, BoardShape]) -> Indices:
+        """Columns of a view, or of each of its corners if those are unknowns, (1 or N, C)."""
+        columns = np.concatenate(
             [self.of_pair[view.pair], self.of_board[view.target], self.of_camera[view.pair]]
         )
         if not shapes:
-            return of_view[None]
+            return columns[None]
         corners = self.of_corners[view.board][shapes[view.board].numbers(view.points)]
-        return np.hstack([np.tile(of_view, (len(corners), 1)), corners])
+        return np.hstack([np.tile(columns, (len(corners), 1)), corners])
 
 
 def _blocks(
@@ -154,7 +154,7 @@ def _blocks(
     every = [one for views in by_view for one in views]
     sigmas = iter(np.ones(len(every)) if equal_noise else view_sigmas(every))
     for views, (residuals, linearize), lengths in zip(of_pair, errors, runs, strict=True):
-        columns = np.concatenate([unknowns.of_view(view, solution.shapes) for view in views])
+        columns = np.concatenate([unknowns.select_columns(view, solution.shapes) for view in views])
         # The root camera fixes the frame: it has no motion.
         first = 0 if len(unknowns.of_pair[views[0].pair]) else 6
         jacobian = partial(_take_columns, linearize, first, columns.shape[1])
@@ -170,7 +170,7 @@ def _blocks(
             yield Block(np.zeros(len(MATRIX)), partial(np.asarray, known), matrix, EXACT)
         yield camera_prior(camera, parameters)
     for name, shape in solution.shapes.items():
-        known = shape.prior()
+        known = shape.compute_prior_jacobian()
         deviation = known @ shape.offsets.ravel()
         yield Block(deviation, partial(np.asarray, known), unknowns.of_corners[name].ravel(), EXACT)
 

@@ -67,7 +67,7 @@ def frame_board_turn(
     root_from_camera: Mapping[str, RigidTransform],
     root_from_board: Mapping[Target, RigidTransform],
 ) -> RigidTransform:
-    """`board_from_seen` of the board that fixes the rig frame, if it is a plain one.
+    """`board_from_observed` of the board that fixes the rig frame, if it is a plain one.
 
     Images cannot tell whether such a board is numbered from its other end or lies on its other
     face. Of all readings this takes the one that puts the cameras nearest to their nominal

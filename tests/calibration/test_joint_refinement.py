@@ -125,12 +125,12 @@ def plate(camera: Camera, sheets: SmoothSheets) -> tuple[float, Array]:
     true = SCENE.on_plane(pixels, pose)
     s = MIRROR.stripe(true)
     rays = camera.rays(pixels)
-    depth = sheets.measure(rays, s).depth
+    depth = sheets.intersect(rays, s).depth
     points = rays * depth[:, None]
     centred = points - points.mean(axis=0)
     flatness = float(np.sqrt(np.linalg.eigvalsh(centred.T @ centred / len(centred))[0]))
     off = fit_rigid_transform(points, true).apply(points) - true
-    return flatness, off[:, 2] / np.sqrt(sheets.measure(rays, s).variance_mm2)
+    return flatness, off[:, 2] / np.sqrt(sheets.intersect(rays, s).variance_mm2)
 
 
 def test_a_plate_measured_with_a_bowed_board_becomes_flatter() -> None:

@@ -162,5 +162,5 @@ def test_equation_13_equals_equation_14(u: float, v: float, i: int) -> None:
     baseline, angle, tilt = baseline_angle_tilt(planes.coefficients[i], "vertical")
     # The chapter prints - tan(tilt): with its own Eq. 9 the sign must be + (docs/method.md).
     by_14 = baseline / (np.tan(angle) - ray[0, 0] + np.tan(tilt) * ray[0, 1])
-    by_13 = planes.measure(ray, np.array([float(i)])).depth[0]
+    by_13 = planes.intersect(ray, np.array([float(i)])).depth[0]
     assert np.isclose(by_13, by_14, rtol=1e-9) or (by_14 <= 0 and np.isnan(by_13))

@@ -57,7 +57,7 @@ def test_its_sheets_lie_where_opencv_projects_them(kind: str, direction: Axis) -
         # Where the search starts must not matter: nobody says how far away the subject stands.
         for middle in ([0.0, 0.0, 300.0], [0.0, 0.0, 3000.0]):
             sheets = sheets_from_projector(light, PLACE, np.array(middle), stripes, direction)
-            depth, per_stripe, variance = sheets.measure(
+            depth, per_stripe, variance = sheets.intersect(
                 points[shown] / points[shown, 2:], s[shown] / halves
             )
             if direction == "vertical":  # along the baseline, so that depth is well told
@@ -83,7 +83,7 @@ def test_sigma_moves_all_sheets_together() -> None:
     light = projector(OpenCVs(LENSES["Brown"]))
     sheets = sheets_from_projector(light, PLACE, np.array([0, 0, 700.0]), 640, "vertical", 0.5)
     rays = np.array([[0.0, 0.0, 1.0], [0.1, 0.05, 1.0]])
-    depth, per_stripe, variance = sheets.measure(rays, np.array([200.0, 300.0]))
+    depth, per_stripe, variance = sheets.intersect(rays, np.array([200.0, 300.0]))
     assert np.all(np.isfinite(depth))
     # half a projector pixel is a quarter of a stripe of two pixels
     np.testing.assert_allclose(np.sqrt(variance), 0.25 * np.abs(per_stripe), rtol=1e-12)

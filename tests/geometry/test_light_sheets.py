@@ -24,10 +24,10 @@ def some_points(rng: np.random.Generator, count: int = 50) -> tuple[np.ndarray, 
 def sliced(model: SmoothSheets, rays: np.ndarray, depth: np.ndarray) -> np.ndarray:
     """s at which rays are measured at a depth, by bisection: depth falls or grows with s."""
     low, high = np.zeros(len(rays)), np.full(len(rays), float(STRIPES))
-    grows = model.offset(rays * depth[:, None], model.at(low)).by_stripe < 0
+    grows = model.offset(rays * depth[:, None], model.evaluate(low)).by_stripe < 0
     for _ in range(60):
         middle = 0.5 * (low + high)
-        off = model.offset(rays * depth[:, None], model.at(middle)).value
+        off = model.offset(rays * depth[:, None], model.evaluate(middle)).value
         above = (off > 0) == grows
         low, high = np.where(above, middle, low), np.where(above, high, middle)
     return 0.5 * (low + high)
@@ -44,19 +44,19 @@ def test_derivatives_are_those_of_the_offset(seed: int) -> None:
 
 def assert_derivatives(model: SmoothSheets, points: Array, s: Array) -> None:
     def moved_points(by: Array) -> Array:
-        return model.offset(points + by, model.at(s)).value
+        return model.offset(points + by, model.evaluate(s)).value
 
     def moved_stripes(by: Array) -> Array:
-        return model.offset(points, model.at(s + by)).value
+        return model.offset(points, model.evaluate(s + by)).value
 
     def moved_parameters(by: Array) -> Array:
         other = model.retract(by)
-        return other.offset(points, other.at(s)).value
+        return other.offset(points, other.evaluate(s)).value
 
     def slope(change: Callable[[Array], Array], axis: Array, step: float) -> Array:
         return (change(step * axis) - change(-step * axis)) / (2.0 * step)
 
-    offset = model.offset(points, model.at(s), parameters=True)
+    offset = model.offset(points, model.evaluate(s), parameters=True)
     for k, axis in enumerate(np.eye(3)):
         # Central differences over 0.01 mm in 1300: rounding and curvature below 1e-6.
         by_point = slope(moved_points, axis, 0.01)
@@ -79,12 +79,13 @@ def test_depth_and_its_slope(seed: int) -> None:
     for model in models(seed):
         s = sliced(model, rays, depth)
         inside = (s > 1.0) & (s < STRIPES - 1.0)
-        found = model.measure(rays, s)
+        found = model.intersect(rays, s)
         # Bisection leaves 1e-14 stripes, a stripe is worth some 10 mm. Of 400 draws no table was off
         # by more than 2e-3 mm, or by 4e-3 of the slope.
         atol, rtol = (1e-6, 1e-5) if isinstance(model, LensSheets) else (5e-3, 1e-2)
         assert np.allclose(found.depth[inside], depth[inside], rtol=0.0, atol=atol)
-        slope = (model.measure(rays, s + 1e-3).depth - model.measure(rays, s - 1e-3).depth) / 2e-3
+        below, above = (model.intersect(rays, s + step).depth for step in (-1e-3, 1e-3))
+        slope = (above - below) / 2e-3
         assert np.allclose(found.per_stripe[inside], slope[inside], rtol=rtol)
 
 
@@ -99,11 +100,11 @@ def test_variance_is_that_of_sheets_drawn_from_the_covariance(seed: int) -> None
         s = sliced(model, rays, depth)
         factor = np.linalg.cholesky(model.covariance + 1e-30 * np.eye(len(model.covariance)))
         draws = [
-            model.retract(factor @ rng.standard_normal(len(factor))).measure(rays, s).depth
+            model.retract(factor @ rng.standard_normal(len(factor))).intersect(rays, s).depth
             for _ in range(200)
         ]
         # 200 draws give a standard deviation to 5 percent; five times that.
-        ratio = np.std(draws, axis=0) / np.sqrt(model.measure(rays, s).variance_mm2)
+        ratio = np.std(draws, axis=0) / np.sqrt(model.intersect(rays, s).variance_mm2)
         inside = (s > 5.0) & (s < STRIPES - 5.0)
         assert np.all(np.abs(ratio[inside] - 1.0) < 0.25)
 
@@ -119,10 +120,10 @@ def test_smooth_planes_of_earlier_versions_are_planes() -> None:
     rays = np.column_stack([rng.uniform(-0.3, 0.3, (300, 2)), np.ones(300)])
     s = rng.integers(1, STRIPES, 300).astype(float)
     # Far away rays and planes are nearly parallel: compare where a scanner measures.
-    depth = chapter.measure(rays, s).depth
+    depth = chapter.intersect(rays, s).depth
     near = np.isfinite(depth) & (depth > 500.0) & (depth < 3000.0)
     assert near.sum() > 50
-    assert np.allclose(model.measure(rays, s).depth[near], depth[near], rtol=1e-8)
+    assert np.allclose(model.intersect(rays, s).depth[near], depth[near], rtol=1e-8)
 
 
 def test_a_lens_without_distortion_is_the_two_by_four_matrix() -> None:
@@ -146,10 +147,10 @@ def test_turning_a_projector_moves_its_axis_and_little_else() -> None:
 def test_no_depth_outside_the_stripes_or_behind() -> None:
     rays = np.tile([0.0, 0.0, 1.0], (3, 1))
     for model in models(3):
-        assert np.isnan(model.measure(rays, np.array([-0.5, STRIPES + 0.5, np.nan])).depth).all()
+        assert np.isnan(model.intersect(rays, np.array([-0.5, STRIPES + 0.5, np.nan])).depth).all()
     # Below the projector, a ray that falls steeply never meets the light that falls least.
     steep = np.array([[0.0, 3.0, 1.0]])
-    assert np.isnan(PINHOLE.measure(steep, np.array([10.0])).depth).all()
+    assert np.isnan(PINHOLE.intersect(steep, np.array([10.0])).depth).all()
 
 
 def test_arrays_hold_everything() -> None:
@@ -168,7 +169,7 @@ def test_arrays_hold_everything() -> None:
         ):
             assert np.array_equal(left, right)
         assert np.array_equal(
-            again.measure(rays, s).depth, sheets.measure(rays, s).depth, equal_nan=True
+            again.intersect(rays, s).depth, sheets.intersect(rays, s).depth, equal_nan=True
         )
 
 
@@ -189,15 +190,15 @@ def test_planes_have_slope_and_variance_between_two_and_at_the_last() -> None:
     ray = np.array([[0.02, 0.01, 1.0]])
     for place in (100.5, 149.0, 151.0, 99.0):
         s = np.array([place])
-        depth = chapter.measure(ray, s).depth
+        depth = chapter.intersect(ray, s).depth
         side = -1.0 if place == 149.0 else 1.0
-        nearby = chapter.measure(ray, s + side * 1e-6).depth
+        nearby = chapter.intersect(ray, s + side * 1e-6).depth
         slope = (nearby - depth) / (side * 1e-6)
-        assert np.allclose(chapter.measure(ray, s).per_stripe, slope, rtol=1e-4)
+        assert np.allclose(chapter.intersect(ray, s).per_stripe, slope, rtol=1e-4)
         facing = chapter.tangent_planes(s)[0, :3] @ ray[0]
         # A plane's offset, 0.1 mm uncertain, moves the depth by that over n . ray.
-        assert np.allclose(chapter.measure(ray, s).variance_mm2, 0.01 / facing**2)
-    assert np.isnan(chapter.measure(ray, np.array([149.5])).variance_mm2).all()
+        assert np.allclose(chapter.intersect(ray, s).variance_mm2, 0.01 / facing**2)
+    assert np.isnan(chapter.intersect(ray, np.array([149.5])).variance_mm2).all()
 
 
 def test_planes_of_any_length_and_sign_measure_and_do_not_say_how_well() -> None:
@@ -210,16 +211,16 @@ def test_planes_of_any_length_and_sign_measure_and_do_not_say_how_well() -> None
     assert (exact.coefficients[:, 3] > 0.0).all()
     assert exact.stripes == STRIPES
     ray, s = np.array([[0.02, 0.01, 1.0]]), np.array([100.5])
-    assert np.isfinite(exact.measure(ray, s).depth).all()
-    assert np.isnan(exact.measure(ray, s).variance_mm2).all()
+    assert np.isfinite(exact.intersect(ray, s).depth).all()
+    assert np.isnan(exact.intersect(ray, s).variance_mm2).all()
     again = sheets_from_arrays("planes", sheets_to_arrays(exact), "horizontal")
-    assert np.isnan(again.measure(ray, s).variance_mm2).all()
+    assert np.isnan(again.intersect(ray, s).variance_mm2).all()
 
 
 def test_a_plane_behind_the_camera_measures_nothing() -> None:
     ahead, behind = [0.0, 0.0, -1.0, 500.0], [0.0, 0.0, 1.0, 500.0]
     planes = LightPlanes.from_planes(np.array([ahead, ahead, behind, behind]), "vertical")
-    depth = planes.measure(np.tile([0.1, 0.0, 1.0], (2, 1)), np.array([0.5, 2.5])).depth
+    depth = planes.intersect(np.tile([0.1, 0.0, 1.0], (2, 1)), np.array([0.5, 2.5])).depth
     np.testing.assert_allclose(depth, [500.0, np.nan])
 
 
@@ -233,11 +234,11 @@ def test_what_is_too_uncertain_is_not_measured() -> None:
     rays = points / points[:, 2:]
     s = model.stripe(points)
     inside = (s > 0) & (s < STRIPES)
-    depth = model.measure(rays[inside], s[inside]).depth
-    share = np.sqrt(model.measure(rays[inside], s[inside]).variance_mm2) / depth
+    depth = model.intersect(rays[inside], s[inside]).depth
+    share = np.sqrt(model.intersect(rays[inside], s[inside]).variance_mm2) / depth
     amid_boards = model.stripe(MIDDLE[None])
     amid = (
-        float(np.sqrt(model.measure(MIDDLE[None] / MIDDLE[2], amid_boards).variance_mm2[0]))
+        float(np.sqrt(model.intersect(MIDDLE[None] / MIDDLE[2], amid_boards).variance_mm2[0]))
         / MIDDLE[2]
     )
     for at_the_boards, most in ((1e-4, 1e-3), (1e-3, 3e-3), (1e-2, 3e-2)):
@@ -257,7 +258,7 @@ def test_a_lens_measures_rays_as_newtons_method_on_its_offset_does(terms: int) -
     points = MIDDLE + rng.uniform(-400.0, 400.0, (3000, 3))
     rays, s = points / points[:, 2:], rng.uniform(-20.0, STRIPES + 20.0, 3000)
     s[::50] = np.nan
-    found = model.measure(rays, s)
+    found = model.intersect(rays, s)
     known = np.isfinite(found.depth)
     assert 0.2 < known.mean() < 0.95
     expected = by_offset(model, rays[known], s[known], found.depth[known])
@@ -273,10 +274,10 @@ def test_the_first_and_the_last_boundary_are_measured_as_well(terms: int) -> Non
     s = np.array([0.0, float(STRIPES)])
     first, last = (MIDDLE + [0.0, y, 0.0] for y in (-284.0, 598.0))
     rays = np.stack([first, last]) / [[first[2]], [last[2]]]
-    depth = model.measure(rays, s).depth
+    depth = model.intersect(rays, s).depth
     np.testing.assert_allclose(model.stripe(rays * depth[:, None]), s, atol=1e-6)
     beyond = np.array([-1e-9, STRIPES + 1e-9])
-    assert np.isnan(model.measure(rays, beyond).depth).all()
+    assert np.isnan(model.intersect(rays, beyond).depth).all()
 
 
 @pytest.mark.parametrize(
@@ -290,9 +291,9 @@ def test_the_first_and_the_last_boundary_are_measured_as_well(terms: int) -> Non
 def test_what_is_known_beforehand_has_its_own_derivatives(model: SmoothSheets) -> None:
     """Where nothing speaks against it: residuals are in standard deviations, of which there are more
     the more a model can bend."""
-    known, jacobian = model.prior()
+    known, jacobian = model.linearize_prior()
     assert jacobian.shape == (len(known), len(model.covariance))
     for k, axis in enumerate(np.eye(len(model.covariance))):
-        ahead, behind = (model.retract(step * axis).prior()[0] for step in (1e-6, -1e-6))
+        ahead, behind = (model.retract(step * axis).linearize_prior()[0] for step in (1e-6, -1e-6))
         # Linear in the step but for rounding, of up to 1e5 standard deviations.
         np.testing.assert_allclose((ahead - behind) / 2e-6, jacobian[:, k], rtol=1e-6, atol=1e-6)

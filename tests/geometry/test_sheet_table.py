@@ -37,7 +37,7 @@ def some_rays(count: int) -> tuple[Array, Array]:
 
 def test_it_agrees_with_the_sheets(sheets: BowedSheets) -> None:
     rays, s = some_rays(20_000)
-    found = sheets.measure(rays, s)
+    found = sheets.intersect(rays, s)
     near = found.depth < 3000.0  # where bodies are; far planes are nearly along the ray
     assert near.sum() > 2500
     depth, slope, variance = by_offset(sheets, rays[near], s[near], found.depth[near])
@@ -51,9 +51,9 @@ def test_it_agrees_with_the_sheets(sheets: BowedSheets) -> None:
 def test_nothing_outside_the_stripes_or_behind(sheets: BowedSheets) -> None:
     rays, _ = some_rays(300)
     for nowhere in (-0.1, STRIPES + 0.1, np.nan):
-        assert np.isnan(sheets.measure(rays, np.full(len(rays), nowhere)).depth).all()
+        assert np.isnan(sheets.intersect(rays, np.full(len(rays), nowhere)).depth).all()
     upward = np.tile([0.0, -2.0, 1.0], (300, 1))
-    depth = sheets.measure(upward, np.linspace(0.0, STRIPES, 300)).depth
+    depth = sheets.intersect(upward, np.linspace(0.0, STRIPES, 300)).depth
     assert (depth[np.isfinite(depth)] > 0.0).all()
 
 
@@ -68,7 +68,7 @@ def test_an_image_is_measured_as_its_rays_are(sheets: BowedSheets) -> None:
     assert points.dtype == sigma_mm.dtype == np.float32
 
     rays = CAMERA.pixel_rays()
-    found = sheets.measure(rays, s.astype(float))
+    found = sheets.intersect(rays, s.astype(float))
     depth, variance, slope = found.depth, found.variance_mm2, found.per_stripe
     along = np.sqrt((slope * sigma) ** 2 + variance) * np.linalg.norm(rays, axis=-1)
     sure = variance <= (MAX_RELATIVE_SIGMA * depth) ** 2
@@ -92,9 +92,9 @@ def test_what_boards_leave_open_everywhere_is_no_guess(sheets: BowedSheets) -> N
     column = int(np.argmin(np.linalg.norm(rays - MIDDLE / MIDDLE[2], axis=-1)) % CAMERA.width)
     row = int(np.argmin(np.linalg.norm(rays - MIDDLE / MIDDLE[2], axis=-1)) // CAMERA.width)
     ray, every = rays[row, column][None], np.linspace(1.0, STRIPES - 1.0, 500)
-    depth = sheets.measure(np.repeat(ray, 500, axis=0), every).depth
+    depth = sheets.intersect(np.repeat(ray, 500, axis=0), every).depth
     stripe = every[np.nanargmin(np.abs(depth - MIDDLE[2]))]
-    share = np.sqrt(sheets.measure(ray, np.array([stripe])).variance_mm2[0]) / MIDDLE[2]
+    share = np.sqrt(sheets.intersect(ray, np.array([stripe])).variance_mm2[0]) / MIDDLE[2]
     s = np.full((CAMERA.height, CAMERA.width), np.nan, np.float32)
     s[row, column] = stripe
     sigma = np.full(s.shape, 0.02, np.float32)

@@ -78,10 +78,10 @@ def test_a_smile_belongs_to_the_truth() -> None:
     rays = truth.camera.rays(np.column_stack([u.ravel(), v.ravel()]))
     true = rays * 400.0
     s = setup.projector.stripe(true)
-    depth = truth.sheets.measure(rays, s).depth
+    depth = truth.sheets.intersect(rays, s).depth
     # Planes without the smile are 0.04 mm off, RMS, and 0.1 at the fan's ends.
     assert np.abs(depth - 400.0).max() < 1e-6
-    slope = truth.sheets.measure(rays, s).per_stripe
+    slope = truth.sheets.intersect(rays, s).per_stripe
     beyond = setup.projector.stripe(true + 0.1 * rays)
     assert np.allclose(0.1 / slope, beyond - s, rtol=0.01)
 

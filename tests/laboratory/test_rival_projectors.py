@@ -44,7 +44,7 @@ def worst_offset(found: LightPlanes, true: LightPlanes) -> float:
     s = np.arange(60.0, 190.0)
     rays = np.stack([0.0 * s, 0.05 * np.sin(s), np.ones_like(s)], axis=-1)
     rays[:, 0] = np.tan(ANGLES[60:190]) - 155.0 / 400.0
-    return float(np.nanmax(np.abs(found.measure(rays, s).depth - true.measure(rays, s).depth)))
+    return float(np.nanmax(np.abs(found.intersect(rays, s).depth - true.intersect(rays, s).depth)))
 
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 1.5])

@@ -34,7 +34,7 @@ def turned(body: BodyMesh, degrees: float, shift: list[float]) -> BodyMesh:
 
 
 def tape_mm(level: Slice, part: str) -> float:
-    girth = level.of(part)
+    girth = level.find_girth(part)
     assert girth is not None
     return girth.tape_mm
 
@@ -55,12 +55,12 @@ def test_parts_by_height(subject: BodyMesh) -> None:
     every = {"left arm", "right arm", "trunk"}
     assert {girth.part for girth in hips.girths} == every
     assert {girth.part for girth in breast.girths} == every
-    left, right = shins.of("left leg"), shins.of("right leg")
+    left, right = shins.find_girth("left leg"), shins.find_girth("right leg")
     assert left is not None
     assert right is not None
     assert left.centre_mm[1] > 0 > right.centre_mm[1]
     assert left.tape_mm == pytest.approx(right.tape_mm, abs=1.0)  # the subject is symmetric
-    assert breast.of("left leg") is None
+    assert breast.find_girth("left leg") is None
 
 
 @pytest.mark.parametrize("degrees", [-60.0, 25.0, 80.0, 180.0])

@@ -160,7 +160,7 @@ def test_of_a_shape_motion_is_known_and_size_as_little_as_its_strains_say() -> N
     points = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
     arms = points - points.mean(axis=0)
     shape = BoardShape(points, arms * [1e-4, -1e-4, 0.0])
-    known = shape.prior(shape.size_sigma)
+    known = shape.compute_prior_jacobian(shape.size_sigma)
     covariance = np.linalg.inv(known.T @ known)
     size = arms.ravel() / np.linalg.norm(arms)
     expected = shape.size_sigma * float(np.linalg.norm(arms))

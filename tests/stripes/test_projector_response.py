@@ -30,7 +30,7 @@ def seen(
     turn = true.copy()
     if error is not None:
         for _ in range(20):  # what is read, less its error, is the truth
-            turn = true + error.at(turn.astype(np.float32) % np.float32(1.0))
+            turn = true + error.evaluate(turn.astype(np.float32) % np.float32(1.0))
     turn = turn + noise * np.random.default_rng(0).normal(size=S.shape)
     grey = np.full(S.shape, 50.0, np.float32)
     return MeasuredWave(wave, (turn % 1.0).astype(np.float32), grey, grey)
@@ -52,7 +52,7 @@ def test_an_error_is_waves_of_the_steps_times_the_frequency() -> None:
         c * np.cos(2.0 * np.pi * 3 * m * turn) + s * np.sin(2.0 * np.pi * 3 * m * turn)
         for m, c, s in zip((1, 2, 3, 4), ERROR.cosines, ERROR.sines, strict=True)
     )
-    np.testing.assert_allclose(ERROR.at(turn), expected, atol=1e-5)
+    np.testing.assert_allclose(ERROR.evaluate(turn), expected, atol=1e-5)
     assert left(correct_wave(seen(Wave(20.0, 3), ERROR), ERROR)) < 1e-5
     wave = seen(Wave(20.0, 3), ERROR)
     assert correct_wave(wave, None) is wave
@@ -119,7 +119,7 @@ def test_the_share_of_the_response_in_the_variance() -> None:
     sigma[1] = 0.07
     share = compute_response_share(ERROR, wave, sigma)
     assert share is not None
-    true = np.std(ERROR.at(np.linspace(0, 1, 3000, endpoint=False, dtype=np.float32)))
+    true = np.std(ERROR.evaluate(np.linspace(0, 1, 3000, endpoint=False, dtype=np.float32)))
     noise = np.sqrt((58 * 0.03**2 + 0.07**2) / 59)
     found = [getattr(share, name) for name in share.__dataclass_fields__]
     np.testing.assert_allclose(found, [20.0 * true, noise], rtol=1e-4)

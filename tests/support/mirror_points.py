@@ -84,5 +84,5 @@ def systematic_mm(planes: LightPlanes, *, spread_mm: float = 60.0) -> float:
     """RMS depth error over a wall at 400 mm, every stripe coordinate known exactly."""
     x, y = np.meshgrid(np.linspace(-spread_mm, spread_mm, 40), np.linspace(-50.0, 40.0, 30))
     points = np.stack([x, y, np.full_like(x, 400.0)], axis=-1).reshape(-1, 3)
-    depth = planes.measure(points / points[:, 2:], MIRROR.stripe(points)).depth
+    depth = planes.intersect(points / points[:, 2:], MIRROR.stripe(points)).depth
     return float(np.sqrt(np.nanmean((depth - 400.0) ** 2)))

@@ -35,7 +35,7 @@ def by_offset(
     model: SmoothSheets, rays: Array, s: Array, depth: Array
 ) -> tuple[Array, Array, Array]:
     """Depths (N,) after one more step of Newton's method, dz/ds and variance, all from the offset."""
-    offset = model.offset(rays * depth[:, None], model.at(s), parameters=True)
+    offset = model.offset(rays * depth[:, None], model.evaluate(s), parameters=True)
     along, jacobian = np.sum(offset.by_point * rays, axis=-1), offset.by_parameter
     assert jacobian is not None
     variance = np.sum((jacobian @ model.covariance) * jacobian, axis=-1)

@@ -36,7 +36,7 @@ def stripe_map(depth: Array) -> StripeMap:
         middle = 0.5 * (low + high)
         with np.errstate(invalid="ignore"):
             # The light comes down steeper with growing s: nearer along the ray.
-            far = planes().measure(rays, middle).depth > depth
+            far = planes().intersect(rays, middle).depth > depth
         low, high = np.where(far, middle, low), np.where(far, high, middle)
     exact = 0.5 * (low + high)
     known = (exact > 0.5) & (exact < STRIPES - 0.5)

@@ -53,7 +53,7 @@ def board_errors(folder: Path, calibration: RigCalibration) -> np.ndarray:
         beside *= np.sign(beside[:, -1:])
         s = np.array([np.interp(0.0, row, np.arange(len(row)), np.nan, np.nan) for row in beside])
         rays = found.camera.rays(true_pixels(pair["camera"], points))
-        depth = found.sheets.measure(rays, s).depth
+        depth = found.sheets.intersect(rays, s).depth
         lit = np.isfinite(depth)
         errors.append(misfit(rays[lit] * depth[lit, None], board[lit]))
     return np.concatenate(errors)

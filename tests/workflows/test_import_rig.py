@@ -121,7 +121,7 @@ def test_what_is_scanned_lies_where_it_is(folder: Path) -> None:
         pixels, s = stripes_seen(points, name)
         assert isinstance(pair.sheets, LensSheets)
         rays = pair.camera.rays(pixels)
-        depth, _, _ = pair.sheets.measure(rays, s)
+        depth, _, _ = pair.sheets.intersect(rays, s)
         found = calibration.rig_from_camera[name].apply(rays * depth[:, None])
         shown = (s > 0) & (s < 512)
         assert shown.sum() > 200
@@ -346,7 +346,7 @@ def test_how_exact_it_is_is_not_made_up(folder: Path) -> None:
     np.testing.assert_array_equal(seen, np.isfinite(without))
     rays = points[seen][::1000].astype(float)
     rays /= rays[:, 2:]
-    _, per_stripe, _ = pair.sheets.measure(rays, np.full(len(rays), 200.0))
+    _, per_stripe, _ = pair.sheets.intersect(rays, np.full(len(rays), 200.0))
     expected = 0.4 / 2.0 * np.abs(per_stripe) * np.linalg.norm(rays, axis=1)  # 2 px a stripe
     np.testing.assert_allclose(along[seen][::1000], expected, rtol=1e-3)
 
@@ -452,7 +452,7 @@ def test_the_other_real_calibration_is_read_and_held_against_a_board(
     for sheets in (pair.sheets, pair.crossing):
         s = sheets.stripe(ray * 600.0)
         assert 0 < s[0] < sheets.stripes
-        assert sheets.measure(ray, s)[0] == pytest.approx(600.0, rel=1e-9)
+        assert sheets.intersect(ray, s)[0] == pytest.approx(600.0, rel=1e-9)
     # One pair alone, one board: a pose of the projector by its corners is 0.3 degrees from the file's.
     shots = tmp_path / "shots"
     shutil.copytree(captures / "two-frequency" / "calseq1", shots / "calseq1")

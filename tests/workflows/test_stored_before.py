@@ -31,7 +31,7 @@ def test_a_calibration_gives_the_depths_that_it_was_fitted_for(calibration: RigC
         )
         middle = pair.camera.rays(np.array([[pair.camera.width / 2.0, pair.camera.height / 2.0]]))
         assert pair.sheets is not None
-        depth = pair.sheets.measure(middle, np.array([160.0])).depth
+        depth = pair.sheets.intersect(middle, np.array([160.0])).depth
         # The subject stands about 1.3 m before every camera of this rig.
         assert 900.0 < depth[0] < 1800.0
 

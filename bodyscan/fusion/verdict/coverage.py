@@ -100,15 +100,15 @@ def _look(
 def _view_points(
     points: Array, normals: Array, image: RangeImage, rig_from_camera: RigidTransform
 ) -> _View:
-    visible, inside, place = _look(points, normals, image.camera, rig_from_camera)
-    index = place - image.corner
+    visible, inside, image_pixel = _look(points, normals, image.camera, rig_from_camera)
+    index = image_pixel - image.corner
     kept = inside & ((index >= 0) & (index < image.sigma_mm.shape)).all(axis=1)
     pixel = tuple(np.where(kept[:, None], index, 0).T)
     valid = kept & image.valid[pixel]
     camera_from_rig = rig_from_camera.inverse()
     points, normals = camera_from_rig.apply(points), camera_from_rig.rotate(normals)
     distance = np.abs(np.sum((image.points[pixel] - points) * normals, axis=1))
-    white = inside & (image.lit[tuple(place.T)] >= 254)
+    white = inside & (image.lit[tuple(image_pixel.T)] >= 254)
     # A mesh of few points may be 10 mm off what was measured; webs and soles are farther off.
     return _View(visible, valid, valid & (distance < 10.0), white)
 

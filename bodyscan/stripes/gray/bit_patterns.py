@@ -58,11 +58,11 @@ def decode_bits(
     s, sigma = correct_across_lines(s, sigma, brightness, boundaries.blur2)
     result = assemble_map(images, lit, s, sigma, boundaries, stripes, beyond)
     along = correlation_along_lines(boundaries)
-    seen = int(np.count_nonzero(white) + np.count_nonzero(coded))
+    observed = int(np.count_nonzero(white) + np.count_nonzero(coded))
     return replace(
         result,
         correlation_px=(0.0, along) if images.transposed else (along, 0.0),
-        saturated=int(np.count_nonzero(white)) / max(seen, 1),
+        saturated=int(np.count_nonzero(white)) / max(observed, 1),
     )
 
 

@@ -39,7 +39,7 @@ class PhaseError:
     cosines: Array
     sines: Array
 
-    def at(self, turn: Floats) -> Floats:
+    def evaluate(self, turn: Floats) -> Floats:
         """Compute the error in turns at turns of any shape."""
         total = np.zeros_like(turn)
         for multiple, cosine, sine in zip(MULTIPLES, self.cosines, self.sines, strict=False):
@@ -52,7 +52,7 @@ def correct_wave(wave: MeasuredWave, error: PhaseError | None) -> MeasuredWave:
     """Subtract the error from a wave's turns."""
     if error is None:
         return wave
-    return replace(wave, turn=(wave.turn - error.at(wave.turn)) % np.float32(1.0))
+    return replace(wave, turn=(wave.turn - error.evaluate(wave.turn)) % np.float32(1.0))
 
 
 def compute_response_share(
