@@ -29,7 +29,12 @@ from bodyscan.fusion.verdict import grade_scan
 from bodyscan.fusion.verdict.coverage import measure_coverage
 from bodyscan.fusion.verdict.evidence import ImageEvidence, RigEvidence, ScanEvidence
 from bodyscan.fusion.verdict.overlaps import find_seams
-from bodyscan.fusion.verdict.rig import find_floor, find_misplaced, find_silent_poles
+from bodyscan.fusion.verdict.rig import (
+    find_compressed,
+    find_floor,
+    find_misplaced,
+    find_silent_poles,
+)
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.mesh.body import BodyCloud, BodyMesh
@@ -294,6 +299,7 @@ def _image_evidence(
         find_seams(subject.images, subject.image_poses, poles),
         contradictions,
         find_floor(unmoved, calibration.rig_from_camera, calibration.rig.volume),
+        compressed=find_compressed(measured.value),
     )
 
 

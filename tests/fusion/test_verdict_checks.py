@@ -8,6 +8,7 @@ from itertools import combinations
 from types import SimpleNamespace
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from made_bodies import cylinder, ellipsoid, mesh_of, together
@@ -21,7 +22,7 @@ from bodyscan.alignment.pose_evidence import ScaleError
 from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.fusion.consistency import Contradictions
 from bodyscan.fusion.verdict.evidence import Coverage, Seam, SeamReport
-from bodyscan.fusion.verdict.rig import find_silent_poles
+from bodyscan.fusion.verdict.rig import find_compressed, find_silent_poles
 from bodyscan.mesh.body import BodyCloud
 from bodyscan.motion.person_motion import PartMotion, PersonMotion
 from bodyscan.reconstruction.range_image import Agreement
@@ -104,6 +105,7 @@ FINDINGS: dict[str, tuple[dict[str, Any], str, str]] = {
     "noise": ({"alignment": alignment(0.1, 0.45)}, "usable", "disagree by 0.45 mm RMS"),
     "contradictions by noise": ({"contradictions": everywhere(0.03, 0.026)}, "good", ""),
     "contradictions": ({"contradictions": everywhere(0.01)}, "usable", "the pairs contradict"),
+    "JPEG": ({"contradictions": everywhere(0.01), "compressed": ("p1",)}, "usable", "causes: images w"),
     "many contradictions": ({"contradictions": everywhere(0.03)}, "repeat", "contradict each other"),
     # A focal length wrong by 1 %, taken for a pole that moved, costs 16.6 mm of girth.
     "contradictions of an aligned pole": (
@@ -156,6 +158,15 @@ def test_pairs_that_failed_for_the_same_reason_share_a_line(scan: MadeScan) -> N
             "left out: p2-1: too dark",
         ),
     )
+
+
+def test_blocks_are_seen() -> None:
+    grey = cv2.GaussianBlur(
+        np.random.default_rng(0).integers(0, 255, (480, 640), np.uint8), None, 3
+    )
+    packed = cv2.imdecode(cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, 40])[1], 0)
+    for lit, pairs in ((grey, ()), (packed, ("a",))):
+        assert find_compressed([SimpleNamespace(pair="a", lit=lit)]) == pairs  # type: ignore
 
 
 def test_a_pole_is_silent_if_several_pairs_saw_nobody() -> None:

@@ -257,5 +257,3 @@ def test_cameras_whose_projectors_are_not_calibrated_are_no_rig() -> None:
 def test_each_failure_is_followed_by_its_own_remedy() -> None:
     reasons = {"a": "dark\n  open it", "b": "blurred\n  focus", "c": "black\n  open it"}
     assert format_list(reasons) == "\n  a: dark\n  c: black\n  open it\n  b: blurred\n  focus"
-    alike = {"a1": "pair a1 shows 3 of 9", "b": "blurred", "a2": "pair a2 shows 4 of 9"}
-    assert format_list(alike) == "\n  a1, a2: pair a1 shows 3 of 9\n  b: blurred"

@@ -109,6 +109,7 @@ class ImageEvidence:
     silent: poles of which no pair saw anybody, see `find_silent_poles`.
     saturated: of overexposed pairs, the share of their pixels in the volume that are white.
     absent: calibrated pairs that measured nothing of the subject.
+    compressed: pairs with images as JPEG leaves them, see `find_compressed`.
     agreements: of pairs that project stripes of two directions.
     seams: see `find_seams`.
     contradictions: see `merge`.
@@ -123,6 +124,17 @@ class ImageEvidence:
     seams: SeamReport | None = None
     contradictions: Contradictions | None = None
     floor_mm: float | None = None
+    compressed: tuple[str, ...] = ()
+
+    @property
+    def compression(self) -> str:
+        """The first of the possible causes if surfaces disagree; "" without compression."""
+        if not self.compressed:
+            return ""
+        return (
+            f"images were compressed as JPEG (blocks of 8 x 8 pixels show in those of "
+            f"{', '.join(self.compressed)}: save PNG or TIFF); "
+        )
 
 
 @dataclass(frozen=True, eq=False)

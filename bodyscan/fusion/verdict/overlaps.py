@@ -189,8 +189,8 @@ def check_disagreement(scan: ScanEvidence) -> Iterator[Finding]:
         yield Finding(
             "usable",
             f"the pairs disagree by {rms_mm:.2f} mm RMS where they overlap; their sigmas predict "
-            f"{expected_mm:.2f} mm. Possible causes: the calibration is another rig's; something was "
-            "moved since; the person did not stand still",
+            f"{expected_mm:.2f} mm. Possible causes: {scan.images.compression}the calibration is "
+            "another rig's; something was moved since; the person did not stand still",
         )
 
 
@@ -215,7 +215,7 @@ def check_contradictions(scan: ScanEvidence) -> Iterator[Finding]:
         "repeat" if found.beyond_noise > 0.02 else "usable",
         f"{f'{outlier} and the others' if outlier else 'the pairs'} contradict each other: at "
         f"{found.share:.1%} of the pairs' common points one sees no surface where the other does. "
-        "Possible causes: "
+        f"Possible causes: {scan.images.compression}"
         + (
             f"the person turned or stepped aside meanwhile; {outlier} was moved since the calibration, "
             "or is from another scan; "

