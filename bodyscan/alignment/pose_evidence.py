@@ -44,6 +44,23 @@ class ScaleError:
     sigma_mm: float
 
 
+@dataclass(frozen=True)
+class CommonError:
+    """Every pair is displaced alike in its own camera's frame: not poles moved, but all lenses or all
+    projectors changed, or were calibrated with one error.
+
+    shift: (3,) mm, to the right, down and away, where cameras look at the body.
+    rotation_deg: about that place.
+    """
+
+    shift: tuple[float, float, float]
+    rotation_deg: float
+
+    @property
+    def shift_mm(self) -> float:
+        return float(np.linalg.norm(self.shift))
+
+
 @dataclass(frozen=True, eq=False)
 class PoseEvidence:
     """Normal equations of the pose errors of P pairs, marginalized over the subject's motion.
@@ -80,20 +97,22 @@ def detect_displacement(
     rig_from_camera: Mapping[str, RigidTransform],
     poles: Mapping[str, str],
     displaced: Collection[str] = (),
-) -> DisplacedPole | ScaleError | None:
+    rival: float = 0.0,
+) -> DisplacedPole | ScaleError | CommonError | None:
     """Find the displacement that explains a scan better than any motion of the subject.
 
     Candidates are one pole or pair; every pole by itself (`all_moved`); all poles farther out or
-    nearer.
+    nearer; all pairs alike in their cameras' frames.
 
     rig_from_camera: as calibrated.
     poles: the pole of each pair that is mounted on one.
     displaced: pairs already known to be displaced.
+    rival: log likelihood ratio of what else would explain the scan.
     """
     sides = [poles.get(name, name) for name in evidence.names]
     if len(set(sides)) < 2 or not set(evidence.names) - set(displaced):
         return None
-    candidates: list[tuple[float, DisplacedPole | ScaleError]] = []
+    candidates: list[tuple[float, DisplacedPole | ScaleError | CommonError]] = []
     for name, pairs in group_by_pole(evidence.names, poles).items():
         # Among few pairs, any single one could be displaced.
         identifiable = len(pairs) > 1 or len(evidence.names) >= MIN_PAIRS
@@ -112,15 +131,20 @@ def detect_displacement(
         scale = evidence.fit(_outward_basis(evidence.names, sides, rig_from_camera).reshape(-1, 1))
         sigma_mm = float(np.sqrt(scale.covariance[0, 0]))
         candidates.append((scale.log_ratio, ScaleError(float(scale.steps[0]), sigma_mm)))
+        common = evidence.fit(common_basis(evidence.names, rig_from_camera))
+        shift, lever = common.steps.reshape(2, 3)
+        turn_deg = float(np.degrees(np.linalg.norm(lever) / LEVER_MM))
+        candidates.append((common.log_ratio, CommonError(tuple(shift.tolist()), turn_deg)))
     log_ratio, best = max(candidates, key=lambda one: one[0], default=(0.0, None))
-    return best if best and log_ratio > MIN_LOG_RATIO and _is_harmful(best) else None
+    return best if best and log_ratio > max(MIN_LOG_RATIO, rival) and _is_harmful(best) else None
 
 
-def _is_harmful(found: DisplacedPole | ScaleError) -> bool:
+def _is_harmful(found: DisplacedPole | ScaleError | CommonError) -> bool:
     if isinstance(found, ScaleError):
         return abs(found.outward_mm) > MIN_OUTWARD_MM
     lever = LEVER_MM * np.radians(found.rotation_deg)
-    return float(np.hypot(found.shift_mm, lever)) > MIN_STEP_MM
+    limit_mm = MIN_OUTWARD_MM if isinstance(found, CommonError) else MIN_STEP_MM
+    return float(np.hypot(found.shift_mm, lever)) > limit_mm
 
 
 def _displaced_pole(name: str, pairs: frozenset[str], steps: Array) -> DisplacedPole:
@@ -154,3 +178,20 @@ def _outward_basis(
         mean = outward[members].mean(axis=0)
         twists[members, 3:] = mean / np.linalg.norm(mean)
     return twists
+
+
+def common_basis(names: Collection[str], rig_from_camera: Mapping[str, RigidTransform]) -> Array:
+    """Twists (6P, 6) of pairs that all move alike in their own camera's frames.
+
+    Translations by 1 mm along the camera's axes, then rotations about the point on its axis that is as
+    far away as the body is in the mean, by which a point at the lever arm moves by 1 mm.
+    """
+    poses = [rig_from_camera[name] for name in names]
+    level = [np.linalg.norm((pose.translation - BODY_CENTRE)[:2]) for pose in poses]
+    blocks = []
+    for pose in poses:
+        looked_at = pose.apply(np.array([0.0, 0.0, np.mean(level)]))
+        turns = pose.rotation / LEVER_MM
+        rotations = np.vstack([turns, np.cross(looked_at, turns, axisb=0, axisc=0)])
+        blocks.append(np.hstack([np.vstack([np.zeros((3, 3)), pose.rotation]), rotations]))
+    return np.concatenate(blocks)

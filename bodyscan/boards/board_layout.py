@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from bodyscan.arrays import Array, Indices
+from bodyscan.errors import BadInput
 from bodyscan.rig.board import Board
 
 
@@ -59,8 +60,15 @@ def _lines(board: Board, count: int) -> Array:
 
 
 def marker_dictionary(board: Board) -> cv2.aruco.Dictionary:
-    """Look up OpenCV's dictionary by its name, which a valid board has."""
-    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
+    """Look up the marker dictionary of a board. Raises BadInput for an unknown name."""
+    number = getattr(cv2.aruco, board.dictionary, None)
+    if not board.dictionary.startswith("DICT_") or not isinstance(number, int):
+        raise BadInput(
+            f"unknown marker dictionary {board.dictionary!r}",
+            where=f"board {board.name}",
+            remedy="use one of OpenCV's names, such as DICT_4X4_1000",
+        )
+    return cv2.aruco.getPredefinedDictionary(number)
 
 
 def markers_per_face(board: Board) -> int:
@@ -74,27 +82,40 @@ def marker_corners(board: Board, face: int = 0) -> tuple[Indices, Array]:
     Corners run clockwise as printed, from the marker's own top left, as OpenCV's detector gives
     them; for an aprilgrid from the print's top left. Its tags count from the lower left, row by row
     upwards, as Kalibr prints them. The back's ids follow the front's.
+
+    Raises BadInput if marker_mm is missing or too large, or the dictionary has too few markers.
     """
-    count = markers_per_face(board)
-    ids = board.first_marker + face * count + np.arange(count)
     if board.kind == "aprilgrid":
-        return ids, _tag_corners(board)
+        return _tag_corners(board, face)
+    where = f"board {board.name}"
+    if board.marker_mm is None or not board.marker_mm < board.square_mm:
+        raise BadInput("a charuco board needs marker_mm, smaller than square_mm", where=where)
+    dictionary, count = marker_dictionary(board), markers_per_face(board)
+    first = board.first_marker + face * count
+    if first + count > len(dictionary.bytesList):
+        raise BadInput(
+            f"{board.dictionary} has {len(dictionary.bytesList)} markers, too few for ids "
+            f"{first} to {first + count - 1}",
+            where=where,
+            remedy="choose a larger dictionary or a smaller first_marker",
+        )
     charuco = cv2.aruco.CharucoBoard(
         (board.columns, board.rows),
         board.square_mm,
-        board.marker_mm or 0.0,
-        marker_dictionary(board),
-        ids,
+        board.marker_mm,
+        dictionary,
+        np.arange(first, first + count),
     )
     charuco.setLegacyPattern(board.legacy_layout)
     corners = np.asarray(charuco.getObjPoints(), float).reshape(-1, 4, 3)[..., :2]
-    return ids, corners
+    return np.asarray(charuco.getIds(), np.int64).ravel(), corners
 
 
-def _tag_corners(board: Board) -> Array:
+def _tag_corners(board: Board, face: int) -> tuple[Indices, Array]:
     x, y = _lines(board, board.columns), _lines(board, board.rows)
     columns, rows = np.meshgrid(np.arange(board.columns), np.arange(board.rows)[::-1])
     column, row = columns.ravel(), rows.ravel()
     left, right, top, bottom = x[2 * column], x[2 * column + 1], y[2 * row], y[2 * row + 1]
     corners = np.stack([left, top, right, top, right, bottom, left, bottom], axis=-1)
-    return corners.reshape(-1, 4, 2)
+    ids = board.first_marker + face * len(column) + np.arange(len(column))
+    return ids.astype(np.int64), corners.reshape(-1, 4, 2)

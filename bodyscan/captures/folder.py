@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import datetime
+from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
@@ -127,6 +128,13 @@ class Captures:
     times: FrameTimes = field(default_factory=dict)
     described_in: tuple[Path, ...] = ()
 
+    @cached_property
+    def _by_pair_and_shot(self) -> dict[tuple[str, str], ImageSequence]:
+        return {(sequence.pair, sequence.shot): sequence for sequence in self.sequences}
+
+    def sequence(self, pair: str, shot: str) -> ImageSequence | None:
+        return self._by_pair_and_shot.get((pair, shot))
+
     def pair_sequences(self, pair: str) -> tuple[ImageSequence, ...]:
         return tuple(sequence for sequence in self.sequences if sequence.pair == pair)
 
@@ -144,6 +152,10 @@ class Captures:
     def relative(self, text: str) -> str:
         """Make the paths in a message relative to `base`, so that it can be stored."""
         return make_paths_relative(text, self.base, self.folders)
+
+    def missing(self) -> tuple[Path, ...]:
+        """List every image that should exist and does not."""
+        return tuple(path for sequence in self.sequences for path in sequence.missing)
 
 
 def open_captures(rig: Rig, rig_path: Path) -> Captures:

@@ -22,7 +22,7 @@ from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
 from bodyscan.motion.body_cells import BodyCells
 from bodyscan.motion.breath import BreathEstimate, estimate_breath
 from bodyscan.motion.cell_equations import CellEquations
-from bodyscan.motion.motion_kinds import MotionKind, build_kinds
+from bodyscan.motion.motion_kinds import MotionKind, build_kinds, retime_kinds
 from bodyscan.motion.temporal_modes import Breaths
 from bodyscan.progress import map_threads
 
@@ -69,6 +69,17 @@ class BodyMotion:
         breaths = Breaths.from_modes(kinds[-1].modes, seconds, middle_s)
         return BodyMotion(kinds, fields, vector, matrix, vector, matrix, np.ones(count), breaths)
 
+    def with_times(self, seconds: Sequence[float], middle_s: float) -> BodyMotion:
+        """At rest at other times, without the motion of parts.
+
+        seconds: each pair's moment.
+        """
+        kinds = retime_kinds(self.kinds, seconds, middle_s)
+        vector = np.zeros(sum(kind.count for kind in kinds))
+        fields = np.concatenate([kind.fields for kind in kinds], axis=2)
+        breaths = Breaths.from_modes(kinds[-1].modes, seconds, middle_s)
+        return replace(self, kinds=kinds, fields=fields, amplitudes=vector, breaths=breaths)
+
     @cached_property
     def slices(self) -> tuple[slice, ...]:
         """The amplitudes of each kind."""
@@ -80,6 +91,13 @@ class BodyMotion:
         """Posterior covariance of the amplitudes, (n, n)."""
         lower = np.tril(dpotri(self.factor, lower=True)[0])
         return (lower + np.tril(lower, -1).T) * self.units[:, None] * self.units
+
+    @property
+    def log_evidence(self) -> float:
+        """Of the overlaps under the present prior variances, relative to a body that nothing moved."""
+        gain = float(self.vector @ self.amplitudes) - 2.0 * np.sum(np.log(np.diag(self.factor)))
+        priors = sum(float(np.linalg.slogdet(kind.prior_information)[1]) for kind in self.kinds)
+        return 0.5 * (gain + 2.0 * float(np.sum(np.log(self.units))) + priors)
 
     def kind(self, name: str) -> MotionKind:
         return next(kind for kind in self.kinds if kind.name == name)
@@ -122,16 +140,31 @@ class BodyMotion:
 
         equations: by pairs (a, b), linearized at the present motion.
         """
-        current = self.displacements([kind.name for kind in self.kinds])
+        return self.solve_projected(self.project(equations, self))
+
+    def project(
+        self, equations: Mapping[tuple[int, int], CellEquations], at: BodyMotion
+    ) -> dict[tuple[int, int], LinearGaussianSystem]:
+        """Normal equations of the M fields' displacement between each two pairs, whatever the moments.
+
+        at: the motion at which the equations were linearized.
+        """
+        current = at.displacements([kind.name for kind in at.kinds])
 
         def project(overlap: tuple[tuple[int, int], CellEquations]) -> LinearGaussianSystem:
             (a, b), cells = overlap
             return self._project(cells.with_model_error(MODEL_ERROR_MM), current[a] - current[b])
 
-        projected = map_threads(project, equations.items(), stage="aligning")
-        matrices = np.array([system.information for system in projected])
-        vectors = np.array([system.vector for system in projected])
-        first, second = np.array(list(equations)).T
+        systems = map_threads(project, equations.items(), stage="aligning")
+        return dict(zip(equations, systems, strict=True))
+
+    def solve_projected(
+        self, projected: Mapping[tuple[int, int], LinearGaussianSystem]
+    ) -> BodyMotion:
+        """Estimate all amplitudes and prior variances from `project`."""
+        matrices = np.array([system.information for system in projected.values()])
+        vectors = np.array([system.vector for system in projected.values()])
+        first, second = np.array(list(projected)).T
         ends = np.cumsum([0, *(kind.fields.shape[2] for kind in self.kinds)])
         differences = [k.modes.values[first] - k.modes.values[second] for k in self.kinds]
         count = len(self.amplitudes)

@@ -18,7 +18,7 @@ import numpy as np
 from bodyscan.alignment.icp import Alignment
 from bodyscan.alignment.matching import Matches, SampledPoints
 from bodyscan.alignment.overlaps import COARSE, OverlapPoints, map_overlaps, match_overlap
-from bodyscan.alignment.pose_evidence import PoseEvidence
+from bodyscan.alignment.pose_evidence import MIN_LOG_RATIO, PoseEvidence
 from bodyscan.alignment.sway_prior import SwayPrior, centre_shifts
 from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.geometry.robust import rms, rms_length
@@ -60,6 +60,15 @@ class BreathOffset:
         return np.sum(displacement * normals, axis=1), self.sigma_mm[cell]
 
 
+@dataclass(frozen=True)
+class TimeFit:
+    """The factor for all moments that explains the motion best, and its log likelihood ratio against
+    the moments as stated; 1 and 0 if none is better beyond doubt."""
+
+    factor: float = 1.0
+    log_ratio: float = 0.0
+
+
 @dataclass(frozen=True, eq=False)
 class EstimatedMotion:
     """A person's motion, in cells of the body.
@@ -72,6 +81,7 @@ class EstimatedMotion:
         motion and of the pairs' poses, (C,).
     moment_ms: the middle of the scan; None (the mean of all) if no pair's moment is known.
     breath: without moments it is 0, as uncertain as people breathe; None for no estimate.
+    times: whether other moments would explain the motion better.
     """
 
     cells: BodyCells
@@ -81,6 +91,7 @@ class EstimatedMotion:
     sigma_mm: Array
     moment_ms: float | None
     breath: BreathOffset | None = None
+    times: TimeFit = TimeFit()
 
     @property
     def significant(self) -> bool:
@@ -179,7 +190,7 @@ def estimate_motion(
     found = _from_middle(images, motion, cells, observed)
     if still or not found.significant:
         return aligned, None, evidence
-    return moved, found, evidence
+    return moved, replace(found, times=solution.fit_times(seconds, middle_s)), evidence
 
 
 def _from_middle(
@@ -224,11 +235,30 @@ def _divide_into_cells(
 
 @dataclass(frozen=True, eq=False)
 class _Solution:
-    """The motion, the next search radius, and whether the motion is negligible."""
+    """The motion, the next search radius, and whether the motion is negligible.
+
+    start, equations: of the last step, see `BodyMotion.update`.
+    """
 
     motion: BodyMotion
     reach_mm: float
+    start: BodyMotion
+    equations: Mapping[tuple[int, int], CellEquations]
     negligible: bool = False
+
+    def fit_times(self, seconds: Sequence[float | None], middle_s: float) -> TimeFit:
+        """By the evidence of the motion: a posture hardly changes within a tenth of a second, and does
+        within a second."""
+        times = [second for second in seconds if second is not None]
+        if len(times) < len(seconds):
+            return TimeFit()
+        factors = 1.0, 0.1, 10.0
+        persons = [self.motion.with_times([f * s for s in times], f * middle_s) for f in factors]
+        projected = persons[0].project(self.equations, self.start)
+        stated, *others = (person.solve_projected(projected).log_evidence for person in persons)
+        fits = [TimeFit(f, e - stated) for f, e in zip(factors[1:], others, strict=True)]
+        best = max(fits, key=lambda one: one.log_ratio)
+        return best if best.log_ratio > MIN_LOG_RATIO else TimeFit()
 
 
 def _solve(
@@ -249,14 +279,15 @@ def _solve(
         equations = _map_matches(linearize, pool, points, (motion, cells), reach, settings)
         if not equations:
             return None
-        motion = motion.update(_combine_directions(equations))
+        start, combined = motion, _combine_directions(equations)
+        motion = start.update(combined)
         reach = max(reach / 2.0, settings.min_reach_mm)
         if remaining == ROUNDS - 1:
             # Calibrations warp surfaces by half of 0.1 mm; so little motion does no harm.
             still = _rms_displacement(motion, NON_RIGID, observed) < 0.1
             if still and _is_rigid_negligible(motion, observed, settings):
-                return _Solution(motion, reach, negligible=True)
-    return _Solution(motion, reach)
+                return _Solution(motion, reach, start, combined, negligible=True)
+    return _Solution(motion, reach, start, combined)
 
 
 def _offset_to_mean_breath(

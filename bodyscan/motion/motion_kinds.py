@@ -94,6 +94,27 @@ def build_kinds(
     )
 
 
+def retime_kinds(
+    kinds: Sequence[MotionKind], seconds: Sequence[float], middle_s: float
+) -> tuple[MotionKind, ...]:
+    """All kinds but `parts` with the modes of other moments, the breath of unit variance.
+
+    No size in people who stand is assumed: who stands very still does so at any times.
+    """
+    stance = TemporalModes.from_correlation(stance_correlation, seconds, middle_s)
+    breathing = TemporalModes.from_correlation(breath_correlation, seconds, middle_s)
+    retimed = []
+    for kind in kinds:
+        if kind.name == "pose":
+            retimed.append(kind)
+        elif kind.name == "breath":
+            identity = np.eye(kind.fields.shape[2] * breathing.count)
+            retimed.append(replace(kind, modes=breathing, precision=identity))
+        elif kind.name != "parts":
+            retimed.append(replace(kind, modes=stance, standing_size=0.0))
+    return tuple(retimed)
+
+
 def _whole_body(name: str, cells: BodyCells, twists: Array, modes: TemporalModes) -> MotionKind:
     """A rigid motion of the whole body; twists: (6, M)."""
     fields = rigid_fields(cells, np.zeros(3), 1.0) @ twists

@@ -15,7 +15,12 @@ from bodyscan.alignment.displaced_poles import (
     motions_between,
 )
 from bodyscan.alignment.icp import Alignment, align
-from bodyscan.alignment.pose_evidence import ScaleError, detect_displacement
+from bodyscan.alignment.pose_evidence import (
+    CommonError,
+    ScaleError,
+    common_basis,
+    detect_displacement,
+)
 from bodyscan.arrays import Array
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance
@@ -30,15 +35,18 @@ class PersonAlignment:
 
     motion: of a person who moved.
     displaced: poles, or pairs, that were displaced and moved back.
-    scale_error: the common displacement outwards, if all poles were displaced.
+    common_error: of all pairs, if one displacement of them all explains the scan.
+    time_factor: other than 1 if the pairs' moments, multiplied by it, explain the motion far better;
+        they were then left out.
     search: for further displaced poles.
     """
 
     alignment: Alignment
     motion: EstimatedMotion | None
     displaced: tuple[DisplacedPole, ...]
-    scale_error: ScaleError | None
+    common_error: ScaleError | CommonError | None
     search: DisplacementSearch
+    time_factor: float = 1.0
 
 
 def align_person(
@@ -56,20 +64,29 @@ def align_person(
     poles: the pole of each pair that is mounted on one.
 
     Motion and displaced poles can explain each other. So the motion is estimated first as if no pole
-    were displaced; what only a displaced pole explains is then freed, and all is repeated.
+    were displaced; what only a displaced pole explains is then freed, and all is repeated. An error
+    common to all pairs may also warp what each measured, so that no pole is asked for after it.
     """
     displaced: list[DisplacedPole] = []
-    scale_error: ScaleError | None = None
+    common_error: ScaleError | CommonError | None = None
+    time_factor = 1.0
     while True:
         search = _search(images, rig_from_camera, aligned, poles, displaced)
         alignment, motion, evidence = estimate_motion(
             images, rig_from_camera, aligned, boards, settings
         )
-        found: DisplacedPole | ScaleError | None = None
+        found: DisplacedPole | ScaleError | CommonError | None = None
         if motion is None or evidence is None:
             found = search.found
-        if found is None and evidence is not None and scale_error is None:
-            found = detect_displacement(evidence, rig_from_camera, poles, _pairs_of(displaced))
+        if found is None and evidence is not None and common_error is None:
+            rival = motion.times.log_ratio if motion is not None else 0.0
+            found = detect_displacement(
+                evidence, rig_from_camera, poles, _pairs_of(displaced), rival
+            )
+        if found is None and motion is not None and motion.times.factor != 1.0:
+            time_factor = motion.times.factor
+            images = [replace(image, time_ms=None, span_ms=None) for image in images]
+            continue
         if found is None:
             if motion is not None:
                 # Offsets caused by a tracked head or arm are not pose errors.
@@ -77,11 +94,15 @@ def align_person(
                 search = replace(search, offset_mm=again.offset_mm)
             motions = _connected_motions(rig_from_camera, alignment)
             final = _measure_again(displaced, motions)
-            return PersonAlignment(alignment, motion, final, scale_error, search)
+            return PersonAlignment(alignment, motion, final, common_error, search, time_factor)
         if isinstance(found, ScaleError):
-            scale_error = found
+            common_error = found
             for side in _pairs_by_pole(boards.names, poles):
                 boards = free_pairs(boards, side)
+        elif isinstance(found, CommonError):
+            common_error = found
+            basis = 30.0 * common_basis(boards.names, rig_from_camera)  # mm, as in `free_pairs`
+            boards = PoseCovariance(boards.names, boards.matrix + basis @ basis.T)
         else:
             displaced.append(found)
             boards = free_pairs(boards, found.pairs)

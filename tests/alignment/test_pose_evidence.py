@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 from bodyscan.alignment.displaced_poles import DisplacedPole
-from bodyscan.alignment.pose_evidence import PoseEvidence, ScaleError, detect_displacement
+from bodyscan.alignment.pose_evidence import (
+    CommonError,
+    PoseEvidence,
+    ScaleError,
+    common_basis,
+    detect_displacement,
+)
 from bodyscan.alignment.sway_prior import BODY_CENTRE
 from bodyscan.arrays import Array
 from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
@@ -43,7 +49,7 @@ def evidence(shifts: Array, seed: int = 0, noise: float = 1.0) -> PoseEvidence:
 
 def off(
     shifts: Array, seed: int = 0, displaced: tuple[str, ...] = ()
-) -> DisplacedPole | ScaleError | None:
+) -> DisplacedPole | ScaleError | CommonError | None:
     return detect_displacement(evidence(shifts, seed), PLACED, POLES, displaced)
 
 
@@ -65,6 +71,29 @@ def test_poles_that_all_stand_off_alike_are_a_size(out_mm: float) -> None:
         found = off(out_mm * OUT, seed)
         assert isinstance(found, ScaleError)
         assert abs(found.outward_mm - out_mm) < 4.0 * found.sigma_mm < 0.5
+
+
+@pytest.mark.parametrize("freedom", [0, 1, 3, 4])
+def test_one_change_of_all_pairs_is_asked_for_before_any_pole(freedom: int) -> None:
+    """All principal points off by 0.3 px were six pairs that moved by themselves."""
+    placed = {}
+    for name, out, height in zip(NAMES, OUT, HEIGHTS, strict=True):
+        right, forward = (
+            np.array([-out[1], out[0], 0.0]),
+            -out - [0.0, 0.0, 0.001 * (height - 1000.0)],
+        )
+        forward /= np.linalg.norm(forward)
+        axes = np.stack([right, np.cross(forward, right), forward], axis=1)
+        placed[name] = RigidTransform(axes, PLACED[name].translation)
+    moved, sound = 2.0 * common_basis(NAMES, placed)[:, freedom], evidence(0.0 * OUT).system
+    vector = sound.vector + sound.information @ moved
+    off = PoseEvidence(NAMES, LinearGaussianSystem(sound.information, vector))
+    found = detect_displacement(off, placed, POLES)
+    assert isinstance(found, CommonError)
+    expected = (0.0, np.degrees(2.0 / 400.0)) if freedom > 2 else (2.0, 0.0)
+    assert (found.shift_mm, found.rotation_deg) == pytest.approx(expected, abs=0.9)
+    # Unless something else explains it better.
+    assert detect_displacement(off, placed, POLES, rival=1e6) is None
 
 
 @pytest.mark.parametrize("pole", ["p1", "p2", "p3"])

@@ -18,7 +18,7 @@ from verdict_given import verdict_given
 
 from bodyscan.alignment.displaced_poles import DisplacedPole, DisplacementSearch
 from bodyscan.alignment.icp import Alignment, Overlap
-from bodyscan.alignment.pose_evidence import ScaleError
+from bodyscan.alignment.pose_evidence import CommonError, ScaleError
 from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.fusion.consistency import Contradictions
 from bodyscan.fusion.verdict.evidence import Coverage, Seam, SeamReport
@@ -116,8 +116,13 @@ FINDINGS: dict[str, tuple[dict[str, Any], str, str]] = {
     "one of all poles": ({"displaced": [step(all_moved=True)]}, "repeat", "pole p1 is displaced"),
     "a pole that turned": ({"displaced": [step(200.0, 14.0)]}, "usable", "pole p1 is displaced by 200"),
     "a person who turned": ({"displaced": [step(5.0, 14.0)]}, "repeat", "person turned by 14 degrees"),
-    "poles farther out": ({"scale_error": ScaleError(0.5, 0.1)}, "usable", "farther from the body"),
-    "poles farther in": ({"scale_error": ScaleError(-3.0, 0.1)}, "repeat", "would be 19 mm too large"),
+    "poles farther out": ({"common_error": ScaleError(0.5, 0.1)}, "usable", "farther from the body"),
+    "poles farther in": ({"common_error": ScaleError(-3.0, 0.1)}, "repeat", "would be 19 mm too large"),
+    "all pairs alike": (
+        {"common_error": CommonError((0.3, 0.0, 0.4), 0.02)}, "usable", "one cause, not poles"),
+    "all pairs alike by much": (
+        {"common_error": CommonError((0.0, 2.0, 0.0), 0.0)}, "repeat", "warm up and calibrate again"),
+    "times ten times too long": ({"time_factor": 0.1}, "usable", "frame times 0.1 times as long"),
     "nominal size": ({"nominal": NominalSize(0.98)}, "good", ""),
     "doubtful size": ({"nominal": NominalSize(1.04)}, "usable", "1.040 times as far apart"),
     "wrong size": ({"nominal": NominalSize(1.11)}, "repeat", "1.110 times as far apart"),

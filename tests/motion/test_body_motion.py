@@ -53,6 +53,13 @@ def test_amplitudes_are_those_of_what_was_seen_and_of_the_prior() -> None:
     np.testing.assert_allclose(motion.amplitudes, truth @ motion.vector, rtol=1e-8, atol=1e-12)
 
 
+def test_the_evidence_is_that_of_data_with_the_prior_integrated_out() -> None:
+    motion, square = seen()
+    root = np.linalg.cholesky(np.linalg.inv(prior()))
+    truth = LinearGaussianSystem(square, motion.vector).project(root).log_evidence(1.0)
+    assert motion.log_evidence == pytest.approx(float(truth))
+
+
 def written_out(motion: BodyMotion, pair: int, *, from_middle: bool) -> Array:
     """(C, 12) field after field and course after course."""
     total = np.zeros((CELLS, 12))

@@ -27,7 +27,7 @@ SOUND: dict[type, dict[str, Any]] = {
         "alignment": Alignment({}, {}, {}, ()),
         "motion": None,
         "displaced": (),
-        "scale_error": None,
+        "common_error": None,
         "search": DisplacementSearch(None, np.inf),
     },
 }

@@ -187,7 +187,7 @@ class ScanEvidence:
         """Whether alignment found displaced poles, or all poles farther out, and corrected them."""
         return bool(
             self.person_alignment
-            and (self.person_alignment.displaced or self.person_alignment.scale_error)
+            and (self.person_alignment.displaced or self.person_alignment.common_error)
         )
 
     @property

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from bodyscan.alignment.displaced_poles import STILL_MM
+from bodyscan.alignment.pose_evidence import ScaleError
 from bodyscan.fusion.verdict.evidence import GIRTH_PER_MM, Finding, ScanEvidence
 from bodyscan.settings import UseLimits
 
@@ -48,19 +49,46 @@ def check_displaced_poles(scan: ScanEvidence) -> Iterator[Finding]:
         )
 
 
-def check_size(scan: ScanEvidence) -> Iterator[Finding]:
-    """A common step of all poles outwards or inwards, corrected too."""
-    size = scan.person_alignment.scale_error if scan.person_alignment else None
-    if size is None:
+def check_common_error(scan: ScanEvidence) -> Iterator[Finding]:
+    """One displacement of all pairs, corrected too: outwards, inwards, or as their cameras look."""
+    found = scan.person_alignment.common_error if scan.person_alignment else None
+    if found is None or scan.alignment is None:
         return
-    girth_mm = abs(size.outward_mm) * GIRTH_PER_MM
-    where, wrong = ("farther from", "small") if size.outward_mm > 0.0 else ("nearer to", "large")
+    if isinstance(found, ScaleError):
+        girth_mm = abs(found.outward_mm) * GIRTH_PER_MM
+        away, wrong = (
+            ("farther from", "small") if found.outward_mm > 0.0 else ("nearer to", "large")
+        )
+        what = (
+            f"all poles are {abs(found.outward_mm):.1f} mm (sigma {found.sigma_mm:.1f} mm) {away} the "
+            "body than calibrated, which no motion of a person explains. Girths would be "
+            f"{girth_mm:.0f} mm too {wrong}"
+        )
+    else:
+        girth_mm = found.shift_mm * GIRTH_PER_MM
+        what = (
+            f"all pairs are displaced alike, each by {found.shift_mm:.1f} mm and "
+            f"{found.rotation_deg:.2f} degrees in its camera's frame: one cause, not poles that moved"
+        )
     yield Finding(
         "repeat" if girth_mm > scan.use.usable_girth_mm else "usable",
-        f"all poles are {abs(size.outward_mm):.1f} mm (sigma {size.sigma_mm:.1f} mm) {where} the body "
-        f"than calibrated, which no motion of a person explains. Girths would be {girth_mm:.0f} mm too "
-        f"{wrong}; now the overlaps alone determine the body's size. Calibrate again",
+        f"{what}; now the overlaps alone determine the body's size. Possible causes: cameras or "
+        "projectors are warmer or colder than when calibrated; all lenses were refocused; the "
+        "calibration was edited. Let the rig warm up and calibrate again",
+        explains=frozenset(scan.alignment.rig_from_camera),
     )
+
+
+def check_times(scan: ScanEvidence) -> Iterator[Finding]:
+    """Moments that the motion contradicts."""
+    factor = scan.person_alignment.time_factor if scan.person_alignment else 1.0
+    if factor != 1.0 and scan.alignment:
+        yield Finding(
+            "usable",
+            f"the person's motion fits frame times {factor:g} times as long as `timing` states. They "
+            "were not used: correct the unit of `frame_ms` in captures.yaml, or of its file `times`",
+            explains=frozenset(scan.alignment.rig_from_camera),
+        )
 
 
 def check_displaced_pairs(scan: ScanEvidence) -> Iterator[Finding]:
