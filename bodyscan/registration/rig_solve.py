@@ -105,12 +105,8 @@ class RigSolution:
             for name, one in residuals.items()
         }
 
-    def relative_position(self, first: str, second: str) -> Array:
-        """Position (3,) mm of the second camera in the frame of the first."""
-        return (self.rig_from_camera[first].inverse() @ self.rig_from_camera[second]).translation
-
     def relative_sigma_mm(self, first: str, second: str) -> float:
-        """Sigma of that position, over all axes."""
+        """Sigma of the second camera's position in the frame of the first, over all axes, mm."""
         motion = self.covariance.relative(first, second)
         position = self.rig_from_camera[second].translation
         return float(np.sqrt(np.trace(point_covariance(motion, position))))

@@ -19,7 +19,6 @@ from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, attempt_each, silent, step
 from bodyscan.registration.advice import advise
 from bodyscan.registration.board_checks import boards_not_found
-from bodyscan.registration.halves import compare_halves
 from bodyscan.registration.references import find_rig_size, rescale_boards, select_solving_views
 from bodyscan.registration.rig_calibration import RigCalibration, check_nominal_size
 from bodyscan.registration.rig_frame import hold_frame, refuse_without_frame_shot
@@ -239,11 +238,8 @@ def add_remarks(solved: SolvedRig, progress: Progress = silent) -> RigCalibratio
     with optional("boards that were not found", notes.append):
         notes += boards_not_found(found.rig, solved.views, solved.images)
     if len(solved.solution.rig_from_camera) > 1 and not found.failed:
-        with step(progress, "advice"):
-            with optional("advice", notes.append):
-                advice += advise(found.rig, solved.solution)
-            with optional("halves of the shots", notes.append):
-                advice.append(compare_halves(found.rig, solved.solution).summary)
+        with step(progress, "advice"), optional("advice", notes.append):
+            advice += advise(found.rig, solved.solution)
     with optional("boards by the stripes", notes.append):
         advice += stripe_board_notes(found.pairs)
     return replace(found, notes=tuple(notes), advice=tuple(advice))

@@ -43,7 +43,7 @@ def calibrated(boards: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     """The folder of a calibration whose remarks all failed."""
     for name in (
         *("coverage_notes", "boards_not_found"),
-        *("advise", "compare_halves", "stripe_board_notes"),
+        *("advise", "stripe_board_notes"),
     ):
         monkeypatch.setattr(calibrate_rig, name, broken)
     calibrate_rig.calibrate_folder(tmp_path / "rig.yaml", tmp_path / "calibration")
@@ -77,7 +77,7 @@ def test_a_remark_that_fails_costs_itself_alone(ring: SeenBoards, calibrated: Pa
     failures = [note.partition(":")[0] for note in found.notes if "KeyError" in note]
     assert failures == [
         *("coverage of the pictures", "boards that were not found"),
-        *("advice", "halves of the shots", "boards by the stripes"),
+        *("advice", "boards by the stripes"),
     ]
 
 
