@@ -111,8 +111,9 @@ def _shots(rig: Rig, captures: Captures, pair: str) -> tuple[CameraCalibration, 
     spec = rig.pair(pair)
     assert spec.projector is not None
     shots = []
+    sequences = {sequence.shot: sequence for sequence in captures.pair_sequences(pair)}
     for number, view in enumerate(views):
-        sequence = captures.sequence(pair, view.shot)
+        sequence = sequences.get(view.shot)
         if sequence is None or not sequence.has_stripes:
             continue
         stripes = decode_sequence(sequence, spec)

@@ -41,7 +41,7 @@ def find_aprilgrid(image: Bytes, board: Board, *, thorough: bool = True) -> Dete
     for position in _candidate_positions(image, board, thorough):
         if best is None or position.agreeing > best.agreeing:
             best = position
-        if best.agreeing >= 0.5 * board_layout.markers_per_face(board):
+        if best.agreeing >= 0.5 * board.marker_count:
             break
     if best is None:
         return None
@@ -95,16 +95,12 @@ def locate_grid(board: Board, tags: Markers, border_bits: int = 2) -> GridPositi
 def _refine(image: Bytes, board: Board, position: GridPosition) -> tuple[Array, Mask]:
     """Refine all corners (N,) of the grid; return pixels (N, 2) and which are good."""
     printed = board_layout.printed_corners(board)
-    reach = _clear_radius_mm(board, position.border_bits) / WINDOW_SQUARES
+    # Other edges near a corner are those of rim, gap and small squares.
+    marker_mm, border_bits = board.marker_mm or 0.0, position.border_bits
+    bits = board_layout.marker_dictionary(board).markerSize + 2 * border_bits
+    clear_mm = 0.85 * min(border_bits * marker_mm / bits, board.square_mm - marker_mm)
     # Tags are black: at their upper left and lower right corners the other two squares are white.
     row, column = np.divmod(np.arange(len(printed)), 2 * board.columns)
     bright_diagonal = np.asarray((row + column) % 2 == 1)
+    reach = clear_mm / WINDOW_SQUARES
     return refine_predicted(image, position.board_map, printed, reach, bright_diagonal)
-
-
-def _clear_radius_mm(board: Board, border_bits: int) -> float:
-    """Radius around a corner without other edges: those of rim, gap and small squares."""
-    marker_mm = board.marker_mm or 0.0
-    bits = board_layout.marker_dictionary(board).markerSize + 2 * border_bits
-    rim = border_bits * marker_mm / bits
-    return 0.85 * min(rim, board.square_mm - marker_mm)

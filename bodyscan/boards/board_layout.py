@@ -14,7 +14,6 @@ import cv2
 import numpy as np
 
 from bodyscan.arrays import Array, Indices
-from bodyscan.errors import BadInput
 from bodyscan.rig.board import Board
 
 
@@ -60,20 +59,8 @@ def _lines(board: Board, count: int) -> Array:
 
 
 def marker_dictionary(board: Board) -> cv2.aruco.Dictionary:
-    """Look up the marker dictionary of a board. Raises BadInput for an unknown name."""
-    number = getattr(cv2.aruco, board.dictionary, None)
-    if not board.dictionary.startswith("DICT_") or not isinstance(number, int):
-        raise BadInput(
-            f"unknown marker dictionary {board.dictionary!r}",
-            where=f"board {board.name}",
-            remedy="use one of OpenCV's names, such as DICT_4X4_1000",
-        )
-    return cv2.aruco.getPredefinedDictionary(number)
-
-
-def markers_per_face(board: Board) -> int:
-    """Number of markers on one face: one per white square, or all tags of an aprilgrid."""
-    return board.marker_count // board.faces
+    """Look up OpenCV's dictionary by its name, which a valid board has."""
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
 
 
 def marker_corners(board: Board, face: int = 0) -> tuple[Indices, Array]:
@@ -82,40 +69,27 @@ def marker_corners(board: Board, face: int = 0) -> tuple[Indices, Array]:
     Corners run clockwise as printed, from the marker's own top left, as OpenCV's detector gives
     them; for an aprilgrid from the print's top left. Its tags count from the lower left, row by row
     upwards, as Kalibr prints them. The back's ids follow the front's.
-
-    Raises BadInput if marker_mm is missing or too large, or the dictionary has too few markers.
     """
+    count = board.marker_count // board.faces
+    ids = board.first_marker + face * count + np.arange(count)
     if board.kind == "aprilgrid":
-        return _tag_corners(board, face)
-    where = f"board {board.name}"
-    if board.marker_mm is None or not board.marker_mm < board.square_mm:
-        raise BadInput("a charuco board needs marker_mm, smaller than square_mm", where=where)
-    dictionary, count = marker_dictionary(board), markers_per_face(board)
-    first = board.first_marker + face * count
-    if first + count > len(dictionary.bytesList):
-        raise BadInput(
-            f"{board.dictionary} has {len(dictionary.bytesList)} markers, too few for ids "
-            f"{first} to {first + count - 1}",
-            where=where,
-            remedy="choose a larger dictionary or a smaller first_marker",
-        )
+        return ids, _tag_corners(board)
     charuco = cv2.aruco.CharucoBoard(
         (board.columns, board.rows),
         board.square_mm,
-        board.marker_mm,
-        dictionary,
-        np.arange(first, first + count),
+        board.marker_mm or 0.0,
+        marker_dictionary(board),
+        ids,
     )
     charuco.setLegacyPattern(board.legacy_layout)
     corners = np.asarray(charuco.getObjPoints(), float).reshape(-1, 4, 3)[..., :2]
-    return np.asarray(charuco.getIds(), np.int64).ravel(), corners
+    return ids, corners
 
 
-def _tag_corners(board: Board, face: int) -> tuple[Indices, Array]:
+def _tag_corners(board: Board) -> Array:
     x, y = _lines(board, board.columns), _lines(board, board.rows)
     columns, rows = np.meshgrid(np.arange(board.columns), np.arange(board.rows)[::-1])
     column, row = columns.ravel(), rows.ravel()
     left, right, top, bottom = x[2 * column], x[2 * column + 1], y[2 * row], y[2 * row + 1]
     corners = np.stack([left, top, right, top, right, bottom, left, bottom], axis=-1)
-    ids = board.first_marker + face * len(column) + np.arange(len(column))
-    return ids.astype(np.int64), corners.reshape(-1, 4, 2)
+    return corners.reshape(-1, 4, 2)

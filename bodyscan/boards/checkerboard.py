@@ -31,23 +31,18 @@ def find_checkerboard(image: Bytes, board: Board, *, quick: bool = False) -> Det
 
     Raises BadInput for a board that no detector finds.
     """
-    if not quick:
-        _refuse_unsuitable(board)
-    for candidate in _candidates(image, board, quick):
-        found = _refine(image, board, candidate)
-        if found is not None:
-            return found
-    return None
-
-
-def _refuse_unsuitable(board: Board) -> None:
-    if min(board.columns, board.rows) < MIN_SQUARES:
+    if not quick and min(board.columns, board.rows) < MIN_SQUARES:
         raise BadInput(
             f"a plain checkerboard of {board.columns} columns and {board.rows} rows cannot be found: "
             f"it takes {MIN_SQUARES} squares in either direction",
             where=f"board {board.name}",
             remedy="use a board with more squares, or a charuco board",
         )
+    for candidate in _candidates(image, board, quick):
+        found = _refine(image, board, candidate)
+        if found is not None:
+            return found
+    return None
 
 
 def _refine(image: Bytes, board: Board, candidate: Array) -> DetectedCorners | None:

@@ -18,7 +18,7 @@ px, all of them. All corners of a board are fitted at once.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -167,25 +167,9 @@ class _Fit:
         return np.asarray(np.sqrt(np.maximum(corner.max(axis=1), 0.0)))
 
 
-@dataclass(frozen=True, eq=False)
-class _LightPrior:
-    """Gaussian prior of g: mean (2,), and information (N, 2) in squared grey levels."""
-
-    mean: Array
-    information: Array
-
-    def add_to(self, equations: StackedEquations, state: Array) -> StackedEquations:
-        """Add the prior's residuals at a state (N, 9) to the equations of the patches."""
-        residual = state[:, 7:] - self.mean
-        normal, gradient = equations.normal.copy(), equations.gradient.copy()
-        normal[:, [7, 8], [7, 8]] += self.information
-        gradient[:, 7:] += self.information * residual
-        cost = equations.cost + np.sum(self.information * residual**2, axis=1)
-        return StackedEquations(normal, gradient, cost, equations.freedoms)
-
-
-def _common_light(fit: _Fit) -> _LightPrior:
-    """Estimate a prior of g from all corners of a board.
+def _common_light(fit: _Fit) -> tuple[Array, Array]:
+    """Estimate a Gaussian prior of g from all corners of a board: mean (2,), and information (N, 2)
+    in squared grey levels.
 
     Light falls off similarly at all of them, while in noise one corner hardly determines it, and a
     wrong g displaces the corner. The prior's variance is the scatter of g less its noise.
@@ -195,18 +179,26 @@ def _common_light(fit: _Fit) -> _LightPrior:
     noise = np.median(np.einsum("nii->ni", fit.covariance)[:, 7:], axis=0)
     scatter = (SIGMAS_PER_MEDIAN * np.median(np.abs(slope - mean), axis=0)) ** 2
     variance = np.maximum(scatter - noise, 0.02 * scatter + 1e-12)
-    return _LightPrior(mean, fit.variance[:, None] / variance)
+    return mean, fit.variance[:, None] / variance
 
 
-def _fit(patches: _Patches, start: Array, along: Array, light: _LightPrior | None = None) -> _Fit:
-    """Fit the image model to every corner's patch."""
+def _fit(
+    patches: _Patches, start: Array, along: Array, light: tuple[Array, Array] | None = None
+) -> _Fit:
+    """Fit the image model to every corner's patch. light: see `_common_light`."""
     angles = np.arctan2(along[:, 1], along[:, 0]) + np.pi / 2.0
     state = np.column_stack([start, angles, np.full(len(start), 0.9), np.zeros((len(start), 4))])
     state[:, 5:] = _linear(patches, state)
 
     def equations(state: Array) -> StackedEquations:
         corners = _equations(patches, state)
-        return light.add_to(corners, state) if light else corners
+        if light is None:
+            return corners
+        mean, information = light
+        residual = state[:, 7:] - mean
+        corners.normal[:, [7, 8], [7, 8]] += information
+        corners.gradient[:, 7:] += information * residual
+        return replace(corners, cost=corners.cost + np.sum(information * residual**2, axis=1))
 
     def within(state: Array) -> Array:
         state[:, 4] = np.clip(state[:, 4], 0.3, 3.0)  # blur, px

@@ -223,10 +223,7 @@ def _compute_starts(timing: Timing, rig: Rig, counts: Mapping[str, int]) -> dict
 
 def _read_times(path: Path, rig: Rig, sequences: Sequences) -> FrameTimes:
     try:
-        content = read_regular(path, MAX_BYTES)
-        if len(content) > MAX_BYTES:
-            raise CaptureError(f"is longer than {MAX_BYTES:,} bytes", where=str(path))
-        lines = content.decode("utf-8-sig").splitlines()
+        lines = read_regular(path, MAX_BYTES).decode("utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         what = f"the file of times cannot be read as text: {error}"
         raise CaptureError(what, where=str(path), remedy=_TIMES_REMEDY) from None

@@ -7,7 +7,6 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import datetime
-from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
@@ -128,13 +127,6 @@ class Captures:
     times: FrameTimes = field(default_factory=dict)
     described_in: tuple[Path, ...] = ()
 
-    @cached_property
-    def _by_pair_and_shot(self) -> dict[tuple[str, str], ImageSequence]:
-        return {(sequence.pair, sequence.shot): sequence for sequence in self.sequences}
-
-    def sequence(self, pair: str, shot: str) -> ImageSequence | None:
-        return self._by_pair_and_shot.get((pair, shot))
-
     def pair_sequences(self, pair: str) -> tuple[ImageSequence, ...]:
         return tuple(sequence for sequence in self.sequences if sequence.pair == pair)
 
@@ -152,10 +144,6 @@ class Captures:
     def relative(self, text: str) -> str:
         """Make the paths in a message relative to `base`, so that it can be stored."""
         return make_paths_relative(text, self.base, self.folders)
-
-    def missing(self) -> tuple[Path, ...]:
-        """List every image that should exist and does not."""
-        return tuple(path for sequence in self.sequences for path in sequence.missing)
 
 
 def open_captures(rig: Rig, rig_path: Path) -> Captures:
@@ -291,14 +279,14 @@ def _open(
     captures = Captures(rig, (folder,), names, sequences, base=folder)
     if file is None:
         return captures
-    times, times_file = _read_times(captures, listing, file.timing)
+    files = (FILE_NAME, file.timing and file.timing.times)
     return replace(
         captures,
         when=file.when,
         subject=file.subject,
         simulated=bool(file.simulated),
-        times=times,
-        described_in=(folder / FILE_NAME, *times_file),
+        times=_read_times(captures, listing, file.timing) if file.timing else {},
+        described_in=tuple(folder / name for name in files if name),
     )
 
 
@@ -315,12 +303,8 @@ def _no_image_error(rig: Rig, folder: Path, template: str, first: str) -> Captur
     )
 
 
-def _read_times(
-    captures: Captures, listing: Listing, timing: Timing | None
-) -> tuple[FrameTimes, tuple[Path, ...]]:
-    """Read when frames were taken; also the path of a separate file of times."""
-    if timing is None:
-        return {}, ()
+def _read_times(captures: Captures, listing: Listing, timing: Timing) -> FrameTimes:
+    """Read when frames were taken."""
     if timing.times is not None and not listing.has(timing.times):
         raise CaptureError(
             f"names the file of times {timing.times}, which does not exist",
@@ -334,8 +318,7 @@ def _read_times(
         else frames.sequence_names(None)
         for one in captures.sequences
     }
-    times_file = () if timing.times is None else (listing.root / timing.times,)
-    return compute_frame_times(timing, captures.rig, taken, listing.root), times_file
+    return compute_frame_times(timing, captures.rig, taken, listing.root)
 
 
 def _discover_shots(rig: Rig, listing: Listing, template: str) -> tuple[str, ...]:

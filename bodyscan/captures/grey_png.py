@@ -85,55 +85,32 @@ def _unfilter(rows: Bytes, image: Bytes) -> bool:
     there is no such filter."""
     above = np.zeros(image.shape[1], np.uint8)
     for v in range(len(rows)):
-        kind, row = rows[v, 0], rows[v, 1:]
-        if kind == SUB:
-            _add_left(row, image[v])
-        elif kind == UP:
-            _add_above(row, above, image[v])
-        elif kind == AVERAGE:
-            _add_average(row, above, image[v])
-        elif kind == PAETH:
-            _add_paeth(row, above, image[v])
-        elif kind == 0:
+        kind, row, line = rows[v, 0], rows[v, 1:], image[v]
+        left, corner = np.int64(0), np.int64(0)
+        if kind == 0:
+            line[:] = row
+        elif kind == SUB:
             for u in range(row.size):
-                image[v, u] = row[u]
+                left = (left + np.int64(row[u])) & 255
+                line[u] = left
+        elif kind == UP:
+            for u in range(row.size):
+                line[u] = np.uint8(row[u] + above[u])
+        elif kind == AVERAGE:
+            for u in range(row.size):
+                left = (np.int64(row[u]) + ((left + np.int64(above[u])) >> 1)) & 255
+                line[u] = left
+        elif kind == PAETH:
+            for u in range(row.size):
+                up = np.int64(above[u])
+                to_left, to_up = abs(up - corner), abs(left - corner)
+                to_corner = abs(left + up - 2 * corner)
+                nearest = up if to_up <= to_corner else corner
+                if to_left <= to_up and to_left <= to_corner:
+                    nearest = left
+                left, corner = (np.int64(row[u]) + nearest) & 255, up
+                line[u] = left
         else:
             return False
-        above = image[v]
+        above = line
     return True
-
-
-@compiled
-def _add_left(row: Bytes, image: Bytes) -> None:
-    left = np.uint8(0)
-    for u in range(row.size):
-        left = np.uint8(left + row[u])
-        image[u] = left
-
-
-@compiled
-def _add_above(row: Bytes, above: Bytes, image: Bytes) -> None:
-    for u in range(row.size):
-        image[u] = np.uint8(row[u] + above[u])
-
-
-@compiled
-def _add_average(row: Bytes, above: Bytes, image: Bytes) -> None:
-    left = np.int64(0)
-    for u in range(row.size):
-        left = (np.int64(row[u]) + ((left + np.int64(above[u])) >> 1)) & 255
-        image[u] = left
-
-
-@compiled
-def _add_paeth(row: Bytes, above: Bytes, image: Bytes) -> None:
-    left, corner = np.int64(0), np.int64(0)
-    for u in range(row.size):
-        up = np.int64(above[u])
-        to_left, to_up = abs(up - corner), abs(left - corner)
-        to_corner = abs(left + up - 2 * corner)
-        nearest = up if to_up <= to_corner else corner
-        if to_left <= to_up and to_left <= to_corner:
-            nearest = left
-        left, corner = (np.int64(row[u]) + nearest) & 255, up
-        image[u] = left

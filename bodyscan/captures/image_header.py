@@ -60,7 +60,12 @@ def read_header(path: Path) -> ImageHeader:
         if not start:
             raise NotAnImage("is an empty file")
         if start.startswith(b"\x89PNG\r\n\x1a\n"):
-            width, height, bits = _read_png_header(start)
+            if len(start) < 33:
+                raise NotAnImage("is cut short")
+            length, kind, width, height, bits = struct.unpack_from(">I4sIIB", start, 8)
+            (checksum,) = struct.unpack_from(">I", start, 29)
+            if (length, kind) != (13, b"IHDR") or zlib.crc32(start[12:29]) != checksum:
+                raise NotAnImage("is damaged (its PNG header is wrong)")
             complete = _ends_with(stream, 33, b"\x00\x00\x00\x00IEND\xaeB`\x82")
             return ImageHeader(width, height, bits, complete)
         kinds = {b"\xff\xd8\xff": "Jpeg", b"BM": "Bmp", b"II*\0": "Tiff", b"MM\0*": "Tiff"}
@@ -76,16 +81,6 @@ def read_header(path: Path) -> ImageHeader:
         except Exception:  # Pillow raises what its parsers run into
             pass
     raise NotAnImage(f"is cut short or damaged (its {kind.upper()} header cannot be read)")
-
-
-def _read_png_header(start: bytes) -> tuple[int, int, int]:
-    if len(start) < 33:
-        raise NotAnImage("is cut short")
-    length, kind, width, height, bits = struct.unpack_from(">I4sIIB", start, 8)
-    (checksum,) = struct.unpack_from(">I", start, 29)
-    if (length, kind) != (13, b"IHDR") or zlib.crc32(start[12:29]) != checksum:
-        raise NotAnImage("is damaged (its PNG header is wrong)")
-    return width, height, bits
 
 
 def _read_by_pillow(stream: BinaryIO, kind: str) -> ImageHeader:

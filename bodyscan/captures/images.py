@@ -162,8 +162,11 @@ def _read_raw(path: Path, camera: CameraSpec, where: str, rows: int | None = Non
     image = decode_grey_png(data, width, height, rows) if is_png else None
     if image is not None and camera.channel == "grey":
         return image
-    found = _decode(data, camera.channel)
-    if found is None or found.shape[:2] != (height, width):
+    colour = cv2.IMREAD_GRAYSCALE if camera.channel == "grey" else cv2.IMREAD_ANYCOLOR
+    flags = colour | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    found = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    readable = found is not None and found.dtype in (np.uint8, np.uint16)
+    if not readable or found.shape[:2] != (height, width):
         raise image_error("cannot be decoded", path, where)
     if found.ndim == 3:
         found = found[:, :, ("blue", "green", "red").index(camera.channel)]
@@ -171,16 +174,6 @@ def _read_raw(path: Path, camera: CameraSpec, where: str, rows: int | None = Non
         what = f"is grey, but the rig file says `channel: {camera.channel}`"
         raise image_error(what, path, where, remedy="Leave `channel` out for this camera.")
     return cast(Raw, np.ascontiguousarray(found))
-
-
-def _decode(data: bytes, channel: str) -> Raw | None:
-    """Decode to (H, W) if image or channel is grey, else (H, W, 3); None if it is not decodable."""
-    colour = cv2.IMREAD_GRAYSCALE if channel == "grey" else cv2.IMREAD_ANYCOLOR
-    flags = colour | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    if image is None or image.dtype not in (np.uint8, np.uint16):
-        return None
-    return cast(Raw, image)
 
 
 def _refuse_black(image: Bytes, path: Path, where: str) -> None:
@@ -212,7 +205,8 @@ def find_full_scale(images: Sequence[Raw], bits: int | None) -> float:
                 "leave `bits` out.",
             )
         return 255.0
-    values = [_sample(image) for image in images]
+    # About a million numbers of each: 8 bits in 16 show within the first thousand.
+    values = [image.ravel()[:: max(1, image.size >> 20)].astype(np.uint16) for image in images]
     largest = max(int(value.max()) for value in values)
     used = reduce(int.__or__, (int(np.bitwise_or.reduce(value)) for value in values))
     if bits is None:
@@ -242,12 +236,6 @@ def convert_to_greys(image: Raw, scale: float) -> Greys:
     if image.dtype == np.uint8:
         return image.astype(np.uint8, copy=False)
     return np.minimum(image * np.float32(255.0 / scale), np.float32(255.0))
-
-
-def _sample(image: Raw) -> NDArray[np.uint16]:
-    """Sample about a million numbers: 8 bits in 16 show within the first thousand."""
-    values = image.ravel()
-    return values[:: max(1, values.size >> 20)].astype(np.uint16, copy=False)
 
 
 def _refuse_eight_bits(values: Sequence[NDArray[np.uint16]], largest: int, used: int) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -79,33 +78,25 @@ def _folder_names(kinds: tuple[StripeCode, ...]) -> dict[StripeCode, str]:
 def _write_kind(
     folder: Path, frames: FrameNames, kind: StripeCode, pairs: list[Pair], coded: Bytes
 ) -> Path:
+    """Write a kind's images, and patterns.json with the best order to show them: lit and dark if they
+    are taken, then the code's."""
     height, width = coded.shape[1:]
-    order = []
-    for name, image in _ordered_images(frames, kind, coded):
-        packed = cv2.imencode(".png", image)[1]
-        write_bytes(folder / f"{name}.png", packed.tobytes())
-        order.append({"file": f"{name}.png", "frame": name})
+    blank, images = np.zeros((height, width), np.uint8), {}
+    if frames.lit is not None:
+        images[frames.lit] = blank + 255
+    if frames.dark is not None and any(one.uses_dark for one in kind.directions):
+        images[frames.dark] = blank
+    of_code = dict(zip(frames.code_names(kind), coded, strict=True))
+    images |= {name: of_code[name] for name in frames.shown_names(kind)}
+    for name, image in images.items():
+        write_bytes(folder / f"{name}.png", cv2.imencode(".png", image)[1].tobytes())
     content = {
         "version": 1,
         "code": {"code": kind.code, **kind.model_dump(mode="json", exclude_defaults=True)},
         "width": width,
         "height": height,
         "pairs": [pair.name for pair in pairs],
-        "show": order,
+        "show": [{"file": f"{name}.png", "frame": name} for name in images],
     }
     write_json(folder / "patterns.json", content)
     return folder / "patterns.json"
-
-
-def _ordered_images(
-    frames: FrameNames, kind: StripeCode, coded: Bytes
-) -> Iterator[tuple[str, Bytes]]:
-    """Yield name and image (H, W) in the best order to show: lit and dark if they are taken, then the
-    code's."""
-    blank = np.zeros(coded.shape[1:], np.uint8)
-    if frames.lit is not None:
-        yield frames.lit, blank + 255
-    if frames.dark is not None and any(one.uses_dark for one in kind.directions):
-        yield frames.dark, blank
-    images = dict(zip(frames.code_names(kind), coded, strict=True))
-    yield from ((name, images[name]) for name in frames.shown_names(kind))

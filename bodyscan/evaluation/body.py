@@ -61,7 +61,10 @@ def true_girths(vertices: Array, faces: Indices) -> Measurements:
     """Girths of the true trunk, every `STEP_MM`."""
     stature = float(vertices[:, 2].max())
     levels = np.arange(TORSO[0] * stature, TORSO[1] * stature, STEP_MM).tolist()
-    return measure(_as_measured(vertices, faces), levels)
+    count = len(vertices)
+    normals, colours = np.zeros((count, 3), np.float32), np.zeros((count, 3), np.uint8)
+    sigma_mm, filled = np.zeros(count, np.float32), np.zeros(len(faces), bool)
+    return measure(BodyMesh(vertices, faces, normals, colours, sigma_mm, filled), levels)
 
 
 def girth_errors(mesh: BodyMesh, true: Measurements, *, mean_breath: bool = False) -> GirthErrors:
@@ -84,13 +87,6 @@ def _trunk_error(ours: Slice, true: Slice) -> float | None:
     if one is None or other is None or one.measured_skin < WHOLE:
         return None
     return one.tape_mm - other.tape_mm
-
-
-def _as_measured(vertices: Array, faces: Indices) -> BodyMesh:
-    count = len(vertices)
-    normals, colours = np.zeros((count, 3), np.float32), np.zeros((count, 3), np.uint8)
-    sigma_mm, filled = np.zeros(count, np.float32), np.zeros(len(faces), bool)
-    return BodyMesh(vertices, faces, normals, colours, sigma_mm, filled)
 
 
 def measure_visible_coverage(

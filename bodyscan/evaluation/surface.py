@@ -61,17 +61,13 @@ def _pseudo_normals(vertices: Array, faces: Indices, face: Indices, barycentric:
     normals[spot] += unit[np.where(twin < 0, face[spot], twin // 3)]
     spot = np.flatnonzero(low.sum(axis=1) >= 2)
     corner = faces[face[spot], np.argmax(barycentric[spot], axis=1)]
-    normals[spot] = _corner_normals(len(vertices), faces, sides, unit)[corner]
-    return normals
-
-
-def _corner_normals(count: int, faces: Indices, sides: Array, unit: Array) -> Array:
-    """(V, 3): sums of the normals around each vertex, weighted by the faces' angles there."""
+    # Of a corner: the sum of the normals around it, weighted by the faces' angles there.
     along = sides / np.maximum(np.linalg.norm(sides, axis=-1, keepdims=True), 1e-300)
     cosine = -np.einsum("fkc,fkc->fk", along, np.roll(along, 1, axis=1))
     weighted = np.arccos(cosine.clip(-1.0, 1.0))[..., None] * unit[:, None]
-    columns = weighted.reshape(-1, 3).T
-    return np.stack([np.bincount(faces.ravel(), column, count) for column in columns], axis=-1)
+    for axis, values in enumerate(weighted.reshape(-1, 3).T):
+        normals[spot, axis] = np.bincount(faces.ravel(), values, len(vertices))[corner]
+    return normals
 
 
 def deviation(signed_mm: Array) -> Deviation:

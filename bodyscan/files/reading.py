@@ -38,9 +38,12 @@ def open_regular(path: Path) -> BinaryIO:
 
 
 def read_regular(path: Path, max_bytes: int | None = None) -> bytes:
-    """Read a whole file; of a longer one, `max_bytes` + 1 bytes. Raises as `open_regular`."""
+    """Read a whole file. Raises as `open_regular`, and OSError if it is longer than `max_bytes`."""
     with open_regular(path) as stream:
-        return stream.read(-1 if max_bytes is None else max_bytes + 1)
+        data = stream.read(-1 if max_bytes is None else max_bytes + 1)
+    if max_bytes is not None and len(data) > max_bytes:
+        raise OSError(errno.EOVERFLOW, f"is longer than {max_bytes:,} bytes", str(path))
+    return data
 
 
 def read_json_object(path: Path, max_bytes: int = 100_000_000) -> dict[str, Any]:
@@ -48,12 +51,10 @@ def read_json_object(path: Path, max_bytes: int = 100_000_000) -> dict[str, Any]
 
     max_bytes: a calibration of sixteen pairs and two hundred shots takes a million.
 
-    Raises ValueError for anything else (duplicate keys, NaN, 1e999, half surrogates, too long,
-    nested too deeply), BadInput if it is not a regular file, OSError if it cannot be read.
+    Raises ValueError for anything else (duplicate keys, NaN, 1e999, half surrogates, nested too
+    deeply), BadInput if it is not a regular file, OSError if it cannot be read or is too long.
     """
     data = read_regular(path, max_bytes)
-    if len(data) > max_bytes:
-        raise ValueError(f"is longer than {max_bytes:,} bytes")
     try:
         content = json.loads(
             data.decode("utf-8"),

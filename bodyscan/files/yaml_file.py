@@ -94,11 +94,9 @@ def read_yaml(path: Path) -> Document:
     """Read one YAML document.
 
     Raises YamlError if it is unreadable, BadInput if it is not a regular file, OSError if it does
-    not exist.
+    not exist or is too long.
     """
     content = read_regular(path, MAX_BYTES)
-    if len(content) > MAX_BYTES:
-        raise _error(Place(1, 1), f"is longer than {MAX_BYTES:,} bytes: this cannot be right")
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:

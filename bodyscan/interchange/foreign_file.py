@@ -49,10 +49,7 @@ class ForeignFile:
         """Read a text file. Raises CalibrationFileError if it is not text, BadInput for a pipe."""
         empty = ForeignFile(path)
         try:
-            data = read_regular(path, MAX_BYTES)
-            if len(data) > MAX_BYTES:
-                raise empty.error(f"is longer than {MAX_BYTES:,} bytes: this cannot be right")
-            return ForeignFile(path, data.decode("utf-8-sig"))
+            return ForeignFile(path, read_regular(path, MAX_BYTES).decode("utf-8-sig"))
         except FileNotFoundError:
             raise empty.error("there is no such file") from None
         except UnicodeDecodeError:

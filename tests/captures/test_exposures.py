@@ -170,7 +170,7 @@ def test_a_rig_file_names_its_exposures(tmp_path: Path) -> None:
     found = read_sequence(sequence, rig.pairs[0].camera)
     assert found.coded.dtype == np.float32
     (tmp_path / "scan/a/p1-long-bit02.png").unlink()
-    gone = open_scan(rig, tmp_path / "scan").missing()
+    gone = [path for s in open_scan(rig, tmp_path / "scan").sequences for path in s.missing]
     assert [path.name for path in gone] == ["p1-long-bit02.png"]
 
 

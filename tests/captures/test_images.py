@@ -17,7 +17,7 @@ from small_captures import BITS, FRAMES, HEIGHT, STRIPES, WIDTH, encoded, pictur
 from small_captures import write_small_captures as small
 
 from bodyscan.captures.check import check, format_report
-from bodyscan.captures.folder import ImageSequence, open_captures
+from bodyscan.captures.folder import Captures, ImageSequence, open_captures
 from bodyscan.captures.grey_png import png_damage
 from bodyscan.captures.image_header import NotAnImage, read_header
 from bodyscan.captures.images import read_board_image, read_image, read_sequence
@@ -29,11 +29,13 @@ CAMERA = CameraSpec(width=WIDTH, height=HEIGHT)
 NOISE = np.random.default_rng(5).integers(0, 256, (HEIGHT, WIDTH), dtype=np.uint8)
 
 
+def sequence_of(captures: Captures, pair: str, shot: str) -> ImageSequence:
+    return next(s for s in captures.pair_sequences(pair) if s.shot == shot)
+
+
 def first_sequence(folder: Path) -> ImageSequence:
     rig_path = small(folder, shots=1)
-    sequence = open_captures(load_rig(rig_path), rig_path).sequence("p1", "b1")
-    assert sequence is not None
-    return sequence
+    return sequence_of(open_captures(load_rig(rig_path), rig_path), "p1", "b1")
 
 
 def read(path: Path, **options: bool) -> np.ndarray:
@@ -225,15 +227,13 @@ def test_boards_are_looked_for_in_the_image_taken_for_them(tmp_path: Path) -> No
         )
     rig = load_rig(rig_path)
     captures = open_captures(rig, rig_path)
-    assert captures.missing() == ()
+    assert not any(s.missing for s in captures.sequences)
     for name, frames in (("p1", len(FRAMES) + 1), ("cam", 1)):
-        sequence = captures.sequence(name, "b1")
-        assert sequence is not None
+        sequence = sequence_of(captures, name, "b1")
         assert len(sequence.paths) == frames
         assert sequence.board_path.name == "room.png"
         assert read_board_image(sequence, rig.pair(name)).max() == 90
-    sequence = captures.sequence("p1", "b1")
-    assert sequence is not None
+    sequence = sequence_of(captures, "p1", "b1")
     lit = read_sequence(sequence, CAMERA).lit
     assert lit is not None
     assert lit.max() == 200
@@ -248,9 +248,8 @@ def test_the_lit_image_is_made_where_none_was_taken(tmp_path: Path) -> None:
     rig = load_rig(rig_path)
     captures = open_captures(rig, rig_path)
     assert captures.shots == ("b1",)
-    assert captures.missing() == ()
-    sequence = captures.sequence("p1", "b1")
-    assert sequence is not None
+    assert not any(s.missing for s in captures.sequences)
+    sequence = sequence_of(captures, "p1", "b1")
     assert sequence.lit is None
     assert sequence.board_path.name == "bit00.png"
     assert read_sequence(sequence, CAMERA).lit is None
@@ -266,14 +265,12 @@ def test_a_star_in_a_name_stands_for_what_differs(tmp_path: Path) -> None:
     rig = load_rig(rig_path)
     captures = open_captures(rig, rig_path)
     assert captures.shots == ("b1",)
-    assert captures.missing() == ()
-    sequence = captures.sequence("p2", "b1")
-    assert sequence is not None
+    assert not any(s.missing for s in captures.sequences)
+    sequence = sequence_of(captures, "p2", "b1")
     np.testing.assert_array_equal(read_sequence(sequence, CAMERA).lit, picture("lit"))
     lit = sequence.board_path
     write(lit.with_name("1_[lit]_again.png"), picture("lit"))
-    again = open_captures(rig, rig_path).sequence("p2", "b1")
-    assert again is not None
+    again = sequence_of(open_captures(rig, rig_path), "p2", "b1")
     with pytest.raises(
         ImageError, match=r"matches 2 files, such as 1481.*lit.*_again\.png"
     ) as caught:
@@ -281,8 +278,7 @@ def test_a_star_in_a_name_stands_for_what_differs(tmp_path: Path) -> None:
     assert caught.value.where.endswith("*_[lit]_*.png (pair p2, shot b1)")
     lit.unlink()
     (lit.parent / "1_[lit]_again.png").unlink()
-    gone = open_captures(rig, rig_path).sequence("p2", "b1")
-    assert gone is not None
+    gone = sequence_of(open_captures(rig, rig_path), "p2", "b1")
     with pytest.raises(ImageError, match="is missing"):
         read_sequence(gone, CAMERA)
 
@@ -318,6 +314,4 @@ def test_all_that_is_missing_is_counted_and_absent_inverses_are_told(tmp_path: P
 
 def reopened(folder: Path) -> ImageSequence:
     rig_path = folder / "rig.yaml"
-    sequence = open_captures(load_rig(rig_path), rig_path).sequence("p1", "b1")
-    assert sequence is not None
-    return sequence
+    return sequence_of(open_captures(load_rig(rig_path), rig_path), "p1", "b1")

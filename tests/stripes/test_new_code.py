@@ -56,8 +56,7 @@ def test_it_goes_all_the_way_from_the_rig_file_to_stripes(tmp_path: Path) -> Non
         for shot in ("b1", "b2", "b3"):
             write(tmp_path / "captures" / shot / "p1" / name, image)
     assert not [error for error in check(tmp_path / "rig.yaml").errors if "p1" in error]
-    sequence = open_captures(rig, tmp_path / "rig.yaml").sequence("p1", "b2")
-    assert sequence is not None
+    sequence = open_captures(rig, tmp_path / "rig.yaml").pair_sequences("p1")[1]
     seen = decode_sequence(sequence, rig.pair("p1"))
     true = (np.arange(30) + 0.5)[:, None] * 12 / 30
     known = np.isfinite(seen.s)
