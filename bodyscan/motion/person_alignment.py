@@ -83,7 +83,8 @@ def align_person(
             found = detect_displacement(
                 evidence, rig_from_camera, poles, _pairs_of(displaced), rival
             )
-        if found is None and motion is not None and motion.times.factor != 1.0:
+        warped = isinstance(common_error, CommonError)  # as by motion within moments
+        if found is None and motion is not None and motion.times.factor != 1.0 and not warped:
             time_factor = motion.times.factor
             images = [replace(image, time_ms=None, span_ms=None) for image in images]
             continue

@@ -76,6 +76,7 @@ def check_common_error(scan: ScanEvidence) -> Iterator[Finding]:
         "projectors are warmer or colder than when calibrated; all lenses were refocused; the "
         "calibration was edited. Let the rig warm up and calibrate again",
         explains=frozenset(scan.alignment.rig_from_camera),
+        spoils=not isinstance(found, ScaleError),
     )
 
 
