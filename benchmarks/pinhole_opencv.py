@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
+from benchmarks.rivals import shear
 from bodyscan.arrays import Array
 from bodyscan.geometry.camera import Camera
 
@@ -33,7 +34,7 @@ def fit_pinhole_opencv(
     camera_matrix = camera.matrix
     camera_matrix[0, 1] = 0.0
     lens = camera.lens.opencv()
-    seen = [camera.without_skew(p).astype(np.float32) for p in pixels]
+    seen = [shear(camera, p).astype(np.float32) for p in pixels]
     objects = [b.astype(np.float32) for b in boards]
     matrix, rotation, translation = _as_camera(start)
     poses = [

@@ -96,9 +96,14 @@ def with_lens(
     }
 
 
+def shear(camera: Camera, pixels: Array) -> Array:
+    """Shear px (N, 2) by -gamma/beta to what a camera without skew would see."""
+    return pixels - camera.gamma / camera.beta * np.outer(pixels[:, 1] - camera.v0, [1.0, 0.0])
+
+
 def without_skew(views: Sequence[LocatedView], cameras: Mapping[str, Camera]) -> list[LocatedView]:
     """Views as seen by cameras without skew, which the rivals assume."""
-    return [replace(v, pixels=cameras[v.pair].without_skew(v.pixels)) for v in views]
+    return [replace(v, pixels=shear(cameras[v.pair], v.pixels)) for v in views]
 
 
 def _run(line: list[str]) -> str | None:

@@ -1,5 +1,5 @@
 """Captures on disk.
 
-folder: where each image lies (captures_file, listing). images: reads them (image_header, grey_png,
-grey_levels). check: a quick check of both. pattern_files: what the projectors show.
+folder: where each image lies (captures_file, listing). images: reads them (image_header, grey_png).
+check: a quick check of both. pattern_files: what the projectors show.
 """

@@ -186,20 +186,12 @@ def reproduce(
             help="Add a bowed board, speckle, jitter, the laser line's smile, defocus.",
         ),
     ] = False,
-    quick: Annotated[
-        bool, typer.Option("--quick", help="Render coarsely, with fewer shots.")
-    ] = False,
-    boards: Annotated[
-        int, typer.Option(min=3, max=10, help="Poses of the board; the chapter has three.")
-    ] = 3,
 ) -> None:
     """Simulate the chapter's own set-up: Tables 1 and 2, Fig. 6 and 7, and all rival models."""
     from bodyscan.laboratory.reproduce import reproduce as run
 
     require_writable(out)
     with output.stages() as progress:
-        text, names = run(
-            out, seed=seed, quick=quick, real_light=real_light, boards=boards, progress=progress
-        )
+        text, names = run(out, seed=seed, real_light=real_light, progress=progress)
     output.say(*text.splitlines())
     output.add_files("written", *(out / name for name in names))

@@ -125,12 +125,6 @@ class Camera:
         x = (pixels[..., 0] - self.u0 - self.gamma * y) / self.alpha
         return np.stack([x, y], axis=-1)
 
-    def without_skew(self, pixels: Array) -> Array:
-        """Shear px (..., 2) by -gamma/beta to what a camera without skew would see."""
-        sheared = pixels.copy()
-        sheared[..., 0] -= self.gamma / self.beta * (pixels[..., 1] - self.v0)
-        return sheared
-
 
 SIZE = ("width", "height")
 

@@ -52,7 +52,6 @@ class Reproduction:
 
     seed: int
     real_light: bool
-    boards: int
     calibrated: Calibrations
     whole: Sequence[ApproachAccuracy]
     fine: Sequence[ApproachAccuracy]
@@ -65,23 +64,18 @@ def reproduce(
     out: Path,
     *,
     seed: int = 0,
-    quick: bool = False,
     real_light: bool = False,
-    boards: int = 3,
     progress: Progress = silent,
 ) -> tuple[str, tuple[str, ...]]:
     """Simulate, calibrate every approach, measure; returns the text, and the names of the files in
     `out`: that text, and the figures.
 
     seed: of all noise.
-    quick: coarser rendering and fewer shots, for a trial.
     real_light: a bowed board, speckle and everything else that an ideal simulation leaves out.
-    boards: number of board poses, from 3 as in the chapter to 10.
     """
     settings = apparatus.real_settings if real_light else apparatus.ideal_settings
-    setup = apparatus.chapter_setup(settings(3 if quick else 5), seed)
-    stops = 3 if quick else 7
-    captures = apparatus.take_captures(setup, boards=boards, stage_stops=stops, progress=progress)
+    setup = apparatus.chapter_setup(settings(), seed)
+    captures = apparatus.take_captures(setup, progress=progress)
     calibrated = calibrate_all(captures)
     compared = [*calibrated.approaches, make_true_approach(setup)]
 
@@ -92,7 +86,6 @@ def reproduce(
     found = Reproduction(
         seed,
         real_light,
-        boards,
         calibrated,
         whole=measure(compared, whole=True),
         fine=measure(compared),

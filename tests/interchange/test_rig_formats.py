@@ -108,7 +108,7 @@ def test_colmap_itself_sees_the_cameras_where_they_stand(points: Array, tmp_path
         own, rig_from_camera = cameras[image.name]
         pixels = [image.project_point(point) for point in points]
         # COLMAP's pixel centres are at +0.5, its cameras without skew.
-        expected = own.without_skew(own.project(rig_from_camera.inverse().apply(points))) + 0.5
+        expected = replace(own, gamma=0.0).project(rig_from_camera.inverse().apply(points)) + 0.5
         np.testing.assert_allclose(pixels, expected, rtol=0, atol=1e-8)
         assert own.gamma != 0
 
@@ -125,7 +125,7 @@ def test_opencv_itself_projects_the_same(points: Array, tmp_path: Path) -> None:
         rotation, translation = node.getNode("R").mat(), node.getNode("T").mat()
         lens = node.getNode("distortion_coefficients").mat()
         pixels, _ = cv2.projectPoints(points, cv2.Rodrigues(rotation)[0], translation, matrix, lens)
-        expected = camera.without_skew(camera.project(rig_from_camera.inverse().apply(points)))
+        expected = replace(camera, gamma=0.0).project(rig_from_camera.inverse().apply(points))
         np.testing.assert_allclose(pixels.reshape(-1, 2), expected, rtol=0, atol=1e-7)
 
 
@@ -142,7 +142,7 @@ def test_what_python_programs_read_projects_the_same(points: Array, tmp_path: Pa
     first = next(iter(cameras.values()))[1]
     for k, (name, (camera, rig_from_camera)) in enumerate(cameras.items()):
         seen = rig_from_camera.inverse().apply(points)
-        expected = camera.without_skew(camera.project(seen))
+        expected = replace(camera, gamma=0.0).project(seen)
         model = ast.literal_eval((files["mrcal"] / f"{name}.cameramodel").read_text("utf-8"))
         fx, fy, cx, cy, *lens = model["intrinsics"]
         matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])

@@ -163,7 +163,6 @@ def test_the_report_says_all_of_it(
     found = Reproduction(
         seed=0,
         real_light=False,
-        boards=3,
         calibrated=calibrated,
         whole=whole,
         fine=fine,

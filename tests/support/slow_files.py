@@ -30,7 +30,6 @@ SLOW = (
     "workflows/test_bad_input.py",
     "simulation/test_simulated_captures.py",
     "calibration/test_stripe_agreement.py",
-    "registration/test_halves.py",
     "jobs/test_cluster.py",
     "registration/test_drift.py",
     "calibration/test_crossing_sheets.py",
