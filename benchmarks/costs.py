@@ -77,8 +77,8 @@ def make_pair(folder: Path, megapixels: float, figure: float = 1.0) -> Path:
 
     figure: its size factor.
     """
+    from bodyscan.rig.gauge import RigFrame
     from bodyscan.rig.rig import load_rig, write_rig
-    from bodyscan.rig.rig_frame import RigFrame
     from bodyscan.simulation import settings_for, simulate
     from bodyscan.workflows.calibrate_rig import calibrate_folder
 
@@ -139,7 +139,7 @@ def around(one: Path, count: int, folder: Path) -> Path:
     from bodyscan.geometry.transforms import RigidTransform
     from bodyscan.geometry.uncertainty import PoseCovariance
     from bodyscan.registration.storage import load_calibration, save_calibration
-    from bodyscan.rig.rig_frame import RigFrame
+    from bodyscan.rig.gauge import RigFrame
 
     known = load_calibration(one / "calibration")
     ((name, pair),) = known.pairs.items()

@@ -80,7 +80,7 @@ def locate_charuco(
     """
     if position is None or not position.valid:
         return None
-    nearby = _corners_next_to(board, position.printed.mean(axis=1))
+    nearby = _find_corners_next_to(board, position.printed.mean(axis=1))
     if len(nearby) < 4:
         return None
     pixels, good = _refine(image, board, position.board_map, nearby, position.printed)
@@ -146,7 +146,7 @@ def fit_markers(printed: Array, corners: Array, board: Board) -> tuple[BoardMap,
     return (board_map, agree) if agree.sum() >= 2 else None
 
 
-def _corners_next_to(board: Board, centres: Array) -> Indices:
+def _find_corners_next_to(board: Board, centres: Array) -> Indices:
     """Find the inner corners, ids on one face, of the squares with these centres (M, 2) mm."""
     square = np.floor(centres / board.square_mm).astype(int)
     column = (square[:, 0, None] + np.array([-1, 0, -1, 0])).ravel()

@@ -226,16 +226,16 @@ def crop_around(boxes: Sequence[Box]) -> Crop:
     return slice(int(top), int(bottom)), slice(int(left), int(right))
 
 
-def box_around(view: BoardView | LocatedView) -> Box:
+def compute_box(view: BoardView | LocatedView) -> Box:
     """Compute a box around a view's board, of which some corners may not have been found."""
     low, high = view.pixels.min(axis=0), view.pixels.max(axis=0)
     margin = 0.5 * (high - low)
     return low - margin, high + margin
 
 
-def box_of_print(camera: Camera, board: Board, view: LocatedView) -> Box:
+def compute_print_box(camera: Camera, board: Board, view: LocatedView) -> Box:
     """Compute a box around the print of a board of known pose, within the box around its view."""
-    low, high = box_around(view)
+    low, high = compute_box(view)
     grid = np.indices((board.columns + 1, board.rows + 1)).reshape(2, -1).T * board.square_mm
     on_face = np.column_stack([grid, np.full(len(grid), view.points[0, 2])])
     points = view.camera_from_board.apply(on_face)
@@ -280,7 +280,7 @@ def max_band_step(boxes: Sequence[Box], camera: CameraSpec) -> int:
     return max(int(np.min(visible) / (4 * BIN_PX)), 1)
 
 
-def boundaries_on_boards(
+def locate_boundaries_on_boards(
     name: str, camera: Camera, projector: StripeCode, shots: Sequence[StripedView]
 ) -> BoundaryPoints:
     """Intersect the boundaries of all shots with their boards; `board` counts the shots.

@@ -216,7 +216,7 @@ def refine_jointly(
         state.camera,
         state.poses,
         tuple(
-            replace(one, covariance=_depth_covariance(state, boards, covariance, direction))
+            replace(one, covariance=_compute_depth_covariance(state, boards, covariance, direction))
             for direction, one in enumerate(state.sheets)
         ),
         covariance[np.ix_(camera_columns, camera_columns)],
@@ -341,10 +341,10 @@ def _stripe_residuals(
     sheets, stripes = state.sheets[direction], board.stripes[direction]
     camera_from_face = state.poses[k] @ board.board_from_face
     points = rays_on_board(rays, camera_from_face, partial(_height, state, board))
-    return _whitened_offsets(sheets, sheets.evaluate(stripes.index), stripes, points)
+    return _whiten_offsets(sheets, sheets.evaluate(stripes.index), stripes, points)
 
 
-def _whitened_offsets(sheets: SmoothSheets, at: Any, stripes: BoardStripes, points: Array) -> Array:
+def _whiten_offsets(sheets: SmoothSheets, at: Any, stripes: BoardStripes, points: Array) -> Array:
     offset = sheets.offset(points[0], at)
     return np.asarray(offset.value / _offset_sigma(stripes, points, offset.by_point), np.float64)
 
@@ -379,7 +379,7 @@ def _stripe_jacobian(
         points = rays_on_board(rays, camera_from_face) + lift_along_rays(
             rays, camera_from_face, height
         )
-        return _whitened_offsets(sheets, at, stripes, points)
+        return _whiten_offsets(sheets, at, stripes, points)
 
     def by_parameter(column: int, step: float) -> Array:
         turn = np.zeros_like(rays)
@@ -403,7 +403,7 @@ def _stripe_jacobian(
     return np.column_stack([*differences, offset.by_parameter / sigma[:, None], by_heights])
 
 
-def _depth_covariance(
+def _compute_depth_covariance(
     state: _State, boards: Sequence[StripedBoard], covariance: Array, direction: int
 ) -> Array:
     """Covariance (P, P) of one direction's sheets together with the rays that meet them, as it

@@ -12,7 +12,7 @@ from bodyscan.calibration.board_views import LocatedView, PlanarView
 from bodyscan.calibration.boundary_points import (
     BoundaryPoints,
     StripedView,
-    boundaries_on_boards,
+    locate_boundaries_on_boards,
     select,
     subsample,
 )
@@ -137,7 +137,7 @@ def calibrate_pair(pair: LocatedPair) -> Outcome[PairCalibration]:
         return Outcome(calibration)
     consistent = drop_inconsistent(pair.name, pair.camera, code, pair.shots)
     shots, notes = consistent.value, consistent.notes
-    points = boundaries_on_boards(pair.name, pair.camera, code, shots)
+    points = locate_boundaries_on_boards(pair.name, pair.camera, code, shots)
     fit = fit_light_sheets(points, code.stripes, code.direction)
     offsets = board_offsets(points, fit.sheets)
     quality = replace(
@@ -172,7 +172,7 @@ def drop_inconsistent(
 
     Raises PairFailed if the projector moved between two shots.
     """
-    points = boundaries_on_boards(name, camera, code, shots)
+    points = locate_boundaries_on_boards(name, camera, code, shots)
     split = find_projector_motion(points, code.stripes, code.direction)
     if split is None:
         return Outcome(tuple(shots))
@@ -269,7 +269,7 @@ def _fit_crossing(
         if shot.boundaries.crossing is not None
     ]
     try:
-        points = boundaries_on_boards(pair.name, pair.camera, across, crossed)
+        points = locate_boundaries_on_boards(pair.name, pair.camera, across, crossed)
         fit = fit_light_sheets(points, across.stripes, across.direction)
     except PairFailed as error:
         return Outcome(None, (f"{pair.name}: crossing stripes are not used: {error.what}",))

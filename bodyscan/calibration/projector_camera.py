@@ -94,8 +94,8 @@ def intersect_central_rays(
     """The point (3,) mm, camera frame, on the ray through the middle of the camera's image that is
     nearest to the ray through the middle of the projector's."""
     camera_from_projector = projector_from_camera.inverse()
-    ray = _middle_ray(camera)
-    light = camera_from_projector.rotate(_middle_ray(projector))
+    ray = _compute_central_ray(camera)
+    light = camera_from_projector.rotate(_compute_central_ray(projector))
     start = camera_from_projector.translation
     # depth * ray - (start + reach * light) is perpendicular to both
     normal = np.array([[ray @ ray, -ray @ light], [ray @ light, -light @ light]])
@@ -116,7 +116,7 @@ def _across_stripes(projector: Camera, direction: Axis) -> tuple[Array, float, i
     return np.array([0.0, projector.beta]), projector.v0, projector.height
 
 
-def _middle_ray(camera: Camera) -> Array:
+def _compute_central_ray(camera: Camera) -> Array:
     middle = 0.5 * np.array([camera.width - 1.0, camera.height - 1.0])
     ray: Array = camera.rays(middle)
     return ray / np.linalg.norm(ray)

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from bodyscan.errors import CaptureError
-from bodyscan.rig.templates import ANYTHING, names_pattern
+from bodyscan.rig.templates import ANYTHING, compile_names
 
 
 class Listing:
@@ -54,7 +54,7 @@ class Listing:
             return relative
         matches = [""]
         for part in relative.split("/"):
-            wanted = names_pattern(part)
+            wanted = compile_names(part)
             matches = [
                 f"{folder}/{name}".lstrip("/")
                 for folder in matches

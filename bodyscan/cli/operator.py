@@ -153,7 +153,7 @@ def measure(
     from bodyscan.fusion.storage import load_scan, refuse_repeat
     from bodyscan.measurement.measurements import heights_from
     from bodyscan.measurement.measurements import measure as measure_mesh
-    from bodyscan.report.measurements import measurements_csv, measurements_document, tables
+    from bodyscan.report.measurement_table import measurements_csv, measurements_document, tables
 
     levels = None if heights is None else heights_from(heights)
     stored = load_scan(result)

@@ -17,7 +17,7 @@ from scipy import ndimage
 from bodyscan.arrays import Array, Bytes, Crop, Floats, Indices, Mask, find_crop
 from bodyscan.fusion.brightness import MIN_GREY
 from bodyscan.fusion.quadratic_fit import fit_full_windows, window_basis
-from bodyscan.fusion.smoothing import estimate_pixel_size, inverse_depths, window_reach
+from bodyscan.fusion.smoothing import compute_inverse_depths, estimate_pixel_size, window_reach
 from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import DARK_CLOTH, HAIR, SKIN, UNSURE, BodyCloud
@@ -210,7 +210,7 @@ def measure_roughness(
 ) -> Roughness:
     """Compare the pixels in a box with quadratics in windows of about `window_mm`."""
     image = image.crop(box)
-    inverse, noise = inverse_depths(image)
+    inverse, noise = compute_inverse_depths(image)
     reach = window_reach(estimate_pixel_size(inverse, image.camera), window_mm)
     fit, full = fit_full_windows(inverse, noise, reach)
     residual = (inverse - fit.value)[full]

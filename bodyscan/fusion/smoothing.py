@@ -60,7 +60,7 @@ def smooth(
     if box is None:
         return None
     image = image.crop(box)
-    inverse, noise = inverse_depths(image)
+    inverse, noise = compute_inverse_depths(image)
     pixel_mm = estimate_pixel_size(inverse, image.camera)
     reach = window_reach(pixel_mm, window_mm)
     fit, fitted = fit_quadratics(inverse, noise, reach, pixel_mm, image.correlation_px)
@@ -90,7 +90,7 @@ def _build_surface(
     points, normals = np.empty((size, 3), np.float32), np.empty((size, 3), np.float32)
     sigma = np.empty(size, np.float32)
     count = _compute_points(
-        (image.points, _common_sigmas(image)),
+        (image.points, _compute_common_sigmas(image)),
         (fit.value, fit.slope_u, fit.slope_v, fit.sigma),
         fitted,
         projection_table(image.camera),
@@ -128,21 +128,21 @@ def distance_to_rim(depth: Floats, jump: float) -> Floats:
     return cv2.distanceTransform(padded, cv2.DIST_L2, 3)[1:-1, 1:-1] + np.float32(1.0)
 
 
-def inverse_depths(image: RangeImage) -> tuple[Floats, Floats]:
-    """Inverse depth 1/z and its sigma (h, w), without the part common to neighbours; 0 where
+def compute_inverse_depths(image: RangeImage) -> tuple[Floats, Floats]:
+    """Compute 1/z and its sigma (h, w), less what neighbours have in common of the sigma; 0 where
     nothing was measured."""
     sigma_mm, valid = image.sigma_mm, image.valid
     depth = np.where(valid, image.points[..., 2], np.float32(1.0))
     # A hundredth of sigma is left at least: rounding.
     smallest = np.float32(0.01) * sigma_mm
-    variance = np.maximum(sigma_mm**2 - _common_sigmas(image) ** 2, smallest**2)
+    variance = np.maximum(sigma_mm**2 - _compute_common_sigmas(image) ** 2, smallest**2)
     # Along the ray a point moves by its length over z times dz.
     length2 = np.einsum("hwc,hwc->hw", image.points, image.points)
     noise = np.sqrt(np.where(valid, variance / length2, np.float32(0.0))) / depth
     return np.where(valid, np.float32(1.0) / depth, np.float32(0.0)), np.asarray(noise, np.float32)
 
 
-def _common_sigmas(image: RangeImage) -> Floats:
+def _compute_common_sigmas(image: RangeImage) -> Floats:
     return np.zeros_like(image.sigma_mm) if image.common_mm is None else image.common_mm
 
 

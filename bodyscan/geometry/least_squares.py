@@ -70,7 +70,7 @@ class Noise:
         return cauchy_weights(residuals, self.group, self.cauchy)
 
     def mean_square(self, residuals: Array) -> float:
-        """Of residuals (N,) weighted against outliers, in their own unit squared."""
+        """Mean square of robustly weighted residuals (N,), in their unit squared."""
         weights = self.weights(residuals / self.estimate_scale(residuals))
         return float(weights @ residuals**2 / np.sum(weights))
 

@@ -79,7 +79,7 @@ class LightPlanes:
 
     @staticmethod
     def from_planes(planes: Array, direction: Axis) -> LightPlanes:
-        """Of planes (S + 1, 4) of any length and sign; how well they are known is not told."""
+        """Normalize planes (S + 1, 4) of any length and sign; their covariance is unknown."""
         unit = planes / np.linalg.norm(planes[:, :3], axis=1, keepdims=True)
         return LightPlanes(towards_camera(unit), np.full((len(planes), 4, 4), np.nan), direction)
 

@@ -59,8 +59,8 @@ MAX_RELATIVE_SIGMA = 1e-3
 """A sheet that leaves a larger share of the depth uncertain counts as missing: that far from all
 boards a smooth model only guesses."""
 GUESSED = 3.0
-"""A depth is a guess if it is this many times as uncertain as amid the boards. What a few boards
-leave open of all depths alike is in their sigma and is no guess."""
+"""A depth is extrapolated if its sigma is this many times that amid the boards. An uncertainty that
+all depths share, because there were few boards, is in their sigmas and does not count."""
 BAND = 16  # rows at a time: what fits into a processor's cache
 
 
@@ -122,8 +122,8 @@ def triangulate_image(
 
 
 def _max_relative_sigma(sheets: LightSheets) -> float:
-    """MAX_RELATIVE_SIGMA, or GUESSED times the sigma amid the boards. A projector that was
-    calibrated elsewhere is a guess nowhere, however roughly it may be known."""
+    """MAX_RELATIVE_SIGMA, or GUESSED times the sigma amid the boards; infinite for a projector
+    calibrated elsewhere, which does not extrapolate from boards."""
     if isinstance(sheets, LensSheets) and sheets.only_centre_uncertain:
         return np.inf
     if not isinstance(sheets, SmoothSheets):

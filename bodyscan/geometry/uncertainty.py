@@ -39,8 +39,8 @@ class PoseCovariance:
     def add_motions(
         self, names: Collection[str], covariance: Array, *, common: bool
     ) -> PoseCovariance:
-        """After these pairs made motions of covariance (6, 6): each its own, or all a `common` one, as
-        those of a pole, which leaves what they know of each other as it was."""
+        """Add a motion of covariance (6, 6) to these pairs: independent ones, or a `common` one, such
+        as a pole's, which leaves their covariance relative to each other unchanged."""
         rows, matrix, count = self._rows(names), self.matrix.copy(), len(names)
         correlation = np.ones((count, count)) if common else np.eye(count)
         matrix[np.ix_(rows, rows)] += np.kron(correlation, covariance)

@@ -112,7 +112,7 @@ class _Screen:
             return
         if job in self._running:
             self._bars.remove_task(self._running.pop(job))
-        self._print(ending(event), "" if state == "done" else "red")
+        self._print(format_ending(event), "" if state == "done" else "red")
 
     def _verdict(self, event: dict[str, Any]) -> None:
         if event["final"] or self._all is None:
@@ -141,7 +141,7 @@ def _verdict_text(event: dict[str, Any]) -> Text:
     return Text(text, STYLES[MARKS.get(event["grade"], "bad")])
 
 
-def ending(event: dict[str, Any]) -> str:
+def format_ending(event: dict[str, Any]) -> str:
     """How a job ended, in one line (or more if it was set aside)."""
     if event["state"] != "done":
         tries = f" after {event['attempts']} attempts" if event["attempts"] else ""

@@ -41,7 +41,7 @@ COLUMNS = {
 def write_summary(jobs: Sequence[Job], outcomes: Sequence[JobResult], out: Path) -> Path:
     """Write summary.csv (one row per job, columns as in docs/formats.md); returns its path."""
     kind = jobs[0].pipeline.kind
-    rows = [_row(job, outcome) for job, outcome in zip(jobs, outcomes, strict=True)]
+    rows = [_make_row(job, outcome) for job, outcome in zip(jobs, outcomes, strict=True)]
     first = ("job", "subject", "when", "state", "attempts", "seconds", "stages")
     text = io.StringIO()
     table = csv.DictWriter(text, (*first, *COLUMNS[kind], "reason"), extrasaction="ignore")
@@ -75,7 +75,7 @@ def find_drift(jobs: Sequence[Job]) -> list[PairDrift]:
     return sorted((one for one in found if one.moved), key=lambda one: -one.shift_mm)
 
 
-def _row(job: Job, outcome: JobResult) -> dict[str, Any]:
+def _make_row(job: Job, outcome: JobResult) -> dict[str, Any]:
     row = asdict(outcome) | {
         "subject": job.subject,
         "stages": " ".join(outcome.stages),
@@ -130,7 +130,7 @@ def _rig_figures(content: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _facts(job: Job) -> dict[str, Any]:
-    """Of its scan; empty where there is none."""
+    """Facts about the job's scan; empty if it has none."""
     return read_record(job.folder / "scan" / "scan.json")
 
 

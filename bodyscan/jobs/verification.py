@@ -34,28 +34,28 @@ def verify(folder: Path, kinds: Kinds = KINDS) -> Verification:
             remedy="give the --out folder of a batch, or a job's folder in it",
         )
     files, faults = 0, []
-    for path, fault in _all(folder, kinds):
+    for path, fault in _verify_all(folder, kinds):
         files += 1
         if fault:
             faults.append(f"{path}: {fault}")
     return Verification(files, tuple(faults), tuple(_find_added(folder)))
 
 
-def _all(folder: Path, kinds: Kinds) -> Iterator[tuple[Path, str]]:
+def _verify_all(folder: Path, kinds: Kinds) -> Iterator[tuple[Path, str]]:
     jobs = read_record(folder / MANIFEST).get("jobs")
     if not isinstance(jobs, dict):
-        yield from _job(folder, kinds)
+        yield from _verify_job(folder, kinds)
         return
     for name, digest in sorted(jobs.items()):
         yield _compare_hash(folder / name / MANIFEST, digest)
         if (folder / name / MANIFEST).exists():
-            yield from _job(folder / name, kinds)
+            yield from _verify_job(folder / name, kinds)
     for path in sorted(folder.glob(f"*/{MANIFEST}")):
         if path.parent.name not in jobs:
             yield path, "is in no list of jobs"
 
 
-def _job(folder: Path, kinds: Kinds) -> Iterator[tuple[Path, str]]:
+def _verify_job(folder: Path, kinds: Kinds) -> Iterator[tuple[Path, str]]:
     path = folder / MANIFEST
     content = read_record(path)
     try:

@@ -250,7 +250,7 @@ class _Watching:
     _turn: int = 0
 
     def state_file(self, path: Path) -> Path:
-        """Where it stands how a scan's job ended."""
+        """Path of the file that records how a scan's job ended."""
         return self.watched.out / job_name(path.name) / STATE
 
     def folders(self) -> list[Path]:
@@ -303,7 +303,7 @@ class _Watching:
         return [self.ended[path] for path in done]
 
     def summary(self) -> dict[str, Any]:
-        """Rewrite the table and the manifest over all jobs."""
+        """Rewrite the table and the manifest of all jobs; return the event that sums them up."""
         if not self.ended:
             return {"event": "summary", "jobs": 0, "set_aside": [], "repeat": []}
         jobs = [self.jobs[path] for path in self.ended]

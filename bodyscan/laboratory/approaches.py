@@ -19,7 +19,7 @@ from bodyscan.calibration.boundary_points import (
     BIN_PX,
     BoundaryPoints,
     boundaries_near,
-    box_around,
+    compute_box,
     concatenate,
     on_board,
     select,
@@ -109,7 +109,7 @@ def locate_boundaries(
             PROJECTOR,
             BOARD,
             pose,
-            boundaries_near(shot.stripes, box_around(shot.view)),
+            boundaries_near(shot.stripes, compute_box(shot.view)),
             number,
             bin_px=bin_px,
         )

@@ -162,7 +162,7 @@ def draw_projector(
         axis.set_xlabel("light stripe number")
         axis.set_ylabel(label)
     axes[0, 0].legend(frameon=False, markerscale=4.0)
-    _distribution(axes[1, 1], residuals_mm)
+    _plot_residuals(axes[1, 1], residuals_mm)
     for axis in axes.ravel():
         axis.grid(color="#999999", alpha=0.25, linewidth=0.6)
     write_bytes(path, png(figure, 750))
@@ -196,7 +196,7 @@ def _baseline_angle_tilt(planes: Array) -> tuple[Array, Array, Array]:
     return length, np.degrees(angle), np.degrees(tilt)
 
 
-def _distribution(axis: Axes, residuals_mm: Array) -> None:
+def _plot_residuals(axis: Axes, residuals_mm: Array) -> None:
     """Plot the distribution of residuals, and a normal curve with their robust sigma."""
     sigma_mm = robust_scale(residuals_mm)
     edges = np.linspace(-8.0 * sigma_mm, 8.0 * sigma_mm, 161)
@@ -238,25 +238,25 @@ def reproduction_text(found: Reproduction) -> str:
         vars(found),
         sixth=sixth,
         seventh=seventh,
-        table_1=_table_1(found.calibrated),
-        whole_table=_table(
+        table_1=_format_table_1(found.calibrated),
+        whole_table=_format(
             against_third,
             [
                 ["Measuring points", *(f"{s.points:,}" for s in found.fine[-1].spheres), ""],
                 ["of lit pixels", *(f"{100 * c:.1f} %" for c in found.fine[-1].covered), ""],
-                *_e_rows(found.whole, whole_times, digits=3),
+                *_make_e_rows(found.whole, whole_times, digits=3),
                 *(
                     [f"chapter {name}", *(f"{e:.2f}" for e in row), ""]
                     for name, row in CHAPTER_TABLE_2.items()
                 ),
             ],
         ),
-        fine_table=_table(against_third, _e_rows(found.fine, fine_times, digits=5)),
-        fitted_table=_table(["", *numbers], fitted),
-        accuracy=_accuracy_table(found.fine),
-        point_sigmas=_table(["", "median sigma", "spheres", "plate", "beyond 3 sigmas"], sigmas),
-        by_stage=_accuracy_table(found.by_stage),
-        by_reference=_accuracy_table(found.by_reference),
+        fine_table=_format(against_third, _make_e_rows(found.fine, fine_times, digits=5)),
+        fitted_table=_format(["", *numbers], fitted),
+        accuracy=_format_accuracy(found.fine),
+        point_sigmas=_format(["", "median sigma", "spheres", "plate", "beyond 3 sigmas"], sigmas),
+        by_stage=_format_accuracy(found.by_stage),
+        by_reference=_format_accuracy(found.by_reference),
         whole_times=whole_times,
         fine_times=fine_times,
         systematic_mm={m.name: m.plate_systematic_mm for m in found.fine},
@@ -269,7 +269,7 @@ def _times(all_: Iterable[ApproachAccuracy]) -> dict[str, float]:
     return {name: e / mean["(iii)"] for name, e in mean.items()}
 
 
-def _e_rows(
+def _make_e_rows(
     all_: Iterable[ApproachAccuracy], times: Mapping[str, float], digits: int
 ) -> list[list[str]]:
     return [
@@ -278,7 +278,7 @@ def _e_rows(
     ]
 
 
-def _table_1(calibrated: Calibrations) -> str:
+def _format_table_1(calibrated: Calibrations) -> str:
     zhang, ours = calibrated.reference, calibrated.ours.camera
     estimates = (
         (zhang.camera.parameters, np.sqrt(np.diag(zhang.covariance))),
@@ -292,10 +292,10 @@ def _table_1(calibrated: Calibrations) -> str:
             value, sigma = values[number], sigmas[number]
             row += [f"{value:.7g}", f"{sigma:.2g}", f"{(value - true) / sigma:+.1f}"]
         rows.append(row)
-    return _table(["", "true", "corners", "sigma", "off by", "joint", "sigma", "off by"], rows)
+    return _format(["", "true", "corners", "sigma", "off by", "joint", "sigma", "off by"], rows)
 
 
-def _accuracy_table(all_: Iterable[ApproachAccuracy]) -> str:
+def _format_accuracy(all_: Iterable[ApproachAccuracy]) -> str:
     columns: dict[str, Callable[[ApproachAccuracy], str]] = {
         "": lambda m: m.name,
         "mean E": lambda m: f"{m.mean_e:.5f}",
@@ -305,10 +305,10 @@ def _accuracy_table(all_: Iterable[ApproachAccuracy]) -> str:
         "centres RMS": lambda m: f"{m.distances.rms_mm:.4f}",
         "scale ppm": lambda m: f"{m.distances.scale_ppm:+.0f}",
     }
-    return _table([*columns], [[cell(m) for cell in columns.values()] for m in all_])
+    return _format([*columns], [[cell(m) for cell in columns.values()] for m in all_])
 
 
-def _table(heading: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+def _format(heading: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Format a Markdown table whose columns are padded so that its source is readable too."""
     cells = [heading, *rows]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]

@@ -110,12 +110,12 @@ def estimate_breath(
     of_common = (to_middle - correction @ information)[:, :first].reshape(fields, COMMON, modes)
 
     def fit(wave: Array) -> tuple[Array, Array, Array]:
-        """Log evidence (S,) of a breath of all sizes; mean (S, M) and covariance in the middle."""
+        """Fit a wave: log evidence (S,) at each size; mean (S, M) and covariance mid-scan."""
         projected = np.einsum("ai,manb,bj->minj", wave, blocks, wave, optimize=True)
-        determined, basis = np.linalg.eigh(projected.reshape(2 * (2 * COMMON,)))
+        eigenvalues, basis = np.linalg.eigh(projected.reshape(2 * (2 * COMMON,)))
         along = basis.T @ (by_field @ wave).ravel()
         carried = (of_common @ wave).reshape(fields, -1) @ basis
-        inflation = 1.0 + variances[:, None] * np.maximum(determined, 0.0)
+        inflation = 1.0 + variances[:, None] * np.maximum(eigenvalues, 0.0)
         gains = variances[:, None] / inflation
         log_evidence = 0.5 * np.sum(gains * along**2 - np.log(inflation), axis=1)
         # Whoever breathes in comes forward, and is carried back.

@@ -19,8 +19,8 @@ from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
 from bodyscan.outcome import Outcome
 from bodyscan.registration.joint_solve import (
     JointSolution,
+    linearize_reprojection,
     refine_solution,
-    reprojection_errors,
 )
 from bodyscan.registration.view_consistency import ConsistentSolve, fit_board
 
@@ -77,7 +77,7 @@ def _gain_per_unknown(
     first = dict(zip(shapes, [0, *ends[:-1].tolist()], strict=True))
     corners, errors, derivatives = [], [], []
     for view in views:
-        residuals, linearize = reprojection_errors(
+        residuals, linearize = linearize_reprojection(
             [view], solution.cameras, solution.root_from_camera, solution.root_from_board
         )
         corners.append(first[view.board] + shapes[view.board].numbers(view.points))

@@ -70,7 +70,7 @@ class PairFigures:
 def figures_of(calibration: RigCalibration) -> list[PairFigures]:
     """Collect the figures of every calibrated pair, in the order of the rig."""
     names = [pair.name for pair in calibration.rig.pairs if pair.name in calibration.pairs]
-    return [_figures(calibration, name) for name in names]
+    return [_collect_figures(calibration, name) for name in names]
 
 
 def grade_calibration(calibration: RigCalibration) -> Verdict:
@@ -103,7 +103,7 @@ def grade_calibration(calibration: RigCalibration) -> Verdict:
     return Verdict(grade, (*(words for _, _, words in findings), *unjudged))
 
 
-def _figures(calibration: RigCalibration, name: str) -> PairFigures:
+def _collect_figures(calibration: RigCalibration, name: str) -> PairFigures:
     pair = calibration.pairs[name]
     quality, camera, corners = pair.quality, pair.camera, calibration.observed.get(name)
     position = calibration.rig_from_camera[name].translation

@@ -26,7 +26,7 @@ from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance
-from bodyscan.registration.joint_solve import reprojection_errors, view_sigmas
+from bodyscan.registration.joint_solve import estimate_view_sigmas, linearize_reprojection
 from bodyscan.registration.view_graph import Target
 
 
@@ -89,8 +89,8 @@ def normal_equations(
         for keys, first in ((names, 0), (names, len(names)), (shapes, 2 * len(names)))
     )
     poses = cameras, rig_from_camera, rig_from_board
-    errors = [reprojection_errors([apply_shape(view, shapes)], *poses) for view in views]
-    sigmas = view_sigmas([residuals for residuals, _ in errors])
+    errors = [linearize_reprojection([apply_shape(view, shapes)], *poses) for view in views]
+    sigmas = estimate_view_sigmas([residuals for residuals, _ in errors])
     whitened = [residuals / sigma for (residuals, _), sigma in zip(errors, sigmas, strict=True)]
     scale = CORNERS.estimate_scale(np.concatenate(whitened))
     weights = [CORNERS.weights(residuals / scale) for residuals in whitened]
@@ -152,7 +152,7 @@ def _eliminate_board(
 
 
 def _by_every_corner(by_corner: Array) -> Array:
-    """Derivatives (2N, 3N) by all corners of a view, from those (2N, 3) by each one's own place."""
+    """Derivatives (2N, 3N) by all corners of a view, from those (2N, 3) by each one's position."""
     count = len(by_corner) // 2
     blocks = np.zeros((count, 2, count, 3))
     blocks[range(count), :, range(count)] = by_corner.reshape(count, 2, 3)

@@ -143,7 +143,7 @@ def _blocks(
     """The corners of each pair's views, then the priors on cameras and shapes."""
     poses = solution.cameras, solution.root_from_camera, solution.root_from_board
     errors = [
-        reprojection_errors([apply_shape(view, solution.shapes) for view in views], *poses)
+        linearize_reprojection([apply_shape(view, solution.shapes) for view in views], *poses)
         for views in of_pair
     ]
     runs = [np.array([2 * len(view.points) for view in views]) for views in of_pair]
@@ -152,7 +152,7 @@ def _blocks(
         for (residuals, _), lengths in zip(errors, runs, strict=True)
     ]
     every = [one for views in by_view for one in views]
-    sigmas = iter(np.ones(len(every)) if equal_noise else view_sigmas(every))
+    sigmas = iter(np.ones(len(every)) if equal_noise else estimate_view_sigmas(every))
     for views, (residuals, linearize), lengths in zip(of_pair, errors, runs, strict=True):
         columns = np.concatenate([unknowns.select_columns(view, solution.shapes) for view in views])
         # The root camera fixes the frame: it has no motion.
@@ -179,7 +179,7 @@ def _take_columns(linearize: Callable[[], Array], first: int, count: int) -> Arr
     return linearize()[:, first : first + count]
 
 
-def view_sigmas(residuals: Sequence[Array]) -> Array:
+def estimate_view_sigmas(residuals: Sequence[Array]) -> Array:
     """Estimate the noise of each view's corners, (V,), relative to that of all views, from its
     residuals (2N,).
 
@@ -197,7 +197,7 @@ def view_sigmas(residuals: Sequence[Array]) -> Array:
     return np.clip(np.sqrt(shrunk / every), 0.25, 4.0)
 
 
-def reprojection_errors(
+def linearize_reprojection(
     views: Sequence[LocatedView],
     cameras: Mapping[str, Camera],
     rig_from_camera: Mapping[str, RigidTransform],

@@ -22,8 +22,8 @@ from bodyscan.outcome import Outcome
 from bodyscan.registration.rig_calibration import MAX_SIZE_ERROR, REFUSED_SIZE_ERROR
 from bodyscan.registration.rig_solve import RigSolution
 from bodyscan.rig.board import Board
+from bodyscan.rig.gauge import Reference
 from bodyscan.rig.rig import Rig
-from bodyscan.rig.rig_frame import Reference
 
 MIN_CORNERS = 6
 """Corners of a board that two cameras must see: fewer give its middle poorly, and hide a wrong

@@ -11,9 +11,9 @@ from bodyscan.calibration.board_views import LocatedView, board_symmetries
 from bodyscan.errors import BadInput
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.view_graph import Target
+from bodyscan.rig.gauge import RigFrame
 from bodyscan.rig.pair import NominalPose, Pair
 from bodyscan.rig.rig import Rig
-from bodyscan.rig.rig_frame import RigFrame
 
 
 def nominal_pose(nominal: NominalPose) -> RigidTransform:
@@ -62,7 +62,7 @@ def refuse_without_frame_shot(rig: Rig, shots: Collection[str]) -> None:
         )
 
 
-def frame_board_turn(
+def find_frame_board_rotation(
     rig: Rig,
     root_from_camera: Mapping[str, RigidTransform],
     root_from_board: Mapping[Target, RigidTransform],
@@ -83,7 +83,7 @@ def frame_board_turn(
 
     def total_displacement(turn: RigidTransform) -> float:
         rotated = {target: root_from_board[target] @ turn.inverse()}
-        to_rig = rig_from_root(rig, root_from_camera, rotated)
+        to_rig = find_rig_from_root(rig, root_from_camera, rotated)
         total = 0.0
         for name, root_from_camera_pose in root_from_camera.items():
             position, nominal = (to_rig @ root_from_camera_pose).translation, rig.pair(name).nominal
@@ -94,7 +94,7 @@ def frame_board_turn(
     return min(board_symmetries(rig.board(target[1])), key=total_displacement)
 
 
-def rig_from_root(
+def find_rig_from_root(
     rig: Rig,
     root_from_camera: Mapping[str, RigidTransform],
     root_from_board: Mapping[Target, RigidTransform],

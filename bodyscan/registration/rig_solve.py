@@ -33,10 +33,10 @@ from bodyscan.registration.cluster_covariance import (
 from bodyscan.registration.joint_solve import JointSolution, solve_poses
 from bodyscan.registration.rig_calibration import ObservedCorners
 from bodyscan.registration.rig_frame import (
-    frame_board_turn,
+    find_frame_board_rotation,
+    find_rig_from_root,
     frame_target,
     hold_frame,
-    rig_from_root,
 )
 from bodyscan.registration.rig_lenses import ChosenLenses, choose_lenses, lens_notes
 from bodyscan.registration.view_consistency import (
@@ -228,12 +228,12 @@ def _transfer_to_rig_frame(rig: Rig, solved: _Solved) -> RigSolution:
     solution, kept = solved.judged.solution, solved.judged.select_consistent(solved.views)
     rig = hold_frame(rig, kept, solution.cameras)
     fixed = frame_target(rig)
-    turn = frame_board_turn(rig, solution.root_from_camera, solution.root_from_board)
+    turn = find_frame_board_rotation(rig, solution.root_from_camera, solution.root_from_board)
     oriented = {
         target: root_from_board @ turn.inverse() if target == fixed else root_from_board
         for target, root_from_board in solution.root_from_board.items()
     }
-    to_rig = rig_from_root(rig, solution.root_from_camera, oriented)
+    to_rig = find_rig_from_root(rig, solution.root_from_camera, oriented)
     rig_from_camera = {name: to_rig @ t for name, t in solution.root_from_camera.items()}
     rig_from_board = {target: to_rig @ t for target, t in oriented.items()}
     equations = normal_equations(

@@ -28,7 +28,7 @@ from bodyscan.geometry.light_sheets import sheets_from_arrays, sheets_to_arrays
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import COLUMNS, ROWS, PoseCovariance, RayUncertainty
 from bodyscan.registration.rig_calibration import ObservedCorners, RigCalibration
-from bodyscan.registration.soundness import find_faults
+from bodyscan.registration.sanity_checks import find_faults
 from bodyscan.rig.rig import Rig
 from bodyscan.version import __version__
 
@@ -105,7 +105,7 @@ def save_calibration(calibration: RigCalibration, folder: Path) -> Path:
         "software": f"bodyscan {__version__}",
         "arrays_sha256": file_hash(folder / ARRAYS_NAME),
         "rig": calibration.rig.model_dump(mode="json"),
-        "pairs": {name: _pair_content(calibration, name) for name in calibration.pairs},
+        "pairs": {name: _describe_pair(calibration, name) for name in calibration.pairs},
         "boards": [
             {"shot": shot, "board": board, "rig_from_board": transform.matrix}
             for (shot, board), transform in sorted(calibration.rig_from_board.items())
@@ -147,10 +147,10 @@ def load_calibration(path: Path, *, accept_changed: bool = False) -> RigCalibrat
                 where=str(file),
                 remedy="calibrate again with this version of bodyscan",
             )
-        arrays_file = _arrays_of(file, content)
+        arrays_file = _find_arrays(file, content)
         if not accept_changed:
             _refuse_changed(content, file, arrays_file)
-        calibration = _calibration(content, read_npz(arrays_file))
+        calibration = _read_calibration(content, read_npz(arrays_file))
     except FileNotFoundError as error:
         raise CalibrationFileError(
             "there is no such file",
@@ -185,13 +185,13 @@ def accept_calibration(path: Path) -> Path | None:
     found = load_calibration(folder, accept_changed=True)
     content = read_json_object(folder / FILE_NAME)
     with suppress(CalibrationFileError):
-        _refuse_changed(content, folder / FILE_NAME, _arrays_of(folder / FILE_NAME, content))
+        _refuse_changed(content, folder / FILE_NAME, _find_arrays(folder / FILE_NAME, content))
         if content["version"] != WITHOUT_HASH:  # which does not tell whether it was edited
             return None
     return save_calibration(replace(found, notes=(*found.notes, EDITED)), folder)
 
 
-def _arrays_of(file: Path, content: dict[str, Any]) -> Path:
+def _find_arrays(file: Path, content: dict[str, Any]) -> Path:
     """The arrays beside the JSON, or the kept ones if a replacement was interrupted."""
     current = file.with_name(ARRAYS_NAME)
     archived = file.parent / HISTORY / file_hash(file) / ARRAYS_NAME
@@ -229,22 +229,22 @@ def calibration_id(path: Path) -> str:
     return file_hash(path / FILE_NAME if path.is_dir() else path)
 
 
-def _pair_content(calibration: RigCalibration, name: str) -> dict[str, Any]:
+def _describe_pair(calibration: RigCalibration, name: str) -> dict[str, Any]:
     pair = calibration.pairs[name]
-    crossing = {} if pair.crossing is None else {"crossing": _light_content(pair.crossing)}
+    crossing = {} if pair.crossing is None else {"crossing": _describe_light(pair.crossing)}
     return {
         "camera": camera_to_fields(pair.camera),
         "rig_from_camera": calibration.rig_from_camera[name].matrix,
-        "light": None if pair.sheets is None else _light_content(pair.sheets),
+        "light": None if pair.sheets is None else _describe_light(pair.sheets),
         "quality": asdict(pair.quality) | UNUSED_QUALITY,
     } | crossing
 
 
-def _light_content(sheets: LightSheets) -> dict[str, Any]:
+def _describe_light(sheets: LightSheets) -> dict[str, Any]:
     return {"kind": sheets.kind, "direction": sheets.direction}
 
 
-def _calibration(content: dict[str, Any], arrays: dict[str, Any]) -> RigCalibration:
+def _read_calibration(content: dict[str, Any], arrays: dict[str, Any]) -> RigCalibration:
     parts = content["pairs"]
     pairs = {
         name: PairCalibration(
@@ -252,9 +252,9 @@ def _calibration(content: dict[str, Any], arrays: dict[str, Any]) -> RigCalibrat
             camera_from_fields(part["camera"]),
             arrays[f"{name}/camera_covariance"],
             None if part["light"] is None else _light(part["light"], f"{name}/light/", arrays),
-            _quality(part["quality"]),
+            _read_quality(part["quality"]),
             _light(part["crossing"], f"{name}/crossing/", arrays) if "crossing" in part else None,
-            _rays(name, arrays),
+            _read_ray_uncertainty(name, arrays),
         )
         for name, part in parts.items()
     }
@@ -286,7 +286,7 @@ def _light(content: dict[str, Any], prefix: str, arrays: dict[str, Any]) -> Ligh
     return sheets_from_arrays(content["kind"], _under(prefix, arrays), content["direction"])
 
 
-def _rays(name: str, arrays: dict[str, Any]) -> RayUncertainty | None:
+def _read_ray_uncertainty(name: str, arrays: dict[str, Any]) -> RayUncertainty | None:
     parts = _under(f"{name}/rays/", arrays)
     if not parts:
         return None
@@ -300,7 +300,7 @@ def _under(prefix: str, arrays: dict[str, Any]) -> dict[str, Any]:
     return {k.removeprefix(prefix): array for k, array in arrays.items() if k.startswith(prefix)}
 
 
-def _quality(content: dict[str, Any]) -> PairQuality:
+def _read_quality(content: dict[str, Any]) -> PairQuality:
     """Read the quality, requiring exactly the types of its fields."""
     content = {key: part for key, part in content.items() if key not in UNUSED_QUALITY}
     odd = content.keys() - {part.name for part in fields(PairQuality)}

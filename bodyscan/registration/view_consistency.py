@@ -21,7 +21,7 @@ from bodyscan.geometry.least_squares import Block, Noise, minimize
 from bodyscan.geometry.robust import rms_length
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.outcome import Outcome
-from bodyscan.registration.joint_solve import JointSolution, refine_solution, reprojection_errors
+from bodyscan.registration.joint_solve import JointSolution, linearize_reprojection, refine_solution
 from bodyscan.registration.view_graph import by_target
 
 MIN_ERROR_PX = 0.2
@@ -139,7 +139,7 @@ def fit_board(
 def _corners(view: LocatedView, solution: JointSolution, root_from_board: RigidTransform) -> Block:
     """Reprojection errors, px; derivatives by the board's motion."""
     poses = solution.cameras, solution.root_from_camera, {view.target: root_from_board}
-    residuals, linearize = reprojection_errors([view], *poses)
+    residuals, linearize = linearize_reprojection([view], *poses)
     return Block(residuals, lambda: linearize()[:, 6:12], slice(0, 6), CORNERS)
 
 

@@ -191,7 +191,7 @@ def _find_supported_pose(
 
 
 def _median_distance(views: Sequence[LocatedView]) -> float:
-    """Usual distance of boards from cameras, mm: the unit of all agreement, because the squares of
+    """Typical distance of boards from cameras, mm: the unit of all agreement, because the squares of
     a board may be given in any unit."""
     distances = [float(np.linalg.norm(view.camera_from_board.translation)) for view in views]
     return float(np.median(distances)) if distances else 1.0

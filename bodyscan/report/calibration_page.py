@@ -68,14 +68,14 @@ def calibration_page(folder: Path) -> Page:
     notes = (*failed, *(calibration.notes or ("Every image and view was used.",)))
     parts: dict[str, Callable[[], list[Block]]] = {
         "The rig": lambda: [Viewer("Cameras in the rig frame", model, draw.rig_model(calibration))],
-        "Pairs": lambda: _pairs(calibration),
+        "Pairs": lambda: _tabulate_pairs(calibration),
         "How well the pairs are connected, and what would help": lambda: [
             Lines(calibration.advice or (f"No advice: {why}.",))
         ],
-        "Boards in the pictures": lambda: _boards(calibration),
-        "Light sheets": lambda: _planes(calibration),
-        "Who shares boards with whom": lambda: _shared_boards(calibration),
-        "How well each place is known": lambda: _sigma(calibration),
+        "Boards in the pictures": lambda: _show_boards(calibration),
+        "Light sheets": lambda: _show_planes(calibration),
+        "Who shares boards with whom": lambda: _show_shared_boards(calibration),
+        "How well each place is known": lambda: _show_sigma(calibration),
         "What was not used, and notes": lambda: [Lines(notes)],
     }
     return Page(
@@ -93,16 +93,16 @@ def calibration_page(folder: Path) -> Page:
     )
 
 
-def _pairs(calibration: RigCalibration) -> list[Block]:
+def _tabulate_pairs(calibration: RigCalibration) -> list[Block]:
     rows = []
     for one in figures_of(calibration):
         pair = calibration.pairs[one.name]
         rows.append((*astuple(one), pair.quality.light_model, pair.camera.lens.kind))
-    return [Table(PAIR_COLUMNS, tuple(rows)), Lines(tuple(_lens_lines(calibration)))]
+    return [Table(PAIR_COLUMNS, tuple(rows)), Lines(tuple(_describe_lenses(calibration)))]
 
 
-def _lens_lines(calibration: RigCalibration) -> Iterator[str]:
-    """How each lens that was tried did on boards to which it was not fitted."""
+def _describe_lenses(calibration: RigCalibration) -> Iterator[str]:
+    """Describe how well each lens that was tried predicted held-out boards."""
     for name, pair in calibration.pairs.items():
         tried = [
             f"{one.kind} {one.rms_px:.3f} px{_format_gain(one.gain)}" for one in pair.quality.lenses
@@ -115,7 +115,7 @@ def _lens_lines(calibration: RigCalibration) -> Iterator[str]:
         )
 
 
-def _light_lines(calibration: RigCalibration) -> Iterator[str]:
+def _describe_light_models(calibration: RigCalibration) -> Iterator[str]:
     """How each model of the light that was tried did on held-out boards, and what was refined."""
     for name, pair in calibration.pairs.items():
         quality = pair.quality
@@ -135,7 +135,7 @@ def _format_gain(gain: float | None) -> str:
     return "" if gain is None else f" ({gain:+z.1f} standard errors better)"
 
 
-def _boards(calibration: RigCalibration) -> list[Block]:
+def _show_boards(calibration: RigCalibration) -> list[Block]:
     if not calibration.observed:
         why = (
             "This calibration was imported: no image of a board was read. `bodyscan check-calibration` "
@@ -163,7 +163,7 @@ def _boards(calibration: RigCalibration) -> list[Block]:
     ]
 
 
-def _planes(calibration: RigCalibration) -> list[Block]:
+def _show_planes(calibration: RigCalibration) -> list[Block]:
     if all(pair.sheets is None for pair in calibration.pairs.values()):
         return ["No pair has a projector."]
     tried = "No model of the light was tried on held-out boards: it was given."
@@ -182,10 +182,10 @@ def _planes(calibration: RigCalibration) -> list[Block]:
         "them, a rotating mirror hardly does. Of bent sheets: their tangent planes.",
         draw.planes_chart(calibration),
     )
-    return [planes, tried, Lines(tuple(_light_lines(calibration)))]
+    return [planes, tried, Lines(tuple(_describe_light_models(calibration)))]
 
 
-def _shared_boards(calibration: RigCalibration) -> list[Block]:
+def _show_shared_boards(calibration: RigCalibration) -> list[Block]:
     if len(calibration.observed) < 2:
         return ["There is nothing to share."]
     shared = draw.shared_boards(calibration)
@@ -197,7 +197,7 @@ def _shared_boards(calibration: RigCalibration) -> list[Block]:
     return [Picture("View graph: boards in common", caption, chart)]
 
 
-def _sigma(calibration: RigCalibration) -> list[Block]:
+def _show_sigma(calibration: RigCalibration) -> list[Block]:
     try:
         picture = draw.sigma_chart(calibration)
     except BadInput as error:

@@ -72,14 +72,14 @@ def scan_page(folder: Path, other: Path | None = None) -> Page:
     sections: list[Section] = []
     if "sha256" in facts:
         scan = load_scan(folder)
-        sections = _sections(scan, compare_surfaces(scan.mesh, other) if other else [])
+        sections = _make_sections(scan, compare_surfaces(scan.mesh, other) if other else [])
     return Page(
         f"Scan of {subject}" if subject else f"Scan {folder.resolve().name}",
         stored_verdict(facts)
         or Verdict("usable", ("this scan was made by a version of bodyscan that gave no verdict",)),
         is_synthetic(folder) or facts.get("simulated", False),
         (
-            ("taken", _in_words(facts.get("when"))),
+            ("taken", _format_date(facts.get("when"))),
             ("calibration", str(facts["calibration_id"])[:12]),
             ("made by", str(facts["software"])),
             ("folder", folder.resolve().name),
@@ -90,7 +90,7 @@ def scan_page(folder: Path, other: Path | None = None) -> Page:
     )
 
 
-def _in_words(when: str | None) -> str:
+def _format_date(when: str | None) -> str:
     """Format a date as people write it; text that is no date is returned unchanged."""
     if not when:
         return "not known"
@@ -101,26 +101,26 @@ def _in_words(when: str | None) -> str:
     return f"{moment.day} {moment:%B %Y, %H:%M}"
 
 
-def _sections(scan: StoredScan, found: list[Comparison]) -> list[Section]:
+def _make_sections(scan: StoredScan, found: list[Comparison]) -> list[Section]:
     # A person stands elsewhere in each scan, but a truth stands where it is true.
     shown = next((one for one in found if one.fitted == one.is_scan), None)
     # The map's scale ends at a round number above 95 % of the deviations.
     limit = charts.round_up(max(shown.figures.p95_mm, 1e-3)) if shown else 1.0
     parts: dict[str, Callable[[], Sequence[Block]]] = {
-        "The body": lambda: _body(scan, shown, limit),
-        "Figures": lambda: [_numbers(scan)],
+        "The body": lambda: _show_body(scan, shown, limit),
+        "Figures": lambda: [_list_numbers(scan)],
     }
     if scan.facts.get("person"):
-        parts["The person"] = lambda: _person(scan.facts["person"])
+        parts["The person"] = lambda: _describe_motion(scan.facts["person"])
     if shown:
-        parts[f"Compared with {shown.name}"] = lambda: _comparison(scan.mesh, found, shown, limit)
-    parts["Pictures"] = lambda: _pictures(scan)
-    parts["Pairs and their overlaps"] = lambda: _pairs(scan.facts)
-    parts["Holes"] = lambda: _holes(scan)
+        parts[f"Compared with {shown.name}"] = lambda: _compare(scan.mesh, found, shown, limit)
+    parts["Pictures"] = lambda: _show_pictures(scan)
+    parts["Pairs and their overlaps"] = lambda: _tabulate_pairs(scan.facts)
+    parts["Holes"] = lambda: _tabulate_holes(scan)
     return make_sections(parts)
 
 
-def _body(scan: StoredScan, shown: Comparison | None, limit: float) -> list[Block]:
+def _show_body(scan: StoredScan, shown: Comparison | None, limit: float) -> list[Block]:
     small = decimate(scan.mesh)
     caption = (
         f"The mesh reduced to {len(small.faces):,} faces, a few tenths of a millimetre from the full "
@@ -155,7 +155,7 @@ def colour_layers(
             *((css(c), f"{k}{' or more' if k == len(PAIRS) else ''}") for k, c in enumerate(PAIRS, 1)),
             grey,
         ]}),
-        _values_layer("sigma", np.where(made_up, np.nan, small.sigma_mm), sigma, grey),
+        _colour_layer("sigma", np.where(made_up, np.nan, small.sigma_mm), sigma, grey),
         Layer("filled", np.where(made_up[:, None], tint, SKIN).astype(np.uint8), {
             "swatches": [(css(SKIN), "measured"), (css(tint), "filled to close the mesh")],
         }),
@@ -173,11 +173,11 @@ def colour_layers(
             Scale(-limit_mm, limit_mm, caption, charts.diverging()),
             (grey[0], "filled, not compared"),
         )
-        found.append(_values_layer("deviation", np.where(made_up, np.nan, signed), scale, grey))
+        found.append(_colour_layer("deviation", np.where(made_up, np.nan, signed), scale, grey))
     return found
 
 
-def _values_layer(
+def _colour_layer(
     name: str, values: NDArray[np.floating], scale: Scale, unknown: tuple[str, str]
 ) -> Layer:
     """Colours by value, and the scale as a legend; unknown: colour of NaN, and what it means."""
@@ -187,7 +187,7 @@ def _values_layer(
     return Layer(name, scale.colours(values), legend)
 
 
-def _numbers(scan: StoredScan) -> Numbers:
+def _list_numbers(scan: StoredScan) -> Numbers:
     mesh, sigma_mm = scan.mesh, scan.cloud.sigma_mm
     largest = next((hole.area_mm2 / 100.0 for hole in find_filled_patches(mesh)), 0.0)
     shape = compute_topology(mesh.vertices, mesh.faces)
@@ -207,11 +207,11 @@ def _numbers(scan: StoredScan) -> Numbers:
         *((Column(name, "% of points", "by brightness, roughness and place", digits=1), 100.0 * share)
           for name, share in compute_cover_shares(scan.cloud.regions).items()),
         (Column("volume", "l", "inside the mesh", digits=2), shape.volume_mm3 / 1e6),
-        *_alignment_numbers(scan.facts.get("alignment")),
+        *_list_alignment_numbers(scan.facts.get("alignment")),
     ))  # fmt: skip
 
 
-def _alignment_numbers(alignment: Mapping[str, Any] | None) -> Iterator[tuple[Column, Value]]:
+def _list_alignment_numbers(alignment: Mapping[str, Any] | None) -> Iterator[tuple[Column, Value]]:
     if alignment is None:
         yield Column("overlaps", "", "pairs are at their calibrated poses"), "not aligned"
         return
@@ -232,7 +232,7 @@ def _alignment_numbers(alignment: Mapping[str, Any] | None) -> Iterator[tuple[Co
         yield Column("sway", "mm", sway, MAX_MOTION_MM, digits=2), motions[farthest]
 
 
-def _person(person: Mapping[str, Any]) -> list[Block]:
+def _describe_motion(person: Mapping[str, Any]) -> list[Block]:
     """What a person moved while being scanned, how far, and how certainly."""
     columns = (
         Column("part"),
@@ -254,7 +254,7 @@ def _person(person: Mapping[str, Any]) -> list[Block]:
     return [intro, Table(columns, rows), Lines(motion.breath_lines)]
 
 
-def _comparison(
+def _compare(
     mesh: BodyMesh, found: list[Comparison], shown: Comparison, limit: float
 ) -> list[Block]:
     """Tabulate the comparisons, and map the one `shown`; limit: of the map's scale, mm."""
@@ -292,7 +292,7 @@ def _comparison(
     ]
 
 
-def _pictures(scan: StoredScan) -> list[Block]:
+def _show_pictures(scan: StoredScan) -> list[Block]:
     views = "From the front, from the subject's left side, from the back."
     table = {
         "cloud.png": ("Measured points, as photographed", "White: nothing was measured there."),
@@ -310,7 +310,7 @@ def _pictures(scan: StoredScan) -> list[Block]:
     return [*shown, Lines((*cloud.notes, *mesh.notes))]
 
 
-def _pairs(facts: Mapping[str, Any]) -> list[Block]:
+def _tabulate_pairs(facts: Mapping[str, Any]) -> list[Block]:
     alignment = facts.get("alignment") or {"motion_mm": {}, "overlaps": [], "refused": {}}
     overlaps = [o for o in alignment["overlaps"] if o["rms_after_mm"] is not None]
 
@@ -351,7 +351,7 @@ def _pairs(facts: Mapping[str, Any]) -> list[Block]:
     return blocks
 
 
-def _holes(scan: StoredScan) -> list[Block]:
+def _tabulate_holes(scan: StoredScan) -> list[Block]:
     found = [hole for hole in find_filled_patches(scan.mesh) if hole.area_mm2 >= 100.0]
     rows = tuple(
         (str(k), hole.area_mm2 / 100.0, hole.centre[2], hole.centre[0], hole.centre[1])

@@ -9,7 +9,7 @@ from pydantic import Field, PositiveFloat
 
 from bodyscan.files.model import Model, Name, Problem, did_you_mean
 from bodyscan.interchange.rig_format import RIG_FORMATS, Unit
-from bodyscan.rig.rig_frame import Vector
+from bodyscan.rig.gauge import Vector
 from bodyscan.stripes.codes import AnyStripeCode
 
 Pixels = Annotated[int, Field(gt=0, le=32767)]

@@ -16,8 +16,8 @@ from bodyscan.files.model_file import load_model
 from bodyscan.files.yaml_file import dump_yaml
 from bodyscan.rig.board import Board, dictionary_family
 from bodyscan.rig.frame_names import CaptureFolder, FrameNames, ImageNames
+from bodyscan.rig.gauge import Reference, RigFrame
 from bodyscan.rig.pair import Pair
-from bodyscan.rig.rig_frame import Reference, RigFrame
 from bodyscan.rig.templates import template_faults
 from bodyscan.stripes.codes import image_kinds
 from bodyscan.stripes.stripe_code import StripeCode

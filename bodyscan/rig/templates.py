@@ -29,7 +29,7 @@ def has_field(template: str, field: str) -> bool:
     return field in _parse_fields(template)
 
 
-def names_pattern(name: str) -> re.Pattern[str]:
+def compile_names(name: str) -> re.Pattern[str]:
     """Compile a pattern for the names that one part of a path, with ANYTHING in it, matches."""
     return re.compile(_anything(re.escape(name)))
 

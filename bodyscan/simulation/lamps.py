@@ -115,7 +115,7 @@ def spread_light(light: Floats, share: Floats, depth: Floats, alpha: float, skin
     outgoing = np.zeros_like(light)
     for step, distance in enumerate(distances):
         weight = np.maximum(1.0 - np.abs(level - step), 0.0).astype(np.float32)
-        kernel = _profile_kernel(round(shape_mm(skin) * alpha / float(distance), 3))
+        kernel = _make_profile_kernel(round(shape_mm(skin) * alpha / float(distance), 3))
         out = cv2.filter2D(light * share, -1, kernel, borderType=cv2.BORDER_REFLECT_101)
         whole = cv2.filter2D(share, -1, kernel, borderType=cv2.BORDER_REFLECT_101)
         outgoing += weight * np.divide(out, whole, out=np.zeros_like(out), where=whole > 1e-6)
@@ -124,7 +124,7 @@ def spread_light(light: Floats, share: Floats, depth: Floats, alpha: float, skin
 
 
 @lru_cache(maxsize=64)
-def _profile_kernel(shape_px: float) -> Floats:
+def _make_profile_kernel(shape_px: float) -> Floats:
     """Sample Burley's profile (exp(-r / d) + exp(-r / 3 d)) / (8 pi d r) on (k, k), sum 1."""
     half = max(1, int(np.ceil(18.0 * shape_px)))  # 1/500 of the light lies beyond
     size, fine_steps = 2 * half + 1, 9  # the profile is steep in the middle

@@ -165,7 +165,7 @@ def draw_true_pairs(rig: Rig, settings: SimulationSettings, seed: int) -> dict[s
     return build_pairs(rig, settings, lambda number: random_stream(seed, Stream.PAIRS, number))
 
 
-def _tasks(truth: Truth, pair: str) -> list[Task]:
+def _list_tasks(truth: Truth, pair: str) -> list[Task]:
     """List what one pair captures: its board shots, then the person."""
     light, motion = truth.settings.lighting, truth.motion
     tasks = [
@@ -188,7 +188,7 @@ def _tasks(truth: Truth, pair: str) -> list[Task]:
 
 def _render_all(rig: Rig, truth: Truth, out: Path, workers: int, progress: Progress) -> None:
     """Render every image of every pair; each thread has one pair at a time."""
-    tasks = {name: _tasks(truth, name) for name in truth.pairs}
+    tasks = {name: _list_tasks(truth, name) for name in truth.pairs}
     room, settings = build_room(truth.pairs.values(), truth.settings.room), truth.settings
     lock, done, total = Lock(), 0, sum(map(len, tasks.values()))
     progress("simulate", 0, total)

@@ -64,13 +64,13 @@ class BoundaryBrightness:
     """The surface's brightness where N stripe boundaries pass between two pixels of a line, (N,)
     each.
 
-    before, behind: lit minus dark of the two pixels, brought together where noise may explain their
+    before, after: lit minus dark of the two pixels, brought together where noise may explain their
         difference.
     along, across: grad(ln a), 1/px, along the line and from line to line; sigma: of `along`.
     """
 
     before: Array
-    behind: Array
+    after: Array
     along: Array
     across: Array
     sigma: Array
@@ -155,7 +155,7 @@ def _interpolate(
     logarithm: Floats, noise2: Floats, across: Floats, shading: Floats, pixels: Indices
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Fields of BoundaryBrightness at flat pixels (N,)."""
-    before, behind = np.empty(pixels.size), np.empty(pixels.size)
+    before, after = np.empty(pixels.size), np.empty(pixels.size)
     along, sideways, sigma = np.empty(pixels.size), np.empty(pixels.size), np.empty(pixels.size)
     for k in range(pixels.size):
         pixel = pixels[k]
@@ -165,8 +165,8 @@ def _interpolate(
         along[k] = smooth + _shrink(right - left - smooth, variance)
         sideways[k], sigma[k] = across[pixel], math.sqrt(variance)
         middle, half = math.exp((left + right) / 2), math.exp(along[k] / 2)
-        before[k], behind[k] = middle / half, middle * half
-    return before, behind, along, sideways, sigma
+        before[k], after[k] = middle / half, middle * half
+    return before, after, along, sideways, sigma
 
 
 @compiled

@@ -47,7 +47,7 @@ class Boundaries:
     blur2: float
 
 
-def bit_that_flips(boundary: Indices, bits: int) -> Indices:
+def find_flipping_bits(boundary: Indices, bits: int) -> Indices:
     """Compute which bit (0 the most significant) flips at boundary i > 0; in the plain code,
     where several flip, the coarsest."""
     lowest_set = np.frexp((boundary & -boundary).astype(np.float64))[1].astype(np.int64) - 1
@@ -73,11 +73,11 @@ def find_boundaries(
     pixels = _find_changes(codes, usable)
     line, before = np.divmod(pixels, codes.shape[1])
     index = np.maximum(codes.ravel()[pixels], codes.ravel()[pixels + 1]).astype(np.int64)
-    bit = bit_that_flips(index + first, len(images.patterns))
+    bit = find_flipping_bits(index + first, len(images.patterns))
     edges = brightness.at_boundaries(pixels)
     pairs = np.stack([pixels, pixels + 1], axis=-1)
     fraction, sigma = _find_zeros(
-        *images.difference(bit, pairs, variance), edges.before, edges.behind
+        *images.difference(bit, pairs, variance), edges.before, edges.after
     )
     position = before + fraction
     joined = join_runs(line, before, position, index, usable)
@@ -122,16 +122,16 @@ def _find_changes(codes: NDArray[np.int32], usable: Mask) -> Indices:
 
 @compiled
 def _find_zeros(
-    difference: Floats, noise: Floats, before: Array, behind: Array
+    difference: Floats, noise: Floats, before: Array, after: Array
 ) -> tuple[Array, Array]:
-    """Find where the difference is zero, px behind the first pixel, and its sigma.
+    """Find where the difference is zero, px past the first pixel, and its sigma.
 
-    difference, noise: (N, 2) in the pixels before and behind; before, behind: lit minus dark.
+    difference, noise: (N, 2) in the pixels before and after it; before, after: lit minus dark in these.
     """
     fraction, sigma = np.empty(before.size), np.empty(before.size)
     for k in range(before.size):
         left, left_sigma = _linearize(difference[k, 0], noise[k, 0], before[k])
-        right, right_sigma = _linearize(difference[k, 1], noise[k, 1], behind[k])
+        right, right_sigma = _linearize(difference[k, 1], noise[k, 1], after[k])
         share = min(max(left / (left - right), 0.0), 1.0)
         variance = ((1.0 - share) * left_sigma) ** 2 + (share * right_sigma) ** 2
         fraction[k] = share

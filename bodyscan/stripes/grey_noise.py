@@ -97,20 +97,19 @@ def _sum_differences(
             level, light, black = pattern[line, x], lit[line, x], dark[line, x]
             if inverse.size:
                 other = inverse[line, x]
-                _add(sums, light, max(level, other), band, share, max_difference)
-                _add(sums, black, min(level, other), band, share, max_difference)
+                _accumulate(sums, light, max(level, other), band, share, max_difference)
+                _accumulate(sums, black, min(level, other), band, share, max_difference)
             else:
                 expected = light if bright[line, x] else black
-                _add(sums, expected, level, band, share, max_difference)
+                _accumulate(sums, expected, level, band, share, max_difference)
     return sums
 
 
 @compiled
-def _add(
+def _accumulate(
     sums: Array, first: float, second: float, band: Indices, share: float, max_difference: Array
 ) -> None:
-    """Add one difference to its band (256,); share: weight of the second frame in the band's
-    level."""
+    """Add a difference of two frames to its band's sums; share: weight of `second` in its level."""
     difference = np.float64(second) - np.float64(first)
     level = np.float64(first) + share * difference
     k = band[np.int64(level)]

@@ -222,6 +222,6 @@ def check_order(numbers: Numbers, good: Mask, transposed: bool, stripes: int) ->
     if len(missing):
         raise DecodingFailed(
             f"the image of stripe {', '.join(map(str, missing[:10]))} shows no line, though those "
-            "before and behind it do",
+            "before and after it do",
             remedy="check whether it is missing, or another was taken twice",
         )

@@ -100,7 +100,7 @@ def check_illumination(bright: Mask, lit: NDArray[Any]) -> None:
         raise DecodingFailed(
             f"the projector lights only {share:.2%} of the picture",
             remedy="check that the projector is on, that lit and dark frames differ, and that no frame "
-            "is missing, so that those behind it moved up",
+            "is missing, so that those after it moved up",
         )
     saturated = np.mean(lit[bright] >= SATURATED)
     if saturated > 0.5:

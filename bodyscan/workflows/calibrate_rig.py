@@ -29,7 +29,7 @@ from bodyscan.registration.rig_solve import (
     solved_pair,
     update_poses,
 )
-from bodyscan.registration.soundness import find_faults
+from bodyscan.registration.sanity_checks import find_faults
 from bodyscan.registration.storage import CORNERS_NAME, archive_previous, save_calibration
 from bodyscan.rig.rig import Rig, load_rig
 from bodyscan.workflows.decode import PrintAreas, decode_on_boards

@@ -103,7 +103,7 @@ class StripeOffset:
 
     @staticmethod
     def from_distances(pair: PairCalibration, rows: Array) -> StripeOffset:
-        """The medians of rows (N, 3) as `_stripe_distances` returns them."""
+        """The medians of rows (N, 3) as `_measure_stripe_distances` returns them."""
         away, across, sigma = rows.T
         low, high = across < -0.4, across > 0.4
         tilt = 0.0
@@ -195,7 +195,7 @@ def check_boards(
     Raises BoardNotFound if no board is seen by two pairs and none has decoded stripes on it.
     """
     views = find_all_boards(calibration.rig, captures, progress)
-    cameras = {name: _camera(pair) for name, pair in calibration.pairs.items()}
+    cameras = {name: _make_camera_calibration(pair) for name, pair in calibration.pairs.items()}
     located = locate_views(calibration.rig, views.value, cameras)
     unique = [view for view in located.value if not view.ambiguous]
     # Sigma of one coordinate of a corner.
@@ -205,7 +205,7 @@ def check_boards(
         poses, calibration.rig_from_camera, calibration.covariance, calibration.rig.poles
     )
     # Which end of a plain board is which makes no difference to its surface.
-    stripes = _stripe_offsets(calibration, captures, views.value, located.value, progress)
+    stripes = _measure_stripe_offsets(calibration, captures, views.value, located.value, progress)
     notes = (*views.notes, *located.notes, *stripes.notes)
     if not drift.rig_from_board and not stripes.value:
         raise _nothing_to_compare(captures, notes)
@@ -251,14 +251,14 @@ def move_line(move: Move) -> str:
     )
 
 
-def _camera(pair: PairCalibration) -> CameraCalibration:
-    """A pair's camera; errors of corners are 0.5 px, which OpenCV's users reach, if not known."""
+def _make_camera_calibration(pair: PairCalibration) -> CameraCalibration:
+    """Describe a pair's camera; if its corner errors are unknown, 0.5 px, typical of OpenCV."""
     known, imported = pair.quality.corners_rms_px, pair.quality.imported_sigma_px
     rms_px = known if known is not None else imported or 0.5
     return CameraCalibration(pair.camera, pair.camera_covariance, (), rms_px)
 
 
-def _stripe_offsets(
+def _measure_stripe_offsets(
     calibration: RigCalibration,
     captures: Captures,
     views: Sequence[BoardView],
@@ -271,7 +271,7 @@ def _stripe_offsets(
     decoded = decode_on_boards(calibration.rig, captures, wanted, progress)
     parts: dict[str, list[Array]] = defaultdict(list)
     for key, boundaries in decoded.value.items():
-        parts[key[0]].append(_stripe_distances(calibration, known[key], boundaries))
+        parts[key[0]].append(_measure_stripe_distances(calibration, known[key], boundaries))
     rows = {pair: np.concatenate(found) for pair, found in sorted(parts.items())}
     offsets = tuple(
         StripeOffset.from_distances(calibration.pairs[pair], found)
@@ -282,7 +282,7 @@ def _stripe_offsets(
     return Outcome(offsets, (*decoded.notes, *lost))
 
 
-def _stripe_distances(
+def _measure_stripe_distances(
     calibration: RigCalibration, view: LocatedView, boundaries: BoardBoundaries
 ) -> Array:
     """Distances of a view's stripe boundaries from the board: (N, 3), distance along its normal (mm),

@@ -16,8 +16,8 @@ from bodyscan.calibration.boundary_points import (
     StripedView,
     band_step,
     boundaries_near,
-    box_around,
-    box_of_print,
+    compute_box,
+    compute_print_box,
     crop_around,
     keep_bands,
     max_band_step,
@@ -109,7 +109,7 @@ class PrintAreas:
     def box(self, view: BoardView) -> Box:
         """The box, px, around the print of a view's board."""
         camera, board = self.cameras[view.pair].camera, self.rig.board(view.board)
-        return box_of_print(camera, board, self.located[view.key])
+        return compute_print_box(camera, board, self.located[view.key])
 
     def select(
         self, view: BoardView, boundaries: BoardBoundaries, bands: tuple[int, int]
@@ -147,7 +147,7 @@ def decode_on_boards(
     for view in views:
         wanted[view.pair, view.shot].append(view)
     sequences = [s for s in captures.sequences if s.has_stripes and (s.pair, s.shot) in wanted]
-    box: Callable[[BoardView], Box] = prints.box if prints else box_around
+    box: Callable[[BoardView], Box] = prints.box if prints else compute_box
     step = {
         name: prints.band_step(rig.pair(name), [view for view in views if view.pair == name])
         if prints

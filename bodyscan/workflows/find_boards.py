@@ -13,7 +13,7 @@ import numpy as np
 from bodyscan.arrays import Array
 from bodyscan.boards.board_layout import corner_points
 from bodyscan.boards.detection import find_boards
-from bodyscan.boards.unfound import describe_unfound
+from bodyscan.boards.detection_failure import describe_unfound
 from bodyscan.boards.view import BoardView, ViewKey, number_corners
 from bodyscan.calibration.board_views import (
     LocatedView,
@@ -40,7 +40,7 @@ from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, attempt_each, map_threads, silent
 from bodyscan.registration.board_checks import appearance_notes, describe_findings
-from bodyscan.registration.soundness import camera_faults
+from bodyscan.registration.sanity_checks import find_camera_faults
 from bodyscan.rig.pair import AUTO, Pair
 from bodyscan.rig.rig import Rig
 
@@ -167,7 +167,7 @@ def calibrate_cameras(
 
     def calibrate(name: str) -> CameraCalibration:
         found = fit(name)
-        for where, what in camera_faults(found.camera, rig.pair(name), "camera"):
+        for where, what in find_camera_faults(found.camera, rig.pair(name), "camera"):
             raise DegeneratePoses(
                 f"the best fit to its boards is not a possible camera: {where} {what}",
                 remedy="Possible causes: corners are mixed up in some of its views, or its boards are "

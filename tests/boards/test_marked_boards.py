@@ -12,7 +12,7 @@ from bodyscan.arrays import Array, Bytes
 from bodyscan.boards.board_layout import corner_points
 from bodyscan.boards.charuco import detect_markers
 from bodyscan.boards.detection import find_boards
-from bodyscan.boards.unfound import describe_unfound
+from bodyscan.boards.detection_failure import describe_unfound
 from bodyscan.boards.view import BoardView
 from bodyscan.registration.board_checks import appearance_notes
 from bodyscan.rig.board import Board

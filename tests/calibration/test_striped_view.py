@@ -15,10 +15,10 @@ from bodyscan.calibration.boundary_points import (
     BoardBoundaries,
     StripedView,
     band_step,
-    boundaries_on_boards,
-    box_around,
-    box_of_print,
+    compute_box,
+    compute_print_box,
     keep_bands,
+    locate_boundaries_on_boards,
     max_band_step,
     on_board,
 )
@@ -65,7 +65,7 @@ def striped(face_mm: float) -> list[StripedView]:
 def off_mm(shots: list[StripedView], face_mm: float) -> Array:
     """How far carried points lie over the true board, in its own frame."""
     code = Gray(stripes=254, direction="vertical")
-    carried = boundaries_on_boards("p1", SCENE.camera, code, shots)
+    carried = locate_boundaries_on_boards("p1", SCENE.camera, code, shots)
     heights = []
     for number, shot in enumerate(shots):
         points = carried.points[carried.board == number]
@@ -100,11 +100,11 @@ def test_the_box_of_a_print_holds_it_all_and_little_else() -> None:
     print_px = SCENE.camera.project(place.apply(np.column_stack([rim * area, np.zeros(4)])))
     corners = SCENE.camera.project(place.apply(FRONT))
     view = LocatedView("p1", "b1", "board", FRONT, corners, place, ())
-    low, high = box_of_print(SCENE.camera, BOARD, view)
+    low, high = compute_print_box(SCENE.camera, BOARD, view)
     np.testing.assert_allclose(low, print_px.min(axis=0) - 16.0, atol=1.0)  # the lens bends them
     np.testing.assert_allclose(high, print_px.max(axis=0) + 16.0, atol=1.0)
     folded = replace(SCENE.camera, lens=Radial(k1=-1.0 / 3.0 / 0.01))  # one to one up to 0.1 alone
-    assert np.array_equal(box_of_print(folded, BOARD, view), box_around(view))
+    assert np.array_equal(compute_print_box(folded, BOARD, view), compute_box(view))
 
 
 def test_boundaries_are_averaged_in_pieces_on_the_print_alone() -> None:

@@ -12,7 +12,7 @@ from ray_cast_scan import ROOT, load_body
 from bodyscan.measurement.head import estimate_head_top
 from bodyscan.measurement.measurements import measure
 from bodyscan.mesh.body import DARK_CLOTH, HAIR, SKIN, UNSURE, BodyMesh
-from bodyscan.report.measurements import tables
+from bodyscan.report.measurement_table import tables
 
 HAIRLINE, SLANT = 0.95, 0.5
 """In statures, over the body's middle; rising towards the face."""

@@ -15,7 +15,7 @@ from bodyscan.errors import BadInput
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.measurement.measurements import Slice, heights_from, measure
 from bodyscan.mesh.body import DARK_CLOTH, HAIR, SKIN, BodyMesh, BreathAt
-from bodyscan.report.measurements import measurements_document, tables
+from bodyscan.report.measurement_table import measurements_document, tables
 
 SUBJECT = Path(__file__).parents[2] / "data" / "subjects" / "woman_average.ply"
 

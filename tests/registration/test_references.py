@@ -21,8 +21,8 @@ from bodyscan.registration.references import (
 )
 from bodyscan.registration.rig_solve import RigSolution, solve_rig
 from bodyscan.rig.board import Board
+from bodyscan.rig.gauge import Reference
 from bodyscan.rig.rig import Rig
-from bodyscan.rig.rig_frame import Reference
 
 PLACINGS, CAMERAS = ring_of_cameras(poles=2, heights=(850, 1300))
 BAR_MM = 400.0

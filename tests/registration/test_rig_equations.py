@@ -14,7 +14,7 @@ from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 from bodyscan.registration.cluster_covariance import NormalEquations, normal_equations
-from bodyscan.registration.joint_solve import view_sigmas
+from bodyscan.registration.joint_solve import estimate_view_sigmas
 from bodyscan.registration.view_graph import Target
 
 CAMERAS = {
@@ -142,7 +142,7 @@ def test_cameras_that_are_known_take_no_degrees_of_freedom() -> None:
 def test_a_view_at_a_slant_counts_by_its_own_noise() -> None:
     rng = np.random.default_rng(0)
     views = [0.016 * rng.standard_normal(96) for _ in range(9)] + [0.065 * rng.standard_normal(96)]
-    sigmas = view_sigmas(views)
+    sigmas = estimate_view_sigmas(views)
     # Of 96 residuals a sigma is known to 7 %; a tenth of the view's is that of all views together.
     np.testing.assert_allclose(sigmas[-1] / np.median(sigmas[:-1]), 0.065 / 0.016, rtol=0.25)
     np.testing.assert_allclose(sigmas[:-1], np.median(sigmas[:-1]), rtol=0.2)
@@ -152,7 +152,7 @@ def test_a_view_at_a_slant_counts_by_its_own_noise() -> None:
 def test_views_without_noise_weigh_alike(noise_px: float) -> None:
     """Advice counts what views would tell that nobody took: computed, without noise."""
     views = [noise_px * np.ones(48), np.zeros(96), np.zeros(200)]
-    np.testing.assert_allclose(view_sigmas(views), 1.0)
+    np.testing.assert_allclose(estimate_view_sigmas(views), 1.0)
 
 
 def test_of_a_shape_motion_is_known_and_size_as_little_as_its_strains_say() -> None:

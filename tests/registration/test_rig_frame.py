@@ -13,11 +13,11 @@ from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.registration.rig_calibration import FLOOR_AXES, RigCalibration
 from bodyscan.registration.rig_frame import (
-    frame_board_turn,
+    find_frame_board_rotation,
+    find_rig_from_root,
     frame_target,
     nominal_pose,
     refuse_without_frame_shot,
-    rig_from_root,
     rig_from_world,
 )
 from bodyscan.registration.view_graph import RelativePose
@@ -107,7 +107,7 @@ def test_a_board_on_the_floor_is_the_frame() -> None:
         {"shot": "s1", "origin_mm": (100, 50, 3), "x_axis": (0, 2, 0), "y_axis": (3, 0, 0)}
     )
     assert frame_target(described) == ("s1", "b")
-    to_rig = rig_from_root(described, {}, {("s1", "b"): SOMEWHERE})
+    to_rig = find_rig_from_root(described, {}, {("s1", "b"): SOMEWHERE})
     on_board = np.array([[0.0, 0.0, 0.0], [10.0, 0.0, 0.0], [0.0, 10.0, 0.0], [0.0, 0.0, 10.0]])
     np.testing.assert_allclose(
         to_rig.apply(SOMEWHERE.apply(on_board)),
@@ -115,20 +115,20 @@ def test_a_board_on_the_floor_is_the_frame() -> None:
         atol=1e-9,
     )
     with pytest.raises(BadInput, match="board b in shot s1"):
-        rig_from_root(described, {}, {("s2", "b"): SOMEWHERE})
+        find_rig_from_root(described, {}, {("s2", "b"): SOMEWHERE})
 
 
 def test_a_pair_is_the_frame_at_its_nominal_pose_or_as_it_is() -> None:
     stands = {"position_mm": (1500, 0, 900), "look_at_mm": (0, 0, 900)}
     described = rig({"pair": "q"}, q=stands)
     assert frame_target(described) is None
-    to_rig = rig_from_root(described, {"q": SOMEWHERE}, {})
+    to_rig = find_rig_from_root(described, {"q": SOMEWHERE}, {})
     nominal = nominal_pose(NominalPose.model_validate(stands))
     np.testing.assert_allclose((to_rig @ SOMEWHERE).matrix, nominal.matrix, atol=1e-9)
-    to_rig = rig_from_root(rig({"pair": "q"}), {"q": SOMEWHERE}, {})
+    to_rig = find_rig_from_root(rig({"pair": "q"}), {"q": SOMEWHERE}, {})
     np.testing.assert_allclose((to_rig @ SOMEWHERE).matrix, np.eye(4), atol=1e-12)
     with pytest.raises(BadInput, match="pair q, which could not be calibrated"):
-        rig_from_root(described, {"p": SOMEWHERE}, {})
+        find_rig_from_root(described, {"p": SOMEWHERE}, {})
 
 
 def looking_in(**places: tuple[float, float, float]) -> dict[str, RigidTransform]:
@@ -160,9 +160,9 @@ def test_of_all_readings_of_a_plain_board_the_one_that_puts_cameras_where_they_s
     cameras = {name: SOMEWHERE @ placing for name, placing in looking_in(**PLACES).items()}
     # What was seen is the board as it lies, read in one of its ways.
     seen = {("s1", "b"): SOMEWHERE @ lies @ turn}
-    found = frame_board_turn(described, cameras, seen)
+    found = find_frame_board_rotation(described, cameras, seen)
     right = {("s1", "b"): seen["s1", "b"] @ found.inverse()}
-    to_rig = rig_from_root(described, cameras, right)
+    to_rig = find_rig_from_root(described, cameras, right)
     for name, place in PLACES.items():
         found_at = (to_rig @ cameras[name]).translation
         if nominal:
@@ -188,9 +188,9 @@ def test_a_plain_board_reads_alike_from_its_ends_and_faces_where_its_print_does(
 
 def test_a_board_that_tells_its_ends_is_left_as_it_was_read() -> None:
     marked = {**PLAIN, "kind": "charuco", "marker_mm": 30}
-    found = frame_board_turn(rig({"shot": "s1"}, marked), {}, {("s1", "b"): SOMEWHERE})
+    found = find_frame_board_rotation(rig({"shot": "s1"}, marked), {}, {("s1", "b"): SOMEWHERE})
     assert np.array_equal(found.matrix, np.eye(4))
-    found = frame_board_turn(rig({"shot": "s1"}), {}, {})
+    found = find_frame_board_rotation(rig({"shot": "s1"}), {}, {})
     assert np.array_equal(found.matrix, np.eye(4))
 
 

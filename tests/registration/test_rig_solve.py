@@ -11,8 +11,8 @@ from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import position_sigma
 from bodyscan.registration.rig_solve import RigSolution, solve_rig
 from bodyscan.rig.board import Board
+from bodyscan.rig.gauge import RigFrame
 from bodyscan.rig.pair import NominalPose
-from bodyscan.rig.rig_frame import RigFrame
 
 
 def centre_errors(placed: RigSolution, placings: dict[str, RigidTransform]) -> dict[str, Array]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bodyscan.errors import DecodingFailed
-from bodyscan.stripes.gray.bit_patterns import fill_from_codes, lay_out
+from bodyscan.stripes.gray.decoding import fill_from_codes, lay_out
 from bodyscan.stripes.scan_lines import ScanLines
 
 SHAPE = (40, 64)

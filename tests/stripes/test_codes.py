@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from bodyscan.errors import BadInput
 from bodyscan.geometry.light_planes import Axis
-from bodyscan.stripes.boundaries import bit_that_flips
+from bodyscan.stripes.boundaries import find_flipping_bits
 from bodyscan.stripes.codes import parse_stripe_code
 from bodyscan.stripes.codes.gray import Gray, bits_needed
 from bodyscan.stripes.codes.phase_shift import PhaseShift
@@ -185,7 +185,7 @@ def test_exactly_one_known_bit_flips_at_a_boundary(boundary: int) -> None:
     before, behind = gray_from_stripe(np.array([boundary - 1, boundary])).tolist()
     flipped = f"{before ^ behind:016b}"
     assert flipped.count("1") == 1
-    assert bit_that_flips(np.array([boundary]), bits)[0] == flipped.index("1")
+    assert find_flipping_bits(np.array([boundary]), bits)[0] == flipped.index("1")
 
 
 @pytest.mark.parametrize("direction", ["horizontal", "vertical"])

@@ -123,7 +123,7 @@ BROKEN = {
         ),
         said="",
     ),
-    "inverse lost, the frames behind it moved up": Broken(
+    "inverse lost, the frames after it moved up": Broken(
         copied=(
             ("00-04-00", "00-05-01"), ("00-04-01", "00-04-00"), ("00-03-00", "00-04-01"),
             ("00-03-01", "00-03-00"), ("00-02-00", "00-03-01"), ("00-02-01", "00-02-00"),

@@ -229,7 +229,7 @@ def test_brightness_around_a_boundary_is_lit_minus_dark(of: type) -> None:
     sharp = Brightness.from_images(images, np.full(256, 1e-6, np.float32), np.ones(lit.shape, bool))
     found = sharp.at_boundaries(np.array([3 * 20 + 4, 3 * 20 + 9]))
     np.testing.assert_allclose(found.before, [100.0, 100.0], rtol=1e-3)
-    np.testing.assert_allclose(found.behind, [100.0, 40.0], rtol=1e-3)
+    np.testing.assert_allclose(found.after, [100.0, 40.0], rtol=1e-3)
     np.testing.assert_allclose(found.along, [0.0, np.log(0.4)], atol=1e-3)
     np.testing.assert_allclose(found.across, 0.0, atol=1e-6)
     np.testing.assert_allclose(found.sigma[0], np.sqrt(2.0 * 2e-6) / 100.0, rtol=1e-3)

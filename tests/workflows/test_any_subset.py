@@ -22,8 +22,8 @@ from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.storage import load_calibration, save_calibration
+from bodyscan.rig.gauge import RigFrame
 from bodyscan.rig.rig import Rig
-from bodyscan.rig.rig_frame import RigFrame
 from bodyscan.stripes.codes.gray import Gray
 from bodyscan.workflows import calibrate_rig, find_boards
 from bodyscan.workflows.calibrate_rig import add_remarks, solve_boards

@@ -11,7 +11,7 @@ from stripe_rendering import code_light, render
 
 from bodyscan.arrays import Array
 from bodyscan.boards.view import BoardView
-from bodyscan.calibration.boundary_points import boundaries_near, box_around, crop_around
+from bodyscan.calibration.boundary_points import boundaries_near, compute_box, crop_around
 from bodyscan.captures.folder import ImageSequence, open_scan
 from bodyscan.errors import BodyscanError, DecodingFailed, ImageError
 from bodyscan.rig.rig import Rig, load_rig
@@ -73,7 +73,7 @@ def test_a_crop_shows_the_same_boundaries_as_the_whole(tmp_path: Path) -> None:
     rig, sequence, _ = a_scan_one_way(tmp_path)
     corners = np.array([[60.0, 40.0], [140.0, 40.0], [60.0, 90.0], [140.0, 90.0]])
     view = BoardView("p1", "s1", "board", np.arange(4), corners)
-    box = box_around(view)
+    box = compute_box(view)
     crop = crop_around([box])
     assert crop == (slice(15, 116), slice(20, 181))  # half a corner box more on each side
     whole = boundaries_near(decode_sequence(sequence, rig.pairs[0]), box)

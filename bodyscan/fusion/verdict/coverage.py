@@ -259,7 +259,7 @@ def check_gaps(scan: ScanEvidence) -> Iterator[Finding]:
 
 
 def check_crown(scan: ScanEvidence) -> Iterator[Finding]:
-    """A crown that was not measured, and may be higher by the 4 mm that ISO 20685-1 allows."""
+    """Check that the crown was measured: it may be higher than filled by the 4 mm of ISO 20685-1."""
     coverage = scan.coverage
     if coverage is None or (scan.mesh and _sees_one_side(scan)):
         return

@@ -16,7 +16,7 @@ SECOND_BODY = 0.4
 
 
 def check_pieces(scan: ScanEvidence) -> Iterator[Finding]:
-    """Bodies that stand beside each other, and pieces that nothing joins, by cells of 50 mm."""
+    """Check for several bodies, and for pieces that nothing joins, by cells of 50 mm."""
     points = scan.cloud.points
     lowest = points.min(axis=0)
     cells = tuple(((points[:, k] - lowest[k]) / 50.0).astype(np.int64) for k in range(3))

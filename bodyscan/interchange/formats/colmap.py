@@ -41,7 +41,7 @@ def write_colmap(cameras: RigCameras, folder: Path) -> Path:
     `bodyscan.json` beside it holds what COLMAP has no place for: each camera's gamma. Returns
     `folder`.
     """
-    model = _colmap_model(cameras)
+    model = _build_model(cameras)
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=".colmap-", dir=folder) as temporary:
@@ -84,7 +84,7 @@ def read_colmap(folder: Path) -> FoundCameras:
             readers[name] = partial(_read_camera, folder, camera, 0.0, rig_pose)
         for image in taken:
             gamma = gammas.get(image.name, 0.0)
-            readers[image.name] = partial(_read_camera, folder, camera, gamma, _image_pose(image))
+            readers[image.name] = partial(_read_camera, folder, camera, gamma, _find_pose(image))
     for name in gammas:
         if name not in readers:
             what = f"names a pair {name!r} that the model does not have"
@@ -109,7 +109,7 @@ def _read_gammas(folder: Path) -> dict[str, float]:
         ) from error
 
 
-def _image_pose(image: Any) -> RigidTransform | None:
+def _find_pose(image: Any) -> RigidTransform | None:
     """Return the pose of an image; None if it has none, or its camera has none in its rig."""
     try:
         return _transform(image.cam_from_world()) if image.has_pose else None
@@ -147,21 +147,21 @@ def _read_camera(
     return FoundCamera(matrix, lens, (camera.width, camera.height), pose, str(folder))
 
 
-def _colmap_model(cameras: Mapping[str, tuple[Camera, RigidTransform]]) -> pycolmap.Reconstruction:
+def _build_model(cameras: Mapping[str, tuple[Camera, RigidTransform]]) -> pycolmap.Reconstruction:
     """Build COLMAP's model; the first pair is the reference sensor, whose frame is the rig's."""
     model, rig = pycolmap.Reconstruction(), pycolmap.Rig(rig_id=1)
     frame = pycolmap.Frame(frame_id=1, rig_id=1)
     reference = next(iter(cameras.values()))[1]
     for number, (camera, rig_from_camera) in enumerate(cameras.values(), start=1):
-        model.add_camera(_colmap_camera(camera, number))
+        model.add_camera(_make_camera(camera, number))
         sensor = pycolmap.sensor_t(pycolmap.SensorType.CAMERA, number)
         if number == 1:
             rig.add_ref_sensor(sensor)
         else:
-            rig.add_sensor(sensor, _rigid3d(rig_from_camera.inverse() @ reference))
+            rig.add_sensor(sensor, _make_rigid3d(rig_from_camera.inverse() @ reference))
         frame.add_data_id(pycolmap.data_t(sensor, number))
     model.add_rig(rig)
-    frame.rig_from_world = _rigid3d(reference.inverse())
+    frame.rig_from_world = _make_rigid3d(reference.inverse())
     model.add_frame(frame)
     for number, name in enumerate(cameras, start=1):
         image = pycolmap.Image(name=name, camera_id=number, image_id=number)
@@ -171,7 +171,7 @@ def _colmap_model(cameras: Mapping[str, tuple[Camera, RigidTransform]]) -> pycol
     return model
 
 
-def _colmap_camera(camera: Camera, camera_id: int) -> pycolmap.Camera:
+def _make_camera(camera: Camera, camera_id: int) -> pycolmap.Camera:
     centre = [camera.u0 + PIXEL_CENTRE, camera.v0 + PIXEL_CENTRE]
     # COLMAP's OPENCV is a prefix of its FULL_OPENCV, which has OpenCV's first eight coefficients.
     is_fisheye, coefficients = opencv_lens(camera)
@@ -186,7 +186,7 @@ def _colmap_camera(camera: Camera, camera_id: int) -> pycolmap.Camera:
     )
 
 
-def _rigid3d(transform: RigidTransform) -> pycolmap.Rigid3d:
+def _make_rigid3d(transform: RigidTransform) -> pycolmap.Rigid3d:
     return pycolmap.Rigid3d(transform.matrix[:3])
 
 

@@ -96,7 +96,7 @@ class _NumberedStripes(StripeCode):
         return bright if kind == PATTERN else 1.0 - bright
 
     def decode(self, images: SequenceImages, limits: StripeLimits | None) -> StripeMap:
-        from bodyscan.stripes.gray.bit_patterns import decode_bits, lay_out
+        from bodyscan.stripes.gray.decoding import decode_bits, lay_out
 
         patterns, inverses = images.coded[PATTERN], images.coded.get(INVERSE)
         lines = lay_out(images.lit, images.dark, patterns, inverses, self.direction)

@@ -151,7 +151,7 @@ class PhaseShift(StripeCode):
         return bright if kind == PATTERN else 1.0 - bright
 
     def decode(self, images: SequenceImages, limits: StripeLimits | None) -> StripeMap:
-        from bodyscan.stripes.gray.bit_patterns import lay_out
+        from bodyscan.stripes.gray.decoding import lay_out
         from bodyscan.stripes.phase.decoding import decode_wave, decode_waves
 
         phases = images.coded[PHASE]

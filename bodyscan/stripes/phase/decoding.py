@@ -20,8 +20,8 @@ import numpy as np
 from bodyscan.arrays import Array, Floats, Greys, Indices, Mask
 from bodyscan.compiled import compiled
 from bodyscan.errors import DecodingFailed
-from bodyscan.stripes.gray.bit_patterns import read_words
 from bodyscan.stripes.gray.bit_words import GRAY
+from bodyscan.stripes.gray.decoding import read_words
 from bodyscan.stripes.grey_noise import measure_noise
 from bodyscan.stripes.phase.projector_response import (
     MIN_PERIODS,

@@ -111,7 +111,7 @@ def measure_wave_noise(
 def _compute_misfits(
     waves: Sequence[MeasuredWave], images: Sequence[Greys], some: Indices
 ) -> Iterator[Array]:
-    """Quantities at some pixels that are zero without noise, each with one image's variance."""
+    """Yield quantities at some pixels that are zero but for noise, scaled to one image's variance."""
     for first, second in pairwise(waves):
         difference = first.mean.ravel()[some] - second.mean.ravel()[some]
         yield difference / np.sqrt(1.0 / first.wave.steps + 1.0 / second.wave.steps)

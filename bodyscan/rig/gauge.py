@@ -1,4 +1,4 @@
-"""What fixes the rig frame and the rig's size."""
+"""What fixes the gauge of a rig: its frame of reference (`RigFrame`) and its size (`Reference`)."""
 
 from __future__ import annotations
 

@@ -17,11 +17,11 @@ from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.light_planes import LightPlanes
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance
-from bodyscan.registration.soundness import (
-    camera_faults,
-    covariance_faults,
+from bodyscan.registration.sanity_checks import (
+    find_camera_faults,
+    find_covariance_faults,
     find_faults,
-    pose_faults,
+    find_pose_faults,
 )
 from bodyscan.rig.pair import Pair
 
@@ -53,7 +53,7 @@ def messages(faults: Any) -> str:
     ],
 )
 def test_impossible_cameras_are_named(changes: dict[str, Any], message: str) -> None:
-    found = messages(camera_faults(replace(SOUND, **changes), PAIR, "here"))
+    found = messages(find_camera_faults(replace(SOUND, **changes), PAIR, "here"))
     assert message in found
     assert bool(found) == bool(message)
 
@@ -71,7 +71,7 @@ def test_impossible_cameras_are_named(changes: dict[str, Any], message: str) -> 
 def test_a_pose_is_a_rotation_and_a_translation_within_100_m(
     rotation: np.ndarray, translation: list[float], message: str
 ) -> None:
-    found = messages(pose_faults(RigidTransform(rotation, np.array(translation)), "here"))
+    found = messages(find_pose_faults(RigidTransform(rotation, np.array(translation)), "here"))
     assert found.startswith(message)
     assert bool(found) == bool(message)
 
@@ -91,7 +91,7 @@ def test_a_pose_is_a_rotation_and_a_translation_within_100_m(
     ],
 )
 def test_a_covariance_is_symmetric_and_positive_semidefinite(matrix: Any, message: str) -> None:
-    found = messages(covariance_faults(matrix, 2, "here"))
+    found = messages(find_covariance_faults(matrix, 2, "here"))
     assert found.startswith(message)
     assert bool(found) == bool(message)
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from bodyscan.arrays import Array, Bytes
-from bodyscan.boards import unfound
+from bodyscan.boards import detection_failure
 from bodyscan.boards.board_layout import marker_corners
 from bodyscan.boards.charuco import Markers
-from bodyscan.boards.unfound import describe_unfound
+from bodyscan.boards.detection_failure import describe_unfound
 from bodyscan.boards.view import AS_PRINTED, Appearance
 from bodyscan.rig.board import Board
 
@@ -58,7 +58,7 @@ def describe(
             return markers
         return Markers(np.zeros(0, np.int64), np.zeros((0, 4, 2)))
 
-    monkeypatch.setattr(unfound, "detect_markers", detect)
+    monkeypatch.setattr(detection_failure, "detect_markers", detect)
     return describe_unfound(IMAGE, board)
 
 

@@ -30,27 +30,27 @@ NOT_A_NUMBER = "holds what is not a number"
 
 def find_faults(calibration: RigCalibration) -> Iterator[Fault]:
     """Everything in a calibration that no calibration can have."""
-    yield from _name_faults(calibration)
+    yield from _find_name_faults(calibration)
     known = {pair.name: pair for pair in calibration.rig.pairs}
     for name, pair in calibration.pairs.items():
         where = f"pairs.{name}"
         if name not in known:
             yield where, f"is not a pair of rig {calibration.rig.name}"
             continue
-        yield from camera_faults(pair.camera, known[name], f"{where}.camera")
+        yield from find_camera_faults(pair.camera, known[name], f"{where}.camera")
         size = len(pair.camera.parameters)
-        yield from covariance_faults(pair.camera_covariance, size, f"{name}/camera_covariance")
-        yield from pose_faults(calibration.rig_from_camera[name], f"{where}.rig_from_camera")
-        yield from _light_faults(pair, known[name])
+        yield from find_covariance_faults(pair.camera_covariance, size, f"{name}/camera_covariance")
+        yield from find_pose_faults(calibration.rig_from_camera[name], f"{where}.rig_from_camera")
+        yield from _find_light_faults(pair, known[name])
     size = 6 * len(calibration.covariance.names)
-    yield from covariance_faults(calibration.covariance.matrix, size, "placing_covariance")
+    yield from find_covariance_faults(calibration.covariance.matrix, size, "placing_covariance")
     for (shot, board), pose in calibration.rig_from_board.items():
-        yield from pose_faults(pose, f"boards: {board} in {shot}")
+        yield from find_pose_faults(pose, f"boards: {board} in {shot}")
     for name, corners in calibration.observed.items():
-        yield from _corner_faults(corners, len(calibration.rig_from_board), f"{name}/seen")
+        yield from _find_corner_faults(corners, len(calibration.rig_from_board), f"{name}/seen")
 
 
-def camera_faults(camera: Camera, pair: Pair, where: str) -> Iterator[Fault]:
+def find_camera_faults(camera: Camera, pair: Pair, where: str) -> Iterator[Fault]:
     """Faults of a camera, given the pair that the rig file describes."""
     size, described = (camera.width, camera.height), (pair.camera.width, pair.camera.height)
     if size != described:
@@ -77,12 +77,12 @@ def camera_faults(camera: Camera, pair: Pair, where: str) -> Iterator[Fault]:
         if not -length < value < 2.0 * length:
             yield f"{where}.{name}", f"lies far outside of the picture (got {value:g})"
     # Rays must pass through half of the image: less is a slip, not a lens.
-    if not _is_finite(camera.lens.coefficients) or _share_of_rays(camera) < 0.5:
+    if not _is_finite(camera.lens.coefficients) or _compute_ray_share(camera) < 0.5:
         values = ", ".join(f"{value:g}" for value in camera.lens.coefficients)
         yield where, f"has a lens that folds its picture over (got {values})"
 
 
-def pose_faults(pose: RigidTransform, where: str) -> Iterator[Fault]:
+def find_pose_faults(pose: RigidTransform, where: str) -> Iterator[Fault]:
     """Faults of a pose: it must be a rotation with a translation of plausible size."""
     rotation = pose.rotation
     if not _is_finite(rotation, pose.translation):
@@ -95,7 +95,7 @@ def pose_faults(pose: RigidTransform, where: str) -> Iterator[Fault]:
         yield where, "lies more than 100 m away"
 
 
-def covariance_faults(matrix: Array, size: int, where: str) -> Iterator[Fault]:
+def find_covariance_faults(matrix: Array, size: int, where: str) -> Iterator[Fault]:
     """Faults of a covariance (size, size); all zero is allowed (nothing is uncertain)."""
     if not isinstance(matrix, np.ndarray) or matrix.shape != (size, size):
         yield where, f"is of shape {np.shape(matrix)}, but {size} x {size} is wanted"
@@ -113,7 +113,7 @@ def covariance_faults(matrix: Array, size: int, where: str) -> Iterator[Fault]:
             yield where, "is not a covariance: it is not positive semidefinite"
 
 
-def _name_faults(calibration: RigCalibration) -> Iterator[Fault]:
+def _find_name_faults(calibration: RigCalibration) -> Iterator[Fault]:
     rig, pairs = calibration.rig, set(calibration.pairs)
     order = calibration.covariance.names
     if not pairs:
@@ -128,7 +128,7 @@ def _name_faults(calibration: RigCalibration) -> Iterator[Fault]:
             yield "boards", f"names no board of rig {rig.name} (got {board!r} in {shot!r})"
 
 
-def _light_faults(pair: PairCalibration, described: Pair) -> Iterator[Fault]:
+def _find_light_faults(pair: PairCalibration, described: Pair) -> Iterator[Fault]:
     code = described.projector
     if (pair.sheets is None) != (code is None):
         yield (
@@ -153,12 +153,12 @@ def _light_faults(pair: PairCalibration, described: Pair) -> Iterator[Fault]:
                 f"{expected.stripes} {expected.direction}",
             )
         elif isinstance(light, LightPlanes):
-            yield from _plane_faults(light, where)
+            yield from _find_plane_faults(light, where)
         elif isinstance(light, SmoothSheets):
-            yield from _smooth_faults(light, where)
+            yield from _find_smooth_faults(light, where)
 
 
-def _plane_faults(light: LightPlanes, where: str) -> Iterator[Fault]:
+def _find_plane_faults(light: LightPlanes, where: str) -> Iterator[Fault]:
     planes, covariance = light.coefficients, light.covariance
     if planes.shape != (light.stripes + 1, 4) or covariance.shape != (light.stripes + 1, 4, 4):
         yield where, f"has arrays of shapes {planes.shape} and {covariance.shape}"
@@ -178,7 +178,7 @@ def _plane_faults(light: LightPlanes, where: str) -> Iterator[Fault]:
         yield where, "has a covariance that is not positive semidefinite"
 
 
-def _smooth_faults(light: SmoothSheets, where: str) -> Iterator[Fault]:
+def _find_smooth_faults(light: SmoothSheets, where: str) -> Iterator[Fault]:
     parameters, size = light.parameters, len(light.parameters)
     if isinstance(light, LensSheets):
         if not SCALE <= size <= SCALE + len(LENS_SIGMAS):
@@ -190,11 +190,11 @@ def _smooth_faults(light: SmoothSheets, where: str) -> Iterator[Fault]:
     elif not _is_finite(parameters, light.middle):
         yield where, NOT_A_NUMBER
     else:
-        yield from pose_faults(light.projector_from_camera, f"{where}: projector_from_camera")
-        yield from covariance_faults(light.covariance, size, f"{where}: covariance")
+        yield from find_pose_faults(light.projector_from_camera, f"{where}: projector_from_camera")
+        yield from find_covariance_faults(light.covariance, size, f"{where}: covariance")
 
 
-def _corner_faults(corners: ObservedCorners, boards: int, where: str) -> Iterator[Fault]:
+def _find_corner_faults(corners: ObservedCorners, boards: int, where: str) -> Iterator[Fault]:
     target = corners.target
     shapes = (corners.pixels.shape, corners.residuals_px.shape, target.shape)
     if shapes != ((len(target), 2), (len(target), 2), (len(target),)):
@@ -209,7 +209,7 @@ def _is_finite(*arrays: Array | Floats) -> bool:
     return all(np.all(np.isfinite(array)) for array in arrays)
 
 
-def _share_of_rays(camera: Camera) -> float:
+def _compute_ray_share(camera: Camera) -> float:
     """Share of the image that rays pass through."""
     across = (np.arange(9) + 0.5) / 9.0
     pixels = np.stack(np.meshgrid(across * camera.width, across * camera.height), axis=-1)

@@ -51,7 +51,7 @@ def describe_unfound(image: Bytes, board: Board) -> str:
 
 
 def _detect(image: Bytes, board: Board, appearance: Appearance) -> Markers:
-    """Detect the board's markers, with the rim on which most are found."""
+    """Detect the board's markers with the border width, in bits, that finds most of them."""
     picture = appearance.undo(image)
     rims = BORDER_BITS if board.kind == "aprilgrid" else (1,)
     found = [detect_markers(picture, board, border_bits=bits) for bits in rims]
