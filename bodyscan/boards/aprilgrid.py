@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from bodyscan.arrays import Array, Bytes, Mask
+from bodyscan.arrays import Bytes
 from bodyscan.boards import board_layout
 from bodyscan.boards.board_map import BoardMap, refine_predicted
 from bodyscan.boards.charuco import Markers, detect_markers, fit_markers
@@ -45,7 +45,15 @@ def find_aprilgrid(image: Bytes, board: Board, *, thorough: bool = True) -> Dete
             break
     if best is None:
         return None
-    pixels, good = _refine(image, board, best)
+    printed = board_layout.printed_corners(board)
+    # Other edges near a corner are those of rim, gap and small squares.
+    marker_mm = board.marker_mm or 0.0
+    bits = board_layout.marker_dictionary(board).markerSize + 2 * best.border_bits
+    clear_mm = 0.85 * min(best.border_bits * marker_mm / bits, board.square_mm - marker_mm)
+    # Tags are black: at their upper left and lower right corners the other two squares are white.
+    row, column = np.divmod(np.arange(len(printed)), 2 * board.columns)
+    bright_diagonal, reach = np.asarray((row + column) % 2 == 1), clear_mm / WINDOW_SQUARES
+    pixels, good = refine_predicted(image, best.board_map, printed, reach, bright_diagonal)
     ids = np.flatnonzero(good).astype(np.int64)
     return DetectedCorners(ids, pixels[good])
 
@@ -90,17 +98,3 @@ def locate_grid(board: Board, tags: Markers, border_bits: int = 2) -> GridPositi
             if agreeing >= max(MIN_TAGS, 0.6 * len(detected)):
                 found.append(GridPosition(fit[0], agreeing, border_bits))
     return max(found, key=lambda position: position.agreeing, default=None)
-
-
-def _refine(image: Bytes, board: Board, position: GridPosition) -> tuple[Array, Mask]:
-    """Refine all corners (N,) of the grid; return pixels (N, 2) and which are good."""
-    printed = board_layout.printed_corners(board)
-    # Other edges near a corner are those of rim, gap and small squares.
-    marker_mm, border_bits = board.marker_mm or 0.0, position.border_bits
-    bits = board_layout.marker_dictionary(board).markerSize + 2 * border_bits
-    clear_mm = 0.85 * min(border_bits * marker_mm / bits, board.square_mm - marker_mm)
-    # Tags are black: at their upper left and lower right corners the other two squares are white.
-    row, column = np.divmod(np.arange(len(printed)), 2 * board.columns)
-    bright_diagonal = np.asarray((row + column) % 2 == 1)
-    reach = clear_mm / WINDOW_SQUARES
-    return refine_predicted(image, position.board_map, printed, reach, bright_diagonal)

@@ -83,7 +83,17 @@ def locate_charuco(
     nearby = _find_corners_next_to(board, position.printed.mean(axis=1))
     if len(nearby) < 4:
         return None
-    pixels, good = _refine(image, board, position.board_map, nearby, position.printed)
+    gap = (1.0 - (board.marker_mm or 0.0) / board.square_mm) / 2.0
+    marked = np.floor(position.printed[0].mean(axis=0) / board.square_mm).astype(int).sum()
+    row, column = np.divmod(nearby, board.columns - 1)
+    pixels, good = refine_predicted(
+        image,
+        position.board_map,
+        board_layout.printed_corners(board)[nearby],
+        board.square_mm,
+        (row + column + marked) % 2 == 0,
+        marker_gap=gap,
+    )
     ids = nearby[good] + position.face * board_layout.corners_per_face(board)
     appearance = Appearance(other_layout=position.board.legacy_layout != board.legacy_layout)
     return DetectedCorners(ids, pixels[good], appearance)
@@ -108,20 +118,6 @@ def _fit_face(board: Board, face: int, markers: Markers) -> FacePosition | None:
         return None
     board_map, inliers = fit
     return FacePosition(board, face, board_map, printed[of_face[inliers]], len(detected))
-
-
-def _refine(
-    image: Bytes, board: Board, board_map: BoardMap, corner_ids: Indices, markers: Array
-) -> tuple[Array, Mask]:
-    """Refine corners (N,) where the markers predict them; return pixels (N, 2) and which are good."""
-    points = board_layout.printed_corners(board)[corner_ids]
-    gap = (1.0 - (board.marker_mm or 0.0) / board.square_mm) / 2.0
-    marked = np.floor(markers[0].mean(axis=0) / board.square_mm).astype(int).sum()
-    row, column = np.divmod(corner_ids, board.columns - 1)
-    bright_diagonal = (row + column + marked) % 2 == 0
-    return refine_predicted(
-        image, board_map, points, board.square_mm, bright_diagonal, marker_gap=gap
-    )
 
 
 def fit_markers(printed: Array, corners: Array, board: Board) -> tuple[BoardMap, Mask] | None:

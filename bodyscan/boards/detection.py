@@ -26,8 +26,6 @@ OTHER_APPEARANCES = (
     Appearance(mirrored=True),
     Appearance(inverted=True, mirrored=True),
 )
-MarkerCache = dict[tuple[str, Appearance], Markers]
-"""Markers by dictionary and appearance."""
 
 
 def find_boards(image: Bytes, boards: Sequence[Board], *, pair: str, shot: str) -> list[BoardView]:
@@ -43,7 +41,7 @@ def find_boards(image: Bytes, boards: Sequence[Board], *, pair: str, shot: str) 
     Raises BadInput for a board that cannot be found.
     """
     views = []
-    cache: MarkerCache = {}
+    cache: dict[tuple[str, Appearance], Markers] = {}
     for board in boards:
         if board.kind != "checkerboard":
             same_dictionary = [one for one in boards if one.dictionary == board.dictionary]
@@ -60,7 +58,7 @@ def find_boards(image: Bytes, boards: Sequence[Board], *, pair: str, shot: str) 
 
 
 def _find_marked(
-    image: Bytes, board: Board, cache: MarkerCache, first: int
+    image: Bytes, board: Board, cache: dict[tuple[str, Appearance], Markers], first: int
 ) -> DetectedCorners | None:
     """Find a board as printed, or else white on black, or mirrored; see `detect_markers`."""
     for appearance in (AS_PRINTED, *OTHER_APPEARANCES):

@@ -25,7 +25,6 @@ from bodyscan.captures.image_header import (
 )
 from bodyscan.errors import BadInput, CaptureError
 from bodyscan.progress import map_threads
-from bodyscan.rig.board import Board
 from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig import Rig, find_unusual_lengths, load_rig
 
@@ -191,7 +190,14 @@ def _find_warnings(
     yield from _warn_of_jpeg(sequences)
     yield from filter(None, [captures and describe_unlisted_images(captures)])
     if len(rig.pairs) > 1:  # a single camera cannot disagree
-        yield from (_describe_symmetry(board) for board in rig.boards if board.is_ambiguous)
+        for board in [board for board in rig.boards if board.is_ambiguous]:
+            sides = f"it has {board.columns} x {board.rows} squares, an even sum"
+            why = "its two faces are equal" if board.faces == 2 else sides
+            yield (
+                f"board {board.name} looks the same rotated by 180 degrees ({why}): cameras may "
+                "number its corners from different ends; better is an odd number of columns with an "
+                "even one of rows, or ChArUco"
+            )
     for count in counts if captures and not rig.is_known else ():
         if 3 <= count.poses < 6:
             yield f"pair {count.pair.name}: {count.poses} board poses will do, 6 or more are better"
@@ -215,16 +221,6 @@ def _warn_of_jpeg(sequences: Iterable[ImageSequence]) -> Iterator[str]:
             f"{max(errors.values()):.0f} grey levels, and stripes' boundaries with them; save PNG, "
             "or JPEG of a quality of 95 or more"
         )
-
-
-def _describe_symmetry(board: Board) -> str:
-    count = f"{board.columns} x {board.rows} squares"
-    why = "its two faces are equal" if board.faces == 2 else f"it has {count}, an even sum"
-    return (
-        f"board {board.name} looks the same rotated by 180 degrees ({why}): cameras may number its "
-        "corners from different ends; better is an odd number of columns with an even one of rows, "
-        "or ChArUco"
-    )
 
 
 def _find_separate_groups(good: list[ImageSequence]) -> list[str]:

@@ -26,7 +26,7 @@ from bodyscan.files.model import MAX_SHOT_LENGTH, SHOT
 from bodyscan.rig.frame_names import CaptureFolder
 from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig import Rig
-from bodyscan.rig.templates import fill, has_field, shot_pattern, with_exposure
+from bodyscan.rig.templates import fill, has_field, shot_pattern
 
 IMAGE_SUFFIXES = {".png", ".bmp", ".tif", ".tiff", ".jpg", ".jpeg", ".pgm", ".ppm"}
 """Suffixes of image files, whatever program wrote them."""
@@ -63,11 +63,6 @@ class ImageSequence:
     def where(self) -> str:
         """Pair and shot, for messages."""
         return f"pair {self.pair}, shot {self.shot}"
-
-    @property
-    def lacks_crossing(self) -> bool:
-        """Whether images are missing, all of them of crossing stripes, which can be spared."""
-        return bool(self.missing) and set(self.crossing).issuperset(self.missing)
 
     @property
     def without_crossing(self) -> ImageSequence:
@@ -261,7 +256,7 @@ def _open(
             where=str(folder / FILE_NAME),
             remedy="Name the right folder, or correct `kind` in its captures.yaml.",
         )
-    first = with_exposure(template, rig.exposures[0]) if rig.exposures else template
+    first = template.replace("{exposure}", rig.exposures[0]) if rig.exposures else template
     entries = {shot.name: shot for shot in (file.shots if file else None) or ()}
     names = wanted or tuple(entries) or _discover_shots(rig, listing, first)
     if not has_field(template, "shot") and len(names) > 1:
@@ -372,7 +367,7 @@ def _collect_sequences(
 ) -> Iterator[ImageSequence]:
     """Collect what each pair took in a shot, by captures.yaml or, without a list, by the files."""
     look = shot.stripes is None and shot.lit is None
-    templates = {name: with_exposure(template, name) for name in rig.exposures} or {"": template}
+    templates = {name: template.replace("{exposure}", name) for name in rig.exposures or ("",)}
     for pair in rig.pairs:
         whole = _collect_stripes(rig, listing, templates, shot.name, pair)
         alone = _collect_board_image(rig, listing, next(iter(templates.values())), shot.name, pair)

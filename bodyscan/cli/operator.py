@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -308,12 +308,11 @@ def _run(
 def _listening(output: Output) -> Iterator[Listen]:
     """Show how jobs go; the process ends at once when it is interrupted."""
     from bodyscan.jobs import display
+    from bodyscan.jobs.supervision import ignore_events
 
-    show = (
-        display.json_lines if output.json else display.silence if output.quiet else display.screen
-    )
+    quiet = nullcontext(ignore_events) if output.quiet else display.screen()
     try:
-        with show() as listen:
+        with display.json_lines() if output.json else quiet as listen:
             yield listen
     except KeyboardInterrupt:
         sys.stdout.flush()

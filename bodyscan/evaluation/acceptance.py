@@ -19,10 +19,6 @@ Positive = Annotated[float, Field(gt=0)]
 Vector = tuple[float, float, float]
 
 
-class AcceptanceError(BadInput):
-    """The acceptance file, or a --limit, is wrong."""
-
-
 class Spheres(Model):
     """Spheres on one carrier: their calibrated radius, and centres in the carrier's own frame."""
 
@@ -68,25 +64,25 @@ class AcceptanceFile(Model):
 def load_acceptance(path: Path | None, changes: Mapping[str, float] = {}) -> AcceptanceFile:
     """Read an acceptance file, or take the defaults if `path` is None, and change some limits.
 
-    Raises AcceptanceError that names every problem.
+    Raises BadInput that names every problem.
     """
     file = AcceptanceFile()
     remedy = "Correct the acceptance file; docs/report.md explains every key."
     if path is not None:
-        file = load_model(path, AcceptanceFile, AcceptanceError, remedy=remedy)
+        file = load_model(path, AcceptanceFile, BadInput, remedy=remedy)
     limits: dict[tuple[str | int, ...], float]
     limits = {("limits", name): value for name, value in changes.items()}
-    return apply_changes(file, limits, AcceptanceError)
+    return apply_changes(file, limits, BadInput)
 
 
 def limit_from(text: str) -> tuple[str, float]:
-    """Parse `flatness_mm=0.5` into name and value. Raises AcceptanceError."""
+    """Parse `flatness_mm=0.5` into name and value. Raises BadInput."""
     name, _, value = text.partition("=")
     try:
         return name.strip(), float(value)
     except ValueError:
         remedy = "write it as --limit flatness_mm=0.5"
-        raise AcceptanceError(f"{text!r} is not a limit", remedy=remedy) from None
+        raise BadInput(f"{text!r} is not a limit", remedy=remedy) from None
 
 
 ALL = "all pairs"

@@ -44,21 +44,17 @@ def write_body(path: Path, body: BodyCloud | BodyMesh, origin: Provenance) -> No
     of a format, or of one that cannot hold a cloud.
     """
     path = Path(path)
-    format_ = _find_format(path, body)
-    if isinstance(body, BodyMesh):
-        body = collapse_slivers(body)
-    format_.write(path, body)
-    write_json(path.with_name(f"{path.name}.json"), describe_body(path.name, format_, body, origin))
-
-
-def _find_format(path: Path, body: BodyCloud | BodyMesh) -> BodyFormat:
     kind = "cloud" if isinstance(body, BodyCloud) else "mesh"
     name = path.suffix.lower().removeprefix(".")
     able = [known for known in BODY_FORMATS.names() if kind in BODY_FORMATS.find(known).holds]
     if name not in able:
         what = name or "a file without suffix"
         raise unknown_format_error(f"a {kind}", what, able, where=str(path))
-    return BODY_FORMATS.find(name)
+    format_ = BODY_FORMATS.find(name)
+    if isinstance(body, BodyMesh):
+        body = collapse_slivers(body)
+    format_.write(path, body)
+    write_json(path.with_name(f"{path.name}.json"), describe_body(path.name, format_, body, origin))
 
 
 def describe_body(

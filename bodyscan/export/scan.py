@@ -56,10 +56,8 @@ def export_scan(
             what = f"there is no {name!r} to export{did_you_mean(name, known)}"
             raise BadInput(what, remedy=f"Choose from {', '.join(known)}.")
     pose = find_body_frame(scan.mesh.vertices).rig_from_body if frame == "body" else None
-    subject, identity = scan.facts.get("subject"), scan.facts["calibration_id"]
-    origin = Provenance(subject, identity, deface, scan_facts(scan.facts), pose)
-    if deface:
-        origin = replace(origin, subject=None, found=_without_person(origin.found))
+    subject, identity = None if deface else scan.facts.get("subject"), scan.facts["calibration_id"]
+    origin = Provenance(subject, identity, deface, _find_facts(scan.facts, deface), pose)
     neck = find_neck(scan.mesh.vertices, scan.mesh.faces) if deface else None
     written = []
     for version in versions:
@@ -75,25 +73,25 @@ def export_scan(
     return written
 
 
-def scan_facts(facts: Mapping[str, Any]) -> dict[str, Any]:
-    """Select what an export repeats from scan.json: verdict, pairs left out, sway (mm)."""
-    alignment = facts.get("alignment")
+def _find_facts(facts: Mapping[str, Any], shared: bool) -> dict[str, Any]:
+    """Select what an export repeats from scan.json: verdict, pairs left out, sway (mm).
+
+    shared: without date, and without sentences, which may name a folder.
+    """
+    verdict, left_out, alignment = (
+        facts.get("verdict"),
+        facts.get("failed", {}),
+        facts.get("alignment"),
+    )
+    if shared:
+        grade = (verdict or {}).get("grade")
+        verdict, left_out = grade and {"grade": grade}, dict.fromkeys(left_out, "")
     return {
-        "when": facts.get("when"),
-        "verdict": facts.get("verdict"),
-        "left_out": facts.get("failed", {}),
+        "when": None if shared else facts.get("when"),
+        "verdict": verdict,
+        "left_out": left_out,
         "sway_mm": alignment["motion_mm"] if alignment else None,
     }
-
-
-def _without_person(found: Mapping[str, Any]) -> dict[str, Any]:
-    """What a file for sharing may say: no date, and no sentence, which may name a folder."""
-    grade = (found["verdict"] or {}).get("grade")
-    shared = {
-        "verdict": grade and {"grade": grade},
-        "left_out": dict.fromkeys(found["left_out"], ""),
-    }
-    return {"when": None, "sway_mm": found["sway_mm"], **shared}
 
 
 def transform_mesh(mesh: BodyMesh, a_from_b: RigidTransform) -> BodyMesh:

@@ -103,7 +103,9 @@ def _json(value: Any, indent: str) -> str:
             raise TypeError(f"JSON keys must be text, got {list(value)[:5]}")
         items = [f"{json.dumps(key)}: {_json(value[key], deeper)}" for key in sorted(value)]
         brackets = "{}"
-    elif isinstance(value, list | tuple) and any(_is_container(item) for item in value):
+    elif isinstance(value, list | tuple) and any(
+        isinstance(item, Mapping | list | tuple) or getattr(item, "ndim", 0) > 0 for item in value
+    ):
         items = [_json(item, deeper) for item in value]
         brackets = "[]"
     elif isinstance(value, list | tuple):
@@ -112,10 +114,6 @@ def _json(value: Any, indent: str) -> str:
         return json.dumps({} if isinstance(value, Mapping) else value, allow_nan=False)
     inside = f",\n{deeper}".join(items)
     return f"{brackets[0]}\n{deeper}{inside}\n{indent}{brackets[1]}"
-
-
-def _is_container(value: Any) -> bool:
-    return isinstance(value, Mapping | list | tuple) or getattr(value, "ndim", 0) > 0
 
 
 @contextmanager

@@ -40,12 +40,6 @@ def json_lines() -> Iterator[Listen]:
 
 
 @contextmanager
-def silence() -> Iterator[Listen]:
-    """Show nothing; only errors are reported."""
-    yield lambda event: None
-
-
-@contextmanager
 def screen() -> Iterator[Listen]:
     """Show one bar for a batch with the time left, and a line for each job that runs or has ended.
 
@@ -95,7 +89,14 @@ class _Screen:
         text = f"{event['done']} of {event['jobs']} jobs done ({event['ran']} of them now)"
         text += f", {aside} set aside" if aside else ""
         text += f"\nto be scanned again: {', '.join(event['repeat'])}" if event["repeat"] else ""
-        text += _drift_text(event["drifted"]) if event["drifted"] else ""
+        if event["drifted"]:
+            name, mm = next(iter(event["drifted"].items()))  # the largest first
+            more = f", and {len(event['drifted']) - 1} more" if len(event["drifted"]) > 1 else ""
+            text += (
+                f"\npair {name}{more}: alignment moves it by {mm:.1f} mm in the same direction in "
+                "every scan, which sway does not explain: the rig has changed since the calibration, "
+                "calibrate again"
+            )
         self._print(f"{text}\ntable: {event['table']}")
 
     def _progress(self, event: dict[str, Any]) -> None:
@@ -155,13 +156,3 @@ def _duration(seconds: float) -> str:
     if seconds < 90:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
-
-
-def _drift_text(drifted: dict[str, float]) -> str:
-    """A warning of drift; drifted: mm, by pair, the largest first."""
-    name, mm = next(iter(drifted.items()))
-    more = f", and {len(drifted) - 1} more" if len(drifted) > 1 else ""
-    return (
-        f"\npair {name}{more}: alignment moves it by {mm:.1f} mm in the same direction in every scan, "
-        "which sway does not explain: the rig has changed since the calibration, calibrate again"
-    )

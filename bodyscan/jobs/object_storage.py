@@ -147,7 +147,8 @@ def _put_back(folder: Path, there: Any, was: dict[str, bytes], ran: tuple[str, .
     now = _stages(folder)
     for stage in sorted(was.keys() | now.keys()):
         if stage in ran or now.get(stage) != was.get(stage):
-            _remove(there, stage)
+            if there.exists(stage):
+                there.rm(stage, recursive=True)
             put(list_files(folder / stage), STAGE)
     put((path for path in folder.iterdir() if path.is_file() and path.name != LOCK), MANIFEST)
 
@@ -190,11 +191,6 @@ def _fetch_one(files: Any, name: str, path: Path) -> None:
 def _put(files: Any, name: str, path: Path) -> None:
     files.makedirs(str(PurePosixPath(name).parent), exist_ok=True)
     files.put_file(str(path), name)
-
-
-def _remove(files: Any, name: str) -> None:
-    if files.exists(name):
-        files.rm(name, recursive=True)
 
 
 def _inside(folder: Path, name: str) -> Path:

@@ -22,11 +22,6 @@ from bodyscan.settings import (
     UseLimits,
 )
 
-
-class PipelineError(BadInput):
-    """The pipeline file, or a --set, is wrong."""
-
-
 SECTIONS = {
     "fuse": ("alignment", "fusion", "mesh", "use", "export"),
     "calibrate": ("rig_export",),
@@ -86,8 +81,8 @@ def _unknown_formats(
 def load_pipeline(path: Path, changes: Sequence[str] = ()) -> Pipeline:
     """Read a pipeline file and apply `--set` changes such as `fusion.points=2000000`.
 
-    Raises PipelineError, which lists every problem, those of the file by line and column.
+    Raises BadInput, which lists every problem, those of the file by line and column.
     """
     remedy = "Correct the pipeline file; docs/formats.md explains every key."
-    pipeline = load_model(Path(path), Pipeline, PipelineError, remedy=remedy)
-    return apply_settings(pipeline, changes, PipelineError) if changes else pipeline
+    pipeline = load_model(Path(path), Pipeline, BadInput, remedy=remedy)
+    return apply_settings(pipeline, changes, BadInput) if changes else pipeline

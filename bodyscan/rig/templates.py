@@ -20,11 +20,6 @@ def fill(template: str, *, shot: str, pair: str, frame: str) -> str:
     return template.format(shot=shot, pair=pair, frame=frame)
 
 
-def with_exposure(template: str, exposure: str) -> str:
-    """Fill in the exposure."""
-    return template.replace("{exposure}", exposure)
-
-
 def has_field(template: str, field: str) -> bool:
     return field in _parse_fields(template)
 

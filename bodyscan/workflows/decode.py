@@ -69,7 +69,7 @@ def decode_sequence(
 
     single_direction = pair.projector.model_copy(update={"crossing": None})
     first_direction = (sequence.without_crossing, single_direction)
-    if sequence.lacks_crossing:
+    if sequence.missing and set(sequence.crossing).issuperset(sequence.missing):
         fault = f"images are missing, such as {sequence.missing[0]}"
         return replace(decode(*first_direction), crossing_fault=fault)
     try:

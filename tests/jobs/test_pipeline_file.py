@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 import yaml
 
+from bodyscan.errors import BadInput
 from bodyscan.jobs.pipeline import (
     SECTIONS,
     Pipeline,
-    PipelineError,
     load_pipeline,
 )
 from bodyscan.settings import AlignmentSettings, ScanSettings
@@ -63,7 +63,7 @@ def test_changes_are_applied() -> None:
     ],
 )
 def test_wrong_changes_are_named(change: str, said: str) -> None:
-    with pytest.raises(PipelineError) as caught:
+    with pytest.raises(BadInput) as caught:
         load_pipeline(FUSE, [change])
     assert said in str(caught.value)
 
@@ -71,7 +71,7 @@ def test_wrong_changes_are_named(change: str, said: str) -> None:
 def test_wrong_files_are_told_by_line(tmp_path: Path) -> None:
     path = tmp_path / "p.yaml"
     path.write_text("name: x\nkind: fuse\nfusion:\n  points: -1\n  colour: red\n")
-    with pytest.raises(PipelineError) as caught:
+    with pytest.raises(BadInput) as caught:
         load_pipeline(path)
     assert f"{path}:4:11: fusion.points: must be 1000 or more" in str(caught.value)
     assert f"{path}:5:3: fusion.colour: is not a key known here" in str(caught.value)

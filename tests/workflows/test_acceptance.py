@@ -14,10 +14,9 @@ from typer.testing import CliRunner
 
 from bodyscan.arrays import Array
 from bodyscan.cli.main import app
-from bodyscan.errors import FailedWork
+from bodyscan.errors import BadInput, FailedWork
 from bodyscan.evaluation.acceptance import (
     ALL,
-    AcceptanceError,
     PlateRow,
     Readings,
     SpacingRow,
@@ -206,7 +205,7 @@ def test_the_worst_of_all_places_is_judged() -> None:
 def test_a_wrong_file_is_explained(tmp_path: Path, text: str, said: str) -> None:
     path = tmp_path / "acceptance.yaml"
     path.write_text(text)
-    with pytest.raises(AcceptanceError, match=said):
+    with pytest.raises(BadInput, match=said):
         load_acceptance(path)
 
 
