@@ -10,7 +10,7 @@ import numpy as np
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.calibration.boundary_points import BoundaryPoints
-from bodyscan.geometry.least_squares import EXACT, Block, Noise, Solution, minimize
+from bodyscan.geometry.least_squares import EXACT, Block, Noise, minimize
 from bodyscan.geometry.light_planes import Axis, LightPlanes, SmoothSheets
 from bodyscan.geometry.linear_gaussian import invert_scaled
 from bodyscan.geometry.robust import cauchy_weights, robust_scale
@@ -96,7 +96,12 @@ def fit_sheets(
     by_point = sheets.offset(data.points, sheets.evaluate(data.index.astype(float))).by_point
     covariance = solution.covariance
     if board_error_mm > 0.0:
-        covariance = covariance + _board_covariance(solution, data, by_point, board_error_mm)
+        weights = solution.weights[0] / (points.sigma * solution.scales[0]) ** 2
+        one = np.zeros_like(data.index)
+        (by_boards,) = _board_covariance(
+            covariance[None], points.jacobian, by_point, weights, data, one, board_error_mm
+        )
+        covariance = covariance + by_boards
     return SheetFit(
         replace(sheets, covariance=0.5 * (covariance + covariance.T)),
         points.residuals / np.linalg.norm(by_point, axis=1),
@@ -126,20 +131,31 @@ def _blocks(sheets: SmoothSheets, data: BoundaryPoints) -> tuple[Block, Block]:
 
 
 def _board_covariance(
-    solution: Solution[Sheets], data: BoundaryPoints, by_point: Array, board_error_mm: float
+    covariance: Array,
+    jacobian: Array,
+    by_point: Array,
+    weights: Array,
+    data: BoundaryPoints,
+    fit: Indices,
+    board_error_mm: float,
 ) -> Array:
-    """Covariance due to each board's pose error: a sandwich estimator with boards as clusters."""
-    points, noise = solution.blocks[0], solution.covariance
-    errors = data.board_errors
+    """Covariance (F, P, P) due to each board's pose error, of F fits of separate points: a sandwich
+    estimator with boards as clusters.
+
+    covariance: (F, P, P) due to the noise of the points.
+    jacobian, by_point: derivatives of the offsets by the parameters (N, P), by the points (N, 3).
+    weights: inverse variances of the offsets, (N,).
+    fit: the fit that each point belongs to, (N,).
+    """
+    errors, boards = data.board_errors, int(data.board.max()) + 1
     residual = np.einsum("ni,ni->n", by_point, errors.along_ray)
-    weights = solution.weights[0] / (points.sigma * solution.scales[0]) ** 2
-    effects = errors.effects * (residual * weights)[:, None]
-    total = np.zeros_like(noise)
-    for board in np.unique(data.board):
-        rows = data.board == board
-        change = board_error_mm * noise @ (points.jacobian[rows].T @ effects[rows])
-        total += change @ change.T
-    return total
+    effects = np.nan_to_num(residual * weights)[:, None] * errors.effects
+    products = np.einsum("ni,nj->ijn", jacobian, effects)
+    cell, cells = fit * boards + data.board, len(covariance) * boards
+    gradient = [[np.bincount(cell, column, cells) for column in row] for row in products]
+    by_board = np.transpose(gradient, (2, 0, 1)).reshape(len(covariance), boards, -1, 3)
+    change = board_error_mm * covariance[:, None] @ by_board
+    return np.einsum("fbik,fbjk->fij", change, change)
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,34 +247,16 @@ def _covariance(
     degrees of freedom, plus what board errors of board_error_mm add."""
     known = np.isfinite(planes[:, 0])
     covariance = np.full((len(planes), 4, 4), np.nan)
-    normals = planes[known, :3]
     # A plane's degrees of freedom: two directions perpendicular to the normal, and the offset.
-    helper = np.where(np.abs(normals[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
-    first = np.cross(normals, helper)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    basis = np.zeros((len(normals), 4, 3))
-    basis[:, :3, 0], basis[:, :3, 1] = first, np.cross(normals, first)
-    basis[:, 3, 2] = 1.0
+    axes = np.linalg.svd(planes[known, None, :3])[2]
+    basis = np.zeros((len(axes), 4, 3))
+    basis[:, :3, :2], basis[:, 3, 2] = axes[:, 1:].transpose(0, 2, 1), 1.0
     transposed = basis.transpose(0, 2, 1)
-    inverse = basis @ invert_scaled(transposed @ moments[known] @ basis)
-    inverse = inverse @ transposed
-    covariance[known] = inverse
+    covariance[known] = basis @ invert_scaled(transposed @ moments[known] @ basis) @ transposed
     if board_error_mm > 0.0:
-        change = inverse[:, None] @ _board_gradients(planes, data, weights)[known]
-        covariance[known] += board_error_mm**2 * np.einsum("nbik,nbjk->nij", change, change)
+        homogeneous = np.column_stack([data.points, np.ones(len(data.points))])
+        normals = planes[data.index, :3]
+        covariance += _board_covariance(
+            covariance, homogeneous, normals, weights, data, data.index, board_error_mm
+        )
     return covariance
-
-
-def _board_gradients(planes: Array, data: BoundaryPoints, weights: Array) -> Array:
-    """Change of each plane's right-hand side per mm of each board error, (S + 1, boards, 4, 3)."""
-    errors = data.board_errors
-    residual = np.sum(planes[data.index, :3] * errors.along_ray, axis=1)
-    effects = np.nan_to_num(residual * weights)[:, None] * errors.effects
-    homogeneous = np.column_stack([data.points, np.ones(len(data.points))])
-    boards = int(data.board.max()) + 1
-    cell, cells = data.index * boards + data.board, len(planes) * boards
-    gradient = np.empty((cells, 4, 3))
-    for i in range(4):
-        for j in range(3):
-            gradient[:, i, j] = np.bincount(cell, homogeneous[:, i] * effects[:, j], cells)
-    return gradient.reshape(len(planes), boards, 4, 3)
