@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from bodyscan.arrays import Array, Indices
+from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import LocatedView, PlanarView
 from bodyscan.calibration.boundary_points import (
     BoundaryPoints,
@@ -135,9 +135,18 @@ def calibrate_pair(pair: LocatedPair) -> Outcome[PairCalibration]:
     code = pair.projector
     if code is None:
         return Outcome(calibration)
-    consistent = drop_inconsistent(pair.name, pair.camera, code, pair.shots)
-    shots, notes = consistent.value, consistent.notes
+    shots, notes = pair.shots, list[str]()
     points = locate_boundaries_on_boards(pair.name, pair.camera, code, shots)
+    odd = find_odd_board(points, code.stripes, code.direction)
+    if odd is not None:
+        number, off_mm = odd
+        notes.append(
+            f"{pair.name}: the stripes of shot {shots[number].view.shot} do not fit the others', with "
+            f"which the boards disagree by {off_mm:.2g} mm, and are not used. Possible causes: the "
+            "board or the projector moved during the sequence; images of several shots are mixed up"
+        )
+        shots = (*shots[:number], *shots[number + 1 :])
+        points = locate_boundaries_on_boards(pair.name, pair.camera, code, shots)
     fit = fit_light_sheets(points, code.stripes, code.direction)
     offsets = board_offsets(points, fit.sheets)
     quality = replace(
@@ -163,37 +172,6 @@ def calibrate_pair(pair: LocatedPair) -> Outcome[PairCalibration]:
         replace(calibration, sheets=sheets, crossing=across[0] if across else None),
         (*notes, *crossing.notes),
     )
-
-
-def drop_inconsistent(
-    name: str, camera: Camera, code: StripeCode, shots: Sequence[StripedView]
-) -> Outcome[tuple[StripedView, ...]]:
-    """Drop shots whose stripes lie where the light of the others cannot put them.
-
-    Raises PairFailed if the projector moved between two shots.
-    """
-    points = locate_boundaries_on_boards(name, camera, code, shots)
-    split = find_projector_motion(points, code.stripes, code.direction)
-    if split is None:
-        return Outcome(tuple(shots))
-    names = [shot.view.shot for shot in shots]
-    misfit = f"{split.joint_px:.1f} px RMS as one group, {split.separate_px:.1f} px as two"
-    others = ", ".join(names[k] for k in split.others)
-    if split.moved:
-        raise PairFailed(
-            f"the stripes changed between shots {names[split.kept[-1]]} and "
-            f"{names[split.others[0]]} ({misfit}). Possible causes: the projector moved; the images "
-            f"of {others} are mixed up",
-            where=f"pair {name}",
-            remedy="fasten it and capture the boards again, or delete the shots before it moved",
-        )
-    plural = "s" if len(split.others) > 1 else ""
-    note = (
-        f"{name}: the stripes of shot{plural} {others} do not fit the others' ({misfit}) and are not "
-        "used. Possible causes: the board or the projector moved during the sequence; images of "
-        "several shots are mixed up"
-    )
-    return Outcome(tuple(shot for k, shot in enumerate(shots) if k not in split.others), (note,))
 
 
 @dataclass(frozen=True, eq=False)
@@ -277,63 +255,56 @@ def _fit_crossing(
     return Outcome(_Light(fit.sheets, crossed, points), (note,))
 
 
-MAX_MISFIT_PX = 0.4
-"""Boards that agree this well are not examined further."""
-MIN_GROUP = 3
-"""Two boards agree on nearly any light."""
+MAX_DISAGREEMENT_PX = 0.4
+MAX_DISAGREEMENT = 1e-3
+"""Boards agree if their stripes lie so few pixels from common sheets, or if they measure the boards
+so near their corners, as a share of their distance: that much a board's bend and its pose are off."""
 
 
-@dataclass(frozen=True, eq=False)
-class ProjectorMotion:
-    """A split of the boards into two groups, each of which is consistent with one light.
+def find_odd_board(data: BoundaryPoints, stripes: int, direction: Axis) -> tuple[int, float] | None:
+    """Find the board without which the others agree on the light; None if all of them do.
 
-    kept, others: numbers of the boards in each group, in the order of the shots; `others` are a few
-        that do not fit or, where the projector `moved`, all that were taken afterwards.
-    joint_px, separate_px: RMS misfit of the stripes with one light for all boards, and with one for
-        each group.
-    """
+    data: its `board` counts the shots. Of fewer than three boards nothing is known.
 
-    kept: Indices
-    others: Indices
-    joint_px: float
-    separate_px: float
-    moved: bool = False
-
-
-def find_projector_motion(
-    data: BoundaryPoints, stripes: int, direction: Axis
-) -> ProjectorMotion | None:
-    """Split the boards into groups with different light; None if all agree or there are fewer than
-    three.
-
-    data: its `board` counts in the order of the shots.
-
-    Raises PairFailed if the misfit is larger than a stripe and no split explains it.
+    Returns the board and by how many mm all of them disagree. Raises PairFailed if they do and leaving
+    one out does not make the rest agree three times better, or leaves two, which agree on any light.
     """
     few = subsample(data, 1200)
     boards = np.unique(few.board)
     if len(boards) < 3:
         return None
-    joint = _misfit(few, [boards], stripes, direction)
-    if joint < MAX_MISFIT_PX:
+    ratio, off_mm = _disagreement(few, stripes, direction)
+    if ratio < 1.0:
         return None
-    best, separate = None, joint
-    for split in _candidate_splits(
-        boards, joint, lambda groups: _misfit(few, groups, stripes, direction)
-    ):
-        if 3.0 * split.separate_px < separate:
-            best, separate = split, split.separate_px
-        if separate < MAX_MISFIT_PX:
-            break
-    if best is None and joint > (width := _stripe_width(few)):
-        raise PairFailed(
-            f"no projector explains the stripes on {len(boards)} boards, nor those on most of them: "
-            f"the misfit is {joint:.1f} px, a stripe is {width:.1f} px wide. Possible causes: images "
-            "of several shots are mixed up; `stripes` or `direction` is wrong",
-            remedy="check that the lit image and the patterns of each shot belong together, and "
-            "`stripes` and `direction` in the rig file",
-        )
-    return best
+    if len(boards) > 3:
+        without = (select(few, few.board != board) for board in boards)
+        ratios = [_disagreement(rest, stripes, direction)[0] for rest in without]
+        if min(ratios) < min(1.0, ratio / 3.0):
+            return int(boards[np.argmin(ratios)]), off_mm
+    raise PairFailed(
+        f"the sheets of light of {len(boards)} boards disagree by {off_mm:.2g} mm, and leaving "
+        "out one does not help. Possible causes: the projector moved against its camera between them; "
+        "images of several shots are mixed up; `stripes` or `direction` in the rig file is wrong",
+        remedy="fasten the projector and capture the boards again, or delete the shots from before "
+        "it moved; check that the lit image and the patterns of each shot belong together",
+    )
+
+
+def _disagreement(data: BoundaryPoints, stripes: int, direction: Axis) -> tuple[float, float]:
+    """Compute by how much boards disagree with sheets fitted to all, relative to what is allowed, and
+    as the RMS offset of the boards from their corners, mm.
+
+    Medians over each board, signed, so that noise and uneven stripes are no disagreement. The sheets
+    may bow, so that no kind of projector is mistaken for one that moved.
+    """
+    pinhole = fit_pinhole(data.points, data.index.astype(float))
+    plain = LensSheets.from_matrix(pinhole, data.points.mean(axis=0), stripes, direction)
+    fit = fit_sheets(BowedSheets.from_pinhole(plain, 1), data, max_steps=12)
+    pixels = fit.distances_mm / np.linalg.norm(data.per_pixel, axis=1)
+    off_px = rms(np.array([np.median(pixels[data.board == k]) for k in np.unique(data.board)]))
+    off_mm = rms(board_offsets(data, fit.sheets))
+    allowed_mm = MAX_DISAGREEMENT * float(np.median(data.points[:, 2]))
+    return min(off_px / MAX_DISAGREEMENT_PX, off_mm / allowed_mm), off_mm
 
 
 def board_offsets(data: BoundaryPoints, sheets: LightSheets) -> Array:
@@ -347,65 +318,3 @@ def board_offsets(data: BoundaryPoints, sheets: LightSheets) -> Array:
     known = np.isfinite(offset)
     offset, board = offset[known], data.board[known]
     return np.array([np.median(offset[board == k]) for k in np.unique(board)], np.float64)
-
-
-Misfit = Callable[[Sequence[Indices]], float]
-
-
-def _candidate_splits(boards: Indices, joint: float, misfit: Misfit) -> Iterator[ProjectorMotion]:
-    """Yield possible splits, simplest first: without one board, in time, without several.
-
-    Boards are dropped one after another, each time the one without which the others agree best, while
-    most boards are left and their agreement still means something.
-    """
-    kept, min_kept = boards, max(MIN_GROUP, len(boards) // 2 + 1)
-    while len(kept) > min_kept or kept is boards:
-        separate, dropped = min((misfit([kept[kept != board]]), board) for board in kept)
-        first = kept is boards
-        kept = kept[kept != dropped]
-        yield ProjectorMotion(kept, np.setdiff1d(boards, kept), joint, separate)
-        if first and len(boards) > 3:
-            yield _split_in_time(boards, joint, misfit)
-
-
-def _split_in_time(boards: Indices, joint: float, misfit: Misfit) -> ProjectorMotion:
-    """Split all boards before a shot from all after it, where the groups agree best.
-
-    If only two boards come first, their agreement means nothing: they are dropped, and the others
-    determine the projector.
-    """
-    cuts = range(2, len(boards) - 1)
-    separate, first = min((misfit([boards[:cut], boards[cut:]]), cut) for cut in cuts)
-    before, after = boards[:first], boards[first:]
-    if first < MIN_GROUP <= len(after):
-        return ProjectorMotion(after, before, joint, separate)
-    return ProjectorMotion(before, after, joint, separate, moved=True)
-
-
-def _stripe_width(data: BoundaryPoints) -> float:
-    """Estimate the width of a stripe, px: distance of neighbouring boundaries, median over boards."""
-    across = np.sum(data.points * data.per_pixel, axis=1) / np.sum(data.per_pixel**2, axis=1)
-    index, boards = data.index.astype(float), (data.board == k for k in np.unique(data.board))
-    slopes = [np.polyfit(index[rows], across[rows], 1)[0] for rows in boards]
-    return float(np.median(np.abs(slopes)))
-
-
-def _misfit(
-    data: BoundaryPoints, groups: Sequence[Indices], stripes: int, direction: Axis
-) -> float:
-    """Compute the RMS over boards of the median distance (px) of stripes from their group's sheets.
-
-    The sheets may bow, so that no kind of projector is mistaken for one that moved.
-    """
-    medians = []
-    for group in groups:
-        points = select(data, np.isin(data.board, group))
-        pinhole, middle = (
-            fit_pinhole(points.points, points.index.astype(float)),
-            points.points.mean(0),
-        )
-        plain = LensSheets.from_matrix(pinhole, middle, stripes, direction)
-        fit = fit_sheets(BowedSheets.from_pinhole(plain, 1), points, max_steps=12)
-        distance = np.abs(fit.distances_mm) / np.linalg.norm(points.per_pixel, axis=1)
-        medians += [float(np.median(distance[points.board == board])) for board in group]
-    return float(np.sqrt(np.mean(np.square(medians))))

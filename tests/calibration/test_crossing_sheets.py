@@ -64,6 +64,7 @@ def calibrated(
     poses: Sequence[RigidTransform] = POSES,
     corner_px: float = 0.01,
     print_mm: float = 0.0,
+    odd: int | None = None,
     seed: int = 5,
 ) -> Outcome[PairCalibration]:
     rng = np.random.default_rng(seed)
@@ -73,8 +74,9 @@ def calibrated(
     for number, pose in enumerate(poses):
         pixels = CAMERA.project(pose.apply(printed))
         pixels += corner_px * rng.standard_normal(pixels.shape)
-        across = boundaries(pose, 1, rng) if number < crossed else None
-        seen = replace(boundaries(pose, 0, rng), crossing=across)
+        lit = poses[number - 1] if number == odd else pose
+        across = boundaries(lit, 1, rng) if number < crossed else None
+        seen = replace(boundaries(lit, 0, rng), crossing=across)
         view = LocatedView("p", f"b{number}", "board", points, pixels, pose)
         shots.append(StripedView(view, BOARD, seen))
         views.append(PlanarView(view.shot, points, pixels))
@@ -170,3 +172,12 @@ def test_a_pair_does_without_crossing_stripes_that_give_no_sheets() -> None:
     assert found.value.sheets is not None
     assert found.value.crossing is None
     assert any("crossing stripes are not used: stripes were decoded on 1" in n for n in found.notes)
+
+
+def test_a_shot_with_stripes_of_another_is_left_out_and_named() -> None:
+    found = calibrated(alone=False, odd=2)
+    assert found.value.quality.stripe_shots == len(POSES) - 1
+    assert any("p: the stripes of shot b2 do not fit the others'" in note for note in found.notes)
+    true, *measured_by = depths(found.value)
+    for depth in measured_by:
+        assert np.median(np.abs(depth - true)) < 0.05

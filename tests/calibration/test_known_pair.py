@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from bodyscan.calibration.known_pair import _projector, _require_baseline, parameter_sigmas
+from bodyscan.calibration.model_selection import HeldOutModel
+from bodyscan.calibration.pair import PairQuality
 from bodyscan.errors import CalibrationFileError
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.opencv import Radial
@@ -74,3 +76,21 @@ def test_each_parameter_by_itself_moves_no_pixel_by_more_than_sigma() -> None:
         moved = camera.retract(1e-3 * sigma * np.eye(len(sigmas))[k])
         shift = 1e3 * np.linalg.norm(moved.project(rays) - pixels, axis=1)
         assert shift.max() == pytest.approx(0.5, rel=0.01)
+
+
+def test_light_that_another_program_calibrated_is_called_so_and_other_light_by_its_model() -> None:
+    tried = tuple(
+        HeldOutModel(name, 0.1, 0.1, 0.1, 1.0, name == "lens") for name in ("planes", "lens")
+    )
+    assert PairQuality(0.1, 5, held_out=tried).light_model == "lens"
+    assert PairQuality(0.1, 5, held_out=tried[:1]).light_model is None
+    assert (
+        PairQuality(None, 0, imported="theirs.json", stripes_projected=63).light_model == "imported"
+    )
+    # A camera alone, without light of its own.
+    camera = PairQuality(None, 0, imported="theirs.json")
+    assert camera.light_model is None
+    # Nothing is known of the accuracy of what was imported without a sigma.
+    assert camera.unjudged
+    assert not PairQuality(None, 0, imported="theirs.json", imported_sigma_px=0.0).unjudged
+    assert not PairQuality(0.1, 5).unjudged
