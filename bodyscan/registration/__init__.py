@@ -2,5 +2,5 @@
 
 Read in this order: rig_solve (the whole), view_graph, joint_solve, view_consistency, board_shape,
 rig_lenses, references, rig_frame, cluster_covariance, rig_calibration (the result), storage,
-soundness. Checks: board_checks, drift, calibration_verdict. What to do next: advice.
+sanity_checks. Checks: board_checks, drift, calibration_verdict. What to do next: advice.
 """

@@ -3,5 +3,5 @@
 page holds what a report is made of, and result_page finds what a folder holds. scan_page,
 calibration_page (with calibration_charts) and acceptance_page make their reports. pictures shades
 bodies; charts uses Matplotlib; model packs what can be rotated.
-measurements: a table on screen.
+measurement_table: measurements on screen, as JSON and as CSV.
 """

@@ -1,4 +1,4 @@
 """The rig file (`rig`): what a rig consists of, and its mistakes by line.
 
-board, pair, rig_frame: its parts. frame_names, templates: how images are named.
+board, pair, gauge (what fixes frame and size): its parts. frame_names, templates: how images are named.
 """

@@ -1,1 +1,1 @@
-"""Decoding of Gray and plain binary codes: bit_patterns, of bit_words, with sequence_checks."""
+"""Decoding of Gray and plain binary codes: decoding, of bit_words, with sequence_checks."""
