@@ -175,9 +175,8 @@ def _report_calibration(output: Output, found: RigCalibration, saved: Path) -> N
         output.show(tables.calibration_table(found))
         output.figures(**tables.calibration_figures(found))
     output.say(*found.advice)
-    output.failures(found.failed, "")
     verdict = grade_calibration(found)
-    output.verdict(verdict)
+    output.verdict(verdict, found.failed)
     output.add_files("calibration", saved)
     output.exit_code = 1 if verdict.mark == "bad" else 0
 
@@ -244,7 +243,7 @@ def refine_rig(
         found = refine(rig, open_scan(rig.rig, folder), folder.name, progress)
     archive_previous(out)
     saved = save_calibration(found.value, out)
-    output.failures(found.failures, "left out")
+    output.failures(found.failures)
     output.say(*found.notes)
     output.add_files("calibration", saved)
 
@@ -281,4 +280,5 @@ def export_rig(
     written = write(load_calibration(calibration), out, formats.split(","))
     for path in written.value:
         output.add_files("rig", path)
-    output.report(written)
+    output.notes(written.notes)
+    output.failures(written.failures)

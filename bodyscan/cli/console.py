@@ -36,7 +36,6 @@ from bodyscan.verdict import STYLES, Verdict
 if TYPE_CHECKING:
     from rich.progress import Progress as Bar
 
-    from bodyscan.outcome import Outcome
 
 # Tables keep their lines whole when the output goes into a file.
 CONSOLE = Console(width=None if sys.stdout.isatty() or "COLUMNS" in os.environ else 120)
@@ -100,11 +99,9 @@ class Output:
         if len(every) > 20 and not self.verbose:
             self._print(f"and {len(every) - 20} more: see --verbose", style="yellow")
 
-    def failures(self, failures: Mapping[str, str], what: str = "failed") -> None:
-        """Report pairs that were lost, with the reason; `what` "": --json alone, a verdict says it."""
+    def failures(self, failures: Mapping[str, str], what: str = "left out") -> None:
+        """Report pairs that were lost, with the reason."""
         self._failures |= failures
-        if not what:
-            return
         parts = {name: reason.partition("\n") for name, reason in failures.items()}
         for name, (reason, _, _) in parts.items():
             self._print(f"{what}: {name}: {reason}", style="red")
@@ -115,14 +112,10 @@ class Output:
         """Turn a failure of the block, whose work is not essential, into a note."""
         return optional(what, lambda line: self.notes([line]))
 
-    def report(self, outcome: Outcome[Any], what: str = "left out") -> None:
-        """Report notes and failures of a step."""
-        self.notes(outcome.notes)
-        self.failures(outcome.failures, what)
-
-    def verdict(self, verdict: Verdict) -> None:
-        """A grade and its reasons."""
+    def verdict(self, verdict: Verdict, failed: Mapping[str, str] | None = None) -> None:
+        """A grade and its reasons, which tell people of `failed` pairs; --json lists these."""
         self._verdict = verdict
+        self._failures |= failed or {}
         self._print(str(verdict), style=STYLES[verdict.mark], wrong=verdict.mark == "bad")
 
     @contextmanager
