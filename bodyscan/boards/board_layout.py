@@ -73,7 +73,12 @@ def marker_corners(board: Board, face: int = 0) -> tuple[Indices, Array]:
     count = board.marker_count // board.faces
     ids = board.first_marker + face * count + np.arange(count)
     if board.kind == "aprilgrid":
-        return ids, _tag_corners(board)
+        x, y = _lines(board, board.columns), _lines(board, board.rows)
+        columns, rows = np.meshgrid(np.arange(board.columns), np.arange(board.rows)[::-1])
+        column, row = columns.ravel(), rows.ravel()
+        left, right, top, bottom = x[2 * column], x[2 * column + 1], y[2 * row], y[2 * row + 1]
+        tags = np.stack([left, top, right, top, right, bottom, left, bottom], axis=-1)
+        return ids, tags.reshape(-1, 4, 2)
     charuco = cv2.aruco.CharucoBoard(
         (board.columns, board.rows),
         board.square_mm,
@@ -84,12 +89,3 @@ def marker_corners(board: Board, face: int = 0) -> tuple[Indices, Array]:
     charuco.setLegacyPattern(board.legacy_layout)
     corners = np.asarray(charuco.getObjPoints(), float).reshape(-1, 4, 3)[..., :2]
     return ids, corners
-
-
-def _tag_corners(board: Board) -> Array:
-    x, y = _lines(board, board.columns), _lines(board, board.rows)
-    columns, rows = np.meshgrid(np.arange(board.columns), np.arange(board.rows)[::-1])
-    column, row = columns.ravel(), rows.ravel()
-    left, right, top, bottom = x[2 * column], x[2 * column + 1], y[2 * row], y[2 * row + 1]
-    corners = np.stack([left, top, right, top, right, bottom, left, bottom], axis=-1)
-    return corners.reshape(-1, 4, 2)

@@ -368,9 +368,12 @@ def _collect_sequences(
     """Collect what each pair took in a shot, by captures.yaml or, without a list, by the files."""
     look = shot.stripes is None and shot.lit is None
     templates = {name: template.replace("{exposure}", name) for name in rig.exposures or ("",)}
+    first = next(iter(templates.values()))
+    frames = rig.frames.sequence_names(None) if has_field(first, "frame") else ("",)
     for pair in rig.pairs:
         whole = _collect_stripes(rig, listing, templates, shot.name, pair)
-        alone = _collect_board_image(rig, listing, next(iter(templates.values())), shot.name, pair)
+        paths, missing = _locate(listing, first, shot.name, pair, frames)
+        alone = ImageSequence(pair.name, shot.name, paths[0], None, (), missing) if paths else None
         stripes, lit = pair.name in (shot.stripes or ()), pair.name in (shot.lit or ())
         if (stripes and not whole.coded) or (lit and alone is None):
             raise CaptureError(
@@ -416,15 +419,6 @@ def _collect_stripes(
         longer=tuple(found[1:]),
         crossing=tuple(path for one in found for path in one.crossing),
     )
-
-
-def _collect_board_image(
-    rig: Rig, listing: Listing, template: str, shot: str, pair: Pair
-) -> ImageSequence | None:
-    """Collect the board image alone; None if none is taken."""
-    frames = rig.frames.sequence_names(None) if has_field(template, "frame") else ("",)
-    paths, missing = _locate(listing, template, shot, pair, frames)
-    return ImageSequence(pair.name, shot, paths[0], None, (), missing) if paths else None
 
 
 def _locate(

@@ -274,23 +274,18 @@ def merge_exposures(stacks: Sequence[Greys], names: Sequence[str], where: str) -
         start, unit = lines[-1]
         lines.append((start + unit * offset, unit * slope))
     merged = np.empty(stacks[0].shape, np.float32)
-    for image in range(len(merged)):
-        merged[image] = _merge_image([stack[image] for stack in stacks], lines)
+    for number, (shortest, *longer) in enumerate(zip(*stacks, strict=True)):
+        total = shortest.astype(np.float32)
+        weights = np.ones_like(total)
+        for image, (offset, slope) in zip(longer, lines[1:], strict=True):
+            level = image.astype(np.float32)
+            # The sensor's noise shrinks with the unit: the weight is its inverse variance. Sensors
+            # become non-linear below white: from 215 to 245 it falls to zero.
+            weight = np.clip((245.0 - level) / 30.0, 0.0, 1.0) / np.float32(slope * slope)
+            total += weight * (np.float32(offset) + np.float32(slope) * level)
+            weights += weight
+        merged[number] = np.clip(total / weights, 0.0, 255.0)
     return merged
-
-
-def _merge_image(images: Sequence[Greys], lines: Sequence[tuple[float, float]]) -> Floats:
-    """Merge one image (H, W); lines: offset and slope that bring each exposure to the shortest."""
-    total = images[0].astype(np.float32)
-    weights = np.ones_like(total)
-    for image, (offset, slope) in zip(images[1:], lines[1:], strict=True):
-        level = image.astype(np.float32)
-        # The sensor's noise shrinks with the unit: the weight is its inverse variance. Sensors
-        # become non-linear below white: from 215 to 245 it falls to zero.
-        weight = np.clip((245.0 - level) / 30.0, 0.0, 1.0) / np.float32(slope * slope)
-        total += weight * (np.float32(offset) + np.float32(slope) * level)
-        weights += weight
-    return np.clip(total / weights, 0.0, 255.0)
 
 
 def _fit_exposures(

@@ -80,7 +80,10 @@ def read_sphere(points: Array, normals: Array, near: Sphere, radius_mm: float) -
     fitted = fit_sphere(points[inliers])
     residual = _drop_farthest(fitted.distances(points[inliers]))
     form_mm, size_mm = float(np.ptp(residual)), 2.0 * (fitted.radius - radius_mm)
-    return SphereReading(fitted, int(inliers.sum()), form_mm, _shell_width(residual), size_mm)
+    # The narrowest interval with nine tenths of the distances, as of ISO 20685-2.
+    ordered, count = np.sort(residual), max(1, round(0.9 * len(residual)))
+    shell_mm = float(np.min(ordered[count - 1 :] - ordered[: len(ordered) - count + 1]))
+    return SphereReading(fitted, int(inliers.sum()), form_mm, shell_mm, size_mm)
 
 
 def require_spheres(readings: Sequence[SphereReading], radius_mm: float, centres_mm: Array) -> None:
@@ -130,8 +133,9 @@ def read_plate(points: Array, normals: Array) -> PlateReading:
     on_plate = points[near]
     flat = on_plate @ null_space(normal[None])
     joined = _largest_piece(flat)
-    inside, area = _within_rim(flat[joined])
-    kept = on_plate[joined][inside]
+    hull = ConvexHull(flat[joined])
+    inward = -(flat[joined] @ hull.equations[:, :2].T + hull.equations[:, 2])
+    kept = on_plate[joined][inward.min(axis=1) > 12.0]  # mm from the rim
     if len(kept) < MIN_PLATE_POINTS:
         raise FailedWork("no plate is among the points")
     normal, offset = fit_plane(kept)
@@ -143,7 +147,9 @@ def read_plate(points: Array, normals: Array) -> PlateReading:
             "plane",
             remedy="check that the folder shows the plate",
         )
-    return PlateReading(len(kept), float(np.ptp(_drop_farthest(residual))), rms(residual), area)
+    return PlateReading(
+        len(kept), float(np.ptp(_drop_farthest(residual))), rms(residual), hull.volume
+    )
 
 
 def _drop_farthest(residual: Array) -> Array:
@@ -151,13 +157,6 @@ def _drop_farthest(residual: Array) -> Array:
     size = np.abs(residual)
     kept = max(1, round((1.0 - 0.003) * len(residual)))
     return residual[np.argsort(size, kind="stable")[:kept]]
-
-
-def _shell_width(residual: Array) -> float:
-    """Width of the narrowest interval with nine tenths of the distances (N,), as of ISO 20685-2."""
-    ordered = np.sort(residual)
-    count = max(1, round(0.9 * len(ordered)))
-    return float(np.min(ordered[count - 1 :] - ordered[: len(ordered) - count + 1]))
 
 
 def _largest_plane(points: Array, rng: np.random.Generator) -> tuple[Array, float]:
@@ -183,10 +182,3 @@ def _largest_piece(flat: Array) -> Mask:
     occupied[tuple(cells.T)] = True
     piece = ndimage.label(occupied, np.ones((3, 3)))[0][tuple(cells.T)]
     return np.asarray(piece == np.argmax(np.bincount(piece)))
-
-
-def _within_rim(flat: Array) -> tuple[Mask, float]:
-    """Which flat points (N, 2) lie 12 mm or more inside their hull, (N,), and its area."""
-    hull = ConvexHull(flat)
-    inward = -(flat @ hull.equations[:, :2].T + hull.equations[:, 2])
-    return inward.min(axis=1) > 12.0, float(hull.volume)

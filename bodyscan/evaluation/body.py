@@ -15,7 +15,7 @@ from bodyscan.geometry.camera import camera_from_fields
 from bodyscan.geometry.camera_tables import is_in_image
 from bodyscan.geometry.robust import rms
 from bodyscan.geometry.transforms import RigidTransform, fit_rigid_transform
-from bodyscan.measurement.measurements import Measurements, Slice, measure
+from bodyscan.measurement.measurements import Measurements, measure
 from bodyscan.mesh.body import BodyMesh
 
 STEP_MM = 20.0
@@ -74,19 +74,15 @@ def girth_errors(mesh: BodyMesh, true: Measurements, *, mean_breath: bool = Fals
     """
     ours = measure(mesh, [one.height_mm for one in true.slices], mean_breath=mean_breath)
     both = zip(ours.slices, true.slices, strict=True)
-    found = {one.height_mm: _trunk_error(one, other) for one, other in both}
-    errors = {height: error for height, error in found.items() if error is not None}
+    errors = {}
+    for one, other in both:
+        found, wanted = one.find_girth("trunk"), other.find_girth("trunk")
+        if found and wanted and found.measured_skin >= WHOLE:
+            errors[one.height_mm] = found.tape_mm - wanted.tape_mm
     sizes = np.abs(list(errors.values())) if errors else np.array([np.nan])
     worst_at = list(errors)[int(np.argmax(sizes))] if errors else float("nan")
     stature_mm = ours.stature_mm - true.stature_mm
     return GirthErrors(len(errors), rms(sizes), float(sizes.max()), worst_at, stature_mm)
-
-
-def _trunk_error(ours: Slice, true: Slice) -> float | None:
-    one, other = ours.find_girth("trunk"), true.find_girth("trunk")
-    if one is None or other is None or one.measured_skin < WHOLE:
-        return None
-    return one.tape_mm - other.tape_mm
 
 
 def measure_visible_coverage(

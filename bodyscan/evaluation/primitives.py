@@ -115,15 +115,8 @@ def _fit_algebraically(points: Array) -> Sphere:
 
 @dataclass(frozen=True, eq=False)
 class Flatness:
-    """Flatness of points measured on a plane.
+    """RMS of the distances of points from the best plane, and of their smooth part."""
 
-    normal, offset_mm: the best plane, normal . p = offset.
-    rms_mm, systematic_rms_mm: RMS of the points' distances from it, and of their smooth part.
-    """
-
-    points: int
-    normal: Array
-    offset_mm: float
     rms_mm: float
     systematic_rms_mm: float
 
@@ -151,7 +144,7 @@ def measure_flatness(points: Array, degree: int = 6) -> Flatness:
     normal, offset = fit_plane(points)
     distances = points @ normal - offset
     smooth = fit_polynomial(points, distances, degree)
-    return Flatness(len(points), normal, offset, rms(distances), rms(smooth))
+    return Flatness(rms(distances), rms(smooth))
 
 
 def fit_polynomial(points: Array, values: Array, degree: int = 6) -> Array:

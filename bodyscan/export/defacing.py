@@ -105,13 +105,6 @@ def deface(mesh: BodyMesh, neck: Neck) -> BodyMesh:
         cap = vertices[rim].mean(axis=0)[None] if number else _dome(vertices[rim], crown_mm)
         faces = np.concatenate([faces, _stitch(rim, len(vertices), len(cap))])
         vertices = np.concatenate([vertices, cap])
-    return _attach_attributes(mesh, head, used, vertices, faces)
-
-
-def _attach_attributes(
-    mesh: BodyMesh, head: Mask, used: Indices, vertices: Array, faces: Indices
-) -> BodyMesh:
-    """Make the mesh: what is kept unchanged, what is added grey, filled and without sigma."""
     added = len(vertices) - len(used)
     filled = mesh.filled[~head]
     return BodyMesh(
@@ -178,7 +171,9 @@ def _dome(rim: Array, crown_mm: float, rings: int = 40) -> Array:
     # Shares of the height from neck to crown: half the head's length and breadth, where it is
     # widest, and where the neck's shape ends.
     half_length, half_breadth, widest, neck_end = 0.36, 0.28, 0.52, 0.45
-    line = _smooth(rim)  # the rim itself zigzags from face to face
+    waves = np.fft.rfft(rim, axis=0)  # the rim itself zigzags from face to face
+    waves[5:] = 0.0
+    line = np.fft.irfft(waves, len(rim), axis=0)
     centre = line[:, :2].mean(axis=0)
     arm, ahead = line[:, :2] - centre, np.roll(line, -1, axis=0)[:, :2] - line[:, :2]
     turns = np.sign((arm[:, 0] * ahead[:, 1] - arm[:, 1] * ahead[:, 0]).sum())
@@ -196,13 +191,6 @@ def _dome(rim: Array, crown_mm: float, rings: int = 40) -> Array:
     z = (1.0 - level[:, None]) * line[:, 2] + level[:, None] * crown_mm
     points = np.concatenate([centre + flat, z[..., None]], axis=-1)
     return np.concatenate([points.reshape(-1, 3), [[*centre, crown_mm]]])
-
-
-def _smooth(line: Array, harmonics: int = 4) -> Array:
-    """Reduce a closed line (N, 3) to its first few harmonics."""
-    waves = np.fft.rfft(line, axis=0)
-    waves[harmonics + 1 :] = 0.0
-    return np.fft.irfft(waves, len(line), axis=0)
 
 
 def _stitch(rim: Indices, start: int, count: int) -> Indices:

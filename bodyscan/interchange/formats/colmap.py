@@ -94,7 +94,6 @@ def read_colmap(folder: Path) -> FoundCameras:
 
 
 def _read_gammas(folder: Path) -> dict[str, float]:
-    """Read the skew of each pair from the file beside the model, if there is one."""
     file = folder / SKEW_FILE
     if not file.is_file():
         return {}
