@@ -139,10 +139,10 @@ def calibrate_pair(pair: LocatedPair) -> Outcome[PairCalibration]:
     points = locate_boundaries_on_boards(pair.name, pair.camera, code, shots)
     odd = find_odd_board(points, code.stripes, code.direction)
     if odd is not None:
-        number, off_mm = odd
+        number, rms_mm = odd
         notes.append(
             f"{pair.name}: the stripes of shot {shots[number].view.shot} do not fit the others', with "
-            f"which the boards disagree by {off_mm:.2g} mm, and are not used. Possible causes: the "
+            f"which the boards disagree by {rms_mm:.2g} mm, and are not used. Possible causes: the "
             "board or the projector moved during the sequence; images of several shots are mixed up"
         )
         shots = (*shots[:number], *shots[number + 1 :])
@@ -273,16 +273,16 @@ def find_odd_board(data: BoundaryPoints, stripes: int, direction: Axis) -> tuple
     boards = np.unique(few.board)
     if len(boards) < 3:
         return None
-    ratio, off_mm = _disagreement(few, stripes, direction)
+    ratio, rms_mm = _disagreement(few, stripes, direction)
     if ratio < 1.0:
         return None
     if len(boards) > 3:
         without = (select(few, few.board != board) for board in boards)
         ratios = [_disagreement(rest, stripes, direction)[0] for rest in without]
         if min(ratios) < min(1.0, ratio / 3.0):
-            return int(boards[np.argmin(ratios)]), off_mm
+            return int(boards[np.argmin(ratios)]), rms_mm
     raise PairFailed(
-        f"the sheets of light of {len(boards)} boards disagree by {off_mm:.2g} mm, and leaving "
+        f"the sheets of light of {len(boards)} boards disagree by {rms_mm:.2g} mm, and leaving "
         "out one does not help. Possible causes: the projector moved against its camera between them; "
         "images of several shots are mixed up; `stripes` or `direction` in the rig file is wrong",
         remedy="fasten the projector and capture the boards again, or delete the shots from before "
@@ -301,10 +301,10 @@ def _disagreement(data: BoundaryPoints, stripes: int, direction: Axis) -> tuple[
     plain = LensSheets.from_matrix(pinhole, data.points.mean(axis=0), stripes, direction)
     fit = fit_sheets(BowedSheets.from_pinhole(plain, 1), data, max_steps=12)
     pixels = fit.distances_mm / np.linalg.norm(data.per_pixel, axis=1)
-    off_px = rms(np.array([np.median(pixels[data.board == k]) for k in np.unique(data.board)]))
-    off_mm = rms(board_offsets(data, fit.sheets))
+    rms_px = rms(np.array([np.median(pixels[data.board == k]) for k in np.unique(data.board)]))
+    rms_mm = rms(board_offsets(data, fit.sheets))
     allowed_mm = MAX_DISAGREEMENT * float(np.median(data.points[:, 2]))
-    return min(off_px / MAX_DISAGREEMENT_PX, off_mm / allowed_mm), off_mm
+    return min(rms_px / MAX_DISAGREEMENT_PX, rms_mm / allowed_mm), rms_mm
 
 
 def board_offsets(data: BoundaryPoints, sheets: LightSheets) -> Array:
