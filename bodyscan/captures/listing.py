@@ -44,8 +44,15 @@ class Listing:
         if not is_link:
             return True
         path = self.root / relative
-        if not self.follow_links:
-            self._refuse_if_outside(path)
+        real = os.path.realpath(path)
+        if not (self.follow_links or Path(real).is_relative_to(self._real_root)):
+            raise CaptureError(
+                f"is a symbolic link that leads out of the capture folder, to {real}",
+                where=str(path),
+                remedy="If it is meant, write `follow_links: true` in the rig file, or say "
+                "--follow-links to `scan` or `check-calibration`; else copy what it points to here, "
+                "or name that folder.",
+            )
         return path.exists()
 
     def find(self, relative: str) -> str:
@@ -89,14 +96,3 @@ class Listing:
         except OSError as error:
             what = f"cannot be read: {error.strerror}"
             raise CaptureError(what, where=str(folder), remedy="Check its permissions.") from None
-
-    def _refuse_if_outside(self, path: Path) -> None:
-        real = os.path.realpath(path)
-        if not Path(real).is_relative_to(self._real_root):
-            raise CaptureError(
-                f"is a symbolic link that leads out of the capture folder, to {real}",
-                where=str(path),
-                remedy="If it is meant, write `follow_links: true` in the rig file, or say "
-                "--follow-links to `scan` or `check-calibration`; else copy what it points to here, "
-                "or name that folder.",
-            )

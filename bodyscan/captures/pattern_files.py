@@ -55,24 +55,20 @@ def write_patterns(rig: Rig, out: Path, width: int, height: int) -> tuple[Path, 
             if any(pair.projector for pair in rig.pairs)
             else "give its pairs a `projector`: docs/formats.md shows how",
         )
-    names = _folder_names(tuple(kinds))
+    names: dict[
+        StripeCode, str
+    ] = {}  # such as gray-640-horizontal, numbered if they would be equal
+    for kind in kinds:
+        directions = "-".join(f"{one.stripes}-{one.direction}" for one in kind.directions)
+        name = f"{kind.code}-{directions}"
+        again = sum(taken.startswith(name) for taken in names.values())
+        names[kind] = f"{name}-{again + 1}" if again else name
     # Make every kind before writing the first: if one does not fit, nothing is written.
     made = {kind: kind.pattern_images(width, height) for kind in kinds}
     return tuple(
         _write_kind(Path(out) / names[kind], rig.frames, kind, pairs, made[kind])
         for kind, pairs in kinds.items()
     )
-
-
-def _folder_names(kinds: tuple[StripeCode, ...]) -> dict[StripeCode, str]:
-    """Make names such as gray-640-horizontal, numbered if they would be equal."""
-    names: dict[StripeCode, str] = {}
-    for kind in kinds:
-        directions = "-".join(f"{one.stripes}-{one.direction}" for one in kind.directions)
-        name = f"{kind.code}-{directions}"
-        again = sum(taken.startswith(name) for taken in names.values())
-        names[kind] = f"{name}-{again + 1}" if again else name
-    return names
 
 
 def _write_kind(

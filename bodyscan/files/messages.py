@@ -66,7 +66,16 @@ def require_writable(folder: Path, *inputs: Path | None) -> None:
 
     It is tested before the work, not after: by writing to the nearest existing folder above.
     """
-    _refuse_overlap(folder, filter(None, inputs))
+    out = folder.resolve()
+    for path in filter(None, inputs):
+        read = (path.parent if path.is_file() else path).resolve()
+        if out == read or read in out.parents or out in read.parents:
+            how = "is" if out == read else "lies inside" if read in out.parents else "contains"
+            raise BadInput(
+                f"{how} {path}, which is read: results would be taken for input, or replace it",
+                where=str(folder),
+                remedy="give --out (or --repair) a folder beside what is read",
+            )
     if folder.exists() and not folder.is_dir():
         raise BadInput(
             "is a file; results go into a folder", where=str(folder), remedy="give another --out"
@@ -80,19 +89,6 @@ def require_writable(folder: Path, *inputs: Path | None) -> None:
             probe.flush()
     except OSError as error:
         raise translate_os_error(OSError(error.errno, error.strerror, str(folder))) from error
-
-
-def _refuse_overlap(folder: Path, inputs: Iterable[Path]) -> None:
-    out = folder.resolve()
-    for path in inputs:
-        read = (path.parent if path.is_file() else path).resolve()
-        if out == read or read in out.parents or out in read.parents:
-            how = "is" if out == read else "lies inside" if read in out.parents else "contains"
-            raise BadInput(
-                f"{how} {path}, which is read: results would be taken for input, or replace it",
-                where=str(folder),
-                remedy="give --out (or --repair) a folder beside what is read",
-            )
 
 
 def make_paths_relative(text: str, base: Path, below: Iterable[Path] = ()) -> str:

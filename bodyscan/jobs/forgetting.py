@@ -179,7 +179,9 @@ def _walk(folder: Path, owner: str | bool | None, unreadable: list[Path]) -> Ite
                 unreadable.append(folder / marker)
                 continue
             is_boards = marker == CAPTURES and content.get("kind") == "calibration"
-            owner = _subject(content) or (False if is_boards else owner)
+            subject = content.get("subject")
+            named = subject if isinstance(subject, str) else None
+            owner = named or (False if is_boards else owner)
     yield folder, names, owner
     for entry in listed:
         if entry.is_dir(follow_symlinks=False):
@@ -193,12 +195,6 @@ def _content(path: Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise ValueError("no mapping")
     return content
-
-
-def _subject(content: Mapping[str, Any]) -> str | None:
-    """The subject that a file names as its folder's owner."""
-    subject = content.get("subject")
-    return subject if isinstance(subject, str) else None
 
 
 def _exports(folder: Path, names: list[str], subject: str) -> set[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -67,18 +67,6 @@ def _verify_job(folder: Path, kinds: Kinds) -> Iterator[tuple[Path, str]]:
     yield path, "" if content_hash(content) == stored else "was changed"
     for name, digest in outputs.items():
         yield _compare_hash(folder / name, digest)
-    yield from _inputs(folder, inputs, kinds)
-
-
-def _find_added(folder: Path) -> Iterator[Path]:
-    """Files that people put among a batch's results, or a job's."""
-    for record in sorted((*folder.glob(f"*/{STAGE}"), *folder.glob(f"*/*/{STAGE}"))):
-        known = {record, *results_in(record.parent).values()}
-        yield from (path for path in list_files(record.parent) if path not in known)
-
-
-def _inputs(folder: Path, inputs: Mapping[str, str], kinds: Kinds) -> Iterator[tuple[Path, str]]:
-    """What the job read, and where it is now."""
     try:
         job = read_job(folder)
         there = kinds[job.pipeline.kind][0].inputs(job)
@@ -89,6 +77,13 @@ def _inputs(folder: Path, inputs: Mapping[str, str], kinds: Kinds) -> Iterator[t
         yield _compare_hash(there.get(name) or job.source / name.removeprefix("captures/"), digest)
     for name in there.keys() - inputs.keys():
         yield there[name], "is new: the job did not read it"
+
+
+def _find_added(folder: Path) -> Iterator[Path]:
+    """Files that people put among a batch's results, or a job's."""
+    for record in sorted((*folder.glob(f"*/{STAGE}"), *folder.glob(f"*/*/{STAGE}"))):
+        known = {record, *results_in(record.parent).values()}
+        yield from (path for path in list_files(record.parent) if path not in known)
 
 
 def _compare_hash(path: Path, digest: str) -> tuple[Path, str]:
