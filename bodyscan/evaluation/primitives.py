@@ -58,9 +58,13 @@ def fit_sphere(points: Array, radius: float | None = None) -> Sphere:
     """
     if len(points) < MIN_POINTS:
         raise FailedWork(f"{len(points)} points are too few for a sphere")
-    sphere = _fit_algebraically(points)
-    if radius is not None:
-        sphere = Sphere(sphere.centre, radius)
+    # Start: |p|^2 = 2 c . p + (r^2 - c^2), linear in c and the last term; about the points' middle.
+    middle = points.mean(axis=0)
+    centred = points - middle
+    rows = np.column_stack([2.0 * centred, np.ones(len(points))])
+    *centre, rest = np.linalg.lstsq(rows, np.sum(centred**2, axis=1), rcond=None)[0]
+    found = float(np.sqrt(max(rest + np.dot(centre, centre), 1e-12)))
+    sphere = Sphere(centre + middle, found if radius is None else radius)
     free = 4 if radius is None else 3
 
     def blocks(sphere: Sphere) -> list[Block]:
@@ -101,16 +105,6 @@ def compare_centre_distances(measured: Array, true: Array) -> CentreDistances:
     found, wanted = pdist(measured), pdist(true)
     scale = float(found @ wanted / (wanted @ wanted)) - 1.0
     return CentreDistances(rms(found - wanted), 1e6 * scale)
-
-
-def _fit_algebraically(points: Array) -> Sphere:
-    """|p|^2 = 2 c . p + (r^2 - c^2), linear in c and the last term; about the points' middle."""
-    middle = points.mean(axis=0)
-    centred = points - middle
-    rows = np.column_stack([2.0 * centred, np.ones(len(points))])
-    solved = np.linalg.lstsq(rows, np.sum(centred**2, axis=1), rcond=None)[0]
-    centre = solved[:3]
-    return Sphere(centre + middle, float(np.sqrt(max(solved[3] + centre @ centre, 1e-12))))
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,9 +30,8 @@ def read_corners(path: Path) -> dict[str, Corners]:
     try:
         lines = read_regular(path, 200_000_000).decode("utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise CaptureError(
-            f"cannot be read as text: {error}", where=str(path), remedy=_REMEDY
-        ) from None
+        what = f"cannot be read as text: {error}"
+        raise CaptureError(what, where=str(path), remedy=_REMEDY) from None
     order: list[int] = []
     found: dict[str, list[tuple[float, float]]] = {}
     for number, line in enumerate(lines, start=1):
@@ -50,9 +49,8 @@ def read_corners(path: Path) -> dict[str, Corners]:
             order = order or [names.index(c) if c in names else -1 for c in columns]
             continue
         if not order:
-            raise CaptureError(
-                "comes before the line that names the columns", where=where, remedy=_REMEDY
-            )
+            what = "comes before the line that names the columns"
+            raise CaptureError(what, where=where, remedy=_REMEDY)
         name, corner = _corner(words, order, where)
         corners = found.setdefault(name, [])
         if corner is not None:

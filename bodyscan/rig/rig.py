@@ -224,7 +224,6 @@ def _find_template_problems(rig: Rig) -> Iterator[Problem]:
 
 
 def _find_unknown_references(rig: Rig) -> Iterator[Problem]:
-    """Find names in `rig_frame` that the file does not have."""
     frame = rig.rig_frame
     for key, parts in (("pair", rig.pairs), ("board", rig.boards)):
         wanted, names = getattr(frame, key), [part.name for part in parts]
