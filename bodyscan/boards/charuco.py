@@ -80,11 +80,16 @@ def locate_charuco(
     """
     if position is None or not position.valid:
         return None
-    nearby = _find_corners_next_to(board, position.printed.mean(axis=1))
+    # The inner corners, ids on one face, of the squares with these markers.
+    square = np.floor(position.printed.mean(axis=1) / board.square_mm).astype(int)
+    column = (square[:, 0, None] + np.array([-1, 0, -1, 0])).ravel()
+    row = (square[:, 1, None] + np.array([-1, -1, 0, 0])).ravel()
+    inside = (column >= 0) & (column < board.columns - 1) & (row >= 0) & (row < board.rows - 1)
+    nearby = np.unique(row[inside] * (board.columns - 1) + column[inside]).astype(np.int64)
     if len(nearby) < 4:
         return None
     gap = (1.0 - (board.marker_mm or 0.0) / board.square_mm) / 2.0
-    marked = np.floor(position.printed[0].mean(axis=0) / board.square_mm).astype(int).sum()
+    marked = square[0].sum()
     row, column = np.divmod(nearby, board.columns - 1)
     pixels, good = refine_predicted(
         image,
@@ -140,12 +145,3 @@ def fit_markers(printed: Array, corners: Array, board: Board) -> tuple[BoardMap,
         error = np.linalg.norm(board_map.apply(printed) - corners, axis=-1)
         agree = (error < tolerance).all(axis=1)
     return (board_map, agree) if agree.sum() >= 2 else None
-
-
-def _find_corners_next_to(board: Board, centres: Array) -> Indices:
-    """Find the inner corners, ids on one face, of the squares with these centres (M, 2) mm."""
-    square = np.floor(centres / board.square_mm).astype(int)
-    column = (square[:, 0, None] + np.array([-1, 0, -1, 0])).ravel()
-    row = (square[:, 1, None] + np.array([-1, -1, 0, 0])).ravel()
-    inside = (column >= 0) & (column < board.columns - 1) & (row >= 0) & (row < board.rows - 1)
-    return np.unique(row[inside] * (board.columns - 1) + column[inside]).astype(np.int64)

@@ -42,9 +42,8 @@ def read_corners(path: Path) -> dict[str, Corners]:
         if words[0].startswith("#"):
             names = line.lstrip("#").split()
             if not order and not {"filename", "x", "y"} <= set(names):
-                raise CaptureError(
-                    f"has the columns {' '.join(names)[:100]}", where=where, remedy=_REMEDY
-                )
+                what = f"has the columns {' '.join(names)[:100]}"
+                raise CaptureError(what, where=where, remedy=_REMEDY)
             columns = ("filename", "x", "y", "level")
             order = order or [names.index(c) if c in names else -1 for c in columns]
             continue
