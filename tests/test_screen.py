@@ -63,5 +63,5 @@ def test_a_table_wider_than_the_screen_is_a_list(
     if whole:
         assert any("p1-1" in line and "0.099" in line for line in lines)
     else:
-        assert "  position mm (x, y, z): 650.0 1126.0" in " ".join(lines)
-        assert "  sigma mm: 0.102 0.104 0.099" in lines
+        assert "p1-1: position mm (x, y, z) 650.0 1126.0" in " ".join(lines)
+        assert "sigma mm 0.102 0.104 0.099" in lines[2]

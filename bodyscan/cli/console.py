@@ -234,9 +234,9 @@ def _fitting(table: RenderableType) -> RenderableType:
     lines = [str(table.title)] if table.title else []
     for row in zip(*(column.cells for column in table.columns), strict=True):
         name, *values = map(str, row)
-        lines.append(name)
         named = zip(headings[1:], values, strict=True)
-        lines += [f"  {heading}: {value}" if heading else f"  {value}" for heading, value in named]
+        cells = [f"{heading} {value}" if heading else value for heading, value in named if value]
+        lines.append(f"{name}: {', '.join(cells)}")
     return Text("\n".join(lines))
 
 
