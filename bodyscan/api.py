@@ -266,18 +266,23 @@ def load_scan(folder: AnyPath) -> StoredScan:
 
 
 def measure(
-    body: Scan | StoredScan | BodyMesh, heights_mm: Sequence[float] | None = None
+    body: Scan | StoredScan | BodyMesh,
+    heights_mm: Sequence[float] | None = None,
+    *,
+    named: bool = False,
 ) -> Measurements:
     """Stature, volume, area and girths of horizontal slices, each with the share measured.
 
     heights_mm: heights of the slices above the floor; every 100 mm if None.
+    named: lay a body over the scan too, which takes seconds: `measures["waist girth"].mm` and
+        `.interval_mm`, and the landmarks in `named.landmarks`.
 
-    Raises BadInput for a height at which there is no body.
+    Raises BadInput for a height at which there is no body, or if no standing body fits the scan.
     """
     from bodyscan.measurement.measurements import measure as measure_mesh
     from bodyscan.mesh.body import BodyMesh
 
-    return measure_mesh(body if isinstance(body, BodyMesh) else body.mesh, heights_mm)
+    return measure_mesh(body if isinstance(body, BodyMesh) else body.mesh, heights_mm, named=named)
 
 
 def export_scan(

@@ -146,24 +146,35 @@ def measure(
         Path | None,
         typer.Option(help="Default: `measurements.json` inside the result; .csv for CSV."),
     ] = None,
+    named: Annotated[
+        bool,
+        typer.Option(
+            "--named", help="Also lay a body over the scan: landmarks, and measures by name."
+        ),
+    ] = False,
     anyway: Anyway = False,
 ) -> None:
-    """Measure a scan's mesh: stature, girths of horizontal slices, volume, area."""
+    """Measure a scan's mesh: stature, girths of horizontal slices, volume, area; by name too."""
     from bodyscan.files.atomic import write_json, write_text
     from bodyscan.fusion.storage import load_scan, refuse_repeat
     from bodyscan.measurement.measurements import heights_from
     from bodyscan.measurement.measurements import measure as measure_mesh
-    from bodyscan.report.measurement_table import measurements_csv, measurements_document, tables
+    from bodyscan.report.measurement_table import (
+        measurements_csv,
+        measurements_document,
+        named_csv,
+        tables,
+    )
 
     levels = None if heights is None else heights_from(heights)
     stored = load_scan(result)
     if not anyway:
         refuse_repeat(result, stored.facts)
-    measured = measure_mesh(stored.mesh, levels)
+    measured = measure_mesh(stored.mesh, levels, named=named)
     content = measurements_document(measured, stored.facts)
     path = out or result / "measurements.json"
     if path.suffix.lower() == ".csv":
-        write_text(path, measurements_csv(content))
+        write_text(path, named_csv(content) if named else measurements_csv(content))
     else:
         write_json(path, content)
     if path.suffix != ".json":

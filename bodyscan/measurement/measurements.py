@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +11,7 @@ from bodyscan.arrays import Array, Bytes, Mask
 from bodyscan.errors import BadInput
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.measurement.head import HeadTop, estimate_head_top
+from bodyscan.measurement.named import Measure, NamedMeasures, measure_by_name
 from bodyscan.measurement.outline import Range, bound_girths, girth_sigma
 from bodyscan.mesh.body import (
     HAIR,
@@ -94,6 +95,7 @@ class Measurements:
     head: where the head ends, even under hair; None if unknown.
     regions: shares of the area.
     facing_known: whether the feet tell front from back, and so left from right; else that is assumed.
+    named: landmarks and measures by name; None if they were not asked for.
     """
 
     stature_mm: float
@@ -108,18 +110,31 @@ class Measurements:
     head: HeadTop | None = None
     regions: dict[str, float] | None = None
     facing_known: bool = True
+    named: NamedMeasures | None = None
+
+    @property
+    def measures(self) -> Mapping[str, Measure]:
+        """Measures by name, such as "waist girth"; empty if they were not asked for."""
+        return {} if self.named is None else self.named.measures
 
 
 def measure(
-    mesh: BodyMesh, heights_mm: Sequence[float] | None = None, *, mean_breath: bool = True
+    mesh: BodyMesh,
+    heights_mm: Sequence[float] | None = None,
+    *,
+    mean_breath: bool = True,
+    named: bool = False,
 ) -> Measurements:
-    """Measure stature, volume, area, and slices at some heights.
+    """Measure stature, volume, area, slices at some heights, and on request measures by name.
 
     heights_mm: heights of the slices; every 100 mm of the body if None.
     mean_breath: measure a breathing person as at mean breath, instead of at the scan's moment.
 
-    Raises BadInput for a height at which there is no body.
+    named: whether to lay a body over the scan (seconds), for landmarks and measures by name.
+
+    Raises BadInput for a height at which there is no body, or if no standing body fits the scan.
     """
+    by_name = measure_by_name(mesh) if named else None
     breath, breathes = mesh.breath, mean_breath and mesh.breath is not None
     mesh = mesh.at_mean_breath() if breathes else mesh
     stature = float(mesh.vertices[:, 2].max())
@@ -156,6 +171,7 @@ def measure(
         head,
         None if kinds is None else compute_region_shares(kinds, areas),
         frame.known,
+        by_name,
     )
 
 

@@ -11,6 +11,7 @@ from typing import Any
 from rich.table import Table
 
 from bodyscan.measurement.measurements import Measurements
+from bodyscan.measurement.named import NamedMeasures
 from bodyscan.measurement.outline import Range
 from bodyscan.mesh.body import DARK_CLOTH, HAIR, REGION_NAMES, SKIN
 from bodyscan.version import __version__
@@ -61,6 +62,8 @@ def tables(measured: Measurements) -> Iterator[Table]:
                 style="" if girth.measured_skin >= 0.95 else "yellow",
             )
     yield slices
+    if measured.named is not None:
+        yield _named_table(measured.named)
 
 
 def _name_covered(regions: Mapping[str, float] | None) -> str:
@@ -81,8 +84,43 @@ def _format_girth(value: float, between: Range, measured: float) -> str:
     return f"{value:.1f}" if known else f"{low:.0f} to {high:.0f}"
 
 
+def _named_table(named: NamedMeasures) -> Table:
+    """Measures by name with their 95 % intervals, the interval alone where too little was measured."""
+    table = Table(title="measures by name, mm")
+    for heading, side in (("measure", "left"), ("value", "right"), ("95 %", "right")):
+        table.add_column(heading, justify="left" if side == "left" else "right")
+    for measure in named.measures.values():
+        low, high = measure.interval_mm
+        value = "" if measure.is_range else f"{measure.mm:.1f}"
+        style = "yellow" if measure.is_range else ""
+        table.add_row(measure.name, value, f"{low:.0f} to {high:.0f}", style=style)
+    for name, reason in named.missing.items():
+        table.add_row(name, "", reason, style="yellow")
+    return table
+
+
+def named_csv(content: Mapping[str, Any]) -> str:
+    """The named measures of a `measurements_document` as CSV: a row for each; lengths in mm."""
+    text = io.StringIO()
+    names = ("subject", "when", "name", "value", "low", "high", "unit", "measured", "standard")
+    table = csv.DictWriter(text, (*names, "definition"), extrasaction="ignore")
+    table.writeheader()
+    for measure in content["measures"]:
+        low, high = measure["interval_mm"]
+        value = None if measure["measured"] < 0.9 else measure["mm"]
+        row = {"subject": content["subject"], "when": content["when"], "unit": "mm"}
+        table.writerow(row | measure | {"value": value, "low": low, "high": high})
+    return text.getvalue()
+
+
 def measurements_document(measured: Measurements, facts: Mapping[str, Any]) -> dict[str, Any]:
     """Content of `measurements.json`; facts: of the scan, as in its scan.json."""
+    named = measured.named
+    by_name = named and {
+        "landmarks": [asdict(landmark) for landmark in named.landmarks.values()],
+        "measures": [asdict(measure) for measure in named.measures.values()],
+        "not_measured": dict(named.missing),
+    }
     return {
         "schema": "bodyscan-measurements",
         "version": 1,
@@ -97,6 +135,7 @@ def measurements_document(measured: Measurements, facts: Mapping[str, Any]) -> d
         **{name: getattr(measured, name) for name in COPIED},
         "rig_from_body": measured.rig_from_body.matrix,
         "slices": [asdict(level) for level in measured.slices],
+        **(by_name or {}),
     }
 
 

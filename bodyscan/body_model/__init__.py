@@ -1,0 +1,1 @@
+"""A parametric body with free data, and its fit to a scan."""

@@ -1,0 +1,294 @@
+"""Fit the parametric body to a scanned surface: shape and pose, then a smooth residual.
+
+Gauss-Newton on distances along the scan's normals (point to plane) between the template's vertices
+and the measured surface, in the manner of non-rigid ICP (Allen, Curless, Popovic 2003; Amberg,
+Romdhani, Vetter 2007). Matches are closest in position and normal together, so that an arm does not
+fit the trunk beside it, go both ways, so that no limb of the scan stays without one of the template's,
+and are weighed by a redescending kernel (Geman-McClure) that narrows from the error of the start to
+what the basis cannot make. Priors: shapes are unit normal, joints stay near a standing pose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse.linalg import splu
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+
+from bodyscan.arrays import Array, Indices
+from bodyscan.body_model.template import (
+    BodyShapeAndPose,
+    BodyTemplate,
+    PosedBody,
+    pose_body,
+)
+from bodyscan.mesh.topology import vertex_normals
+
+NORMAL_MM = 80.0
+"""Distance that counts as much as normals at right angles: the opposite sides of an arm, 80 mm apart,
+never match."""
+BASIS_MM = 4.0
+"""What bodies have that the basis cannot make, RMS: asymmetry, muscles, cloth."""
+PATCHES = 500.0
+"""Patches of 60 x 60 mm on a body of 1.8 m^2."""
+START_ARMS_DEG = (15.0, 35.0, 55.0)
+"""Arms from the trunk at which fits start; each finds arms within 15 degrees of it."""
+JOINT_DEG = {
+    "pelvis": 10.0, "lumbar": 8.0, "thorax": 8.0, "neck": 12.0, "head": 12.0, "clavicle": 8.0,
+    "upper arm": 30.0, "forearm": 25.0, "hand": 20.0, "thigh": 12.0, "shank": 8.0, "foot": 12.0,
+}  # fmt: skip
+"""Standard deviation of the joints of people who stand to be scanned, about each axis, degrees."""
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Measured points (N, 3), mm, body frame, with outward unit normals (N, 3)."""
+
+    points: Array
+    normals: Array
+
+
+@dataclass(frozen=True, eq=False)
+class FittedBody:
+    """A template laid over a scan.
+
+    vertices: (V, 3), mm, body frame; the template's topology.
+    body: shape and pose before the residual.
+    distance_mm: (V,), from each vertex to the surface along its normal; NaN where nothing was measured.
+    rms_mm: of the distances of shape and pose alone: what the basis could not make.
+    """
+
+    template: BodyTemplate
+    vertices: Array
+    body: BodyShapeAndPose
+    posed: PosedBody
+    distance_mm: Array
+    rms_mm: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Matches:
+    """M vertices, by index (M,), the points they match (M, 3), normals there (M, 3), weights (M,)."""
+
+    vertices: Indices
+    points: Array
+    normals: Array
+    weights: Array
+
+
+def fit_body(template: BodyTemplate, surface: Surface) -> FittedBody:
+    """Fit a template to a standing body's surface (body frame, floor at z = 0)."""
+    tree = KDTree(_lift(surface.points, surface.normals))
+    starts = [_start(template, surface, arms) for arms in START_ARMS_DEG]
+    tried = [
+        _fit_pose(template, surface, tree, start, (120.0, 100.0, 80.0, 70.0, 60.0, 50.0, 40.0))
+        for start in starts
+    ]
+    body, _ = min(tried, key=lambda pair: pair[1])
+    body, _ = _fit_pose(
+        template,
+        surface,
+        tree,
+        body,
+        (35.0, 30.0, 25.0, 22.0, 20.0, 18.0, 16.0, 14.0, 12.0, 10.0, 10.0, 10.0),
+    )
+    posed = pose_body(template, body)
+    matches = _match(template, surface, tree, posed.vertices, 10.0)
+    distance = np.einsum("vi,vi->v", posed.vertices - matches.points, matches.normals)
+    known = matches.weights > 0.0
+    rms = float(np.sqrt(np.mean(distance[known] ** 2))) if known.any() else float("nan")
+    vertices = _fit_residual(template, surface, tree, posed.vertices)
+    matches = _match(template, surface, tree, vertices, 10.0)
+    distance = np.einsum("vi,vi->v", vertices - matches.points, matches.normals)
+    distance[matches.weights == 0.0] = np.nan
+    return FittedBody(template, vertices, body, posed, distance, rms)
+
+
+def _lift(points: Array, normals: Array) -> Array:
+    return np.hstack([points, NORMAL_MM / np.sqrt(2.0) * normals])
+
+
+def _start(template: BodyTemplate, surface: Surface, arms_deg: float) -> BodyShapeAndPose:
+    """The likeliest shape of the surface's stature, on the floor, arms at an angle from the trunk."""
+    top, sole = int(template.vertices[:, 2].argmax()), int(template.vertices[:, 2].argmin())
+    gain = (template.shapes[:, top, 2] - template.shapes[:, sole, 2]).astype(np.float64)
+    mean = template.vertices[top, 2] - template.vertices[sole, 2]
+    shape = gain * (surface.points[:, 2].max() - mean) / (gain @ gain)
+    rotations = np.zeros_like(template.joints)
+    for side, turn in (("left", 1.0), ("right", -1.0)):
+        joint = template.joint_names.index(f"{side} upper arm")
+        elbow = template.joint_names.index(f"{side} forearm")
+        along = template.joints[elbow] - template.joints[joint]
+        now = np.degrees(np.arctan2(abs(along[1]), -along[2]))
+        rotations[joint, 0] = turn * np.radians(arms_deg - now)
+    vertices = pose_body(template, BodyShapeAndPose(shape, rotations, np.zeros(3))).vertices
+    centre = np.median(surface.points[:, :2], axis=0) - np.median(vertices[:, :2], axis=0)
+    return BodyShapeAndPose(shape, rotations, np.append(centre, -vertices[:, 2].min()))
+
+
+def _match(
+    template: BodyTemplate, surface: Surface, tree: KDTree, vertices: Array, scale_mm: float
+) -> _Matches:
+    """Match every vertex to its closest point; weight 0 far off, with unlike normals, beside holes."""
+    normals = vertex_normals(vertices, template.faces).astype(np.float64)
+    _, nearest = tree.query(_lift(vertices, normals))
+    points, target = surface.points[nearest], surface.normals[nearest]
+    weights = _weigh(vertices - points, normals, target, scale_mm)
+    weights[template.hidden] = 0.0
+    return _Matches(np.arange(len(vertices)), points, target, weights)
+
+
+def _match_back(
+    template: BodyTemplate, surface: Surface, vertices: Array, scale_mm: float
+) -> _Matches:
+    """Match a few thousand points to their closest vertices: what draws a limb that fits nothing yet to
+    the surface that nothing fits."""
+    sample = slice(None, None, max(1, len(surface.points) // 4000))
+    points, target = surface.points[sample], surface.normals[sample]
+    normals = vertex_normals(vertices, template.faces).astype(np.float64)
+    shown = np.flatnonzero(~template.hidden)
+    _, nearest = KDTree(_lift(vertices[shown], normals[shown])).query(_lift(points, target))
+    found = shown[nearest]
+    weights = _weigh(vertices[found] - points, normals[found], target, scale_mm)
+    return _Matches(found, points, target, weights)
+
+
+def _weigh(offset: Array, normals: Array, target: Array, scale_mm: float) -> Array:
+    """Geman-McClure weights of offsets (M, 3): 0 beyond three scales, with normals 60 degrees apart,
+    and where the offset runs along the surface, beside a hole's rim."""
+    distance = np.linalg.norm(offset, axis=1)
+    along = np.abs(np.einsum("vi,vi->v", offset, target))
+    aside = np.sqrt(np.maximum(distance**2 - along**2, 0.0))
+    near = (distance < 3.0 * scale_mm) & (aside < 15.0 + along)
+    alike = np.einsum("vi,vi->v", normals, target) > 0.5
+    return np.where(near & alike, 1.0 / (1.0 + (distance / scale_mm) ** 2) ** 2, 0.0)
+
+
+def _fit_pose(
+    template: BodyTemplate,
+    surface: Surface,
+    tree: KDTree,
+    body: BodyShapeAndPose,
+    scales_mm: tuple[float, ...],
+) -> tuple[BodyShapeAndPose, float]:
+    """Refine shape and pose, one Gauss-Newton step a scale; returns them and the last cost."""
+    cost = np.inf
+    for scale in scales_mm:
+        posed = pose_body(template, body)
+        found = _match(template, surface, tree, posed.vertices, scale)
+        back = _match_back(template, surface, posed.vertices, scale)
+        body, cost = _step(template, body, posed, [found, back], max(BASIS_MM, scale / 4.0))
+        missing = 2.0 - found.weights[~template.hidden].mean() - back.weights.mean()
+        cost += missing * len(template.vertices) / 25.0
+    return body, cost
+
+
+def _step(
+    template: BodyTemplate,
+    body: BodyShapeAndPose,
+    posed: PosedBody,
+    matches: Sequence[_Matches],
+    sigma_mm: float,
+) -> tuple[BodyShapeAndPose, float]:
+    """One Gauss-Newton step, and the cost before it. sigma_mm: of a matched distance."""
+    joints, shapes = 3 * len(template.joints), len(template.shapes)
+    precision = np.concatenate(
+        [np.full(3, 1e-6), np.repeat(_joint_precision(template), 3), np.ones(shapes)]
+    )
+    here = np.concatenate([np.zeros(3), body.rotations.ravel(), body.shape])
+    information, gradient = np.diag(precision), precision * here
+    cost = float(precision @ here**2)
+    for some in matches:
+        used = np.flatnonzero(some.weights > 0.0)[::2]
+        at, normals = some.vertices[used], some.normals[used]
+        jacobian = _jacobian(template, body, posed, at, normals)
+        residual = np.einsum("vi,vi->v", posed.vertices[at] - some.points[used], normals)
+        # What the basis cannot make is smooth over 50 mm: as many observations as such patches.
+        weights = some.weights[used] / sigma_mm**2 * (PATCHES / max(len(some.weights) / 2, 1))
+        information += (jacobian * weights[:, None]).T @ jacobian
+        gradient += jacobian.T @ (weights * residual)
+        cost += float(weights @ residual**2)
+    step = np.linalg.solve(information, -gradient)
+    turns, shift = step[3 : 3 + joints].reshape(-1, 3), step[:3]
+    angle = np.linalg.norm(turns, axis=1, keepdims=True)
+    turns = turns * np.minimum(1.0, 0.5 / np.maximum(angle, 1e-12))
+    rotations = (Rotation.from_rotvec(body.rotations) * Rotation.from_rotvec(turns)).as_rotvec()
+    shape = np.clip(body.shape + step[3 + joints :], -4.0, 4.0)
+    return BodyShapeAndPose(shape, rotations, body.root + shift), cost
+
+
+def _joint_precision(template: BodyTemplate) -> Array:
+    names = [name.removeprefix("left ").removeprefix("right ") for name in template.joint_names]
+    return np.array([np.radians(JOINT_DEG[name]) ** -2.0 for name in names])
+
+
+def _jacobian(
+    template: BodyTemplate,
+    body: BodyShapeAndPose,
+    posed: PosedBody,
+    used: Indices,
+    normals: Array,
+) -> Array:
+    """Derivatives (M, 3 + 3 J + K) of displacements along normals by root, turns and shapes.
+
+    Turns are right increments of the joints' own rotations, in their own axes.
+    """
+    weights = template.weights[used]
+    shaped = template.vertices[used] + np.tensordot(body.shape, template.shapes[:, used], axes=1)
+    rest = template.joints + np.tensordot(body.shape, template.joint_shapes, axes=1)
+    moves = template.descendants
+    at = np.einsum("jab,mjb->mja", posed.rotations, shaped[:, None] - rest) + posed.joints
+    columns = [normals]
+    for joint in range(len(rest)):
+        below = weights * moves[joint]
+        arm = np.einsum("mj,mja->ma", below, at - posed.joints[joint])
+        columns.append(np.cross(arm, normals) @ posed.rotations[joint])
+    blended = np.einsum("mj,jab->mab", weights, posed.rotations)
+    facing = np.einsum("ma,mab->mb", normals, blended)
+    by_shape = np.einsum("mb,kmb->mk", facing, template.shapes[:, used])
+    offsets = np.zeros_like(template.joint_shapes, dtype=np.float64)
+    for joint, parent in enumerate(template.parents):
+        own = template.joint_shapes[:, joint]
+        if parent >= 0:
+            bone = own - template.joint_shapes[:, parent]
+            offsets[:, joint] = offsets[:, parent] + bone @ posed.rotations[parent].T
+    shifts = offsets - np.einsum("jab,kjb->kja", posed.rotations, template.joint_shapes)
+    by_shape += np.einsum("ma,mj,kja->mk", normals, weights, shifts, optimize=True)
+    return np.hstack([*columns, by_shape])
+
+
+def _fit_residual(template: BodyTemplate, surface: Surface, tree: KDTree, vertices: Array) -> Array:
+    """Displace vertices onto the surface along its normals, smoothly: biharmonic in the displacement.
+
+    What slides along the surface stays where the prior on shape and pose has put it.
+    """
+    laplacian = _laplacian(template.faces, len(vertices))
+    smooth = (laplacian.T @ laplacian).tocsc()
+    rest = vertices
+    for stiffness, scale in ((10.0, 20.0), (1.0, 12.0), (0.1, 8.0), (0.1, 8.0)):
+        matches = _match(template, surface, tree, vertices, scale)
+        gap = np.einsum("vi,vi->v", matches.points - vertices, matches.normals)
+        target = vertices - rest + gap[:, None] * matches.normals
+        system = stiffness * smooth + sparse.diags(matches.weights + 1e-4)
+        factor = splu(
+            system.tocsc(),
+            permc_spec="MMD_AT_PLUS_A",
+            diag_pivot_thresh=0.0,
+            options={"SymmetricMode": True},
+        )
+        vertices = rest + factor.solve(matches.weights[:, None] * target)
+    return vertices
+
+
+def _laplacian(faces: Indices, count: int) -> sparse.csr_matrix:
+    """The uniform graph Laplacian (V, V)."""
+    a, b, c = faces.T
+    rows, columns = np.concatenate([a, b, c, b, c, a]), np.concatenate([b, c, a, a, b, c])
+    links = sparse.csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(count, count))
+    links.data[:] = 1.0
+    degree = np.asarray(links.sum(axis=1)).ravel()
+    return sparse.csr_matrix(sparse.identity(count) - sparse.diags(1.0 / degree) @ links)

@@ -1,0 +1,131 @@
+"""A parametric body: mean shape, shape basis, skeleton, skinning weights, parts and landmarks.
+
+The data are MakeHuman's (CC0), reduced by `data/body/make_template.py`; `data/body/README.md` says how.
+Shapes are the principal components of a population of both sexes, from small children to old age, each
+scaled to one standard deviation, so that their coefficients are unit normal.
+
+Frame of the template: mm, z up, x forward, y to the left, the floor at z = 0 for the mean shape.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+from io import BytesIO
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from bodyscan.arrays import Array, Bytes, Indices, Mask
+
+
+@dataclass(frozen=True, eq=False)
+class BodyTemplate:
+    """A body with V vertices, F faces, K shapes and J joints, mm.
+
+    vertices: (V, 3), the mean shape in the rest pose.
+    faces: (F, 3), outward.
+    shapes: (K, V, 3) float32, displacements of one standard deviation.
+    joints: (J, 3), the first is the root; joint_shapes: (K, J, 3) their displacements.
+    parents: (J,), -1 for the root; parents come before their children.
+    weights: (V, J), how much of each joint's motion a vertex follows; rows sum to 1.
+    parts: (V,) uint8, index into part_names.
+    landmarks: vertex of each landmark, by name.
+    landmark_sigma_mm: (L,), of each landmark's position along an axis: RMS over 20 simulated bodies,
+        half of which have surface that the shapes cannot make.
+    hidden: (V,) bool, inside the mouth and the nostrils, which no camera sees.
+    """
+
+    vertices: Array
+    faces: Indices
+    shapes: Array
+    joints: Array
+    joint_shapes: Array
+    parents: Indices
+    joint_names: tuple[str, ...]
+    weights: Array
+    parts: Bytes
+    part_names: tuple[str, ...]
+    landmarks: Mapping[str, int]
+    landmark_sigma_mm: Array
+    hidden: Mask
+
+    @property
+    def descendants(self) -> Array:
+        """(J, J) bool: [j, k] whether joint k moves with joint j (itself included)."""
+        moves = np.eye(len(self.parents), dtype=bool)
+        for joint, parent in enumerate(self.parents):
+            if parent >= 0:
+                moves[:, joint] |= moves[:, parent]
+        return moves
+
+
+@dataclass(frozen=True, eq=False)
+class BodyShapeAndPose:
+    """Parameters of a template's body.
+
+    shape: (K,), in standard deviations.
+    rotations: (J, 3), rotation vectors of the joints relative to their parents, rest axes, rad.
+    root: (3,), position of the first joint, mm, body frame.
+    """
+
+    shape: Array
+    rotations: Array
+    root: Array
+
+
+@dataclass(frozen=True, eq=False)
+class PosedBody:
+    """A template's body in a pose.
+
+    vertices: (V, 3), mm. rotations: (J, 3, 3) and joints: (J, 3) of the posed bones, body frame.
+    """
+
+    vertices: Array
+    rotations: Array
+    joints: Array
+
+
+def pose_body(template: BodyTemplate, body: BodyShapeAndPose) -> PosedBody:
+    """Shape and pose a template by linear blend skinning."""
+    shaped = template.vertices + np.tensordot(body.shape, template.shapes, axes=1)
+    rest = template.joints + np.tensordot(body.shape, template.joint_shapes, axes=1)
+    local = Rotation.from_rotvec(body.rotations).as_matrix()
+    turned, placed = np.empty_like(local), np.empty_like(rest)
+    for joint, parent in enumerate(template.parents):
+        if parent < 0:
+            turned[joint], placed[joint] = local[joint], body.root
+        else:
+            turned[joint] = turned[parent] @ local[joint]
+            placed[joint] = placed[parent] + turned[parent] @ (rest[joint] - rest[parent])
+    offsets = placed - np.einsum("jab,jb->ja", turned, rest)
+    blended = np.einsum("vj,jab->vab", template.weights, turned)
+    return PosedBody(
+        np.einsum("vab,vb->va", blended, shaped) + template.weights @ offsets, turned, placed
+    )
+
+
+@cache
+def load_template() -> BodyTemplate:
+    """Read the template that the package brings."""
+    data = np.load(
+        BytesIO(resources.files("bodyscan.body_model").joinpath("template.npz").read_bytes())
+    )
+    shapes = data["shapes"].astype(np.float32) * data["shape_scales"][:, None, None]
+    return BodyTemplate(
+        data["vertices"],
+        data["faces"].astype(np.int64),
+        shapes,
+        data["joints"],
+        data["joint_shapes"],
+        data["parents"],
+        tuple(data["joint_names"].tolist()),
+        data["weights"] / 255.0 / (data["weights"].sum(axis=1, keepdims=True) / 255.0),
+        data["parts"],
+        tuple(data["part_names"].tolist()),
+        dict(zip(data["landmark_names"].tolist(), data["landmark_vertices"].tolist(), strict=True)),
+        data["landmark_sigma_mm"],
+        data["hidden"],
+    )
