@@ -11,13 +11,12 @@ what the basis cannot make. Priors: shapes are unit normal, joints stay near a s
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
 from scipy.spatial import KDTree
-from scipy.spatial.transform import Rotation
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.body_model.template import (
@@ -195,9 +194,8 @@ def _step(
     sigma_mm: float,
 ) -> tuple[BodyShapeAndPose, float]:
     """One Gauss-Newton step, and the cost before it. sigma_mm: of a matched distance."""
-    joints, shapes = 3 * len(template.joints), len(template.shapes)
     precision = np.concatenate(
-        [np.full(3, 1e-6), np.repeat(_joint_precision(template), 3), np.ones(shapes)]
+        [np.full(3, 1e-6), np.repeat(_joint_precision(template), 3), np.ones(len(template.shapes))]
     )
     here = np.concatenate([np.zeros(3), body.rotations.ravel(), body.shape])
     information, gradient = np.diag(precision), precision * here
@@ -205,7 +203,7 @@ def _step(
     for some in matches:
         used = np.flatnonzero(some.weights > 0.0)[::2]
         at, normals = some.vertices[used], some.normals[used]
-        jacobian = _jacobian(template, body, posed, at, normals)
+        jacobian = differentiate(template, body, posed, at, normals)
         residual = np.einsum("vi,vi->v", posed.vertices[at] - some.points[used], normals)
         # What the basis cannot make is smooth over 50 mm: as many observations as such patches.
         weights = some.weights[used] / sigma_mm**2 * (PATCHES / max(len(some.weights) / 2, 1))
@@ -213,12 +211,8 @@ def _step(
         gradient += jacobian.T @ (weights * residual)
         cost += float(weights @ residual**2)
     step = np.linalg.solve(information, -gradient)
-    turns, shift = step[3 : 3 + joints].reshape(-1, 3), step[:3]
-    angle = np.linalg.norm(turns, axis=1, keepdims=True)
-    turns = turns * np.minimum(1.0, 0.5 / np.maximum(angle, 1e-12))
-    rotations = (Rotation.from_rotvec(body.rotations) * Rotation.from_rotvec(turns)).as_rotvec()
-    shape = np.clip(body.shape + step[3 + joints :], -4.0, 4.0)
-    return BodyShapeAndPose(shape, rotations, body.root + shift), cost
+    moved = body.add_step(step)
+    return replace(moved, shape=np.clip(moved.shape, -4.0, 4.0)), cost
 
 
 def _joint_precision(template: BodyTemplate) -> Array:
@@ -226,7 +220,7 @@ def _joint_precision(template: BodyTemplate) -> Array:
     return np.array([np.radians(JOINT_DEG[name]) ** -2.0 for name in names])
 
 
-def _jacobian(
+def differentiate(
     template: BodyTemplate,
     body: BodyShapeAndPose,
     posed: PosedBody,

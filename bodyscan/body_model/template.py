@@ -75,6 +75,13 @@ class BodyShapeAndPose:
     rotations: Array
     root: Array
 
+    def add_step(self, step: Array) -> BodyShapeAndPose:
+        """Add a step (3 + 3 J + K,): of the root, right increments of the rotations, the shape."""
+        turns = step[3 : 3 + self.rotations.size].reshape(-1, 3)
+        turned = Rotation.from_rotvec(self.rotations) * Rotation.from_rotvec(turns)
+        shape = self.shape + step[3 + self.rotations.size :]
+        return BodyShapeAndPose(shape, turned.as_rotvec(), self.root + step[:3])
+
 
 @dataclass(frozen=True, eq=False)
 class PosedBody:

@@ -154,7 +154,7 @@ def measure(
     ] = False,
     anyway: Anyway = False,
 ) -> None:
-    """Measure a scan's mesh: stature, girths of horizontal slices, volume, area; by name too."""
+    """Measure a scan's mesh: stature, girths of horizontal slices, volume, area."""
     from bodyscan.files.atomic import write_json, write_text
     from bodyscan.fusion.storage import load_scan, refuse_repeat
     from bodyscan.measurement.measurements import heights_from

@@ -143,7 +143,21 @@ def measure_by_name(mesh: BodyMesh) -> NamedMeasures:
             f" {fitted.rms_mm:.0f} mm off in shape",
             remedy="Named measures need a person who stands with arms and legs apart.",
         )
-    body = _locate(mesh, rig_from_body, fitted, None if breath is None else breath.sigma_mm)
+    return take_measures(mesh, rig_from_body, fitted, None if breath is None else breath.sigma_mm)
+
+
+def take_measures(
+    mesh: BodyMesh,
+    rig_from_body: RigidTransform,
+    fitted: FittedBody,
+    breath_mm: Floats | None = None,
+) -> NamedMeasures:
+    """Take every named measure of a mesh over which a template lies (body frame).
+
+    breath_mm: (V,), sigma of the vertices' displacement to mean breath.
+    """
+    template = fitted.template
+    body = _locate(mesh, rig_from_body, fitted, breath_mm)
     measures, missing = {}, {}
     for definition in read_definitions():
         try:
