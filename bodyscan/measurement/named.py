@@ -39,6 +39,8 @@ from bodyscan.mesh.body_parts import find_body_frame
 from bodyscan.mesh.slices import MeshSlicer, hull_perimeter
 from bodyscan.mesh.topology import vertex_normals
 
+CROWN_MM = 20.0
+"""Height of the crown below the top."""
 SAMPLES = 80_000
 """Points of the mesh that the template is fitted to: one in 5 mm."""
 
@@ -235,7 +237,12 @@ Taken = tuple[float, float, float]
 
 def _height(body: _Body, definition: Mapping[str, Any], shift_mm: float) -> Taken:
     if definition.get("top"):
-        return float(body.vertices[:, 2].max()), 1.0, float(np.median(body.noise_mm))
+        top = float(body.vertices[:, 2].max())
+        crown = body.vertices[body.mesh.faces, 2].max(axis=1) > top - CROWN_MM
+        # A crown that nobody saw is closed by a guess, which may be off by as much.
+        seen = float((~body.mesh.filled[crown]).mean())
+        noise = float(np.median(body.noise_mm))
+        return top, seen, noise if seen > 0.5 else CROWN_MM / 1.96
     heights = [body.landmarks[name][2] for name in definition["landmarks"]]
     return float(np.mean(heights)), 1.0, float(np.median(body.noise_mm))
 
@@ -265,7 +272,10 @@ def _girth(body: _Body, definition: Mapping[str, Any], shift_mm: float) -> Taken
     levels = [float(axis @ (first + share * (last - first))) for share in shares]
     if "find" in definition:
         levels = np.linspace(levels[0], levels[-1], 15).tolist()
-    taken = [_slice(body, axis, definition["part"], level + shift_mm) for level in levels]
+    cuts = [_slice(body, axis, definition["part"], level + shift_mm) for level in levels]
+    taken = [cut for cut in cuts if cut is not None]
+    if not taken:
+        raise _NotThere(f"no {definition['part']} lies at its landmarks")
     girths = [hull_perimeter(piece) for piece, _, _ in taken]
     best = {"widest": np.argmax, "narrowest": np.argmin}.get(definition.get("find", ""))
     chosen = 0 if best is None else int(best(girths))
@@ -276,7 +286,10 @@ def _extent(body: _Body, definition: Mapping[str, Any], shift_mm: float) -> Take
     """Extent of a part's level slice forward, or to the side."""
     level = float(np.mean([body.landmarks[name][2] for name in definition["landmarks"]]))
     up = np.array([0.0, 0.0, 1.0])
-    piece, measured, girth_sigma = _slice(body, up, definition["part"], level + shift_mm)
+    cut = _slice(body, up, definition["part"], level + shift_mm)
+    if cut is None:
+        raise _NotThere(f"no {definition['part']} lies at its landmarks")
+    piece, measured, girth_sigma = cut
     axis = 0 if definition["kind"] == "depth" else 1
     return float(np.ptp(piece[:, axis])), measured, girth_sigma / np.pi
 
@@ -295,12 +308,12 @@ def _tape(body: _Body, definition: Mapping[str, Any], shift_mm: float) -> Taken:
         points = np.vstack([np.zeros((0, 2)), *(loop.segments[:, 0] for loop in loops)])
         # The surface between two points of a trunk bulges by less than half of their distance.
         near = (points[:, 0] > 0.0) & (points[:, 0] < length) & (np.abs(points[:, 1]) < length / 2)
-        ends = np.array([[0.0, 0.0], [length, 0.0], [length / 2.0, -length]])
-        chain = np.vstack([ends, points[near]])
-        corners = chain[ConvexHull(chain).vertices]
-        above = corners[corners[:, 1] > -length / 2]
-        above = above[np.argsort(above[:, 0])]
-        total += float(np.linalg.norm(np.diff(above, axis=0), axis=1).sum())
+        chain = np.vstack([[[length, 0.0], [0.0, 0.0]], points[near]])
+        # Counterclockwise from the end to the start: the outer side of the hull.
+        corners = ConvexHull(np.vstack([chain, [length / 2.0, -length]])).vertices
+        outer = np.roll(corners, -int(np.argmax(corners == 0)))
+        outer = outer[: int(np.argmax(outer == 1)) + 1]
+        total += float(np.linalg.norm(np.diff(chain[outer], axis=0), axis=1).sum())
     return total, 1.0, float(np.sqrt(2.0) * np.median(body.noise_mm))
 
 
@@ -317,9 +330,9 @@ _KINDS = {
 
 def _slice(
     body: _Body, axis: Array, part: str | Sequence[str], level_mm: float
-) -> tuple[Array, float, float]:
+) -> tuple[Array, float, float] | None:
     """Points (N, 2) of a part in a slice square to an axis, the share of its length that was measured,
-    and the sigma of its girth. Raises _NotThere."""
+    and the sigma of its girth; None if the part is not there."""
     key = tuple(axis.tolist())
     if key not in body.slicers:
         aside = np.cross(axis, [1.0, 0.0, 0.0])
@@ -332,6 +345,9 @@ def _slice(
     for loop in body.slicers[key].slice(level_mm):
         corners = body.mesh.faces[loop.faces]
         mine = np.isin(body.parts[corners], wanted).sum(axis=1) >= 2
+        # A limb by itself has some vertices named after its neighbours.
+        if loop.lengths[mine].sum() > 0.8 * loop.girth_mm:
+            mine[:] = True
         length = loop.lengths[mine].sum()
         # Less is a stray rim of the part.
         if length > 50.0:
@@ -340,4 +356,4 @@ def _slice(
             noise = np.pi * body.noise_mm[corners[mine]].mean()
             breath = 2.0 * np.pi * body.breath_mm[corners[mine]].mean()
             return loop.segments[mine].reshape(-1, 2), share, float(np.hypot(noise, breath))
-    raise _NotThere(f"no {' or '.join(names)} lies at its landmarks")
+    return None
