@@ -163,8 +163,8 @@ def _weigh(offset: Array, normals: Array, target: Array, scale_mm: float) -> Arr
     along = np.abs(np.einsum("vi,vi->v", offset, target))
     aside = np.sqrt(np.maximum(distance**2 - along**2, 0.0))
     near = (distance < 3.0 * scale_mm) & (aside < 15.0 + along)
-    alike = np.einsum("vi,vi->v", normals, target) > 0.5
-    return np.where(near & alike, 1.0 / (1.0 + (distance / scale_mm) ** 2) ** 2, 0.0)
+    cosine = np.einsum("vi,vi->v", normals, target)
+    return np.where(near & (cosine > 0.5), 1.0 / (1.0 + (distance / scale_mm) ** 2) ** 2, 0.0)
 
 
 def _fit_pose(

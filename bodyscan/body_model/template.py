@@ -78,9 +78,9 @@ class BodyShapeAndPose:
     def add_step(self, step: Array) -> BodyShapeAndPose:
         """Add a step (3 + 3 J + K,): of the root, right increments of the rotations, the shape."""
         turns = step[3 : 3 + self.rotations.size].reshape(-1, 3)
-        turned = Rotation.from_rotvec(self.rotations) * Rotation.from_rotvec(turns)
+        rotated = Rotation.from_rotvec(self.rotations) * Rotation.from_rotvec(turns)
         shape = self.shape + step[3 + self.rotations.size :]
-        return BodyShapeAndPose(shape, turned.as_rotvec(), self.root + step[:3])
+        return BodyShapeAndPose(shape, rotated.as_rotvec(), self.root + step[:3])
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,17 +100,17 @@ def pose_body(template: BodyTemplate, body: BodyShapeAndPose) -> PosedBody:
     shaped = template.vertices + np.tensordot(body.shape, template.shapes, axes=1)
     rest = template.joints + np.tensordot(body.shape, template.joint_shapes, axes=1)
     local = Rotation.from_rotvec(body.rotations).as_matrix()
-    turned, placed = np.empty_like(local), np.empty_like(rest)
+    rotated, placed = np.empty_like(local), np.empty_like(rest)
     for joint, parent in enumerate(template.parents):
         if parent < 0:
-            turned[joint], placed[joint] = local[joint], body.root
+            rotated[joint], placed[joint] = local[joint], body.root
         else:
-            turned[joint] = turned[parent] @ local[joint]
-            placed[joint] = placed[parent] + turned[parent] @ (rest[joint] - rest[parent])
-    offsets = placed - np.einsum("jab,jb->ja", turned, rest)
-    blended = np.einsum("vj,jab->vab", template.weights, turned)
+            rotated[joint] = rotated[parent] @ local[joint]
+            placed[joint] = placed[parent] + rotated[parent] @ (rest[joint] - rest[parent])
+    offsets = placed - np.einsum("jab,jb->ja", rotated, rest)
+    blended = np.einsum("vj,jab->vab", template.weights, rotated)
     return PosedBody(
-        np.einsum("vab,vb->va", blended, shaped) + template.weights @ offsets, turned, placed
+        np.einsum("vab,vb->va", blended, shaped) + template.weights @ offsets, rotated, placed
     )
 
 

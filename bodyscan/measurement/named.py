@@ -338,8 +338,8 @@ def _slice(
         aside = np.cross(axis, [1.0, 0.0, 0.0])
         aside /= np.linalg.norm(aside)
         frame = np.stack([np.cross(aside, axis), aside, axis])
-        turned = body.vertices @ frame.T
-        body.slicers[key] = MeshSlicer(turned, body.mesh.faces, body.mesh.filled)
+        rotated = body.vertices @ frame.T
+        body.slicers[key] = MeshSlicer(rotated, body.mesh.faces, body.mesh.filled)
     names = [part] if isinstance(part, str) else part
     wanted = [body.part_names.index(name) for name in names]
     for loop in body.slicers[key].slice(level_mm):
