@@ -19,7 +19,7 @@ measure changes there.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib import resources
 from itertools import pairwise
@@ -30,7 +30,7 @@ import yaml
 from scipy.spatial import ConvexHull, KDTree
 
 from bodyscan.arrays import Array, Bytes, Floats
-from bodyscan.body_model.fitting import FittedBody, Surface, fit_body
+from bodyscan.body_model.fitting import BASIS_MM, FittedBody, Surface, fit_body
 from bodyscan.body_model.template import load_template
 from bodyscan.errors import BadInput
 from bodyscan.geometry.transforms import RigidTransform
@@ -41,6 +41,9 @@ from bodyscan.mesh.topology import vertex_normals
 
 CROWN_MM = 20.0
 """Height of the crown below the top."""
+UNLIKE = 1.7
+"""Error over sigma of landmarks on the two people of an independent renderer, whose hair, cloth and breath
+the bodies that the sigmas were measured on lack."""
 SAMPLES = 80_000
 """Points of the mesh that the template is fitted to: one in 5 mm."""
 
@@ -138,13 +141,14 @@ def measure_by_name(mesh: BodyMesh) -> NamedMeasures:
     rig_from_body = find_body_frame(mesh.vertices).rig_from_body
     template = load_template()
     fitted = fit_body(template, _sample(mesh, rig_from_body.inverse()))
-    known = np.isfinite(fitted.distance_mm) | template.hidden
-    if known.mean() < 0.5 or not fitted.rms_mm < 12.0:
+    known = np.isfinite(fitted.distance_mm[~template.hidden])
+    if known.mean() < 0.65 or not fitted.rms_mm < 2.0 * BASIS_MM:
         raise BadInput(
             f"no standing body fits the scan: {100.0 * known.mean():.0f} % of one lies on its surface,"
             f" {fitted.rms_mm:.0f} mm off in shape",
             remedy="Named measures need a person who stands with arms and legs apart.",
         )
+    rig_from_body, fitted = _face_forward(rig_from_body, fitted)
     return take_measures(mesh, rig_from_body, fitted, None if breath is None else breath.sigma_mm)
 
 
@@ -178,6 +182,18 @@ def take_measures(
     return NamedMeasures(landmarks, measures, missing)
 
 
+def _face_forward(
+    rig_from_body: RigidTransform, fitted: FittedBody
+) -> tuple[RigidTransform, FittedBody]:
+    """Turn the body frame about its z to where pelvis and chest face."""
+    names = fitted.template.joint_names
+    facing = sum(fitted.posed.rotations[names.index(name)][:2, 0] for name in ("pelvis", "thorax"))
+    x, y = facing / np.linalg.norm(facing)
+    turn = RigidTransform(np.array([[x, -y, 0.0], [y, x, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))
+    vertices = turn.inverse().apply(fitted.vertices)
+    return rig_from_body @ turn, replace(fitted, vertices=vertices)
+
+
 class _NotThere(Exception):
     """Why a measure cannot be taken."""
 
@@ -205,7 +221,8 @@ def _locate(
     )
     landmarks = {name: fitted.vertices[at] for name, at in template.landmarks.items()}
     parts = template.parts[nearest]
-    sigma = dict(zip(template.landmarks, template.landmark_sigma_mm.tolist(), strict=True))
+    sigmas = (UNLIKE * template.landmark_sigma_mm).tolist()
+    sigma = dict(zip(template.landmarks, sigmas, strict=True))
     noise = mesh.sigma_mm.astype(np.float64)
     noise[~np.isfinite(noise)] = np.nanmedian(noise)
     lean = np.zeros(len(vertices)) if breath_mm is None else breath_mm.astype(np.float64)
@@ -297,6 +314,8 @@ def _extent(body: _Body, definition: Mapping[str, Any], shift_mm: float) -> Take
 def _tape(body: _Body, definition: Mapping[str, Any], shift_mm: float) -> Taken:
     """Length from landmark to landmark over the surface's hull, in the plane with `outward`."""
     total, outward = 0.0, np.array(definition["outward"], float)
+    trunk = [body.part_names.index(name) for name in ("trunk", "neck")]
+    on_trunk = np.isin(body.parts[body.mesh.faces], trunk).sum(axis=1) >= 2
     for a, b in pairwise(body.landmarks[name] for name in definition["landmarks"]):
         length = float(np.linalg.norm(b - a))
         along = (b - a) / length
@@ -305,7 +324,9 @@ def _tape(body: _Body, definition: Mapping[str, Any], shift_mm: float) -> Taken:
         frame = np.stack([along, out, np.cross(along, out)])
         local = (body.vertices - a) @ frame.T
         loops = MeshSlicer(local, body.mesh.faces, body.mesh.filled).slice(0.0)
-        points = np.vstack([np.zeros((0, 2)), *(loop.segments[:, 0] for loop in loops)])
+        points = np.vstack(
+            [np.zeros((0, 2))] + [loop.segments[on_trunk[loop.faces], 0] for loop in loops]
+        )
         # The surface between two points of a trunk bulges by less than half of their distance.
         near = (points[:, 0] > 0.0) & (points[:, 0] < length) & (np.abs(points[:, 1]) < length / 2)
         chain = np.vstack([[[length, 0.0], [0.0, 0.0]], points[near]])

@@ -30,6 +30,8 @@ def random_body(seed: int, *, arms_deg: float = 0.0) -> Array:
     """Vertices (V, 3) of a body in a scanning pose; 3 mm RMS of it are no shape of the template's."""
     rng = np.random.default_rng(seed)
     rotations = rng.normal(0.0, np.radians(3.0), TEMPLATE.joints.shape)
+    lower = [name.endswith(("pelvis", "thigh", "shank", "foot")) for name in TEMPLATE.joint_names]
+    rotations[lower] = 0.0  # both feet stand on the floor
     for side, sign in (("left", -1.0), ("right", 1.0)):
         arm = TEMPLATE.joint_names.index(f"{side} upper arm")
         rotations[arm, 0] += sign * np.radians(15.0 - arms_deg)
