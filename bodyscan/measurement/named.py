@@ -42,8 +42,8 @@ from bodyscan.mesh.topology import vertex_normals
 CROWN_MM = 20.0
 """Height of the crown below the top."""
 UNLIKE = 1.7
-"""Error over sigma of landmarks on the two people of an independent renderer, whose hair, cloth and breath
-the bodies that the sigmas were measured on lack."""
+"""Error over sigma of landmarks on the two people of an independent renderer: they have hair, cloth and
+breath, which the bodies that sigmas were measured on lack."""
 SAMPLES = 80_000
 """Points of the mesh that the template is fitted to: one in 5 mm."""
 
@@ -289,10 +289,11 @@ def _girth(body: _Body, definition: Mapping[str, Any], shift_mm: float) -> Taken
     levels = [float(axis @ (first + share * (last - first))) for share in shares]
     if "find" in definition:
         levels = np.linspace(levels[0], levels[-1], 15).tolist()
-    cuts = [_slice(body, axis, definition["part"], level + shift_mm) for level in levels]
+    part = definition["part"]
+    cuts = [_slice(body, axis, part, level + shift_mm) for level in levels]
     taken = [cut for cut in cuts if cut is not None]
     if not taken:
-        raise _NotThere(f"no {definition['part']} lies at its landmarks")
+        raise _NotThere(f"no {part} lies at its landmarks")
     girths = [hull_perimeter(piece) for piece, _, _ in taken]
     best = {"widest": np.argmax, "narrowest": np.argmin}.get(definition.get("find", ""))
     chosen = 0 if best is None else int(best(girths))
@@ -353,13 +354,13 @@ def _slice(
     body: _Body, axis: Array, part: str | Sequence[str], level_mm: float
 ) -> tuple[Array, float, float] | None:
     """Points (N, 2) of a part in a slice square to an axis, the share of its length that was measured,
-    and the sigma of its girth; None if the part is not there."""
+    and the sigma of its girth, of the largest loop that has it; None if none has.
+    """
     key = tuple(axis.tolist())
     if key not in body.slicers:
         aside = np.cross(axis, [1.0, 0.0, 0.0])
         aside /= np.linalg.norm(aside)
-        frame = np.stack([np.cross(aside, axis), aside, axis])
-        rotated = body.vertices @ frame.T
+        rotated = body.vertices @ np.stack([np.cross(aside, axis), aside, axis]).T
         body.slicers[key] = MeshSlicer(rotated, body.mesh.faces, body.mesh.filled)
     names = [part] if isinstance(part, str) else part
     wanted = [body.part_names.index(name) for name in names]
@@ -369,12 +370,13 @@ def _slice(
         # A limb by itself has some vertices named after its neighbours.
         if loop.lengths[mine].sum() > 0.8 * loop.girth_mm:
             mine[:] = True
-        length = loop.lengths[mine].sum()
+        length = float(loop.lengths[mine].sum())
         # Less is a stray rim of the part.
         if length > 50.0:
-            share = float(loop.lengths[mine & loop.measured].sum() / length)
+            share = float(loop.lengths[mine & loop.measured].sum()) / length
             # Noise is alike over a quarter of the girth, breath all around it.
             noise = np.pi * body.noise_mm[corners[mine]].mean()
             breath = 2.0 * np.pi * body.breath_mm[corners[mine]].mean()
-            return loop.segments[mine].reshape(-1, 2), share, float(np.hypot(noise, breath))
+            sigma_mm = float(np.hypot(noise, breath))
+            return loop.segments[mine].reshape(-1, 2), share, sigma_mm
     return None
