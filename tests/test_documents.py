@@ -31,7 +31,7 @@ def test_links_lead_to_files(document: Path) -> None:
 def test_source_files_named_are_there(document: Path) -> None:
     sources = {
         "/" + str(path.relative_to(PROJECT))
-        for room in ("bodyscan", "benchmarks", "tests", "examples", "docs")
+        for room in ("bodyscan", "benchmarks", "tests", "examples", "docs", "data")
         for path in (PROJECT / room).rglob("*.py")
     }
     named = SOURCE.findall(document.read_text("utf-8"))

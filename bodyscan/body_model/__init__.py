@@ -1,1 +1,4 @@
-"""A parametric body with free data, and its fit to a scan."""
+"""A parametric body with free data, laid over a scan.
+
+template: shapes, skeleton, parts, landmarks. fitting: shape and pose, then a smooth residual.
+"""

@@ -1,4 +1,5 @@
 """Measure a body mesh.
 
 measurements: stature, girths, volume, area (outline: across filled surface). head: its top.
+named: landmarks, and measures by name, each a file in `measures`.
 """
