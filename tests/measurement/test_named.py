@@ -54,7 +54,8 @@ def scanned(vertices: Array, turn_deg: float = 0.0) -> BodyMesh:
     hidden |= TEMPLATE.hidden
     c, s = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
     turned = vertices @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-    mesh = mesh_of(turned, TEMPLATE.faces, hidden[TEMPLATE.faces].any(axis=1))
+    filled = np.asarray(hidden[TEMPLATE.faces].any(axis=1))
+    mesh = mesh_of(turned, TEMPLATE.faces, filled)
     return replace(mesh, sigma_mm=np.where(hidden, np.nan, np.float32(0.2)).astype(np.float32))
 
 
