@@ -149,9 +149,9 @@ class Author:
         nape = back & mid & self.band(base - 15, base + 15)
         out["cervicale"] = self.near((x[nape].min(), 0, base - 3), back & mid)
         throat = front & mid
-        ends = (self.pick(throat & self.band(low, low + 15), (1, 0, 0)) for low in (535, 660))
-        low, high = (self.vertices[end] for end in ends)
-        out["suprasternale"] = self.deepest(throat & self.band(560, 640), low, high)
+        # The notch lies some 50 mm below the seventh cervical vertebra.
+        notch = throat & self.band(base - 70, base - 35)
+        out["suprasternale"] = self.near((x[notch].mean(), 0, base - 53), notch)
         belly = throat & self.band(190, 215)
         out["omphalion"] = self.near((x[belly].max(), 0, 200), throat)
         seat = mid & self.band(-70, 0) & (self.normals[:, 2] < -0.3)
