@@ -153,8 +153,9 @@ def _calibration_folder(rig_file: Path, out: Path | None, overwrite: bool) -> Pa
 
     # A default beside the rig file may lie among its captures: their shots are told by name.
     folder = out or rig_file.parent / "calibration"
+    _require_writable(folder, overwrite)
     named = load_rig(rig_file).calibration if out else ()
-    _require_writable(folder, overwrite, *(capture_path(rig_file, entry) for entry in named))
+    require_writable(folder, *(capture_path(rig_file, entry) for entry in named))
     return folder
 
 
