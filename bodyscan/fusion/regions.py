@@ -185,7 +185,8 @@ def _measure_texture(
     known = np.bincount(cell, minlength=cells.count) >= 50
     medians, some = np.zeros((3, cells.count)), np.unique(cell)
     for row, values in zip(medians, (residual, residual / expected_mm, expected_mm), strict=True):
-        row[some] = ndimage.median(values, cell, some)
+        if some.size:
+            row[some] = ndimage.median(values, cell, some)
     scatter_mm, sigmas = SIGMAS_PER_MEDIAN * medians[:2]
     noise_mm = medians[2]
     relief_mm = np.sqrt(np.maximum(scatter_mm**2 - noise_mm**2, 0.0))

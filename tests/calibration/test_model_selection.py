@@ -30,7 +30,7 @@ class AtOneDepth:
     def __init__(self, depth: float = 0.0, variance: float = 0.0) -> None:
         self._depth, self._variance = depth, variance
 
-    def measure(self, rays: Array, s: Array) -> RayDepths:
+    def intersect(self, rays: Array, s: Array) -> RayDepths:
         assert np.all(rays[:, 2] == 1.0)
         return RayDepths(np.full(s.shape, self._depth), s, np.full(s.shape, self._variance))
 
