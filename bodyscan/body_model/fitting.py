@@ -25,7 +25,8 @@ from bodyscan.body_model.template import (
     PosedBody,
     pose_body,
 )
-from bodyscan.mesh.topology import vertex_normals
+from bodyscan.geometry.robust import rms
+from bodyscan.mesh.topology import directed_edges, vertex_normals
 
 NORMAL_MM = 80.0
 """Distance that counts as much as normals at right angles: the opposite sides of an arm, 80 mm apart,
@@ -96,15 +97,22 @@ def fit_body(template: BodyTemplate, surface: Surface) -> FittedBody:
         (35.0, 30.0, 25.0, 22.0, 20.0, 18.0, 16.0, 14.0, 12.0, 10.0, 10.0, 10.0),
     )
     posed = pose_body(template, body)
-    matches = _match(template, surface, tree, posed.vertices, 10.0)
-    distance = np.einsum("vi,vi->v", posed.vertices - matches.points, matches.normals)
-    known = matches.weights > 0.0
-    rms = float(np.sqrt(np.mean(distance[known] ** 2))) if known.any() else float("nan")
+    missed = _measure_distance(template, surface, tree, posed.vertices)
+    missed = missed[np.isfinite(missed)]
     vertices = _fit_residual(template, surface, tree, posed.vertices)
+    distance = _measure_distance(template, surface, tree, vertices)
+    rms_mm = rms(missed) if missed.size else float("nan")
+    return FittedBody(template, vertices, body, posed, distance, rms_mm)
+
+
+def _measure_distance(
+    template: BodyTemplate, surface: Surface, tree: KDTree, vertices: Array
+) -> Array:
+    """Signed distance (V,) mm of vertices from the surface, along its normals; NaN without a match."""
     matches = _match(template, surface, tree, vertices, 10.0)
     distance = np.einsum("vi,vi->v", vertices - matches.points, matches.normals)
     distance[matches.weights == 0.0] = np.nan
-    return FittedBody(template, vertices, body, posed, distance, rms)
+    return distance
 
 
 def _lift(points: Array, normals: Array) -> Array:
@@ -246,9 +254,8 @@ def differentiate(
     by_shape = np.einsum("mb,kmb->mk", facing, template.shapes[:, used])
     offsets = np.zeros_like(template.joint_shapes, dtype=np.float64)
     for joint, parent in enumerate(template.parents):
-        own = template.joint_shapes[:, joint]
         if parent >= 0:
-            bone = own - template.joint_shapes[:, parent]
+            bone = template.joint_shapes[:, joint] - template.joint_shapes[:, parent]
             offsets[:, joint] = offsets[:, parent] + bone @ posed.rotations[parent].T
     shifts = offsets - np.einsum("jab,kjb->kja", posed.rotations, template.joint_shapes)
     by_shape += np.einsum("ma,mj,kja->mk", normals, weights, shifts, optimize=True)
@@ -279,10 +286,8 @@ def _fit_residual(template: BodyTemplate, surface: Surface, tree: KDTree, vertic
 
 
 def _laplacian(faces: Indices, count: int) -> sparse.csr_matrix:
-    """The uniform graph Laplacian (V, V)."""
-    a, b, c = faces.T
-    rows, columns = np.concatenate([a, b, c, b, c, a]), np.concatenate([b, c, a, a, b, c])
-    links = sparse.csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(count, count))
-    links.data[:] = 1.0
+    """The uniform graph Laplacian (V, V) of a closed mesh, each edge of which runs both ways."""
+    edges = directed_edges(faces)
+    links = sparse.csr_matrix((np.ones(len(edges)), edges.T), shape=(count, count))
     degree = np.asarray(links.sum(axis=1)).ravel()
     return sparse.csr_matrix(sparse.identity(count) - sparse.diags(1.0 / degree) @ links)

@@ -174,7 +174,9 @@ def measure(
     content = measurements_document(measured, stored.facts)
     path = out or result / "measurements.json"
     if path.suffix.lower() == ".csv":
-        write_text(path, named_csv(content) if named else measurements_csv(content))
+        by_name = measured.named
+        table = named_csv(by_name, stored.facts) if by_name else measurements_csv(content)
+        write_text(path, table)
     else:
         write_json(path, content)
     if path.suffix != ".json":

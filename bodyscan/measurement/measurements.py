@@ -11,7 +11,7 @@ from bodyscan.arrays import Array, Bytes, Mask
 from bodyscan.errors import BadInput
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.measurement.head import HeadTop, estimate_head_top
-from bodyscan.measurement.named import Measure, NamedMeasures, measure_by_name
+from bodyscan.measurement.named import CROWN_MM, Measure, NamedMeasures, measure_by_name
 from bodyscan.measurement.outline import Range, bound_girths, girth_sigma
 from bodyscan.mesh.body import (
     HAIR,
@@ -26,9 +26,6 @@ from bodyscan.mesh.body import (
 from bodyscan.mesh.body_parts import Piece, find_body_frame, find_parts
 from bodyscan.mesh.slices import MeshSlicer
 from bodyscan.mesh.topology import face_areas, signed_volume
-
-CROWN_MM = 20.0
-"""Height of the crown below the top."""
 
 
 @dataclass(frozen=True)

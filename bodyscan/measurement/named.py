@@ -41,7 +41,7 @@ from bodyscan.mesh.topology import vertex_normals
 
 CROWN_MM = 20.0
 """Height of the crown below the top."""
-UNLIKE = 1.7
+LANDMARK_INFLATION = 1.7
 """Error over sigma of landmarks on the two people of an independent renderer: they have hair, cloth and
 breath, which the bodies that sigmas were measured on lack."""
 SAMPLES = 80_000
@@ -221,12 +221,12 @@ def _locate(
     )
     landmarks = {name: fitted.vertices[at] for name, at in template.landmarks.items()}
     parts = template.parts[nearest]
-    sigmas = (UNLIKE * template.landmark_sigma_mm).tolist()
+    sigmas = (LANDMARK_INFLATION * template.landmark_sigma_mm).tolist()
     sigma = dict(zip(template.landmarks, sigmas, strict=True))
     noise = mesh.sigma_mm.astype(np.float64)
     noise[~np.isfinite(noise)] = np.nanmedian(noise)
-    lean = np.zeros(len(vertices)) if breath_mm is None else breath_mm.astype(np.float64)
-    return _Body(vertices, mesh, parts, template.part_names, landmarks, sigma, noise, lean, {})
+    breath = np.zeros(len(vertices)) if breath_mm is None else breath_mm.astype(np.float64)
+    return _Body(vertices, mesh, parts, template.part_names, landmarks, sigma, noise, breath, {})
 
 
 def _take(body: _Body, definition: Mapping[str, Any]) -> Measure:
@@ -238,8 +238,8 @@ def _take(body: _Body, definition: Mapping[str, Any]) -> Measure:
         moved = [kind(body, definition, step * sigma_mm)[0] for step in (-1.96, -1.0, 1.0, 1.96)]
     else:
         count = len(definition["landmarks"])
-        spread = 1.96 * sigma_mm * (np.sqrt(2.0) if count > 1 else 1.0)
-        moved = [value - spread, value + spread]
+        half_width = 1.96 * sigma_mm * (np.sqrt(2.0) if count > 1 else 1.0)
+        moved = [value - half_width, value + half_width]
     margin = 1.96 * noise_mm
     low, high = min([value, *moved]) - margin, max([value, *moved]) + margin
     source = definition.get("standard", "")
@@ -257,9 +257,9 @@ def _height(body: _Body, definition: Mapping[str, Any], shift_mm: float) -> Take
         top = float(body.vertices[:, 2].max())
         crown = body.vertices[body.mesh.faces, 2].max(axis=1) > top - CROWN_MM
         # A crown that nobody saw is closed by a guess, which may be off by as much.
-        seen = float((~body.mesh.filled[crown]).mean())
+        measured = float((~body.mesh.filled[crown]).mean())
         noise = float(np.median(body.noise_mm))
-        return top, seen, noise if seen > 0.5 else CROWN_MM / 1.96
+        return top, measured, noise if measured > 0.5 else CROWN_MM / 1.96
     heights = [body.landmarks[name][2] for name in definition["landmarks"]]
     return float(np.mean(heights)), 1.0, float(np.median(body.noise_mm))
 

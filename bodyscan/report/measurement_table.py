@@ -99,17 +99,17 @@ def _named_table(named: NamedMeasures) -> Table:
     return table
 
 
-def named_csv(content: Mapping[str, Any]) -> str:
-    """The named measures of a `measurements_document` as CSV: a row for each; lengths in mm."""
+def named_csv(named: NamedMeasures, facts: Mapping[str, Any]) -> str:
+    """Named measures as CSV: a row for each, lengths in mm; facts: of the scan, as in its scan.json."""
     text = io.StringIO()
     names = ("subject", "when", "name", "value", "low", "high", "unit", "measured", "standard")
     table = csv.DictWriter(text, (*names, "definition"), extrasaction="ignore")
     table.writeheader()
-    for measure in content["measures"]:
-        low, high = measure["interval_mm"]
-        value = None if measure["measured"] < 0.9 else measure["mm"]
-        row = {"subject": content["subject"], "when": content["when"], "unit": "mm"}
-        table.writerow(row | measure | {"value": value, "low": low, "high": high})
+    scan = {"subject": facts.get("subject"), "when": facts.get("when"), "unit": "mm"}
+    for measure in named.measures.values():
+        low, high = measure.interval_mm
+        value = None if measure.is_range else measure.mm
+        table.writerow(scan | asdict(measure) | {"value": value, "low": low, "high": high})
     return text.getvalue()
 
 
