@@ -31,10 +31,11 @@ def add_pose_variance(
     facing = towards > 0.2 * cdist(points, centres)
     lever = np.hstack([np.cross(points, normals), normals])
     variance = np.zeros(len(points))
-    # Many points face the same pairs.
-    code = facing @ (1 << np.arange(size, dtype=np.int64))
-    order = np.argsort(code, kind="stable")
-    for group in np.split(order, np.flatnonzero(np.diff(code[order])) + 1):
+    # Many points face the same pairs; bytes hold any number of these.
+    bits = np.packbits(facing, axis=1)
+    order = np.lexsort(bits.T)
+    starts = np.flatnonzero(np.diff(bits[order].astype(np.int16), axis=0).any(axis=1)) + 1
+    for group in np.split(order, starts):
         pairs = np.flatnonzero(facing[group[0]])
         used = np.minimum(cloud.pairs_seen[group], len(pairs))
         variance[group] = _mean_variance(lever[group], joint[pairs][:, :, pairs], used)

@@ -71,6 +71,17 @@ def test_what_pairs_do_not_share_averages_out(
     assert found.sigma_mm[back] == pytest.approx(np.hypot(0.03, 0.4), rel=1e-3)
 
 
+def test_the_seventieth_pair_errs_as_the_first(cloud: BodyCloud) -> None:
+    """All pairs but the last stand in front; the last is known to a metre: what it faces is unsure."""
+    places = placed(*[[1300.0, 0.0, 900.0]] * 69, [0.0, 1300.0, 900.0])
+    covariance = np.zeros((420, 420))
+    covariance[414:, 414:] = np.diag([0.0, 0.0, 0.0, 1e6, 1e6, 0.0])
+    found = add_pose_variance(cloud, places, PoseCovariance(tuple(places), covariance))
+    towards = np.array(places["p69"].translation) - cloud.points
+    cosine = np.sum(towards * cloud.normals, axis=1) / np.linalg.norm(towards, axis=1)
+    assert np.array_equal(found.sigma_mm > 1.0, cosine > 0.2)
+
+
 def test_a_mean_of_three_pairs_spreads_by_its_error_bar(cloud: BodyCloud) -> None:
     """Motions drawn from a joint covariance without any structure; 2000 draws tell a spread to
     1.6 %, four times that for the worst of the points."""
