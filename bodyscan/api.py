@@ -31,6 +31,7 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
+import bodyscan.api  # annotations name its types, which `get_type_hints` then imports
 from bodyscan.errors import BadInput, BodyscanError, FailedWork
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, silent
@@ -44,7 +45,7 @@ from bodyscan.settings import (
 from bodyscan.verdict import Verdict
 
 if TYPE_CHECKING:
-    from bodyscan.arrays import Bytes
+    from bodyscan.arrays import Bytes as Bytes
     from bodyscan.fusion.storage import Scan, StoredScan
     from bodyscan.measurement.measurements import Measurements
     from bodyscan.mesh.body import BodyCloud, BodyMesh
@@ -57,6 +58,7 @@ AnyPath: TypeAlias = str | PathLike[str]
 _HOMES = {
     "BodyCloud": "bodyscan.mesh.body",
     "BodyMesh": "bodyscan.mesh.body",
+    "Bytes": "bodyscan.arrays",
     "Measurements": "bodyscan.measurement.measurements",
     "RangeImage": "bodyscan.reconstruction.range_image",
     "Rig": "bodyscan.rig.rig",
@@ -101,7 +103,7 @@ __all__ = [
 ]
 
 
-def load_rig(path: AnyPath) -> Rig:
+def load_rig(path: AnyPath) -> bodyscan.Rig:
     """Read a rig file. Raises RigFileError with every problem, by line and column.
 
     >>> rig = load_rig("rigs/three-pole-12.yaml")
@@ -114,8 +116,8 @@ def load_rig(path: AnyPath) -> Rig:
 
 
 def calibrate_rig(
-    rig_file: AnyPath | Rig, *, folder: AnyPath | None = None, progress: Progress = silent
-) -> RigCalibration:
+    rig_file: AnyPath | bodyscan.Rig, *, folder: AnyPath | None = None, progress: Progress = silent
+) -> bodyscan.RigCalibration:
     """Calibrate every pair of a rig and its pose, from the board images that the rig file names.
 
     rig_file: a path, or a `Rig` from `load_rig`, changed or not.
@@ -135,7 +137,9 @@ def calibrate_rig(
     return calibrate(rig, open_captures(rig, path), progress, folder=path.parent)
 
 
-def import_calibration(rig_file: AnyPath, *, sigma_px: float | None = None) -> RigCalibration:
+def import_calibration(
+    rig_file: AnyPath, *, sigma_px: float | None = None
+) -> bodyscan.RigCalibration:
     """Import other programs' calibrations, from the files that the rig file names as `known`.
 
     sigma_px: sigma of their pixels, px, overriding the rig file's; if neither gives one, the
@@ -150,11 +154,11 @@ def import_calibration(rig_file: AnyPath, *, sigma_px: float | None = None) -> R
 
 def put_image(
     inbox: AnyPath,
-    calibration: RigCalibration,
+    calibration: bodyscan.RigCalibration,
     scan: str,
     pair: str,
     frame: str,
-    image: Bytes,
+    image: bodyscan.api.Bytes,
     *,
     shot: str = "s01",
 ) -> Path:
@@ -170,14 +174,14 @@ def put_image(
     return put(Path(inbox), calibration.rig, scan, pair, frame, image, shot=shot)
 
 
-def save_calibration(calibration: RigCalibration, folder: AnyPath) -> Path:
+def save_calibration(calibration: bodyscan.RigCalibration, folder: AnyPath) -> Path:
     """Write calibration.json and its arrays into `folder`; return the path of the JSON."""
     from bodyscan.registration.storage import save_calibration as save
 
     return save(calibration, Path(folder))
 
 
-def load_calibration(path: AnyPath) -> RigCalibration:
+def load_calibration(path: AnyPath) -> bodyscan.RigCalibration:
     """Read what `save_calibration` or `bodyscan calibrate-rig` wrote, exact to the last bit.
 
     Raises CalibrationFileError:
@@ -195,8 +199,8 @@ def load_calibration(path: AnyPath) -> RigCalibration:
 
 
 def triangulate(
-    folder: AnyPath, calibration: RigCalibration, *, progress: Progress = silent
-) -> Outcome[list[RangeImage]]:
+    folder: AnyPath, calibration: bodyscan.RigCalibration, *, progress: Progress = silent
+) -> Outcome[list[bodyscan.RangeImage]]:
     """Each pair's range image of a scan, background included, in its camera's frame.
 
     Pairs that gave nothing are in the outcome's `failures`, with the reason. Raises CaptureError;
@@ -211,12 +215,12 @@ def triangulate(
 
 def scan(
     folder: AnyPath,
-    calibration: RigCalibration,
+    calibration: bodyscan.RigCalibration,
     settings: ScanSettings = ScanSettings(),
     *,
     empty: AnyPath | None = None,
     progress: Progress = silent,
-) -> Scan:
+) -> bodyscan.Scan:
     """Fuse one person's captures into a cloud and a closed mesh, with a verdict on them.
 
     empty: captures of the rig with nobody in it; the surfaces they show are cut away.
@@ -235,13 +239,13 @@ def scan(
 
 
 def save_scan(
-    scan: Scan,
+    scan: bodyscan.Scan,
     folder: AnyPath,
     *,
     calibration: AnyPath,
     subject: str | None = None,
     when: datetime | None = None,
-) -> StoredScan:
+) -> bodyscan.StoredScan:
     """Write the body model and its description (scan.json) into `folder`; return it as read back.
 
     calibration: path of the stored calibration that the scan was made with; scan.json refers to it
@@ -258,7 +262,7 @@ def save_scan(
     return load_scan(folder)
 
 
-def load_scan(folder: AnyPath) -> StoredScan:
+def load_scan(folder: AnyPath) -> bodyscan.StoredScan:
     """Read what `save_scan` or `bodyscan scan` wrote. Raises ResultError if missing or damaged."""
     from bodyscan.fusion.storage import load_scan as load
 
@@ -266,11 +270,11 @@ def load_scan(folder: AnyPath) -> StoredScan:
 
 
 def measure(
-    body: Scan | StoredScan | BodyMesh,
+    body: bodyscan.Scan | bodyscan.StoredScan | bodyscan.BodyMesh,
     heights_mm: Sequence[float] | None = None,
     *,
     named: bool = False,
-) -> Measurements:
+) -> bodyscan.Measurements:
     """Stature, volume, area and girths of horizontal slices, each with the share measured.
 
     heights_mm: heights of the slices above the floor; every 100 mm if None.
@@ -286,7 +290,7 @@ def measure(
 
 
 def export_scan(
-    stored: StoredScan,
+    stored: bodyscan.StoredScan,
     folder: AnyPath,
     settings: ExportSettings = ExportSettings(),
     *,

@@ -5,7 +5,9 @@ from __future__ import annotations
 import doctest
 import subprocess
 import sys
+from inspect import signature
 from pathlib import Path
+from typing import get_type_hints
 
 import pytest
 
@@ -38,6 +40,12 @@ def test_a_rig_is_loaded_without_what_fuses() -> None:
 def test_every_name_is_there_and_says_what_it_is(name: str) -> None:
     assert getattr(bodyscan, name) is getattr(api, name)
     assert getattr(bodyscan, name).__doc__
+
+
+@pytest.mark.parametrize("name", [name for name in api.__all__ if name.islower()])
+def test_programs_can_ask_for_the_types_of_every_function(name: str) -> None:
+    function = getattr(bodyscan, name)
+    assert get_type_hints(function).keys() == {*signature(function).parameters, "return"}
 
 
 def test_the_list_is_sorted_short_and_all_that_shows() -> None:
