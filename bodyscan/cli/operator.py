@@ -323,9 +323,9 @@ def _listening(output: Output) -> Iterator[Listen]:
     from bodyscan.jobs import display
     from bodyscan.jobs.supervision import ignore_events
 
-    quiet = nullcontext(ignore_events) if output.quiet else display.screen()
+    quiet = nullcontext(ignore_events) if output.quiet else display.show_on_screen()
     try:
-        with display.json_lines() if output.json else quiet as listen:
+        with display.print_json_lines() if output.json else quiet as listen:
             yield listen
     except KeyboardInterrupt:
         sys.stdout.flush()

@@ -26,7 +26,7 @@ from bodyscan.verdict import LEFT_OUT, MARKS, STYLES
 
 
 @contextmanager
-def json_lines() -> Iterator[Listen]:
+def print_json_lines() -> Iterator[Listen]:
     """Print every event as a line of JSON on standard output, with the time (seconds since 1970)."""
     lock = threading.Lock()
 
@@ -40,7 +40,7 @@ def json_lines() -> Iterator[Listen]:
 
 
 @contextmanager
-def screen() -> Iterator[Listen]:
+def show_on_screen() -> Iterator[Listen]:
     """Show one bar for a batch with the time left, and a line for each job that runs or has ended.
 
     A watch has no such bar; instead a line for each scan as soon as its points are judged.
@@ -68,21 +68,21 @@ class _Screen:
 
     def __call__(self, event: dict[str, Any]) -> None:
         with self._lock:
-            getattr(self, f"_{event['event']}")(event)
+            getattr(self, f"_show_{event['event']}")(event)
 
     def _print(self, text: str | Text, style: str = "") -> None:
         text = text if isinstance(text, Text) else Text(text, style)
         self._bars.console.print(text, soft_wrap=True)
 
-    def _batch(self, event: dict[str, Any]) -> None:
+    def _show_batch(self, event: dict[str, Any]) -> None:
         self._all = self._bars.add_task("all jobs", total=len(event["jobs"]), more="")
 
-    def _shares(self, event: dict[str, Any]) -> None:
+    def _show_shares(self, event: dict[str, Any]) -> None:
         jobs = "job" if event["workers"] == 1 else "jobs"
         text = f"{event['workers']} {jobs} at a time, {event['threads']} threads each"
         self._print(f"{text} ({event['why']})", "dim")
 
-    def _summary(self, event: dict[str, Any]) -> None:
+    def _show_summary(self, event: dict[str, Any]) -> None:
         if self._all is None:
             return
         aside = len(event["set_aside"])
@@ -99,11 +99,11 @@ class _Screen:
             )
         self._print(f"{text}\ntable: {event['table']}")
 
-    def _progress(self, event: dict[str, Any]) -> None:
+    def _show_progress(self, event: dict[str, Any]) -> None:
         if self._all is not None:
             self._bars.update(self._all, completed=event["ended"])
 
-    def _job(self, event: dict[str, Any]) -> None:
+    def _show_job(self, event: dict[str, Any]) -> None:
         job, state = event["job"], event["state"]
         if state in ("running", "sent"):
             more = f"attempt {event['attempt']}" if event.get("attempt", 1) > 1 else ""
@@ -115,11 +115,11 @@ class _Screen:
             self._bars.remove_task(self._running.pop(job))
         self._print(format_ending(event), "" if state == "done" else "red")
 
-    def _verdict(self, event: dict[str, Any]) -> None:
+    def _show_verdict(self, event: dict[str, Any]) -> None:
         if event["final"] or self._all is None:
-            self._print(_verdict_text(event))
+            self._print(_format_verdict(event))
 
-    def _stage(self, event: dict[str, Any]) -> None:
+    def _show_stage(self, event: dict[str, Any]) -> None:
         if "kept" in event:
             added = f"files that were added to {event['stage']} are now in {event['kept']}"
             self._print(f"{event['job']}: {added}")
@@ -132,7 +132,7 @@ class _Screen:
             )
 
 
-def _verdict_text(event: dict[str, Any]) -> Text:
+def _format_verdict(event: dict[str, Any]) -> Text:
     """A scan's verdict with its worst reason, and every other pair that was lost."""
     grade = event["grade"] if event["final"] else f"{event['grade']} so far"
     text = ": ".join([event["job"], grade, *event["reasons"][:1]])
@@ -149,10 +149,10 @@ def format_ending(event: dict[str, Any]) -> str:
         return f"{event['job']}: set aside{tries}: {event['reason']}"
     if not event["stages"]:
         return f"{event['job']}: up to date"
-    return f"{event['job']}: {', '.join(event['stages'])} in {_duration(event['seconds'])}"
+    return f"{event['job']}: {', '.join(event['stages'])} in {_format_duration(event['seconds'])}"
 
 
-def _duration(seconds: float) -> str:
+def _format_duration(seconds: float) -> str:
     if seconds < 90:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

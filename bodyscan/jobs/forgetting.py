@@ -67,11 +67,11 @@ def find_subject(subject: str, workspace: Path) -> SubjectFiles:
     unnamed: dict[Path, int] = {}
     named = {workspace, *workspace.parents}
     walked = list(_walk(workspace, None, unreadable))
-    sources = _sources_of(subject, walked)
+    sources = _find_sources(subject, walked)
     for folder, names, owner in walked:
         if owner is None and sources & {folder, *folder.parents}:
             owner = subject
-        found = set(names) if owner == subject else _exports(folder, names, subject)
+        found = set(names) if owner == subject else _find_exports(folder, names, subject)
         files += (folder / name for name in found)
         if owner == subject and folder != workspace:
             folders.append(folder)
@@ -83,14 +83,14 @@ def find_subject(subject: str, workspace: Path) -> SubjectFiles:
             unnamed[folder] = count
     order = {name: rank for rank, name in enumerate(_MARKERS, start=1)}
     files.sort(key=lambda path: (order.get(path.name, 0), path))
-    rows = [out for out in tables if _without(subject, out / SUMMARY) is not None]
+    rows = [out for out in tables if _drop_rows(subject, out / SUMMARY) is not None]
     return SubjectFiles(
         *(tuple(files), tuple(folders), tuple(tables), tuple(rows), tuple(unreadable)),
-        _gather(unnamed, named),
+        _count_by_folder(unnamed, named),
     )
 
 
-def _sources_of(subject: str, walked: Sequence[_Folder]) -> set[Path]:
+def _find_sources(subject: str, walked: Sequence[_Folder]) -> set[Path]:
     """Folders of images that name nobody, from which the subject's jobs were made."""
     owners = {folder.resolve(): (folder, owner) for folder, _, owner in walked}
     sources = set()
@@ -110,7 +110,7 @@ def _may_show_someone(name: str, names: Sequence[str]) -> bool:
     return name.lower().endswith((*images, *bodies)) and f"{name}.json" not in names
 
 
-def _gather(unnamed: Mapping[Path, int], named: Collection[Path]) -> dict[Path, int]:
+def _count_by_folder(unnamed: Mapping[Path, int], named: Collection[Path]) -> dict[Path, int]:
     """Count by the highest folder that holds nothing which is known to be of someone, or no one."""
     counts: Counter[Path] = Counter()
     for folder, count in unnamed.items():
@@ -131,7 +131,7 @@ def forget_subject(subject: str, workspace: Path) -> SubjectFiles:
             locks.enter_context(lock_file(out / BATCH_LOCK, wait=False))
         require_found(found, subject, workspace)
         for out in found.rows:
-            write_text(out / SUMMARY, _without(subject, out / SUMMARY) or "")
+            write_text(out / SUMMARY, _drop_rows(subject, out / SUMMARY) or "")
         for path in found.files:
             path.unlink(missing_ok=True)
         for folder in sorted(found.folders, reverse=True):
@@ -174,7 +174,7 @@ def _walk(folder: Path, owner: str | bool | None, unreadable: list[Path]) -> Ite
     for marker in _MARKERS:
         if marker in names:
             try:
-                content = _content(folder / marker)
+                content = _read_mapping(folder / marker)
             except (OSError, ValueError, YamlError, RecursionError):
                 unreadable.append(folder / marker)
                 continue
@@ -188,7 +188,7 @@ def _walk(folder: Path, owner: str | bool | None, unreadable: list[Path]) -> Ite
             yield from _walk(Path(entry.path), owner, unreadable)
 
 
-def _content(path: Path) -> dict[str, Any]:
+def _read_mapping(path: Path) -> dict[str, Any]:
     """The mapping in a JSON file or captures.yaml. Raises ValueError, YamlError."""
     is_yaml = path.name == CAPTURES
     content: Any = read_yaml(path).data if is_yaml else json.loads(path.read_text("utf-8"))
@@ -197,7 +197,7 @@ def _content(path: Path) -> dict[str, Any]:
     return content
 
 
-def _exports(folder: Path, names: list[str], subject: str) -> set[str]:
+def _find_exports(folder: Path, names: list[str], subject: str) -> set[str]:
     """The subject's exports, reports and measurements in a folder of no one or another subject."""
     found: set[str] = set()
     for name in names:
@@ -205,7 +205,7 @@ def _exports(folder: Path, names: list[str], subject: str) -> set[str]:
         if not name.endswith(".json") or name in _MARKERS:
             continue
         with suppress(OSError, ValueError, RecursionError):
-            content = _content(folder / name)
+            content = _read_mapping(folder / name)
             is_ours = str(content.get("schema")).startswith("bodyscan-")
             whose = (content.get("subject"), content.get("compared_with"))
             if subject in whose and (described in names or is_ours):
@@ -213,7 +213,7 @@ def _exports(folder: Path, names: list[str], subject: str) -> set[str]:
     return found
 
 
-def _without(subject: str, summary: Path) -> str | None:
+def _drop_rows(subject: str, summary: Path) -> str | None:
     """The summary without the subject's rows; None if it has none."""
     try:
         text = summary.read_text("utf-8")

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from bodyscan.jobs.display import json_lines, screen
+from bodyscan.jobs.display import print_json_lines, show_on_screen
 
 EVENTS: list[dict[str, Any]] = [
     {"event": "shares", "workers": 2, "threads": 1, "why": "2 cores"},
@@ -30,7 +30,7 @@ EVENTS: list[dict[str, Any]] = [
 
 
 def test_people_are_told_what_happened(capsys: pytest.CaptureFixture[str]) -> None:
-    with screen() as listen:
+    with show_on_screen() as listen:
         for event in EVENTS:
             listen(event)
     said = capsys.readouterr().err
@@ -43,7 +43,7 @@ def test_people_are_told_what_happened(capsys: pytest.CaptureFixture[str]) -> No
 
 
 def test_programs_are_told_in_json(capsys: pytest.CaptureFixture[str]) -> None:
-    with json_lines() as listen:
+    with print_json_lines() as listen:
         for event in EVENTS:
             listen(event)
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
@@ -56,7 +56,7 @@ def test_a_reader_that_goes_away_stops_nothing(monkeypatch: pytest.MonkeyPatch) 
             raise BrokenPipeError
 
     monkeypatch.setattr(sys, "stdout", Gone())
-    with json_lines() as listen:
+    with print_json_lines() as listen:
         listen(EVENTS[0])
 
 
@@ -78,7 +78,7 @@ def test_a_verdict_names_every_pair_that_was_lost(
     reasons: list[str], said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     event = {"event": "verdict", "job": "anna", "grade": "usable", "reasons": reasons}
-    with screen() as listen:
+    with show_on_screen() as listen:
         listen(event | {"final": True})
     told = capsys.readouterr()
     assert said in told.out + told.err

@@ -75,13 +75,13 @@ def kinds(scan_version: int = 1) -> dict[str, tuple[Stage, ...]]:
 def batch(scans: Path, out: Path, workers: int) -> int:
     # As in the package, a job's own process does not load what hands jobs out.
     from bodyscan.jobs.batch import Allocation, finish, run_batch, run_locally
-    from bodyscan.jobs.display import json_lines
+    from bodyscan.jobs.display import print_json_lines
     from bodyscan.jobs.job import find_jobs
     from bodyscan.jobs.pipeline import load_pipeline
 
     pipeline = load_pipeline(PIPELINE)
     jobs = find_jobs(pipeline, scans, out, scans, "export")
-    with json_lines() as listen:
+    with print_json_lines() as listen:
         run = run_locally(Allocation(workers, 1, ""), COMMAND, listen)
         outcomes = run_batch(jobs, out, run, listen)
         listen(finish(jobs, outcomes, out))
