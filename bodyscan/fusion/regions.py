@@ -77,6 +77,12 @@ class _Grid:
         label = ndimage.label(occupied.reshape(self.shape), np.ones((3, 3, 3)))[0]
         return np.asarray(label.ravel(), np.int64)
 
+    def compute_medians(self, values: Floats, cell: Indices) -> Array:
+        """Median (count,) of the values (N,) in each cell, by the cell (N,) of each; 0 if none."""
+        medians, some = np.zeros(self.count), np.unique(cell)
+        medians[some] = ndimage.median(values, cell, some) if some.size else 0.0
+        return medians
+
     def find_majority(self, mask: Mask, among: Mask) -> Mask:
         """(count,): cells around which more than half of the `among` cells are in `mask`."""
         counts = [
@@ -87,9 +93,9 @@ class _Grid:
 
 
 @dataclass(frozen=True, eq=False)
-class _Texture:
-    """Texture of each cell, (count,): whether enough pixels are known, and whether it is rough
-    beyond noise or smooth, noise included; relief_mm: standard deviation, noise subtracted."""
+class _Textures:
+    """The texture of each cell, (count,): whether it is known, of 50 pixels or more, and whether it
+    is rough beyond noise, or smooth with it; relief_mm: standard deviation without noise's share."""
 
     known: Mask
     rough: Mask
@@ -120,7 +126,8 @@ def label_regions(
     covered = darks > 0.5 * total
     patch = cells.label_patches(darks > 0)
     head = find_head(cloud.points, cells.centres)
-    texture = _measure_texture(cells, patch > 0, head, range_images, rig_from_camera, window_mm)
+    wanted = head | (patch > 0)
+    texture = _classify_textures(cells, wanted, range_images, rig_from_camera, window_mm)
     known = texture.known & covered
     rough = cells.find_majority(texture.rough, known)
     smooth = cells.find_majority(texture.smooth, known)
@@ -158,42 +165,35 @@ def find_head(points: Array, queries: Array) -> Mask:
     return np.asarray((queries[:, 2] > NECK * top) & (across < 0.12 * top))
 
 
-def _measure_texture(
+def _classify_textures(
     cells: _Grid,
-    dark: Mask,
-    head: Mask,
+    wanted: Mask,
     range_images: Sequence[RangeImage],
     rig_from_camera: Mapping[str, RigidTransform],
     window_mm: float,
-) -> _Texture:
-    """Texture of dark cells and of the head with 50 pixels or more, by the medians of their
-    residuals; elsewhere it is not known."""
-    wanted = dark | head
+) -> _Textures:
+    """Classify the `wanted` cells (count,) by the median residuals of their pixels."""
+    nothing = Roughness(np.zeros((0, 3)), *np.zeros((2, 0), np.float32))
 
-    def measure(image: RangeImage) -> Roughness | None:
+    def measure(image: RangeImage) -> Roughness:
         pose, inside = rig_from_camera[image.pair], image.valid
         inside[inside] = wanted[cells.find(pose.apply(image.points[inside].astype(np.float64)))]
         box = find_crop(inside)
-        return None if box is None else measure_roughness(image, pose, box, window_mm)
+        return nothing if box is None else measure_roughness(image, pose, box, window_mm)
 
-    each = map_threads(measure, range_images, stage="naming regions")
-    nothing = np.zeros(0, np.float32)
-    found = [Roughness(np.zeros((0, 3)), nothing, nothing), *(one for one in each if one)]
+    found = [nothing, *map_threads(measure, range_images, stage="labelling regions")]
     cell = np.concatenate([cells.find(one.points) for one in found])
-    residual = np.concatenate([one.residual_mm for one in found])
+    residual_mm = np.concatenate([one.residual_mm for one in found])
     expected_mm = np.concatenate([one.expected_mm for one in found])
     known = np.bincount(cell, minlength=cells.count) >= 50
-    medians, some = np.zeros((3, cells.count)), np.unique(cell)
-    for row, values in zip(medians, (residual, residual / expected_mm, expected_mm), strict=True):
-        if some.size:
-            row[some] = ndimage.median(values, cell, some)
-    scatter_mm, sigmas = SIGMAS_PER_MEDIAN * medians[:2]
-    noise_mm = medians[2]
+    scatter_mm = SIGMAS_PER_MEDIAN * cells.compute_medians(residual_mm, cell)
+    sigmas = SIGMAS_PER_MEDIAN * cells.compute_medians(residual_mm / expected_mm, cell)
+    noise_mm = cells.compute_medians(expected_mm, cell)
     relief_mm = np.sqrt(np.maximum(scatter_mm**2 - noise_mm**2, 0.0))
     # Sigmas of dark cloth are right to a third; where several exposures show relief they include
     # it, so that only what is coarser than the stripes counts.
     rough = known & (sigmas > 3.0) & (scatter_mm > ROUGH_MM)
-    return _Texture(known, rough, known & (scatter_mm < ROUGH_MM), relief_mm)
+    return _Textures(known, rough, known & (scatter_mm < ROUGH_MM), relief_mm)
 
 
 @dataclass(frozen=True, eq=False)
