@@ -21,8 +21,8 @@ from bodyscan.calibration.boundary_points import (
     on_board,
 )
 from bodyscan.calibration.camera import CameraCalibration, locate_board
-from bodyscan.calibration.light_sheets import fit_light_sheets
 from bodyscan.calibration.sheet_fit import fit_light_planes, fit_pinhole
+from bodyscan.calibration.sheet_selection import fit_light_sheets
 from bodyscan.captures.folder import Captures
 from bodyscan.errors import PairFailed
 from bodyscan.geometry.light_planes import Axis, LightPlanes, LightSheets

@@ -18,9 +18,9 @@ from bodyscan.calibration.boundary_points import (
 )
 from bodyscan.calibration.camera import LensTrial
 from bodyscan.calibration.joint_refinement import BoardStripes, StripedBoard, refine_jointly
-from bodyscan.calibration.light_sheets import fit_light_sheets
 from bodyscan.calibration.model_selection import HeldOutModel
 from bodyscan.calibration.sheet_fit import fit_pinhole, fit_sheets
+from bodyscan.calibration.sheet_selection import fit_light_sheets
 from bodyscan.errors import PairFailed
 from bodyscan.geometry.bowed_sheets import BowedSheets
 from bodyscan.geometry.camera import Camera

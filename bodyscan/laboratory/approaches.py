@@ -27,8 +27,8 @@ from bodyscan.calibration.boundary_points import (
 )
 from bodyscan.calibration.camera import CameraCalibration, calibrate_camera, locate_board
 from bodyscan.calibration.joint_refinement import BoardStripes, StripedBoard, refine_jointly
-from bodyscan.calibration.light_sheets import fit_light_sheets
 from bodyscan.calibration.sheet_fit import PlaneFit, fit_light_planes, fit_pinhole
+from bodyscan.calibration.sheet_selection import fit_light_sheets
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.light_planes import Axis, LightPlanes, LightSheets, SmoothSheets
 from bodyscan.geometry.transforms import RigidTransform

@@ -28,7 +28,7 @@ from bodyscan.calibration.joint_refinement import (
     StripedBoard,
     refine_jointly,
 )
-from bodyscan.calibration.light_sheets import fit_light_sheets
+from bodyscan.calibration.sheet_selection import fit_light_sheets
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.light_planes import SmoothSheets
 from bodyscan.geometry.transforms import RigidTransform, fit_rigid_transform

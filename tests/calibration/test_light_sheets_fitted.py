@@ -20,8 +20,8 @@ from sheet_models import PINHOLE
 
 from bodyscan.arrays import Array
 from bodyscan.calibration.boundary_points import BoundaryPoints, concatenate, select
-from bodyscan.calibration.light_sheets import SheetsFit, fit_light_sheets
 from bodyscan.calibration.sheet_fit import count_boards
+from bodyscan.calibration.sheet_selection import SheetsFit, fit_light_sheets
 from bodyscan.errors import PairFailed
 from bodyscan.geometry.lens_sheets import LensSheets
 from bodyscan.geometry.light_planes import LightPlanes, SmoothSheets

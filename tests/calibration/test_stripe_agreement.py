@@ -17,8 +17,8 @@ from lit_boards import (
 )
 
 from bodyscan.calibration.boundary_points import boundary_points, concatenate
-from bodyscan.calibration.light_sheets import fit_light_sheets
 from bodyscan.calibration.pair import board_offsets, find_odd_board
+from bodyscan.calibration.sheet_selection import fit_light_sheets
 from bodyscan.errors import PairFailed
 
 MORE_POSES = (

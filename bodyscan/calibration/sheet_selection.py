@@ -1,4 +1,4 @@
-"""Fit the light sheets of one pair: try every model and let held-out boards choose (3.2)."""
+"""Choose the model of one pair's light sheets by held-out boards, and fit it to all (3.2)."""
 
 from __future__ import annotations
 
