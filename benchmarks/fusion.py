@@ -173,7 +173,7 @@ def _read(workspace: Path, folder: Path) -> Step:
     def read(sequence: Any) -> None:
         read_sequence(sequence, cameras[sequence.pair], workers=1)
 
-    return lambda: map_threads(read, captures.sequences, stage="reading"), lambda _: {}
+    return lambda: map_threads(read, captures.sequences), lambda _: {}
 
 
 def _images_of(workspace: Path) -> list[list[str]]:
@@ -190,7 +190,7 @@ def _read_with_opencv(paths: list[list[str]]) -> None:
     def read(pair: list[str]) -> list[Any]:
         return [cv2.imread(path, cv2.IMREAD_GRAYSCALE) for path in pair]
 
-    map_threads(read, paths, stage="reading")
+    map_threads(read, paths)
 
 
 def _ours(workspace: Path, folder: Path) -> Step:

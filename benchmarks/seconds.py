@@ -125,7 +125,6 @@ def _work(workspace: Path, what: str) -> Callable[[], Any]:
         return lambda: map_threads(
             lambda own: read_sequence(own, cameras[own.pair], workers=1) and None,
             captures.sequences,
-            stage="reading",
         )
     import cv2
 
@@ -133,7 +132,6 @@ def _work(workspace: Path, what: str) -> Callable[[], Any]:
     return lambda: map_threads(
         lambda own: [cv2.imread(path, cv2.IMREAD_GRAYSCALE) for path in own] and None,
         paths,
-        stage="reading",
     )
 
 

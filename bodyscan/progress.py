@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import TypeVar
@@ -38,22 +38,11 @@ def background() -> ThreadPoolExecutor:
 
 
 def map_threads(
-    work: Callable[[Item], Result],
-    items: Iterable[Item],
-    *,
-    stage: str,
-    progress: Progress = silent,
-    workers: int = THREADS,
+    work: Callable[[Item], Result], items: Iterable[Item], *, workers: int = THREADS
 ) -> list[Result]:
     """Run `work` on every item in threads; return the results in the order of the items."""
-    todo: Sequence[Item] = list(items)
-    progress(stage, 0, len(todo))
-    results = []
     with ThreadPoolExecutor(workers) as pool:
-        for done, result in enumerate(pool.map(work, todo), start=1):
-            results.append(result)
-            progress(stage, done, len(todo))
-    return results
+        return list(pool.map(work, items))
 
 
 def attempt_each(
@@ -66,19 +55,22 @@ def attempt_each(
     workers: int = THREADS,
 ) -> tuple[dict[Item, Result], dict[Item, Error]]:
     """Run `work` on every item in threads; return results and errors of type `error`, by item."""
+    good: dict[Item, Result] = {}
     bad: dict[Item, Error] = {}
 
-    def attempt(item: Item) -> list[tuple[Item, Result]]:
+    def attempt(item: Item) -> None:
         try:
-            return [(item, work(item))]
+            good[item] = work(item)
         except error as found:
             bad[item] = found
-            return []
 
-    todo: Sequence[Item] = list(items)
-    found = map_threads(attempt, todo, stage=stage, progress=progress, workers=workers)
-    good = dict(one for each in found for one in each)
-    return good, {item: bad[item] for item in todo if item in bad}
+    todo = list(items)
+    progress(stage, 0, len(todo))
+    with ThreadPoolExecutor(workers) as pool:
+        for done, _ in enumerate(pool.map(attempt, todo), start=1):
+            progress(stage, done, len(todo))
+    results = {item: good[item] for item in todo if item in good}
+    return results, {item: bad[item] for item in todo if item in bad}
 
 
 def split_range(count: int) -> list[slice]:

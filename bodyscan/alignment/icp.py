@@ -8,7 +8,6 @@ calibrated poses.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from typing import TypeVar
@@ -31,7 +30,7 @@ from bodyscan.arrays import Array
 from bodyscan.geometry.robust import rms
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance
-from bodyscan.progress import THREADS
+from bodyscan.progress import map_threads
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.settings import AlignmentSettings
 
@@ -93,8 +92,6 @@ def align(
     rig_from_camera: Mapping[str, RigidTransform],
     prior: PoseCovariance,
     settings: AlignmentSettings,
-    *,
-    workers: int = THREADS,
 ) -> Alignment:
     """Align range images by small rigid motions that minimize the distances in their overlaps.
 
@@ -105,26 +102,23 @@ def align(
     names = [image.pair for image in images]
     start = [rig_from_camera[name] for name in names]
     sway = SwayPrior.from_settings(settings)
-    with ThreadPoolExecutor(workers) as pool:
-        clouds = list(
-            pool.map(lambda image: OverlapPoints.from_image(image, settings.spacing_mm), images)
-        )
-        coarse = [cloud.select(COARSE) for cloud in clouds]
-        if settings.matching == "open3d":
-            from bodyscan.alignment.open3d_registration import register  # Open3D loads for a second
+    clouds = map_threads(lambda one: OverlapPoints.from_image(one, settings.spacing_mm), images)
+    coarse = [cloud.select(COARSE) for cloud in clouds]
+    if settings.matching == "open3d":
+        from bodyscan.alignment.open3d_registration import register  # Open3D loads for a second
 
-            inner = [cloud.inner for cloud in clouds]
-            motion, covariance = register(inner, start, names, prior, settings), None
-        else:
-            motion, covariance = _register(pool, (coarse, clouds), start, names, prior, settings)
-        widest = sway.covariance(names, prior, sway.max_scale)
-        motion, refused = reject_large_motions(names, motion, widest, settings.limit_sigmas)
-        moved = [t.retract(m) for t, m in zip(start, motion, strict=True)]
-        # Both with the same reach, so that they can be compared.
-        before, after = (
-            _map_matches(_measure_distances, pool, coarse, poses, settings.min_reach_mm, settings)
-            for poses in (start, moved)
-        )
+        inner = [cloud.inner for cloud in clouds]
+        motion, covariance = register(inner, start, names, prior, settings), None
+    else:
+        motion, covariance = _register((coarse, clouds), start, names, prior, settings)
+    widest = sway.covariance(names, prior, sway.max_scale)
+    motion, refused = reject_large_motions(names, motion, widest, settings.limit_sigmas)
+    moved = [t.retract(m) for t, m in zip(start, motion, strict=True)]
+    # Both with the same reach, so that they can be compared.
+    before, after = (
+        _map_matches(_measure_distances, coarse, poses, settings.min_reach_mm, settings)
+        for poses in (start, moved)
+    )
     shift = np.linalg.norm(centre_shifts(motion), axis=1).tolist()
     connected = _find_largest_group(after)
     unknown = 0, np.nan, np.nan
@@ -143,7 +137,6 @@ def align(
 
 
 def _register(
-    pool: ThreadPoolExecutor,
     clouds: tuple[Sequence[OverlapPoints], Sequence[OverlapPoints]],
     start: Sequence[RigidTransform],
     names: Sequence[str],
@@ -161,7 +154,7 @@ def _register(
     for remaining in range(settings.rounds, 0, -1):
         moved = [t.retract(m) for t, m in zip(start, motion, strict=True)]
         points = fine if remaining <= 2 else coarse
-        overlaps = _map_matches(measure, pool, points, moved, reach, settings)
+        overlaps = _map_matches(measure, points, moved, reach, settings)
         covariance = sway.covariance(names, prior, scale)
         motion = solve_motions(overlaps, motion, covariance)
         reach, scale = max(reach / 2.0, settings.min_reach_mm), sway.scale(motion)
@@ -170,7 +163,6 @@ def _register(
 
 def _map_matches(
     measure: Callable[[Matches], Result],
-    pool: ThreadPoolExecutor,
     clouds: Sequence[OverlapPoints],
     poses: Sequence[RigidTransform],
     reach_mm: float,
@@ -184,7 +176,7 @@ def _map_matches(
         )
         return None if matches is None else measure(matches)
 
-    return map_overlaps(pool, len(clouds), measure_two)
+    return map_overlaps(len(clouds), measure_two)
 
 
 def _find_largest_group(overlaps: Iterable[tuple[int, int]]) -> set[int]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import permutations
 from typing import TypeVar
@@ -22,6 +21,7 @@ from bodyscan.arrays import Array, Mask
 from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
 from bodyscan.geometry.robust import robust_scale
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.progress import map_threads
 from bodyscan.reconstruction.range_image import RangeImage
 
 Result = TypeVar("Result")
@@ -77,14 +77,14 @@ def match_overlap(
 
 
 def map_overlaps(
-    pool: ThreadPoolExecutor, count: int, measure: Callable[[int, int], Result | None]
+    count: int, measure: Callable[[int, int], Result | None]
 ) -> dict[tuple[int, int], Result]:
     """Call `measure` for each of `count` images as source and each other as target; drop None.
 
     Both directions are used, so that errors of one direction on curved surfaces cancel.
     """
     index_pairs = list(permutations(range(count), 2))
-    results = pool.map(lambda both: measure(*both), index_pairs)
+    results = map_threads(lambda both: measure(*both), index_pairs)
     return {
         both: result
         for both, result in zip(index_pairs, results, strict=True)

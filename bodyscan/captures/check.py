@@ -112,7 +112,7 @@ def check(rig_path: Path, known_errors: Iterable[str] = ()) -> CheckReport:
         errors.append(str(error))
     sequences = captures.sequences if captures else ()
     find_bad = partial(_find_bad_images, rig, set(captures.corners if captures else ()))
-    found = map_threads(find_bad, sequences, stage="checking", workers=WORKERS)
+    found = map_threads(find_bad, sequences, workers=WORKERS)
     good = [sequence for sequence, bad in zip(sequences, found, strict=True) if not bad]
     striped = {p.name: [s.has_stripes for s in good if s.pair == p.name] for p in rig.pairs}
     counts = tuple(

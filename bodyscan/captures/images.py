@@ -6,7 +6,6 @@ Also what their numbers mean as grey levels, 0 to 255, and several exposures mer
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial, reduce
 from pathlib import Path
@@ -23,7 +22,7 @@ from bodyscan.captures.image_header import find_header_fault, image_error, missi
 from bodyscan.errors import ImageError
 from bodyscan.files.reading import read_regular
 from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
-from bodyscan.progress import THREADS
+from bodyscan.progress import THREADS, map_threads
 from bodyscan.rig.pair import CameraSpec, Pair
 from bodyscan.stripes.decoding import images_by_kind
 
@@ -127,8 +126,7 @@ def _read_stack(sequence: ImageSequence, camera: CameraSpec, crop: Crop, workers
             raise image_error(what, paths[k], sequence.where)
         stack[k] = image[early]
 
-    with ThreadPoolExecutor(workers) as pool:
-        list(pool.map(read_into, range(1, len(paths))))
+    map_threads(read_into, range(1, len(paths)), workers=workers)
     scale = _find_scale(list(stack), camera, paths[0], sequence.where)
     return convert_to_greys(np.ascontiguousarray(stack[(slice(None), *late)]), scale)
 

@@ -29,7 +29,7 @@ def file_hash(path: Path) -> str:
 def file_hashes(files: Mapping[str, Path]) -> dict[str, str]:
     """Compute the SHA-256 of each file by name, sorted by name."""
     names = sorted(files)
-    hashes = map_threads(lambda name: file_hash(files[name]), names, stage="hashing")
+    hashes = map_threads(lambda name: file_hash(files[name]), names)
     return dict(zip(names, hashes, strict=True))
 
 

@@ -6,7 +6,6 @@ Everything happens on the pixel grid, where a neighbour is one step away.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import cv2
@@ -15,7 +14,7 @@ import numpy as np
 from bodyscan.arrays import Bytes, Floats, Mask, find_crop, pad_crop
 from bodyscan.errors import ScanFailed
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.progress import THREADS
+from bodyscan.progress import map_threads
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.rig.rig import Volume
 
@@ -30,7 +29,6 @@ def clean(
     *,
     empty: Sequence[RangeImage] = (),
     smallest_patch_mm2: float = 150.0,
-    workers: int = THREADS,
 ) -> list[RangeImage]:
     """Remove from range images whatever shows no part of the subject.
 
@@ -56,8 +54,7 @@ def clean(
             kept[box] = drop_speckles(solid, MAX_SLOPE * pixel_mm, smallest_patch_mm2 / pixel_mm**2)
         return apply_mask(image, kept)
 
-    with ThreadPoolExecutor(workers) as pool:
-        return list(pool.map(clean_one, range_images))
+    return map_threads(clean_one, range_images)
 
 
 def require_subject(cleaned: Sequence[RangeImage]) -> list[RangeImage]:

@@ -41,8 +41,6 @@ def fill_distances(
     finest_mm: float,
     range_images: Sequence[RangeImage],
     rig_from_camera: dict[str, RigidTransform],
-    *,
-    workers: int,
 ) -> Distances:
     """Signed distances of a closed surface through the cloud, on a grid with room around it, no
     cell smaller than `finest_mm`; range_images: as measured, background included."""
@@ -71,7 +69,7 @@ def fill_distances(
     points = cloud.points[grey < DARK * np.median(grey)]
     dark[tuple(np.rint((points - bricks.origin) / cell_mm).astype(int).T)] = True
     dark = _dilate(dark, 2)
-    free = _find_free_nodes(guess, measured, dark, bricks, range_images, rig_from_camera, workers)
+    free = _find_free_nodes(guess, measured, dark, bricks, range_images, rig_from_camera)
     bound[free] = 0.5 * cell_mm
     if free.any():
         _mirror(bound, below, ~measured)
@@ -109,7 +107,6 @@ def _find_free_nodes(
     bricks: Bricks,
     range_images: Sequence[RangeImage],
     rig_from_camera: dict[str, RigidTransform],
-    workers: int,
 ) -> Mask:
     """Find nodes (a, b, c) inside a guessed surface, off the cloud, that cameras saw through."""
     free = np.zeros(guess.shape, bool)
@@ -129,8 +126,6 @@ def _find_free_nodes(
     votes = map_threads(
         lambda image: find_free_points(nodes, surface, image, rig_from_camera[image.pair]),
         range_images,
-        stage="free space",
-        workers=workers,
     )
     free[tuple(index[np.logical_or.reduce(votes)].T)] = True
     return free
@@ -150,7 +145,8 @@ def fill_harmonically(values: Floats, fixed: Mask, bound: Floats, certain: float
         free = ~fixed
     else:
         coarse = fill_harmonically(*_coarsen(values, fixed, bound), certain)
-        guess, near = _refine(coarse), _near_zero(coarse)
+        # Within two nodes of both signs: a coarser zero set is off by less than one.
+        guess, near = _refine(coarse), _dilate(coarse < 0.0, 2) & _dilate(coarse >= 0.0, 2)
         found, sweeps = np.where(fixed, values, np.maximum(guess, bound)), RELAXATION_SWEEPS
         active = ~fixed & (bound > guess)
         if active.any():  # a gap is narrow: of the eight nodes of a coarser one not all have bounds
@@ -176,12 +172,6 @@ def _sum_eight(part: Values) -> Values:
     part = part[::2] + part[1::2]
     part = part[:, ::2] + part[:, 1::2]
     return part[:, :, ::2] + part[:, :, 1::2]
-
-
-def _near_zero(values: Floats) -> Mask:
-    """Nodes (a, b, c) within 2 nodes of both signs: a coarser zero set is off by less than one."""
-    negative = values < 0.0
-    return _dilate(negative, 2) & _dilate(~negative, 2)
 
 
 def _dilate(where: Mask, nodes: int) -> Mask:
@@ -232,10 +222,9 @@ def find_free_points(
     surface: PartialSurface,
     image: RangeImage,
     rig_from_camera: RigidTransform,
-    margin_mm: float = 10.0,
 ) -> Mask:
-    """Find the points (N, 3), rig frame, that one camera saw through by at least `margin_mm`:
-    something was measured behind them, or they lie in a gap (see `find_gaps`)."""
+    """Find the points (N, 3), rig frame, that one camera saw through by at least 10 mm: something
+    was measured behind them, or they lie in a gap (see `find_gaps`)."""
     in_camera = rig_from_camera.inverse().apply(points.astype(np.float64))
     ahead = in_camera[:, 2] > 1.0
     u, v = image.camera.project(np.where(ahead[:, None], in_camera, 1.0)).T
@@ -249,7 +238,7 @@ def find_free_points(
     columns, rows = columns[index], rows[index]
     # The nearest depth around, 0 if anything is missing: rims and flying pixels prove nothing.
     nearest = cv2.erode(image.open_depth, np.ones((5, 5), np.uint8))
-    through[index] = in_camera[index, 2] < nearest[rows, columns] - margin_mm
+    through[index] = in_camera[index, 2] < nearest[rows, columns] - 10.0
     depth_mm = float(np.median(in_camera[index, 2]))
     stride = max(1, round(RAY_SPACING_MM * image.camera.alpha / depth_mm))
     block_rows, block_columns = rows // stride, columns // stride

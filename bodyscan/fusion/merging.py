@@ -7,7 +7,6 @@ projecting the point into it. No search tree is built.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -23,7 +22,7 @@ from bodyscan.fusion.voxel_thinning import Samples, take_samples
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.mesh.body import BodyCloud
-from bodyscan.progress import THREADS
+from bodyscan.progress import map_threads
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.settings import FusionSettings
 
@@ -42,7 +41,6 @@ def merge(
     settings: FusionSettings,
     *,
     poses: PoseCovariance | None = None,
-    workers: int = THREADS,
 ) -> MergedCloud:
     """Merge aligned, cleaned range images into one even cloud of about `settings.points` points.
 
@@ -52,20 +50,18 @@ def merge(
     a double surface within `settings.double_mm` the heavier one stays. Raises ScanFailed for images
     that show next to nothing.
     """
-    with ThreadPoolExecutor(workers) as pool:
-        smoothed = pool.map(
-            lambda image: smooth(image, rig_from_camera[image.pair], settings.window_mm),
-            range_images,
-        )
-        surfaces = [surface for surface in smoothed if surface is not None]
-        samples = take_samples(surfaces, settings.points)
-        compared = pool.map(
-            lambda number: compare_with_surface(
-                samples, surfaces[number], number, settings.agreement_mm, settings.double_mm
-            ),
-            range(len(surfaces)),
-        )
-        consistency = list(compared)
+    smoothed = map_threads(
+        lambda image: smooth(image, rig_from_camera[image.pair], settings.window_mm),
+        range_images,
+    )
+    surfaces = [surface for surface in smoothed if surface is not None]
+    samples = take_samples(surfaces, settings.points)
+    consistency = map_threads(
+        lambda number: compare_with_surface(
+            samples, surfaces[number], number, settings.agreement_mm, settings.double_mm
+        ),
+        range(len(surfaces)),
+    )
     grey = equalize_brightness(samples, surfaces, consistency)
     cloud = average(samples, surfaces, consistency, grey, poses)
     pairs = [surface.pair for surface in surfaces]

@@ -21,7 +21,6 @@ from bodyscan.mesh.body import BodyCloud, BodyMesh, select_regions
 from bodyscan.mesh.repair import extract_largest_piece
 from bodyscan.mesh.surface_nets import SIDE, Bricks, extract_surface
 from bodyscan.mesh.topology import check_manifold, compute_topology, vertex_normals
-from bodyscan.progress import THREADS
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.settings import MeshSettings
 
@@ -31,8 +30,6 @@ def mesh(
     settings: MeshSettings,
     range_images: Sequence[RangeImage] = (),
     rig_from_camera: dict[str, RigidTransform] | None = None,
-    *,
-    workers: int = THREADS,
 ) -> BodyMesh:
     """One closed manifold surface around a cloud, with faces outward.
 
@@ -41,7 +38,7 @@ def mesh(
     A vertex farther than `settings.reach_mm` from every point counts as not measured. Raises
     ScanFailed if no closed surface comes out.
     """
-    shape = closed_surface(cloud, settings, range_images, rig_from_camera, workers=workers)
+    shape = closed_surface(cloud, settings, range_images, rig_from_camera)
     return attach_attributes(*shape, cloud, settings.reach_mm)
 
 
@@ -50,8 +47,6 @@ def closed_surface(
     settings: MeshSettings,
     range_images: Sequence[RangeImage] = (),
     rig_from_camera: dict[str, RigidTransform] | None = None,
-    *,
-    workers: int = THREADS,
 ) -> tuple[Array, Indices]:
     """Vertices (V, 3) mm and faces (F, 3) of the mesh, only as exact as the grid; see `mesh`."""
     if len(cloud.points) < 1000:
@@ -59,9 +54,8 @@ def closed_surface(
             f"a cloud of {len(cloud.points)} points is too small for a mesh",
             remedy="Look at the range images; is the subject inside the scan volume?",
         )
-    bricks, distances = compute_distances(
-        cloud, settings.cell_mm, range_images, rig_from_camera or {}, workers=workers
-    )
+    cell_mm, poses = settings.cell_mm, rig_from_camera or {}
+    bricks, distances = compute_distances(cloud, cell_mm, range_images, poses)
     vertices, faces = extract_surface(bricks, distances)
     if not len(faces):
         raise ScanFailed("no surface came out of the cloud: its points contradict each other")
@@ -78,12 +72,10 @@ def compute_distances(
     cell_mm: float,
     range_images: Sequence[RangeImage],
     rig_from_camera: dict[str, RigidTransform],
-    *,
-    workers: int,
 ) -> tuple[Bricks, Floats]:
     """Compute signed distances (mm) of a closed surface at the nodes of a sparse grid around it:
     from the cloud where it is near, from `hole_filling` elsewhere, blended in between."""
-    coarse = fill_distances(cloud, cell_mm, range_images, rig_from_camera, workers=workers)
+    coarse = fill_distances(cloud, cell_mm, range_images, rig_from_camera)
     extent = coarse.cell_mm * np.array(coarse.values.shape)
     shape = tuple(np.ceil(extent / cell_mm / SIDE).astype(int))
     occupied = find_near_bricks(cloud.points, coarse.origin, cell_mm, shape)

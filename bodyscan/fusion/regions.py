@@ -181,7 +181,7 @@ def _classify_textures(
         box = find_crop(inside)
         return nothing if box is None else measure_roughness(image, pose, box, window_mm)
 
-    found = [nothing, *map_threads(measure, range_images, stage="labelling regions")]
+    found = [nothing, *map_threads(measure, range_images)]
     cell = np.concatenate([cells.find(one.points) for one in found])
     residual_mm = np.concatenate([one.residual_mm for one in found])
     expected_mm = np.concatenate([one.expected_mm for one in found])

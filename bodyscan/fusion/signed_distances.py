@@ -122,5 +122,5 @@ def interpolate_distances(distances: Distances, bricks: Bricks) -> Floats:
         places = np.stack(np.broadcast_arrays(*at))
         map_coordinates(distances.values, places, found[part], order=1, mode="nearest")
 
-    map_threads(fill, split_range(len(found)), stage="distances")
+    map_threads(fill, split_range(len(found)))
     return found

@@ -148,7 +148,7 @@ def save_scan(scan: Scan, folder: Path, origin: Origin) -> Path:
         return file_hash(folder / name)
 
     names = (CLOUD_NAME, MESH_NAME)
-    digests = map_threads(write, names, stage="writing")
+    digests = map_threads(write, names)
     write_json(
         folder / FILE_NAME,
         origin.facts

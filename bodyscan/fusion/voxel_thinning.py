@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +13,7 @@ from bodyscan.arrays import Bytes, Floats, Mask
 from bodyscan.compiled import compiled
 from bodyscan.errors import ScanFailed
 from bodyscan.fusion.smoothing import SmoothSurface
-from bodyscan.progress import THREADS
+from bodyscan.progress import THREADS, map_threads
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,12 +86,11 @@ def select_per_voxel(points: Floats, second_rate: Mask, voxel_mm: float) -> NDAr
     """Select one point in each occupied voxel, the nearest to its centre, second-rate ones (N,)
     only where there is no other; return their indices, ascending."""
     low = points.min(axis=0)
-    with ThreadPoolExecutor(THREADS) as pool:
-        parts = pool.map(
-            lambda layer: _best_per_voxel(points, second_rate, low, voxel_mm, THREADS, layer),
-            range(THREADS),
-        )
-    return np.sort(np.concatenate(list(parts)))
+    parts = map_threads(
+        lambda layer: _best_per_voxel(points, second_rate, low, voxel_mm, THREADS, layer),
+        range(THREADS),
+    )
+    return np.sort(np.concatenate(parts))
 
 
 @compiled

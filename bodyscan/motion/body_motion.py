@@ -155,7 +155,7 @@ class BodyMotion:
             (a, b), cells = overlap
             return self._project(cells.with_model_error(MODEL_ERROR_MM), current[a] - current[b])
 
-        systems = map_threads(project, equations.items(), stage="aligning")
+        systems = map_threads(project, equations.items())
         return dict(zip(equations, systems, strict=True))
 
     def solve_projected(
@@ -199,9 +199,11 @@ class BodyMotion:
 
     def observation_matrix(self, pair: int, cells: Indices, normals: Array) -> Array:
         """Jacobian (c, n) of displacements along normals (c, 3) from the middle to a pair's moment."""
-        return np.hstack(
-            [_along_normals(k, cells, normals, k.modes_from_middle(pair)) for k in self.kinds]
-        )
+        parts = []
+        for kind in self.kinds:
+            along = np.einsum("cim,ci->cm", kind.fields[cells, :3], normals)
+            parts.append((along[:, :, None] * kind.modes_from_middle(pair)).reshape(len(cells), -1))
+        return np.hstack(parts)
 
     def _project(self, equations: CellEquations, offset: Array) -> LinearGaussianSystem:
         """Project an overlap's normal equations onto the M fields.
@@ -269,9 +271,3 @@ def _sum_products(block: Array, first: Array, second: Array) -> Array:
     modes = (first[:, :, None] * second[:, None, :]).reshape(len(block), -1)
     shape = (*block.shape[1:], first.shape[1], second.shape[1])
     return np.asarray((flat.T @ modes).reshape(shape).transpose(0, 2, 1, 3))
-
-
-def _along_normals(kind: MotionKind, cells: Indices, normals: Array, modes: Array) -> Array:
-    """Jacobian (c, M J) of a kind's displacement of cells along normals (c, 3)."""
-    along = np.einsum("cim,ci->cm", kind.fields[cells, :3], normals)
-    return (along[:, :, None] * modes).reshape(len(cells), -1)

@@ -8,7 +8,6 @@ This is done only if the overlaps require it; a mannequin stays as aligned.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TypeVar
@@ -31,7 +30,7 @@ from bodyscan.motion.body_parts import LIMBS
 from bodyscan.motion.breath import SIZES_MM
 from bodyscan.motion.cell_equations import CellEquations
 from bodyscan.motion.motion_uncertainty import girth_sigmas, shape_sigmas
-from bodyscan.progress import THREADS
+from bodyscan.progress import map_threads
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.settings import AlignmentSettings
 
@@ -137,8 +136,6 @@ def estimate_motion(
     aligned: Alignment,
     prior: PoseCovariance,
     settings: AlignmentSettings,
-    *,
-    workers: int = THREADS,
 ) -> tuple[Alignment, EstimatedMotion | None, PoseEvidence | None]:
     """Estimate the motion of a person, and the poses of the pairs, from all overlaps.
 
@@ -153,36 +150,33 @@ def estimate_motion(
         return aligned, None, None
     names = [image.pair for image in images]
     seconds = [None if image.time_ms is None else 1e-3 * image.time_ms for image in images]
-    with ThreadPoolExecutor(workers) as pool:
-        initial = [rig_from_camera[name] for name in names]
-        sample = partial(_View.from_image, spacing_mm=settings.spacing_mm)
-        views, cells = _divide_into_cells(
-            list(pool.map(sample, initial, images)),
-            [aligned.rig_from_camera[name] for name in names],
-        )
-        observed = np.array(
-            [np.bincount(view.cell, minlength=len(cells.centres)) > 0 for view in views]
-        )
-        sway = np.repeat([np.radians(settings.sway_deg), settings.sway_mm], 3)
-        boards = SwayPrior(0.0, 0.0, 0.0, 0.0).covariance(names, prior)
-        middle_s = 1e-3 * (_middle_of_scan(images) or 0.0)
-        at_rest = BodyMotion.at_rest(cells, seconds, middle_s, boards, sway)
-        solution = _solve(pool, views, (at_rest, cells), observed, settings)
-        if solution is None:
-            return aligned, None, None
-        motion = solution.motion
-        poses = PoseEvidence(tuple(names), motion.pose_equations())
-        evidence = None if None in seconds else poses
-        if solution.negligible:
-            return aligned, None, evidence
-        distances = _map_matches(
-            lambda matches, cell: rms(matches.distances),
-            pool,
-            [view.select(COARSE) for view in views],
-            (motion, cells),
-            solution.reach_mm,
-            settings,
-        )
+    sampled = map_threads(
+        lambda one: _View.from_image(rig_from_camera[one.pair], one, settings.spacing_mm), images
+    )
+    poses = [aligned.rig_from_camera[name] for name in names]
+    views, cells = _divide_into_cells(sampled, poses)
+    observed = np.array(
+        [np.bincount(view.cell, minlength=len(cells.centres)) > 0 for view in views]
+    )
+    sway = np.repeat([np.radians(settings.sway_deg), settings.sway_mm], 3)
+    boards = SwayPrior(0.0, 0.0, 0.0, 0.0).covariance(names, prior)
+    middle_s = 1e-3 * (_middle_of_scan(images) or 0.0)
+    at_rest = BodyMotion.at_rest(cells, seconds, middle_s, boards, sway)
+    solution = _solve(views, (at_rest, cells), observed, settings)
+    if solution is None:
+        return aligned, None, None
+    motion = solution.motion
+    known = PoseEvidence(tuple(names), motion.pose_equations())
+    evidence = None if None in seconds else known
+    if solution.negligible:
+        return aligned, None, evidence
+    distances = _map_matches(
+        lambda matches, cell: rms(matches.distances),
+        [view.select(COARSE) for view in views],
+        (motion, cells),
+        solution.reach_mm,
+        settings,
+    )
     moved = _update_alignment(aligned, names, views, motion, distances)
     # Overlaps that motion brings no closer are apart because of the pairs' own calibrations.
     no_closer = moved.rms_after_mm > 0.95 * aligned.rms_after_mm
@@ -262,7 +256,6 @@ class _Solution:
 
 
 def _solve(
-    pool: ThreadPoolExecutor,
     views: Sequence[_View],
     person: tuple[BodyMotion, BodyCells],
     observed: Mask,
@@ -276,7 +269,7 @@ def _solve(
     coarse, reach = [view.select(COARSE) for view in views], settings.reach_mm
     for remaining in range(ROUNDS, 0, -1):
         points = coarse if remaining > 1 else views
-        equations = _map_matches(linearize, pool, points, (motion, cells), reach, settings)
+        equations = _map_matches(linearize, points, (motion, cells), reach, settings)
         if not equations:
             return None
         start, combined = motion, _combine_directions(equations)
@@ -311,7 +304,6 @@ def _offset_to_mean_breath(
 
 def _map_matches(
     measure: Callable[[Matches, Indices], Result],
-    pool: ThreadPoolExecutor,
     views: Sequence[_View],
     person: tuple[BodyMotion, BodyCells],
     reach_mm: float,
@@ -338,7 +330,7 @@ def _map_matches(
         )
         return None if matches is None else measure(matches, view.cell[matches.source])
 
-    return map_overlaps(pool, len(views), measure_two)
+    return map_overlaps(len(views), measure_two)
 
 
 def _combine_directions(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +13,7 @@ from bodyscan.compiled import compiled
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.motion.body_cells import BodyCells, field_in_camera
 from bodyscan.motion.estimation import EstimatedMotion
-from bodyscan.progress import THREADS
+from bodyscan.progress import map_threads
 from bodyscan.reconstruction.range_image import RangeImage
 
 Numbers = NDArray[np.int32]
@@ -24,8 +23,6 @@ def warp_to_middle(
     images: Sequence[RangeImage],
     rig_from_camera: Mapping[str, RigidTransform],
     motion: EstimatedMotion | None,
-    *,
-    workers: int = THREADS,
 ) -> list[RangeImage]:
     """Warp all range images to the middle of the scan; unchanged without a motion."""
     if motion is None:
@@ -36,8 +33,7 @@ def warp_to_middle(
             image, rig_from_camera[image.pair], motion.cells, motion.warps[image.pair]
         )
 
-    with ThreadPoolExecutor(workers) as pool:
-        return list(pool.map(warp, images))
+    return map_threads(warp, images)
 
 
 def warp_image(

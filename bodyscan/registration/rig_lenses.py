@@ -76,9 +76,7 @@ def choose_lenses(rig: Rig, views: Sequence[LocatedView], solution: JointSolutio
         planar = [PlanarView(view.shot, view.points, view.pixels) for view in of_pair]
         return choose_lens(tried, cameras[name], poses, planar)
 
-    lenses = map_threads(
-        lambda name: choose(name, kinds[name]), list(kinds), stage="choosing lenses"
-    )
+    lenses = map_threads(lambda name: choose(name, kinds[name]), kinds)
     chosen = dict(zip(kinds, lenses, strict=True))
     sizes = {name: (camera.width, camera.height) for name, camera in cameras.items()}
     for size in sorted(set(sizes.values())):  # all that images show of which are of one make

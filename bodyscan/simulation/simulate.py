@@ -207,7 +207,7 @@ def _render_all(rig: Rig, truth: Truth, out: Path, workers: int, progress: Progr
                 done += 1
                 progress("simulate", done, total)
 
-    map_threads(render, enumerate(truth.pairs.values()), stage="simulate", workers=workers)
+    map_threads(render, enumerate(truth.pairs.values()), workers=workers)
 
 
 def _render_task(

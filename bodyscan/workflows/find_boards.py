@@ -152,7 +152,7 @@ def _look_closer(
         image = read_board_image(sequence, rig.pair(sequence.pair))
         return "; ".join(f"{board.name}: {describe_unfound(image, board)}" for board in rig.boards)
 
-    return dict(zip(chosen, map_threads(look, chosen, stage="looking closer"), strict=True))
+    return dict(zip(chosen, map_threads(look, chosen), strict=True))
 
 
 def calibrate_cameras(

@@ -47,11 +47,11 @@ def test_a_wall_and_something_beyond_the_volume_are_seen_through_alike() -> None
     guess = PartialSurface(vertices, faces, np.ones(len(faces), bool), np.zeros(len(faces), bool))
     places = np.random.default_rng(0).uniform([-50, -400, 650], [50, 400, 1150], (5000, 3))
     points = places.astype(np.float32)
-    through = find_free_points(points, guess, wall, POSE, 10.0)
+    through = find_free_points(points, guess, wall, POSE)
     assert 0.2 < through.mean() < 0.8
-    np.testing.assert_array_equal(find_free_points(points, guess, far, POSE, 10.0), through)
+    np.testing.assert_array_equal(find_free_points(points, guess, far, POSE), through)
     # Without a word of what is behind, only what lies between measured parts can be open.
-    blind = find_free_points(points, guess, replace(far, beyond=None), POSE, 10.0)
+    blind = find_free_points(points, guess, replace(far, beyond=None), POSE)
     assert blind.sum() < through.sum()
 
 
@@ -140,7 +140,7 @@ def test_what_is_beside_or_behind_the_camera_was_not_seen_through() -> None:
         np.float32,
     )
     with np.errstate(all="raise"):  # nothing is divided by a depth of 0
-        through = find_free_points(points, guess, shown(measured), HERE, 10.0)
+        through = find_free_points(points, guess, shown(measured), HERE)
     assert through.tolist() == [True, True, False, False, False, False, False]
 
 

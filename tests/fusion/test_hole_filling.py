@@ -144,9 +144,7 @@ def test_what_was_seen_through_is_half_a_cell_outside() -> None:
     points = np.where(between[..., None], 3000.0 * rays, np.nan).astype(np.float32)
     sigma = np.where(between, np.float32(0.1), np.float32(np.nan))
     wall = RangeImage("p", camera, points, points, sigma, np.zeros(between.shape, np.uint8))
-    guessed, seen = (
-        fill_distances(rods, 1.0, images, {"p": pose}, workers=1) for images in ([], [wall])
-    )
+    guessed, seen = (fill_distances(rods, 1.0, images, {"p": pose}) for images in ([], [wall]))
     _, y, height = guessed.origin[:, None, None, None] + CELL_MM * np.indices(guessed.values.shape)
     gap = (np.abs(y) < 20.0) & (np.abs(height - 900.0) < 60.0) & (guessed.values < 0.0)
     assert gap.sum() > 500

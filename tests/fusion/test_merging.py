@@ -14,6 +14,7 @@ from bodyscan.evaluation.surface import deviation, sample_surface, signed_distan
 from bodyscan.fusion.merging import merge
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud
+from bodyscan.progress import map_threads
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.settings import FusionSettings
 
@@ -88,9 +89,10 @@ def test_more_pairs_are_better(off: Array, cloud: BodyCloud) -> None:
 
 
 def test_the_same_images_give_the_same_bytes(
-    scan: Scan, cleaned: list[RangeImage], cloud: BodyCloud
+    scan: Scan, cleaned: list[RangeImage], cloud: BodyCloud, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    again = merge(cleaned, scan.rig_from_camera, SETTINGS, workers=3).cloud
+    monkeypatch.setattr(map_threads, "__kwdefaults__", {"workers": 3})
+    again = merge(cleaned, scan.rig_from_camera, SETTINGS).cloud
     assert again.regions is None  # which merging does not tell
     for name in ("points", "normals", "sigma_mm", "colours", "pairs_seen"):
         assert getattr(again, name).tobytes() == getattr(cloud, name).tobytes()

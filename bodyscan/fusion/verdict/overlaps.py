@@ -8,7 +8,6 @@ up to their rims and over centimetres, by the median of every patch, which noise
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -27,7 +26,7 @@ from bodyscan.arrays import Array, Indices
 from bodyscan.fusion.verdict.evidence import GIRTH_PER_MM, Finding, ScanEvidence, Seam, SeamReport
 from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.progress import THREADS
+from bodyscan.progress import map_threads
 from bodyscan.reconstruction.range_image import RangeImage
 
 MAX_DISAGREEMENT_MM = 0.4
@@ -48,12 +47,11 @@ def find_seams(
     images: cleaned.
     poles: the pole of each pair that stands on one.
     """
-    with ThreadPoolExecutor(THREADS) as pool:
-        points = list(pool.map(lambda im: sample_points(im, 3.0, (NARROW_MARGIN_PX,))[0], images))
-        compared = pool.map(
-            lambda two: _compare_pairs(two[0], two[1], rig_from_camera), combinations(points, 2)
-        )
-        seams = tuple(seam for seam in compared if len(seam.distances_mm))
+    points = map_threads(lambda im: sample_points(im, 3.0, (NARROW_MARGIN_PX,))[0], images)
+    compared = map_threads(
+        lambda two: _compare_pairs(*two, rig_from_camera), combinations(points, 2)
+    )
+    seams = tuple(seam for seam in compared if len(seam.distances_mm))
     names = [image.pair for image in images]
     count = {image.pair: np.count_nonzero(image.valid) for image in images}
     # A pair that measured less than a hundredth of everything affects no girth.
