@@ -234,7 +234,8 @@ FACE = np.tile(np.arange(100), len(BANDS) // 100)
 
 def coverage(filled: Mask, **pair: float) -> Coverage:
     share, white = pair.get("share", 1.0), pair.get("white", 0.0)
-    return Coverage(BANDS, np.ones(len(BANDS)), filled, {"p1": share}, {"p1": white})
+    shares, none = ({"p1": share}, {"p1": white}), np.zeros_like(filled)
+    return Coverage(BANDS, np.ones(len(BANDS)), filled, *shares, none)
 
 
 @pytest.mark.parametrize(
@@ -243,6 +244,7 @@ def coverage(filled: Mask, **pair: float) -> Coverage:
         (coverage(FACE < 10), "good", ""),
         (coverage(FACE < 20), "usable", "20% of the surface is filled"),
         (coverage(FACE < 60), "repeat", "60% of the surface is filled"),
+        (coverage(FACE < 100), "repeat", "next to nothing was measured: 0.0 cm2 in all"),
         (coverage((BANDS < 50.0) | (FACE < 2)), "good", ""),  # soles are never seen
         (coverage((FACE < 60) & (BANDS == 625.0)), "usable", "measured from 600 to 650 mm"),
         (coverage((FACE < 40) & (BANDS == 625.0)), "good", ""),
@@ -255,12 +257,13 @@ def test_coverage(scan: MadeScan, given: Coverage, grade: str, words: str) -> No
     verdict = verdict_given(scan.cloud, coverage=given)
     assert verdict.grade == grade, str(verdict)
     assert words in str(verdict)
+    assert len(set(verdict.reasons)) == len(verdict.reasons)
 
 
 def test_the_stature_is_a_guess_if_the_crown_may_be_higher(scan: MadeScan) -> None:
     """Of a crown that is measured to its hairline the planes around bound nothing."""
     top = float(scan.cloud.points[:, 2].max())
-    check = Coverage(np.array([top]), np.ones(1), np.array([True]), {}, {})
+    check = Coverage(np.array([top]), np.ones(1), np.array([True]), {}, {}, np.array([False]))
     kept = scan.cloud.points[:, 2] < top - 200.0
     below = replace(scan.cloud, points=scan.cloud.points[kept], normals=scan.cloud.normals[kept])
     assert "the stature is a guess" not in str(verdict_given(scan.cloud, coverage=check))

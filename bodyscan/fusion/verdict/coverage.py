@@ -16,7 +16,7 @@ from bodyscan.calibration.pair import PairCalibration
 from bodyscan.fusion.brightness import MIN_GREY
 from bodyscan.fusion.hole_filling import Crown
 from bodyscan.fusion.regions import DARK
-from bodyscan.fusion.verdict.evidence import Coverage, Finding, ScanEvidence
+from bodyscan.fusion.verdict.evidence import BAND_MM, Coverage, Finding, ScanEvidence
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import SKIN, BodyMesh
@@ -186,21 +186,13 @@ def check_yields(scan: ScanEvidence) -> Iterator[Finding]:
 
 
 def check_rings(scan: ScanEvidence) -> Iterator[Finding]:
-    """A surface next to none of which was measured, or too little round the body for want of pairs."""
+    """A surface of which too little was measured round the body for want of pairs."""
     coverage = scan.coverage
     if coverage is None:
         return
-    measured_mm2 = coverage.areas_mm2[~coverage.filled].sum()
-    if measured_mm2 < 2000.0:  # three fingers
-        yield Finding(
-            "repeat", f"next to nothing was measured: {measured_mm2 / 100.0:.1f} cm2 in all"
-        )
-    if coverage.missed is None:
-        return
-    band = np.maximum(coverage.heights_mm / 50.0, 0.0).astype(np.int64)
-    area = np.bincount(band, coverage.areas_mm2)
+    area = coverage.sum_bands(coverage.areas_mm2)
     # Closed flat, a gap of 15 % costs 4 mm of a girth of 800: its arc less its chord.
-    gaping = np.bincount(band, coverage.areas_mm2 * coverage.missed) > 0.15 * area
+    gaping = coverage.sum_bands(coverage.areas_mm2 * coverage.missed) > 0.15 * area
     share = float(np.sum(gaping) / np.count_nonzero(area))
     if share > 0.5:
         absent = ", ".join(sorted(scan.images.absent))
@@ -229,9 +221,9 @@ def check_gaps(scan: ScanEvidence) -> Iterator[Finding]:
         return
     if coverage is None:
         return
-    missed = np.zeros(len(coverage.filled), bool) if coverage.missed is None else coverage.missed
-    missed_mm2 = coverage.areas_mm2[missed].sum()
-    mostly = 2.0 * missed_mm2 > coverage.areas_mm2[coverage.filled].sum()
+    mostly = (
+        2.0 * coverage.areas_mm2[coverage.missed].sum() > coverage.areas_mm2[coverage.filled].sum()
+    )
     lost = scan.images.absent if mostly else frozenset()
     if coverage.filled_share > MAX_FILLED:
         yield Finding(
@@ -239,20 +231,18 @@ def check_gaps(scan: ScanEvidence) -> Iterator[Finding]:
             f"{coverage.filled_share:.0%} of the surface is filled: nothing was measured there",
             lost,
         )
-    band_mm = 50.0
-    band = np.maximum(coverage.heights_mm / band_mm, 0.0).astype(np.int64)
-    area = np.bincount(band, coverage.areas_mm2)
-    filled = np.bincount(band, coverage.areas_mm2 * coverage.filled) / np.maximum(area, 1e-9)
-    heights = np.maximum(scan.cloud.points[:, 2] / band_mm, 0)
+    area = coverage.sum_bands(coverage.areas_mm2)
+    filled = coverage.sum_bands(coverage.areas_mm2 * coverage.filled) / np.maximum(area, 1e-9)
+    heights = np.maximum(scan.cloud.points[:, 2] / BAND_MM, 0)
     points = np.bincount(heights.astype(np.int64), None, len(area))[: len(area)]
     filled[(area == 0.0) & (points == 0)] = 1.0  # the mesh begins above it
-    empty = (filled > 0.5) & (band_mm * np.arange(len(filled)) >= 50.0)  # soles are never seen
+    empty = (filled > 0.5) & (BAND_MM * np.arange(len(filled)) >= 50.0)  # soles are never seen
     starts = np.flatnonzero(empty & ~np.roll(empty, 1))
     ends = np.flatnonzero(empty & ~np.roll(empty, -1)) + 1
     for low, high in zip(starts, ends, strict=True):
         yield Finding(
             "usable",
-            f"next to nothing was measured from {band_mm * low:.0f} to {band_mm * high:.0f} mm. "
+            f"next to nothing was measured from {BAND_MM * low:.0f} to {BAND_MM * high:.0f} mm. "
             "Possible causes: hair; black cloth; out of view",
             lost,
         )

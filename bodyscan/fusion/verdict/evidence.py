@@ -25,6 +25,7 @@ from bodyscan.verdict import Grade
 
 GIRTH_PER_MM = 2.0 * np.pi
 """mm by which a girth is wrong if its surface is displaced by 1 mm all round."""
+BAND_MM = 50.0  # of the body's height, by which gaps are reported
 
 
 @dataclass(frozen=True)
@@ -153,7 +154,12 @@ class Coverage:
     filled: Mask
     yields: Mapping[str, float]
     saturated: Mapping[str, float]
-    missed: Mask | None = None
+    missed: Mask
+
+    def sum_bands(self, areas_mm2: Array) -> Array:
+        """Areas (N,) of the faces summed in bands of BAND_MM in height, from the floor up."""
+        band = np.maximum(self.heights_mm / BAND_MM, 0.0).astype(np.int64)
+        return np.asarray(np.bincount(band, areas_mm2), np.float64)
 
     @property
     def filled_share(self) -> float:
