@@ -204,9 +204,8 @@ def expose_scene(
         Scene(surfaces), setup.view, setup.projector, lamps, settings.projection, rng
     )
     frames = {name: expose(image, settings.noise, rng) for name, image in images.items()}
-    code = PROJECTOR
-    coded = np.stack([frames[name] for name in FrameNames().code_names(code)])
-    return frames["lit"], decode_stripes(code, frames["lit"], frames["dark"], coded)
+    coded = np.stack([frames[name] for name in FrameNames().code_names(PROJECTOR)])
+    return frames["lit"], decode_stripes(PROJECTOR, frames["lit"], frames["dark"], coded)
 
 
 def _ground() -> Surface:

@@ -209,7 +209,7 @@ class Calibrations:
     reference: Zhang's camera.
     planes: the chapter's fit of its free planes.
     ours: our approach, with the camera of the joint solve.
-    model, refinement: what ours chose.
+    model: of its light sheets, as held-out boards chose.
     approaches: (i), (i) mended, (ii), (ii) with skew, (iii), ours.
     by_stage, by_reference: every model of the projector, calibrated either way.
     """
@@ -219,7 +219,6 @@ class Calibrations:
     ours: Approach
     camera_covariance: Array
     model: str
-    refinement: str
     approaches: tuple[Approach, ...]
     by_stage: tuple[Approach, ...]
     by_reference: tuple[Approach, ...]
@@ -232,7 +231,7 @@ def calibrate_all(captures: ChapterCaptures) -> Calibrations:
     skewed = calibrate_by_slide_stage(captures.stage, captures.readings, skewed=True)
     by_matrix = calibrate_by_matrix(captures.stage, captures.readings)
     planes = fit_light_planes(reference_boards.points, PROJECTOR.stripes, PROJECTOR.direction)
-    ours, covariance, model, refinement = calibrate_ours(captures, reference, reference_boards)
+    ours, covariance, model = calibrate_ours(captures, reference, reference_boards)
     second, with_skew = (
         locate_boards(captures.boards, boards.camera) for boards in (stage, skewed)
     )
@@ -253,21 +252,23 @@ def calibrate_all(captures: ChapterCaptures) -> Calibrations:
         for boards in (stage, reference_boards)
     )
     return Calibrations(
-        reference, planes, ours, covariance, model, refinement, approaches, by_stage, by_reference
+        reference, planes, ours, covariance, model, approaches, by_stage, by_reference
     )
 
 
 def calibrate_ours(
     captures: ChapterCaptures, reference: CameraCalibration, boards: LocatedBoards
-) -> tuple[Approach, Array, str, str]:
+) -> tuple[Approach, Array, str]:
     """Calibrate as `bodyscan calibrate-rig` does for a single pair: the light model that held-out
-    boards choose, and a joint solve of corners and stripes."""
+    boards choose, and a joint solve of corners and stripes if that model is smooth.
+
+    Returns also the covariance (P, P) of the camera's parameters, and the model's name.
+    """
     shots, camera = captures.boards, boards.camera
     bins = locate_boundaries(shots, camera, boards.camera_from_board, bin_px=BIN_PX).points
     fit = fit_light_sheets(bins, PROJECTOR.stripes, PROJECTOR.direction)
     if not isinstance(fit.sheets, SmoothSheets):
-        approach = Approach("ours", camera, fit.sheets)
-        return approach, reference.covariance, fit.model, "corners, then stripes"
+        return Approach("ours", camera, fit.sheets), reference.covariance, fit.model
     data = subsample(bins, 6000)
     striped = [
         StripedBoard(
@@ -280,4 +281,4 @@ def calibrate_ours(
     flatness = {BOARD.name: BOARD.flatness_sigma_mm}
     refined = refine_jointly(camera, reference.poses, [fit.sheets], striped, flatness)
     approach = Approach("ours", refined.camera, *refined.sheets)
-    return approach, refined.camera_covariance, fit.model, "joint solve"
+    return approach, refined.camera_covariance, fit.model

@@ -145,12 +145,8 @@ def draw_projector(
     true: as they are, (N, 4).
     """
     figure, axes = plt.subplots(2, 2, figsize=(10.0, 7.5), constrained_layout=True)
-    for axis, part, label in zip(
-        axes.ravel(),
-        range(3),
-        ("baseline, mm", "projection angle, degrees", "tilt angle, degrees"),
-        strict=False,
-    ):
+    labels = ("baseline, mm", "projection angle, degrees", "tilt angle, degrees")
+    for part, (axis, label) in enumerate(zip(axes.ravel(), labels, strict=False)):
         values = _baseline_angle_tilt(true)[part]
         axis.plot(s, values, color="#333333", linewidth=3.0, alpha=0.35, label="true")
         for colour, (name, found) in zip(COLOURS, planes.items(), strict=False):
@@ -292,7 +288,7 @@ def _format_table_1(calibrated: Calibrations) -> str:
             value, sigma = values[number], sigmas[number]
             row += [f"{value:.7g}", f"{sigma:.2g}", f"{(value - true) / sigma:+.1f}"]
         rows.append(row)
-    return _format(["", "true", "corners", "sigma", "off by", "joint", "sigma", "off by"], rows)
+    return _format(["", "true", "corners", "sigma", "off by", "ours", "sigma", "off by"], rows)
 
 
 def _format_accuracy(all_: Iterable[ApproachAccuracy]) -> str:
