@@ -197,12 +197,9 @@ def camera_prior(camera: Camera, columns: Indices) -> Block:
     return Block(residuals, lambda: np.diag(weights), columns, EXACT)
 
 
-def locate_board(
-    camera: Camera, view: PlanarView, start: RigidTransform | None = None
-) -> tuple[RigidTransform, Array]:
+def locate_board(camera: Camera, view: PlanarView) -> tuple[RigidTransform, Array]:
     """Fit `camera_from_board` of one view with a known camera; also return residuals (N, 2) px."""
-    start = estimate_pose(camera, view) if start is None else start
-    (pose,), (residuals,) = locate_boards(camera, [view], [start])
+    (pose,), (residuals,) = locate_boards(camera, [view], [estimate_pose(camera, view)])
     return pose, residuals
 
 

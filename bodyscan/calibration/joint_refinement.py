@@ -274,7 +274,10 @@ def _blocks(state: _State, boards: Sequence[StripedBoard]) -> Iterator[Block]:
             )
             heights = warp[: len(WARP_POWERS)]
             for direction, sheet_columns in enumerate(sheets):
-                rays = _boundary_rays(state.camera, board.stripes[direction])
+                stripes = board.stripes[direction]
+                # Through the boundaries' pixels, and half a pixel across from them.
+                pixels = np.stack([stripes.pixels, stripes.pixels + 0.5 * stripes.across])
+                rays = state.camera.rays(pixels)
                 yield Block(
                     _stripe_residuals(state, k, board, direction, rays),
                     partial(_stripe_jacobian, state, k, board, direction, rays),
@@ -314,11 +317,6 @@ def _corner_jacobian(state: _State, k: int, board: StripedBoard) -> Array:
     parts = [by_parameter, by_point @ twist_jacobian(points), by_heights]
     jacobian = np.concatenate([*parts, by_print.reshape(len(points), 2, -1)], axis=2)
     return jacobian.reshape(-1, jacobian.shape[2])
-
-
-def _boundary_rays(camera: Camera, stripes: BoardStripes) -> Array:
-    """Rays (2, N, 3), z = 1: through boundary pixels, and half a pixel across from them."""
-    return camera.rays(np.stack([stripes.pixels, stripes.pixels + 0.5 * stripes.across]))
 
 
 def _rays_by_camera(camera: Camera, rays: Array) -> Array:
@@ -414,7 +412,7 @@ def _compute_depth_covariance(
     that explains most of how the boards' points move is removed (an S-transformation to the frame of
     the boards: Baarda 1973). What remains along the rays is expressed as the change of the sheets
     that changes depths equally (by least squares). What no such change expresses, a lens, is in the
-    rays' sheet_columns sigma.
+    rays' own sigma.
     """
     sheets, stripes = state.sheets[direction], [board.stripes[direction] for board in boards]
     index = np.concatenate([one.index for one in stripes])

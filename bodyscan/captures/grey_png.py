@@ -45,12 +45,13 @@ def _png_chunks(data: bytes) -> Iterator[tuple[bytes, memoryview, int]]:
         position = end + 4
 
 
-def _update_crc(content: memoryview, crc: int, step: int = 5120) -> int:
+def _update_crc(content: memoryview, crc: int) -> int:
     """Continue the CRC-32 `crc` with the content of a chunk.
 
     Chunks are a few kilobytes, whose sum takes a microsecond. From 5120 bytes on ISA-L releases the
     interpreter's lock for it, and getting it back from another thread takes many times as long.
     """
+    step = 5120
     if len(content) > 16 * step:
         return isal_zlib.crc32(content, crc)
     for first in range(0, len(content), step):

@@ -13,10 +13,10 @@ from pydantic import Field
 from bodyscan.errors import BadInput
 from bodyscan.files.model import Model, Problem
 from bodyscan.files.model_file import apply_changes, load_model
+from bodyscan.rig.gauge import Vector
 from bodyscan.verdict import Verdict
 
 Positive = Annotated[float, Field(gt=0)]
-Vector = tuple[float, float, float]
 
 
 class Spheres(Model):

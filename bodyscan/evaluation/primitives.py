@@ -129,15 +129,15 @@ def _principal_axes(points: Array) -> tuple[Array, Array]:
     return middle, np.linalg.eigh(centred.T @ centred)[1]
 
 
-def measure_flatness(points: Array, degree: int = 6) -> Flatness:
+def measure_flatness(points: Array) -> Flatness:
     """Measure the flatness of points (N, 3) on a plane.
 
-    The smooth part of the distances is a polynomial of this degree over the plane (products of
+    The smooth part of the distances is a polynomial of degree 6 over the plane (products of
     Legendre polynomials); noise of N points contributes only sqrt(terms / N) of itself to it.
     """
     normal, offset = fit_plane(points)
     distances = points @ normal - offset
-    smooth = fit_polynomial(points, distances, degree)
+    smooth = fit_polynomial(points, distances)
     return Flatness(rms(distances), rms(smooth))
 
 

@@ -166,8 +166,8 @@ def _trace_loops(edges: Indices) -> list[Indices]:
     return loops
 
 
-def _dome(rim: Array, crown_mm: float, rings: int = 40) -> Array:
-    """Build rings from a rim (N, 3) to an ellipsoid, and the top: (rings N + 1, 3)."""
+def _dome(rim: Array, crown_mm: float) -> Array:
+    """Build 40 rings from a rim (N, 3) to an ellipsoid, and the top: (40 N + 1, 3)."""
     # Shares of the height from neck to crown: half the head's length and breadth, where it is
     # widest, and where the neck's shape ends.
     half_length, half_breadth, widest, neck_end = 0.36, 0.28, 0.52, 0.45
@@ -180,9 +180,8 @@ def _dome(rim: Array, crown_mm: float, rings: int = 40) -> Array:
     angle = np.arctan2(arm[0, 1], arm[0, 0]) + turns * 2.0 * np.pi * np.arange(len(rim)) / len(rim)
     height = crown_mm - float(rim[:, 2].mean())
     ellipse = height * np.stack([half_length * np.cos(angle), half_breadth * np.sin(angle)], axis=1)
-    half = rings // 2
-    rising = np.sin(np.linspace(0.0, np.pi / 2.0, rings - half + 1))[:-1]
-    below = widest * np.arange(1, half + 1) / (half + 1)
+    rising = np.sin(np.linspace(0.0, np.pi / 2.0, 21))[:-1]
+    below = widest * np.arange(1, 21) / 21
     level = np.concatenate([below, widest + (1 - widest) * rising])
     up = np.clip(level / neck_end, 0.0, 1.0)
     blend = (up * up * (3.0 - 2.0 * up))[:, None, None]

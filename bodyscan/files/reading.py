@@ -46,15 +46,14 @@ def read_regular(path: Path, max_bytes: int | None = None) -> bytes:
     return data
 
 
-def read_json_object(path: Path, max_bytes: int = 100_000_000) -> dict[str, Any]:
+def read_json_object(path: Path) -> dict[str, Any]:
     """Read the single mapping in a JSON file, with every number finite.
-
-    max_bytes: a calibration of sixteen pairs and two hundred shots takes a million.
 
     Raises ValueError for anything else (duplicate keys, NaN, 1e999, half surrogates, nested too
     deeply), BadInput if it is not a regular file, OSError if it cannot be read or is too long.
     """
-    data = read_regular(path, max_bytes)
+    # A calibration of sixteen pairs and two hundred shots takes a million bytes.
+    data = read_regular(path, 100_000_000)
     try:
         content = json.loads(
             data.decode("utf-8"),

@@ -247,15 +247,13 @@ def _solve_window(
     return count
 
 
-def _noise_scale(
-    inverse: Floats, noise: Floats, fit: QuadraticFit, full: Mask, every: int = 8
-) -> np.float32:
+def _noise_scale(inverse: Floats, noise: Floats, fit: QuadraticFit, full: Mask) -> np.float32:
     """Factor for `noise`, at least 1, from the residuals of full windows in every 8th row."""
-    there = full[::every]
+    there = full[::8]
     if not there.any():
         return np.float32(1.0)
-    residual = (inverse - fit.value)[::every][there] / noise[::every][there]
+    residual = (inverse - fit.value)[::8][there] / noise[::8][there]
     # A residual lacks the part of the pixel's noise that the fit absorbed.
-    absorbed = np.square(fit.sigma[::every][there][0] / noise[::every][there][0])
+    absorbed = np.square(fit.sigma[::8][there][0] / noise[::8][there][0])
     typical = np.median(np.abs(residual)) / np.sqrt(1.0 - absorbed)
     return np.float32(max(1.0, typical / NORMAL_MEDIAN))

@@ -189,9 +189,10 @@ def _pseudo_inverse(scaled: Array) -> Array:
     return inverse
 
 
-def multiply_transposed(left: Array, right: Array, block: int = 128) -> Array:
+def multiply_transposed(left: Array, right: Array) -> Array:
     """left.T @ right for tall matrices, in blocks of rows too small for BLAS to start threads:
     pairs are fitted in parallel, and threads waiting for a core cost more than they save."""
+    block = 128
     blocks = len(left) // block
     if not blocks:
         return np.asarray(left.T @ right, np.float64)

@@ -119,7 +119,7 @@ def run_on_cluster(
     threads: per job. The cluster decides how many jobs run at once: one for each thread of each
         worker (`dask worker --nthreads`).
 
-    Raises BadInput if dask.distributed is not ours, FailedWork if nobody answers or there is
+    Raises BadInput if dask.distributed is not installed, FailedWork if nobody answers or there is
     no worker.
     """
     try:
@@ -127,7 +127,7 @@ def run_on_cluster(
         from distributed import as_completed as as_ended
     except ImportError:
         raise BadInput(
-            "--cluster needs dask.distributed, which is not ours",
+            "--cluster needs dask.distributed, which is not installed",
             remedy="pip install 'bodyscan[cluster]' here and on every worker",
         ) from None
 

@@ -96,19 +96,15 @@ def rescale_boards(rig: Rig, factor: float) -> Rig:
     """The rig with the square sizes that its boards turned out to have."""
     certified = {name for reference in rig.references for name in reference.boards}
     alone = certified.issuperset(board.name for board in rig.boards)
-    return rig.model_copy(
-        update={
-            "boards": tuple(
-                board if board.name in certified and not alone else _scale_board(board, factor)
-                for board in rig.boards
-            )
-        }
-    )
 
+    def rescale(board: Board) -> Board:
+        if board.name in certified and not alone:
+            return board
+        marker_mm = board.marker_mm and board.marker_mm * factor
+        size = {"square_mm": board.square_mm * factor, "marker_mm": marker_mm}
+        return board.model_copy(update=size)
 
-def _scale_board(board: Board, factor: float) -> Board:
-    marker = None if board.marker_mm is None else board.marker_mm * factor
-    return board.model_copy(update={"square_mm": board.square_mm * factor, "marker_mm": marker})
+    return rig.model_copy(update={"boards": tuple(map(rescale, rig.boards))})
 
 
 def _format_size(size: Size) -> str:

@@ -127,13 +127,10 @@ def solve_rig(
     rig: Rig,
     views: Sequence[LocatedView],
     cameras: Mapping[str, Camera],
-    *,
-    choose: bool = True,
 ) -> Outcome[RigSolution]:
     """Join all pairs by their shared board views.
 
-    cameras: with the richest lens to be tried.
-    choose: whether held-out boards choose the lens of cameras for which the rig file leaves it
+    cameras: with the richest lens to be tried; held-out boards choose where the rig file leaves it
         open.
 
     Pairs that agree with the others in too few shots are in `failures`. Raises RigDisconnected if
@@ -145,23 +142,19 @@ def solve_rig(
     while True:
         names = sorted(start)
         shared = [view for view in views if view.pair in start]
-        solved = _solve(rig, shared, {n: cameras[n] for n in names}, start, choose)
+        solved = _solve(rig, shared, {n: cameras[n] for n in names}, start)
         unsynchronised = _find_unsynchronised(solved.views, solved.judged.wrong)
         if not unsynchronised:
             break
         if 2 * len(unsynchronised) >= len(names):
-            solved = _solve(rig, shared, {n: cameras[n] for n in names}, start, choose, weigh=True)
+            solved = _solve(rig, shared, {n: cameras[n] for n in names}, start, weigh=True)
             loose = (
                 f"{describe_unsynchronised(names)}: all views are used, weighted by how well they "
                 "agree, with sigmas to match; synchronise the cameras, or hold the board still",
             )
             break
         left_out |= {name: describe_unsynchronised([name]) for name in unsynchronised}
-        start = {
-            name: rig_from_camera
-            for name, rig_from_camera in start.items()
-            if name not in unsynchronised
-        }
+        start = {name: pose for name, pose in start.items() if name not in unsynchronised}
     solution = _transfer_to_rig_frame(rig, solved)
     notes = (*loose, *solved.judged.notes, *solved.notes, *lens_notes(solution.lenses))
     return Outcome(solution, notes, left_out)
@@ -172,7 +165,6 @@ def _solve(
     views: Sequence[LocatedView],
     cameras: dict[str, Camera],
     start: Mapping[str, RigidTransform],
-    choose: bool,
     *,
     weigh: bool = False,
 ) -> _Solved:
@@ -199,16 +191,13 @@ def _solve(
         limit_px=np.inf if weigh else error_limit(kept, cameras),
     )
     judged = solve(resolved, solution, wrong=[view.key for view in gross])
-    lenses: ChosenLenses | None = None
     # If pairs are to be left out, the others are solved again anyway.
     if _find_unsynchronised(resolved, judged.wrong):
-        return _Solved(judged, resolved, (), lenses)
+        return _Solved(judged, resolved, (), None)
     shaped = estimate_board_shapes(resolved, judged, root=root)
-    solution = shaped.value
-    if choose:
-        true = [apply_shape(v, solution.shapes) for v in judged.select_consistent(resolved)]
-        lenses = choose_lenses(rig, true, solution)
-        solution = lenses.solution
+    true = [apply_shape(v, shaped.value.shapes) for v in judged.select_consistent(resolved)]
+    lenses = choose_lenses(rig, true, shaped.value)
+    solution = lenses.solution
     if solution.shapes or solution.cameras != judged.solution.cameras:
         judged = solve(resolved, solution, wrong=judged.wrong)
     return _Solved(judged, resolved, shaped.notes, lenses)

@@ -148,7 +148,8 @@ class Motion:
 
     def trunk(self, pair: str) -> RigidTransform:
         """Compute `swayed_from_still` of the trunk at the middle of a pair's frames."""
-        return self.body.trunk_motion(self.middle_ms(pair), self.moment_ms)
+        ankles = self.body.ankles
+        return ankles.motion(self.middle_ms(pair)) @ ankles.motion(self.moment_ms).inverse()
 
 
 @dataclass(frozen=True, eq=False)

@@ -42,9 +42,8 @@ def build_pairs(
     A pair that fixes the rig frame stands exactly where it should. Raises BadInput for a pair
     without a nominal pose.
     """
-    fixed = None if rig.rig_frame.shot else (rig.rig_frame.pair or rig.pairs[0].name)
     return {
-        pair.name: _build(pair, pair.name == fixed, settings, stream(number))
+        pair.name: _build(pair, pair is rig.frame_pair, settings, stream(number))
         for number, pair in enumerate(rig.pairs)
     }
 

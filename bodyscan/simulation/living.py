@@ -126,10 +126,6 @@ class LivingBody:
         away = [np.linalg.norm(self.vertices(ms) - start, axis=1).max() for ms in moments_ms]
         return float(max(away))
 
-    def trunk_motion(self, ms: float, since_ms: float) -> RigidTransform:
-        """Compute the trunk's motion between two moments, rig frame."""
-        return self.ankles.motion(ms) @ self.ankles.motion(since_ms).inverse()
-
 
 def moves(person: Person) -> bool:
     """Whether any part of the person moves while frames are taken."""
@@ -146,7 +142,12 @@ def animate(still: Surface, person: Person, rng: np.random.Generator) -> LivingB
     limbs = [(weights, np.radians(person.arms_deg)) for weights in arms]
     limbs += [(head, np.radians(person.head_deg))]
     joints = tuple(
-        Joint(weights, _border(vertices, weights), draw_signal(rms, 3, rng, speed=False))
+        # Its joint is where a limb ends.
+        Joint(
+            weights,
+            vertices[(weights > 0.3) & (weights < 0.7)].mean(axis=0),
+            draw_signal(rms, 3, rng, speed=False),
+        )
         for weights, rms in limbs
     )
     # Leaning forward is a rotation about y, leaning left one about -x; there is none about z.
@@ -186,11 +187,6 @@ def _edges(surface: Surface) -> csr_matrix:
     lengths = np.linalg.norm(np.diff(surface.vertices[ends], axis=1)[:, 0], axis=1)
     count = len(surface.vertices)
     return csr_matrix((lengths, (ends[:, 0], ends[:, 1])), shape=(count, count))
-
-
-def _border(vertices: Array, weights: Array) -> Array:
-    """Average the vertices (3,) where a limb ends: its joint."""
-    return vertices[(weights > 0.3) & (weights < 0.7)].mean(axis=0)
 
 
 def _breath_modes(vertices: Array, trunk: Array, height: float) -> Array:

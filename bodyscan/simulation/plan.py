@@ -135,8 +135,8 @@ def _mask_visible(board: Board, sight: Sight, stripes: bool) -> Mask:
 
 
 def _floor_shot(rig: Rig, pairs: Mapping[str, TruePair]) -> BoardShot:
-    frame = rig.rig_frame
-    board = rig.board(frame.board) if frame.board else rig.boards[0]
+    frame, board = rig.rig_frame, rig.frame_board
+    assert board is not None
     x, y = np.array(frame.x_axis, float), np.array(frame.y_axis, float)
     x, y = x / np.linalg.norm(x), y / np.linalg.norm(y)
     pose = RigidTransform(np.stack([x, y, np.cross(x, y)], axis=1), np.array(frame.origin_mm))

@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import networkx as nx
 import numpy as np
 
 from bodyscan.alignment.displaced_poles import (
@@ -20,6 +19,7 @@ from bodyscan.alignment.displaced_poles import (
     motions_between,
 )
 from bodyscan.alignment.icp import Alignment, align
+from bodyscan.alignment.overlaps import find_connected_groups
 from bodyscan.alignment.sway_prior import BODY_CENTRE
 from bodyscan.arrays import Array
 from bodyscan.boards.view import BoardView
@@ -453,11 +453,9 @@ def judge_scans(
 
 def _separate_groups(alignments: Sequence[Alignment]) -> tuple[tuple[str, ...], ...]:
     """Connected components of the overlaps of all scans, the largest first; () if there is one."""
-    graph = nx.Graph()
-    for found in alignments:
-        graph.add_nodes_from(found.rig_from_camera)
-        graph.add_edges_from((overlap.source, overlap.target) for overlap in found.overlaps)
-    groups = sorted((tuple(sorted(group)) for group in nx.connected_components(graph)), key=len)
+    names = [name for found in alignments for name in found.rig_from_camera]
+    edges = [(one.source, one.target) for found in alignments for one in found.overlaps]
+    groups = sorted((tuple(sorted(one)) for one in find_connected_groups(names, edges)), key=len)
     return tuple(groups[::-1]) if len(groups) > 1 else ()
 
 
