@@ -15,6 +15,7 @@ import numpy as np
 from scipy import ndimage
 
 from bodyscan.arrays import Array, Bytes, Crop, Floats, Indices, Mask, find_crop
+from bodyscan.compiled import compiled
 from bodyscan.fusion.brightness import MIN_GREY
 from bodyscan.fusion.quadratic_fit import fit_full_windows, window_basis
 from bodyscan.fusion.smoothing import compute_inverse_depths, estimate_pixel_size, window_reach
@@ -79,9 +80,7 @@ class _Grid:
 
     def compute_medians(self, values: Floats, cell: Indices) -> Array:
         """Median (count,) of the values (N,) in each cell, by the cell (N,) of each; 0 if none."""
-        medians, some = np.zeros(self.count), np.unique(cell)
-        medians[some] = ndimage.median(values, cell, some) if some.size else 0.0
-        return medians
+        return _group_medians(values, cell, self.count)
 
     def find_majority(self, mask: Mask, among: Mask) -> Mask:
         """(count,): cells around which more than half of the `among` cells are in `mask`."""
@@ -223,3 +222,24 @@ def measure_roughness(
     left = np.float32(np.sqrt(1.0 - absorbed))
     points_rig = rig_from_camera.apply(points.astype(np.float64))
     return Roughness(points_rig, np.abs(residual) * length, left * noise[full] * length)
+
+
+@compiled
+def _group_medians(values: Floats, group: Indices, count: int) -> Array:
+    """Median (count,) of the values (N,) of each group, by the number (N,) of each; 0 if none.
+
+    Values are brought together by counting: scipy's median sorts all of them, in twenty times the time.
+    """
+    ends = np.zeros(count + 1, np.int64)
+    for number in group:
+        ends[number + 1] += 1
+    ends = np.cumsum(ends)
+    place, gathered = ends.copy(), np.empty_like(values)
+    for n in range(len(values)):
+        gathered[place[group[n]]] = values[n]
+        place[group[n]] += 1
+    medians = np.zeros(count)
+    for k in range(count):
+        if ends[k] < ends[k + 1]:
+            medians[k] = np.median(gathered[ends[k] : ends[k + 1]])
+    return medians
