@@ -15,7 +15,7 @@ from itertools import pairwise
 
 import numpy as np
 from scipy.linalg import cho_solve
-from scipy.linalg.lapack import dpotrf, dpotri, dtrtrs
+from scipy.linalg.lapack import dpotrf, dpotri, dtrtri, dtrtrs
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
@@ -91,6 +91,12 @@ class BodyMotion:
         """Posterior covariance of the amplitudes, (n, n)."""
         lower = np.tril(dpotri(self.factor, lower=True)[0])
         return (lower + np.tril(lower, -1).T) * self.units[:, None] * self.units
+
+    @property
+    def variances(self) -> Array:
+        """Posterior variances of the amplitudes, (n,), at half the cost of `covariance`."""
+        inverse = dtrtri(self.factor, lower=True)[0]
+        return np.asarray(np.einsum("ij,ij->j", inverse, inverse) * self.units**2)
 
     @property
     def log_evidence(self) -> float:
@@ -255,7 +261,7 @@ class BodyMotion:
         The usual size counts as much as the six amplitudes of a rigid motion: what the overlaps
         hardly see did not stand still.
         """
-        kinds, variances = [], np.diag(self.covariance)
+        kinds, variances = [], self.variances
         for kind, block in zip(self.kinds, self.slices, strict=True):
             if kind.precision is None:
                 determined = kind.count - np.sum(variances[block]) / kind.size**2

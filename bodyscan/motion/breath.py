@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.spatial.distance import cdist
 from scipy.special import log_ndtr
 
@@ -96,43 +97,44 @@ def estimate_breath(
     system = system * 0.3  # neighbouring cells share errors of calibrations: three count as one
     modes, fields = len(middle), system.size // len(middle)
     variances, typical = SIZES_MM**2, float(np.mean(SIZES_MM**2))
-    any_wave = np.einsum("k,kai,kbi->ab", breaths.priors, breaths.waves, breaths.waves)
-    local = np.diag(np.arange(fields) >= COMMON)
-    other = typical * (np.kron(np.eye(fields), breaths.irregular) + np.kron(local, any_wave))
-    certain = np.linalg.inv(np.eye(system.size) + system.information @ other)
-    information, vector = certain @ system.information, certain @ system.vector
+    waves = breaths.waves
+    any_wave = np.einsum("k,kai,kbi->ab", breaths.priors, waves, waves)
+    local = np.arange(fields)[:, None, None] >= COMMON
+    other = typical * (breaths.irregular + local * any_wave)  # (M, J, J), of each field
+    by_other = system.information.reshape(-1, fields, 1, modes) @ other
+    known = np.column_stack([system.information, system.vector])
+    certain = np.linalg.solve(np.eye(system.size) + by_other.reshape(2 * (system.size,)), known)
+    information, vector = certain[:, :-1], certain[:, -1]
     first = COMMON * modes
     blocks = information[:first, :first].reshape(COMMON, modes, COMMON, modes)
-    by_field = vector[:first].reshape(COMMON, modes)
     to_middle = np.kron(np.eye(fields), middle)
-    correction = to_middle @ other
+    correction = block_diag(*(middle @ other))
     remaining = correction @ (to_middle.T - information @ correction.T)
     of_common = (to_middle - correction @ information)[:, :first].reshape(fields, COMMON, modes)
 
-    def fit(wave: Array) -> tuple[Array, Array, Array]:
-        """Fit a wave: log evidence (S,) at each size; mean (S, M) and covariance mid-scan."""
-        projected = np.einsum("ai,manb,bj->minj", wave, blocks, wave, optimize=True)
-        eigenvalues, basis = np.linalg.eigh(projected.reshape(2 * (2 * COMMON,)))
-        along = basis.T @ (by_field @ wave).ravel()
-        carried = (of_common @ wave).reshape(fields, -1) @ basis
-        inflation = 1.0 + variances[:, None] * np.maximum(eigenvalues, 0.0)
-        gains = variances[:, None] / inflation
-        log_evidence = 0.5 * np.sum(gains * along**2 - np.log(inflation), axis=1)
-        # Whoever breathes in comes forward, and is carried back.
-        size, sigma = (gains * along) @ basis[0], np.sqrt(gains @ basis[0] ** 2)
-        log_evidence += log_ndtr(-size / sigma)
-        covariance = (carried * gains[:, None]) @ carried.T
-        return log_evidence, (gains * along) @ carried.T, covariance
+    # Of every wave: log evidence (K, S) at each size, and the means (K, S, M) mid-scan.
+    projected = np.einsum("kai,manb,kbj->kminj", waves, blocks, waves, optimize=True)
+    eigenvalues, basis = np.linalg.eigh(projected.reshape(-1, 2 * COMMON, 2 * COMMON))
+    by_field = vector[:first].reshape(COMMON, modes) @ waves
+    along = by_field.reshape(-1, 1, 2 * COMMON) @ basis
+    carried = np.tensordot(of_common, waves, (2, 1)).transpose(2, 0, 1, 3)
+    carried = carried.reshape(len(waves), fields, -1) @ basis
+    inflation = 1.0 + variances[:, None] * np.maximum(eigenvalues, 0.0)[:, None]
+    gains = variances[:, None] / inflation
+    log_evidence = 0.5 * np.sum(gains * along**2 - np.log(inflation), axis=2)
+    # Whoever breathes in comes forward, and is carried back.
+    forward = basis[:, :1]
+    size, sigma = np.sum(gains * along * forward, 2), np.sqrt(np.sum(gains * forward**2, 2))
+    log_evidence += log_ndtr(-size / sigma)
+    means = (gains * along) @ carried.transpose(0, 2, 1)
 
-    log_evidences, means, covariances = (
-        np.array(each) for each in zip(*map(fit, breaths.waves), strict=True)
-    )
-    weights = breaths.priors[:, None] * np.exp(log_evidences - log_evidences.max())
+    weights = breaths.priors[:, None] * np.exp(log_evidence - log_evidence.max())
     weights /= weights.sum()
-    mean = np.einsum("ks,ksm->m", weights, means)
-    second = np.einsum("ks,ksmn->mn", weights, covariances)
-    second += np.einsum("ks,ksm,ksn->mn", weights, means - mean, means - mean, optimize=True)
-    periodic = np.einsum("ks,s,kai,kbi->ab", weights, variances, breaths.waves, breaths.waves)
+    mean = np.tensordot(weights, means, 2)
+    spread = (np.sqrt(weights)[..., None] * (means - mean)).reshape(-1, fields)
+    within = carried * np.sqrt(np.sum(weights[..., None] * gains, axis=1, keepdims=True))
+    second = spread.T @ spread + np.tensordot(within, within, ((0, 2), (0, 2)))
+    periodic = np.tensordot((weights @ variances)[:, None, None] * waves, waves, ((0, 2), (0, 2)))
     return BreathEstimate(
         periodic + typical * breaths.irregular, correction @ vector + mean, remaining + second
     )
