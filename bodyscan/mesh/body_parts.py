@@ -17,6 +17,7 @@ import cv2
 import networkx as nx
 import numpy as np
 from scipy import ndimage
+from scipy.spatial import cKDTree
 
 from bodyscan.arrays import Array, Floats, Indices
 from bodyscan.geometry.transforms import RigidTransform
@@ -342,7 +343,9 @@ def find_body_frame(vertices: Array) -> BodyFrame:
     middle = 0.5 * (np.percentile(upper, 2, axis=0) + np.percentile(upper, 98, axis=0))
     _, axes = np.linalg.eigh(np.cov((upper - upper.mean(axis=0)).T))
     feet, ankles = vertices[heights < 0.03, :2], vertices[(heights > 0.05) & (heights < 0.15), :2]
-    toes = feet.mean(axis=0) - ankles.mean(axis=0) if len(feet) and len(ankles) else np.zeros(2)
+    # A raised foot has no sole on the floor: its ankle lies over none of `feet`.
+    ankles = ankles[cKDTree(feet).query(ankles)[0] < 0.02 * vertices[:, 2].max()]
+    toes = feet.mean(axis=0) - ankles.mean(axis=0) if len(ankles) else np.zeros(2)
     known = bool(np.linalg.norm(toes) > 0.01 * vertices[:, 2].max())
     along = axes.T @ toes
     # A stout body may be deeper than wide.
