@@ -141,21 +141,19 @@ class BodyMotion:
             total += field.reshape(len(total), -1) @ self.amplitudes_at(name, values.T)
         return total.T.reshape(total.shape[1], -1, 12)
 
-    def update(self, equations: Mapping[tuple[int, int], CellEquations]) -> BodyMotion:
-        """Estimate all amplitudes, and each kind's prior variance, in one Gauss-Newton step.
-
-        equations: by pairs (a, b), linearized at the present motion.
-        """
-        return self.solve_projected(self.project(equations, self))
+    def find_fields(self, names: Sequence[str]) -> Indices:
+        """Numbers of the named kinds' fields among all M."""
+        named = [np.full(kind.fields.shape[2], kind.name in names) for kind in self.kinds]
+        return np.flatnonzero(np.concatenate(named))
 
     def project(
-        self, equations: Mapping[tuple[int, int], CellEquations], at: BodyMotion
+        self, equations: Mapping[tuple[int, int], CellEquations]
     ) -> dict[tuple[int, int], LinearGaussianSystem]:
         """Normal equations of the M fields' displacement between each two pairs, whatever the moments.
 
-        at: the motion at which the equations were linearized.
+        equations: by pairs (a, b), linearized at this motion.
         """
-        current = at.displacements([kind.name for kind in at.kinds])
+        current = self.displacements([kind.name for kind in self.kinds])
 
         def project(overlap: tuple[tuple[int, int], CellEquations]) -> LinearGaussianSystem:
             (a, b), cells = overlap
@@ -167,7 +165,10 @@ class BodyMotion:
     def solve_projected(
         self, projected: Mapping[tuple[int, int], LinearGaussianSystem]
     ) -> BodyMotion:
-        """Estimate all amplitudes and prior variances from `project`."""
+        """Estimate all amplitudes, and each kind's prior variance, in one Gauss-Newton step.
+
+        projected: by pairs (a, b), see `project`.
+        """
         matrices = np.array([system.information for system in projected.values()])
         vectors = np.array([system.vector for system in projected.values()])
         first, second = np.array(list(projected)).T

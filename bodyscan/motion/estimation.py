@@ -20,6 +20,7 @@ from bodyscan.alignment.overlaps import COARSE, OverlapPoints, map_overlaps, mat
 from bodyscan.alignment.pose_evidence import MIN_LOG_RATIO, PoseEvidence
 from bodyscan.alignment.sway_prior import SwayPrior, centre_shifts
 from bodyscan.arrays import Array, Indices, Mask
+from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
 from bodyscan.geometry.robust import rms, rms_length
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance
@@ -231,13 +232,12 @@ def _divide_into_cells(
 class _Solution:
     """The motion, the next search radius, and whether the motion is negligible.
 
-    start, equations: of the last step, see `BodyMotion.update`.
+    projected: of the last step, see `BodyMotion.project`.
     """
 
     motion: BodyMotion
     reach_mm: float
-    start: BodyMotion
-    equations: Mapping[tuple[int, int], CellEquations]
+    projected: Mapping[tuple[int, int], LinearGaussianSystem]
     negligible: bool = False
 
     def fit_times(self, seconds: Sequence[float | None], middle_s: float) -> TimeFit:
@@ -248,7 +248,8 @@ class _Solution:
             return TimeFit()
         factors = 1.0, 0.1, 10.0
         persons = [self.motion.with_times([f * s for s in times], f * middle_s) for f in factors]
-        projected = persons[0].project(self.equations, self.start)
+        fields = self.motion.find_fields([kind.name for kind in persons[0].kinds])
+        projected = {both: system.select(fields) for both, system in self.projected.items()}
         stated, *others = (person.solve_projected(projected).log_evidence for person in persons)
         fits = [TimeFit(f, e - stated) for f, e in zip(factors[1:], others, strict=True)]
         best = max(fits, key=lambda one: one.log_ratio)
@@ -272,15 +273,15 @@ def _solve(
         equations = _map_matches(linearize, points, (motion, cells), reach, settings)
         if not equations:
             return None
-        start, combined = motion, _combine_directions(equations)
-        motion = start.update(combined)
+        projected = motion.project(_combine_directions(equations))
+        motion = motion.solve_projected(projected)
         reach = max(reach / 2.0, settings.min_reach_mm)
         if remaining == ROUNDS - 1:
             # Calibrations warp surfaces by half of 0.1 mm; so little motion does no harm.
             still = _rms_displacement(motion, NON_RIGID, observed) < 0.1
             if still and _is_rigid_negligible(motion, observed, settings):
-                return _Solution(motion, reach, start, combined, negligible=True)
-    return _Solution(motion, reach, start, combined)
+                return _Solution(motion, reach, projected, negligible=True)
+    return _Solution(motion, reach, projected)
 
 
 def _offset_to_mean_breath(
