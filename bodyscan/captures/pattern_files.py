@@ -71,19 +71,27 @@ def write_patterns(rig: Rig, out: Path, width: int, height: int) -> tuple[Path, 
     )
 
 
-def _write_kind(
-    folder: Path, frames: FrameNames, kind: StripeCode, pairs: list[Pair], coded: Bytes
-) -> Path:
-    """Write a kind's images, and patterns.json with the best order to show them: lit and dark if they
-    are taken, then the code's."""
-    height, width = coded.shape[1:]
-    blank, images = np.zeros((height, width), np.uint8), {}
+def name_patterns(frames: FrameNames, kind: StripeCode, coded: Bytes) -> dict[str, Bytes]:
+    """A projector's images (height, width) by frame, in the best order to show them: lit and dark if
+    they are taken, then the code's.
+
+    coded: from `StripeCode.pattern_images`.
+    """
+    blank, images = np.zeros(coded.shape[1:], np.uint8), dict[str, Bytes]()
     if frames.lit is not None:
         images[frames.lit] = blank + 255
     if frames.dark is not None and any(one.uses_dark for one in kind.directions):
         images[frames.dark] = blank
     of_code = dict(zip(frames.code_names(kind), coded, strict=True))
-    images |= {name: of_code[name] for name in frames.shown_names(kind)}
+    return images | {name: of_code[name] for name in frames.shown_names(kind)}
+
+
+def _write_kind(
+    folder: Path, frames: FrameNames, kind: StripeCode, pairs: list[Pair], coded: Bytes
+) -> Path:
+    """Write a kind's images, and patterns.json with the best order to show them."""
+    height, width = coded.shape[1:]
+    images = name_patterns(frames, kind, coded)
     for name, image in images.items():
         write_bytes(folder / f"{name}.png", cv2.imencode(".png", image)[1].tobytes())
     content = {

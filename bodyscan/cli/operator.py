@@ -22,6 +22,7 @@ from bodyscan.cli.options import (
     OutFolder,
     Overwrite,
     Result,
+    RigFile,
     ScanFolder,
 )
 from bodyscan.errors import BadInput, FailedWork
@@ -41,8 +42,47 @@ DEFAULTS = ScanSettings()
 
 def register(app: typer.Typer) -> None:
     """Add these commands to the command line, in the order of a day."""
-    for command in (scan, report, measure, export, batch, watch, verify, forget):
+    for command in (capture, scan, report, measure, export, batch, watch, verify, forget):
         add_command(app, PANEL, command)
+
+
+def capture(
+    output: Output,
+    rig_file: RigFile,
+    out: Annotated[Path, typer.Option(help="Capture folder to write, such as INBOX/anna.")],
+    subject: Annotated[
+        str | None, typer.Option(help="The subject's pseudonym. Default: the folder's name.")
+    ] = None,
+    board: Annotated[
+        str | None, typer.Option(metavar="SHOT", help="Take this shot of a board, not a person.")
+    ] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Project the stripes and photograph them by all pairs, with the devices of the rig file."""
+    from bodyscan.capture.devices import load_capture_rig, open_devices
+    from bodyscan.capture.exposure import find_exposures, measure_delays
+    from bodyscan.capture.session import Shot, capture_shot, refuse_existing_shot
+
+    rig = load_capture_rig(rig_file)
+    shot = Shot(out, subject=subject or out.name)
+    if board is not None:
+        shot = Shot(out, name=board, kind="calibration")
+    require_writable(out)
+    refuse_existing_shot(rig, shot, overwrite)
+    with output.stages() as progress, open_devices(rig, rig_file.parent) as devices:
+        for pair, delay_ms in measure_delays(devices).items():
+            output.say(
+                f"{pair}: the projector shows a frame {delay_ms:.0f} ms after it is asked to"
+            )
+        if devices.plan.exposure_ms is None:
+            output.say(*(found.describe(pair) for pair, found in find_exposures(devices)))
+        found = capture_shot(devices, shot, progress)
+    output.figures(frames=found.frames, retaken=found.retaken)
+    output.failures(found.lost)
+    again = f", {found.retaken} taken again" if found.retaken else ""
+    output.say(f"{found.frames} frames{again}")
+    output.add_files("captures", out)
+    output.exit_code = 1 if found.lost else 0
 
 
 Matching = Annotated[
@@ -359,7 +399,7 @@ def watch(
 ) -> None:
     """Fuse scans while their images arrive; the verdict comes seconds after the last image.
 
-    You can stop it at any moment; started again, it continues. docs/inbox.md describes the protocol.
+    You can stop it at any moment; started again, it continues. docs/station.md describes the protocol.
     """
     from bodyscan.files.model_file import apply_settings
     from bodyscan.jobs.pipeline import Pipeline, load_pipeline

@@ -3,7 +3,7 @@
 An inbox has one folder per scan, whose images are still being written. An image is whole if it ends
 as its format does, or has not changed for a while; a pair is whole if all its images are; a scan is
 complete if all pairs are whole, or `done` is in its folder, or nothing has arrived for long.
-docs/inbox.md is the protocol.
+docs/station.md is the protocol.
 
 The jobs are those of a batch, with the same folders, stages, states and manifests, so that a batch
 or `verify` accepts them as its own, and nothing is done twice.

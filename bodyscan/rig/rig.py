@@ -15,6 +15,7 @@ from bodyscan.files.model import Model, Name, Problem, did_you_mean, find_duplic
 from bodyscan.files.model_file import load_model
 from bodyscan.files.yaml_file import dump_yaml
 from bodyscan.rig.board import Board, dictionary_family
+from bodyscan.rig.devices import CapturePlan
 from bodyscan.rig.frame_names import CaptureFolder, FrameNames, ImageNames
 from bodyscan.rig.gauge import Reference, RigFrame
 from bodyscan.rig.pair import Pair
@@ -46,6 +47,7 @@ class Rig(Model):
         taken once.
     follow_links: whether symbolic links may lead out of a capture folder.
     references: certified lengths that fix the size.
+    capture: the devices that take its images; None if another program does.
     """
 
     version: Literal[1] = 1
@@ -60,6 +62,7 @@ class Rig(Model):
     frames: FrameNames = FrameNames()
     rig_frame: RigFrame = RigFrame()
     volume: Volume = Volume()
+    capture: CapturePlan | None = None
 
     def pair(self, name: str) -> Pair:
         """Return the pair of that name. Raises KeyError if there is none."""
@@ -103,6 +106,11 @@ class Rig(Model):
         yield from _find_template_problems(self)
         yield from _find_unknown_references(self)
         yield from _find_wrong_references(self)
+        names = [pair.name for pair in self.pairs]
+        for name in self.capture.pairs if self.capture else ():
+            if name not in names:
+                wrong = f"names no pair of this file{did_you_mean(name, names)}"
+                yield ("capture", "pairs", name), wrong
 
 
 def load_rig(path: Path) -> Rig:

@@ -86,6 +86,7 @@ def simulate(
     seed: int = 0,
     settings: SimulationSettings | None = None,
     board_shots: int | None = None,
+    take: int = 0,
     workers: int = THREADS,
     progress: Progress = silent,
 ) -> None:
@@ -95,6 +96,7 @@ def simulate(
     scale: of image size and number of stripes.
     board_shots: not counting the one that fixes the rig frame; by default 40 for twelve pairs; 0
         for the subject alone, in front of a rig that was calibrated before.
+    take: another number lets the subject sway otherwise in front of the same rig.
     workers: pairs at the same time.
 
     The same arguments give the same bytes. Raises RigFileError, and BadInput for a rig without
@@ -106,7 +108,7 @@ def simulate(
     for pair in rig.pairs:
         if pair.projector is not None:
             refuse_unknown_code(pair.projector, pair.name)
-    truth = _decide(rig, subject, settings, seed, board_shots)
+    truth = _decide(rig, subject, settings, seed, board_shots, take)
     _render_all(rig, truth, Path(out), workers, progress)
     write_rig(out / "rig.yaml", rig)
     if truth.plan:
@@ -132,7 +134,12 @@ def random_stream(seed: int, *purpose: int) -> np.random.Generator:
 
 
 def _decide(
-    rig: Rig, subject: Path | None, settings: SimulationSettings, seed: int, shots: int | None
+    rig: Rig,
+    subject: Path | None,
+    settings: SimulationSettings,
+    seed: int,
+    shots: int | None,
+    take: int,
 ) -> Truth:
     """Draw everything that is true of the data set before any image is made."""
     pairs = draw_true_pairs(rig, settings, seed)
@@ -150,7 +157,9 @@ def _decide(
     )
     motion, sways = None, dict.fromkeys(pairs, RigidTransform.identity())
     if moves(settings.person):
-        living = animate(person, settings.person, random_stream(seed, Stream.LIFE))
+        living = animate(
+            person, settings.person, random_stream(seed, Stream.LIFE, *([take] if take else []))
+        )
         times = files.compute_person_times(rig, PERSON_SHOT, settings.pace)
         every = [ms for by_frame in times.values() for ms in by_frame.values()]
         motion = Motion(living, times, (min(every) + max(every)) / 2.0)

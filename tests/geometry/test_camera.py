@@ -1,6 +1,5 @@
 from dataclasses import replace
 
-import cv2
 import numpy as np
 from any_camera import cameras, pixels_of
 from hypothesis import given
@@ -32,12 +31,3 @@ def test_distortion_is_that_of_equations_3_to_5(camera: Camera) -> None:
     # Eq. 3 scales u - u0, which holds x and, through the skew, y; so does ours.
     real = np.stack([u + (u - camera.u0) * factor, v + (v - camera.v0) * factor], axis=1)
     assert np.allclose(camera.project(points), real, atol=1e-8)
-
-
-@given(cameras)
-def test_without_skew_it_is_opencvs_camera(camera: Camera) -> None:
-    camera = replace(camera, gamma=0.0, lens=Radial(-0.1, 0.05))
-    points, matrix = camera.rays(pixels_of(camera)) * 700.0, camera.matrix
-    still = np.zeros(3)
-    opencv = cv2.projectPoints(points, still, still, matrix, camera.lens.opencv())[0].reshape(-1, 2)
-    assert np.allclose(camera.project(points), opencv, atol=1e-8)

@@ -8,31 +8,10 @@ import pytest
 from bodyscan.simulation.patterns import (
     FINE,
     PAD,
-    count_bits,
-    gray_code_bits,
     make_light_table,
-    table_index,
 )
 
 NO_BLUR = np.array([0.0])
-
-
-@pytest.mark.parametrize(("stripes", "bits"), [(2, 1), (254, 8), (256, 8), (320, 9), (640, 10)])
-def test_every_stripe_has_its_code_and_neighbours_differ_in_one_bit(
-    stripes: int, bits: int
-) -> None:
-    code = gray_code_bits(stripes)
-    assert code.shape == (bits, stripes)
-    assert bits == count_bits(stripes)
-    assert len({tuple(column) for column in code.T}) == stripes
-    assert (np.diff(code.astype(int), axis=1) != 0).sum(axis=0).tolist() == [1] * (stripes - 1)
-
-
-def test_light_is_on_in_lit_stripes_and_nowhere_beyond_the_sweep() -> None:
-    lit = np.array([True, False, True])
-    table = make_light_table(lit, NO_BLUR)
-    s = np.array([-1.0, 0.5, 1.5, 2.5, 3.5, np.nan, np.inf, -np.inf])
-    assert table.ravel()[table_index(s, 3)].tolist() == [0, 1, 0, 1, 0, 0, 0, 0]
 
 
 def test_blur_spreads_light_and_keeps_its_sum() -> None:

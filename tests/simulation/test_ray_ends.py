@@ -9,7 +9,7 @@ from small_view import LAMPS, SHARP, projector, view, wall
 
 from bodyscan.rig.board import Board
 from bodyscan.simulation.board import make_print
-from bodyscan.simulation.rays import interpolate, trace_band
+from bodyscan.simulation.rays import trace_band
 from bodyscan.simulation.scene import Scene, Surface, grid_surface
 from bodyscan.simulation.settings import BoardMaking
 
@@ -42,20 +42,3 @@ def test_a_curved_surface_is_cast_ray_by_ray() -> None:
     ends = trace_band(scene, band, projector(), LAMPS)
     straight = scene.cast(band.rays.reshape(-1, 3)).depth.reshape(ends.depth.shape)
     assert ends.depth == pytest.approx(straight, abs=0.01)
-
-
-def test_interpolation_is_bilinear() -> None:
-    rng = np.random.default_rng(0)
-    corners = rng.random((2, 4, 5), dtype=np.float32)
-    shift = rng.random((3, 4, 2), dtype=np.float32)
-    offsets = rng.random((6, 2), dtype=np.float32)
-    even = rng.random((3, 4)) < 0.7
-    values = np.full((2, 3, 4, 6), -1.0, np.float32)
-    interpolate(corners, shift, offsets, even, values)
-    x, y = np.moveaxis((offsets + shift[:, :, None]) % 1.0, -1, 0)
-    a, b, c, d = (
-        corners[:, r : r + 3, k : k + 4, None] for r, k in ((0, 0), (0, 1), (1, 0), (1, 1))
-    )
-    plain = (1 - y) * ((1 - x) * a + x * b) + y * ((1 - x) * c + x * d)
-    assert values[:, even] == pytest.approx(plain[:, even], abs=1e-6)
-    assert (values[:, ~even] == -1.0).all()

@@ -17,7 +17,7 @@ from bodyscan.stripes.codes import parse_stripe_code
 from bodyscan.stripes.codes.gray import Gray, bits_needed
 from bodyscan.stripes.codes.phase_shift import PhaseShift
 from bodyscan.stripes.codes.stripe_index import StripeIndex
-from bodyscan.stripes.gray.bit_words import BINARY, GRAY, gray_from_stripe, stripe_from_gray
+from bodyscan.stripes.gray.bit_words import BINARY, GRAY, gray_from_stripe
 from bodyscan.stripes.stripe_code import StripeCode
 
 
@@ -101,21 +101,6 @@ def test_invalid_keys(code: str, keys: dict[str, Any], said: str) -> None:
     assert said in str(caught.value)
 
 
-def test_waves_are_as_described() -> None:
-    first, second = waves(
-        period=(8, 64), steps=(6, 3), shift="backward", start_deg=90, origin=2.5
-    ).waves
-    assert (first.period, first.steps, second.period, second.steps) == (8.0, 6, 64.0, 3)
-    assert first.start == pytest.approx(np.pi / 2.0)
-    assert first.origin == 2.5
-    assert first.sign == -1.0
-    (one,) = waves(periods=5).waves
-    assert one.period == 12.8
-    (only,) = waves(6).waves
-    assert only.period == 6.0
-    assert (only.start, only.origin, only.sign, only.steps) == (0.0, 0.0, 1.0, 4)
-
-
 def test_patterns_show_a_stripes_number_in_bits_the_coarsest_first() -> None:
     s = np.array([0.0, 0.99, 1.0, 2.5, 3.0])
     plain = described("binary", 4, first_code=3)
@@ -169,14 +154,6 @@ def test_crossing_stripes_run_the_other_way_and_are_no_more_than_two() -> None:
         with pytest.raises(ValidationError) as caught:
             described("gray", crossing=wrong)
         assert said in str(caught.value)
-
-
-@given(st.integers(2, 65535))
-def test_gray_words_are_decoded(stripes: int) -> None:
-    stripe = np.unique(np.linspace(0, stripes - 1, 50).astype(np.int64))
-    gray = gray_from_stripe(stripe)
-    assert gray.max() < 2 ** bits_needed(stripes)
-    np.testing.assert_array_equal(stripe_from_gray(gray.astype(np.uint16)), stripe)
 
 
 @given(st.integers(1, 65535))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bodyscan.arrays import Greys
-from bodyscan.stripes.scan_lines import ScanLines, transpose
+from bodyscan.stripes.scan_lines import ScanLines
 
 LEVELS = np.linspace(0.5, 9.0, 256, dtype=np.float32)
 """Variance of each grey level."""
@@ -20,34 +20,6 @@ def frames(inverses: bool, of: type = np.uint8, direction: str = "vertical") -> 
     patterns: Greys = rng.integers(0, 250, (3, *SHAPE)).astype(of)
     others: Greys = rng.integers(0, 250, (3, *SHAPE)).astype(of)
     return ScanLines.from_images(lit, dark, patterns, others if inverses else None, direction)
-
-
-def test_horizontal_stripes_make_lines_of_columns() -> None:
-    across, along = frames(True), frames(True, direction="horizontal")
-    assert (across.transposed, along.transposed) == (False, True)
-    assert np.array_equal(along.lit, across.lit.T)
-    assert np.array_equal(along.dark, across.dark.T)
-    assert along.inverses is not None
-    assert across.inverses is not None
-    for k in range(3):
-        assert np.array_equal(along.patterns[k], across.patterns[k].T)
-        assert np.array_equal(along.inverses[k], across.inverses[k].T)
-    assert np.array_equal(transpose(across.patterns), along.patterns)
-    assert frames(False, direction="horizontal").inverses is None
-
-
-@pytest.mark.parametrize("of", [np.uint8, np.float32])
-@pytest.mark.parametrize("inverses", [True, False])
-def test_words_have_the_first_pattern_as_most_significant_bit(inverses: bool, of: type) -> None:
-    images = frames(inverses, of)
-    lit, dark = images.lit.astype(float), images.dark.astype(float)
-    patterns = images.patterns.astype(float)
-    middle = 0.5 * (lit + dark) if images.inverses is None else images.inverses.astype(float)
-    bits = patterns > middle
-    for k in range(3):
-        assert np.array_equal(images.bright(k), bits[k])
-    assert np.array_equal(images.words(), 4 * bits[0] + 2 * bits[1] + bits[2])
-    np.testing.assert_array_equal(images.contrast, lit - dark)
 
 
 @pytest.mark.parametrize("of", [np.uint8, np.float32])
