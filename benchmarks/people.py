@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from benchmarks.cast_people import SCALE, STANCE_DEG, STANCE_MM, cast_person
 from bodyscan.arrays import Array, Mask
 from bodyscan.evaluation.body import WHOLE, true_girths
-from bodyscan.evaluation.surface import fit_to_surface, normalized_errors, signed_distances
+from bodyscan.evaluation.surface import fit_to_surface, normalize_errors, signed_distances
 from bodyscan.geometry.robust import rms
 from bodyscan.measurement.measurements import Measurements, measure
 from bodyscan.outcome import Outcome
@@ -150,7 +150,7 @@ def median_of_worst(found: Sequence[Found]) -> float:
 
 def _over_sigmas(found: Sequence[Found]) -> str:
     """Errors over sigmas as `evaluate` reports them."""
-    spread, beyond = normalized_errors(
+    spread, beyond = normalize_errors(
         np.concatenate([one.over_sigmas for one in found]), np.ones(())
     )
     return f"{spread:.2f} | {100.0 * beyond:.1f} %"

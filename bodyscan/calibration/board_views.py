@@ -241,7 +241,7 @@ def board_symmetries(board: Board) -> tuple[RigidTransform, ...]:
     return tuple(found)
 
 
-def covered_share(pixels: Sequence[Array], width: int, height: int) -> float:
+def measure_covered_share(pixels: Sequence[Array], width: int, height: int) -> float:
     """Share of an image inside the convex hulls of all views' corners; pixels: (N, 2) each."""
     cells = 64  # across and down
     mask = np.zeros((cells, cells), np.uint8)
@@ -258,7 +258,7 @@ def coverage_notes(rig: Rig, views: Sequence[BoardView]) -> list[str]:
     narrow = []
     for pair in rig.pairs:
         pixels = [view.pixels for view in views if view.pair == pair.name]
-        share = covered_share(pixels, pair.camera.width, pair.camera.height)
+        share = measure_covered_share(pixels, pair.camera.width, pair.camera.height)
         if pixels and share < 0.2:
             narrow.append(f"{100 * share:.0f} % of {pair.name}'s")
     if not narrow:

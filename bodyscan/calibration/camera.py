@@ -331,7 +331,7 @@ def choose_lens(
         return ChosenLens(chosen, (), (), ray_uncertainty(chosen.camera, richest, views))
     residuals = _hold_out(chosen, views, cluster)
     trials: list[tuple[CameraCalibration, Array, float | None]] = [(chosen, residuals, None)]
-    corner_cluster = _by_corner(cluster, views)
+    corner_cluster = _repeat_by_corner(cluster, views)
     for kind in kinds[1:]:
         if kind is Fisheye and not _is_wide(camera, views):
             continue
@@ -382,7 +382,7 @@ def _compare_fits(
         _corner_block(_State(fit.camera, fit.poses), views).residuals.reshape(-1, 2)
         for fit in (first, second)
     )
-    return ResidualPair(first_px, second_px, _by_corner(cluster, views))
+    return ResidualPair(first_px, second_px, _repeat_by_corner(cluster, views))
 
 
 def _folds(fit: CameraCalibration, views: Sequence[PlanarView]) -> bool:
@@ -402,7 +402,7 @@ def _corner_rays(camera: Camera, views: Sequence[PlanarView]) -> Array:
     return camera.rays(np.concatenate([view.pixels for view in views]))
 
 
-def _by_corner(number: Indices, views: Sequence[PlanarView]) -> Indices:
+def _repeat_by_corner(number: Indices, views: Sequence[PlanarView]) -> Indices:
     """Numbers (N,) of all corners from those (V,) of their views."""
     return np.repeat(number, [len(view.points) for view in views])
 

@@ -296,18 +296,18 @@ def _prior_block(prior: tuple[Array, Array], columns: Indices) -> Block:
     return Block(residuals, lambda: jacobian, columns, EXACT)
 
 
-def _corner_points(state: _State, k: int, board: StripedBoard) -> Array:
+def _place_corners(state: _State, k: int, board: StripedBoard) -> Array:
     """Corners of the k-th board as warped, camera frame, (N, 3) mm."""
     return state.poses[k].apply(state.warps[board.board].apply(board.view.points))
 
 
 def _corner_residuals(state: _State, k: int, board: StripedBoard) -> Array:
-    return (state.camera.project(_corner_points(state, k, board)) - board.view.pixels).ravel()
+    return (state.camera.project(_place_corners(state, k, board)) - board.view.pixels).ravel()
 
 
 def _corner_jacobian(state: _State, k: int, board: StripedBoard) -> Array:
     """Derivatives (2N, ...) by camera, this board's pose, and its warp."""
-    points, warp = _corner_points(state, k, board), state.warps[board.board]
+    points, warp = _place_corners(state, k, board), state.warps[board.board]
     by_parameter, by_point = state.camera.jacobians(points)
     in_board = by_point @ state.poses[k].rotation
     by_heights = in_board[:, :, 2:] * warp.basis(board.view.points[:, :2])[:, None, :]

@@ -60,8 +60,8 @@ class PairCount:
             return None
         kind = "whole stripe sequence" if self.pair.projector else "lit image"
         return (
-            f"pair {self.pair.name}: has {_count(self.poses, kind)}; calibration needs 3 or more, "
-            "with the board tilted differently in each"
+            f"pair {self.pair.name}: has {_format_count(self.poses, kind)}; calibration needs 3 or "
+            "more, with the board tilted differently in each"
         )
 
 
@@ -144,10 +144,10 @@ def check(rig_path: Path, known_errors: Iterable[str] = ()) -> CheckReport:
 def format_report(report: CheckReport) -> list[str]:
     """Format the report as lines of text, with bad images grouped by pair and fault."""
     rig = report.rig
-    counts = f"{_count(len(rig.pairs), 'pair')}, {_count(len(rig.boards), 'board')}"
+    counts = f"{_format_count(len(rig.pairs), 'pair')}, {_format_count(len(rig.boards), 'board')}"
     lines = [f"{report.rig_path}: rig {rig.name}: {counts}", *map(str, report.folders)]
-    shots = _count(len(report.shots), "calibration shot")
-    lines.append(f"{shots}, {_count(report.images, 'image')}")
+    shots = _format_count(len(report.shots), "calibration shot")
+    lines.append(f"{shots}, {_format_count(report.images, 'image')}")
     width = max(len(pair.name) for pair in rig.pairs)
     for count in report.pairs if report.folders else ():
         stripes = f"{count.stripe_shots:4d} with stripes, " if count.pair.projector else ""
@@ -156,7 +156,7 @@ def format_report(report: CheckReport) -> list[str]:
     lines += [f"error: {text}" for text in report.errors]
     lines += [f"warning: {text}" for text in report.warnings]
     faults = len(report.errors) + len(report.bad_images)
-    lines.append("good" if report.ok else f"{_count(faults, 'fault')} to correct")
+    lines.append("good" if report.ok else f"{_format_count(faults, 'fault')} to correct")
     return lines
 
 
@@ -263,7 +263,7 @@ def _format_bad_images(bad: tuple[BadImage, ...]) -> list[str]:
     return lines
 
 
-def _count(count: int, noun: str) -> str:
+def _format_count(count: int, noun: str) -> str:
     return f"{count} {noun}{'' if count == 1 else 's'}"
 
 

@@ -178,7 +178,7 @@ def figures(readings: Readings, file: AcceptanceFile) -> list[Figure]:
         ("flatness_mm", _worst(plates, "flatness_mm"),
          "range of the points' distances from the best plane, all pairs merged, 3 in 1000 points "
          "left out"),
-        ("repeatability_mm", _repeatability(readings.spacings),
+        ("repeatability_mm", _find_widest_range(readings.spacings),
          "range of one distance between spheres over repeated shots at one place"),
         ("single_probing_form_mm", _worst(single, "form_mm"),
          "probing form of one pair by itself, not merged"),
@@ -242,7 +242,8 @@ def _worst(rows: Sequence[Any], name: str) -> tuple[float | None, str]:
     return getattr(row, name), ", ".join([row.place, row.shot, *([view] if view != ALL else [])])
 
 
-def _repeatability(rows: Sequence[SpacingRow]) -> tuple[float | None, str]:
+def _find_widest_range(rows: Sequence[SpacingRow]) -> tuple[float | None, str]:
+    """Largest range of a spacing's errors over its repetitions at one place, and where it is."""
     groups: dict[tuple[str, str], list[float]] = {}
     for row in rows:
         groups.setdefault((row.place, row.between), []).append(row.error_mm)

@@ -77,7 +77,7 @@ def deviation(signed_mm: Array) -> Deviation:
     return Deviation(len(signed_mm), bias, median, rms_mm, p95, worst)
 
 
-def normalized_errors(signed_mm: Array, sigma_mm: NDArray[np.floating[Any]]) -> tuple[float, float]:
+def normalize_errors(signed_mm: Array, sigma_mm: NDArray[np.floating[Any]]) -> tuple[float, float]:
     """Robust sigma of errors over their sigmas (1 if these are right), and the share beyond
     three (0.003 if Gaussian)."""
     over = np.abs(signed_mm / sigma_mm)

@@ -150,15 +150,15 @@ def run_on_cluster(
             missing = set(futures.values())
             for future in as_ended(futures, loop=client.loop):
                 missing.remove(futures[future])
-                yield _result_of(future, futures[future])
+                yield _await_result(future, futures[future])
             for name in sorted(missing):
                 yield _cluster_lost(name, "")
 
     return run
 
 
-def _result_of(future: Any, job: str) -> JobResult:
-    """The result of a job that a cluster did, or lost."""
+def _await_result(future: Any, job: str) -> JobResult:
+    """Wait for the result of a job that a cluster did, or lost."""
     from concurrent.futures import CancelledError
 
     try:

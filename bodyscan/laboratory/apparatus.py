@@ -172,7 +172,7 @@ def pose_about(
     return RigidTransform(rotation, np.asarray(position) - rotation @ middle)
 
 
-def sphere_scene() -> list[Surface]:
+def build_spheres() -> list[Surface]:
     """Build five white spheres on the ground, and a wall behind."""
     mesh = o3d.geometry.TriangleMesh.create_sphere(RADIUS_MM, resolution=400)
     arms = np.asarray(mesh.vertices)
@@ -270,7 +270,7 @@ def take_captures(
     for pose, stream in [*zip(poses, count(), strict=False), *zip(stage, count(100), strict=False)]:
         shots.append(_board_shot(setup, pose, stream))
         progress("rendering", len(shots), total)
-    spheres = _expose(setup, sphere_scene(), 200)
+    spheres = _expose(setup, build_spheres(), 200)
     progress("rendering", total - 1, total)
     plate = _expose(setup, plate_scene(), 300)
     progress("rendering", total, total)

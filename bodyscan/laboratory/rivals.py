@@ -129,7 +129,7 @@ def projection_matrix(points: Array, pixels: Array) -> Array:
 
     Direct linear transformation (Abdel-Aziz and Karara 1971) with Hartley's scaling.
     """
-    space, image = _scaling(points), _scaling(pixels)
+    space, image = _compute_scaling(points), _compute_scaling(pixels)
     x = _homogeneous(points) @ space.T
     u, v = (_homogeneous(pixels) @ image.T)[:, :2].T
     zero = np.zeros_like(x)
@@ -157,7 +157,7 @@ def split_projection_matrix(
     return camera, pose
 
 
-def _scaling(points: Array) -> Array:
+def _compute_scaling(points: Array) -> Array:
     """Compute the matrix (D + 1, D + 1) that scales points to mean 0, mean distance sqrt(D)."""
     size = points.shape[1]
     mean = points.mean(axis=0)

@@ -91,7 +91,7 @@ def _nonlinearity(
     ends: tuple[Array, Array],
     limits: Array,
 ) -> tuple[Array, Array]:
-    """Stripes by which near and far limits (rows, columns) at the corners of blocks must be pad_crop.
+    """Stripes by which near and far limits (rows, columns) at the corners of blocks must be widened.
 
     ends: depths at which the rays enter and leave.
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bodyscan.calibration.board_views import covered_share
+from bodyscan.calibration.board_views import measure_covered_share
 from bodyscan.geometry.uncertainty import position_sigma
 from bodyscan.registration.rig_calibration import RigCalibration, nominal_size
 from bodyscan.verdict import Grade, Verdict
@@ -114,7 +114,7 @@ def _collect_figures(calibration: RigCalibration, name: str) -> PairFigures:
         views = [
             corners.pixels[corners.target == k].astype(float) for k in np.unique(corners.target)
         ]
-        share = 100.0 * covered_share(views, camera.width, camera.height)
+        share = 100.0 * measure_covered_share(views, camera.width, camera.height)
     return PairFigures(
         name,
         quality.corners_rms_px,

@@ -31,7 +31,7 @@ CORNERS = Noise("corners", group=2, min_scale=0.1 * MIN_ERROR_PX)
 def error_limit(views: Iterable[LocatedView], cameras: Mapping[str, Camera]) -> float:
     """Error in px above which a view is inconsistent, by those of views at the poses that each was
     located at by itself."""
-    errors = [_error(view, cameras, view.camera_from_board) for view in views]
+    errors = [_measure_misfit(view, cameras, view.camera_from_board) for view in views]
     return max(6.0 * float(np.median(errors)), MIN_ERROR_PX)
 
 
@@ -46,7 +46,7 @@ def find_inconsistent_views(
         root_from_view = solution.root_from_camera[group[0].pair] @ group[0].camera_from_board
         root_from_board = solution.root_from_board.get(group[0].target, root_from_view)
         errors = [
-            _error(
+            _measure_misfit(
                 view,
                 solution.cameras,
                 solution.root_from_camera[view.pair].inverse() @ root_from_board,
@@ -143,7 +143,7 @@ def _corners(view: LocatedView, solution: JointSolution, root_from_board: RigidT
     return Block(residuals, lambda: linearize()[:, 6:12], slice(0, 6), CORNERS)
 
 
-def _error(
+def _measure_misfit(
     view: LocatedView, cameras: Mapping[str, Camera], camera_from_board: RigidTransform
 ) -> float:
     """RMS reprojection error of a view with its board at that pose, px."""

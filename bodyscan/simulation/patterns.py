@@ -46,10 +46,11 @@ def gray_code_bits(stripes: int, first: int = 0) -> Mask:
     return (code >> positions[:, None] & 1).astype(bool)
 
 
-def table_index(
+def find_table_entries(
     s: NDArray[np.floating], stripes: int, blur: NDArray[np.integer] | None = None
 ) -> NDArray[np.int32]:
-    """Look up table entries of s (NaN: outside the sweep), in the row of its blur if several."""
+    """Numbers of the entries of a light table for s (NaN: outside the sweep), in the row of its blur
+    if there are several."""
     entries = (stripes + 2 * PAD) * FINE
     position = np.nan_to_num((s + PAD) * FINE, nan=0.0, posinf=0.0, neginf=0.0)
     index = np.clip(position, 0, entries - 1).astype(np.int32)

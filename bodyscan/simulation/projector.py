@@ -54,7 +54,7 @@ class MirrorProjector:
         """
         zero, side = self._normals
         m1, m2, m3 = (float(self.sheet @ v) for v in (zero, side, self.axis))
-        q1, q2, q3 = (_project(points, v, self.centre) for v in (zero, side, self.axis))
+        q1, q2, q3 = (_measure_along(points, v, self.centre) for v in (zero, side, self.axis))
         constant = q3 * m3 + float(self.sheet @ (self.centre - self.laser))
         a, b = q1 * m1 - q2 * m2, q1 * m2 + q2 * m1
         radius, phase = np.hypot(a, b), np.arctan2(b, a)
@@ -84,14 +84,14 @@ class MirrorProjector:
         cos, sin = np.cos(theta), np.sin(theta)
         zero, side = self._normals
         edge = np.cross(self.sheet, self.aim)
-        height = cos * _project(points, zero, self.centre) + sin * _project(
+        height = cos * _measure_along(points, zero, self.centre) + sin * _measure_along(
             points, side, self.centre
         )
         height = height - self.offset_mm
 
         def mirrored(axis: Array) -> Reals:
             tilt = cos * float(zero @ axis) + sin * float(side @ axis)
-            return _project(points, axis, self.laser) - 2.0 * height * tilt
+            return _measure_along(points, axis, self.laser) - 2.0 * height * tilt
 
         forward = mirrored(self.aim)
         lit = (forward > 0) & (height > 0)
@@ -146,7 +146,7 @@ class PinholeProjector:
 
     def slide(self, points: Reals) -> tuple[Reals, Reals]:
         """Compute slide coordinates (along, across) of points; NaN behind the projector."""
-        x, y, z = (_project(points, row, self.centre) for row in self.rotation)
+        x, y, z = (_measure_along(points, row, self.centre) for row in self.rotation)
         front = np.where(z > 0, z, np.nan).astype(points.dtype)
         x, y = x / front, y / front
         square = x**2 + y**2
@@ -166,7 +166,7 @@ class PinholeProjector:
 Projector = MirrorProjector | PinholeProjector
 
 
-def _project(points: Reals, vector: Array, origin: Array) -> Reals:
+def _measure_along(points: Reals, vector: Array, origin: Array) -> Reals:
     """Compute the distance of points (..., 3) from the origin along a vector."""
     x, y, z = (points[..., i] * float(vector[i]) for i in range(3))
     return x + y + z - float(vector @ origin)

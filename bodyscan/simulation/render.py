@@ -13,7 +13,7 @@ from bodyscan.arrays import Array, Floats, Mask
 from bodyscan.rig.frame_names import FrameNames
 from bodyscan.simulation.lamps import Lamps, compute_laser_light, spread_light
 from bodyscan.simulation.lens import TrueCamera
-from bodyscan.simulation.patterns import make_light_table, make_patterns, table_index
+from bodyscan.simulation.patterns import find_table_entries, make_light_table, make_patterns
 from bodyscan.simulation.projector import Projector
 from bodyscan.simulation.rays import Band, View, mean_light, trace_band
 from bodyscan.simulation.scene import Scene
@@ -202,7 +202,7 @@ class _LitRays:
         return _LitRays(
             weight=ends.white * ends.albedo,
             gloss=ends.gloss,
-            index=table_index(ends.s, source.projector.stripes, blurs),
+            index=find_table_entries(ends.s, source.projector.stripes, blurs),
             ambient=(ends.room * ends.albedo).mean(axis=-1),
             skin=ends.skin.mean(axis=-1),
             depth=ends.depth.min(axis=-1),

@@ -130,7 +130,7 @@ class StripeCode(Model):
     @property
     def needs_lit(self) -> bool:
         """Whether it cannot be read without a lit image."""
-        return not self.is_projected
+        return self.needs_dark or not self.is_projected
 
     @property
     def needs_dark(self) -> bool:

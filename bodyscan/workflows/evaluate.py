@@ -25,7 +25,7 @@ from bodyscan.evaluation.surface import (
     Deviation,
     deviation,
     fit_to_surface,
-    normalized_errors,
+    normalize_errors,
     signed_distances,
 )
 from bodyscan.export.scan import transform_mesh
@@ -183,7 +183,7 @@ def _scan_lines(stored: StoredScan, calibration: RigCalibration, truth: Truth) -
 
 
 def _cloud_lines(signed_mm: Array, sigma_mm: Floats) -> Iterator[str]:
-    scale, beyond = normalized_errors(signed_mm, sigma_mm)
+    scale, beyond = normalize_errors(signed_mm, sigma_mm)
     yield f"  cloud, {len(signed_mm):,} points   {_figures(deviation(signed_mm))}"
     yield (
         f"  error over sigma        {scale:.2f} (robust; 1 is right), {100.0 * beyond:.2f} % "

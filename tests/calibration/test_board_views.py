@@ -15,10 +15,10 @@ from bodyscan.calibration.board_views import (
     LocatedView,
     board_symmetries,
     coverage_notes,
-    covered_share,
     has_enough_corners,
     match_corners,
     max_displacement_mm,
+    measure_covered_share,
     planar_view,
 )
 from bodyscan.geometry.transforms import RigidTransform
@@ -118,8 +118,8 @@ def test_the_covered_share_of_the_picture_is_that_of_the_hulls() -> None:
     one, next_to = corners(0, 0, 320, 240), corners(320, 240, 319, 239)
     # The picture is divided into 64 cells each way.
     for views, share in (([one], 0.25), ([one, one], 0.25), ([one, next_to], 0.5)):
-        assert covered_share(views, 640, 480) == pytest.approx(share, abs=0.04)
-    assert covered_share([corners(0, 0, 639, 479)], 640, 480) == 1.0
+        assert measure_covered_share(views, 640, 480) == pytest.approx(share, abs=0.04)
+    assert measure_covered_share([corners(0, 0, 639, 479)], 640, 480) == 1.0
 
 
 @pytest.mark.parametrize(("size", "named"), [(0.22, True), (0.6, False)])

@@ -147,13 +147,13 @@ def test_points_are_as_far_off_as_they_say(
     captures: ChapterCaptures, calibrated: Calibrations
 ) -> None:
     found = compare_point_sigmas(calibrated.ours, captures)
-    # Nearly all of a sigma is common to all points: one calibration is one draw of a normal variable,
-    # of which nothing but "not beyond three" can be asked; many are drawn in test_refinement_choice.
+    # What a calibration leaves open is common to all points: one calibration is one draw of it, of
+    # which nothing but "not beyond three" can be asked.
     assert found.spheres < 3.0
     assert found.plate < 3.0
-    # Nor may it be had by sigmas that are too large: 0.076 mm in docs/reproduction.md, and corners of
+    # Nor may it be had by sigmas that are too large: 0.011 mm in docs/reproduction.md, and corners of
     # images so coarsely rendered err by 0.03 px instead of 0.014.
-    assert found.median_mm < 3.0 * 0.076
+    assert found.median_mm < 3.0 * 0.011
 
 
 def test_the_report_says_all_of_it(

@@ -12,7 +12,7 @@ from small_workspace import Workspace
 
 import bodyscan
 from bodyscan.arrays import Array
-from bodyscan.evaluation.surface import deviation, normalized_errors, signed_distances
+from bodyscan.evaluation.surface import deviation, normalize_errors, signed_distances
 from bodyscan.fusion.storage import load_scan
 from bodyscan.geometry.robust import rms_length
 from bodyscan.mesh.ply import read_ply_mesh
@@ -71,7 +71,7 @@ def test_the_cloud_lies_on_the_body(workspace: Workspace) -> None:
 
 def test_points_are_as_far_off_as_they_say(workspace: Workspace) -> None:
     cloud = load_scan(workspace.folder / "scan").cloud
-    spread, beyond = normalized_errors(distances(cloud.points, workspace), cloud.sigma_mm)
+    spread, beyond = normalize_errors(distances(cloud.points, workspace), cloud.sigma_mm)
     # Asked for: 0.8 to 1.25; 0.9 to 1.0 on twelve pairs and forty shots. Here 1.65: four pairs, ten
     # shots, whose light sheets err over wide places alike, which smoothing takes for noise.
     assert 0.4 < spread < 2.0

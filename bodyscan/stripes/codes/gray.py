@@ -62,10 +62,6 @@ class _NumberedStripes(StripeCode):
         """How stripes are written in bits."""
 
     @property
-    def needs_lit(self) -> bool:
-        return not self.inverses
-
-    @property
     def needs_dark(self) -> bool:
         return not self.inverses
 

@@ -110,10 +110,6 @@ class PhaseShift(StripeCode):
         return math.ceil(2.0 * self.stripes / self._lengths[0] - 1e-9)
 
     @property
-    def needs_lit(self) -> bool:
-        return self.needs_gray and not self.inverses
-
-    @property
     def needs_dark(self) -> bool:
         return self.needs_gray and not self.inverses
 

@@ -140,7 +140,7 @@ def _select_triples(turn: Floats, usable: Mask, lag: int) -> Floats:
 
 
 def _evaluate_waves(turn: Floats | Array, steps: int, count: int = len(MULTIPLES)) -> Array:
-    """Cosines, then sines, (M, 2 K), of the first K multiples, at most `count`."""
+    """Cosines, then sines, (M, 2 K), of turns (M,) times `steps` times the first `count` multiples."""
     angle = 2.0 * np.pi * steps * np.multiply.outer(turn, MULTIPLES[:count])
     return np.concatenate([np.cos(angle), np.sin(angle)], axis=1)
 
