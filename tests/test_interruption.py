@@ -68,6 +68,17 @@ def test_ctrl_c_ends_the_work(busy: str, whole_group: bool) -> None:
     assert errors == "stopped\n"
 
 
+def test_two_signals_at_once_are_one() -> None:
+    """Both are pending when Python looks: it handles one after the other."""
+    process = start(BUSY["waiting"])
+    child_of(process)
+    for number in (signal.SIGSTOP, signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGCONT):
+        os.killpg(process.pid, number)
+    _, errors = process.communicate(timeout=30)
+    assert process.returncode in (129, 130, 143)
+    assert errors == "stopped\n"
+
+
 def test_the_work_ends_with_who_waits_for_it() -> None:
     if not Path("/proc").exists():
         pytest.skip("Linux alone ends a process with its parent")

@@ -24,6 +24,8 @@ STOP_SIGNAL = signal.SIGUSR1
 class _StopRequest(Exception):
     """The command is to end, because of a signal of that number."""
 
+    signals = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
 
 def run_interruptibly(work: Callable[[], int]) -> int:
     """Run `work` in a child and return its exit code; after a signal, 128 and its number.
@@ -34,23 +36,22 @@ def run_interruptibly(work: Callable[[], int]) -> int:
         return work()
     sys.stdout.flush()
     sys.stderr.flush()
-    heard = [
-        number
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-        if signal.getsignal(number) != signal.SIG_IGN
-    ]
-    for number in heard:
-        signal.signal(number, _raise_request)
+    signal.pthread_sigmask(
+        signal.SIG_BLOCK, _StopRequest.signals
+    )  # until both processes know what to do
+    for number in _StopRequest.signals:
+        if signal.getsignal(number) != signal.SIG_IGN:
+            signal.signal(number, _raise_request)
     parent = os.getpid()
     child = os.fork()
     if child == 0:
         _work(work, parent)
     try:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, _StopRequest.signals)
         return _code(os.waitpid(child, 0)[1])
     except _StopRequest as request:
-        for number in heard:
-            signal.signal(number, signal.SIG_IGN)
-        _stop(child)
+        with suppress(ChildProcessError, ProcessLookupError):  # it has ended meanwhile
+            _stop(child)
         return 128 + int(request.args[0])
 
 
@@ -62,6 +63,7 @@ def _work(work: Callable[[], int], parent: int) -> NoReturn:
         signal.signal(number, _interrupt)
     _end_with(parent)
     try:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, _StopRequest.signals)
         code = work()
     except KeyboardInterrupt:
         code = STOPPED
@@ -102,12 +104,23 @@ def _say_stopped() -> None:
 
 
 def _raise_request(number: int, frame: FrameType | None) -> None:
+    _hear_no_more()
     raise _StopRequest(number)
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
-    signal.signal(number, signal.SIG_IGN)  # once is enough: what tidies up is not to be disturbed
+    _hear_no_more()
     raise KeyboardInterrupt
+
+
+def _hear_no_more() -> None:
+    """Once is enough: what tidies up is not to be disturbed.
+
+    By a function of ours: Python reports a signal that it was handling when that became SIG_IGN.
+    """
+    for number in (*_StopRequest.signals, STOP_SIGNAL):
+        if signal.getsignal(number) in (_raise_request, _interrupt):
+            signal.signal(number, lambda number, frame: None)
 
 
 def _end_with(parent: int) -> None:
