@@ -176,8 +176,9 @@ def measure_rays(
     distance: of the boards, mm.
     """
     jacobian = np.empty(int(np.sqrt(2 * len(covariance))))
+    last, variance = (np.inf, np.inf, np.inf), np.nan
     for n in range(len(s)):
-        found[:, n] = np.nan
+        found[0, n] = found[1, n] = found[2, n] = np.nan
         x, y = rays[n, 0], rays[n, 1]
         depth = _depth(frame, lens, distance, x, y, s[n])
         if not (depth > 0.0 and 0.0 <= s[n] <= stripes):
@@ -185,9 +186,13 @@ def measure_rays(
         point = _to_projector(frame, x * depth, y * depth, depth)
         image = _distort(lens, point[0], point[1])
         per_stripe = point[2] / _slope_times_reach(frame, point, image, x, y)
-        _by_freedom(lens, point, image, jacobian)
-        variance = variance_along(covariance, jacobian) * per_stripe**2
-        found[0, n], found[1, n], found[2, n] = depth, per_stripe, variance
+        # The variance of s is smooth over the projector's image: points within 0.2 degrees and 0.3 %
+        # of their distance share it, to 2 % of sigma.
+        aside = max(abs(point[0] - last[0]), abs(point[1] - last[1]))
+        if not max(aside, abs(point[2] / last[2] - 1.0)) < 3e-3:
+            _by_freedom(lens, point, image, jacobian)
+            last, variance = point, variance_along(covariance, jacobian)
+        found[0, n], found[1, n], found[2, n] = depth, per_stripe, variance * per_stripe**2
 
 
 @compiled

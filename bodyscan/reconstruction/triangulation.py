@@ -14,6 +14,7 @@ import numpy as np
 
 from bodyscan.arrays import Floats, Mask, find_crop
 from bodyscan.calibration.pair import PairCalibration
+from bodyscan.compiled import compiled
 from bodyscan.errors import BadInput
 from bodyscan.geometry.light_planes import LightSheets
 from bodyscan.geometry.light_sheets import stripes_per_pixel, triangulate_image
@@ -206,20 +207,48 @@ def grid_normals(points: Floats, measured: Mask | None = None) -> Floats:
     box = find_crop(measured)
     if box is None:
         return normals
-    x, y, z = np.moveaxis(points[box], -1, 0)
-    with np.errstate(all="ignore"):
-        planes = np.stack([x / z, y / z, np.float32(1000.0) / z])  # all about as large
-        ramp, total = np.arange(-2.0, 3.0), np.ones(5)
-        x_u, y_u, inverse_u = (cv2.sepFilter2D(plane, -1, ramp, total) for plane in planes)
-        x_v, y_v, inverse_v = (cv2.sepFilter2D(plane, -1, total, ramp) for plane in planes)
-        # Cramer's rule converts slopes by column and row to slopes by x/z and y/z.
-        determinant = x_u * y_v - x_v * y_u
-        p, q = inverse_u * y_v - inverse_v * y_u, inverse_v * x_u - inverse_u * x_v
-        r = determinant * planes[2] - p * planes[0] - q * planes[1]
-        length = np.sqrt(p * p + q * q + r * r)
-        signed = np.where(determinant > 0.0, -length, length)
-        found = np.stack([p, q, r], axis=-1) / signed[..., None]
     border = {"borderType": cv2.BORDER_CONSTANT, "borderValue": 0}
     inner = cv2.erode(measured[box].view(np.uint8), np.ones((5, 5), np.uint8), **border) > 0
-    normals[box][inner] = found[inner]
+    _fit_normals(points[box], inner, normals[box])
     return normals
+
+
+@compiled
+def _fit_normals(points: Floats, inner: Mask, normals: Floats) -> None:
+    """Write the normals of `grid_normals` where the window is complete (h, w).
+
+    Sums over five rows are formed once a column, and then over five columns.
+    """
+    height, width = inner.shape
+    sums, falls = np.empty((3, width)), np.empty((3, width))  # of X/Z, Y/Z, 1/Z; by row of these
+    u, v = np.empty(3), np.empty(3)
+    for row in range(2, height - 2):
+        columns = np.flatnonzero(inner[row])
+        if columns.size == 0:
+            continue
+        for column in range(columns[0] - 2, columns[-1] + 3):
+            for k in range(3):
+                sums[k, column] = falls[k, column] = 0.0
+            for step in range(-2, 3):
+                x, y, z = points[row + step, column]
+                inverse = 1.0 / z
+                for k, value in enumerate((x * inverse, y * inverse, 1000.0 * inverse)):
+                    sums[k, column] += value
+                    falls[k, column] += step * value
+        for n in range(columns.size):
+            column = columns[n]
+            for k in range(3):
+                u[k] = v[k] = 0.0
+                for step in range(-2, 3):
+                    u[k] += step * sums[k, column + step]
+                    v[k] += falls[k, column + step]
+            x, y, z = points[row, column]
+            # Cramer's rule converts slopes by column and row to slopes by x/z and y/z.
+            determinant = u[0] * v[1] - u[1] * v[0]
+            p, q = u[2] * v[1] - v[2] * u[1], v[2] * u[0] - u[2] * v[0]
+            r = (determinant * 1000.0 - p * x - q * y) / z
+            length = np.sqrt(p * p + q * q + r * r)
+            signed = -length if determinant > 0.0 else length
+            normals[row, column, 0] = p / signed
+            normals[row, column, 1] = q / signed
+            normals[row, column, 2] = r / signed
