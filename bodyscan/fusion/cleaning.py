@@ -11,7 +11,8 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from bodyscan.arrays import Bytes, Floats, Mask, find_crop, pad_crop
+from bodyscan.arrays import Array, Bytes, Floats, Mask, find_crop, pad_crop
+from bodyscan.compiled import compiled
 from bodyscan.errors import ScanFailed
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.progress import map_threads
@@ -82,9 +83,26 @@ def cut_to_volume(image: RangeImage, rig_from_camera: RigidTransform, volume: Vo
 
 def find_inside(image: RangeImage, rig_from_camera: RigidTransform, volume: Volume) -> Mask:
     """(h, w): where a point was measured inside the upright cylinder of the scan volume."""
-    x, y, z = cv2.split(cv2.transform(image.points, rig_from_camera.matrix[:3]))
-    around = x * x + y * y < volume.radius_mm**2
-    return around & (z > volume.bottom_mm) & (z < volume.top_mm) & np.isfinite(image.sigma_mm)
+    inside = np.isfinite(image.sigma_mm)
+    limits = volume.radius_mm, volume.bottom_mm, volume.top_mm
+    _drop_outside(image.points, rig_from_camera.matrix[:3], limits, inside)
+    return inside
+
+
+@compiled
+def _drop_outside(
+    points: Floats, matrix: Array, limits: tuple[float, float, float], kept: Mask
+) -> None:
+    """Unset kept pixels (h, w) whose points lie outside an upright cylinder: radius, bottom, top."""
+    radius, bottom, top = limits
+    for row in range(kept.shape[0]):
+        for column in range(kept.shape[1]):
+            if kept[row, column]:
+                a, b, c = points[row, column]
+                x = matrix[0, 0] * a + matrix[0, 1] * b + matrix[0, 2] * c + matrix[0, 3]
+                y = matrix[1, 0] * a + matrix[1, 1] * b + matrix[1, 2] * c + matrix[1, 3]
+                z = matrix[2, 0] * a + matrix[2, 1] * b + matrix[2, 2] * c + matrix[2, 3]
+                kept[row, column] = x * x + y * y < radius * radius and bottom < z < top
 
 
 def find_foreground(image: RangeImage, empty: RangeImage) -> Mask:
@@ -103,15 +121,31 @@ def drop_flying_pixels(depth: Floats, step_mm: float, *, supporters: int = 13) -
     At a straight rim a pixel has 14 of its 24 neighbours; a flying one has few. A second pass no
     longer counts what the first removed.
     """
-    distances_px = np.hypot(*np.mgrid[-2:3, -2:3])
-    limits = np.where(distances_px > 0, step_mm * distances_px, -1.0).astype(np.float32)
-    rows, columns = depth.shape
     for _ in range(2):
-        padded, count = np.pad(depth, 2, constant_values=np.nan), np.zeros(depth.shape, np.uint8)
-        for (down, right), limit in np.ndenumerate(limits):
-            count += np.abs(padded[down : down + rows, right : right + columns] - depth) < limit
+        count = _count_supporters(depth, step_mm)
         depth = np.where(count >= supporters, depth, np.float32(np.nan))
     return depth
+
+
+@compiled
+def _count_supporters(depth: Floats, step_mm: float) -> Bytes:
+    """Of each pixel's 24 neighbours (h, w), how many agree with it within `step_mm` per step."""
+    height, width = depth.shape
+    count = np.zeros((height, width), np.uint8)
+    steps = np.empty((5, 5), np.float32)
+    for down in range(5):
+        for right in range(5):
+            steps[down, right] = step_mm * np.sqrt((down - 2) ** 2 + (right - 2) ** 2)
+    for row in range(height):
+        for column in range(width):
+            here = depth[row, column]
+            if np.isnan(here):
+                continue
+            for r in range(max(row - 2, 0), min(row + 3, height)):
+                for c in range(max(column - 2, 0), min(column + 3, width)):
+                    away = abs(depth[r, c] - here)
+                    count[row, column] += away < steps[r - row + 2, c - column + 2]
+    return count
 
 
 def drop_speckles(depth: Floats, step_mm: float, smallest_px: float) -> Mask:
