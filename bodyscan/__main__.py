@@ -8,6 +8,7 @@ import sys
 
 def start() -> None:
     """Run the command; see `bodyscan.cli.main`."""
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # our errors say what is wrong with a file
     try:
         from bodyscan.cli.main import main
 

@@ -8,6 +8,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from itertools import product
 
+import numpy as np
+
 from bodyscan.arrays import Bytes
 from bodyscan.boards.aprilgrid import BORDER_BITS, locate_grid
 from bodyscan.boards.charuco import Markers, detect_markers, locate_face
@@ -24,10 +26,7 @@ def describe_unfound(image: Bytes, board: Board) -> str:
     """Describe what the image (H, W) shows instead of the board, to follow the board's name."""
     if board.kind == "checkerboard":
         return _describe_grids(image, board)
-    markers, appearance = max(
-        ((_detect(image, board, look), look) for look in (AS_PRINTED, *OTHER_APPEARANCES)),
-        key=lambda found: len(found[0].ids),
-    )
+    markers, appearance = detect_any(image, board)
     count = f"{len(markers.ids)} markers of {board.dictionary}"
     if len(markers.ids) < MIN_MARKERS:
         return count + _describe_other_dictionary(image, board)
@@ -35,6 +34,9 @@ def describe_unfound(image: Bytes, board: Board) -> str:
         count += ", white on black"
     if appearance.mirrored:
         count += ", mirrored"
+    first = estimate_first_marker(board, markers)
+    if first != board.first_marker:
+        return f"{count}, which lie as on this board with first_marker {first}"
     if _count_agreeing(board, markers):
         return f"{count}, with too few sharp corners next to them"
     better = max(_fit_other_sizes(board, markers), default=None)
@@ -48,6 +50,27 @@ def describe_unfound(image: Bytes, board: Board) -> str:
         f"{count}; {agreeing} of them lie as on a board of {columns} columns x {-negative_rows} rows, "
         f"not {board.columns} x {board.rows}"
     )
+
+
+def detect_any(image: Bytes, board: Board) -> tuple[Markers, Appearance]:
+    """Detect all markers of the board's dictionary, in the appearance that shows most of them."""
+    every = ((_detect(image, board, look), look) for look in (AS_PRINTED, *OTHER_APPEARANCES))
+    return max(every, key=lambda found: len(found[0].ids))
+
+
+def estimate_first_marker(board: Board, markers: Markers) -> int:
+    """Estimate with which first marker most of the markers lie as on the board: the described one
+    unless another has at least two more."""
+    best, found = board.first_marker, _count_agreeing(board, markers)
+    middle = int(np.median(markers.ids)) if len(markers.ids) else 0
+    for first in range(max(0, middle - board.marker_count + 1), middle + 1):
+        shown = (markers.ids >= first) & (markers.ids < first + board.marker_count)
+        if np.count_nonzero(shown) < found + 2:
+            continue
+        agreeing = _count_agreeing(board.model_copy(update={"first_marker": first}), markers)
+        if agreeing >= found + 2:
+            best, found = first, agreeing
+    return best
 
 
 def _detect(image: Bytes, board: Board, appearance: Appearance) -> Markers:

@@ -81,6 +81,8 @@ def read_known_pair(pair: Pair, folder: Path) -> KnownPair:
         light = _find(known, known.projector, pair.name, folder)
         projector = _projector(light, pair.projector)
         from_world = _pose(known, known.projector, light, pair.name)
+        if known.projector.nodes and camera_from_world is not None:
+            from_world = from_world or RigidTransform.identity()  # the projector is the world
         if from_world is None:
             raise CalibrationFileError(
                 f"does not say where the projector of pair {pair.name} stands",
@@ -124,7 +126,8 @@ def _find(known: Known, device: KnownCamera, name: str, folder: Path) -> FoundCa
     path = Path(folder) / (device.file or known.file)
     form = RIG_FORMATS.find(known.format)
     if device.nodes and form.read_nodes:
-        return form.read_nodes(path, device.nodes)
+        pose_path = Path(folder) / device.pose_file if device.pose_file else None
+        return form.read_nodes(path, device.nodes, pose_path)
     cameras = form.read(path)
     only = device.file is not None or device is known.camera
     if device.name is None and only and len(cameras) == 1:

@@ -24,6 +24,7 @@ from bodyscan.captures.image_header import (
     read_header,
 )
 from bodyscan.errors import BadInput, CaptureError
+from bodyscan.files.messages import describe_similar_shots
 from bodyscan.progress import map_threads
 from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig import Rig, find_unusual_lengths, load_rig
@@ -233,9 +234,10 @@ def _find_separate_groups(good: list[ImageSequence]) -> list[str]:
     if len(groups) < 2:
         return []
     named = " | ".join(sorted(", ".join(sorted(group)) for group in groups))
+    similar = describe_similar_shots((sequence.pair, sequence.shot) for sequence in good)
     return [
-        f"these groups of pairs have no shot in common, so that nothing joins them: {named}; take "
-        "shots in which cameras of both see a board"
+        f"these groups of pairs have no shot in common, so that nothing joins them: {named}; "
+        + (similar or "take shots in which cameras of both see a board")
     ]
 
 

@@ -33,6 +33,7 @@ class ImageHeader:
 
     rounding_error: of JPEG, RMS in grey levels, for an image with sharp edges everywhere, such as
         stripes.
+    fault: of TIFF, what this program does not read.
     """
 
     width: int
@@ -40,6 +41,7 @@ class ImageHeader:
     bits: int
     complete: bool
     rounding_error: float = 0.0
+    fault: str = ""
 
 
 class NotAnImage(Exception):
@@ -88,15 +90,45 @@ def _read_by_pillow(stream: BinaryIO, kind: str) -> ImageHeader:
     plugin = import_module(f"PIL.{kind}ImagePlugin")
     image: Any = getattr(plugin, f"{kind}ImageFile")(stream)
     width, height = image.size
-    if kind != "Jpeg":  # OpenCV decodes no BMP or TIFF that is cut short
-        depths = image.tag_v2.get(258, (1,)) if kind == "Tiff" else (8,)
-        return ImageHeader(width, height, max(depths), True)
+    # OpenCV decodes no BMP or TIFF that is cut short.
+    if kind == "Tiff":
+        return _read_tiff_header(image)
+    if kind == "Bmp":
+        return ImageHeader(width, height, 8, True)
     # A coefficient rounded to multiples of q errs by q / sqrt(12); the transform preserves squares.
     # Table 0 is that of brightness.
     squares = [step**2 for step in image.quantization.get(0, [0])]
     rounding_error = (sum(squares) / len(squares) / 12) ** 0.5
     complete = _ends_with(stream, stream.tell(), b"\xff\xd9")
     return ImageHeader(width, height, 8, complete, rounding_error)
+
+
+def _read_tiff_header(image: Any) -> ImageHeader:
+    """Read a TIFF's tags: its size as stored, whatever its orientation, and whether it is read."""
+    tags, fault, pages = image.tag_v2, "", 0
+    unread = {34712: "JPEG 2000", 34887: "LERC", 34925: "LZMA", 50000: "Zstandard", 50001: "WebP"}
+    if tags.get(259) in unread:
+        fault = (
+            f"is compressed by {unread[tags[259]]}, which is not read: save it with LZW or Deflate"
+        )
+    width, height, bits = tags[256], tags[257], max(tags.get(258, (1,)))
+    for number in range(image.n_frames):
+        image.seek(number)
+        pages += not image.tag_v2.get(254, 0)  # not a thumbnail or mask
+    if pages > 1:
+        fault = f"holds {pages} images: save each as a file of its own"
+    return ImageHeader(width, height, bits, True, fault=fault)
+
+
+def store_upright(tiff: bytes) -> bytes:
+    """The TIFF file without its orientation tag: OpenCV turns pixels by it whatever its flags say."""
+    order = "<" if tiff.startswith(b"II") else ">"
+    (first,) = struct.unpack_from(f"{order}I", tiff, 4)
+    (count,) = struct.unpack_from(f"{order}H", tiff, first)
+    for entry in range(first + 2, min(first + 2 + 12 * count, len(tiff) - 11), 12):
+        if struct.unpack_from(f"{order}H", tiff, entry) == (274,):
+            return tiff[: entry + 8] + struct.pack(f"{order}H", 1) + tiff[entry + 10 :]
+    return tiff
 
 
 def _ends_with(stream: BinaryIO, start: int, mark: bytes) -> bool:
@@ -123,7 +155,7 @@ def find_header_fault(path: Path, width: int, height: int) -> str | None:
         return f"is {size} pixels, but the rig file says {width} x {height}"
     if header.bits > 16:
         return f"has {header.bits} bits a sample; 8 to 16 are read"
-    return None if header.complete else "is cut short"
+    return header.fault or (None if header.complete else "is cut short")
 
 
 def describe_missing(path: Path) -> str:

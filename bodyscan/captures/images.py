@@ -18,7 +18,12 @@ from numpy.typing import NDArray
 from bodyscan.arrays import WHOLE, Array, Bytes, Crop, Floats, Greys, whole_grey
 from bodyscan.captures.folder import ImageSequence
 from bodyscan.captures.grey_png import decode_grey_png, png_damage
-from bodyscan.captures.image_header import find_header_fault, image_error, missing_error
+from bodyscan.captures.image_header import (
+    find_header_fault,
+    image_error,
+    missing_error,
+    store_upright,
+)
 from bodyscan.errors import ImageError
 from bodyscan.files.reading import read_regular
 from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
@@ -146,9 +151,9 @@ def _read_raw(path: Path, camera: CameraSpec, where: str, rows: int | None = Non
 
     rows: only so many rows, from the first, need be read.
 
-    The size is checked in the header before anything is decoded. A rotation noted in EXIF is not
-    applied, since it would swap the camera's axes. Raises ImageError for a file that is missing, no
-    image, of the wrong size or depth, cut short, damaged, or without the channel.
+    The size is checked in the header before anything is decoded. A rotation noted in EXIF or TIFF
+    is not applied, since it would swap the camera's axes. Raises ImageError for a file that is
+    missing, no image, of the wrong size or depth, cut short, damaged, or without the channel.
     """
     width, height = camera.width, camera.height
     fault = find_header_fault(path, width, height)
@@ -162,6 +167,7 @@ def _read_raw(path: Path, camera: CameraSpec, where: str, rows: int | None = Non
         return image
     colour = cv2.IMREAD_GRAYSCALE if camera.channel == "grey" else cv2.IMREAD_ANYCOLOR
     flags = colour | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    data = store_upright(data) if data[:2] in (b"II", b"MM") else data
     found = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     readable = found is not None and found.dtype in (np.uint8, np.uint16)
     if not readable or found.shape[:2] != (height, width):
@@ -172,6 +178,16 @@ def _read_raw(path: Path, camera: CameraSpec, where: str, rows: int | None = Non
         what = f"is grey, but the rig file says `channel: {camera.channel}`"
         raise image_error(what, path, where, remedy="Leave `channel` out for this camera.")
     return cast(Raw, np.ascontiguousarray(found))
+
+
+def measure_mosaic(image: Bytes) -> float:
+    """Measure by how much the four pixels of each 2 x 2 differ in brightness over the whole image
+    (H, W): a few hundredths at most, but some tenths of a raw Bayer image."""
+    rows, columns = (size // 16 for size in image.shape)
+    blocks = image[: 16 * rows, : 16 * columns].reshape(rows, 8, 2, columns, 8, 2)
+    pixels = blocks.mean(axis=(1, 4)).transpose(0, 2, 1, 3).reshape(-1, 4) + 1.0
+    bright = pixels[pixels.mean(axis=1) >= np.median(pixels)]
+    return float(np.ptp(np.median(bright / bright.mean(axis=1, keepdims=True), axis=0)))
 
 
 def _refuse_black(image: Bytes, path: Path, where: str) -> None:

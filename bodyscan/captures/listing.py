@@ -30,6 +30,7 @@ class Listing:
         if not root.is_dir() and not (self._named and not root.exists()):
             what = "is not a folder" if root.exists() else "does not exist"
             remedy = "Check the folder's name, and that its disk is connected."
+            remedy = "Write / between folders, not \\." if "\\" in str(root) else remedy
             raise CaptureError(f"the capture folder {what}", where=str(root), remedy=remedy)
         self.root, self.follow_links = root, follow_links
         self._real_root = os.path.realpath(root)
@@ -60,8 +61,7 @@ class Listing:
         if ANYTHING not in relative:
             return relative
         matches = [""]
-        for part in relative.split("/"):
-            wanted = compile_names(part)
+        for part, wanted in zip(relative.split("/"), compile_names(relative), strict=True):
             matches = [
                 f"{folder}/{name}".lstrip("/")
                 for folder in matches

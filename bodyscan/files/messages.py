@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import re
+import unicodedata
 from collections.abc import Iterable
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -89,6 +90,25 @@ def require_writable(folder: Path, *inputs: Path | None) -> None:
             probe.flush()
     except OSError as error:
         raise translate_os_error(OSError(error.errno, error.strerror, str(folder))) from error
+
+
+def describe_similar_shots(shots: Iterable[tuple[str, str]]) -> str:
+    """Describe two shots, of (pair, shot), whose names differ only in how they are written; "" if there
+    are none."""
+    written: dict[str, tuple[str, str]] = {}
+    for pair, shot in sorted(set(shots)):
+        name = unicodedata.normalize("NFC", shot)
+        plain = re.sub(r"(?<!\d)0+(?=\d)", "", name.casefold())
+        other, first = written.setdefault(plain, (pair, shot))
+        if first == shot or other == pair:
+            continue
+        how = "zeros" if first.casefold() != name.casefold() else "capitals"
+        if unicodedata.normalize("NFC", first) == name:
+            how, first, shot = "how an accent is written", ascii(first), ascii(shot)
+        return (
+            f"shots {first} ({other}) and {shot} ({pair}) differ only in {how}: give both one name"
+        )
+    return ""
 
 
 def make_paths_relative(text: str, base: Path, below: Iterable[Path] = ()) -> str:

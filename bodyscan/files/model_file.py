@@ -70,7 +70,8 @@ def load_model(
         loaded = model.model_validate_json(json.dumps(document.data), strict=True)
         problems += [_locate(problem, document) for problem in also(loaded)]
     except ValidationError as refused:
-        problems += _translate(refused, document, model)
+        known = {problem.place for problem in problems}  # one mistake is one line
+        problems += [p for p in _translate(refused, document, model) if p.place not in known]
     if problems:
         raise combine_problems(path, problems, error, remedy)
     return loaded

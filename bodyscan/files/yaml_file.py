@@ -8,6 +8,7 @@ takes mappings, lists, text, numbers, true/false and null, with anchors, aliases
 from __future__ import annotations
 
 import re
+import unicodedata
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -122,7 +123,11 @@ def parse_yaml(text: str, max_nodes: int = MAX_NODES, *, foreign: bool = False) 
         compose = yaml.compose_all if foreign else lambda *args: iter([yaml.compose(*args)])
         node = next(iter(compose(text, _PlainLoader)), None)
     except yaml.MarkedYAMLError as error:
-        raise _error(_place(error.problem_mark or error.context_mark), _describe(error)) from None
+        place, what = _place(error.problem_mark or error.context_mark), _describe(error)
+        lines = text.splitlines()[: place.line] if not foreign else []
+        odd = [(n, _find_odd_letter(line)) for n, line in enumerate(lines, 1)]
+        what += "".join(f"; line {n} {found}" for n, found in odd if found)
+        raise _error(place, what) from None
     except yaml.YAMLError as error:
         raise _error(Place(1, 1), f"is not YAML: {error}".splitlines()[0]) from None
     document = Document()
@@ -149,7 +154,8 @@ class _Dumper(yaml.SafeDumper):
 
 
 def _represent_text(dumper: _Dumper, text: str) -> yaml.Node:
-    style = None if parse_scalar(text) == text and text.isprintable() else '"'
+    plain = parse_scalar(text) == text and text.isprintable() and not _find_odd_letter(text)
+    style = None if plain else '"'
     return dumper.represent_scalar("tag:yaml.org,2002:str", text, style=style)
 
 
@@ -181,6 +187,8 @@ class _Builder:
             if node.style:
                 return node.value
             self.document.raw[where] = node.value
+            if (odd := _find_odd_letter(node.value)) and not self.foreign:
+                self._problem(place, where, odd)
             return parse_scalar(node.value)
         if isinstance(node, yaml.MappingNode):
             return self._mapping(node, where, depth)
@@ -197,6 +205,8 @@ class _Builder:
             if key.value in keys:
                 text = f"is given twice in the same place: one of the two '{key.value}' must go"
                 self._problem(place, (*where, key.value), text)
+            if (odd := _find_odd_letter(key.value)) and not key.style and not self.foreign:
+                self._problem(place, (*where, key.value), odd)
             keys.add(key.value)
         result = {}
         for name, (key, value) in self._entries(node, where, depth).items():
@@ -244,6 +254,20 @@ def parse_scalar(text: str) -> Any:
     if re.fullmatch(r"[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN|Nan)", text):
         return float(text.replace(".", "").lower())
     return text
+
+
+def _find_odd_letter(text: str) -> str:
+    """Describe a letter that looks like a space, quote or minus of YAML without being one, or ""."""
+    spaces, quotes = "\u00a0\u2007\u202f\u200b\ufeff\u3000", "\u201c\u201d\u201e\u2018\u2019"
+    odd = rf"[{spaces}]|(?:^|(?<=: ))(?:[{quotes}]|[\u2212\u2013](?=[.0-9]))"
+    found = re.search(odd, re.sub(r"(^|\s)#.*", "", text))
+    if found is None:
+        return ""
+    name = unicodedata.name(found[0]).lower()
+    return (
+        f"has a {name} (U+{ord(found[0]):04X}), which is not YAML's own: type it anew, or put the "
+        "value in plain quotes if it is meant"
+    )
 
 
 def _refuse_deep(text: str, *, only_first: bool) -> None:

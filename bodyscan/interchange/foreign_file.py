@@ -25,7 +25,10 @@ from bodyscan.geometry.transforms import RigidTransform
 MAX_BYTES = 100_000_000  # mrcal's files hold all corners of a calibration, some megabytes
 MAX_VALUES = 1_000_000  # OpenCV's as well
 
-LENS_KEYS = ("distortion_model", "camera_model", "lens_model", "projection_model", "camera_type")
+LENS_KEYS = (
+    *("distortion_model", "camera_model", "lens_model", "projection_model", "camera_type"),
+    *("model", "type", "lens"),
+)
 LENS_WORDS = {
     "fisheye": r"(opencv)?fisheye|(pinhole)?equi(distant)?|kannalabrandt[48]?|kb4",
     "polynomial": r"plumbbob|rationalpolynomial|(pinhole)?radtan|radialtangential|brown(conrady)?"
@@ -51,7 +54,8 @@ class ForeignFile:
         try:
             return ForeignFile(path, read_regular(path, MAX_BYTES).decode("utf-8-sig"))
         except FileNotFoundError:
-            raise empty.error("there is no such file") from None
+            slash = ", with / between folders" if "\\" in str(path) else ""
+            raise empty.error("there is no such file", remedy=f"check its name{slash}") from None
         except UnicodeDecodeError:
             raise empty.error("is not UTF-8 text") from None
         except OSError as fault:
@@ -93,6 +97,8 @@ class ForeignFile:
 
     def numbers(self, value: Any, name: str, *counts: int) -> Array:
         """`value` as a flat array of one of these lengths."""
+        if isinstance(value, dict):  # a matrix of OpenCV's
+            value = value.get("data", value)
         try:
             array: Array = np.asarray(value, np.float64).ravel()
         except (TypeError, ValueError, OverflowError):

@@ -32,15 +32,15 @@ class RigFormat:
     write: writes cameras to that path, which it returns; raises BadInput for a lens that the format
         cannot express.
     read: returns every camera of such a file or folder, by name, each checked when it is taken.
-    read_nodes: reads one camera of a file whose nodes may have any name; None if the format fixes
-        the names. Both raise CalibrationFileError.
+    read_nodes: reads one camera of a file whose nodes may have any name, and its pose of that file or
+        another; None if the format fixes the names. Both raise CalibrationFileError.
     """
 
     path: str
     unit: Unit | None
     write: Callable[[RigCameras, Path], Path]
     read: Callable[[Path], FoundCameras]
-    read_nodes: Callable[[Path, Nodes], FoundCamera] | None = None
+    read_nodes: Callable[[Path, Nodes, Path | None], FoundCamera] | None = None
 
 
 def projector_name(pair: str) -> str:

@@ -165,11 +165,11 @@ def put_image(
     """
     if pair not in {one.name for one in rig.pairs}:
         raise BadInput(f"rig {rig.name} has no pair {pair}", where=f"scan {scan}, frame {frame}")
-    name = fill(rig.files, shot=shot, pair=pair, frame=frame)
+    name = fill(rig.template(pair), shot=shot, pair=pair, frame=frame)
     lossless = (".png", ".tif", ".tiff", ".bmp", ".pgm")
     if ANYTHING in name or Path(name).suffix.lower() not in lossless:
         raise BadInput(
-            f"`files` is {rig.files}, by which no image can be written",
+            f"`files` is {rig.template(pair)}, by which no image can be written",
             where=f"rig {rig.name}",
             remedy=f"calibrate with a template that has no * and ends in one of {lossless}",
         )

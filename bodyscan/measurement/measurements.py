@@ -197,12 +197,22 @@ def _head_top(vertices: Array, mesh: BodyMesh, stature: float, crown: str | None
 
 
 def heights_from(text: str) -> list[float]:
-    """Heights written as "800,1050", mm. Raises BadInput if one is not a number."""
+    """Heights written as "800,1050", mm. Raises BadInput if one is not a number, or seems to be the
+    decimals of the one before."""
+    words = text.split(",")
     try:
-        return [float(word) for word in text.split(",")]
+        heights = [float(word) for word in words]
     except ValueError as error:
         remedy = "Write mm with commas between: 800,1050."
         raise BadInput(f"{text!r} is not a list of heights", remedy=remedy) from error
+    for k in range(1, len(words)):
+        if heights[k] < 100.0 <= heights[k - 1]:
+            before, word = words[k - 1].strip(), words[k].strip()
+            raise BadInput(
+                f"{text!r} names {before} and {word} mm: is {word} the decimals of {before}?",
+                remedy=f"Write {before}.{word} with a point, or the lower first: {word},{before}.",
+            )
+    return heights
 
 
 def _share(areas: Array, which: Mask, among: Mask) -> float:

@@ -14,6 +14,7 @@ import numpy as np
 from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import LocatedView, max_displacement_mm
 from bodyscan.errors import RigDisconnected
+from bodyscan.files.messages import describe_similar_shots
 from bodyscan.geometry.transforms import RigidTransform
 
 AGREEMENT = 0.04
@@ -86,7 +87,7 @@ def initial_poses(
     groups and what would tie them, the shots whose board numbering leaves a tie open, or the pairs
     of which no two agree.
     """
-    _refuse_disconnected(view_graph(views, pairs))
+    _refuse_disconnected(view_graph(views, pairs), views)
     targets, reach = by_target(views), _median_distance(views)
     groups: list[Group] = [{name: RigidTransform.identity()} for name in pairs]
     ties: dict[tuple[int, int], RelativePose | None] = {}
@@ -262,13 +263,14 @@ def _gaps(candidate: RigidTransform, others: Sequence[RigidTransform], reach: fl
     return np.linalg.norm(shifts, axis=1) + angles * reach
 
 
-def _refuse_disconnected(graph: nx.Graph) -> None:
+def _refuse_disconnected(graph: nx.Graph, views: Iterable[LocatedView]) -> None:
     groups = sorted((sorted(group) for group in nx.connected_components(graph)), key=len)
     if len(groups) > 1:
         smallest, rest = groups[0], groups[-1]
         raise RigDisconnected(
             f"no shared board view ties {', '.join(smallest)} to {', '.join(rest)}",
-            remedy=f"capture shots in which {smallest[0]} and {rest[0]} (or others of these two "
+            remedy=describe_similar_shots((view.pair, view.shot) for view in views)
+            or f"capture shots in which {smallest[0]} and {rest[0]} (or others of these two "
             "groups) see the board at the same moment",
         )
 

@@ -57,12 +57,14 @@ class KnownCamera(Model):
     """A camera, or a projector described as one, in another program's file.
 
     file: if it differs from the pair's.
+    pose_file: if rotation and translation are in another file than the matrix.
     name: the camera's name in the file.
     matrix, distortion, size (or width and height), rotation, translation: names of OpenCV's nodes.
     inverse: rotation and translation take the camera's coordinates to the world's, not the reverse.
     """
 
     file: Text | None = None
+    pose_file: Text | None = None
     name: Text | None = None
     matrix: Text | None = None
     distortion: Text | None = None
@@ -87,6 +89,8 @@ class KnownCamera(Model):
             absent = [key for key in keys if getattr(self, key) is None]
             if len(absent) == 1:
                 yield (absent[0],), f"is missing: {what}"
+        if self.pose_file is not None and self.rotation is None:
+            yield ("rotation",), "is missing: the node of `pose_file` that holds it"
         if self.size is not None and self.width is not None:
             yield ("size",), "is said twice: give it, or width and height"
         if self.nodes and self.matrix is None:
@@ -132,10 +136,12 @@ class Pair(Model):
     """One camera and one projector, or a camera alone.
 
     known: what another program has calibrated of it.
+    files: how its images are named, if otherwise than the rig's.
     """
 
     name: Name
     pole: Name | None = None
+    files: str | None = None
     camera: CameraSpec
     projector: AnyStripeCode | None = None
     nominal: NominalPose | None = None

@@ -1,6 +1,7 @@
 """File-name templates such as `{shot}/{pair}/{frame}.png`: checked, filled in, read backwards.
 
-`*` stands for any part of a name, such as the time: a path with it is a pattern of names.
+`*` stands for any part of a name, such as the time: a path with it is a pattern of names. At the end
+`.*` stands for the suffixes of images.
 """
 
 from __future__ import annotations
@@ -24,15 +25,15 @@ def has_field(template: str, field: str) -> bool:
     return field in _parse_fields(template)
 
 
-def compile_names(name: str) -> re.Pattern[str]:
-    """Compile a pattern for the names that one part of a path, with ANYTHING in it, matches."""
-    return re.compile(_anything(re.escape(name)))
+def compile_names(path: str) -> tuple[re.Pattern[str], ...]:
+    """Compile patterns for the names that each part of a path, with ANYTHING in it, matches."""
+    return tuple(re.compile(part) for part in _split_pattern(path))
 
 
 @lru_cache(maxsize=4096)
 def shot_pattern(template: str, pair: str, frame: str) -> tuple[re.Pattern[str], ...]:
     """Compile one pattern per part of a path; together they find the shot (group `shot`) in it."""
-    marked = re.escape(fill(template, shot="\0", pair=pair, frame=frame)).split("/")
+    marked = _split_pattern(fill(template, shot="\0", pair=pair, frame=frame))
     return tuple(_compile_part(part) for part in marked)
 
 
@@ -54,7 +55,7 @@ def template_faults(
     if "exposure" in fields and not exposures:
         yield "holds {exposure}, but the rig file names no `exposures`"
     videos = (".mp4", ".m4v", ".avi", ".mov", ".mkv", ".webm", ".wmv", ".mpg", ".mpeg")
-    suffixes = (".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg")
+    suffixes = (".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg", ".*")
     if template.lower().endswith(videos):
         images = f"{template.rpartition('.')[0]}/%04d.png"
         yield (
@@ -63,7 +64,10 @@ def template_faults(
             " the numbers of the images, such as '0000'"
         )
     elif not template.lower().endswith(suffixes):
-        yield f"must end in {', '.join(suffixes)}: only PNG, TIFF, BMP and JPEG images are read"
+        yield (
+            f"must end in {', '.join(suffixes[:-1])}, or .* for any of these: only PNG, TIFF, BMP and "
+            "JPEG images are read"
+        )
     fault = path_fault(template)
     if fault:
         yield fault
@@ -116,11 +120,14 @@ def _parse_fields(template: str) -> set[str]:
 
 def _compile_part(part: str) -> re.Pattern[str]:
     """Compile one part of a path, in which NUL marks the shot."""
-    first, *others = _anything(part).split(re.escape("\0"))
+    first, *others = part.split(re.escape("\0"))
     if not others:
         return re.compile(first)
     return re.compile(first + f"(?P<shot>{SHOT})" + "(?P=shot)".join(others))
 
 
-def _anything(escaped: str) -> str:
-    return escaped.replace(re.escape(ANYTHING), ".*")
+def _split_pattern(path: str) -> list[str]:
+    """Regular expressions for the parts of a path."""
+    suffix = r"\.(?i:png|tiff?|bmp|jpe?g)" if path.endswith(f".{ANYTHING}") else ""
+    rest = path[: -len(f".{ANYTHING}")] if suffix else path
+    return (re.escape(rest).replace(re.escape(ANYTHING), ".*") + suffix).split("/")

@@ -190,7 +190,10 @@ def _without_stripes(rig: Rig, views: Iterable[BoardView], decoded: set[str]) ->
     return {
         pair.name: "no stripe sequence was found in any shot of the board: there is no image such as "
         + fill(
-            rig.files, shot=shots[pair.name], pair=pair.name, frame=rig.frames.code_names(code)[0]
+            rig.template(pair.name),
+            shot=shots[pair.name],
+            pair=pair.name,
+            frame=rig.frames.code_names(code)[0],
         )
         for pair in rig.pairs
         for code in [pair.projector]

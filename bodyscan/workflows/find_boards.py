@@ -11,9 +11,13 @@ from pathlib import Path
 import numpy as np
 
 from bodyscan.arrays import Array
-from bodyscan.boards.board_layout import corner_points
+from bodyscan.boards.board_layout import corner_grid, corner_points
 from bodyscan.boards.detection import find_boards
-from bodyscan.boards.detection_failure import describe_unfound
+from bodyscan.boards.detection_failure import (
+    describe_unfound,
+    detect_any,
+    estimate_first_marker,
+)
 from bodyscan.boards.view import BoardView, ViewKey, number_corners
 from bodyscan.calibration.board_views import (
     LocatedView,
@@ -31,7 +35,7 @@ from bodyscan.calibration.camera import (
 )
 from bodyscan.calibration.known_pair import read_known_camera
 from bodyscan.captures.folder import Captures, ImageSequence
-from bodyscan.captures.images import read_board_image
+from bodyscan.captures.images import measure_mosaic, read_board_image
 from bodyscan.errors import BadInput, BodyscanError, DegeneratePoses, FailedWork, format_list
 from bodyscan.files.corners_vnl import Corners, write_corners
 from bodyscan.geometry.lenses import FAMILY, LENSES
@@ -39,8 +43,13 @@ from bodyscan.geometry.robust import rms_length
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, attempt_each, map_threads, silent
-from bodyscan.registration.board_checks import appearance_notes, describe_findings
+from bodyscan.registration.board_checks import (
+    appearance_notes,
+    describe_findings,
+    refuse_other_pitch,
+)
 from bodyscan.registration.sanity_checks import find_camera_faults
+from bodyscan.rig.board import Board
 from bodyscan.rig.pair import AUTO, Pair
 from bodyscan.rig.rig import Rig
 
@@ -69,16 +78,24 @@ def find_all_boards(rig: Rig, captures: Captures, progress: Progress = silent) -
     Images that cannot be read, or that show no board, become notes.
     """
 
+    first = {sequence.pair: sequence for sequence in reversed(captures.sequences)}
+    mosaics: dict[str, float] = {}
+
     def find(sequence: ImageSequence) -> list[BoardView]:
         if sequence.board_path in captures.corners:
             return _given_view(rig, captures, sequence)
         image = read_board_image(sequence, rig.pair(sequence.pair))
+        if first[sequence.pair] is sequence:
+            mosaics[sequence.pair] = measure_mosaic(image)
         return find_boards(image, rig.boards, pair=sequence.pair, shot=sequence.shot)
 
     found, refused = attempt_each(
         find, captures.sequences, BodyscanError, stage="finding boards", progress=progress
     )
     views = [view for each in found.values() for view in each]
+    for board in rig.boards:
+        refuse_other_pitch(board, views)
+        _refuse_other_markers(rig, captures, board, views)
     without = [s for s, each in found.items() if not each and s.board_path not in captures.corners]
     described = _look_closer(rig, views, without)
     missing = [
@@ -86,8 +103,44 @@ def find_all_boards(rig: Rig, captures: Captures, progress: Progress = silent) -
         + (f": {described[s]}" if s in described else "")
         for s in without
     ]
-    notes = (*map(str, refused.values()), *missing, *appearance_notes(rig, views))
+    raw = [
+        f"{pair}: neighbouring pixels differ by {differ:.0%} in squares of 2 x 2, as in a raw Bayer "
+        "image, which is not grey: demosaic the images first"
+        for pair, differ in sorted(mosaics.items())
+        if differ > 0.05  # of grey images 0.01 at most
+    ]
+    notes = (*map(str, refused.values()), *missing, *raw, *appearance_notes(rig, views))
     return FoundBoards(views, notes, refused=refused)
+
+
+def _refuse_other_markers(
+    rig: Rig, captures: Captures, board: Board, views: Sequence[BoardView]
+) -> None:
+    """Raise BadInput if the markers seen name another first marker than the rig file.
+
+    They are looked at again only if a border of the board's corners was seen in no view, as where
+    its numbers are shifted: three images, with all markers of the dictionary.
+    """
+    seen = sorted((v for v in views if v.board == board.name), key=lambda v: -len(v.pixels))
+    if board.kind == "checkerboard" or board.faces == 2 or not seen:
+        return
+    ids, (columns, rows) = np.concatenate([v.corner_ids for v in seen]), corner_grid(board)
+    if {0, columns - 1} <= set(ids % columns) and {0, rows - 1} <= set(ids // columns):
+        return
+    taken = {
+        (s.pair, s.shot): s for s in captures.sequences if s.board_path not in captures.corners
+    }
+    found = set()
+    for sequence in [taken[v.key[:2]] for v in seen if v.key[:2] in taken][:3]:
+        markers, _ = detect_any(read_board_image(sequence, rig.pair(sequence.pair)), board)
+        found.add(estimate_first_marker(board, markers))
+    if len(found) == 1 and board.first_marker not in found:
+        raise BadInput(
+            f"the markers in the images lie as on this board with first_marker {found.pop()}, not "
+            f"{board.first_marker}",
+            where=f"board {board.name}",
+            remedy="correct first_marker in the rig file",
+        )
 
 
 def _given_view(rig: Rig, captures: Captures, sequence: ImageSequence) -> list[BoardView]:

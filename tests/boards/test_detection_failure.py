@@ -75,6 +75,8 @@ def test_a_board_of_other_columns_or_rows_is_named(monkeypatch: pytest.MonkeyPat
     assert "as on a board of 8 columns x 9 rows, not 9 x 8" in text
     text = describe(shown(changed(columns=6)), monkeypatch)
     assert "which do not lie as on 9 columns x 8 rows. Possible causes: " in text
+    text = describe(shown(changed(first_marker=3)), monkeypatch)
+    assert text.endswith("which lie as on this board with first_marker 3")
 
 
 def test_markers_where_they_should_be_lack_corners(monkeypatch: pytest.MonkeyPatch) -> None:

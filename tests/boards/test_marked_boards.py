@@ -3,10 +3,13 @@ none is found."""
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
 from board_rendering import render, true_corners, view_of
+from small_captures import write
 
 from bodyscan.arrays import Array, Bytes
 from bodyscan.boards.board_layout import corner_points
@@ -14,10 +17,14 @@ from bodyscan.boards.charuco import detect_markers
 from bodyscan.boards.detection import find_boards
 from bodyscan.boards.detection_failure import describe_unfound
 from bodyscan.boards.view import BoardView
-from bodyscan.registration.board_checks import appearance_notes
+from bodyscan.captures.folder import open_captures
+from bodyscan.errors import BadInput
+from bodyscan.registration.board_checks import appearance_notes, refuse_other_pitch
 from bodyscan.rig.board import Board
+from bodyscan.rig.frame_names import CaptureFolder
 from bodyscan.rig.pair import CameraSpec, Pair
 from bodyscan.rig.rig import Rig
+from bodyscan.workflows.find_boards import find_all_boards
 
 MARKED = Board(
     name="marked", kind="charuco", columns=9, rows=8, square_mm=70, marker_mm=52, margin_mm=10
@@ -70,16 +77,6 @@ def test_looking_for_few_markers_finds_those_as_well(dictionary: str) -> None:
     np.testing.assert_array_equal(every.corners[concerned][order[0]], some.corners[order[1]])
 
 
-@pytest.mark.slow
-def test_two_boards_of_one_dictionary_are_both_found() -> None:
-    """Markers are looked for once, as far as the board with the highest numbers needs them."""
-    second = MARKED.model_copy(update={"name": "second", "first_marker": 400})
-    for shown in (MARKED, second):
-        image = render([(shown, PLACE)], blur_px=0.8)
-        views = find_boards(image, [MARKED, second], pair="p", shot="s")
-        assert [view.board for view in views] == [shown.name]
-
-
 def test_either_of_the_two_historic_layouts_is_recognised(picture: Bytes) -> None:
     described = MARKED.model_copy(update={"legacy_layout": True})
     (view,) = found(picture, described)
@@ -102,15 +99,6 @@ def test_another_dictionary_is_named(picture: Bytes) -> None:
     described = MARKED.model_copy(update={"dictionary": "DICT_5X5_1000"})
     assert found(picture, described) == []
     assert "0 markers of DICT_5X5_1000, but 3" in describe_unfound(picture, described)
-
-
-@pytest.mark.slow
-def test_another_grid_is_named() -> None:
-    plain = Board(name="plain", columns=9, rows=7, square_mm=30, margin_mm=20)
-    image = render([(plain, view_of(plain, 20, 60, 20, fill=0.6))])
-    described = plain.model_copy(update={"columns": 8, "rows": 6})
-    assert found(image, described) == []
-    assert "one of 8 x 6: 9 columns x 7 rows" in describe_unfound(image, described)
 
 
 def tag_picture(*, border_bits: int, turns: int, from_below: bool) -> tuple[Bytes, Array]:
@@ -155,6 +143,31 @@ def test_grids_of_april_tags_are_found(border_bits: int, turns: int, from_below:
     assert len(view.corner_ids) == 80
     # Tags of 40 px leave windows of 4 to 8 px: measured 0.004 to 0.008 px with noise of 1 level.
     assert rms(view, true) < 0.015
+
+
+def test_tags_that_stand_otherwise_than_described_are_refused() -> None:
+    image, _ = tag_picture(border_bits=2, turns=2, from_below=True)
+    refuse_other_pitch(TAGS, found(image, TAGS))
+    described = TAGS.model_copy(update={"square_mm": 127.0})
+    with pytest.raises(BadInput, match=r"100 mm stand 130\.0.* not 127") as refused:
+        refuse_other_pitch(described, found(image, described))
+    assert "or marker_mm 97.69 square" in refused.value.remedy
+
+
+@pytest.mark.parametrize("first", [1, 2, 5])
+def test_the_first_marker_is_read_off_the_markers(tmp_path: Path, first: int) -> None:
+    """One shift by an odd number of markers looks like the other layout, others like another place."""
+    printed = MARKED.model_copy(update={"first_marker": first})
+    write(tmp_path / "captures" / "s" / "p.png", render([(printed, PLACE)], blur_px=0.8))
+    rig = Rig(
+        name="r", boards=(MARKED,), pairs=(CAMERA,), files="{shot}/{pair}.png",
+        calibration=(CaptureFolder(folder="captures"),),
+    )  # fmt: skip
+    captures = open_captures(rig, tmp_path / "rig.yaml")
+    with pytest.raises(BadInput, match=f"with first_marker {first}, not 0"):
+        find_all_boards(rig, captures)
+    right = rig.model_copy(update={"boards": (printed,)})
+    assert len(find_all_boards(right, captures).value) == 1
 
 
 def test_part_of_a_grid_is_enough() -> None:

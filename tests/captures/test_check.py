@@ -77,16 +77,6 @@ def test_one_bad_folder_does_not_hide_the_others(rig_path: Path) -> None:
     assert report.shots == ("b1", "b2", "b3")
 
 
-def test_no_captures_at_all(rig_path: Path) -> None:
-    write(rig_path, RIG.replace("calibration:\n  - folder: captures\n", ""))
-    report = check(rig_path)
-    assert report.ok
-    assert "names no calibration captures" in report.warnings[0]
-    shutil.rmtree(rig_path.parent / "captures")
-    write(rig_path, RIG)
-    assert "does not exist" in check(rig_path).errors[0]
-
-
 def test_checking_decodes_nothing_and_imports_nothing_heavy(rig_path: Path) -> None:
     code = (
         "import sys; from bodyscan.captures.check import check\n"
@@ -195,6 +185,12 @@ def test_groups_of_pairs_without_a_common_shot_are_reported(rig_path: Path) -> N
     (line,) = lines_with(rig_path, "no shot in common")
     assert "cam, p1 | p2;" in line
     assert not check(rig_path).ok
+    for shot in ("b1", "b2", "b3"):
+        folder = rig_path.parent / "captures" / f"cb{shot[1]}"
+        folder.rename(folder.with_name(f"b0{shot[1]}"))
+    assert (
+        "shots b1 (cam) and b01 (p2) differ only in zeros: give" in lines_with(rig_path, "zeros")[0]
+    )
 
 
 def test_the_shot_that_fixes_the_rig_frame_must_be_complete(rig_path: Path) -> None:

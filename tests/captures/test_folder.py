@@ -160,6 +160,18 @@ def test_a_template_without_frame_holds_lit_images(tmp_path: Path) -> None:
         opened(tmp_path / "rig.yaml")
 
 
+def test_cameras_may_write_files_of_other_kinds(tmp_path: Path) -> None:
+    names = {"p1": "p1-lit.TIF", "p2": "lit.jpg", "cam": "left.png"}
+    for pair, name in names.items():
+        write(tmp_path / "captures" / "b1" / pair / name, b"not looked at")
+        write(tmp_path / "captures" / "b1" / pair / "lit.json", b"")
+    text = RIG + "files: '{shot}/{pair}/{frame}.*'\n"
+    for pair, files in (("p1", "{shot}/{pair}/p1-{frame}.*"), ("cam", "{shot}/cam/left.png")):
+        text = text.replace(f"name: {pair}\n", f"name: {pair}\n    files: '{files}'\n")
+    captures = opened(with_rig(tmp_path, text))
+    assert {s.pair: s.paths[0].name for s in captures.sequences} == names
+
+
 def test_a_template_without_shot_makes_a_folder_one_shot(tmp_path: Path) -> None:
     for frame in FRAMES:
         write(tmp_path / "scan7" / f"{frame}.png", b"not looked at")
@@ -219,18 +231,6 @@ def test_mistakes_in_captures_yaml(tmp_path: Path, text: str, line: str) -> None
         opened(rig_path)
     assert str(caught.value).startswith(str(path))
     assert line in str(caught.value)
-
-
-def test_captures_yaml_survives_writing(tmp_path: Path) -> None:
-    rig = load_rig(write_small_captures(tmp_path, shots=1))
-    file = CapturesFile(
-        kind="scan",
-        when=datetime(2026, 11, 21, 10, 0, 3),
-        subject="S-0001",
-        shots=(ShotEntry(name="08"), ShotEntry(name="1e3", lit=("p1",))),
-    )
-    write_captures_file(tmp_path, file)
-    assert load_captures_file(tmp_path, rig) == file
 
 
 def test_folders_that_are_not_there_or_hold_nothing(tmp_path: Path) -> None:

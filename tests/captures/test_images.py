@@ -6,13 +6,16 @@ import os
 import struct
 import zlib
 from contextlib import suppress
+from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 from small_captures import BITS, FRAMES, HEIGHT, STRIPES, WIDTH, encoded, picture, write
 from small_captures import write_small_captures as small
 
@@ -20,7 +23,12 @@ from bodyscan.captures.check import check, format_report
 from bodyscan.captures.folder import Captures, ImageSequence, open_captures
 from bodyscan.captures.grey_png import png_damage
 from bodyscan.captures.image_header import NotAnImage, read_header
-from bodyscan.captures.images import read_board_image, read_image, read_sequence
+from bodyscan.captures.images import (
+    measure_mosaic,
+    read_board_image,
+    read_image,
+    read_sequence,
+)
 from bodyscan.errors import BadInput, ImageError
 from bodyscan.rig.pair import CameraSpec
 from bodyscan.rig.rig import load_rig
@@ -56,10 +64,17 @@ def png(width: int, height: int, bits: int = 8) -> bytes:
     )
 
 
-def test_a_png_is_read_to_the_last_bit(tmp_path: Path) -> None:
-    image = read(write(tmp_path / "x.png", NOISE))
-    assert image.dtype == np.uint8
-    np.testing.assert_array_equal(image, NOISE)
+def tiff(**options: Any) -> bytes:
+    """A TIFF of NOISE."""
+    stream = BytesIO()
+    Image.fromarray(NOISE).save(stream, "tiff", **options)
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_pixels_of_a_tiff_are_read_as_stored(tmp_path: Path, orientation: int) -> None:
+    content = tiff(tiffinfo={274: orientation}, compression="tiff_lzw")
+    np.testing.assert_array_equal(read(write(tmp_path / "x.tif", content)), NOISE)
 
 
 def test_colour_becomes_grey_and_exif_turns_are_not_applied(tmp_path: Path) -> None:
@@ -84,6 +99,8 @@ def test_colour_becomes_grey_and_exif_turns_are_not_applied(tmp_path: Path) -> N
         (encoded(NOISE, ".bmp")[:-20], "cannot be decoded"),
         (encoded(NOISE, ".bmp")[:20], "is cut short"),
         (encoded(NOISE, ".tif")[:-20], "cannot be decoded"),
+        (tiff(compression="zstd"), "is compressed by Zstandard, which is not read: save it with"),
+        (tiff(save_all=True, append_images=[Image.fromarray(NOISE)] * 2), "holds 3 images: save"),
         (encoded(NOISE.astype(np.float32), ".tif"), "has 32 bits a sample; 8 to 16 are read"),
         (encoded(NOISE.T), "is 30 x 40 pixels, but the rig file says 40 x 30"),
         (encoded(NOISE.T.copy(), ".jpg"), "is 30 x 40 pixels, but the rig file says 40 x 30"),
@@ -157,6 +174,14 @@ def test_a_jpeg_header_is_found_behind_long_segments(tmp_path: Path) -> None:
         header = read_header(path)
         assert (header.width, header.height, header.bits) == (WIDTH, HEIGHT, 8)
         assert header.complete is complete
+
+
+def test_a_raw_bayer_image_is_told_from_a_grey_one() -> None:
+    v, u = np.indices((96, 128))
+    grey = (40 + 150 * ((u // 13 + v // 13) % 2) + 0.2 * u).astype(np.uint8)
+    assert measure_mosaic(grey) < 0.02
+    grey[::2, ::2] //= 2
+    assert measure_mosaic(grey) > 0.3
 
 
 @pytest.mark.parametrize(("level", "good"), [(0, False), (8, False), (9, True)])

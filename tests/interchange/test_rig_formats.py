@@ -391,6 +391,7 @@ ROS_NODES = {"matrix": "camera_matrix", "distortion": "distortion_coefficients"}
         ("MODEL", "equidistant", Fisheye(-0.2, 0.05)),
         ("MODEL", "plumb_bob", lens_from_opencv(np.array([-0.2, 0.05, 0, 0, 0]))),
         ("distortion_model: MODEL", "fisheye_model: 1", Fisheye(-0.2, 0.05)),
+        ("distortion_model: MODEL", "model: fisheye", Fisheye(-0.2, 0.05)),
         (
             "distortion_model: MODEL",
             "camera_model: my-camera 7",

@@ -176,6 +176,9 @@ def test_heights_are_numbers_with_commas_between() -> None:
     assert heights_from("800,1050.5") == [800.0, 1050.5]
     with pytest.raises(BadInput, match="'800;1050' is not a list of heights"):
         heights_from("800;1050")
+    with pytest.raises(BadInput, match=r"is 5 the decimals of 1050\?") as asked:
+        heights_from("1050,5")
+    assert "1050.5" in asked.value.remedy
 
 
 @pytest.mark.parametrize(

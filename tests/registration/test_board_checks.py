@@ -79,6 +79,4 @@ def test_a_board_of_which_little_is_found_is_doubted() -> None:
     said = describe_findings(TWO_BOARDS, [partial_view(10), partial_view(12), partial_view(48)], 30)
     assert "found in 3 of 30 images, with 25 % of its corners in the median view" in said
     assert "may not be those" in said
-    assert "may not be those" in describe_findings(TWO_BOARDS, [partial_view(23)], 30)
     assert "may not be those" not in describe_findings(TWO_BOARDS, [partial_view(24)], 30)
-    assert "may not be those" not in describe_findings(TWO_BOARDS, [partial_view(45)], 30)

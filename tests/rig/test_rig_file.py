@@ -15,10 +15,9 @@ from small_captures import RIG, write
 from bodyscan.errors import RigFileError
 from bodyscan.files.yaml_file import dump_yaml, read_yaml
 from bodyscan.rig.board import MARKERS_IN, Board
-from bodyscan.rig.frame_names import FrameNames
 from bodyscan.rig.rig import Rig, find_unusual_lengths, load_rig, write_rig
 from bodyscan.stripes.codes import parse_stripe_code
-from bodyscan.stripes.codes.gray import INVERSE, PATTERN, Gray
+from bodyscan.stripes.codes.gray import Gray
 
 RIGS = Path(__file__).parents[2] / "rigs"
 REFERENCE = "version: 1\nreferences: [{name: a"
@@ -69,6 +68,9 @@ def test_merge_keys_take_what_is_not_given(tmp_path: Path) -> None:
     assert rig.pair("p3").camera == rig.pair("p2").camera
 
 
+CHARUCO = "square_mm: 30, kind: charuco"
+
+
 @pytest.mark.parametrize(
     ("old", "new", "line"),
     [
@@ -83,6 +85,11 @@ def test_merge_keys_take_what_is_not_given(tmp_path: Path) -> None:
         ("square_mm: 30", "square_mm: 30, marker_mm: 9", "is for boards with markers"),
         ("square_mm: 30", "square_mm: 30, thickness_mm: 6", "is for a board with faces: 2"),
         ("square_mm: 30", "square_mm: 30, faces: 3", "boards[0].faces: must be 1 or 2 (got 3)"),
+        ("square_mm: 30", CHARUCO, "boards[0].marker_mm: is missing"),
+        ("square_mm: 30", f"{CHARUCO}, marker_mm: 30", "marker_mm: must be less than square_mm (30)"),
+        ("square_mm: 30", f"{CHARUCO}, marker_mm: 9, dictionary: DICT_4x4_50", "mean 'DICT_4X4_50'?"),
+        ("square_mm: 30", f"{CHARUCO}, marker_mm: 9, dictionary: DICT_4X4_50, first_marker: 45",
+         "boards[0].dictionary: holds markers 0 to 49, but this board needs 45 to 54"),
         ("columns: 5", "columns: 5, columns: 6", "4:31: boards[0].columns: is given twice"),
         ("name: p2", "name: p1", "9:11: pairs[1].name: is given to two pairs: every name once"),
         ("name: p2", "name: ../up", "pairs[1].name: must be a name of letters, digits"),
@@ -106,6 +113,10 @@ def test_merge_keys_take_what_is_not_given(tmp_path: Path) -> None:
         ("version: 1", "version: 2", "1:10: version: must be 1 (got 2)"),
         ("  - folder: captures", "  - folder: a\n  - folder: a/", "folder: is listed twice"),
         ("  - folder: captures", "  folder: captures", "calibration: must be a list (got a map"),
+        ("square_mm: 30", "square_mm: \u00a030", "square_mm: has a no-break space (U+00A0)"),
+        ("square_mm: 30", "square_mm:\u00a030", "4:40: boards[0].square_mm:\xa030: has a no-break"),
+        ("name: p2", "name: \u201cp2\u201d", "pairs[1].name: has a left double quotation mark"),
+        ("version: 1\n", "version:\u00a01\n", "; line 1 has a no-break space (U+00A0)"),
         ("version: 1", "version: 1\nrig_frame: {pair: p9}", "rig_frame.pair: names no pair"),
         ("version: 1", "version: 1\nrig_frame: {pair: p1, shot: b}", "together with shot"),
         ("version: 1", "version: 1\nrig_frame: {shot: b, board: bord}", "(did you mean 'board'?)"),
@@ -164,25 +175,6 @@ def test_keys_without_a_value_are_ignored() -> None:
     nothing = {"inverses": None, "steps": None, "period": None}
     assert parse_stripe_code({"code": "gray", **keys, **nothing}) == Gray(**keys)
     assert parse_stripe_code({"code": "stripe-index", **keys, **nothing}).code == "stripe-index"
-
-
-CHARUCO = "square_mm: 30, kind: charuco"
-
-
-@pytest.mark.parametrize(
-    ("board", "line"),
-    [
-        (CHARUCO, "boards[0].marker_mm: is missing"),
-        (CHARUCO + ", marker_mm: 30", "boards[0].marker_mm: must be less than square_mm (30)"),
-        (CHARUCO + ", marker_mm: 20, dictionary: DICT_4x4_50", "(did you mean 'DICT_4X4_50'?)"),
-        (CHARUCO + ", marker_mm: 20, dictionary: DICT_4X4_50, first_marker: 45",
-         "boards[0].dictionary: holds markers 0 to 49, but this board needs 45 to 54"),
-    ],
-)  # fmt: skip
-def test_charuco_boards_are_checked(tmp_path: Path, board: str, line: str) -> None:
-    lines = refused(tmp_path, changed("square_mm: 30", board))
-    assert len(lines) == 1
-    assert line in lines[0]
 
 
 def test_markers_of_two_boards_must_differ(tmp_path: Path) -> None:
@@ -281,30 +273,6 @@ def test_marker_count_is_that_of_opencv(columns: int, rows: int) -> None:
     opencv = cv2.aruco.CharucoBoard((columns, rows), 1.0, 0.7, dictionary)
     board = Board(name="b", kind="charuco", columns=columns, rows=rows, square_mm=1, marker_mm=0.7)
     assert board.marker_count == len(opencv.getIds())
-
-
-@pytest.mark.parametrize(
-    ("code", "names"),
-    [
-        ({}, "bit00 bit01 bit02 bit00-inverse bit01-inverse bit02-inverse"),
-        ({"inverses": False}, "bit00 bit01 bit02"),
-        ({"code": "binary", "inverses": False}, "bit00 bit01 bit02"),
-        ({"code": "light-section"}, "stripe000 stripe001 stripe002 stripe003 stripe004"),
-        ({"code": "stripe-index"}, "index"),
-        # 5 stripes are 2.5 periods of 2, and so 5 half periods.
-        ({"code": "phase-shift", "steps": 3, "period": 2, "inverses": False},
-         "bit00 bit01 bit02 phase00 phase01 phase02"),
-    ],
-)  # fmt: skip
-def test_each_code_has_its_images(code: dict[str, Any], names: str) -> None:
-    spec = parse_stripe_code({**code, "stripes": 5, "direction": "vertical"})
-    assert FrameNames().code_names(spec) == tuple(names.split())
-
-
-def test_frame_names() -> None:
-    names = FrameNames.model_validate({"inverse": ("a", "b", "c")})
-    assert names.kind_names(PATTERN, 3) == ("bit00", "bit01", "bit02")
-    assert names.kind_names(INVERSE, 3) == ("a", "b", "c")
 
 
 @pytest.mark.slow

@@ -228,6 +228,26 @@ def test_the_only_camera_without_a_pose_is_the_world(folder: Path) -> None:
         imported(folder, content)
 
 
+def test_a_projector_may_be_the_world_and_a_pose_in_a_file_of_its_own(folder: Path) -> None:
+    content, poses = json.loads(json.dumps(described("a"))), rotations_and_shifts("a")
+    known, camera_from_light = (
+        content["pairs"][0]["known"],
+        poses["camera"] @ poses["light"].inverse(),
+    )
+    store = cv2.FileStorage(str(folder / "poses.yaml"), cv2.FILE_STORAGE_WRITE)
+    store.write("R", camera_from_light.rotation)
+    store.write("T", camera_from_light.translation)
+    store.release()
+    known["camera"] |= {"rotation": "R", "translation": "T", "pose_file": "poses.yaml"}
+    del known["projector"]["rotation"], known["projector"]["translation"]
+    found, expected = (imported(folder, one).pairs["a"].sheets for one in (content, described("a")))
+    assert isinstance(found, LensSheets)
+    assert isinstance(expected, LensSheets)
+    np.testing.assert_allclose(found.parameters, expected.parameters, atol=1e-9)
+    difference = found.projector_from_camera.inverse() @ expected.projector_from_camera
+    np.testing.assert_allclose(difference.matrix, np.eye(4), atol=1e-9)
+
+
 @pytest.mark.parametrize(
     ("where", "value", "said"),
     [

@@ -114,7 +114,7 @@ def _read_projector(file: ForeignFile, entry: Any, name: str, label: str) -> Fou
 
 def _read_camera(file: ForeignFile, entry: Any, name: str, label: str) -> FoundCamera:
     def numbers(key: str) -> Any:
-        return _values(_find_below(file, entry, key, name))
+        return _find_below(file, entry, key, name)
 
     size = [numbers("image_width"), numbers("image_height")]
     return FoundCamera(
@@ -126,14 +126,17 @@ def _read_camera(file: ForeignFile, entry: Any, name: str, label: str) -> FoundC
     )
 
 
-def read_nodes(path: Path, nodes: Nodes) -> FoundCamera:
-    """Read the camera whose numbers are in these nodes: matrix; distortion, size (or width and height),
-    rotation and translation if given."""
+def read_nodes(path: Path, nodes: Nodes, pose_path: Path | None = None) -> FoundCamera:
+    """Read the camera whose numbers are in these nodes: matrix; distortion, size (or width and height)
+    if given; rotation and translation, of `pose_path` if they are in another file."""
     file = ForeignFile.read(path)
     root = _read_root(file)
+    pose_file = ForeignFile.read(pose_path) if pose_path else file
+    poses = _read_root(pose_file) if pose_path else root
 
     def values(what: str) -> Any:
-        return _values(_find_node(file, root, nodes[what])[0])
+        inside = (pose_file, poses) if what in ("rotation", "translation") else (file, root)
+        return _find_node(*inside, nodes[what])[0]
 
     size = file.size(values("size"), nodes["size"]) if "size" in nodes else None
     if "width" in nodes:
@@ -141,7 +144,7 @@ def read_nodes(path: Path, nodes: Nodes) -> FoundCamera:
     pose = None
     if "rotation" in nodes:
         names = nodes["rotation"], nodes["translation"]
-        pose = file.pose(values("rotation"), values("translation"), *names)
+        pose = pose_file.pose(values("rotation"), values("translation"), *names)
     matrix = file.matrix(values("matrix"), nodes["matrix"])
     coefficients = values("distortion") if "distortion" in nodes else []
     name = nodes.get("distortion", nodes["matrix"])
@@ -178,11 +181,6 @@ def _find_below(file: ForeignFile, node: Any, name: str, passed: str) -> Any:
             remedy=f"there is {', '.join(keys) or 'none'}",
         )
     return node[name]
-
-
-def _values(node: Any) -> Any:
-    """What is in a node; of a matrix its numbers row by row."""
-    return node["data"] if isinstance(node, dict) and "data" in node else node
 
 
 FORMAT = RigFormat("rig-opencv.yaml", "mm", write_opencv, read_opencv, read_nodes)
