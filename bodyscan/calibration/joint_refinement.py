@@ -163,14 +163,12 @@ class BoardWarp:
 class JointFit:
     """The fit to corners and stripes together.
 
-    camera_from_board: of each board, in the order given.
     sheets: of each direction.
     camera_covariance: (P, P).
     corners_rms_px: robustly weighted.
     """
 
     camera: Camera
-    camera_from_board: tuple[RigidTransform, ...]
     sheets: tuple[SmoothSheets, ...]
     camera_covariance: Array
     corners_rms_px: float
@@ -214,7 +212,6 @@ def refine_jointly(
     corners = np.concatenate([_corner_residuals(state, k, one) for k, one in enumerate(boards)])
     return JointFit(
         state.camera,
-        state.poses,
         tuple(
             replace(one, covariance=_compute_depth_covariance(state, boards, covariance, direction))
             for direction, one in enumerate(state.sheets)

@@ -25,7 +25,7 @@ def matrix_from_homographies(homographies: Sequence[Array], width: int, height: 
     scaled = [h / np.linalg.norm(h[:, :2]) * np.sqrt(2) for h in scaled]
     matrix = _full_matrix(scaled)
     if matrix is None:
-        matrix = _central_matrix(scaled)
+        matrix = _solve_central_matrix(scaled)
     return np.linalg.inv(size) @ matrix
 
 
@@ -45,7 +45,7 @@ def _full_matrix(homographies: Sequence[Array]) -> Array | None:
     return matrix if plausible and 0.7 < matrix[0, 0] / matrix[1, 1] < 1.4 else None
 
 
-def _central_matrix(homographies: Sequence[Array]) -> Array:
+def _solve_central_matrix(homographies: Sequence[Array]) -> Array:
     """Solve for A with a focal length only."""
     rows, right = [], []
     for h in homographies:

@@ -222,14 +222,14 @@ def _keys_at(model: type[BaseModel], where: Where) -> list[str]:
     for part in where:
         if isinstance(part, str) and here is not None:
             field = here.model_fields.get(part)
-            here = _model_in(field.annotation) if field else None
+            here = _find_model(field.annotation) if field else None
     return list(here.model_fields) if here else []
 
 
-def _model_in(annotation: Any) -> type[BaseModel] | None:
+def _find_model(annotation: Any) -> type[BaseModel] | None:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
-    found = (_model_in(argument) for argument in get_args(annotation))
+    found = (_find_model(argument) for argument in get_args(annotation))
     return next((model for model in found if model), None)
 
 

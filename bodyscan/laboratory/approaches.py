@@ -67,7 +67,7 @@ def calibrate_by_slide_stage(
     readings: (shots,) mm, of the stage.
     """
     camera, camera_from_stage = calibrate_tsai(
-        *_stage_points(shots, readings), CAMERA.width, CAMERA.height, skewed=skewed
+        *_stack_stage_points(shots, readings), CAMERA.width, CAMERA.height, skewed=skewed
     )
     return locate_boundaries(shots, camera, _stage_poses(camera_from_stage, readings))
 
@@ -77,7 +77,7 @@ def calibrate_by_matrix(shots: Sequence[StripedShot], readings: Array) -> Locate
 
     The stripes' positions are read off each board by its own homography, which has no lens either.
     """
-    matrix = projection_matrix(*_stage_points(shots, readings))
+    matrix = projection_matrix(*_stack_stage_points(shots, readings))
     camera, camera_from_stage = split_projection_matrix(matrix, CAMERA.width, CAMERA.height)
     poses = _stage_poses(camera_from_stage, readings)
     # The same test of what lies on the checkered area as for every other model.
@@ -122,7 +122,7 @@ def _planar_views(shots: Sequence[StripedShot]) -> list[PlanarView]:
     return [planar_view(shot.view, BOARD) for shot in shots]
 
 
-def _stage_points(shots: Sequence[StripedShot], readings: Array) -> tuple[Array, Array]:
+def _stack_stage_points(shots: Sequence[StripedShot], readings: Array) -> tuple[Array, Array]:
     """Stack all corners (N, 3) mm, frame of the board at reading 0, and their pixels (N, 2)."""
     views = _planar_views(shots)
     points = [

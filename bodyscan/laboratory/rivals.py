@@ -78,7 +78,7 @@ def _undo_kappa(camera: Camera, kappa: float) -> Array:
 def _solve_alignment(points: Array, image: Array) -> tuple[Array, Array]:
     """Solve radial alignment for (8,) s r1, s tx, r2, ty, |r2| = 1; residuals (N,) px mm."""
     u, v = image[:, :1], image[:, 1:]
-    whole = _homogeneous(points)
+    whole = _append_ones(points)
     rows = np.concatenate([v * whole, -u * whole], axis=1)
     size = np.linalg.norm(rows, axis=0)
     _, vectors = np.linalg.eigh((rows / size).T @ (rows / size))
@@ -92,7 +92,7 @@ def _align(points: Array, image: Array) -> tuple[Array, Array, float]:
     solved, _ = _solve_alignment(points, image)
     aspect = float(np.linalg.norm(solved[:3]))
     first, second = solved[:4] / aspect, solved[4:]
-    whole = _homogeneous(points)
+    whole = _append_ones(points)
     # The sign: points are imaged on their own side of the axis.
     sign = np.sign(np.sum((whole @ np.stack([first, second]).T) * image))
     first, second = sign * first, sign * second
@@ -130,8 +130,8 @@ def projection_matrix(points: Array, pixels: Array) -> Array:
     Direct linear transformation (Abdel-Aziz and Karara 1971) with Hartley's scaling.
     """
     space, image = _compute_scaling(points), _compute_scaling(pixels)
-    x = _homogeneous(points) @ space.T
-    u, v = (_homogeneous(pixels) @ image.T)[:, :2].T
+    x = _append_ones(points) @ space.T
+    u, v = (_append_ones(pixels) @ image.T)[:, :2].T
     zero = np.zeros_like(x)
     rows = np.block([[x, zero, -u[:, None] * x], [zero, x, -v[:, None] * x]])
     _, vectors = np.linalg.eigh(rows.T @ rows)
@@ -168,7 +168,7 @@ def _compute_scaling(points: Array) -> Array:
     return matrix
 
 
-def _homogeneous(points: Array) -> Array:
+def _append_ones(points: Array) -> Array:
     """Append ones to points (N, D)."""
     return np.column_stack([points, np.ones(len(points))])
 
@@ -239,7 +239,7 @@ def fit_remapped_pinhole(points: Array, s: Array, stripes: int, direction: Axis)
     half = stripes / 2.0
     matrix[0] = (matrix[0] - half * matrix[1]) / half
     matrix /= np.linalg.norm(matrix[1])
-    whole = _homogeneous((points - middle) / size)
+    whole = _append_ones((points - middle) / size)
     index, powers = s / half - 1.0, _powers(s / half - 1.0)
 
     def residuals(values: Array) -> Array:

@@ -89,13 +89,13 @@ def read_ply_cloud(path: Path) -> BodyCloud:
     """Read a cloud that `write_ply` wrote. Raises ResultError if the file is not one."""
     (vertices,) = _read(Path(path), "cloud")
     regions = _regions(vertices, path)
-    return BodyCloud(*_vertex_arrays(vertices), vertices["pairs_seen"].copy(), regions)
+    return BodyCloud(*_split_vertices(vertices), vertices["pairs_seen"].copy(), regions)
 
 
 def read_ply_mesh(path: Path) -> BodyMesh:
     """Read a mesh that `write_ply` wrote. Raises ResultError if the file is not one."""
     vertices, faces = _read(Path(path), "mesh")
-    points, normals, sigma_mm, colours = _vertex_arrays(vertices)
+    points, normals, sigma_mm, colours = _split_vertices(vertices)
     corners = faces["vertex_indices"]["corners"].astype(np.int64)
     fault = find_fault(points, corners)
     if fault:
@@ -117,7 +117,7 @@ def _regions(vertices: Records, path: Path) -> Bytes | None:
     return regions
 
 
-def _vertex_arrays(records: Records) -> tuple[Array, Floats, Floats, Bytes]:
+def _split_vertices(records: Records) -> tuple[Array, Floats, Floats, Bytes]:
     def columns(part: str) -> NDArray[Any]:
         return np.stack([records[name] for name in _COLUMNS[part]], axis=-1)
 

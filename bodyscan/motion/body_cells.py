@@ -183,7 +183,7 @@ def _build_graph(centres: Array, normals: Array, points: Array) -> sparse.csr_ar
     midpoints = 0.5 * (centres[edges[:, 0]] + centres[edges[:, 1]])
     # Half the gap between a hand and a thigh, in which nothing was measured.
     edges = edges[cKDTree(points).query(midpoints)[0] < 15.0]
-    edges = np.concatenate([edges, _opposite_sides(centres, normals)])
+    edges = np.concatenate([edges, _find_opposite_cells(centres, normals)])
     while True:
         graph = _weighted_graph(centres, edges)
         label = connected_components(graph, directed=False)[1].astype(np.int64)
@@ -205,7 +205,7 @@ def _weighted_graph(centres: Array, edges: Indices) -> sparse.csr_array:
     return (upper + upper.T).tocsr()
 
 
-def _opposite_sides(centres: Array, normals: Array) -> Indices:
+def _find_opposite_cells(centres: Array, normals: Array) -> Indices:
     """(N, 2): cells, and for each the nearest cell straight behind it that faces the other way.
 
     Within 300 mm, the thickest trunk; straight is a cosine of 0.85 between the line through the
@@ -218,7 +218,7 @@ def _opposite_sides(centres: Array, normals: Array) -> Indices:
 
 @compiled
 def _find_nearest_behind(centres: Array, normals: Array) -> Indices:
-    """The cell (C,) that `_opposite_sides` finds behind each, -1 for none."""
+    """The cell (C,) that `_find_opposite_cells` finds behind each, -1 for none."""
     nearest, count = np.full(len(centres), -1, np.int64), len(centres)
     closest = np.full(count, 300.0**2)
     for i in range(count):

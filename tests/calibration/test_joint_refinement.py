@@ -169,7 +169,6 @@ def test_the_bow_of_a_board_is_estimated() -> None:
 
 def test_boards_without_stripes_take_part_with_their_corners() -> None:
     found = solved(0.0, 5, unlit=2).joint
-    assert len(found.camera_from_board) == 5
     assert found.corners_rms_px < 0.03
     assert plate(found.camera, found.sheets[0])[0] < 0.003
 

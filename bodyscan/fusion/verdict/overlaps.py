@@ -114,16 +114,16 @@ def find_misaligned(
 ) -> tuple[Misalignment, ...]:
     """The fewest groups of pairs without which all other steps are within the limit, worst first."""
     found: list[Misalignment] = []
-    while _largest_step(groups, seams) > limit_mm:
+    while _find_largest_step(groups, seams) > limit_mm:
         without = {
             name: [seam for seam in seams if not group.intersection(seam.pairs)]
             for name, group in groups.items()
         }
-        steps = {name: _step_around(group, seams) for name, group in groups.items()}
+        steps = {name: _estimate_step_around(group, seams) for name, group in groups.items()}
         worst = min(
             (name for name in groups if steps[name] > limit_mm),
             key=lambda n: (
-                max(_largest_step(groups, without[n]), limit_mm),
+                max(_find_largest_step(groups, without[n]), limit_mm),
                 len(groups[n]),
                 -steps[n],
             ),
@@ -143,11 +143,11 @@ def estimate_step(seams: Sequence[Seam]) -> float:
     return float(np.sqrt(max(np.percentile(distance**2 - sigma**2, 75.0), 0.0)))
 
 
-def _largest_step(groups: Mapping[str, frozenset[str]], seams: Sequence[Seam]) -> float:
-    return max((_step_around(group, seams) for group in groups.values()), default=0.0)
+def _find_largest_step(groups: Mapping[str, frozenset[str]], seams: Sequence[Seam]) -> float:
+    return max((_estimate_step_around(group, seams) for group in groups.values()), default=0.0)
 
 
-def _step_around(group: frozenset[str], seams: Sequence[Seam]) -> float:
+def _estimate_step_around(group: frozenset[str], seams: Sequence[Seam]) -> float:
     around = [seam for seam in seams if len(group.intersection(seam.pairs)) == 1]
     return estimate_step(around) if around else 0.0
 
