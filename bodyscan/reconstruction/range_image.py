@@ -34,7 +34,7 @@ class Agreement:
     stripes: int = 0
 
     @property
-    def moderate(self) -> bool:
+    def unusual(self) -> bool:
         """Whether the calibration, not noise, is off by more than usual.
 
         By 0.002 of the projector's image: calibrations reproject to half a pixel or one of some 1000.

@@ -170,14 +170,14 @@ def shifted(stripes_off: float) -> StripeMap:
     return replace(seen, crossing=replace(seen.crossing, s=s))
 
 
-@pytest.mark.parametrize(("off", "moderate"), [(0.05, False), (2.0, True)])
-def test_what_a_calibration_is_off_is_told_in_stripes(off: float, moderate: bool) -> None:
+@pytest.mark.parametrize(("off", "unusual"), [(0.05, False), (2.0, True)])
+def test_what_a_calibration_is_off_is_told_in_stripes(off: float, unusual: bool) -> None:
     """Limits are 0.3 and 3 of 160 rows."""
     agreement = reconstruct_range_image(pair(), shifted(off)).agreement
     assert agreement is not None
-    assert agreement.moderate == moderate
+    assert agreement.unusual == unusual
     assert f"{agreement.offset_stripes:.1f} of 160 stripes" in str(agreement)
-    if moderate:  # 1.48 medians, and columns' noise
+    if unusual:  # 1.48 medians, and columns' noise
         assert abs(agreement.offset_stripes / (1.4826 * off) - 1.0) < 0.05
 
 

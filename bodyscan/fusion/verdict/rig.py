@@ -137,7 +137,7 @@ def check_nominal_size(scan: ScanEvidence) -> Iterator[Finding]:
 def check_stripe_directions(scan: ScanEvidence) -> Iterator[Finding]:
     """Depths from stripes of two directions that differ by more than noise."""
     for name, agreement in scan.images.agreements.items():
-        if agreement.moderate:
+        if agreement.unusual:
             yield Finding(
                 "usable",
                 f"pair {name}: depths from the two stripe directions differ by "
