@@ -14,10 +14,7 @@ from bodyscan.alignment.icp import Alignment, align
 from bodyscan.arrays import Array
 from bodyscan.motion.body_parts import PARTS
 from bodyscan.motion.breath import breath_along_normals
-from bodyscan.motion.estimation import (
-    EstimatedMotion,
-    estimate_motion,
-)
+from bodyscan.motion.estimation import EstimatedMotion, estimate_motion
 from bodyscan.motion.person_motion import PersonMotion
 from bodyscan.motion.warping import warp_to_middle
 from bodyscan.reconstruction.range_image import RangeImage
@@ -79,9 +76,7 @@ def test_sigmas_say_what_is_left(
     _, alignment, followed = found
     assert followed is not None
     errors = errors_mm(standing.at(standing.middle_s), surface(standing, alignment, followed))
-    # As much as they err, within what a single person's motion may be off by. Of both the
-    # squares' mean: arms err, and are known, several times worse than legs. (Of five
-    # people, on three and four poles, 0.9.)
+    # Of five people, on three and four poles, 0.9.
     assert 0.6 < rms(errors) / rms(followed.sigma_mm) < 1.4
 
 

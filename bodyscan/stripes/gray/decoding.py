@@ -27,10 +27,6 @@ from bodyscan.stripes.stripe_limits import StripeLimits
 from bodyscan.stripes.stripe_map import StripeMap, assemble_map
 from bodyscan.stripes.usable_pixels import MIN_CONTRAST, SATURATED, find_usable_pixels
 
-END_STRIPES = 2
-"""Stripes at each end of the light without a point: blur is at most as wide as a stripe, and the
-outermost one may be dark."""
-
 
 def decode_bits(
     code: WordCode, images: ScanLines, lit: Greys, stripes: int, limits: StripeLimits | None
@@ -43,8 +39,9 @@ def decode_bits(
     codes = code.stripes(read_words(code, images, stripes, variance))
     fine_bit = code.bit_two_wide(len(images.patterns))
     usable, coded = find_usable_pixels(images, codes, variance, stripes, fine_bit)
-    # Where the light ends blur moves boundaries outwards, and what is beyond keeps the last code.
-    inside = (codes >= END_STRIPES) & (codes < stripes - END_STRIPES)
+    # Where the light ends blur moves boundaries, and what is scattered beyond keeps the last code. The
+    # outermost stripe may be dark, and blur is hardly wider than one.
+    inside = (codes >= 2) & (codes < stripes - 2)
     usable, coded = usable & inside, coded & inside
     white = cv2.subtract(images.lit, images.dark) >= np.float32(MIN_CONTRAST)
     white &= (images.lit >= SATURATED) & (codes >= 0) & (codes < stripes)
