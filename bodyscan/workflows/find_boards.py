@@ -193,19 +193,24 @@ def write_found_corners(
 def _look_closer(
     rig: Rig, views: Sequence[BoardView], without: Sequence[ImageSequence]
 ) -> dict[ImageSequence, str]:
-    """What images without a board do show, for pairs that saw few boards or missed few."""
-    chosen: list[ImageSequence] = []
+    """What images without a board do show: closely for pairs that saw few boards or missed few, at a
+    glance for those that saw most."""
+    chosen: list[tuple[ImageSequence, bool]] = []
     for pair in rig.pairs:
         images = [sequence for sequence in without if sequence.pair == pair.name]
         found = sum(view.pair == pair.name for view in views)
         if found < MIN_POSES or len(images) <= LOOKED_AT:
-            chosen += images[:LOOKED_AT]
+            chosen += [(one, False) for one in images[:LOOKED_AT]]
+        elif found > len(images):
+            chosen += [(one, True) for one in images]
 
-    def look(sequence: ImageSequence) -> str:
-        image = read_board_image(sequence, rig.pair(sequence.pair))
-        return "; ".join(f"{board.name}: {describe_unfound(image, board)}" for board in rig.boards)
+    def look(one: tuple[ImageSequence, bool]) -> str:
+        image = read_board_image(one[0], rig.pair(one[0].pair))
+        texts = [(b.name, describe_unfound(image, b, quick=one[1])) for b in rig.boards]
+        return "; ".join(f"{name}: {text}" for name, text in texts if text)
 
-    return dict(zip(chosen, map_threads(look, chosen), strict=True))
+    texts = map_threads(look, chosen)
+    return {one: text for (one, _), text in zip(chosen, texts, strict=True) if text}
 
 
 def calibrate_cameras(
