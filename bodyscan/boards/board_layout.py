@@ -38,15 +38,15 @@ def corner_points(board: Board) -> Array:
     corners of all tags, row by row: id r * 2 * columns + c.
     """
     grid = np.meshgrid(*(_lines(board, count) for count in (board.columns, board.rows)))
-    x, y = (lines.ravel() for lines in grid)
+    x, y = grid[0].ravel(), board.stretch * grid[1].ravel()
     front = np.stack([x, y, np.zeros_like(x)], axis=-1)
     back = np.stack([board.size_mm[0] - x, y, np.full_like(x, board.thickness_mm)], axis=-1)
     return np.concatenate([front, back]) if board.faces == 2 else front
 
 
 def printed_corners(board: Board) -> Array:
-    """Corners (N, 2) mm on the print of one face, x along the columns."""
-    return corner_points(board.model_copy(update={"faces": 1}))[:, :2]
+    """Corners (N, 2) mm on the print of one face before it was stretched, x along the columns."""
+    return corner_points(board.model_copy(update={"faces": 1, "stretch": 1.0}))[:, :2]
 
 
 def _lines(board: Board, count: int) -> Array:

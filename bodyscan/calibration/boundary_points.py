@@ -236,7 +236,11 @@ def compute_box(view: BoardView | LocatedView) -> Box:
 def compute_print_box(camera: Camera, board: Board, view: LocatedView) -> Box:
     """Compute a box around the print of a board of known pose, within the box around its view."""
     low, high = compute_box(view)
-    grid = np.indices((board.columns + 1, board.rows + 1)).reshape(2, -1).T * board.square_mm
+    grid = np.indices((board.columns + 1, board.rows + 1)).reshape(2, -1).T / (
+        board.columns,
+        board.rows,
+    )
+    grid = grid * board.size_mm
     on_face = np.column_stack([grid, np.full(len(grid), view.points[0, 2])])
     points = view.camera_from_board.apply(on_face)
     ideal = points[:, :2] / points[:, 2:]

@@ -160,19 +160,14 @@ def open_captures(rig: Rig, rig_path: Path) -> Captures:
 
 def open_folder(rig: Rig, rig_path: Path, entry: CaptureFolder) -> Captures:
     """Open one folder of the rig file's `calibration` list. Raises as `open_scan`."""
-    folder, templates = capture_path(rig_path, entry), _pair_templates(rig, entry.files)
+    folder, template = capture_path(rig_path, entry), entry.files or rig.files
     if entry.corners is None:
-        return _open(rig, folder, "calibration", templates, entry.shots)
+        return _open(rig, folder, "calibration", template, entry.shots)
 
     # Wherever the images were for the other program, the last parts of their paths are the same.
-    depths = {template.count("/") + 1 for template in templates.values()}
-    corners = read_corners(Path(rig_path).parent / entry.corners)
-    named = {
-        "/".join(name.split("/")[-last:]): pixels
-        for name, pixels in corners.items()
-        for last in depths
-    }
-    captures = _open(rig, folder, "calibration", templates, entry.shots, tuple(named))
+    last, corners = template.count("/") + 1, read_corners(Path(rig_path).parent / entry.corners)
+    named = {"/".join(name.split("/")[-last:]): pixels for name, pixels in corners.items()}
+    captures = _open(rig, folder, "calibration", template, entry.shots, tuple(named))
     return replace(captures, corners={folder / name: pixels for name, pixels in named.items()})
 
 
@@ -190,12 +185,7 @@ def open_scan(rig: Rig, folder: Path) -> Captures:
     this is no scan, if it holds no image of this rig, or if a symbolic link leads out of it and the
     rig does not follow links.
     """
-    return _open(rig, Path(folder), "scan", _pair_templates(rig), None)
-
-
-def _pair_templates(rig: Rig, files: str | None = None) -> dict[str, str]:
-    """Each pair's template of file names: a folder's own, the pair's, or the rig's."""
-    return {pair.name: files or rig.template(pair.name) for pair in rig.pairs}
+    return _open(rig, Path(folder), "scan", rig.files, None)
 
 
 def open_check(rig: Rig, folder: Path) -> tuple[Kind, Captures]:
@@ -207,7 +197,7 @@ def open_check(rig: Rig, folder: Path) -> tuple[Kind, Captures]:
     listing = Listing(Path(folder), follow_links=rig.follow_links)
     file = load_captures_file(Path(folder), rig) if listing.has(FILE_NAME) else None
     kind: Kind = file.kind if file is not None else "scan"
-    captures = _open(rig, Path(folder), kind, _pair_templates(rig), None)
+    captures = _open(rig, Path(folder), kind, rig.files, None)
     if file is None and len(captures.shots) > 1:
         kind = "calibration"
     return kind, captures
@@ -249,13 +239,12 @@ def _open(
     rig: Rig,
     folder: Path,
     kind: Kind,
-    templates: Mapping[str, str],
+    template: str,
     wanted: tuple[str, ...] | None,
     named: tuple[str, ...] = (),
 ) -> Captures:
     """Open a folder's captures of one kind.
 
-    templates: by pair.
     wanted: shots, instead of those that captures.yaml lists or that are found.
     named: files that count as present, since their corners are known.
     """
@@ -267,21 +256,21 @@ def _open(
             where=str(folder / FILE_NAME),
             remedy="Name the right folder, or correct `kind` in its captures.yaml.",
         )
+    first = template.replace("{exposure}", rig.exposures[0]) if rig.exposures else template
     entries = {shot.name: shot for shot in (file.shots if file else None) or ()}
-    names = wanted or tuple(entries) or _discover_shots(rig, listing, templates)
-    single = [template for template in templates.values() if not has_field(template, "shot")]
-    if single and len(names) > 1:
+    names = wanted or tuple(entries) or _discover_shots(rig, listing, first)
+    if not has_field(template, "shot") and len(names) > 1:
         raise CaptureError(
-            f"holds one shot by the template {single[0]}, but {len(names)} are listed",
+            f"holds one shot by the template {template}, but {len(names)} are listed",
             where=str(folder),
             remedy="Put {shot} into the template, or list one shot.",
         )
     shots = [entries.get(name, ShotEntry(name=name)) for name in names]
     sequences = tuple(
-        sequence for shot in shots for sequence in _collect_sequences(rig, listing, templates, shot)
+        sequence for shot in shots for sequence in _collect_sequences(rig, listing, template, shot)
     )
     if not sequences:
-        raise _no_image_error(rig, folder, templates[rig.pairs[0].name])
+        raise _no_image_error(rig, folder, template, first)
     captures = Captures(rig, (folder,), names, sequences, base=folder)
     if file is None:
         return captures
@@ -296,15 +285,10 @@ def _open(
     )
 
 
-def _shortest(rig: Rig, template: str) -> str:
-    """A template with the name of the shortest exposure filled in."""
-    return template.replace("{exposure}", rig.exposures[0]) if rig.exposures else template
-
-
-def _no_image_error(rig: Rig, folder: Path, template: str) -> CaptureError:
-    """Make the error for a folder without images; template: of the first pair."""
+def _no_image_error(rig: Rig, folder: Path, template: str, first: str) -> CaptureError:
+    """Make the error for a folder without images; first: the template of the first exposure."""
     frame = next(iter(rig.frames.sequence_names(rig.pairs[0].projector)), "")
-    example = fill(_shortest(rig, template), shot="SHOT", pair=rig.pairs[0].name, frame=frame)
+    example = fill(first, shot="SHOT", pair=rig.pairs[0].name, frame=frame)
     return CaptureError(
         f"holds no image of rig {rig.name} by the template {template}, such as {example}",
         where=str(folder),
@@ -332,9 +316,9 @@ def _read_times(captures: Captures, listing: Listing, timing: Timing) -> FrameTi
     return compute_frame_times(timing, captures.rig, taken, listing.root)
 
 
-def _discover_shots(rig: Rig, listing: Listing, templates: Mapping[str, str]) -> tuple[str, ...]:
+def _discover_shots(rig: Rig, listing: Listing, template: str) -> tuple[str, ...]:
     """Find shots by the names of files: those with a lit image or a code's first image."""
-    if not all(has_field(template, "shot") for template in templates.values()):
+    if not has_field(template, "shot"):
         name = listing.root.resolve().name
         if re.fullmatch(SHOT, name) and len(name) <= MAX_SHOT_LENGTH:
             return (name,)
@@ -349,7 +333,6 @@ def _discover_shots(rig: Rig, listing: Listing, templates: Mapping[str, str]) ->
         if pair.projector:
             frames |= set(rig.frames.code_names(pair.projector)[:1])
         for frame in filter(None, frames):
-            template = _shortest(rig, templates[pair.name])
             found |= _find_shots(listing, shot_pattern(template, pair.name, frame), "", None)
     return tuple(sorted((name for name in found if len(name) <= MAX_SHOT_LENGTH), key=_natural_key))
 
@@ -380,15 +363,14 @@ def _natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
 
 
 def _collect_sequences(
-    rig: Rig, listing: Listing, of_pair: Mapping[str, str], shot: ShotEntry
+    rig: Rig, listing: Listing, template: str, shot: ShotEntry
 ) -> Iterator[ImageSequence]:
     """Collect what each pair took in a shot, by captures.yaml or, without a list, by the files."""
     look = shot.stripes is None and shot.lit is None
+    templates = {name: template.replace("{exposure}", name) for name in rig.exposures or ("",)}
+    first = next(iter(templates.values()))
+    frames = rig.frames.sequence_names(None) if has_field(first, "frame") else ("",)
     for pair in rig.pairs:
-        template = of_pair[pair.name]
-        templates = {name: template.replace("{exposure}", name) for name in rig.exposures or ("",)}
-        first = next(iter(templates.values()))
-        frames = rig.frames.sequence_names(None) if has_field(first, "frame") else ("",)
         whole = _collect_stripes(rig, listing, templates, shot.name, pair)
         paths, missing = _locate(listing, first, shot.name, pair, frames)
         alone = ImageSequence(pair.name, shot.name, paths[0], None, (), missing) if paths else None

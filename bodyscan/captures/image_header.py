@@ -104,30 +104,29 @@ def _read_by_pillow(stream: BinaryIO, kind: str) -> ImageHeader:
 
 
 def _read_tiff_header(image: Any) -> ImageHeader:
-    """Read a TIFF's tags: its size as stored, whatever its orientation, and whether it is read."""
+    """Read a TIFF's tags: its size as stored, whatever its orientation, and what is not read of it."""
     tags, fault, pages = image.tag_v2, "", 0
     unread = {34712: "JPEG 2000", 34887: "LERC", 34925: "LZMA", 50000: "Zstandard", 50001: "WebP"}
     if tags.get(259) in unread:
         fault = (
             f"is compressed by {unread[tags[259]]}, which is not read: save it with LZW or Deflate"
         )
-    width, height, bits = tags[256], tags[257], max(tags.get(258, (1,)))
     for number in range(image.n_frames):
         image.seek(number)
         pages += not image.tag_v2.get(254, 0)  # not a thumbnail or mask
-    if pages > 1:
-        fault = f"holds {pages} images: save each as a file of its own"
-    return ImageHeader(width, height, bits, True, fault=fault)
+    fault = f"holds {pages} images: save each as a file of its own" if pages > 1 else fault
+    return ImageHeader(tags[256], tags[257], max(tags.get(258, (1,))), True, fault=fault)
 
 
 def store_upright(tiff: bytes) -> bytes:
     """The TIFF file without its orientation tag: OpenCV turns pixels by it whatever its flags say."""
     order = "<" if tiff.startswith(b"II") else ">"
     (first,) = struct.unpack_from(f"{order}I", tiff, 4)
-    (count,) = struct.unpack_from(f"{order}H", tiff, first)
-    for entry in range(first + 2, min(first + 2 + 12 * count, len(tiff) - 11), 12):
-        if struct.unpack_from(f"{order}H", tiff, entry) == (274,):
-            return tiff[: entry + 8] + struct.pack(f"{order}H", 1) + tiff[entry + 10 :]
+    for entry in range(first + 2, len(tiff) - 11, 12):  # in the order of their numbers
+        (tag,) = struct.unpack_from(f"{order}H", tiff, entry)
+        if tag >= 274:
+            one = struct.pack(f"{order}H", 1)
+            return tiff[: entry + 8] + one + tiff[entry + 10 :] if tag == 274 else tiff
     return tiff
 
 

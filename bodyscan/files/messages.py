@@ -93,21 +93,14 @@ def require_writable(folder: Path, *inputs: Path | None) -> None:
 
 
 def describe_similar_shots(shots: Iterable[tuple[str, str]]) -> str:
-    """Describe two shots, of (pair, shot), whose names differ only in how they are written; "" if there
-    are none."""
+    """Describe two shots, of (pair, shot), whose names differ only in how they are written, or ""."""
     written: dict[str, tuple[str, str]] = {}
     for pair, shot in sorted(set(shots)):
-        name = unicodedata.normalize("NFC", shot)
-        plain = re.sub(r"(?<!\d)0+(?=\d)", "", name.casefold())
-        other, first = written.setdefault(plain, (pair, shot))
-        if first == shot or other == pair:
-            continue
-        how = "zeros" if first.casefold() != name.casefold() else "capitals"
-        if unicodedata.normalize("NFC", first) == name:
-            how, first, shot = "how an accent is written", ascii(first), ascii(shot)
-        return (
-            f"shots {first} ({other}) and {shot} ({pair}) differ only in {how}: give both one name"
-        )
+        name = unicodedata.normalize("NFC", shot).casefold()
+        other, first = written.setdefault(re.sub(r"(?<!\d)0+(?=\d)", "", name), (pair, shot))
+        if first != shot and other != pair:
+            both = f"{first!a} ({other}) and {shot!a} ({pair})"
+            return f"shots {both} differ only in zeros, capitals or accents: give both one name"
     return ""
 
 

@@ -123,11 +123,7 @@ def parse_yaml(text: str, max_nodes: int = MAX_NODES, *, foreign: bool = False) 
         compose = yaml.compose_all if foreign else lambda *args: iter([yaml.compose(*args)])
         node = next(iter(compose(text, _PlainLoader)), None)
     except yaml.MarkedYAMLError as error:
-        place, what = _place(error.problem_mark or error.context_mark), _describe(error)
-        lines = text.splitlines()[: place.line] if not foreign else []
-        odd = [(n, _find_odd_letter(line)) for n, line in enumerate(lines, 1)]
-        what += "".join(f"; line {n} {found}" for n, found in odd if found)
-        raise _error(place, what) from None
+        raise _error(_place(error.problem_mark or error.context_mark), _describe(error)) from None
     except yaml.YAMLError as error:
         raise _error(Place(1, 1), f"is not YAML: {error}".splitlines()[0]) from None
     document = Document()
@@ -259,15 +255,11 @@ def parse_scalar(text: str) -> Any:
 def _find_odd_letter(text: str) -> str:
     """Describe a letter that looks like a space, quote or minus of YAML without being one, or ""."""
     spaces, quotes = "\u00a0\u2007\u202f\u200b\ufeff\u3000", "\u201c\u201d\u201e\u2018\u2019"
-    odd = rf"[{spaces}]|(?:^|(?<=: ))(?:[{quotes}]|[\u2212\u2013](?=[.0-9]))"
-    found = re.search(odd, re.sub(r"(^|\s)#.*", "", text))
+    found = re.search(rf"[{spaces}]|^(?:[{quotes}]|[\u2212\u2013](?=[.0-9]))", text)
     if found is None:
         return ""
-    name = unicodedata.name(found[0]).lower()
-    return (
-        f"has a {name} (U+{ord(found[0]):04X}), which is not YAML's own: type it anew, or put the "
-        "value in plain quotes if it is meant"
-    )
+    name = f"a {unicodedata.name(found[0]).lower()} (U+{ord(found[0]):04X})"
+    return f"has {name}: type it anew, or put the value in plain quotes if it is meant"
 
 
 def _refuse_deep(text: str, *, only_first: bool) -> None:

@@ -207,11 +207,9 @@ def heights_from(text: str) -> list[float]:
         raise BadInput(f"{text!r} is not a list of heights", remedy=remedy) from error
     for k in range(1, len(words)):
         if heights[k] < 100.0 <= heights[k - 1]:
-            before, word = words[k - 1].strip(), words[k].strip()
-            raise BadInput(
-                f"{text!r} names {before} and {word} mm: is {word} the decimals of {before}?",
-                remedy=f"Write {before}.{word} with a point, or the lower first: {word},{before}.",
-            )
+            what = f"{text!r}: is {words[k]} the decimals of {words[k - 1]}?"
+            remedy = f"Write {words[k - 1]}.{words[k]} with a point, or the lower height first."
+            raise BadInput(what, remedy=remedy)
     return heights
 
 

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from functools import partial
 
 import numpy as np
 from scipy.optimize import minimize_scalar
 
+from bodyscan.arrays import Array
 from bodyscan.boards.board_layout import corner_points, corners_per_face
 from bodyscan.boards.board_map import fit_board_map
 from bodyscan.boards.view import BoardView
-from bodyscan.errors import BadInput
+from bodyscan.calibration.board_views import has_enough_corners, planar_view
+from bodyscan.calibration.camera import CameraCalibration, calibrate_camera
+from bodyscan.errors import BadInput, DegeneratePoses
+from bodyscan.geometry.camera import Camera
 from bodyscan.rig.board import Board
 from bodyscan.rig.rig import Rig
 
@@ -24,42 +31,90 @@ def describe_board(board: Board) -> str:
     )
 
 
-def estimate_pitch(board: Board, views: Sequence[BoardView]) -> float:
-    """Estimate the square_mm that fits an aprilgrid's corners best, with tags as large as described.
+def refuse_other_pitch(board: Board, views: Sequence[BoardView]) -> None:
+    """Raise BadInput if tags stand 0.3 % otherwise than described: focal lengths err by half of it.
 
     Whatever homography and lens a view has, it shows the ratio of tag and distance, to a few parts in
-    ten thousand. As described if no view has 40 corners, which determine the lens.
+    ten thousand. Views of less than 40 corners do not determine the lens.
     """
-    largest = sorted(views, key=lambda view: -len(view.pixels))[:10]
-    largest = [view for view in largest if len(view.pixels) >= 40]
-    if board.kind != "aprilgrid" or not largest:
-        return board.square_mm
+    seen = [v for v in views if v.board == board.name and len(v.pixels) >= 40]
+    seen = sorted(seen, key=lambda view: -len(view.pixels))[:10]
+    if board.kind != "aprilgrid" or board.marker_mm is None or not seen:
+        return
 
     def misfit(square_mm: float) -> float:
-        tried = board.model_copy(update={"square_mm": square_mm})
-        residuals = []
-        for view in largest:
-            printed = corner_points(tried)[view.corner_ids, :2]
-            residuals.append(fit_board_map(printed, view.pixels).apply(printed) - view.pixels)
-        return float(np.median(np.abs(np.concatenate(residuals))))
+        tried = corner_points(board.model_copy(update={"square_mm": square_mm}))[:, :2]
+        fits = ((tried[v.corner_ids], v.pixels) for v in seen)
+        errors = [fit_board_map(printed, seen).apply(printed) - seen for printed, seen in fits]
+        return float(np.median(np.abs(np.concatenate(errors))))
 
-    side = board.marker_mm or 0.0
-    found = minimize_scalar(misfit, bounds=(1.02 * side, 2.0 * side), method="bounded")
-    return float(found.x)
-
-
-def refuse_other_pitch(board: Board, views: Sequence[BoardView]) -> None:
-    """Raise BadInput if tags stand 0.3 % otherwise than described: focal lengths err by half of it."""
-    pitch = estimate_pitch(board, [view for view in views if view.board == board.name])
-    if abs(pitch / board.square_mm - 1.0) > 3e-3:
-        side = (board.marker_mm or 0.0) * board.square_mm / pitch
+    side, square_mm = board.marker_mm, board.square_mm
+    pitch = float(minimize_scalar(misfit, bounds=(1.02 * side, 2.0 * side), method="bounded").x)
+    if abs(pitch / square_mm - 1.0) > 3e-3:
         raise BadInput(
-            f"the tags of {board.marker_mm:g} mm stand {pitch:.2f} mm from one another in the images, "
-            f"not {board.square_mm:g}",
+            f"tags of {side:g} mm stand {pitch:.2f} mm from one another in images, not {square_mm:g}",
             where=f"board {board.name}",
-            remedy=f"measure both on the print: square_mm {pitch:.2f} would fit marker_mm "
-            f"{board.marker_mm:g}, or marker_mm {side:.2f} square_mm {board.square_mm:g}",
+            remedy=f"measure both on the print: square_mm {pitch:.2f} would fit marker_mm {side:g}, or "
+            f"marker_mm {side * square_mm / pitch:.2f} square_mm {square_mm:g}",
         )
+
+
+def common_aspect(cameras: Iterable[tuple[Camera, Array]]) -> float:
+    """Return fy / fx if all cameras, each with the covariance (P, P) of its parameters, have one in
+    common that is not 1, beyond 0.5 % and three sigmas; else 1."""
+    ratios, variances = [], []
+    for camera, covariance in cameras:
+        slope = np.array([-1.0 / camera.alpha, 1.0 / camera.beta])
+        ratios.append(math.log(camera.beta / camera.alpha))
+        variances.append(slope @ covariance[:2, :2] @ slope + 2e-3**2)  # sensors differ by 0.2 %
+    weights = 1.0 / np.array(variances)
+    mean, sigma = float(np.average(ratios, weights=weights)), float(weights.sum() ** -0.5)
+    # With a wrong board each camera's ratio follows its own views, by some tenths.
+    agree = np.all((np.array(ratios) - mean) ** 2 < 9.0 / weights + (0.3 * mean) ** 2)
+    return math.exp(mean) if agree and abs(mean) > max(5e-3, 3.0 * sigma) else 1.0
+
+
+def correct_stretch(
+    rig: Rig, views: Sequence[BoardView], cameras: Mapping[str, CameraCalibration]
+) -> tuple[Rig, list[str]]:
+    """Return the rig with its boards stretched as their views show, and a line on each that is.
+
+    Printers stretch pages along one axis. In upright views that looks like pixels that are not square,
+    of all cameras alike, and only then it is looked for; views of a turned board tell the two apart.
+    """
+    ratio = common_aspect((one.camera, one.covariance) for one in cameras.values())
+    boards, notes = list(rig.boards), list[str]()
+    for k, board in enumerate(rig.boards) if ratio != 1.0 else ():
+        groups = [
+            (found.camera, [v for v in views if (v.pair, v.board) == (name, board.name)])
+            for name, found in cameras.items()
+        ]
+        groups = sorted(groups, key=lambda group: -len(group[1]))[:2]  # two cameras are enough
+        count = sum(len(view.pixels) for _, group in groups for view in group)
+        misfit = partial(_misfit_of_stretch, board, groups)
+        bounds = min(1.0, ratio**2) / 1.01, max(1.0, ratio**2) * 1.01
+        with suppress(DegeneratePoses):
+            found = minimize_scalar(misfit, bounds=bounds, method="bounded")
+            # In variances of a corner: chance gives one, bent boards and simple lenses some tens.
+            if misfit(1.0) - found.fun > 100.0 * found.fun / count:
+                boards[k] = board.model_copy(update={"stretch": board.stretch * float(found.x)})
+                notes.append(
+                    f"board {board.name}: squares are {found.x:.4f} times as high as wide, by views of "
+                    "the turned board; used so: measure both sides, and write `stretch` in the rig file"
+                )
+    return rig.model_copy(update={"boards": tuple(boards)}), notes
+
+
+def _misfit_of_stretch(
+    board: Board, groups: Sequence[tuple[Camera, Sequence[BoardView]]], stretch: float
+) -> float:
+    """Sum of the squared residuals, px2, of cameras calibrated with squares so many times as high."""
+    tried, total = board.model_copy(update={"stretch": board.stretch * stretch}), 0.0
+    for camera, views in groups:
+        seen = [planar_view(view, tried) for view in views if has_enough_corners(view, tried)]
+        found = calibrate_camera(seen, camera.width, camera.height, type(camera.lens)())
+        total += found.rms_px**2 * sum(len(view.pixels) for view in seen)
+    return total
 
 
 def boards_not_found(rig: Rig, views: Sequence[BoardView], images: int) -> list[str]:

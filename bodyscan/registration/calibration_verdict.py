@@ -9,6 +9,7 @@ import numpy as np
 
 from bodyscan.calibration.board_views import measure_covered_share
 from bodyscan.geometry.uncertainty import position_sigma
+from bodyscan.registration.board_checks import common_aspect
 from bodyscan.registration.rig_calibration import RigCalibration, nominal_size
 from bodyscan.verdict import Grade, Verdict
 
@@ -86,6 +87,14 @@ def grade_calibration(calibration: RigCalibration) -> Verdict:
             far = error and times > 2.0
             prefix = "recalibrate: " if far else ""
             findings.append((far, times, f"{prefix}pair {pair.name}: {words}"))
+    pairs = calibration.pairs.values()
+    aspect = common_aspect((one.camera, one.camera_covariance) for one in pairs)
+    if aspect != 1.0:
+        words = (
+            f"fy is {aspect:.3f} times fx in all cameras: pixels that are not square, or a print that "
+            "is stretched, and lengths with it: measure squares both ways, turn the board in some shots"
+        )
+        findings.append((False, 1.0, words))
     size = nominal_size(calibration.rig, calibration.rig_from_camera)
     if size and size.mark != "good":  # one in use is reported; a new one is not made
         findings.append((False, 1.0, f"{size.words}: {size.remedy}"))

@@ -40,6 +40,7 @@ class Board(Model):
 
     columns, rows: number of squares, not of corners; of an aprilgrid, number of tags.
     square_mm: side of a square; of an aprilgrid, the distance from one tag to the next.
+    stretch: how many times as high as wide the squares are; square_mm is their width.
 
     Board frame: origin at the first square's outer corner (of the checkered area), x along the
     columns, y along the rows (down, as printed), z away from whoever looks at the front.
@@ -50,6 +51,7 @@ class Board(Model):
     columns: Annotated[int, Field(ge=3, le=200)]
     rows: Annotated[int, Field(ge=3, le=200)]
     square_mm: PositiveFloat
+    stretch: Annotated[float, Field(gt=0.8, lt=1.25)] = 1.0
     marker_mm: PositiveFloat | None = None
     dictionary: str = "DICT_4X4_1000"
     legacy_layout: bool = False
@@ -62,7 +64,7 @@ class Board(Model):
     @property
     def size_mm(self) -> tuple[float, float]:
         """Of the checkered area, along its columns and along its rows."""
-        return self.columns * self.square_mm, self.rows * self.square_mm
+        return self.columns * self.square_mm, self.rows * self.square_mm * self.stretch
 
     @property
     def flatness_sigma_mm(self) -> float:

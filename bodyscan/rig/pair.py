@@ -136,12 +136,10 @@ class Pair(Model):
     """One camera and one projector, or a camera alone.
 
     known: what another program has calibrated of it.
-    files: how its images are named, if otherwise than the rig's.
     """
 
     name: Name
     pole: Name | None = None
-    files: str | None = None
     camera: CameraSpec
     projector: AnyStripeCode | None = None
     nominal: NominalPose | None = None

@@ -68,10 +68,6 @@ class Rig(Model):
         """Return the pair of that name. Raises KeyError if there is none."""
         return {pair.name: pair for pair in self.pairs}[name]
 
-    def template(self, pair: str) -> str:
-        """The template of a pair's file names."""
-        return self.pair(pair).files or self.files
-
     def board(self, name: str) -> Board:
         """Return the board of that name. Raises KeyError if there is none."""
         return {board.name: board for board in self.boards}[name]
@@ -199,9 +195,8 @@ def _find_wrong_frames(rig: Rig) -> Iterator[Problem]:
         for lacking in [name for name, one in directions if one.needs_lit][:1]:
             wrong = f"the images of pair {lacking} do not show the scene under full light"
             yield ("frames", "lit"), f"is needed: {wrong}"
-        cameras = [pair.name for pair in rig.pairs if not pair.projector]
-        alone = [name for name in cameras if "{frame}" in rig.template(name)]
-        if alone and frames.board is None:
+        alone = [pair.name for pair in rig.pairs if not pair.projector]
+        if alone and frames.board is None and "{frame}" in rig.files:
             wrong = f"or board is needed: pair {alone[0]}, a camera alone, takes no other image"
             yield ("frames", "lit"), wrong
 
@@ -224,22 +219,16 @@ def _find_wrong_counts(
 
 def _find_template_problems(rig: Rig) -> Iterator[Problem]:
     """Find file-name templates that do not fit the pairs and exposures."""
+    many, stripes = len(rig.pairs) > 1, any(pair.projector for pair in rig.pairs)
     if len(rig.exposures) == 1:
         yield ("exposures",), "names one exposure: name two or more, the shortest first, or none"
-    rest = [pair for pair in rig.pairs if not pair.files]
-    stripes = any(pair.projector for pair in rest)
-    templates: list[tuple[tuple[str | int, ...], str | None, bool, bool]] = [
-        (("files",), rig.files, len(rest) > 1, stripes)
-    ]
-    for index, pair in enumerate(rig.pairs):
-        templates.append((("pairs", index, "files"), pair.files, False, pair.projector is not None))
+    templates: list[tuple[tuple[str | int, ...], str, bool]] = [(("files",), rig.files, stripes)]
     for index, folder in enumerate(rig.calibration):
-        of_folder = ("calibration", index, "files")
-        templates.append((of_folder, folder.files, len(rig.pairs) > 1, False))
-    for where, template, many, needs_frame in templates:
-        for fault in template_faults(template or rig.files, many, needs_frame, bool(rig.exposures)):
-            if template:
-                yield where, fault
+        if folder.files:
+            templates.append((("calibration", index, "files"), folder.files, False))
+    for where, template, needs_frame in templates:
+        for fault in template_faults(template, many, needs_frame, bool(rig.exposures)):
+            yield where, fault
 
 
 def _find_unknown_references(rig: Rig) -> Iterator[Problem]:

@@ -117,9 +117,7 @@ def refuse_unknown_frames(rig: Rig) -> None:
         "it projects stripes one way only": crossed is not None,
         "it takes a lit image, and looks for boards there": rig.frames.lit != rig.frames.board_image
         or rig.frames.lit is None,
-        "it cannot tell what `*` in file names stands for": any(
-            "*" in rig.template(pair.name) for pair in rig.pairs
-        ),
+        "it cannot tell what `*` in file names stands for": "*" in rig.files,
     }
     for what, refused in wrong.items():
         if refused:

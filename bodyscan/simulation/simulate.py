@@ -254,7 +254,7 @@ def _render_task(
     if code and not code.is_projected and task.sequence:
         exposed = simulate_instrument(exposed, code, rig.frames)
     for frame, grey in exposed.items():
-        name = fill(rig.template(pair.name), shot=task.shot, pair=pair.name, frame=frame)
+        name = fill(rig.files, shot=task.shot, pair=pair.name, frame=frame)
         files.write_image(out / task.folder / name, grey)
 
 

@@ -38,7 +38,10 @@ def decode_stripes(
         if code.crossing is None:
             return stripes
     except DecodingFailed as error:
-        raise DecodingFailed(error.what, where=where, remedy=error.remedy) from error
+        step, remedy = describe_step(code, lit, dark, coded), error.remedy
+        if step:
+            remedy = "let the camera begin that much earlier or later, or rename the files"
+        raise DecodingFailed(step or error.what, where=where, remedy=remedy) from error
     try:
         crossing = _decode_direction(code.crossing, lit, dark, crossing_images[0], None)
         return replace(stripes, crossing=crossing)
@@ -48,6 +51,29 @@ def decode_stripes(
             remedy = "exchange the lists of frames and of `crossing`, or correct `direction`"
         fault = f"{error.what}\n  {remedy}" if remedy else error.what
         return replace(stripes, crossing_fault=fault)
+
+
+def describe_step(code: StripeCode, lit: Greys | None, dark: Greys | None, coded: Greys) -> str:
+    """Say by how many frames a sequence is out of step, "" if it is in step.
+
+    The lit image is the brightest at nearly every pixel, the dark one the darkest. Frames follow one
+    another as files do, each pattern before its inverse, or in the best order to show them.
+    """
+    files = np.arange(sum(code.image_counts.values()))
+    if lit is None or dark is None or len(coded) < len(files):
+        return ""
+    levels = np.stack([lit, dark, *coded[: len(files)]])[:, ::4, ::4].astype(np.float32)
+    contrast = np.ptp(levels, axis=0)
+    shares = (levels - levels.min(axis=0))[:, contrast > 20.0] / contrast[contrast > 20.0]
+    is_lit, is_dark = (np.mean(x, axis=1) > 0.9 for x in (shares > 0.8, shares < 0.2))
+    by_bit = files.reshape(2, -1).T.ravel() if len(files) % 2 == 0 else files
+    orders = [[0, 1, *(2 + np.array(order))] for order in (files, by_bit, code.show_order)]
+    for late in (0, 1, -1, *range(2, len(files) + 1)):  # begun one early, the lit image is lost
+        if any((late < 0 or is_lit[o[late]]) and is_dark[o[late + 1]] for o in orders):
+            side = f"{late} before" if late > 0 else "1 after"
+            step = f"the frames are out of step by {abs(late)}: each file holds that {side} its own"
+            return step if late else ""
+    return ""
 
 
 def _decode_direction(

@@ -18,7 +18,7 @@ from bodyscan.optional import optional
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, attempt_each, silent, step
 from bodyscan.registration.advice import advise
-from bodyscan.registration.board_checks import boards_not_found
+from bodyscan.registration.board_checks import boards_not_found, correct_stretch
 from bodyscan.registration.references import find_rig_size, rescale_boards, select_solving_views
 from bodyscan.registration.rig_calibration import RigCalibration, check_nominal_size
 from bodyscan.registration.rig_frame import hold_frame, refuse_without_frame_shot
@@ -97,6 +97,9 @@ def solve_boards(
     """Calibrate a rig from boards found in its images, without the remarks on it."""
     cameras = calibrate_cameras(rig, boards.value, progress, folder=folder)
     cameras = require_cameras(rig, captures, boards, cameras)
+    rig, stretched = correct_stretch(rig, boards.value, cameras.value)
+    if stretched:
+        cameras = calibrate_cameras(rig, boards.value, progress, folder=folder)
     located = locate_views(rig, select_solving_views(rig, boards.value), cameras.value)
     prints = PrintAreas(rig, cameras.value, {view.key: view for view in located.value})
     with step(progress, "joining the pairs"):
@@ -112,7 +115,7 @@ def solve_boards(
         raise no_pair_calibrated(rig, failed)
     for pair in pairs.value.values():
         solution = update_poses(solved.rig, solution, pair)
-    notes = (*solved.rig_notes, *(note for stage in stages for note in stage.notes))
+    notes = (*stretched, *solved.rig_notes, *(note for stage in stages for note in stage.notes))
     calibration = RigCalibration(
         solved.rig,
         pairs.value,

@@ -35,7 +35,7 @@ from bodyscan.calibration.camera import (
 )
 from bodyscan.calibration.known_pair import read_known_camera
 from bodyscan.captures.folder import Captures, ImageSequence
-from bodyscan.captures.images import measure_mosaic, read_board_image
+from bodyscan.captures.images import measure_mosaic, read_board_image, read_sequence
 from bodyscan.errors import BadInput, BodyscanError, DegeneratePoses, FailedWork, format_list
 from bodyscan.files.corners_vnl import Corners, write_corners
 from bodyscan.geometry.lenses import FAMILY, LENSES
@@ -52,6 +52,7 @@ from bodyscan.registration.sanity_checks import find_camera_faults
 from bodyscan.rig.board import Board
 from bodyscan.rig.pair import AUTO, Pair
 from bodyscan.rig.rig import Rig
+from bodyscan.stripes.decoding import describe_step
 
 HERE = Path()
 LOOKED_AT = 3
@@ -116,29 +117,26 @@ def find_all_boards(rig: Rig, captures: Captures, progress: Progress = silent) -
 def _refuse_other_markers(
     rig: Rig, captures: Captures, board: Board, views: Sequence[BoardView]
 ) -> None:
-    """Raise BadInput if the markers seen name another first marker than the rig file.
+    """Raise BadInput if the markers of an image name another first marker than the rig file.
 
-    They are looked at again only if a border of the board's corners was seen in no view, as where
-    its numbers are shifted: three images, with all markers of the dictionary.
+    They are looked at again only if a border of the board's corners is in no view, as where numbers
+    are shifted.
     """
-    seen = sorted((v for v in views if v.board == board.name), key=lambda v: -len(v.pixels))
+    seen = [view for view in views if view.board == board.name]
     if board.kind == "checkerboard" or board.faces == 2 or not seen:
         return
-    ids, (columns, rows) = np.concatenate([v.corner_ids for v in seen]), corner_grid(board)
-    if {0, columns - 1} <= set(ids % columns) and {0, rows - 1} <= set(ids // columns):
+    ids, (columns, rows) = np.concatenate([view.corner_ids for view in seen]), corner_grid(board)
+    whole = {0, columns - 1} <= set(ids % columns) and {0, rows - 1} <= set(ids // columns)
+    pair, shot, _ = max(seen, key=lambda view: len(view.pixels)).key
+    sequence = next(s for s in captures.pair_sequences(pair) if s.shot == shot)
+    if whole or sequence.board_path in captures.corners:
         return
-    taken = {
-        (s.pair, s.shot): s for s in captures.sequences if s.board_path not in captures.corners
-    }
-    found = set()
-    for sequence in [taken[v.key[:2]] for v in seen if v.key[:2] in taken][:3]:
-        markers, _ = detect_any(read_board_image(sequence, rig.pair(sequence.pair)), board)
-        found.add(estimate_first_marker(board, markers))
-    if len(found) == 1 and board.first_marker not in found:
+    markers, _ = detect_any(read_board_image(sequence, rig.pair(pair)), board)
+    first = estimate_first_marker(board, markers)
+    if first != board.first_marker:
         raise BadInput(
-            f"the markers in the images lie as on this board with first_marker {found.pop()}, not "
-            f"{board.first_marker}",
-            where=f"board {board.name}",
+            f"markers lie as on this board with first_marker {first}, not {board.first_marker}",
+            where=f"board {board.name}: {sequence.board_path}",
             remedy="correct first_marker in the rig file",
         )
 
@@ -193,24 +191,25 @@ def write_found_corners(
 def _look_closer(
     rig: Rig, views: Sequence[BoardView], without: Sequence[ImageSequence]
 ) -> dict[ImageSequence, str]:
-    """What images without a board do show: closely for pairs that saw few boards or missed few, at a
-    glance for those that saw most."""
-    chosen: list[tuple[ImageSequence, bool]] = []
+    """What images without a board do show, for pairs that saw few boards or missed few."""
+    chosen: list[ImageSequence] = []
     for pair in rig.pairs:
         images = [sequence for sequence in without if sequence.pair == pair.name]
         found = sum(view.pair == pair.name for view in views)
         if found < MIN_POSES or len(images) <= LOOKED_AT:
-            chosen += [(one, False) for one in images[:LOOKED_AT]]
-        elif found > len(images):
-            chosen += [(one, True) for one in images]
+            chosen += images[:LOOKED_AT]
 
-    def look(one: tuple[ImageSequence, bool]) -> str:
-        image = read_board_image(one[0], rig.pair(one[0].pair))
-        texts = [(b.name, describe_unfound(image, b, quick=one[1])) for b in rig.boards]
-        return "; ".join(f"{name}: {text}" for name, text in texts if text)
+    def look(sequence: ImageSequence) -> str:
+        pair = rig.pair(sequence.pair)
+        if pair.projector and sequence.has_stripes and not sequence.missing:
+            images = read_sequence(sequence.without_crossing, pair.camera)
+            step = describe_step(pair.projector, images.lit, images.dark, images.coded)
+            if step:
+                return step
+        image = read_board_image(sequence, pair)
+        return "; ".join(f"{board.name}: {describe_unfound(image, board)}" for board in rig.boards)
 
-    texts = map_threads(look, chosen)
-    return {one: text for (one, _), text in zip(chosen, texts, strict=True) if text}
+    return dict(zip(chosen, map_threads(look, chosen), strict=True))
 
 
 def calibrate_cameras(
@@ -308,6 +307,8 @@ def _describe_boardless(rig: Rig, boards: FoundBoards, searched: int) -> str:
     whatever the number of markers counted."""
     examples: dict[str, str] = {}
     for note in boards.notes:
+        if "out of step by" in note:
+            return note
         _, found, what = note.partition("no board found:")
         if found:
             examples.setdefault(re.sub(r"\d+ (?=markers of|of)", "", what), note)

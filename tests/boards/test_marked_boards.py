@@ -156,7 +156,6 @@ def test_tags_that_stand_otherwise_than_described_are_refused() -> None:
 
 @pytest.mark.parametrize("first", [1, 2, 5])
 def test_the_first_marker_is_read_off_the_markers(tmp_path: Path, first: int) -> None:
-    """One shift by an odd number of markers looks like the other layout, others like another place."""
     printed = MARKED.model_copy(update={"first_marker": first})
     write(tmp_path / "captures" / "s" / "p.png", render([(printed, PLACE)], blur_px=0.8))
     rig = Rig(
@@ -164,7 +163,7 @@ def test_the_first_marker_is_read_off_the_markers(tmp_path: Path, first: int) ->
         calibration=(CaptureFolder(folder="captures"),),
     )  # fmt: skip
     captures = open_captures(rig, tmp_path / "rig.yaml")
-    with pytest.raises(BadInput, match=f"with first_marker {first}, not 0"):
+    with pytest.raises(BadInput, match=f"on this board with first_marker {first}, not 0"):
         find_all_boards(rig, captures)
     right = rig.model_copy(update={"boards": (printed,)})
     assert len(find_all_boards(right, captures).value) == 1

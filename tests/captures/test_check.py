@@ -189,7 +189,7 @@ def test_groups_of_pairs_without_a_common_shot_are_reported(rig_path: Path) -> N
         folder = rig_path.parent / "captures" / f"cb{shot[1]}"
         folder.rename(folder.with_name(f"b0{shot[1]}"))
     assert (
-        "shots b1 (cam) and b01 (p2) differ only in zeros: give" in lines_with(rig_path, "zeros")[0]
+        "shots 'b1' (cam) and 'b01' (p2) differ only in zeros" in lines_with(rig_path, "zeros")[0]
     )
 
 

@@ -5,16 +5,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import pytest
+from ring import CHARUCO, ring_of_cameras, ring_rig, ring_views
 
-from bodyscan.boards.board_layout import corner_grid
+from bodyscan.boards.board_layout import corner_grid, corner_points
 from bodyscan.boards.view import Appearance, BoardView
+from bodyscan.calibration.board_views import match_corners
 from bodyscan.registration.board_checks import (
     appearance_notes,
     boards_not_found,
+    common_aspect,
+    correct_stretch,
     describe_findings,
 )
 from bodyscan.rig.board import Board
 from bodyscan.rig.rig import Rig
+from bodyscan.workflows.find_boards import calibrate_cameras
 
 MARKED = Board(name="m", kind="charuco", columns=9, rows=8, square_mm=50, marker_mm=40)
 RIG = Rig.model_validate(
@@ -79,4 +85,22 @@ def test_a_board_of_which_little_is_found_is_doubted() -> None:
     said = describe_findings(TWO_BOARDS, [partial_view(10), partial_view(12), partial_view(48)], 30)
     assert "found in 3 of 30 images, with 25 % of its corners in the median view" in said
     assert "may not be those" in said
-    assert "may not be those" not in describe_findings(TWO_BOARDS, [partial_view(24)], 30)
+
+
+@pytest.mark.parametrize("stretch", [1.02, 0.92, 1.0])
+def test_a_stretched_print_is_told_from_pixels_that_are_not_square(stretch: float) -> None:
+    placings, cameras = ring_of_cameras(heights=(700, 1200))
+    placings = {name: placings[name] for name in ("p1-1", "p1-2")}
+    cameras = {name: cameras[name] for name in placings}
+    points = corner_points(printed := CHARUCO.model_copy(update={"stretch": stretch}))
+    views = [
+        BoardView(v.pair, v.shot, v.board, match_corners(v.points, points), v.pixels)
+        for v in ring_views(placings, cameras, shots=12, board=printed)[0]
+    ]
+    found = calibrate_cameras(ring_rig(placings), views).value
+    corrected, notes = correct_stretch(ring_rig(placings), views, found)
+    assert corrected.boards[0].stretch == pytest.approx(stretch, abs=5e-4)
+    assert len(notes) == (stretch != 1.0)
+    found = calibrate_cameras(corrected, views).value
+    assert max(one.rms_px for one in found.values()) < 0.06, "with noise of 0.04"
+    assert common_aspect((one.camera, one.covariance) for one in found.values()) == 1.0

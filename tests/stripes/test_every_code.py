@@ -9,6 +9,7 @@ import pytest
 from stripe_rendering import Field, boundary_errors, checkered, code_light, render, robust, wavy
 
 from bodyscan.arrays import Array, Bytes, Indices
+from bodyscan.errors import DecodingFailed
 from bodyscan.geometry.light_planes import Axis
 from bodyscan.stripes.codes import parse_stripe_code
 from bodyscan.stripes.decoding import decode_stripes
@@ -162,7 +163,7 @@ def test_projected_patterns_are_decoded_to_their_stripes(code: Code, direction: 
     true = (pixel + 0.5) / (len(pixel) / 40)
     true = np.broadcast_to(true[:, None] if direction == "horizontal" else true, lit.shape)
     known = np.isfinite(seen.s)
-    assert known.mean() > 0.86
+    assert known.mean() > 0.92
     # Light that is not blurred at all says at which pixels a boundary lies between, and no more:
     # s is right to half a pixel of 3 or 4 a stripe.
     # A pixel that lies between no two boundaries says so by its sigma.
@@ -228,3 +229,16 @@ def test_limits_do_not_change_s_within_them(code: Code, rising: bool) -> None:
     assert part.beyond[deep].mean() > 0.99
     assert not part.beyond[whole.s < 34.0 if rising else whole.s > 21.0].any()
     assert whole.beyond is None
+
+
+@pytest.mark.parametrize(("late", "by_bit"), [(1, False), (2, True), (-1, False)])
+def test_frames_out_of_step_are_counted(late: int, by_bit: bool) -> None:
+    lit, dark, coded, _ = captured(GRAY, wavy(2.2), 60)
+    order = np.arange(12).reshape(2, 6).T.ravel() if by_bit else np.arange(12)
+    moved = np.roll(np.stack([lit, dark, *coded[order]]), late, axis=0)
+    with pytest.raises(DecodingFailed, match=f"out of step by {abs(late)}: each file holds"):
+        decode_stripes(spec_of(GRAY, 60), moved[0], moved[1], moved[2:][np.argsort(order)])
+    with pytest.raises(DecodingFailed, match="patterns of bits 2 and 3 are the same picture"):
+        decode_stripes(
+            spec_of(GRAY, 60), lit, dark, coded[[0, 1, 2, 2, *range(4, 8), 8, 8, 10, 11]]
+        )

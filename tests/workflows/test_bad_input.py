@@ -98,7 +98,7 @@ FAULTS: dict[str, tuple[Callable[[Path], None], str, str]] = {
     "nobody": (lambda s: changed(s, lambda i: 0.0 * i + 12.0), "repeat", "p1-2, p1-3, p2-2, p2-3: "),
     "a pole lost": (lambda s: delete(s, "p2-*/*"), "repeat", "left out: p2-2, p2-3: .*is missing"),
     "a frame lost": (lambda s: delete(s, "p1-3/bit04-i*"), "usable", "p1-3: .*bit04-inverse"),
-    "frames one late": (one_late, "repeat", "out of step by one"),
+    "frames one late": (one_late, "repeat", "out of step by 1: each file holds that 1 before its own"),
     "a projector off": (
         lambda s: changed(s, lambda i: 0.0 * i + 12.0, "p2-2/*"), "usable", "out: p2-2: .*lights only"),
     "upside down": (

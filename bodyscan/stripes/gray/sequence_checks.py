@@ -34,15 +34,6 @@ def check_exposure(images: ScanLines) -> None:
     bright = contrast >= MIN_CONTRAST
     inverted = contrast <= -MIN_CONTRAST
     if np.mean(inverted) > max(float(np.mean(bright)), 1e-3):
-        # Names exchanged, the first pattern would be bright in half of the picture.
-        first = (*images.patterns[:1], images.dark)[0][some].astype(np.int16) - lit
-        if np.mean(first[inverted] < -0.5 * contrast[inverted]) > 0.9:
-            raise DecodingFailed(
-                "the frames are out of step by one: the file of the dark frame shows the projector "
-                "full on, that of the first pattern shows it dark",
-                remedy="each file holds the frame before its own: let the camera begin one frame "
-                "later, or rename the files, and take this shot again if its last frame is lost",
-            )
         raise DecodingFailed(
             "the dark frame is brighter than the lit frame",
             remedy="check whether the names of the two are exchanged in the rig file",
@@ -118,6 +109,11 @@ def _find_fault(
     min_share = 0.75 if images.inverses is None else 0.5 if code.single else 0.6
     worst = min(shares, key=lambda bit: shares[bit], default=0)
     if shares and shares[worst] < min_share:
+        light = float(contrast[good].mean())
+        for bit in range(1, bits):
+            first, second = images.patterns[bit - 1 : bit + 1, ::step, ::step].astype(np.float32)
+            if np.mean(np.abs(first - second)) < 0.05 * light:  # others differ by half
+                return f"the patterns of bits {bit - 1} and {bit} are the same picture"
         return (
             f"where bit {worst} changes, only {shares[worst]:.0%} of neighbouring pixels are in "
             "neighbouring stripes"
