@@ -71,8 +71,3 @@ def attempt_each(
             progress(stage, done, len(todo))
     results = {item: good[item] for item in todo if item in good}
     return results, {item: bad[item] for item in todo if item in bad}
-
-
-def split_range(count: int) -> list[slice]:
-    """Split range(count) into THREADS slices of nearly equal length."""
-    return [slice(k * count // THREADS, (k + 1) * count // THREADS) for k in range(THREADS)]

@@ -114,38 +114,32 @@ def find_foreground(image: RangeImage, empty: RangeImage) -> Mask:
         return image.points[..., 2] < cv2.erode(far, window)[image.part] - 4.0
 
 
-def drop_flying_pixels(depth: Floats, step_mm: float, *, supporters: int = 13) -> Floats:
+@compiled
+def drop_flying_pixels(depth: Floats, step_mm: float, supporters: int = 13) -> Floats:
     """Depth (h, w) of pixels that enough neighbours agree with, within `step_mm` per step; else
     NaN.
 
     At a straight rim a pixel has 14 of its 24 neighbours; a flying one has few. A second pass no
     longer counts what the first removed.
     """
-    for _ in range(2):
-        count = _count_supporters(depth, step_mm)
-        depth = np.where(count >= supporters, depth, np.float32(np.nan))
-    return depth
-
-
-@compiled
-def _count_supporters(depth: Floats, step_mm: float) -> Bytes:
-    """Of each pixel's 24 neighbours (h, w), how many agree with it within `step_mm` per step."""
-    height, width = depth.shape
-    count = np.zeros((height, width), np.uint8)
-    steps = np.empty((5, 5), np.float32)
+    (height, width), steps = depth.shape, np.empty((5, 5), np.float32)
     for down in range(5):
         for right in range(5):
             steps[down, right] = step_mm * np.sqrt((down - 2) ** 2 + (right - 2) ** 2)
-    for row in range(height):
-        for column in range(width):
-            here = depth[row, column]
-            if np.isnan(here):
-                continue
-            for r in range(max(row - 2, 0), min(row + 3, height)):
-                for c in range(max(column - 2, 0), min(column + 3, width)):
-                    away = abs(depth[r, c] - here)
-                    count[row, column] += away < steps[r - row + 2, c - column + 2]
-    return count
+    for _ in range(2):
+        kept = np.full((height, width), np.float32(np.nan))
+        for row in range(height):
+            for column in range(width):
+                here, count = depth[row, column], 0
+                if np.isnan(here):
+                    continue
+                for r in range(max(row - 2, 0), min(row + 3, height)):
+                    for c in range(max(column - 2, 0), min(column + 3, width)):
+                        count += abs(depth[r, c] - here) < steps[r - row + 2, c - column + 2]
+                if count >= supporters:
+                    kept[row, column] = here
+        depth = kept
+    return depth
 
 
 def drop_speckles(depth: Floats, step_mm: float, smallest_px: float) -> Mask:

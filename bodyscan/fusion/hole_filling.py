@@ -74,9 +74,10 @@ def fill_distances(
     if free.any():
         _mirror(bound, below, ~measured)
         guess = np.maximum(fill_harmonically(values, fixed, bound, certain), -height)
-    node = np.argwhere(~measured & (guess < cell_mm))
-    crown, at = Crown.from_cloud(cloud.points, cloud.normals), tuple(node.T)
-    above = crown.compute_heights_above(bricks.origin + cell_mm * node)
+    crown = Crown.from_cloud(cloud.points, cloud.normals)
+    layer = np.searchsorted(height, crown.lowest_mm)
+    node = np.argwhere(~measured[..., layer:] & (guess[..., layer:] < cell_mm)) + [0, 0, layer]
+    above, at = crown.compute_heights_above(bricks.origin + cell_mm * node), tuple(node.T)
     guess[at] = np.maximum(guess[at], above - Crown.NOISE_MM)
     return Distances(guess, bricks.origin, cell_mm)
 
@@ -353,9 +354,14 @@ class Crown:
         found = linprog([0.0, 0.0, -1.0], A_ub=self.normals, b_ub=above, bounds=room)
         return 0.0 if found.x is None else float(found.x[2])
 
+    @property
+    def lowest_mm(self) -> float:
+        """Height from which on the planes bound the head."""
+        return float(self.highest[2]) - 60.0 / 3.0
+
     def compute_heights_above(self, points: Array) -> Array:
         """Height (N,) mm of points (N, 3) at the top of the head above its planes; -inf elsewhere."""
-        near = points[:, 2] > self.highest[2] - 60.0 / 3.0
+        near = points[:, 2] > self.lowest_mm
         near &= np.hypot(*(points[:, :2] - self.highest[:2]).T) < CROWN_RADIUS_MM
         above = np.full(len(points), -np.inf)
         above[near] = np.max(points[near] @ self.normals.T - self.offsets, axis=1, initial=-np.inf)

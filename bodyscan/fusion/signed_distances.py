@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
 
 from bodyscan.arrays import Array, Floats, Mask
 from bodyscan.compiled import compiled
 from bodyscan.mesh.body import BodyCloud
 from bodyscan.mesh.surface_nets import SIDE, Bricks
-from bodyscan.progress import map_threads, split_range
 
 REACH_CELLS = 1.3
 """Reach of a point: an edge that crosses the surface ends within one cell."""
@@ -53,13 +50,18 @@ def splat_planes(
     return sums, weights
 
 
+@compiled
 def find_near_bricks(points: Array, origin: Array, cell_mm: float, shape: tuple[int, ...]) -> Mask:
     """Find the bricks (a, b, c) with nodes within, or next to, a point's reach."""
     near, margin = np.zeros(shape, np.bool_), REACH_CELLS + 2.0
-    cells = (points - origin) / cell_mm
-    ends = [((cells + step) // SIDE).astype(np.int32).T for step in (-margin, margin)]
-    for x, y, z in product(*zip(*ends, strict=True)):
-        near[x, y, z] = True
+    first, last = np.empty(3, np.int64), np.empty(3, np.int64)
+    for n in range(len(points)):
+        for axis in range(3):
+            place = (points[n, axis] - origin[axis]) / cell_mm
+            first[axis], last[axis] = (place - margin) // SIDE, (place + margin) // SIDE
+        for i in range(first[0], last[0] + 1):
+            for j in range(first[1], last[1] + 1):
+                near[i, j, first[2] : last[2] + 1] = True
     return near
 
 
@@ -113,14 +115,28 @@ def find_crossed_bricks(distances: Distances, cell_mm: float, shape: tuple[int, 
 def interpolate_distances(distances: Distances, bricks: Bricks) -> Floats:
     """Interpolate distances linearly at the nodes of a finer grid with the same origin; beyond the
     grid as at its rim."""
-    nodes = SIDE * bricks.indices[..., None] + np.arange(SIDE)
-    x, y, z = np.moveaxis(nodes * (bricks.cell_mm / distances.cell_mm), 1, 0)
-    found = np.empty(bricks.shape, np.float32)
+    return _interpolate(distances.values, bricks.indices, bricks.cell_mm / distances.cell_mm)
 
-    def fill(part: slice) -> None:
-        at = x[part, :, None, None], y[part, None, :, None], z[part, None, None, :]
-        places = np.stack(np.broadcast_arrays(*at))
-        map_coordinates(distances.values, places, found[part], order=1, mode="nearest")
 
-    map_threads(fill, split_range(len(found)))
+@compiled
+def _interpolate(values: Floats, indices: NDArray[np.int32], ratio: float) -> Floats:
+    """From values (a, b, c) to (B, SIDE, SIDE, SIDE); ratio: of the finer cell to theirs."""
+    found = np.empty((len(indices), SIDE, SIDE, SIDE), np.float32)
+    first, share = np.empty((3, SIDE), np.int64), np.empty((3, SIDE))
+    for brick in range(len(indices)):
+        for axis in range(3):
+            for node in range(SIDE):
+                place = min((SIDE * indices[brick, axis] + node) * ratio, values.shape[axis] - 1.0)
+                first[axis, node] = min(int(place), values.shape[axis] - 2)
+                share[axis, node] = place - first[axis, node]
+        for i in range(SIDE):
+            for j in range(SIDE):
+                a, b, p, q = first[0, i], first[1, j], share[0, i], share[1, j]
+                for k in range(SIDE):
+                    c, z, total = first[2, k], share[2, k], 0.0
+                    for step in range(4):
+                        row = values[a + step // 2, b + step % 2]
+                        across = (p if step > 1 else 1.0 - p) * (q if step % 2 else 1.0 - q)
+                        total += across * (row[c] + z * (row[c + 1] - row[c]))
+                    found[brick, i, j, k] = total
     return found

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from bodyscan.arrays import Array, Floats, Indices, Mask
+from bodyscan.compiled import compiled
 from bodyscan.mesh.body import BodyCloud
 from bodyscan.mesh.topology import face_normals
 from bodyscan.progress import THREADS
@@ -55,7 +56,9 @@ def measure_support(vertices: Array, normals: Floats, cloud: BodyCloud, reach_mm
     distance, near = tree.query(vertices, 8, distance_upper_bound=reach_mm, workers=THREADS)
     near = np.minimum(near, len(cloud.points) - 1)  # for those without: any
     distance = np.asarray(distance)
-    around = _average_planes(vertices, normals, distance, near, cloud, 0.5 * reach_mm)
+    around = _average_planes(
+        (vertices, normals), (cloud.points, cloud.normals), distance, near, 0.5 * reach_mm
+    )
     nearest = near[:, 0]
     return Support(nearest, cloud.sigma_mm[nearest], *around, reach_mm)
 
@@ -84,25 +87,38 @@ def fit_to_points(vertices: Array, faces: Indices, normals: Floats, around: Supp
     return vertices + move[:, None] * normals
 
 
+@compiled
 def _average_planes(
-    vertices: Array,
-    normals: Floats,
+    surface: tuple[Array, Floats],
+    cloud: tuple[Array, Floats],
     distance: Array,
     near: Indices,
-    cloud: BodyCloud,
     scale_mm: float,
 ) -> tuple[Array, Array, Array]:
     """Weight, shift and scatter as in `Support`, from the nearest points.
 
+    surface, cloud: points and normals.
     distance, near: (V, k), infinite where there are no more points. A point's weight falls off as a
         Gaussian; one that faces another direction counts for the scatter only.
     """
-    point_normals = cloud.normals[near]
-    planes = np.einsum("vkc,vkc->vk", cloud.points[near] - vertices[:, None], point_normals)
-    cosine = np.einsum("vc,vkc->vk", normals, point_normals)
-    weights = np.exp(-0.5 * (distance / scale_mm) ** 2)
-    facing = weights * np.maximum(cosine, 0.0) ** 2
-    weight, tiny = facing.sum(axis=1), np.finfo(float).tiny
-    shift = np.sum(facing * planes, axis=1) / np.maximum(weight, tiny)
-    squares = np.sum(weights * (planes - shift[:, None]) ** 2, axis=1)
-    return weight, shift, np.sqrt(squares / np.maximum(weights.sum(axis=1), tiny))
+    (vertices, normals), (points, point_normals) = surface, cloud
+    (count, size), tiny = near.shape, 1e-300
+    weight, shift, scatter = np.zeros(count), np.zeros(count), np.empty(count)
+    planes, weights = np.empty(size), np.empty(size)
+    for n in range(count):
+        squares = 0.0
+        for j in range(size):
+            k, planes[j], cosine = near[n, j], 0.0, 0.0
+            for axis in range(3):
+                normal = point_normals[k, axis]
+                planes[j] += (points[k, axis] - vertices[n, axis]) * normal
+                cosine += normals[n, axis] * normal
+            weights[j] = np.exp(-0.5 * (distance[n, j] / scale_mm) ** 2)
+            facing = weights[j] * max(cosine, 0.0) ** 2
+            weight[n] += facing
+            shift[n] += facing * planes[j]
+        shift[n] /= max(weight[n], tiny)
+        for j in range(size):
+            squares += weights[j] * (planes[j] - shift[n]) ** 2
+        scatter[n] = np.sqrt(squares / max(weights.sum(), tiny))
+    return weight, shift, scatter

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from bodyscan.arrays import Array, Floats, Mask
-from bodyscan.compiled import compiled
+from bodyscan.arrays import Array, Floats
 from bodyscan.geometry.bowed_sheets import BOW_DEGREE, PLANE_DEGREE, BowedSheets
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.camera_tables import look_up_rays, ray_table
@@ -102,51 +101,24 @@ def triangulate_image(
     viewing rays (height, width): sigma_mm, and common_mm, the part that neighbours share.
     """
     pixels, limit = ray_table(camera), _max_relative_sigma(sheets)
-    shared = np.zeros_like(s) if shared is None else shared
     points = np.full((*s.shape, 3), np.nan, np.float32)
     sigma_mm, common_mm = np.full((2, *s.shape), np.nan, np.float32)
     for first in range(0, len(s), BAND):
         rows = slice(first, first + BAND)
         wanted = np.isfinite(s[rows])
-        rays = look_up_rays(pixels, wanted, first)
-        found = sheets.intersect(rays, s[rows][wanted].astype(np.float64))
-        errors = sigma[rows], shared[rows]
-        _place_points(
-            wanted, rays, (found.depth, found.per_stripe, found.variance_mm2), errors, limit,
-            (points[rows], sigma_mm[rows], common_mm[rows]),
-        )  # fmt: skip
+        rays, at = look_up_rays(pixels, wanted, first), np.flatnonzero(wanted)
+        found = sheets.intersect(rays, s[rows].take(at).astype(np.float64))
+        common = found.variance_mm2
+        if shared is not None:
+            common = common + np.square(found.per_stripe * shared[rows].take(at))
+        longer = np.einsum("nc,nc->n", rays, rays)  # mm along the ray by mm of depth, squared
+        along = np.sqrt((np.square(found.per_stripe * sigma[rows].take(at)) + common) * longer)
+        known = (found.variance_mm2 <= np.square(limit * found.depth)) & np.isfinite(along)
+        at = at[known]
+        points[rows].reshape(-1, 3)[at] = (rays * found.depth[:, None])[known]
+        sigma_mm[rows].reshape(-1)[at] = along[known]
+        common_mm[rows].reshape(-1)[at] = np.sqrt(common * longer)[known]
     return points, sigma_mm, common_mm
-
-
-@compiled
-def _place_points(
-    wanted: Mask,
-    rays: Array,
-    found: tuple[Array, Array, Array],
-    errors: tuple[Floats, Floats],
-    limit: float,
-    images: tuple[Floats, Floats, Floats],
-) -> None:
-    """Write what `triangulate_image` returns for some of its rows.
-
-    rays, found: (N, 3) and `RayDepths` of the wanted pixels (rows, width).
-    errors: standard deviations of s, of each pixel and shared, (rows, width).
-    """
-    (depth, per_stripe, variance), (sigma, shared) = found, errors
-    points, sigma_mm, common_mm = images
-    n = 0
-    for v in range(wanted.shape[0]):
-        for u in range(wanted.shape[1]):
-            if not wanted[v, u]:
-                continue
-            x, y, z = rays[n, 0], rays[n, 1], depth[n]
-            longer = x * x + y * y + 1.0  # than one mm of depth, one mm along the ray, squared
-            common = variance[n] + (per_stripe[n] * shared[v, u]) ** 2
-            along = np.sqrt(((per_stripe[n] * sigma[v, u]) ** 2 + common) * longer)
-            if variance[n] <= (limit * z) ** 2 and np.isfinite(along):
-                points[v, u, 0], points[v, u, 1], points[v, u, 2] = x * z, y * z, z
-                sigma_mm[v, u], common_mm[v, u] = along, np.sqrt(common * longer)
-            n += 1
 
 
 def _max_relative_sigma(sheets: LightSheets) -> float:

@@ -14,7 +14,6 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 
 from bodyscan.arrays import Array, Indices
-from bodyscan.compiled import compiled
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.progress import THREADS
 
@@ -211,28 +210,11 @@ def _find_opposite_cells(centres: Array, normals: Array) -> Indices:
     Within 300 mm, the thickest trunk; straight is a cosine of 0.85 between the line through the
     limb and the normals at both ends.
     """
-    nearest = _find_nearest_behind(centres, normals)
-    found = np.flatnonzero(nearest >= 0)
+    x, n = (values.astype(np.float32) for values in (centres - centres.mean(axis=0), normals))
+    depth = np.sum(x * n, axis=1) - x @ n.T  # [j, i]: of j behind i
+    square = np.sum(x**2, axis=1)
+    distance = np.sqrt(np.maximum(square[:, None] + square - 2.0 * x @ x.T, np.float32(1.0)))
+    opposite = (np.minimum(depth, depth.T) > 0.85 * distance) & (distance < 300.0)
+    nearest = np.argmin(np.where(opposite, distance, np.float32(np.inf)), axis=1)
+    found = np.flatnonzero(np.any(opposite, axis=1))
     return np.stack([found, nearest[found]], axis=1)
-
-
-@compiled
-def _find_nearest_behind(centres: Array, normals: Array) -> Indices:
-    """The cell (C,) that `_find_opposite_cells` finds behind each, -1 for none."""
-    nearest, count = np.full(len(centres), -1, np.int64), len(centres)
-    closest = np.full(count, 300.0**2)
-    for i in range(count):
-        for j in range(i):
-            behind_i = before_j = square = 0.0
-            for k in range(3):
-                step = centres[i, k] - centres[j, k]
-                square += step * step
-                behind_i += step * normals[i, k]
-                before_j -= step * normals[j, k]
-            depth = min(behind_i, before_j)
-            if depth > 0.0 and depth * depth > 0.85**2 * square:
-                if square < closest[i]:
-                    nearest[i], closest[i] = j, square
-                if square < closest[j]:
-                    nearest[j], closest[j] = i, square
-    return nearest

@@ -82,7 +82,7 @@ def draw_cloud(
     if colour == "photo":
         return png(_draw_points(points, normals, cloud.colours[:, ::-1], views, height_px), views)
     if colour == "sigma":
-        scale = Scale(0.0, float(np.percentile(values, 98)), "sigma, mm", turbo())
+        scale = Scale(0.0, float(np.percentile(values[::10], 98)), "sigma, mm", turbo())
     elif colour == "pairs_seen":
         scale, values = Scale(0.0, 6.0, "pairs", turbo()), cloud.pairs_seen.astype(np.float32)
     else:
@@ -145,7 +145,7 @@ def _frames(points: Array, views: Sequence[str], height_px: int) -> list[_Frame]
     low, high = points.min(axis=0), points.max(axis=0)
     step = float((high - low).max() + 40.0) / height_px
     middle = 0.5 * (low[2] + high[2])
-    body = find_body_frame(points)
+    body = find_body_frame(points[:: max(1, len(points) // 50_000)])
     turn = body.rig_from_body.rotation if body.known else np.eye(3)
     frames = []
     for view in views:
