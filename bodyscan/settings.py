@@ -21,7 +21,7 @@ from bodyscan.files.model import Model, Problem
 from bodyscan.progress import THREADS
 
 Millimetres = Annotated[float, Field(gt=0)]
-MeshVersion = Literal["full", "light", "open"]
+MeshVersion = Literal["full", "light", "open", "registered"]
 
 BODY_CENTRE_MM = (0.0, 0.0, 900.0)
 """Rig frame, mm: roughly the middle of a standing person. A pair's motion is stated at this point,
@@ -156,7 +156,8 @@ class ExportSettings(Model):
     up, glb in metres with y up."""
 
     versions: tuple[MeshVersion, ...] = Field(default=("full", "light"), min_length=1)
-    """full; light: 50,000 faces, which any viewer can turn; open: without the filled faces."""
+    """full; light: 50,000 faces, which any viewer can turn; open: without the filled faces; registered:
+    a parametric body laid over it, in one topology for all people, with parts, landmarks, skeleton."""
 
     deface: bool = False
     """remove the face, for sharing; everything below the neck stays as it is."""

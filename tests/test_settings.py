@@ -12,7 +12,6 @@ import pytest
 
 from bodyscan import settings
 from bodyscan.files.model import Model
-from bodyscan.progress import THREADS
 
 PACKAGE = Path(settings.__file__).parent
 MODELS = {
@@ -56,16 +55,6 @@ def test_beside_every_value_stand_its_unit_and_its_meaning(name: str) -> None:
     for value, said in zip(body, [*body[1:], None], strict=True):
         if isinstance(value, ast.AnnAssign) and "Settings" not in ast.unparse(value.annotation):
             assert isinstance(said, ast.Expr), f"{name}.{ast.unparse(value.target)} says nothing"
-
-
-def test_how_many_threads_is_said_once() -> None:
-    found = [
-        f"{path}:{line}"
-        for path, tree in trees().items()
-        for line, name, value in defaults(tree)
-        if name == "workers" and value == THREADS
-    ]
-    assert not found
 
 
 def defaults(tree: ast.AST) -> Iterator[tuple[int, str, object]]:

@@ -26,6 +26,7 @@ from bodyscan.body_model.template import (
     pose_body,
 )
 from bodyscan.geometry.robust import rms
+from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.topology import directed_edges, vertex_normals
 
 NORMAL_MM = 80.0
@@ -57,17 +58,39 @@ class FittedBody:
     """A template laid over a scan.
 
     vertices: (V, 3), mm, body frame; the template's topology.
-    body: shape and pose before the residual.
+    shape: (K,) of the template, and posed: its body in that shape and pose, before the residual.
     distance_mm: (V,), from each vertex to the surface along its normal; NaN where nothing was measured.
     rms_mm: of the distances of shape and pose alone: what the basis could not make.
     """
 
     template: BodyTemplate
     vertices: Array
-    body: BodyShapeAndPose
+    shape: Array
     posed: PosedBody
     distance_mm: Array
     rms_mm: float
+
+    @property
+    def rest_joints(self) -> Array:
+        """Joints (J, 3) of its shape in the rest pose, mm."""
+        return self.template.joints + np.tensordot(self.shape, self.template.joint_shapes, axes=1)
+
+    def transform(self, a_from_b: RigidTransform) -> FittedBody:
+        """Transform from frame b to frame a."""
+        posed = PosedBody(
+            a_from_b.apply(self.posed.vertices),
+            a_from_b.rotation @ self.posed.rotations,
+            a_from_b.apply(self.posed.joints),
+        )
+        return replace(self, vertices=a_from_b.apply(self.vertices), posed=posed)
+
+    def find_rest_vertices(self, weights: Array) -> Array:
+        """Vertices (V, 3) in the rest pose, from which skinning by weights (V, J) gives `vertices`."""
+        rotations = self.posed.rotations
+        offsets = self.posed.joints - np.einsum("jab,jb->ja", rotations, self.rest_joints)
+        blended = np.einsum("vj,jab->vab", weights, rotations)
+        moved = self.vertices - weights @ offsets
+        return np.asarray(np.linalg.solve(blended, moved[:, :, None])[:, :, 0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +105,7 @@ class _Matches:
 
 def fit_body(template: BodyTemplate, surface: Surface) -> FittedBody:
     """Fit a template to a standing body's surface (body frame, floor at z = 0)."""
-    tree = KDTree(_lift(surface.points, surface.normals))
+    tree = KDTree(join_positions_normals(surface.points, surface.normals))
     starts = [_start(template, surface, arms) for arms in START_ARMS_DEG]
     tried = [
         _fit_pose(template, surface, tree, start, (120.0, 100.0, 80.0, 70.0, 60.0, 50.0, 40.0))
@@ -102,20 +125,22 @@ def fit_body(template: BodyTemplate, surface: Surface) -> FittedBody:
     vertices = _fit_residual(template, surface, tree, posed.vertices)
     distance = _measure_distance(template, surface, tree, vertices)
     rms_mm = rms(missed) if missed.size else float("nan")
-    return FittedBody(template, vertices, body, posed, distance, rms_mm)
+    return FittedBody(template, vertices, body.shape, posed, distance, rms_mm)
 
 
 def _measure_distance(
     template: BodyTemplate, surface: Surface, tree: KDTree, vertices: Array
 ) -> Array:
     """Signed distance (V,) mm of vertices from the surface, along its normals; NaN without a match."""
-    matches = _match(template, surface, tree, vertices, 10.0)
+    normals = _compute_normals(template, vertices)
+    matches = _match(template, surface, tree, vertices, normals, 10.0)
     distance = np.einsum("vi,vi->v", vertices - matches.points, matches.normals)
     distance[matches.weights == 0.0] = np.nan
     return distance
 
 
-def _lift(points: Array, normals: Array) -> Array:
+def join_positions_normals(points: Array, normals: Array) -> Array:
+    """Points (N, 6) whose distance is that of position and normal together, mm."""
     return np.hstack([points, NORMAL_MM / np.sqrt(2.0) * normals])
 
 
@@ -137,12 +162,20 @@ def _start(template: BodyTemplate, surface: Surface, arms_deg: float) -> BodySha
     return BodyShapeAndPose(shape, rotations, np.append(centre, -vertices[:, 2].min()))
 
 
+def _compute_normals(template: BodyTemplate, vertices: Array) -> Array:
+    return vertex_normals(vertices, template.faces).astype(np.float64)
+
+
 def _match(
-    template: BodyTemplate, surface: Surface, tree: KDTree, vertices: Array, scale_mm: float
+    template: BodyTemplate,
+    surface: Surface,
+    tree: KDTree,
+    vertices: Array,
+    normals: Array,
+    scale_mm: float,
 ) -> _Matches:
     """Match every vertex to its closest point; weight 0 far off, with unlike normals, beside holes."""
-    normals = vertex_normals(vertices, template.faces).astype(np.float64)
-    _, nearest = tree.query(_lift(vertices, normals))
+    _, nearest = tree.query(join_positions_normals(vertices, normals))
     points, target = surface.points[nearest], surface.normals[nearest]
     weights = _weigh(vertices - points, normals, target, scale_mm)
     weights[template.hidden] = 0.0
@@ -150,15 +183,15 @@ def _match(
 
 
 def _match_back(
-    template: BodyTemplate, surface: Surface, vertices: Array, scale_mm: float
+    template: BodyTemplate, surface: Surface, vertices: Array, normals: Array, scale_mm: float
 ) -> _Matches:
     """Match a few thousand points to their closest vertices: what draws a limb that fits nothing yet to
     the surface that nothing fits."""
     sample = slice(None, None, max(1, len(surface.points) // 4000))
     points, target = surface.points[sample], surface.normals[sample]
-    normals = vertex_normals(vertices, template.faces).astype(np.float64)
     shown = np.flatnonzero(~template.hidden)
-    _, nearest = KDTree(_lift(vertices[shown], normals[shown])).query(_lift(points, target))
+    there = KDTree(join_positions_normals(vertices[shown], normals[shown]))
+    _, nearest = there.query(join_positions_normals(points, target))
     found = shown[nearest]
     weights = _weigh(vertices[found] - points, normals[found], target, scale_mm)
     return _Matches(found, points, target, weights)
@@ -186,8 +219,9 @@ def _fit_pose(
     cost = np.inf
     for scale in scales_mm:
         posed = pose_body(template, body)
-        found = _match(template, surface, tree, posed.vertices, scale)
-        back = _match_back(template, surface, posed.vertices, scale)
+        normals = _compute_normals(template, posed.vertices)
+        found = _match(template, surface, tree, posed.vertices, normals, scale)
+        back = _match_back(template, surface, posed.vertices, normals, scale)
         body, cost = _step(template, body, posed, [found, back], max(BASIS_MM, scale / 4.0))
         missing = 2.0 - found.weights[~template.hidden].mean() - back.weights.mean()
         cost += missing * len(template.vertices) / 25.0
@@ -271,7 +305,8 @@ def _fit_residual(template: BodyTemplate, surface: Surface, tree: KDTree, vertic
     smooth = (laplacian.T @ laplacian).tocsc()
     rest = vertices
     for stiffness, scale in ((10.0, 20.0), (1.0, 12.0), (0.1, 8.0), (0.1, 8.0)):
-        matches = _match(template, surface, tree, vertices, scale)
+        normals = _compute_normals(template, vertices)
+        matches = _match(template, surface, tree, vertices, normals, scale)
         gap = np.einsum("vi,vi->v", matches.points - vertices, matches.normals)
         target = vertices - rest + gap[:, None] * matches.normals
         system = stiffness * smooth + sparse.diags(matches.weights + 1e-4)

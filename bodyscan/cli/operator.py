@@ -192,6 +192,10 @@ def measure(
             "--named", help="Also lay a body over the scan: landmarks, and measures by name."
         ),
     ] = False,
+    landmarks: Annotated[
+        Path | None,
+        typer.Option(help="With --named: also write the landmarks to this .csv, .json or .lnd."),
+    ] = None,
     anyway: Anyway = False,
 ) -> None:
     """Measure a scan's mesh: stature, girths of horizontal slices, volume, area."""
@@ -204,10 +208,10 @@ def measure(
         measurements_document,
         named_csv,
         tables,
+        write_landmarks,
     )
 
-    levels = None if heights is None else heights_from(heights)
-    stored = load_scan(result)
+    stored, levels = load_scan(result), None if heights is None else heights_from(heights)
     if not anyway:
         refuse_repeat(result, stored.facts)
     measured = measure_mesh(stored.mesh, levels, named=named)
@@ -219,12 +223,16 @@ def measure(
         write_text(path, table)
     else:
         write_json(path, content)
-    if path.suffix != ".json":
-        # As beside an export, so that `bodyscan forget` knows whose it is.
-        write_json(path.with_name(f"{path.name}.json"), {"subject": content["subject"]})
+    if landmarks is not None and measured.named is not None:
+        write_landmarks(landmarks, measured.named, stored.facts)
+    written = [path, *([landmarks] if landmarks is not None and named else [])]
+    for one in written:
+        if one.suffix != ".json":
+            # As beside an export, so that `bodyscan forget` knows whose it is.
+            write_json(one.with_name(f"{one.name}.json"), {"subject": content["subject"]})
     output.show(*tables(measured))
     output.figures(**content)
-    output.add_files("measurements", path)
+    output.add_files("measurements", *written)
 
 
 def export(
@@ -238,6 +246,14 @@ def export(
         bool,
         typer.Option(
             "--deface", help="Replace the head by a plain one, for sharing; writes into `shared`."
+        ),
+    ] = False,
+    registered: Annotated[
+        bool,
+        typer.Option(
+            "--registered",
+            help="Also lay a parametric body over the scan: one topology for all, with parts, "
+            "landmarks, skeleton.",
         ),
     ] = False,
     frame: Annotated[
@@ -255,7 +271,9 @@ def export(
         stored = load_scan(result)
         if not anyway:
             refuse_repeat(result, stored.facts)
-        written = export_scan(stored, folder, formats.split(","), deface=deface, frame=frame)
+        versions = (*ExportSettings().versions, *(["registered"] if registered else []))
+        chosen = formats.split(",")
+        written = export_scan(stored, folder, chosen, versions, deface=deface, frame=frame)
     for path in written:
         output.add_files("export", path)
 

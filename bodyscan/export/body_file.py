@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from bodyscan.arrays import Array
+from bodyscan.body_model.skinned import SkinnedBody
 from bodyscan.export.formats import BODY_FORMATS, BodyFormat
 from bodyscan.files.atomic import write_json
 from bodyscan.files.registry import unknown_format_error
@@ -37,11 +38,11 @@ class Provenance:
     rig_from_body: RigidTransform | None = None
 
 
-def write_body(path: Path, body: BodyCloud | BodyMesh, origin: Provenance) -> None:
+def write_body(path: Path, body: BodyCloud | BodyMesh | SkinnedBody, origin: Provenance) -> None:
     """Write `body` in the format that `path`'s suffix names, and `<path>.json` beside it.
 
-    A mesh is written without its faces of zero area. Raises BadInput for a suffix that is not that
-    of a format, or of one that cannot hold a cloud.
+    A mesh is written without its faces of zero area; a registered body has all of them. Raises
+    BadInput for a suffix that is not that of a format, or of one that cannot hold a cloud.
     """
     path = Path(path)
     kind = "cloud" if isinstance(body, BodyCloud) else "mesh"
@@ -51,9 +52,15 @@ def write_body(path: Path, body: BodyCloud | BodyMesh, origin: Provenance) -> No
         what = name or "a file without suffix"
         raise unknown_format_error(f"a {kind}", what, able, where=str(path))
     format_ = BODY_FORMATS.find(name)
-    if isinstance(body, BodyMesh):
-        body = collapse_slivers(body)
-    format_.write(path, body)
+    if isinstance(body, SkinnedBody):
+        if format_.write_skinned is None:
+            format_.write(path, body.mesh)
+        else:
+            format_.write_skinned(path, body)
+        body = body.mesh
+    else:
+        body = collapse_slivers(body) if isinstance(body, BodyMesh) else body
+        format_.write(path, body)
     write_json(path.with_name(f"{path.name}.json"), describe_body(path.name, format_, body, origin))
 
 

@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from bodyscan.body_model.registered import register_body
+from bodyscan.body_model.skinned import SkinnedBody, make_skinned
 from bodyscan.errors import BadInput
 from bodyscan.export.body_file import Provenance, write_body
 from bodyscan.export.defacing import deface as replace_head
@@ -17,6 +19,8 @@ from bodyscan.export.formats import BODY_FORMATS
 from bodyscan.files.model import did_you_mean
 from bodyscan.fusion.storage import StoredScan
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.measurement.landmarks import find_landmarks
+from bodyscan.measurement.sections import BodySections
 from bodyscan.mesh.body import BodyMesh
 from bodyscan.mesh.body_parts import find_body_frame
 from bodyscan.mesh.repair import decimate
@@ -40,37 +44,53 @@ def export_scan(
 ) -> list[Path]:
     """Write the mesh in each format (see `BODY_FORMATS`) and version; returns the paths.
 
-    versions: full, light (50,000 faces), open (without filled faces). Each file has a JSON beside
-        it.
+    versions: full, light (50,000 faces), open (without filled faces), registered (a parametric body
+        laid over the scan). Each file has a JSON beside it.
     deface: replace the subject's head by a plain one; below the neck nothing changes. The JSON then
         has neither pseudonym nor date.
     frame: rig, or body (origin under the body, x the way it faces).
 
-    Raises BadInput for an unknown format, version or frame, FailedWork if no neck is found.
+    Raises BadInput for an unknown format, version or frame, for a registered body that shows a face
+    or fits nobody; FailedWork if no neck is found.
     """
     names = [name.strip().lower().removeprefix(".") for name in formats]
     for name in names:
         BODY_FORMATS.find(name)
-    for name, known in [*((version, VERSIONS) for version in versions), (frame, ("rig", "body"))]:
+    every = (*VERSIONS, "registered")
+    for name, known in [*((version, every) for version in versions), (frame, ("rig", "body"))]:
         if name not in known:
             what = f"there is no {name!r} to export{did_you_mean(name, known)}"
             raise BadInput(what, remedy=f"Choose from {', '.join(known)}.")
+    if deface and "registered" in versions:
+        what = "a registered body shows the face, which is to be removed"
+        raise BadInput(what, remedy="Leave out one of `registered` and `deface`.")
     pose = find_body_frame(scan.mesh.vertices).rig_from_body if frame == "body" else None
     subject, identity = None if deface else scan.facts.get("subject"), scan.facts["calibration_id"]
     origin = Provenance(subject, identity, deface, _find_facts(scan.facts, deface), pose)
     neck = find_neck(scan.mesh.vertices, scan.mesh.faces) if deface else None
     written = []
     for version in versions:
-        stem, convert = VERSIONS[version]
-        mesh = convert(scan.mesh)
-        if neck is not None:
-            mesh = replace_head(mesh, neck)
-        if pose is not None:
-            mesh = transform_mesh(mesh, pose.inverse())
+        body: BodyMesh | SkinnedBody
+        if version == "registered":
+            stem, body = "body-registered", _register(scan.mesh, pose)
+        else:
+            stem, convert = VERSIONS[version]
+            body = convert(scan.mesh)
+            body = body if neck is None else replace_head(body, neck)
+            body = body if pose is None else transform_mesh(body, pose.inverse())
         for name in names:
             written.append(folder / f"{stem}.{name}")
-            write_body(written[-1], mesh, origin)
+            write_body(written[-1], body, origin)
     return written
+
+
+def _register(mesh: BodyMesh, rig_from_frame: RigidTransform | None) -> SkinnedBody:
+    """Lay the parametric body over a scan's mesh, with its landmarks."""
+    registered = register_body(mesh)
+    landmarks = find_landmarks(BodySections(registered)).values()
+    carried = [(one.name, np.array(one.position_mm), one.sigma_mm, one.found) for one in landmarks]
+    frame = RigidTransform.identity() if rig_from_frame is None else rig_from_frame.inverse()
+    return make_skinned(registered, carried, frame)
 
 
 def _find_facts(facts: Mapping[str, Any], shared: bool) -> dict[str, Any]:

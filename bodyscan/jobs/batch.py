@@ -68,8 +68,9 @@ def hold_output(out: Path) -> Iterator[None]:
         except OSError as error:
             raise BadInput(f"cannot be written: {error.strerror}", where=str(out)) from error
         with lock_file(out / BATCH_LOCK, wait=False):
-            for path in (*out.glob(".summary.*.tmp.csv"), *out.glob(".manifest.*.tmp.json")):
-                path.unlink(missing_ok=True)
+            for name in ("summary.*.tmp.csv", "measures.*.tmp.csv", "manifest.*.tmp.json"):
+                for path in out.glob(f".{name}"):
+                    path.unlink(missing_ok=True)
             yield
 
 
@@ -209,11 +210,18 @@ def finish(jobs: Sequence[Job], outcomes: Sequence[JobResult], out: Path) -> dic
 
     Raises FailedWork if they cannot be written.
     """
-    from bodyscan.jobs.summary import find_drift, scans_to_repeat, write_out_manifest, write_summary
+    from bodyscan.jobs.summary import (
+        find_drift,
+        scans_to_repeat,
+        write_day_measures,
+        write_out_manifest,
+        write_summary,
+    )
 
     try:
         with restrict_to_owner():
             table = write_summary(jobs, outcomes, out)
+            measures = write_day_measures(jobs, out)
             write_out_manifest(out)
     except OSError as error:
         raise FailedWork(
@@ -232,6 +240,7 @@ def finish(jobs: Sequence[Job], outcomes: Sequence[JobResult], out: Path) -> dic
         "repeat": scans_to_repeat(done),
         "drifted": {one.pair: round(one.shift_mm, 2) for one in find_drift(done)},
         "table": str(table),
+        "measures": measures and str(measures),
     }
 
 

@@ -24,7 +24,7 @@ from bodyscan.captures.captures_file import FILE_NAME as CAPTURES
 from bodyscan.errors import BadInput
 from bodyscan.files.atomic import lock_file, restrict_to_owner, write_text
 from bodyscan.files.yaml_file import YamlError, read_yaml
-from bodyscan.jobs.job import BATCH_LOCK, CALIBRATION, JOB, MANIFEST, SUMMARY
+from bodyscan.jobs.job import BATCH_LOCK, CALIBRATION, JOB, MANIFEST, MEASURES, SUMMARY
 from bodyscan.jobs.summary import write_out_manifest
 
 # Removed in this order, so that the file which names the owner goes last: an interrupted removal
@@ -43,7 +43,7 @@ class SubjectFiles:
     files: of the subject.
     folders: of the subject alone.
     tables: folders of batches, whose manifests are rewritten.
-    rows: those of them whose summary has rows of the subject.
+    rows: their tables that have rows of the subject.
     unreadable: files that should name a folder's owner, and do not.
     unnamed: folders whose images or bodies name nobody, with how many there are in and below them.
     """
@@ -83,7 +83,8 @@ def find_subject(subject: str, workspace: Path) -> SubjectFiles:
             unnamed[folder] = count
     order = {name: rank for rank, name in enumerate(_MARKERS, start=1)}
     files.sort(key=lambda path: (order.get(path.name, 0), path))
-    rows = [out for out in tables if _drop_rows(subject, out / SUMMARY) is not None]
+    every = [out / name for out in tables for name in (SUMMARY, MEASURES)]
+    rows = [table for table in every if _drop_rows(subject, table) is not None]
     return SubjectFiles(
         *(tuple(files), tuple(folders), tuple(tables), tuple(rows), tuple(unreadable)),
         _count_by_folder(unnamed, named),
@@ -130,8 +131,8 @@ def forget_subject(subject: str, workspace: Path) -> SubjectFiles:
         for out in found.tables:
             locks.enter_context(lock_file(out / BATCH_LOCK, wait=False))
         require_found(found, subject, workspace)
-        for out in found.rows:
-            write_text(out / SUMMARY, _drop_rows(subject, out / SUMMARY) or "")
+        for table in found.rows:
+            write_text(table, _drop_rows(subject, table) or "")
         for path in found.files:
             path.unlink(missing_ok=True)
         for folder in sorted(found.folders, reverse=True):
@@ -151,7 +152,7 @@ def list_by_folder(found: SubjectFiles) -> Iterator[str]:
     counts = Counter(one for folders in inside.values() for one in folders)
     yield from (f"{folder} ({counts[folder]} files)" for folder in highest)
     yield from (str(path) for path, folders in inside.items() if not folders)
-    yield from (f"the subject's rows of {out / SUMMARY}" for out in found.rows)
+    yield from (f"the subject's rows of {table}" for table in found.rows)
 
 
 def require_found(found: SubjectFiles, subject: str, workspace: Path) -> None:
@@ -213,10 +214,10 @@ def _find_exports(folder: Path, names: list[str], subject: str) -> set[str]:
     return found
 
 
-def _drop_rows(subject: str, summary: Path) -> str | None:
-    """The summary without the subject's rows; None if it has none."""
+def _drop_rows(subject: str, path: Path) -> str | None:
+    """A table without the subject's rows; None if it has none."""
     try:
-        text = summary.read_text("utf-8")
+        text = path.read_text("utf-8")
     except OSError:
         return None
     reader = csv.DictReader(io.StringIO(text))

@@ -20,7 +20,8 @@ from bodyscan.jobs.pipeline import Pipeline
 JOB, STATE, LOG, LOCK, MANIFEST = "job.json", "state.json", "log.txt", "lock", "manifest.json"
 KEPT = "kept-"  # begins the name of a folder with what people added to a result that is gone
 STAGE = "stage.json"  # in every stage's folder: what it was made from, and its hashes
-SUMMARY, BATCH_LOCK = "summary.csv", "batch.lock"
+SUMMARY, MEASURES, BATCH_LOCK = "summary.csv", "measures.csv", "batch.lock"
+MEASURES_FILE = f"measures/{MEASURES}"  # a job's, from its folder
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ def job_name(folder_name: str) -> str:
 
     A name with quotes, line breaks or other alphabets thus is safe in every file system and table.
     """
-    reserved = (MANIFEST, SUMMARY, BATCH_LOCK)
+    reserved = (MANIFEST, SUMMARY, MEASURES, BATCH_LOCK)
     plain_name = re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}", folder_name)
     if plain_name and folder_name not in reserved:
         return folder_name

@@ -18,7 +18,18 @@ from bodyscan.captures.captures_file import FILE_NAME as CAPTURES
 from bodyscan.errors import BadInput, BodyscanError, FailedWork
 from bodyscan.files.atomic import scratch_folder
 from bodyscan.files.hashing import list_files
-from bodyscan.jobs.job import KEPT, LOCK, MANIFEST, STAGE, SUMMARY, Job, find_jobs, write_job
+from bodyscan.jobs.job import (
+    KEPT,
+    LOCK,
+    MANIFEST,
+    MEASURES,
+    MEASURES_FILE,
+    STAGE,
+    SUMMARY,
+    Job,
+    find_jobs,
+    write_job,
+)
 from bodyscan.jobs.pipeline import Pipeline
 from bodyscan.jobs.supervision import JobProcess, JobResult, Listen, ignore_events, supervise_job
 
@@ -118,7 +129,7 @@ def fetch_figures(jobs: Sequence[Job], store: Store) -> None:
     for job in jobs:
         with _answering(store.job(job.name)):
             files = _open(store.job(job.name))
-            for name in ("scan/scan.json", "calibration/calibration.json", MANIFEST):
+            for name in ("scan/scan.json", MEASURES_FILE, "calibration/calibration.json", MANIFEST):
                 _fetch_one(files, name, job.folder / name)
 
 
@@ -126,8 +137,9 @@ def put_summary(out: Path, store: Store) -> str:
     """Put back the table and the manifest over all jobs; returns the table's URL."""
     with _answering(store.out):
         files = _open(store.out)
-        for name in (SUMMARY, MANIFEST):
-            _put(files, name, out / name)
+        for name in (SUMMARY, MEASURES, MANIFEST):
+            if (out / name).exists():
+                _put(files, name, out / name)
     return store.job(SUMMARY)
 
 

@@ -86,6 +86,16 @@ def run_scan(
         print(note, flush=True)  # into the job's log
 
 
+def run_measures(job: Job, out: Path, progress: Progress, announce: Announce) -> None:
+    """Measure as `bodyscan measure --named` does, with landmarks; nobody there is no failure."""
+    from bodyscan.fusion.storage import load_scan
+    from bodyscan.report.measurement_table import write_measures
+
+    with step(progress, "measuring"):
+        if reason := write_measures(load_scan(job.folder / "scan"), out):
+            print(f"no measures by name: {reason}", flush=True)  # into the job's log
+
+
 def run_export(job: Job, out: Path, progress: Progress, announce: Announce) -> None:
     """Export as `bodyscan export` does."""
     from bodyscan.export.scan import export_scan
@@ -130,11 +140,15 @@ def run_rig_export(job: Job, out: Path, progress: Progress, announce: Announce) 
         export_rig(load_calibration(job.folder / "calibration"), out, formats)
 
 
-def results_of(stage: str) -> Callable[[Job], dict[str, Path]]:
-    """Inputs that are the results of an earlier stage."""
+def results_of(*stages: str) -> Callable[[Job], dict[str, Path]]:
+    """Inputs that are the results of earlier stages."""
 
     def inputs(job: Job) -> dict[str, Path]:
-        return {f"{stage}/{name}": path for name, path in results_in(job.folder / stage).items()}
+        return {
+            f"{stage}/{name}": path
+            for stage in stages
+            for name, path in results_in(job.folder / stage).items()
+        }
 
     return inputs
 
@@ -142,8 +156,9 @@ def results_of(stage: str) -> Callable[[Job], dict[str, Path]]:
 KINDS: Kinds = {
     "fuse": (
         Stage("scan", 7, ("alignment", "fusion", "mesh"), scan_inputs, run_scan),
+        Stage("measures", 1, (), results_of("scan"), run_measures),
         Stage("export", 4, ("export",), results_of("scan"), run_export),
-        Stage("report", 1, (), results_of("scan"), run_report),
+        Stage("report", 2, (), results_of("scan", "measures"), run_report),
     ),
     "calibrate": (
         Stage("calibration", 3, (), rig_inputs, run_calibrate),

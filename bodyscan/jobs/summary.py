@@ -15,7 +15,7 @@ from bodyscan.alignment.displaced_poles import PairDrift, estimate_drift
 from bodyscan.arrays import Array
 from bodyscan.files.atomic import write_json, write_text
 from bodyscan.files.hashing import file_hash
-from bodyscan.jobs.job import MANIFEST, SUMMARY, Job, read_record
+from bodyscan.jobs.job import MANIFEST, MEASURES, MEASURES_FILE, SUMMARY, Job, read_record
 from bodyscan.jobs.supervision import JobResult
 from bodyscan.settings import BODY_CENTRE_MM
 
@@ -47,8 +47,30 @@ def write_summary(jobs: Sequence[Job], outcomes: Sequence[JobResult], out: Path)
     table = csv.DictWriter(text, (*first, *COLUMNS[kind], "reason"), extrasaction="ignore")
     table.writeheader()
     table.writerows(rows)
-    write_text(out / SUMMARY, text.getvalue().encode("utf-8", "backslashreplace").decode())
+    _write_table(out / SUMMARY, text)
     return out / SUMMARY
+
+
+def _write_table(path: Path, text: io.StringIO) -> None:
+    write_text(path, text.getvalue().encode("utf-8", "backslashreplace").decode())
+
+
+def write_day_measures(jobs: Sequence[Job], out: Path) -> Path | None:
+    """Write measures.csv: the rows of every job's, after the job's name; None if no job has any."""
+    text, table = io.StringIO(), None
+    for job in jobs:
+        try:
+            rows = csv.DictReader(io.StringIO((job.folder / MEASURES_FILE).read_text("utf-8")))
+        except OSError:
+            continue
+        if table is None:
+            table = csv.DictWriter(text, ("job", *(rows.fieldnames or ())), extrasaction="ignore")
+            table.writeheader()
+        table.writerows({"job": job.name} | row | {"subject": job.subject} for row in rows)
+    if table is None:
+        return None
+    _write_table(out / MEASURES, text)
+    return out / MEASURES
 
 
 def write_out_manifest(out: Path) -> None:

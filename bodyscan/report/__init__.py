@@ -3,5 +3,5 @@
 page holds what a report is made of, and result_page finds what a folder holds. scan_page,
 calibration_page (with calibration_charts) and acceptance_page make their reports. pictures shades
 bodies; charts uses Matplotlib; model packs what can be rotated.
-measurement_table: measurements on screen, as JSON and as CSV.
+measurement_table: measurements on screen, as JSON and CSV; measures_section: drawn on the body.
 """

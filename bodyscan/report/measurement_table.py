@@ -1,21 +1,27 @@
-"""Measurements as a table and as a JSON document."""
+"""Measurements as tables, JSON and CSV, and landmarks as files."""
 
 from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.table import Table
 
-from bodyscan.measurement.measurements import Measurements
-from bodyscan.measurement.named import NamedMeasures
+from bodyscan.errors import BadInput
+from bodyscan.files.atomic import json_text, write_json, write_text
+from bodyscan.fusion.storage import StoredScan
+from bodyscan.measurement.measurements import Measurements, measure
+from bodyscan.measurement.named import MIN_MEASURED, Measure, NamedMeasures, read_definitions
 from bodyscan.measurement.outline import Range
 from bodyscan.mesh.body import DARK_CLOTH, HAIR, REGION_NAMES, SKIN
 from bodyscan.version import __version__
 
+MEASUREMENTS = "measurements.json"
 COPIED = (
     *("stature_mm", "stature_measured", "crown", "regions", "volume_l", "area_m2", "measured"),
     *("at_mean_breath", "facing_known"),
@@ -80,36 +86,119 @@ def _format_girth(value: float, between: Range, measured: float) -> str:
     Two measurers with a tape differ by 4 mm (ISO 20685-1).
     """
     low, high = between
-    known = high - low <= 4.0 and measured >= 0.9
+    known = high - low <= 4.0 and measured >= MIN_MEASURED
     return f"{value:.1f}" if known else f"{low:.0f} to {high:.0f}"
 
 
 def _named_table(named: NamedMeasures) -> Table:
     """Measures by name with their 95 % intervals, the interval alone where too little was measured."""
     table = Table(title="measures by name, mm")
-    for heading, side in (("measure", "left"), ("value", "right"), ("95 %", "right")):
-        table.add_column(heading, justify="left" if side == "left" else "right")
-    for measure in named.measures.values():
-        low, high = measure.interval_mm
-        value = "" if measure.is_range else f"{measure.mm:.1f}"
-        style = "yellow" if measure.is_range else ""
-        table.add_row(measure.name, value, f"{low:.0f} to {high:.0f}", style=style)
+    for heading in ("measure", "value", "95 %", "the standard's stance"):
+        table.add_column(heading, justify="right" if heading in ("value", "95 %") else "left")
+    for one in named.measures.values():
+        low, high = one.interval_mm
+        value = "" if one.is_range else f"{one.mm:.1f}"
+        style = "yellow" if one.is_range else ""
+        table.add_row(one.name, value, f"{low:.0f} to {high:.0f}", one.stance, style=style)
     for name, reason in named.missing.items():
-        table.add_row(name, "", reason, style="yellow")
+        table.add_row(name, "", reason, "", style="yellow")
     return table
 
 
-def named_csv(named: NamedMeasures, facts: Mapping[str, Any]) -> str:
-    """Named measures as CSV: a row for each, lengths in mm; facts: of the scan, as in its scan.json."""
-    text = io.StringIO()
-    names = ("subject", "when", "name", "value", "low", "high", "unit", "measured", "standard")
-    table = csv.DictWriter(text, (*names, "definition"), extrasaction="ignore")
-    table.writeheader()
+MEASURE_COLUMNS = (
+    *("subject", "when", "verdict", "name", "value", "low", "high", "unit", "measured"),
+    *("standard", "clause", "stance", "definition", "reason"),
+)
+"""Of a table of measures by name: one row for each person and measure."""
+
+
+def named_csv(named: NamedMeasures | str, facts: Mapping[str, Any]) -> str:
+    """Named measures as CSV: a row for each, lengths in mm; no value where it is a range, neither value
+    nor interval where it could not be taken, for a reason.
+
+    named: or the reason why there are none. facts: of the scan, as in its scan.json.
+    """
+    verdict = (facts.get("verdict") or {}).get("grade")
+    scan = {"subject": facts.get("subject"), "when": facts.get("when"), "verdict": verdict}
+    rows = []
+    for definition in read_definitions():
+        row = scan | {column: definition.get(column) for column in MEASURE_COLUMNS[9:13]}
+        row |= {"name": definition["name"], "unit": "mm", "stance": None, "reason": named}
+        if not isinstance(named, str):
+            row["reason"] = named.missing.get(definition["name"])
+            if measure := named.measures.get(definition["name"]):
+                low, high = (round(end, 1) for end in measure.interval_mm)
+                value = None if measure.is_range else round(measure.mm, 1)
+                row |= {"value": value, "low": low, "high": high, "stance": measure.stance}
+                row["measured"] = round(measure.measured, 3)
+        rows.append(row)
+    return _write_csv(MEASURE_COLUMNS, rows)
+
+
+def landmarks_csv(named: NamedMeasures, facts: Mapping[str, Any]) -> str:
+    """Landmarks as CSV: x, y, z in mm, rig frame; sigma by axis."""
+    columns = ("subject", "when", "name", "x", "y", "z", "sigma", "unit", "found")
     scan = {"subject": facts.get("subject"), "when": facts.get("when"), "unit": "mm"}
-    for measure in named.measures.values():
-        low, high = measure.interval_mm
-        value = None if measure.is_range else measure.mm
-        table.writerow(scan | asdict(measure) | {"value": value, "low": low, "high": high})
+    rows = []
+    for landmark in named.landmarks.values():
+        place = dict(zip("xyz", (round(value, 2) for value in landmark.position_mm), strict=True))
+        row = {"name": landmark.name, "sigma": landmark.sigma_mm, "found": landmark.found}
+        rows.append(scan | row | place)
+    return _write_csv(columns, rows)
+
+
+def landmarks_lnd(named: NamedMeasures, facts: Mapping[str, Any]) -> str:
+    """Landmarks as CAESAR's .lnd files have them, in mm: number, three fields of its scanner's images
+    (0 here), x, y, z, name."""
+    lines = ["UNITS = mm", "AUX ="]
+    for number, landmark in enumerate(named.landmarks.values(), start=1):
+        x, y, z = landmark.position_mm
+        lines.append(f"{number} 0 0 0 {x:.2f} {y:.2f} {z:.2f} {landmark.name.replace(' ', '_')}")
+    return "\n".join([*lines, "END =", ""])
+
+
+def landmarks_json(named: NamedMeasures, facts: Mapping[str, Any]) -> str:
+    """Landmarks as JSON."""
+    content = {"schema": "bodyscan-landmarks", "version": 1, "units": "mm", "frame": "rig"}
+    scan = {"subject": facts.get("subject"), "when": facts.get("when")}
+    landmarks = [asdict(landmark) for landmark in named.landmarks.values()]
+    return json_text(content | scan | {"landmarks": landmarks})
+
+
+LANDMARK_FORMATS = {".csv": landmarks_csv, ".json": landmarks_json, ".lnd": landmarks_lnd}
+
+
+def write_landmarks(path: Path, named: NamedMeasures, facts: Mapping[str, Any]) -> None:
+    """Write landmarks as the path's suffix says. Raises BadInput for another suffix."""
+    if path.suffix.lower() not in LANDMARK_FORMATS:
+        what = f"landmarks cannot be written as {path.suffix!r}"
+        remedy = f"Choose from {', '.join(LANDMARK_FORMATS)}."
+        raise BadInput(what, where=str(path), remedy=remedy)
+    write_text(path, LANDMARK_FORMATS[path.suffix.lower()](named, facts))
+
+
+def write_measures(stored: StoredScan, folder: Path) -> str:
+    """Write measurements.json and measures.csv of a scan, and its landmarks in every format; returns
+    why there are none by name, or "". A scan that no standing body fits has all else."""
+    reason = ""
+    try:
+        measured = measure(stored.mesh, named=True)
+    except BadInput as error:
+        reason, measured = error.what, measure(stored.mesh)
+    named = measured.named
+    write_json(folder / MEASUREMENTS, measurements_document(measured, stored.facts))
+    write_text(folder / "measures.csv", named_csv(named or reason, stored.facts))
+    if named is not None:
+        for suffix in LANDMARK_FORMATS:
+            write_landmarks(folder / f"landmarks{suffix}", named, stored.facts)
+    return reason
+
+
+def _write_csv(columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str:
+    text = io.StringIO()
+    table = csv.DictWriter(text, columns, extrasaction="ignore")
+    table.writeheader()
+    table.writerows(rows)
     return text.getvalue()
 
 
@@ -118,8 +207,9 @@ def measurements_document(measured: Measurements, facts: Mapping[str, Any]) -> d
     named = measured.named
     by_name = named and {
         "landmarks": [asdict(landmark) for landmark in named.landmarks.values()],
-        "measures": [asdict(measure) for measure in named.measures.values()],
+        "measures": [_describe(measure) for measure in named.measures.values()],
         "not_measured": dict(named.missing),
+        "posture": asdict(named.posture),
     }
     return {
         "schema": "bodyscan-measurements",
@@ -139,6 +229,10 @@ def measurements_document(measured: Measurements, facts: Mapping[str, Any]) -> d
     }
 
 
+def _describe(measure: Measure) -> dict[str, Any]:
+    return asdict(measure) | {"path_mm": np.round(measure.path_mm, 1)}
+
+
 def measurements_csv(content: Mapping[str, Any]) -> str:
     """The `measurements_document` as CSV: a row for each part of each slice, beside what is of the
     whole body; lengths in mm, ranges as `low` and `high`."""
@@ -147,12 +241,10 @@ def measurements_csv(content: Mapping[str, Any]) -> str:
     body |= {"grade": (content["verdict"] or {}).get("grade")}
     ends = ("girth_low_mm", "girth_high_mm", "tape_low_mm", "tape_high_mm")
     part = ("part", "girth_mm", "tape_mm", "width_mm", "depth_mm", "area_mm2", "measured")
-    text = io.StringIO()
-    table = csv.DictWriter(text, (*body, "height_mm", *part, *ends), extrasaction="ignore")
-    table.writeheader()
+    rows = []
     for level in content["slices"]:
         for girth in level["girths"]:
             between = (*girth["girth_range_mm"], *girth["tape_range_mm"])
             row = body | girth | {"height_mm": level["height_mm"]}
-            table.writerow(row | dict(zip(ends, between, strict=True)))
-    return text.getvalue()
+            rows.append(row | dict(zip(ends, between, strict=True)))
+    return _write_csv((*body, "height_mm", *part, *ends), rows)

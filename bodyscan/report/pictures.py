@@ -5,7 +5,7 @@ Orthographic views side by side in one PNG.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -68,6 +68,59 @@ def draw_mesh(
     base[mesh.filled] = FILLED_TINT
     frames = _frames(mesh.vertices, views, height_px)
     return png([_draw_faces(mesh, base, frame) for frame in frames], views)
+
+
+@dataclass(frozen=True, eq=False)
+class Callout:
+    """A polyline (N, 3) mm, rig frame, on a picture, with a label and a colour (blue, green, red)."""
+
+    text: str
+    path: Array
+    colour: tuple[int, int, int]
+
+
+def draw_callouts(
+    mesh: BodyMesh, callouts: Mapping[str, Sequence[Callout]], *, height_px: int = 1100
+) -> bytes:
+    """Shaded pictures of a mesh with lines drawn over them by view, each with its label in the margin
+    of its side."""
+    base, wide = np.full((len(mesh.faces), 3), 225, np.uint8), 250  # px, of a margin
+    panels = []
+    frames = _frames(mesh.vertices, tuple(callouts), height_px)
+    for view, frame in zip(callouts, frames, strict=True):
+        margin = np.full((height_px, wide, 3), BACKGROUND, np.uint8)
+        canvas = np.hstack([margin, _draw_faces(mesh, base, frame), margin])
+        ends: dict[bool, list[tuple[float, float, Callout]]] = {False: [], True: []}
+        for callout in callouts[view]:
+            pixels = frame.project(callout.path)[:, :2] + [wide, 0.0]
+            sixteenths = np.rint(pixels * 16.0).astype(np.int32).reshape(-1, 1, 2)
+            cv2.polylines(canvas, [sixteenths], False, callout.colour, 2, cv2.LINE_AA, shift=4)
+            at_right = bool(pixels[:, 0].mean() >= canvas.shape[1] / 2)
+            column, row = pixels[int(np.argmax(pixels[:, 0] if at_right else -pixels[:, 0]))]
+            ends[at_right].append((float(row), float(column), callout))
+        _label_margin(canvas, ends[False], wide - 14, at_right=False)
+        _label_margin(canvas, ends[True], canvas.shape[1] - wide + 14, at_right=True)
+        panels.append(canvas)
+    return png(panels, tuple(callouts))
+
+
+def _label_margin(
+    canvas: Bytes, ends: list[tuple[float, float, Callout]], edge: int, *, at_right: bool
+) -> None:
+    """Write labels beside a column, a line apart, each joined to its line's end (row, column)."""
+    ends.sort(key=lambda end: end[:2])
+    rows, step = [row for row, _, _ in ends], 17.0
+    for k in range(1, len(rows)):  # down from the one above, then up from the bottom
+        rows[k] = max(rows[k], rows[k - 1] + step)
+    below = canvas.shape[0] - 8.0 + step
+    for k in reversed(range(len(rows))):
+        below = rows[k] = min(rows[k], below - step)
+    for place, (row, column, callout) in zip(rows, ends, strict=True):
+        (width, _), _ = cv2.getTextSize(callout.text, cv2.FONT_HERSHEY_SIMPLEX, 0.45, 1)
+        knee = (edge - 4 if at_right else edge + 4, round(place) - 4)
+        joined = np.array([[round(column), round(row)], knee], np.int32)
+        cv2.polylines(canvas, [joined], False, UNKNOWN, 1, cv2.LINE_AA)
+        write_label(canvas, callout.text, (edge if at_right else edge - width, round(place)))
 
 
 def draw_cloud(

@@ -30,6 +30,7 @@ from bodyscan.motion.person_motion import PartMotion, PersonMotion
 from bodyscan.progress import THREADS
 from bodyscan.registration.rig_calibration import FLOOR_AXES
 from bodyscan.report import charts
+from bodyscan.report.measures_section import show_measures
 from bodyscan.report.model import Layer, css, pack
 from bodyscan.report.page import (
     Block,
@@ -72,7 +73,8 @@ def scan_page(folder: Path, other: Path | None = None) -> Page:
     sections: list[Section] = []
     if "sha256" in facts:
         scan = load_scan(folder)
-        sections = _make_sections(scan, compare_surfaces(scan.mesh, other) if other else [])
+        found = compare_surfaces(scan.mesh, other) if other else []
+        sections = _make_sections(scan, found, folder)
     return Page(
         f"Scan of {subject}" if subject else f"Scan {folder.resolve().name}",
         stored_verdict(facts)
@@ -101,7 +103,7 @@ def _format_date(when: str | None) -> str:
     return f"{moment.day} {moment:%B %Y, %H:%M}"
 
 
-def _make_sections(scan: StoredScan, found: list[Comparison]) -> list[Section]:
+def _make_sections(scan: StoredScan, found: list[Comparison], folder: Path) -> list[Section]:
     # A person stands elsewhere in each scan, but a truth stands where it is true.
     shown = next((one for one in found if one.fitted == one.is_scan), None)
     # The map's scale ends at a round number above 95 % of the deviations.
@@ -109,6 +111,7 @@ def _make_sections(scan: StoredScan, found: list[Comparison]) -> list[Section]:
     parts: dict[str, Callable[[], Sequence[Block]]] = {
         "The body": lambda: _show_body(scan, shown, limit),
         "Figures": lambda: [_list_numbers(scan)],
+        "Measures by name": lambda: show_measures(scan, folder),
     }
     if scan.facts.get("person"):
         parts["The person"] = lambda: _describe_motion(scan.facts["person"])

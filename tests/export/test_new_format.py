@@ -12,8 +12,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xyz_format
-from copied_package import run_with_file
-from made_scan import make_scan
 from small_bodies import ball, points
 
 from bodyscan.errors import BadInput
@@ -72,15 +70,6 @@ def test_names_are_known_without_importing_what_writes_them() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
-
-
-@pytest.mark.slow
-def test_its_file_in_the_folder_is_all_it_needs(tmp_path: Path) -> None:
-    make_scan(tmp_path / "scan")
-    call = ("export", "scan", "--format", "xyz")
-    done = run_with_file(tmp_path, xyz_format, "export/formats/xyz.py", *call)
-    assert done.returncode == 0, done.stderr
-    assert (tmp_path / "scan" / "export" / "body.xyz").is_file()
 
 
 def test_the_docs_have_every_format_with_what_it_holds() -> None:

@@ -9,7 +9,6 @@ import pytest
 from made_bodies import cylinder, mesh_of
 from ray_cast_scan import ROOT, load_body
 
-from bodyscan.measurement.head import estimate_head_top
 from bodyscan.measurement.measurements import measure
 from bodyscan.mesh.body import DARK_CLOTH, HAIR, SKIN, UNSURE, BodyMesh
 from bodyscan.report.measurement_table import tables
@@ -69,10 +68,6 @@ def test_where_no_forehead_shows_the_head_is_somewhere_truncate(bald: BodyMesh) 
     assert found.head.sigma_mm == pytest.approx((found.stature_mm - low) / np.sqrt(12.0), abs=1.0)
 
 
-def test_a_head_that_nothing_shows_of_is_not_estimated() -> None:
-    assert estimate_head_top(np.empty((0, 3)), 1700.0) is None
-
-
 def test_the_table_says_what_stature_is_of(bald: BodyMesh) -> None:
     shown = told(haired(bald, 12.0))
     assert "top of the hair" in shown
@@ -103,30 +98,3 @@ def test_what_was_filled_is_of_no_region() -> None:
     assert found.regions is not None
     assert found.regions["unsure"] == 1.0
     assert UNSURE == 0
-
-
-def test_where_a_head_leans_to_changes_nothing() -> None:
-    """Not even by what is expected of its place: 300 mm are whole cells, so nothing but rounding is
-    left."""
-    turn, down = np.meshgrid(np.linspace(-1.2, 1.2, 7), np.linspace(0.3, 0.75, 3))
-    ways = [np.cos(down) * np.cos(turn), np.cos(down) * np.sin(turn), np.sin(down)]
-    skin = np.stack(ways, axis=-1).reshape(-1, 3) * [99.0, 77.0, 95.0] + [0.0, 0.0, 1600.0]
-    upright = estimate_head_top(skin, 1705.0)
-    assert upright is not None
-    for aside in ([300.0, 0.0, 0.0], [0.0, 300.0, 0.0], [0.0, -300.0, 0.0]):
-        found = estimate_head_top(skin + aside, 1705.0)
-        assert found is not None
-        assert found.height_mm == pytest.approx(upright.height_mm, abs=1e-6)
-        assert found.sigma_mm == pytest.approx(upright.sigma_mm, abs=1e-6)
-
-
-def test_a_dozen_places_of_a_forehead_are_enough() -> None:
-    """Fewer say no more than that the head ends between skin and hair."""
-    across = 15.0 * np.arange(4) + 7.5
-    for places, told in ((12, True), (11, False)):
-        y, z = np.meshgrid(across, across[:3])
-        skin = np.stack([np.full(12, 95.0), y.ravel() - 30.0, z.ravel() + 1650.0], axis=-1)[:places]
-        found = estimate_head_top(skin, 1725.0)
-        assert found is not None
-        between = 0.5 * (skin[:, 2].max() + 1725.0)
-        assert bool(abs(found.height_mm - between) > 0.01) is told

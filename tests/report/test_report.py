@@ -164,23 +164,6 @@ def test_a_larger_body_lies_outside_of_a_smaller_one(tmp_path: Path) -> None:
     assert "Compared with small" in page
 
 
-def test_a_scan_that_stood_elsewhere_is_laid_on_the_other(tmp_path: Path) -> None:
-    other = make_scan(tmp_path / "there")
-    mesh = egg()
-    away = replace(mesh, vertices=mesh.vertices + np.array([6.0, -4.0, 2.0]))
-    standing, laid = compare_surfaces(away, other.folder)
-    assert standing.figures.median_mm > 1.0
-    assert laid.figures.p95_mm < 0.05
-    assert laid.other_from_scan.translation == pytest.approx([-6.0, 4.0, -2.0], abs=0.3)
-
-
-def test_a_surface_in_metres_is_refused(tmp_path: Path) -> None:
-    ball = o3d.geometry.TriangleMesh.create_sphere(0.9)
-    o3d.io.write_triangle_mesh(str(tmp_path / "metres.ply"), ball)
-    with pytest.raises(BadInput, match="millimetres"):
-        compare_surfaces(egg(20), tmp_path / "metres.ply")
-
-
 def test_a_scan_without_a_model_has_a_report_of_why(tmp_path: Path) -> None:
     facts = {
         "schema": "bodyscan-scan",

@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from bodyscan.files.registry import Registry
+
+if TYPE_CHECKING:
+    from bodyscan.body_model.skinned import SkinnedBody
 
 Content = Literal["mesh", "cloud", "colours", "normals", "sigma", "filled", "regions"]
 
@@ -21,12 +24,15 @@ class BodyFormat:
         them.
     unit: of the file.
     axes: where its x, y and z point, as the subject sees it.
+    write_skinned: writes a registered body with its parts and what else the format holds of it; None
+        if it is no more than its mesh to it.
     """
 
     write: Callable[[Path, Any], None]
     holds: frozenset[Content]
     unit: Literal["mm", "m"] = "mm"
     axes: tuple[str, str, str] = ("front", "left", "up")
+    write_skinned: Callable[[Path, SkinnedBody], None] | None = None
 
 
 BODY_FORMATS: Registry[BodyFormat] = Registry("bodyscan.export.formats", "a body")

@@ -4,16 +4,76 @@ from __future__ import annotations
 
 import json
 import struct
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from bodyscan.arrays import Bytes, Indices
+from bodyscan.arrays import Array, Bytes, Indices
+from bodyscan.body_model.skinned import SkinnedBody
 from bodyscan.export.formats import BodyFormat
 from bodyscan.files.atomic import atomic_replacement
 from bodyscan.mesh.body import BodyCloud, BodyMesh
+from bodyscan.mesh.topology import vertex_normals
+
+MATERIALS = {
+    "materials": [
+        {"name": "body", "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.9}}
+    ]
+}
+
+
+@dataclass(eq=False)
+class _Buffer:
+    """The binary part of a file as it grows: chunks of a multiple of four bytes, views, accessors."""
+
+    chunks: list[bytes] = field(default_factory=list)
+    views: list[dict[str, Any]] = field(default_factory=list)
+    accessors: list[dict[str, Any]] = field(default_factory=list)
+
+    def add(
+        self, values: NDArray[Any], kind: str, *, target: int | None = 34962, **extra: Any
+    ) -> int:
+        """Add an accessor of that kind (SCALAR, VEC3, ...); returns its number.
+
+        target: 34962 for vertices, 34963 for indices, None for what a graphics card does not hold.
+        """
+        data = values.tobytes()
+        size = sum(map(len, self.chunks))
+        view = {"buffer": 0, "byteOffset": size, "byteLength": len(data)}
+        self.views.append(view if target is None else view | {"target": target})
+        self.accessors.append({
+            "bufferView": len(self.views) - 1,
+            # FLOAT, UNSIGNED_BYTE, UNSIGNED_SHORT, UNSIGNED_INT
+            "componentType": {"f4": 5126, "u1": 5121, "u2": 5123, "u4": 5125}[values.dtype.str[1:]],
+            "count": len(values) if kind != "SCALAR" else values.size,
+            "type": kind,
+            **extra,
+        })  # fmt: skip
+        self.chunks.append(data + b"\0" * (-len(data) % 4))
+        return len(self.accessors) - 1
+
+    def write(self, path: Path, content: dict[str, Any]) -> None:
+        """Write the file; content: scenes, nodes and meshes of the JSON part."""
+        size = sum(map(len, self.chunks))
+        document = content | {
+            "asset": {"version": "2.0", "generator": "bodyscan"},
+            "scene": 0,
+            "accessors": self.accessors,
+            "bufferViews": self.views,
+            "buffers": [{"byteLength": size}],
+        }
+        text = json.dumps(document, separators=(",", ":")).encode("ascii")
+        text += b" " * (-len(text) % 4)
+        with atomic_replacement(Path(path)) as temporary, temporary.open("wb") as stream:
+            stream.write(struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + size))
+            stream.write(struct.pack("<I4s", len(text), b"JSON") + text)
+            stream.write(struct.pack("<I4s", size, b"BIN\0"))
+            for chunk in self.chunks:
+                stream.write(chunk)
 
 
 def write_glb(path: Path, body: BodyCloud | BodyMesh) -> None:
@@ -31,16 +91,95 @@ def write_glb(path: Path, body: BodyCloud | BodyMesh) -> None:
     if isinstance(body, BodyMesh):
         attributes["_FILLED"] = np.isnan(body.sigma_mm)
         indices = body.faces
-    document, chunks = _document(attributes, indices)
-    text = json.dumps(document, separators=(",", ":")).encode("ascii")
-    text += b" " * (-len(text) % 4)
-    size = sum(map(len, chunks))
-    with atomic_replacement(Path(path)) as temporary, temporary.open("wb") as stream:
-        stream.write(struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + size))
-        stream.write(struct.pack("<I4s", len(text), b"JSON") + text)
-        stream.write(struct.pack("<I4s", size, b"BIN\0"))
-        for chunk in chunks:
-            stream.write(chunk)
+    buffer = _Buffer()
+    primitive = _add_primitive(buffer, attributes, indices)
+    meshes = [{"primitives": [primitive], "name": "body"}]
+    nodes = [{"mesh": 0, "name": "body"}]
+    content = {"scenes": [{"nodes": [0]}], "nodes": nodes, "meshes": meshes}
+    buffer.write(path, content | MATERIALS)
+
+
+def write_skinned_glb(path: Path, body: SkinnedBody) -> None:
+    """Write a registered body with its skeleton: the mesh in the rest pose, bones as the person stood,
+    landmarks as nodes of the bones that carry them, and a clip to the rest pose and back.
+
+    Vertices also carry `_PART`, an index into the mesh's `extras.parts`.
+    """
+    count = len(body.joint_names)
+    four = np.argsort(-body.weights, axis=1, kind="stable")[:, :4]
+    weights = np.take_along_axis(body.weights, four, axis=1).astype("<f4")
+    buffer = _Buffer()
+    attributes = {
+        "POSITION": _y_up(body.rest_vertices) / 1000.0,
+        "NORMAL": _y_up(vertex_normals(body.rest_vertices, body.mesh.faces)),
+        "COLOR_0": _linear(body.mesh.colours),
+        "_FILLED": np.isnan(body.mesh.sigma_mm),
+        "_PART": body.parts,
+    }
+    primitive = _add_primitive(buffer, attributes, body.mesh.faces)
+    joints = np.where(weights > 0.0, four, 0).astype("u1")
+    primitive["attributes"] |= {
+        "JOINTS_0": buffer.add(joints, "VEC4"),
+        "WEIGHTS_0": buffer.add(weights, "VEC4"),
+    }
+    inverse = np.tile(np.eye(4, dtype="<f4"), (count, 1, 1))
+    inverse[:, 3, :3] = -_y_up(body.rest_joints) / 1000.0  # matrices are stored by columns
+    skin = {
+        "joints": list(range(1, count + 1)),
+        "inverseBindMatrices": buffer.add(inverse, "MAT4", target=None),
+        "skeleton": 1,
+    }
+    mesh = {"primitives": [primitive], "name": "body", "extras": {"parts": list(body.part_names)}}
+    nodes = [{"mesh": 0, "skin": 0, "name": "body"}, *_list_bones(body)]
+    for landmark in body.landmarks:
+        nodes[1 + landmark.joint].setdefault("children", []).append(len(nodes))
+        place = _y_up(landmark.offset[None])[0] / 1000.0
+        extras = {"landmark": landmark.name, "sigma_mm": landmark.sigma_mm, "found": landmark.found}
+        nodes.append({"name": landmark.name, "translation": place.tolist(), "extras": extras})
+    buffer.write(path, {
+        "scenes": [{"nodes": [0, 1]}],
+        "nodes": nodes,
+        "meshes": [mesh],
+        "skins": [skin],
+        "animations": [_make_clip(buffer, body)],
+    } | MATERIALS)  # fmt: skip
+
+
+def _list_bones(body: SkinnedBody) -> list[dict[str, Any]]:
+    """A node for each joint: its place and rotation in its parent's frame, as the person stood."""
+    bones: list[dict[str, Any]] = []
+    for joint, parent in enumerate(body.parents):
+        place = body.root if parent < 0 else body.rest_joints[joint] - body.rest_joints[parent]
+        bones.append({
+            "name": body.joint_names[joint],
+            "translation": (_y_up(place[None])[0] / 1000.0).tolist(),
+            "rotation": _quaternions(body.rotations[joint : joint + 1])[0].tolist(),
+        })  # fmt: skip
+        if parent >= 0:
+            bones[parent].setdefault("children", []).append(joint + 1)
+    return bones
+
+
+def _make_clip(buffer: _Buffer, body: SkinnedBody) -> dict[str, Any]:
+    """A clip of four seconds: every joint but the root turns to the rest pose and back."""
+    times = np.array([0.0, 2.0, 4.0], "<f4")
+    when = buffer.add(times, "SCALAR", target=None, min=[0.0], max=[4.0])
+    samplers: list[dict[str, Any]] = []
+    channels: list[dict[str, Any]] = []
+    for joint in range(1, len(body.joint_names)):
+        stood = body.rotations[joint]
+        values = _quaternions(np.stack([stood, np.zeros(3), stood])).astype("<f4")
+        output = buffer.add(values, "VEC4", target=None)
+        channels.append({
+            "sampler": len(samplers), "target": {"node": joint + 1, "path": "rotation"},
+        })  # fmt: skip
+        samplers.append({"input": when, "output": output, "interpolation": "LINEAR"})
+    return {"name": "rest pose", "samplers": samplers, "channels": channels}
+
+
+def _quaternions(rotations: Array) -> Array:
+    """Quaternions (N, 4), x y z w, in glTF's axes, of rotation vectors (N, 3)."""
+    return np.asarray(Rotation.from_rotvec(_y_up(rotations)).as_quat())
 
 
 def _y_up(vectors: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -56,64 +195,31 @@ def _linear(colours: Bytes) -> NDArray[np.uint16]:
     return np.concatenate([table[colours], np.full((len(colours), 1), 65535, np.uint16)], axis=1)
 
 
-def _document(
-    attributes: dict[str, NDArray[Any]], indices: Indices | None
-) -> tuple[dict[str, Any], list[bytes]]:
-    """Build the JSON part and the chunks of the binary part (each a multiple of four bytes)."""
-    accessors: list[dict[str, Any]] = []
-    views: list[dict[str, Any]] = []
-    chunks: list[bytes] = []
-
-    def add(values: NDArray[Any], kind: str, *, is_index: bool = False, **extra: Any) -> int:
-        data = values.tobytes()
-        views.append({
-            "buffer": 0,
-            "byteOffset": sum(map(len, chunks)),
-            "byteLength": len(data),
-            "target": 34963 if is_index else 34962,  # ELEMENT_ARRAY_BUFFER, ARRAY_BUFFER
-        })  # fmt: skip
-        accessors.append({
-            "bufferView": len(views) - 1,
-            # FLOAT, UNSIGNED_SHORT, UNSIGNED_INT
-            "componentType": {"f4": 5126, "u2": 5123, "u4": 5125}[values.dtype.str[1:]],
-            "count": len(values) if kind != "SCALAR" else values.size,
-            "type": kind,
-            **extra,
-        })  # fmt: skip
-        chunks.append(data)
-        return len(accessors) - 1
-
+def _add_primitive(
+    buffer: _Buffer, attributes: dict[str, NDArray[Any]], indices: Indices | None
+) -> dict[str, Any]:
+    """Add attributes, and triangles if there are any; returns the primitive that has them."""
     numbers = {}
     for name, values in attributes.items():
         if name == "COLOR_0":
-            numbers[name] = add(values.astype("<u2"), "VEC4", normalized=True)
+            numbers[name] = buffer.add(values.astype("<u2"), "VEC4", normalized=True)
             continue
         floats = values.astype("<f4")
         ends = {}
         if name == "POSITION":
             ends = {"min": floats.min(axis=0).tolist(), "max": floats.max(axis=0).tolist()}
-        numbers[name] = add(floats, "SCALAR" if floats.ndim == 1 else "VEC3", **ends)
+        numbers[name] = buffer.add(floats, "SCALAR" if floats.ndim == 1 else "VEC3", **ends)
     primitive: dict[str, Any] = {"attributes": numbers, "material": 0, "mode": 0}  # POINTS
     if indices is not None:
         primitive["mode"] = 4  # TRIANGLES
-        primitive["indices"] = add(indices.astype("<u4").ravel(), "SCALAR", is_index=True)
-    surface = {"metallicFactor": 0.0, "roughnessFactor": 0.9}
-    document = {
-        "asset": {"version": "2.0", "generator": "bodyscan"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "name": "body"}],
-        "meshes": [{"primitives": [primitive], "name": "body"}],
-        "materials": [{"name": "body", "pbrMetallicRoughness": surface}],
-        "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": sum(map(len, chunks))}],
-    }
-    return document, chunks
+        corners = indices.astype("<u4").ravel()
+        primitive["indices"] = buffer.add(corners, "SCALAR", target=34963)
+    return primitive
 
 
 FORMAT = BodyFormat(
     write_glb,
+    write_skinned=write_skinned_glb,
     holds=frozenset({"mesh", "cloud", "colours", "normals", "filled", "regions"}),
     unit="m",
     axes=("left", "up", "front"),

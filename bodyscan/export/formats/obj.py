@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 
+from bodyscan.arrays import Indices
+from bodyscan.body_model.skinned import SkinnedBody
 from bodyscan.export.formats import BodyFormat
 from bodyscan.files.atomic import atomic_replacement
 from bodyscan.mesh.body import BodyMesh
@@ -13,15 +16,43 @@ from bodyscan.mesh.body import BodyMesh
 
 def write_obj(path: Path, mesh: BodyMesh) -> None:
     """Write a mesh in mm, rig frame: positions to 0.1 um, normals and colours to four places."""
-    points = np.column_stack([mesh.vertices, mesh.colours / 255.0])
     with atomic_replacement(Path(path)) as temporary, temporary.open("wb") as stream:
-        stream.write(b"# bodyscan: mm, x the way the subject faces, z up, floor at z = 0\n")
-        stream.write(b"o body\n")
-        for word, rows in (("v", points), ("vn", mesh.normals)):
-            # Adding 0 makes 0 of -0.
-            rounded = np.round(rows.astype(np.float64), 4) + 0.0
-            np.savetxt(stream, rounded, word + " %.4f" * rounded.shape[1])
-        np.savetxt(stream, np.repeat(mesh.faces + 1, 2, axis=1), "f" + " %d//%d" * 3)
+        _write_vertices(stream, mesh)
+        _write_faces(stream, mesh.faces)
 
 
-FORMAT = BodyFormat(write_obj, holds=frozenset({"mesh", "colours", "normals"}))
+def write_skinned_obj(path: Path, body: SkinnedBody) -> None:
+    """Write a registered body as the person stood: a group of faces for each part, in which order is
+    the same for everybody, and the landmarks as points at its end, each a group."""
+    with atomic_replacement(Path(path)) as temporary, temporary.open("wb") as stream:
+        _write_vertices(stream, body.mesh)
+        for part, name in enumerate(body.part_names):
+            stream.write(f"g {name.replace(' ', '_')}\n".encode("ascii"))
+            _write_faces(stream, body.mesh.faces[body.face_parts == part])
+        stream.write(b"o landmarks\n")
+        for number, landmark in enumerate(body.landmarks, start=len(body.mesh.vertices) + 1):
+            name = landmark.name.replace(" ", "_")
+            x, y, z = landmark.position
+            lines = f"g {name}\nv {x:.4f} {y:.4f} {z:.4f}\np {number}\n"
+            stream.write(lines.encode("ascii"))
+
+
+def _write_vertices(stream: IO[bytes], mesh: BodyMesh) -> None:
+    stream.write(b"# bodyscan: mm, x the way the subject faces, z up, floor at z = 0\n")
+    stream.write(b"o body\n")
+    points = np.column_stack([mesh.vertices, mesh.colours / 255.0])
+    for word, rows in (("v", points), ("vn", mesh.normals)):
+        # Adding 0 makes 0 of -0.
+        rounded = np.round(rows.astype(np.float64), 4) + 0.0
+        np.savetxt(stream, rounded, word + " %.4f" * rounded.shape[1])
+
+
+def _write_faces(stream: IO[bytes], faces: Indices) -> None:
+    np.savetxt(stream, np.repeat(faces + 1, 2, axis=1), "f" + " %d//%d" * 3)
+
+
+FORMAT = BodyFormat(
+    write_obj,
+    holds=frozenset({"mesh", "colours", "normals"}),
+    write_skinned=write_skinned_obj,
+)

@@ -1,0 +1,158 @@
+"""Plane sections of one or several parts of a registered body.
+
+The scan's own surface where it was measured; where it was not, the template's, whose armpits and
+crotch are closed as bodies are. So no web between limbs is ever part of a girth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from scipy.spatial import ConvexHull
+
+from bodyscan.arrays import Array, Bytes, Mask
+from bodyscan.body_model.fitting import BASIS_MM
+from bodyscan.body_model.registered import RegisteredBody, vote_on_faces
+from bodyscan.mesh.slices import Loop, MeshSlicer, hull_perimeter
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True, eq=False)
+class Section:
+    """A section of some parts by a plane.
+
+    points: (N, 2) mm, in the plane, the two ends of each segment; seen: (N,) whether it was measured.
+    axes: (3, 3), the plane's two axes and its normal, body frame. level_mm: along the normal.
+    measured: share of its length that was measured.
+    sigma_mm: standard deviation of its tape girth.
+    """
+
+    points: Array
+    seen: Mask
+    axes: Array
+    level_mm: float
+    measured: float
+    sigma_mm: float
+
+    @cached_property
+    def tape_mm(self) -> float:
+        """Girth as a tape runs: the convex hull's perimeter."""
+        return hull_perimeter(self.points)
+
+    @cached_property
+    def tape_measured(self) -> float:
+        """Share of the tape that touches measured skin or spans hollows between it: what was not
+        measured and lies within BASIS_MM of the tape might touch it."""
+        ends = self.points.reshape(-1, 2, 2)[~self.seen[::2]]
+        hull = ConvexHull(self.points)
+        inside = -(hull.equations[:, :2] @ ends.mean(axis=1).T + hull.equations[:, 2:]).max(axis=0)
+        lengths = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+        return max(0.0, 1.0 - float(lengths[inside < BASIS_MM].sum()) / float(hull.area))
+
+    @cached_property
+    def min_tape_mm(self) -> float:
+        """The least that the girth can be: straight across what was not measured."""
+        return hull_perimeter(self.points[self.seen]) if self.seen.any() else 0.0
+
+    @property
+    def positions(self) -> Array:
+        """Its points (N, 3), mm, body frame."""
+        level = np.full(len(self.points), self.level_mm)
+        return np.column_stack([self.points, level]) @ self.axes
+
+
+@dataclass(frozen=True, eq=False)
+class BodySections:
+    """Cuts a registered body. slicers: by the plane's normal, made when they are needed."""
+
+    body: RegisteredBody
+    slicers: dict[tuple[float, ...], tuple[Array, MeshSlicer, MeshSlicer]] = field(
+        default_factory=dict
+    )
+
+    @cached_property
+    def noise_mm(self) -> Array:
+        """(N,) sigma of the scan's vertices; the median where nothing was measured."""
+        noise = self.body.mesh.sigma_mm.astype(np.float64)
+        noise[~np.isfinite(noise)] = np.nanmedian(noise)
+        return noise
+
+    @cached_property
+    def _face_parts(self) -> tuple[Bytes, Bytes]:
+        """Parts of the faces of the scan, and of the template."""
+        template = self.body.fitted.template
+        return (
+            vote_on_faces(self.body.parts[self.body.mesh.faces]),
+            vote_on_faces(template.parts[template.faces]),
+        )
+
+    def cut(self, normal: Array, level_mm: float, parts: str | Sequence[str]) -> Section | None:
+        """Section of the largest loop that has these parts, by the plane square to a normal (3,);
+        None if none has."""
+        axes, scan, template = self._find_slicers(normal)
+        names = [parts] if isinstance(parts, str) else parts
+        wanted = [self.body.fitted.template.part_names.index(name) for name in names]
+        of_scan, of_template = self._face_parts
+        seen = _select(scan.slice(level_mm), of_scan, wanted)
+        made = _select(template.slice(level_mm), of_template, wanted)
+        if made is None:
+            made = seen
+        if made is None:
+            return None
+        points, noise, breath = np.zeros((0, 2)), 0.0, 0.0
+        if seen is not None and (seen[1] & seen[0].measured).any():
+            loop, mine = seen[0], seen[1] & seen[0].measured
+            points = loop.segments[mine].reshape(-1, 2)
+            corners = self.body.mesh.faces[loop.faces[mine]]
+            noise = float(self.noise_mm[corners].mean())
+            breath = float(self.body.breath_sigma_mm[corners].mean())
+        loop, mine = made
+        known = mine & loop.measured if len(points) else np.zeros_like(mine)
+        measured = float(loop.lengths[known].sum() / loop.lengths[mine].sum())
+        closed = loop.segments[mine & ~known].reshape(-1, 2)
+        # Noise is alike over a quarter of the girth; breath all around it; the template's surface
+        # differs from a body's all over what nobody saw.
+        sigma = np.pi * np.array([noise, 2.0 * breath, 2.0 * BASIS_MM * (1.0 - measured)])
+        return Section(
+            np.concatenate([closed, points]),
+            np.arange(len(closed) + len(points)) >= len(closed),
+            axes,
+            level_mm,
+            measured,
+            float(np.linalg.norm(sigma)),
+        )
+
+    def _find_slicers(self, normal: Array) -> tuple[Array, MeshSlicer, MeshSlicer]:
+        key = tuple(normal.tolist())
+        if key not in self.slicers:
+            across = np.cross(normal, [1.0, 0.0, 0.0])
+            across /= np.linalg.norm(across)
+            axes = np.stack([np.cross(across, normal), across, normal])
+            mesh, fitted = self.body.mesh, self.body.fitted
+            faces = fitted.template.faces
+            unseen = np.asarray(~self.body.measured[faces].all(axis=1))
+            self.slicers[key] = (
+                axes,
+                MeshSlicer(self.body.vertices @ axes.T, mesh.faces, mesh.filled),
+                MeshSlicer(fitted.vertices @ axes.T, faces, unseen),
+            )
+        return self.slicers[key]
+
+
+def _select(
+    loops: Sequence[Loop], face_parts: Bytes, wanted: Sequence[int]
+) -> tuple[Loop, Mask] | None:
+    """The largest loop with more than a rim of the wanted parts, and which segments are theirs."""
+    for loop in loops:
+        mine = np.isin(face_parts[loop.faces], wanted)
+        length = loop.lengths[mine].sum()
+        # A limb by itself has some faces named after its neighbours.
+        if length > 0.8 * loop.girth_mm:
+            mine[:] = True
+        if length > 50.0:
+            return loop, mine
+    return None
