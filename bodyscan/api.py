@@ -201,10 +201,11 @@ def load_calibration(path: AnyPath) -> bodyscan.RigCalibration:
 def triangulate(
     folder: AnyPath, calibration: bodyscan.RigCalibration, *, progress: Progress = silent
 ) -> Outcome[list[bodyscan.RangeImage]]:
-    """Each pair's range image of a scan, background included, in its camera's frame.
+    """Each pair's range image of a scan, in its camera's frame: what lies in the rig's `volume` and a
+    little around it.
 
-    Pairs that gave nothing are in the outcome's `failures`, with the reason. Raises CaptureError;
-    ScanFailed if no pair gave anything.
+    Pairs that gave nothing are in the outcome's `failures` or `notes`, with the reason. Raises
+    CaptureError; ScanFailed if no pair gave anything.
     """
     from bodyscan.captures.folder import open_scan
     from bodyscan.workflows.range_images import reconstruct_range_images

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
@@ -282,10 +283,19 @@ def describe_unlisted_images(captures: Captures) -> str | None:
     folders = {path.parent.parent for path in wanted} | {path.parent for path in wanted}
     named = {(len(path.parts), path.stem) for path in wanted}
     suffixes = {path.suffix for path in wanted}
+    patterns = {
+        re.escape(str(path)).replace(re.escape(sequence.shot), ".+")
+        for sequence in captures.sequences
+        for path in sequence.paths
+    }
+    listed = any(entry.shots for entry in captures.rig.calibration) and not renamed
+    unwanted = re.compile("|".join(sorted(patterns)) if listed else "(?!)")
     found = []
     for folder in captures.folders:
         for path in (Path(root, name) for root, _, names in os.walk(folder) for name in names):
             if path.suffix.lower() not in IMAGE_SUFFIXES or path in wanted:
+                continue
+            if unwanted.fullmatch(str(path)):
                 continue
             of_shot = set(path.relative_to(folder).parts[:-1]) & set(captures.shots)
             # of another shot whose name differs only in its suffix

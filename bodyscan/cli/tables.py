@@ -26,6 +26,7 @@ def calibration_table(calibration: RigCalibration) -> Table:
         quality = pair.quality
         position = calibration.rig_from_camera[name].translation
         sigma = position_sigma(calibration.covariance, name, position)
+        known = " ".join(f"{value:.3f}" for value in sigma) if sigma.any() else "defines the frame"
         stripes = f"{quality.stripes_calibrated} of {quality.stripes_projected}"
         table.add_row(
             name,
@@ -36,7 +37,7 @@ def calibration_table(calibration: RigCalibration) -> Table:
             "-" if quality.planes_rms_mm is None else f"{quality.planes_rms_mm:.3f}",
             "-" if pair.sheets is None else stripes,
             " ".join(f"{value:.1f}" for value in position),
-            "not known" if quality.unjudged else " ".join(f"{value:.3f}" for value in sigma),
+            "not known" if quality.unjudged else known,
         )
     for name in calibration.failed:
         table.add_row(name, "failed", *["-"] * 7, style="red")

@@ -14,6 +14,8 @@ from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 
+import numpy as np
+
 from bodyscan.captures.captures_file import FILE_NAME
 from bodyscan.captures.folder import Captures, ImageSequence, open_scan
 from bodyscan.errors import BadInput, BodyscanError, ScanFailed, format_list
@@ -103,6 +105,8 @@ def reconstruct_range_images(
         raise ScanFailed(f"no pair gave a range image:{format_list(failed)}")
     images = [image for image, *_ in found.values()]
     notes = [f"{image.pair}: {image.agreement}" for image in images if image.agreement is not None]
+    empty = (image.pair for image in images if not np.isfinite(image.points).any())
+    notes += [f"{pair}: nothing that it measured lies inside the rig's `volume`" for pair in empty]
     notes += map(captures.relative, crossing_notes({one: made[-1] for one, made in found.items()}))
     responses = ((image.pair, share) for image, shares, _ in found.values() for share in shares)
     return Outcome(images, (*notes, *response_notes(responses)), failed)

@@ -14,7 +14,7 @@ from small_captures import RIG, write
 
 from bodyscan.errors import RigFileError
 from bodyscan.files.yaml_file import dump_yaml, read_yaml
-from bodyscan.rig.board import MARKERS_IN, Board
+from bodyscan.rig.board import MARKERS_IN
 from bodyscan.rig.rig import Rig, find_unusual_lengths, load_rig, write_rig
 from bodyscan.stripes.codes import parse_stripe_code
 from bodyscan.stripes.codes.gray import Gray
@@ -264,14 +264,6 @@ def test_dictionaries_are_those_of_opencv() -> None:
         assert len(dictionary.bytesList) == count
     names = {name.lower() for name in dir(cv2.aruco) if name.startswith("DICT_")}
     assert names == {name.lower() for name in MARKERS_IN}
-
-
-@pytest.mark.parametrize(("columns", "rows"), [(9, 7), (8, 11), (8, 6), (5, 4)])
-def test_marker_count_is_that_of_opencv(columns: int, rows: int) -> None:
-    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_1000)
-    opencv = cv2.aruco.CharucoBoard((columns, rows), 1.0, 0.7, dictionary)
-    board = Board(name="b", kind="charuco", columns=columns, rows=rows, square_mm=1, marker_mm=0.7)
-    assert board.marker_count == len(opencv.getIds())
 
 
 @pytest.mark.slow

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from bodyscan.captures.folder import ImageSequence
 from bodyscan.errors import BadInput, CaptureError
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.opencv import Radial
@@ -67,3 +70,15 @@ def test_two_shots_of_a_pair_are_no_one_person() -> None:
     with pytest.raises(CaptureError, match=r"scans/anna: pair a .* 2 shots \(s1, s2\)") as caught:
         require_one_moment(captured(("a", "s1"), ("b", "s1"), ("a", "s2")))
     assert "name: s1" in caught.value.remedy
+
+
+def test_a_pair_that_measured_nothing_in_the_volume_is_named() -> None:
+    points = np.full((4, 5, 3), np.nan, np.float32)
+    taken = ImageSequence("p", "s", None, None, (Path(),), ())
+    image = replace(range_image(), points=points)
+    rig = SimpleNamespace(pairs=[SimpleNamespace(name="p", projector=True)])
+    calibration: Any = SimpleNamespace(rig=rig, pairs={"p": None}, failed={})
+    every = [taken]
+    captures: Any = SimpleNamespace(sequences=every, pair_sequences=lambda _: every, relative=str)
+    found = reconstruct_range_images(calibration, captures, made={taken: (image, (), "")})
+    assert "p: nothing that it measured lies inside" in found.notes[0]
