@@ -131,7 +131,7 @@ def write_rig(path: Path, rig: Rig) -> None:
 
 def find_unusual_lengths(rig: Rig) -> Iterator[str]:
     """Warn of lengths that a body scanner is unlikely to have, such as metres instead of mm."""
-    lengths = [(f"board {one.name}: square_mm", one.square_mm, 2.0, 500.0) for one in rig.boards]
+    lengths = [(f"board {one.name}: square_mm", one.square_mm, 8.0, 500.0) for one in rig.boards]
     lengths += [
         ("volume: radius_mm", rig.volume.radius_mm, 50.0, 5000.0),
         ("volume: its height", rig.volume.top_mm - rig.volume.bottom_mm, 50.0, 5000.0),

@@ -31,7 +31,7 @@ from bodyscan.registration.rig_solve import (
 )
 from bodyscan.registration.sanity_checks import find_faults
 from bodyscan.registration.storage import CORNERS_NAME, archive_previous, save_calibration
-from bodyscan.rig.rig import Rig, load_rig
+from bodyscan.rig.rig import Rig, find_unusual_lengths, load_rig
 from bodyscan.workflows.decode import PrintAreas, decode_on_boards
 from bodyscan.workflows.find_boards import (
     HERE,
@@ -77,7 +77,7 @@ def calibrate_folder(
     solved = solve_boards(rig, captures, boards, progress, folder=Path(rig_file).parent)
     remarked = add_remarks(solved, progress)
     archive_previous(folder)
-    notes = list(remarked.notes)
+    notes = [*remarked.notes, *find_unusual_lengths(rig)]
     with optional(CORNERS_NAME, notes.append):
         write_found_corners(folder / CORNERS_NAME, rig, captures, boards.value)
     with optional("images that are not used", notes.append):

@@ -361,13 +361,13 @@ def test_boards_are_needed_for_calibration_captures_only(tmp_path: Path) -> None
     assert load_rig(write(tmp_path / "r.yaml", text)).boards == ()
 
 
-def test_lengths_in_metres_are_warned_of() -> None:
+def test_lengths_in_metres_or_centimetres_are_warned_of() -> None:
     content = yaml.safe_load((RIGS / "three-pole-12.yaml").read_text())
-    content["boards"][0] |= {"square_mm": 0.07, "marker_mm": 0.05}
+    content["boards"][0] |= {"square_mm": 7, "marker_mm": 5}
     content["volume"] = {"radius_mm": 0.7, "bottom_mm": 0.0, "top_mm": 2.2}
     content["pairs"][0]["nominal"] = {"position_mm": [0.65, 1.1, 0.7], "look_at_mm": [0, 0, 0.3]}
     warnings = list(find_unusual_lengths(Rig.model_validate(content)))
     assert len(warnings) == 4
-    assert "square_mm is 0.07 mm" in warnings[0]
+    assert "square_mm is 7 mm" in warnings[0]
     assert "radius_mm is 0.7 mm" in warnings[1]
     assert "pair p1-1" in warnings[3]
