@@ -1,4 +1,5 @@
 # make demo         set up, simulate a rig, calibrate it, scan a person, export the mesh
+# make station      set up, simulate and calibrate a rig, open its page: people are simulated as they come
 # make test         set up, run all tests on all cores
 # make test-quick   those that answer within seconds, for the loop of everyday work
 # make coverage     all tests again, with the lines of the package that they run
@@ -30,6 +31,20 @@ demo: setup
 	$(BIN)/bodyscan scan $(OUT)/captures/person --calibration $(OUT)/calibration --out $(OUT)/scan
 	$(BIN)/bodyscan export $(OUT)/scan --out $(OUT)/export
 	$(BIN)/bodyscan evaluate $(OUT)
+
+.PHONY: station
+SHOWN := build/station
+station: $(SHOWN)/calibration/calibration.json
+	mkdir -p $(SHOWN)/inbox
+	$(BIN)/bodyscan station --calibration $(SHOWN)/calibration --rig $(SHOWN)/rig.yaml \
+		--inbox $(SHOWN)/inbox --out $(SHOWN)/models
+
+$(SHOWN)/calibration/calibration.json: | setup
+	rm -rf $(SHOWN)
+	$(BIN)/bodyscan simulate rigs/three-pole-12.yaml --out $(SHOWN) --scale 0.4 --board-shots 20
+	printf 'capture:\n  camera: {kind: simulated, subject: %s, samples: 2}\n' \
+		$(CURDIR)/data/subjects/woman_average.ply >> $(SHOWN)/rig.yaml
+	$(BIN)/bodyscan calibrate-rig $(SHOWN)/rig.yaml
 
 test: setup
 	$(BIN)/python -m pytest $(PARALLEL)
@@ -82,7 +97,7 @@ mutants: setup
 lock:
 	rm -rf build/lock
 	"$(PYTHON)" -m venv build/lock
-	build/lock/bin/python -m pip install --quiet --disable-pip-version-check '.[dev,docs,cluster,e57]'
+	build/lock/bin/python -m pip install --quiet --disable-pip-version-check '.[dev,docs,cluster,e57,station,capture-pylon]'
 	build/lock/bin/python -m pip freeze --exclude bodyscan > data/constraints.txt
 	rm -rf build/lock
 

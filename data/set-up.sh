@@ -30,6 +30,6 @@ elif [ -n "$missing" ]; then
 fi
 
 [ -x "$venv/bin/python" ] || "$python" -m venv "$venv"
-"$venv/bin/python" -m pip install --quiet --disable-pip-version-check --editable '.[dev,docs,cluster]'
+"$venv/bin/python" -m pip install --quiet --disable-pip-version-check --editable '.[dev,docs,cluster,station]'
 "$venv/bin/python" -c 'import open3d, pycolmap, cv2' ||
     { echo "the libraries are installed but do not load, see the message above" >&2; exit 1; }

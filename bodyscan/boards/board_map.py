@@ -45,21 +45,25 @@ class BoardMap:
         return np.stack(columns, axis=-1)
 
 
-def fit_board_map(printed: Array, pixels: Array) -> BoardMap:
+def fit_board_map(printed: Array, pixels: Array, *, curved: bool = False) -> BoardMap:
     """Fit a map by least squares to printed points (N, 2) mm and their image points (N, 2) px, N >= 4.
 
     The polynomial is cubic, quadratic or absent, as the number of points allows; a slight ridge
     keeps it from running away where points are few.
+    curved: for a fisheye, in whose picture a board may reach from one horizon to the other: a quintic,
+        if there are twice as many points as it has terms, and no homography.
     """
+    curved = curved and len(printed) >= 42
     middle = (printed.min(axis=0) + printed.max(axis=0)) / 2
     size = float(np.ptp(printed, axis=0).max()) / 2
-    homography = cv2.findHomography(printed, pixels, 0)[0]
+    homography = np.zeros((3, 3)) if curved else cv2.findHomography(printed, pixels, 0)[0]
     if homography is None:
         homography = np.full((3, 3), np.nan)
-    degree = 3 if len(printed) >= 40 else 2 if len(printed) >= 20 else 0
+    homography[2, 2] = homography[2, 2] or 1.0
+    degree = 5 if curved else 3 if len(printed) >= 40 else 2 if len(printed) >= 20 else 0
     design = _monomials((printed - middle) / size, degree)
     residual = pixels - _project(homography, printed)
-    ridge = 1e-3 * len(printed) * np.eye(design.shape[1])
+    ridge = (1e-6 if curved else 1e-3) * len(printed) * np.eye(design.shape[1])
     solved = np.linalg.solve(design.T @ design + ridge, design.T @ residual)
     return BoardMap(homography, np.asarray(solved, np.float64), middle, size, degree)
 

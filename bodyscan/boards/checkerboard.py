@@ -40,22 +40,27 @@ def find_checkerboard(image: Bytes, board: Board, *, quick: bool = False) -> Det
         )
     for candidate in _candidates(image, board, quick):
         found = _refine(image, board, candidate)
+        if found is None or len(found.ids) < len(candidate):
+            curved = _refine(image, board, candidate, curved=True)
+            found = max(filter(None, (found, curved)), key=lambda one: len(one.ids), default=None)
         if found is not None:
             return found
     return None
 
 
-def _refine(image: Bytes, board: Board, candidate: Array) -> DetectedCorners | None:
+def _refine(
+    image: Bytes, board: Board, candidate: Array, *, curved: bool = False
+) -> DetectedCorners | None:
     """Refine a detector's corners (N, 2) px; None unless most are found and form this board.
 
     Detectors err by a pixel or two at times: corners not found there are looked for where the
-    others predict them.
+    others predict them; on a board that is `curved` (`fit_board_map`) all are needed for that.
     """
     printed = board_layout.printed_corners(board)
     row, column = np.divmod(np.arange(len(printed)), board.columns - 1)
     pixels, first_is_black = _number_as_printed(image, board, candidate, printed)
     bright_diagonal = ((row + column) % 2 == 0) != first_is_black
-    board_map, start = fit_board_map(printed, pixels), pixels
+    board_map, start = fit_board_map(printed, pixels, curved=curved), pixels
     good = np.zeros(len(printed), bool)
     for _ in range(3):
         along = board.square_mm * board_map.jacobian(printed)
@@ -63,7 +68,8 @@ def _refine(image: Bytes, board: Board, candidate: Array) -> DetectedCorners | N
         pixels, good = np.where(found[:, None] & ~good[:, None], refined, pixels), good | found
         if good.mean() < 0.4:
             return None
-        board_map = fit_board_map(printed[good], pixels[good])
+        near = good | curved
+        board_map = fit_board_map(printed[near], pixels[near], curved=curved)
         error = np.linalg.norm(board_map.apply(printed) - pixels, axis=-1)
         size = np.sqrt(np.abs(np.linalg.det(along)))
         # A bowed board and a lens leave hundredths of a square, mixed-up corners a whole one.
@@ -116,20 +122,27 @@ def _candidates(image: Bytes, board: Board, quick: bool) -> Iterator[Array]:
     uneven light or a busy background; enlarged crops for fine and slanted boards; the sector-based
     detector, a fifth of a second per megapixel, for blurred and noisy ones (its
     CALIB_CB_NORMALIZE_IMAGE shifts corners by 0.25 px), and enlarged, in a second, for fine ones.
+    Boards of many squares by the latter alone, in the image at half its size first.
     """
     size = (board.columns - 1, board.rows - 1)
-    yield from _detect(image, size)
+    # The quad-based detector sorts quads for 10 to 20 s where one of 500 squares is covered.
+    large = size[0] * size[1] > 200
+    if large:
+        yield from _detect(image, size, scale=0.5, sector_based=True)
+    else:
+        yield from _detect(image, size)
     if not quick and not shows_lattice(image, size):
         return
-    adaptive = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
-    yield from _detect(image, size, flags=adaptive)
+    if not large:
+        adaptive = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+        yield from _detect(image, size, flags=adaptive)
     if quick:
         return
     regions = board_regions(image, size[0] * size[1])
-    small = [region for region in regions if 2 * image[region].size < image.size]
-    for region in small:
-        yield from _detect(image, size, region, scale=2.0)
-    for region in regions:
+    for region in regions if not large else ():
+        if 2 * image[region].size < image.size:
+            yield from _detect(image, size, region, scale=2.0)
+    for region in regions if not large else ():
         yield from _detect(image, size, region)
     for region in (*regions, WHOLE):
         yield from _detect(image, size, region, sector_based=True)

@@ -13,7 +13,7 @@ import numpy as np
 from bodyscan.arrays import Bytes
 from bodyscan.boards.aprilgrid import BORDER_BITS, locate_grid
 from bodyscan.boards.charuco import Markers, detect_markers, locate_face
-from bodyscan.boards.checkerboard import MIN_SQUARES, find_checkerboard
+from bodyscan.boards.checkerboard import MIN_SQUARES, find_checkerboard, shows_lattice
 from bodyscan.boards.detection import OTHER_APPEARANCES
 from bodyscan.boards.view import AS_PRINTED, Appearance
 from bodyscan.rig.board import LARGEST_DICTIONARIES, MARKERS_IN, Board
@@ -22,10 +22,17 @@ MIN_MARKERS = 4
 """Fewer may be chance: quadrilaterals that happen to read as a marker."""
 
 
-def describe_unfound(image: Bytes, board: Board) -> str:
-    """Describe what the image (H, W) shows instead of the board, to follow the board's name."""
+def describe_unfound(image: Bytes, board: Board, *, quick: bool = False) -> str:
+    """Describe what the image (H, W) shows instead of the board, to follow the board's name.
+
+    quick: in a tenth of a second; "" for a board with markers.
+    """
     if board.kind == "checkerboard":
-        return _describe_grids(image, board)
+        return (
+            f"not whole, {_say_lattice(image, board)}" if quick else _describe_grids(image, board)
+        )
+    if quick:
+        return ""
     markers, appearance = detect_any(image, board)
     count = f"{len(markers.ids)} markers of {board.dictionary}"
     if len(markers.ids) < MIN_MARKERS:
@@ -131,4 +138,11 @@ def _describe_grids(image: Bytes, board: Board) -> str:
                 f"no grid of {wanted}, but one of {columns - 1} x {rows - 1}: {columns} columns x "
                 f"{rows} rows of squares"
             )
-    return f"no grid of {wanted}, nor of one more or fewer in either direction"
+    seen = _say_lattice(image, board)
+    return f"no grid of {wanted}, nor of one more or fewer in either direction, {seen}"
+
+
+def _say_lattice(image: Bytes, board: Board) -> str:
+    if shows_lattice(image, (board.columns - 1, board.rows - 1)):
+        return "but squares like a board's: some may be cut off, covered, blurred or too dark"
+    return "nor anything like a board's squares"

@@ -34,6 +34,7 @@ from bodyscan.settings import AlignmentSettings, ExportSettings, FusionSettings,
 if TYPE_CHECKING:
     from bodyscan.jobs.job import Job
     from bodyscan.jobs.object_storage import Store
+    from bodyscan.jobs.pipeline import Pipeline
     from bodyscan.jobs.supervision import Listen
 
 PANEL = "Operator: scan people"
@@ -42,7 +43,7 @@ DEFAULTS = ScanSettings()
 
 def register(app: typer.Typer) -> None:
     """Add these commands to the command line, in the order of a day."""
-    for command in (capture, scan, report, measure, export, batch, watch, verify, forget):
+    for command in (capture, scan, report, measure, export, batch, watch, station, verify, forget):
         add_command(app, PANEL, command)
 
 
@@ -392,6 +393,20 @@ def _listening(output: Output) -> Iterator[Listen]:
         os._exit(130)  # the jobs' processes end with this one
 
 
+PipelineFile = Annotated[
+    Path | None,
+    typer.Option("--pipeline", metavar="PIPELINE.YAML", help="Settings, as for `batch`."),
+]
+QuietSeconds = Annotated[
+    float,
+    typer.Option(
+        "--quiet-s",
+        min=1.0,
+        help="Take a scan as complete when nothing has come for this many seconds.",
+    ),
+]
+
+
 def watch(
     output: Output,
     inbox: Annotated[
@@ -399,18 +414,9 @@ def watch(
     ],
     calibration: Calibration,
     out: OutFolder,
-    pipeline: Annotated[
-        Path | None, typer.Option(metavar="PIPELINE.YAML", help="Settings, as for `batch`.")
-    ] = None,
+    pipeline: PipelineFile = None,
     changes: Changes = None,
-    quiet_s: Annotated[
-        float,
-        typer.Option(
-            "--quiet-s",
-            min=1.0,
-            help="Take a scan as complete when nothing has come for this many seconds.",
-        ),
-    ] = 30.0,
+    quiet_s: QuietSeconds = 30.0,
     once: Annotated[
         bool, typer.Option("--once", help="End when everything in INBOX is done.")
     ] = False,
@@ -419,22 +425,60 @@ def watch(
 
     You can stop it at any moment; started again, it continues. docs/station.md describes the protocol.
     """
-    from bodyscan.files.model_file import apply_settings
-    from bodyscan.jobs.pipeline import Pipeline, load_pipeline
     from bodyscan.jobs.watching import Watched
     from bodyscan.jobs.watching import watch as watch_inbox
 
     require_writable(out, inbox, calibration)
     output.stream_events()
-    settings = (
-        load_pipeline(pipeline, changes or ())
-        if pipeline
-        else apply_settings(Pipeline(name="watch", kind="fuse"), changes or (), BadInput)
-    )
-    watched = Watched(inbox, out, calibration, settings, quiet_s)
+    watched = Watched(inbox, out, calibration, _watch_settings(pipeline, changes), quiet_s)
     with _listening(output) as listen:
         summary = watch_inbox(watched, listen, once=once)
     output.exit_code = 1 if summary["set_aside"] or summary["repeat"] else 0
+
+
+def _watch_settings(pipeline: Path | None, changes: list[str] | None) -> Pipeline:
+    from bodyscan.files.model_file import apply_settings
+    from bodyscan.jobs.pipeline import Pipeline, load_pipeline
+
+    if pipeline:
+        return load_pipeline(pipeline, changes or ())
+    return apply_settings(Pipeline(name="watch", kind="fuse"), changes or (), BadInput)
+
+
+def station(
+    output: Output,
+    calibration: Calibration,
+    inbox: Annotated[Path, typer.Option(help="Folder in which each scan appears as a folder.")],
+    out: OutFolder,
+    rig: Annotated[
+        Path | None,
+        typer.Option(metavar="RIG.YAML", help="Rig file: its devices, and its shots of the board."),
+    ] = None,
+    host: Annotated[
+        str, typer.Option(help="Name or address under which other computers reach this one.")
+    ] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the page.")] = 8765,
+    certificate: Annotated[
+        Path | None, typer.Option(metavar="FILE.pem", help="Certificate for https, with --key.")
+    ] = None,
+    key: Annotated[
+        Path | None, typer.Option(metavar="FILE.pem", help="Private key of the certificate.")
+    ] = None,
+    pipeline: PipelineFile = None,
+    changes: Changes = None,
+    quiet_s: QuietSeconds = 30.0,
+) -> None:
+    """Serve a page for the people at a rig: scan, see the verdict, the day, the rig, calibrate.
+
+    It does what `watch` does, and shows it. docs/station.md describes the pages.
+    """
+    from bodyscan.jobs.watching import Watched
+    from bodyscan.station.serving import Address, serve
+
+    require_writable(out, inbox, calibration)
+    settings = _watch_settings(pipeline, changes)
+    watched = Watched(inbox, out, calibration, settings, quiet_s, preview=True)
+    serve(watched, rig, Address(host, port, certificate, key), output.say)
 
 
 def verify(

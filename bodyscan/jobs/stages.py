@@ -17,6 +17,7 @@ from bodyscan.rig.rig import Rig, load_rig
 from bodyscan.verdict import Announce
 
 if TYPE_CHECKING:
+    from bodyscan.fusion.storage import Made
     from bodyscan.workflows.range_images import Preparation
 
 
@@ -71,16 +72,18 @@ def run_scan(
     progress: Progress,
     announce: Announce,
     preparation: Preparation | None = None,
+    made: Made | None = None,
 ) -> None:
     """Scan as `bodyscan scan` does: cloud, mesh, their facts, pictures.
 
     preparation: what a resident process has already loaded and decoded.
+    made: called with the cloud and the mesh as soon as they are there.
     """
     from bodyscan.workflows.scan_person import scan_folder
 
     folders, settings = (job.source, calibration_of(job), out), job.pipeline.scan
     *_, pictures = scan_folder(
-        *folders, settings, progress, preparation=preparation, announce=announce
+        *folders, settings, progress, preparation=preparation, announce=announce, made=made
     )
     for note in pictures.notes:
         print(note, flush=True)  # into the job's log

@@ -91,7 +91,7 @@ def find_drift(jobs: Sequence[Job]) -> list[PairDrift]:
     sway differs from scan to scan."""
     shifts: dict[tuple[Path | None, str], list[Array]] = {}
     for job in jobs:
-        for pair, shift in _motions(job).items():
+        for pair, shift in pair_motions(job).items():
             shifts.setdefault((job.calibration, pair), []).append(shift)
     found = [estimate_drift(pair, np.array(each)) for (_, pair), each in shifts.items()]
     return sorted((one for one in found if one.moved), key=lambda one: -one.shift_mm)
@@ -156,7 +156,7 @@ def _facts(job: Job) -> dict[str, Any]:
     return read_record(job.folder / "scan" / "scan.json")
 
 
-def _motions(job: Job) -> dict[str, Array]:
+def pair_motions(job: Job) -> dict[str, Array]:
     """Motion (3,) mm of every pair at the body's centre, from its calibrated to its aligned pose."""
     alignment = _facts(job).get("alignment")
     if not alignment or job.calibration is None:

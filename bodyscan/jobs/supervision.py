@@ -132,6 +132,8 @@ def listen_to(process: Popen[str], job: Job, listen: Listen) -> tuple[str, tuple
                 ran.append(message["stage"])
             if "grade" in message:
                 listen({"event": "verdict", "job": job.name, **message})
+            if "cloud" in message:
+                listen({"event": "cloud", "job": job.name, **message})
             if "stage" in message:
                 listen({"event": "stage", "job": job.name, **message})
             if "ended" in message:

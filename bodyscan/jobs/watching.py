@@ -14,12 +14,13 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from subprocess import Popen
+from threading import Event
 from typing import Any
 
 import cv2
@@ -63,11 +64,16 @@ file in one go, in hundredths of a second."""
 
 @dataclass(frozen=True)
 class Arrival:
-    """What has arrived of a scan. whole: pairs with all their images. complete: nothing more is
-    expected."""
+    """What has arrived of a scan.
+
+    whole: pairs with all their images.
+    complete: nothing more is expected.
+    images: of each pair that takes part, how many images are there, and how many are to come in all.
+    """
 
     whole: tuple[str, ...]
     complete: bool
+    images: Mapping[str, tuple[int, int]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -112,7 +118,8 @@ class IncomingScan:
         is_marked = mark is not None and mark.changed_ns > self._since_ns
         complete = is_marked or (bool(whole) and expected <= whole)
         complete |= now_s - self._changed_s >= quiet_s
-        return Arrival(tuple(sorted(whole)), complete)
+        counts = {s.pair: (len(s.paths) - len(s.missing), len(s.paths)) for s in sequences}
+        return Arrival(tuple(sorted(whole)), complete, counts)
 
     def _is_whole(self, sequence: ImageSequence, now_s: float) -> bool:
         if sequence.missing:
@@ -185,6 +192,7 @@ class Watched:
     """What is watched and what to do with it.
 
     quiet_s: a scan with missing images is taken as it is if nothing has arrived for this long.
+    preview: tell what has arrived, and the cloud before it is meshed (events `images`, `cloud`).
     """
 
     inbox: Path
@@ -193,13 +201,18 @@ class Watched:
     pipeline: Pipeline
     quiet_s: float = 30.0
     command: Sequence[str] = COMMAND
+    preview: bool = False
 
 
 def watch(
-    watched: Watched, listen: Listen = ignore_events, *, once: bool = False
+    watched: Watched,
+    listen: Listen = ignore_events,
+    *,
+    once: bool = False,
+    stopped: Event | None = None,
 ) -> dict[str, Any]:
-    """Fuse every scan of the inbox as its images arrive, until interrupted, or, with `once`, until
-    everything there is done. Returns the event that ends a batch.
+    """Fuse every scan of the inbox as its images arrive, until interrupted or `stopped`, or, with
+    `once`, until everything there is done. Returns the event that ends a batch.
 
     A job that fails twice is set aside with its reason, and the others go on. Raises BadInput if
     the inbox is not a folder, if a batch or another watch is working in `out`, or if the
@@ -215,7 +228,7 @@ def watch(
         def do(job: Job) -> JobResult:
             return write_or_refuse(job) or supervise_job(job, process, listen)
 
-        watching = _Watching(watched, process, lambda job: pool.submit(do, job))
+        watching = _Watching(watched, process, lambda job: pool.submit(do, job), listen)
         try:
             process.start()
             while True:
@@ -227,7 +240,7 @@ def watch(
                 for outcome in watching.take_ended():
                     listen({"event": "job", **asdict(outcome)})
                     listen(watching.summary())
-                if once and not watching.scans:
+                if (once and not watching.scans) or (stopped and stopped.is_set()):
                     return watching.summary()
                 time.sleep(0.1)
         finally:
@@ -237,16 +250,19 @@ def watch(
 
 @dataclass
 class _Watching:
-    """scans: not ended yet. prepared: their pairs that were sent. running: their jobs."""
+    """scans: not ended yet. prepared: their pairs that were sent. running: their jobs. shown: of their
+    images."""
 
     watched: Watched
     process: ResidentProcess
     submit: Callable[[Job], Future[JobResult]]
+    listen: Listen
     scans: dict[Path, IncomingScan] = field(default_factory=dict)
     prepared: dict[Path, set[str]] = field(default_factory=dict)
     running: dict[Path, Future[JobResult]] = field(default_factory=dict)
     jobs: dict[Path, Job] = field(default_factory=dict)
     ended: dict[Path, JobResult] = field(default_factory=dict)
+    shown: dict[Path, Arrival] = field(default_factory=dict)
     _turn: int = 0
 
     def state_file(self, path: Path) -> Path:
@@ -286,6 +302,10 @@ class _Watching:
         if path in self.running:
             return
         arrival = scan.look(time.monotonic(), self.watched.quiet_s)
+        if self.watched.preview and arrival != self.shown.get(path):
+            self.shown[path] = arrival
+            job, images = job_name(path.name), dict(arrival.images)
+            self.listen({"event": "images", "job": job, "scan": path.name, "pairs": images})
         new = set(arrival.whole) - self.prepared.setdefault(path, set())
         if new:
             self.prepared[path] |= new
@@ -300,6 +320,7 @@ class _Watching:
         for path in done:
             self.ended[path] = self.running.pop(path).result()
             del self.scans[path], self.prepared[path]
+            self.shown.pop(path, None)
         return [self.ended[path] for path in done]
 
     def summary(self) -> dict[str, Any]:
@@ -350,6 +371,7 @@ class ResidentProcess:
     def __init__(self, watched: Watched) -> None:
         self._arguments = (*watched.command, "--resident", str(watched.calibration))
         self._calibration, self._threads = watched.calibration, watched.pipeline.resources.threads
+        self._preview = watched.preview
         self._process: Popen[str] | None = None
         self._is_stopped = False
         self._sent: set[Path] = set()
@@ -382,7 +404,7 @@ class ResidentProcess:
         if self._process.poll() is not None:
             self._suspected |= self._sent
             self.start()
-        self._send(folder=str(job.folder))
+        self._send(folder=str(job.folder), preview=self._preview)
         return listen_to(self._process, job, listen)
 
     def _send(self, **request: Any) -> None:

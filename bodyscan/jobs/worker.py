@@ -63,8 +63,12 @@ def stay() -> int:
 
     A request is a JSON object on a line of standard input. With `pairs` it asks to decode those of
     a scan that is still arriving, without to do the job in `folder` as a process of its own would,
-    with the same stages, locks and manifests. Returns 2 if the calibration cannot be used.
+    with the same stages, locks and manifests; with `preview` it shows the cloud too. Returns 2 if
+    the calibration cannot be used.
     """
+    from bodyscan.fusion.storage import no_use
+    from bodyscan.mesh.body import BodyCloud, BodyMesh
+    from bodyscan.report.model import pack_cloud
     from bodyscan.workflows.range_images import Preparation
 
     emit = _become_worker()
@@ -75,7 +79,11 @@ def stay() -> int:
         emit(unusable=str(error))
         return error.exit_code
     scan, *others = KINDS["fuse"]
-    run = partial(run_scan, preparation=preparation)
+
+    def show(body: BodyCloud | BodyMesh) -> None:
+        if isinstance(body, BodyCloud):
+            emit(cloud=pack_cloud(body))
+
     # Now, not while someone waits for the first verdict.
     import_module("bodyscan.workflows.scan_person")
     emit(ready=True)
@@ -85,6 +93,8 @@ def stay() -> int:
         if "pairs" in request:
             preparation.prepare(folder, request["pairs"])
             continue
+        made = show if request.get("preview") else no_use
+        run = partial(run_scan, preparation=preparation, made=made)
         with _log_of(folder):
             reason, _ = _attempt(folder, {"fuse": (replace(scan, run=run), *others)}, emit)
         emit(ended=request["folder"], failed=reason)

@@ -32,13 +32,13 @@ def advise(rig: Rig, solution: RigSolution) -> list[str]:
         for first, second, link in sorted(chain, key=lambda edge: -edge[2]["sigma_mm"])
         if link["sigma_mm"] > 2.0 * median
     ]
-    sigmas = {name: _sigma(solution, name) for name in solution.rig_from_camera}
+    sigmas = {name: pair_sigma_mm(solution, name) for name in solution.rig_from_camera}
     worst = max(sorted(sigmas), key=lambda name: sigmas[name])
     lines.append(f"{worst} has the largest sigma in the rig frame: {sigmas[worst]:.3f} mm")
     return lines + suggest_shots(rig, solution, worst)
 
 
-def _sigma(solution: RigSolution, name: str) -> float:
+def pair_sigma_mm(solution: RigSolution, name: str) -> float:
     """Sigma of a camera's position over all axes, mm."""
     position = solution.rig_from_camera[name].translation
     return float(np.linalg.norm(position_sigma(solution.covariance, name, position)))
@@ -101,7 +101,7 @@ def suggest_shots(rig: Rig, solution: RigSolution, pair: str) -> list[str]:
     shots = next((k for k, one in enumerate(after, start=1) if one <= before / 4.0), MAX_SHOTS)
     # The sigma as boards have shown it; the gain as if corners erred independently.
     gain = float(np.sqrt(after[shots - 1] / before))
-    (shot, board), sigma = best, _sigma(solution, pair)
+    (shot, board), sigma = best, pair_sigma_mm(solution, pair)
     effect = f"{sigma:.3f} to {gain * sigma:.3f} mm"
     if gain > 0.8:  # not worth taking
         return [

@@ -11,10 +11,12 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 
 from bodyscan.arrays import Array, Indices
+from bodyscan.boards.view import ViewKey
 from bodyscan.calibration.board_views import (
     BoardShape,
     LocatedView,
@@ -26,7 +28,7 @@ from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance
-from bodyscan.registration.joint_solve import estimate_view_sigmas, linearize_reprojection
+from bodyscan.registration.joint_solve import estimate_view_sigmas, linearize_marginalized
 from bodyscan.registration.view_graph import Target
 
 
@@ -72,12 +74,13 @@ def normal_equations(
     fixed_pair: str | None,
     fixed_target: Target | None,
     shapes: Mapping[str, BoardShape] | None = None,
+    motions: Mapping[ViewKey, Array] = MappingProxyType({}),
 ) -> NormalEquations:
     """Build the joint solve's normal equations, with Cauchy weights and each view's noise.
 
     fixed_pair, fixed_target: what fixes the rig frame: a pair, or a board, which then has no motion.
     views: of boards as described where there are shapes.
-    shapes: of boards whose corners were unknowns too.
+    shapes: of boards whose corners were unknowns too. motions: see `JointSolution`.
     """
     names, shapes = sorted(rig_from_camera), shapes or {}
     sizes = [6] * len(names)
@@ -89,7 +92,8 @@ def normal_equations(
         for keys, first in ((names, 0), (names, len(names)), (shapes, 2 * len(names)))
     )
     poses = cameras, rig_from_camera, rig_from_board
-    errors = [linearize_reprojection([apply_shape(view, shapes)], *poses) for view in views]
+    true = [apply_shape(view, shapes) for view in views]
+    errors = [linearize_marginalized([view], *poses, motions) for view in true]
     sigmas = estimate_view_sigmas([residuals for residuals, _ in errors])
     whitened = [residuals / sigma for (residuals, _), sigma in zip(errors, sigmas, strict=True)]
     scale = CORNERS.estimate_scale(np.concatenate(whitened))

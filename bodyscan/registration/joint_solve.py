@@ -14,11 +14,12 @@ from functools import partial
 import numpy as np
 
 from bodyscan.arrays import Array, Indices
+from bodyscan.boards.view import ViewKey
 from bodyscan.calibration.board_views import BoardShape, LocatedView, apply_shape
 from bodyscan.calibration.camera import CORNERS, camera_prior
 from bodyscan.geometry.camera import MATRIX, Camera, CameraPrior
 from bodyscan.geometry.least_squares import EXACT, Block, Noise, minimize
-from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
+from bodyscan.geometry.transforms import RigidTransform, adjoint, twist_jacobian
 from bodyscan.registration.view_graph import Target
 
 
@@ -27,12 +28,15 @@ class JointSolution:
     """Cameras, and all poses in the root camera's frame, mm: the start or the result of a solve.
 
     shapes: of all boards if their corners are unknowns, none if they lie as described.
+    motions: by view, (6, K): how its board may have moved since the others saw it; independent twists
+        of one sigma each, board frame, over the corners' sigma in px. Of all views or of none.
     """
 
     root_from_camera: dict[str, RigidTransform]
     root_from_board: dict[Target, RigidTransform]
     cameras: dict[str, Camera]
     shapes: dict[str, BoardShape] = field(default_factory=dict)
+    motions: Mapping[ViewKey, Array] = field(default_factory=dict)
 
 
 def solve_poses(
@@ -120,7 +124,7 @@ class _Unknowns:
             name: replace(shape, offsets=shape.offsets + step[self.of_corners[name]])
             for name, shape in solution.shapes.items()
         }
-        return JointSolution(root_from_camera, boards, cameras, shapes)
+        return JointSolution(root_from_camera, boards, cameras, shapes, solution.motions)
 
     def select_columns(self, view: LocatedView, shapes: Mapping[str, BoardShape]) -> Indices:
         """Columns of a view, or of each of its corners if those are unknowns, (1 or N, C)."""
@@ -143,7 +147,9 @@ def _blocks(
     """The corners of each pair's views, then the priors on cameras and shapes."""
     poses = solution.cameras, solution.root_from_camera, solution.root_from_board
     errors = [
-        linearize_reprojection([apply_shape(view, solution.shapes) for view in views], *poses)
+        linearize_marginalized(
+            [apply_shape(v, solution.shapes) for v in views], *poses, solution.motions
+        )
         for views in of_pair
     ]
     runs = [np.array([2 * len(view.points) for view in views]) for views in of_pair]
@@ -228,3 +234,27 @@ def linearize_reprojection(
         return jacobian.reshape(-1, jacobian.shape[2])
 
     return (camera.project(points) - pixels).ravel(), linearize
+
+
+def linearize_marginalized(
+    views: Sequence[LocatedView],
+    cameras: Mapping[str, Camera],
+    rig_from_camera: Mapping[str, RigidTransform],
+    rig_from_board: Mapping[Target, RigidTransform],
+    motions: Mapping[ViewKey, Array],
+) -> tuple[Array, Callable[[], Array]]:
+    """`linearize_reprojection` with the motion of each view's board marginalized: whitened by
+    (1 + M M^T)^-1/2, M being the residuals' derivatives by the motion (see `JointSolution`)."""
+    poses = cameras, rig_from_camera, rig_from_board
+    if not motions:
+        return linearize_reprojection(views, *poses)
+    parts = []
+    for view in views:
+        residuals, linearize = linearize_reprojection([view], *poses)
+        rows = np.column_stack([residuals, linearize()])
+        by_motion = rows[:, 7:13] @ adjoint(rig_from_board[view.target]) @ motions[view.key]
+        left, size, _ = np.linalg.svd(by_motion, full_matrices=False)
+        known = left * (1.0 - 1.0 / np.hypot(1.0, size))
+        parts.append(rows - known @ (left.T @ rows))
+    whitened = np.concatenate(parts)
+    return whitened[:, 0], lambda: whitened[:, 1:]

@@ -8,7 +8,7 @@ found to be bent.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -24,13 +24,14 @@ from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance, RayUncertainty, point_covariance
 from bodyscan.outcome import Outcome
+from bodyscan.registration.board_motion import estimate_motions
 from bodyscan.registration.board_shape import estimate_board_shapes
 from bodyscan.registration.cluster_covariance import (
     cluster_board_poses,
     cluster_robust_covariance,
     normal_equations,
 )
-from bodyscan.registration.joint_solve import JointSolution, solve_poses
+from bodyscan.registration.joint_solve import JointSolution, refine_solution, solve_poses
 from bodyscan.registration.rig_calibration import ObservedCorners
 from bodyscan.registration.rig_frame import (
     find_frame_board_rotation,
@@ -47,7 +48,7 @@ from bodyscan.registration.view_consistency import (
 )
 from bodyscan.registration.view_graph import (
     Target,
-    describe_unsynchronised,
+    by_target,
     initial_poses,
     locate_boards_jointly,
     view_graph,
@@ -138,25 +139,13 @@ def solve_rig(
     views that contradict each other by far; BadInput if nothing fixes the rig frame.
     """
     start, left_out = initial_poses(views, sorted(cameras))
-    loose: tuple[str, ...] = ()
-    while True:
-        names = sorted(start)
-        shared = [view for view in views if view.pair in start]
-        solved = _solve(rig, shared, {n: cameras[n] for n in names}, start)
-        unsynchronised = _find_unsynchronised(solved.views, solved.judged.wrong)
-        if not unsynchronised:
-            break
-        if 2 * len(unsynchronised) >= len(names):
-            solved = _solve(rig, shared, {n: cameras[n] for n in names}, start, weigh=True)
-            loose = (
-                f"{describe_unsynchronised(names)}: all views are used, weighted by how well they "
-                "agree, with sigmas to match; synchronise the cameras, or hold the board still",
-            )
-            break
-        left_out |= {name: describe_unsynchronised([name]) for name in unsynchronised}
-        start = {name: pose for name, pose in start.items() if name not in unsynchronised}
+    shared = [view for view in views if view.pair in start]
+    own = {name: cameras[name] for name in sorted(start)}
+    solved = _solve(rig, shared, own, start)
+    if _are_unsynchronised(solved.views, solved.judged.wrong):
+        solved = _solve(rig, shared, own, start, weigh=True)
     solution = _transfer_to_rig_frame(rig, solved)
-    notes = (*loose, *solved.judged.notes, *solved.notes, *lens_notes(solution.lenses))
+    notes = (*solved.judged.notes, *solved.notes, *lens_notes(solution.lenses))
     return Outcome(solution, notes, left_out)
 
 
@@ -177,39 +166,71 @@ def _solve(
     root_from_camera = {name: to_root @ pose for name, pose in start.items()}
     resolved, boards, inconsistent = locate_boards_jointly(views, root_from_camera)
     solution = JointSolution(root_from_camera, boards, cameras)
-    # The graph's poses alone are rough: 30 px.
-    gross = find_inconsistent_views(
-        [view for view in resolved if view.target in inconsistent], solution, 30.0
-    ).value
-    gross = [] if weigh else gross
-    kept = [view for view in resolved if view not in gross]
-    for loss_px in LOSSES_PX:
-        solution = solve_poses(kept, solution, root=root, loss_px=loss_px)
-    solve = partial(
-        solve_consistently,
-        root=root,
-        limit_px=np.inf if weigh else error_limit(kept, cameras),
-    )
-    judged = solve(resolved, solution, wrong=[view.key for view in gross])
-    # If pairs are to be left out, the others are solved again anyway.
-    if _find_unsynchronised(resolved, judged.wrong):
-        return _Solved(judged, resolved, (), None)
+    if weigh:
+        judged, limit_px = _weigh_views(resolved, solution, root), np.inf
+    else:
+        judged, limit_px = _judge_views(resolved, solution, inconsistent, root)
+        if _are_unsynchronised(resolved, judged.wrong):
+            return _Solved(judged, resolved, (), None)  # all is solved again
+    solve = partial(solve_consistently, root=root, limit_px=limit_px)
+    moved = judged.notes if weigh else ()
     shaped = estimate_board_shapes(resolved, judged, root=root)
     true = [apply_shape(v, shaped.value.shapes) for v in judged.select_consistent(resolved)]
     lenses = choose_lenses(rig, true, shaped.value)
     solution = lenses.solution
     if solution.shapes or solution.cameras != judged.solution.cameras:
         judged = solve(resolved, solution, wrong=judged.wrong)
-    return _Solved(judged, resolved, shaped.notes, lenses)
+    return _Solved(judged, resolved, (*moved, *shaped.notes), lenses)
 
 
-def _find_unsynchronised(views: Sequence[LocatedView], wrong: Collection[ViewKey]) -> list[str]:
-    """Pairs most of whose shared views are wrong."""
-    count = Counter(view.target for view in views)
-    shared = [view for view in views if count[view.target] > 1]
-    dropped = Counter(view.pair for view in shared if view.key in wrong)
-    number = Counter(view.pair for view in shared)
-    return sorted(name for name in number if 2 * dropped[name] > number[name])
+def _judge_views(
+    views: Sequence[LocatedView], solution: JointSolution, inconsistent: Set[Target], root: str
+) -> tuple[ConsistentSolve, float]:
+    """Solve without the views that contradict the others; also return the limit on a view's error."""
+    # The graph's poses alone are rough: 30 px.
+    doubtful = [view for view in views if view.target in inconsistent]
+    gross = {view.key for view in find_inconsistent_views(doubtful, solution, 30.0).value}
+    kept = [view for view in views if view.key not in gross]
+    limit_px = error_limit(kept, solution.cameras)
+    for loss_px in LOSSES_PX:
+        solution = solve_poses(kept, solution, root=root, loss_px=loss_px)
+    judged = solve_consistently(views, solution, root=root, limit_px=limit_px, wrong=gross)
+    return judged, limit_px
+
+
+def _weigh_views(
+    views: Sequence[LocatedView], solution: JointSolution, root: str
+) -> ConsistentSolve:
+    """Solve with all views, each of a moment of its own: see `board_motion`."""
+    errors = [
+        solution.cameras[view.pair].project(view.camera_from_board.apply(view.points)) - view.pixels
+        for view in views
+    ]
+    noise_px = CORNERS.estimate_scale(np.concatenate(errors).ravel())
+    for _round in range(4):  # the last changes spreads by less than a hundredth
+        motions, rms_mm = estimate_motions(views, solution, noise_px)
+        solution = refine_solution(views, replace(solution, motions=motions), root=root)
+    largest = max(rms_mm.values())
+    moved = [f"{name} by {mm:.2g} mm" for name, mm in rms_mm.items() if mm > 0.1 * largest]
+    note = (
+        f"the board had moved when these took their pictures (RMS): {', '.join(moved)}. They were not "
+        "taken together with the others'. All views are used, weighted by how well they agree, with "
+        "sigmas to match; synchronise the cameras, or hold the board still"
+    )
+    return ConsistentSolve(solution, frozenset(), (note,))
+
+
+def _are_unsynchronised(views: Sequence[LocatedView], wrong: Collection[ViewKey]) -> bool:
+    """Whether views disagree as those of different moments do, and not as slips, one by one: most of
+    a pair's shared views are wrong, or some in more than a tenth of the shots of every board."""
+    shared = [group for group in by_target(views).values() if len(group) > 1]
+    number = Counter(view.pair for group in shared for view in group)
+    dropped = Counter(view.pair for group in shared for view in group if view.key in wrong)
+    shots = Counter(group[0].board for group in shared)
+    odd = Counter(group[0].board for group in shared if any(v.key in wrong for v in group))
+    return any(2 * dropped[name] > number[name] for name in number) or (
+        bool(shots) and all(10 * odd[board] > count for board, count in shots.items())
+    )
 
 
 def _transfer_to_rig_frame(rig: Rig, solved: _Solved) -> RigSolution:
@@ -233,6 +254,7 @@ def _transfer_to_rig_frame(rig: Rig, solved: _Solved) -> RigSolution:
         fixed_pair=rig.frame_pair.name if rig.frame_pair else None,
         fixed_target=fixed,
         shapes=solution.shapes,
+        motions=solution.motions,
     )
     true = [apply_shape(view, solution.shapes) for view in kept]
     views = [view.resolve(turn) if view.target == fixed else view for view in true]

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyscan.arrays import Array, Bytes
-from bodyscan.mesh.body import BodyMesh
+from bodyscan.mesh.body import BodyCloud, BodyMesh
 
 Legend = dict[str, Any]
 
@@ -35,23 +35,26 @@ class Strokes:
 
 
 def pack(
-    shape: BodyMesh | None,
+    shape: BodyMesh | BodyCloud | None,
     layers: Sequence[Layer] = (),
     *,
     strokes: Strokes | None = None,
     labels: Sequence[tuple[str, Array]] = (),
     view_deg: tuple[float, float] = (25.0, 6.0),
 ) -> dict[str, Any]:
-    """Pack a model for `viewer.js`.
+    """Pack a model for `viewer.js`: a mesh, or points that are drawn as squares.
 
     view_deg: where the viewer stands at first: azimuth from x towards y, and elevation.
 
     A coordinate is `low + step * integer`, in steps of 1/65,535 of the longest side. Raises
     ValueError for a mesh of more than 65,536 vertices.
     """
-    if shape is not None and len(shape.vertices) > 65_536:
-        raise ValueError(f"{len(shape.vertices)} vertices; 16-bit indices address 65,536")
-    coordinates = [shape.vertices] if shape is not None else []
+    vertices: Array | None = None
+    if shape is not None:
+        vertices = shape.points if isinstance(shape, BodyCloud) else shape.vertices
+    if vertices is not None and len(vertices) > 65_536:
+        raise ValueError(f"{len(vertices)} vertices; 16-bit indices address 65,536")
+    coordinates = [vertices] if vertices is not None else []
     coordinates += [strokes.ends.reshape(-1, 3)] if strokes is not None else []
     everything = np.concatenate(coordinates)
     low, high = everything.min(axis=0), everything.max(axis=0)
@@ -74,13 +77,11 @@ def pack(
             "size": float(np.linalg.norm(high - low)),
         },
     }
-    if shape is not None:
+    if shape is not None and vertices is not None:
         normals = np.clip(np.rint(127 * np.nan_to_num(shape.normals)), -127, 127)
-        packed |= {
-            "positions": whole(shape.vertices),
-            "normals": encode(normals.astype(np.int8)),
-            "faces": encode(shape.faces.astype("<u2")),
-        }
+        packed |= {"positions": whole(vertices), "normals": encode(normals.astype(np.int8))}
+    if isinstance(shape, BodyMesh):
+        packed["faces"] = encode(shape.faces.astype("<u2"))
     if layers:
         packed["layers"] = [asdict(layer) | {"colours": encode(layer.colours)} for layer in layers]
     if strokes is not None:
@@ -89,6 +90,12 @@ def pack(
             "colours": encode(np.repeat(strokes.colours, 2, axis=0)),
         }
     return packed
+
+
+def pack_cloud(cloud: BodyCloud) -> dict[str, Any]:
+    """Pack a coarse cloud, of 25,000 points at most, as photographed."""
+    few = cloud.subsample(-(-len(cloud.points) // 25_000))
+    return pack(few, [Layer("photo", few.colours)])
 
 
 def encode(array: NDArray[Any]) -> str:

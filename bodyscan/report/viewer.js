@@ -4,8 +4,8 @@
 (() => {
   const MESH = [
     `attribute vec3 position; attribute vec3 normal; attribute vec3 colour;
-     uniform mat4 clip; uniform vec3 low; uniform float step; varying vec3 n; varying vec3 c; varying vec3 at;
-     void main() { vec3 p = low + step * position; n = normal; c = colour; at = p; gl_Position = clip * vec4(p, 1.0); }`,
+     uniform mat4 clip; uniform vec3 low; uniform float step; uniform float size; varying vec3 n; varying vec3 c; varying vec3 at;
+     void main() { vec3 p = low + step * position; n = normal; c = colour; at = p; gl_PointSize = size; gl_Position = clip * vec4(p, 1.0); }`,
     // A lamp at the viewer's shoulder and a weaker one opposite; what faces away is seen from inside.
     `precision mediump float; varying vec3 n; varying vec3 c; varying vec3 at; uniform vec3 eye; uniform vec3 lamp;
      uniform float plain;
@@ -77,14 +77,18 @@
 
   function upload(gl, model) {
     const parts = { layers: [] };
-    if (model.faces) {
+    if (model.positions) {
       parts.mesh = program(gl, MESH);
-      parts.positions = buffer(gl, words(model.positions));
+      const positions = words(model.positions);
+      parts.points = positions.length / 3;
+      parts.positions = buffer(gl, positions);
       parts.normals = buffer(gl, new Int8Array(bytes(model.normals).buffer));
+      parts.layers = model.layers.map((layer) => buffer(gl, bytes(layer.colours)));
+    }
+    if (model.faces) {
       const corners = words(model.faces);
       parts.corners = corners.length;
       parts.faces = buffer(gl, corners, gl.ELEMENT_ARRAY_BUFFER);
-      parts.layers = model.layers.map((layer) => buffer(gl, bytes(layer.colours)));
     }
     if (model.lines) {
       parts.line = program(gl, LINES);
@@ -119,8 +123,12 @@
       feed(gl, parts.mesh, "position", parts.positions, gl.UNSIGNED_SHORT, false);
       feed(gl, parts.mesh, "normal", parts.normals, gl.BYTE, true);
       feed(gl, parts.mesh, "colour", parts.layers[layer], gl.UNSIGNED_BYTE, true);
-      gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, parts.faces);
-      gl.drawElements(gl.TRIANGLES, parts.corners, gl.UNSIGNED_SHORT, 0);
+      // Points of a coarse cloud lie some 8 mm apart: squares of that size close the surface.
+      gl.uniform1f(gl.getUniformLocation(parts.mesh, "size"), Math.max(2, (8 * gl.canvas.height) / (2 * view.distance * Math.tan(FIELD / 2))));
+      if (parts.faces) {
+        gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, parts.faces);
+        gl.drawElements(gl.TRIANGLES, parts.corners, gl.UNSIGNED_SHORT, 0);
+      } else gl.drawArrays(gl.POINTS, 0, parts.points);
     }
     if (parts.line) {
       frame(gl, parts.line, model, clip);
@@ -204,13 +212,13 @@
     });
   }
 
-  function start(figure) {
-    const model = JSON.parse(figure.querySelector("script").textContent), canvas = figure.querySelector("canvas");
+  function start(figure, model) {
+    const canvas = figure.querySelector("canvas");
     const [labels, buttons, legend] = ["labels", "layers", "legend"].map((name) => figure.querySelector(`.${name}`));
     // The picture is kept, so that it can be printed.
     const gl = canvas.getContext("webgl", { preserveDrawingBuffer: true, antialias: true });
     if (!gl) {
-      element("p", "This browser shows no WebGL: the pictures below show the same.", canvas.parentElement).className = "failed";
+      element("p", "This browser shows no WebGL: the pictures show the same.", canvas.parentElement).className = "failed";
       return;
     }
     const home = { ...model.view, distance: (0.54 * model.view.size) / Math.tan(FIELD / 2) };
@@ -218,6 +226,7 @@
     let parts = upload(gl, model), layer = 0, waiting = false;
     const draw = () => {
       waiting = false;
+      if (!canvas.isConnected) return;
       const sharp = window.devicePixelRatio || 1;
       const [width, height] = [canvas.clientWidth, canvas.clientHeight].map((x) => Math.max(1, Math.round(x * sharp)));
       if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
@@ -234,11 +243,21 @@
     if (model.layers.length > 1) model.layers.forEach((one, k) => element("button", one.name, buttons).addEventListener("click", () => choose(k)));
     steer(canvas, view, home, changed);
     new ResizeObserver(changed).observe(canvas);
+    if (figure.dataset.turning) {  // by itself until a person takes it
+      const again = () => { if (!canvas.isConnected || !figure.dataset.turning) return; view.azimuth -= 0.012; changed(); setTimeout(again, 40); };
+      canvas.addEventListener("pointerdown", () => { delete figure.dataset.turning; });
+      again();
+    }
     canvas.addEventListener("webglcontextlost", (e) => e.preventDefault());
     canvas.addEventListener("webglcontextrestored", () => { parts = upload(gl, model); changed(); });
     window.addEventListener("beforeprint", draw);
     choose(0);
   }
 
-  document.querySelectorAll("figure.viewer").forEach(start);
+  // A page whose figures have no model yet shows them by this; a figure is shown anew with another canvas.
+  window.showModel = start;
+  document.querySelectorAll("figure.viewer").forEach((figure) => {
+    const script = figure.querySelector("script");
+    if (script) start(figure, JSON.parse(script.textContent));
+  });
 })();

@@ -15,25 +15,6 @@ from bodyscan.stripes.scan_lines import ScanLines
 from bodyscan.stripes.stripe_coordinates import interpolate_stripes
 
 
-@dataclass(frozen=True)
-class ResponseShare:
-    """Error of s due to the projector's response, before its correction, and due to noise after it.
-
-    response_rms, noise_rms: stripes, over the pixels that have s.
-    """
-
-    response_rms: float
-    noise_rms: float
-
-    def __str__(self) -> str:
-        total = self.response_rms**2 + self.noise_rms**2
-        return (
-            f"an error of s of {self.response_rms:.2g} stripes RMS due to the projector's response was"
-            f" corrected ({self.response_rms**2 / total:.0%} of the variance; the rest is noise of"
-            f" {self.noise_rms:.2g} stripes)"
-        )
-
-
 @dataclass(frozen=True, eq=False)
 class StripeMap:
     """The stripe coordinate of every lit pixel, and the stripe boundaries between them.
@@ -48,7 +29,6 @@ class StripeMap:
     beyond: (height, width) bool, lit by a stripe that lies deeper than wanted, where s is NaN (see
         `StripeLimits`); None if all stripes were wanted.
     crossing, crossing_fault: the map of the stripes that run the other way, or why there is none.
-    response: error due to the projector's response; None if not measured or noise explains it.
     correlation_px: distance along rows and along columns within which pixels share noise.
     saturated: share of the pixels lit by wanted stripes that are white; 0 if not counted.
     """
@@ -62,7 +42,6 @@ class StripeMap:
     stripes: int
     beyond: Mask | None = None
     crossing: StripeMap | None = None
-    response: ResponseShare | None = None
     crossing_fault: str = ""
     correlation_px: tuple[float, float] = (0.0, 0.0)
     saturated: float = 0.0

@@ -35,7 +35,7 @@ from bodyscan.rig.templates import fill
 from bodyscan.stripes.decoding import decode_stripes
 from bodyscan.stripes.stripe_code import StripeCode
 from bodyscan.stripes.stripe_limits import StripeLimits
-from bodyscan.stripes.stripe_map import ResponseShare, StripeMap
+from bodyscan.stripes.stripe_map import StripeMap
 
 NUMBER = re.compile(r"\d[\d.]*%?(, \d[\d.]*%?)*")
 """Figures in an error's text, left out to tell whether two shots failed for the same reason."""
@@ -85,12 +85,10 @@ class BoardStripes:
     """What one sequence shows on boards.
 
     boundaries: near each view.
-    responses: corrections of the projector's response.
     crossing_fault: why the stripes that cross are not used; "" if they are, or there are none.
     """
 
     boundaries: Mapping[ViewKey, BoardBoundaries]
-    responses: tuple[ResponseShare, ...] = ()
     crossing_fault: str = ""
 
 
@@ -170,7 +168,7 @@ def decode_on_boards(
         if prints:
             bands = every, turn[sequence]
             near = {view.key: prints.select(view, near[view.key], bands) for view in group}
-        return BoardStripes(near, tuple(responses_in(stripes)), stripes.crossing_fault)
+        return BoardStripes(near, stripes.crossing_fault)
 
     found, errors = attempt_each(
         decode, sequences, BodyscanError, stage="decoding stripes", progress=progress
@@ -179,9 +177,7 @@ def decode_on_boards(
     failed, failure_notes = describe_failures(errors, {pair for pair, _, _ in boundaries})
     failed |= _without_stripes(rig, views, {sequence.pair for sequence in sequences})
     faults = {sequence: one.crossing_fault for sequence, one in found.items()}
-    responses = ((s.pair, share) for s, one in found.items() for share in one.responses)
-    notes = (*failure_notes, *crossing_notes(faults), *response_notes(responses))
-    return Outcome(boundaries, notes, failed)
+    return Outcome(boundaries, (*failure_notes, *crossing_notes(faults)), failed)
 
 
 def _without_stripes(rig: Rig, views: Iterable[BoardView], decoded: set[str]) -> dict[str, str]:
@@ -219,19 +215,6 @@ def _group_faults(
         kind = NUMBER.sub("", fault.partition("such as")[0])
         groups.setdefault((sequence.pair, kind), (fault, []))[1].append(sequence)
     return {(pair, fault): group for (pair, _), (fault, group) in groups.items()}
-
-
-def responses_in(stripes: StripeMap) -> list[ResponseShare]:
-    """Response corrections in a stripe map and its crossing map."""
-    maps = (stripes, stripes.crossing)
-    return [one.response for one in maps if one is not None and one.response is not None]
-
-
-def response_notes(responses: Iterable[tuple[str, ResponseShare]]) -> Iterator[str]:
-    """One line for each pair with a corrected projector response, quoting its strongest shot."""
-    strongest = dict(sorted(responses, key=lambda one: one[1].response_rms))
-    for pair, share in sorted(strongest.items()):
-        yield f"{pair}: {share}"
 
 
 def describe_failures(

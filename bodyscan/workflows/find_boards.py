@@ -191,15 +191,19 @@ def write_found_corners(
 def _look_closer(
     rig: Rig, views: Sequence[BoardView], without: Sequence[ImageSequence]
 ) -> dict[ImageSequence, str]:
-    """What images without a board do show, for pairs that saw few boards or missed few."""
-    chosen: list[ImageSequence] = []
+    """What images without a board do show: closely for pairs that saw few boards or missed few, at a
+    glance for those that saw most."""
+    chosen: list[tuple[ImageSequence, bool]] = []
     for pair in rig.pairs:
         images = [sequence for sequence in without if sequence.pair == pair.name]
         found = sum(view.pair == pair.name for view in views)
         if found < MIN_POSES or len(images) <= LOOKED_AT:
-            chosen += images[:LOOKED_AT]
+            chosen += [(one, False) for one in images[:LOOKED_AT]]
+        elif found > len(images):
+            chosen += [(one, True) for one in images]
 
-    def look(sequence: ImageSequence) -> str:
+    def look(one: tuple[ImageSequence, bool]) -> str:
+        sequence, quick = one
         pair = rig.pair(sequence.pair)
         if pair.projector and sequence.has_stripes and not sequence.missing:
             images = read_sequence(sequence.without_crossing, pair.camera)
@@ -207,9 +211,11 @@ def _look_closer(
             if step:
                 return step
         image = read_board_image(sequence, pair)
-        return "; ".join(f"{board.name}: {describe_unfound(image, board)}" for board in rig.boards)
+        texts = [(board.name, describe_unfound(image, board, quick=quick)) for board in rig.boards]
+        return "; ".join(f"{name}: {text}" for name, text in texts if text)
 
-    return dict(zip(chosen, map_threads(look, chosen), strict=True))
+    texts = map_threads(look, chosen)
+    return {one: text for (one, _), text in zip(chosen, texts, strict=True) if text}
 
 
 def calibrate_cameras(

@@ -27,11 +27,10 @@ from bodyscan.reconstruction.scan_volume import stripes_in_volume
 from bodyscan.reconstruction.triangulation import reconstruct_range_image
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.storage import load_calibration
-from bodyscan.stripes.stripe_map import ResponseShare
-from bodyscan.workflows.decode import crossing_notes, decode_sequence, response_notes, responses_in
+from bodyscan.workflows.decode import crossing_notes, decode_sequence
 
-Reconstructed = tuple[RangeImage, tuple[ResponseShare, ...], str]
-"""A range image with the projector's response and why the crossing stripes were not used."""
+Reconstructed = tuple[RangeImage, str]
+"""A range image, and why the crossing stripes were not used."""
 
 
 def reconstruct_sequence(
@@ -59,7 +58,7 @@ def reconstruct_sequence(
         image = replace(image, time_ms=moment, span_ms=span)
     if volume_only:
         image = cut_to_volume(image, at, calibration.rig.volume)
-    return image, tuple(responses_in(stripes)), stripes.crossing_fault
+    return image, stripes.crossing_fault
 
 
 def reconstruct_range_images(
@@ -103,13 +102,13 @@ def reconstruct_range_images(
     failed |= {s.pair: captures.relative(str(error)) for s, error in errors.items()}
     if not found:
         raise ScanFailed(f"no pair gave a range image:{format_list(failed)}")
-    images = [image for image, *_ in found.values()]
+    images = [image for image, _ in found.values()]
     notes = [f"{image.pair}: {image.agreement}" for image in images if image.agreement is not None]
     empty = (image.pair for image in images if not np.isfinite(image.points).any())
     notes += [f"{pair}: nothing that it measured lies inside the rig's `volume`" for pair in empty]
-    notes += map(captures.relative, crossing_notes({one: made[-1] for one, made in found.items()}))
-    responses = ((image.pair, share) for image, shares, _ in found.values() for share in shares)
-    return Outcome(images, (*notes, *response_notes(responses)), failed)
+    faults = {sequence: fault for sequence, (_, fault) in found.items()}
+    notes += map(captures.relative, crossing_notes(faults))
+    return Outcome(images, tuple(notes), failed)
 
 
 _Made = tuple[Reconstructed, tuple[tuple[int, int], ...]]

@@ -112,6 +112,7 @@ def scan_folder(
     follow_links: bool = False,
     preparation: Preparation | None = None,
     announce: Announce = say_nothing,
+    made: Made | None = None,
 ) -> tuple[Scan, Path, Outcome[list[Path]]]:
     """Scan a capture folder; return the scan, its scan.json in `out` and the pictures beside it.
 
@@ -123,6 +124,7 @@ def scan_folder(
     preparation: what was loaded and decoded before.
     announce: called with the verdict on the points alone, and with the final one once the result is
         saved.
+    made: called with the cloud and the mesh while pictures of them are drawn.
 
     Raises ScanFailed after recording it in scan.json.
     """
@@ -138,6 +140,8 @@ def scan_folder(
     with background() as other:
 
         def draw(body: BodyCloud | BodyMesh) -> None:
+            if made is not None:
+                other.submit(made, body)
             drawn.append(other.submit(draw_pictures, body))
 
         try:

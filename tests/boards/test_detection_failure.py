@@ -103,4 +103,15 @@ def test_of_the_narrowest_checkerboard_that_was_not_found_it_is_said_what_shows(
     board = Board(name="b", kind="checkerboard", columns=4, rows=9, square_mm=30)
     assert "but one of 4 x 8: 5 columns x 9 rows" in describe_unfound(checkered(5, 9), board)
     nothing = describe_unfound(np.full((240, 320), 90, np.uint8), board)
-    assert nothing.endswith(", nor of one more or fewer in either direction")
+    assert nothing.endswith(
+        "more or fewer in either direction, nor anything like a board's squares"
+    )
+
+
+def test_at_a_glance_squares_that_are_not_whole_are_told_from_none() -> None:
+    board = Board(name="b", kind="checkerboard", columns=9, rows=7, square_mm=30)
+    cut = describe_unfound(checkered(9, 7)[:, 70:], board, quick=True)
+    assert cut.startswith("not whole, but squares like a board's")
+    empty = describe_unfound(np.full((240, 320), 90, np.uint8), board, quick=True)
+    assert empty == "not whole, nor anything like a board's squares"
+    assert describe_unfound(IMAGE, BOARD, quick=True) == ""

@@ -14,10 +14,7 @@ from bodyscan.alignment.icp import Alignment, align
 from bodyscan.arrays import Array
 from bodyscan.motion.body_parts import PARTS
 from bodyscan.motion.breath import breath_along_normals
-from bodyscan.motion.estimation import (
-    EstimatedMotion,
-    estimate_motion,
-)
+from bodyscan.motion.estimation import EstimatedMotion, estimate_motion
 from bodyscan.motion.person_motion import PersonMotion
 from bodyscan.motion.warping import warp_to_middle
 from bodyscan.reconstruction.range_image import RangeImage
@@ -79,9 +76,7 @@ def test_sigmas_say_what_is_left(
     _, alignment, followed = found
     assert followed is not None
     errors = errors_mm(standing.at(standing.middle_s), surface(standing, alignment, followed))
-    # As much as they err, within what a single person's motion may be off by. Of both the
-    # squares' mean: arms err, and are known, several times worse than legs. (Of five
-    # people, on three and four poles, 0.9.)
+    # Of five people, on three and four poles, 0.9.
     assert 0.6 < rms(errors) / rms(followed.sigma_mm) < 1.4
 
 
@@ -101,20 +96,6 @@ def test_the_operator_hears_what_each_part_did(
     # Along the arm nothing shows how far it moved.
     assert 0.5 < moved["left arm"] / np.percentile(most[arm], 95) < 1.3
     assert "left arm: moved by" in person.lines[2]
-
-
-def test_a_pair_has_seen_what_faces_it_and_not_what_faces_away(
-    standing: LivingScan, found: tuple[Alignment, Alignment, EstimatedMotion | None]
-) -> None:
-    _, _, followed = found
-    assert followed is not None
-    cells = followed.cells
-    for pair, seen in zip(followed.warps, followed.observed, strict=True):
-        away = cells.centres - standing.rig_from_camera[pair].translation
-        facing = -np.sum(away * cells.normals, axis=1) / np.linalg.norm(away, axis=1)
-        # A cell's points face as it does, but a cell of a hand may have points of its other side.
-        assert 0.1 < seen.mean() < 0.3
-        assert seen[facing < -0.2].mean() < 0.01
 
 
 def test_without_a_trunk_there_is_no_breath(

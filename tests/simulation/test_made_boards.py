@@ -46,26 +46,10 @@ def test_charuco_is_as_opencv_draws_it(legacy: bool, face: int) -> None:
     assert (dark == image).mean() > 0.98
 
 
-def test_margin_is_blank_and_the_first_square_dark() -> None:
-    printed = make_print(PLAIN, 0, MAKING)
-    places = np.array([[-3, 10], [3, 3], [23, 3], [23, 23], [103, 3], [97, 3]], np.float32)
-    dark = printed.albedo(places) < 0.4
-    assert dark.tolist() == [False, True, False, True, False, True]
-
-
 def test_a_dictionary_with_too_few_markers_is_refused() -> None:
     board = CHARUCO.model_copy(update={"dictionary": "DICT_4X4_50", "first_marker": 40})
     with pytest.raises(BadInput, match="50 markers"):
         make_board(board, MAKING, np.random.default_rng(0))
-
-
-def test_corners_of_a_perfect_board_lie_where_the_rig_file_says() -> None:
-    corners = make_board(CHARUCO, MAKING, np.random.default_rng(0)).corners
-    assert len(corners) == 2 * 5 * 3
-    assert corners[0] == pytest.approx([60, 60, 0])
-    assert corners[1] == pytest.approx([120, 60, 0])
-    assert corners[5] == pytest.approx([60, 120, 0])
-    assert corners[15] == pytest.approx([300, 60, 5])  # the back is turned about the y axis
 
 
 def test_a_bowed_board_stands_out_towards_its_front() -> None:

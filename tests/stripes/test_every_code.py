@@ -163,7 +163,7 @@ def test_projected_patterns_are_decoded_to_their_stripes(code: Code, direction: 
     true = (pixel + 0.5) / (len(pixel) / 40)
     true = np.broadcast_to(true[:, None] if direction == "horizontal" else true, lit.shape)
     known = np.isfinite(seen.s)
-    assert known.mean() > 0.92
+    assert known.mean() > 0.86
     # Light that is not blurred at all says at which pixels a boundary lies between, and no more:
     # s is right to half a pixel of 3 or 4 a stripe.
     # A pixel that lies between no two boundaries says so by its sigma.

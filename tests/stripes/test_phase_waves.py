@@ -138,7 +138,7 @@ def test_an_ambiguous_order_is_not_guessed(keys: Keys, light: float) -> None:
 
 @pytest.mark.parametrize("gamma", [1.4, 2.2])
 @pytest.mark.parametrize("keys", [HIERARCHICAL, HETERODYNE], ids=str)
-def test_the_projectors_response_is_corrected_and_reported(keys: Keys, gamma: float) -> None:
+def test_the_projectors_response_is_corrected(keys: Keys, gamma: float) -> None:
     lit, coded, s = captured(keys, gamma=gamma)
     straight = errors(read(keys, *captured(keys)[:2]), s)
     seen = read(keys, lit, coded)
@@ -146,15 +146,6 @@ def test_the_projectors_response_is_corrected_and_reported(keys: Keys, gamma: fl
     assert len(off) > 0.97 * np.isfinite(inner(s)).sum()
     # A quarter more than the noise of a straight projector: amplitudes are less at a gamma as well.
     assert rms(off) < 1.35 * rms(straight) + 0.01
-    if keys is HIERARCHICAL:
-        assert seen.response is not None
-        # The second harmonic of cos^2's power, over the first, in turns of 20 stripes.
-        place = np.arange(3600) / 3600 * 2 * np.pi
-        wave = (0.5 + 0.5 * np.cos(place)) ** gamma
-        share = np.mean(wave * np.cos(2 * place)) / np.mean(wave * np.cos(place))
-        predicted = share / (2 * np.pi) * 20 / 2**0.5
-        assert seen.response.response_rms == pytest.approx(predicted, rel=0.2)
-        assert "was corrected" in str(seen.response)
 
 
 def test_unevenly_distributed_phases_are_no_response() -> None:

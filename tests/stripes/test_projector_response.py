@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from bodyscan.stripes.phase.projector_response import (
     PhaseError,
-    compute_response_share,
     correct_wave,
     estimate_error,
     estimate_error_against,
@@ -44,28 +42,6 @@ def left(wave: MeasuredWave, s: np.ndarray = S) -> float:
 
 ERROR = PhaseError(3, np.array([0.012, -0.004, 0.0, 0.0]), np.array([-0.02, 0.003, 0.001, 0.0]))
 EVERYWHERE = np.ones(S.shape, bool)
-
-
-def test_an_error_is_waves_of_the_steps_times_the_frequency() -> None:
-    turn = np.linspace(0.0, 1.0, 50, dtype=np.float32)
-    expected = sum(
-        c * np.cos(2.0 * np.pi * 3 * m * turn) + s * np.sin(2.0 * np.pi * 3 * m * turn)
-        for m, c, s in zip((1, 2, 3, 4), ERROR.cosines, ERROR.sines, strict=True)
-    )
-    np.testing.assert_allclose(ERROR.evaluate(turn), expected, atol=1e-5)
-    assert left(correct_wave(seen(Wave(20.0, 3), ERROR), ERROR)) < 1e-5
-    wave = seen(Wave(20.0, 3), ERROR)
-    assert correct_wave(wave, None) is wave
-
-
-@pytest.mark.parametrize(("noise", "best"), [(0.0, 4e-4), (0.001, 1.5e-3)])
-def test_the_error_of_a_wave_that_repeats_is_found(noise: float, best: float) -> None:
-    wave = seen(Wave(20.0, 3), ERROR, noise)
-    assert left(wave) > 0.015
-    error = estimate_error(wave, EVERYWHERE, STRIPES)
-    assert error is not None
-    assert error.steps == 3
-    assert left(correct_wave(wave, error)) < best
 
 
 def test_the_error_is_found_despite_surface_edges() -> None:
@@ -110,18 +86,3 @@ def test_a_wave_that_has_nothing_to_do_with_the_finer_one_gives_no_error() -> No
     assert estimate_error_against(long, mixed, EVERYWHERE, STRIPES) is None
     backwards = replace(long, turn=np.float32(1.0) - long.turn)
     assert estimate_error_against(backwards, fine, EVERYWHERE, STRIPES) is None
-
-
-def test_the_share_of_the_response_in_the_variance() -> None:
-    wave = seen(Wave(20.0, 3), ERROR)
-    sigma = np.full(S.shape, 0.03, np.float32)
-    sigma[0] = np.nan
-    sigma[1] = 0.07
-    share = compute_response_share(ERROR, wave, sigma)
-    assert share is not None
-    true = np.std(ERROR.evaluate(np.linspace(0, 1, 3000, endpoint=False, dtype=np.float32)))
-    noise = np.sqrt((58 * 0.03**2 + 0.07**2) / 59)
-    found = [getattr(share, name) for name in share.__dataclass_fields__]
-    np.testing.assert_allclose(found, [20.0 * true, noise], rtol=1e-4)
-    assert compute_response_share(None, wave, sigma) is None
-    assert compute_response_share(ERROR, wave, np.full(S.shape, np.nan, np.float32)) is None

@@ -35,6 +35,22 @@ def contrast(sequence: Sequence) -> Bytes:
     return cv2.subtract(sequence.lit, sequence.dark)
 
 
+def test_where_the_light_ends_no_stripe_is_read_from_what_skin_scatters_beyond() -> None:
+    """The last stripe is dark. Rows of points there were 3 to 12 mm inside a thigh."""
+    s_at, stripes = wavy(2.2), 80
+    sequence = render_sequence(s_at, stripes=stripes - 1)
+
+    def scatter(frame: np.ndarray) -> np.ndarray:
+        wide = cv2.GaussianBlur(frame.astype(np.float32), (0, 0), 3.0)
+        return np.rint(0.4 * frame + 0.6 * wide).astype(np.uint8)
+
+    frames = sequence.lit, sequence.dark, sequence.patterns, sequence.inverses
+    scattered = (scatter(f) if f.ndim == 2 else np.stack(list(map(scatter, f))) for f in frames)
+    seen = decode_gray(*scattered, stripes=stripes, direction="horizontal")
+    v, u = np.nonzero(seen.s > stripes - 8)
+    assert np.sqrt(np.mean((seen.s[v, u] - s_at(u, v)) ** 2)) < 0.05
+
+
 @pytest.mark.parametrize("gamma", [1.5, 2.2])
 def test_a_projector_whose_fine_bits_and_inverses_sum_to_less_than_lit_loses_no_pixels(
     gamma: float,

@@ -74,6 +74,10 @@ class Page:
 
     def open(self, path: Path, width: int = 1200, height: int = 900) -> None:
         """Open a file and wait until it is loaded and drawn."""
+        self.navigate(path.resolve().as_uri(), width, height)
+
+    def navigate(self, url: str, width: int, height: int) -> None:
+        """Open an address and wait until it is loaded and drawn."""
         self.call(
             "Emulation.setDeviceMetricsOverride",
             width=width,
@@ -81,11 +85,11 @@ class Page:
             deviceScaleFactor=1,
             mobile=False,
         )
-        self.call("Page.navigate", url=path.resolve().as_uri())
+        self.call("Page.navigate", url=url)
         deadline = time.monotonic() + PATIENCE_S
         while self.evaluate("document.readyState") != "complete":
             if time.monotonic() > deadline:
-                raise TimeoutError(f"{path} did not load")
+                raise TimeoutError(f"{url} did not load")
             time.sleep(0.1)
         self.settle()
 

@@ -88,14 +88,15 @@ def ring_views(
     seed: int = 0,
     board: Board = CHARUCO,
     least_facing: float = 0.4,
+    poses: Sequence[RigidTransform] = (),
 ) -> tuple[list[LocatedView], dict[tuple[str, str], RigidTransform]]:
-    """What each camera sees of each shot, located with the true camera."""
+    """What each camera sees of each shot, located with the true camera; poses: of the shots' boards."""
     rng = np.random.default_rng(seed)
     points = corner_points(board)
     per_face = len(points) // board.faces
     seen: list[tuple[str, PlanarView, tuple[RigidTransform, ...]]] = []
     truth = {}
-    for number, rig_from_board in enumerate(board_poses(shots, rng)):
+    for number, rig_from_board in enumerate(poses or board_poses(shots, rng)):
         shot = f"s{number:02d}"
         truth[shot, board.name] = rig_from_board
         for name, camera in cameras.items():
@@ -123,10 +124,10 @@ def ring_views(
                     )
                 view = PlanarView(shot, label.inverse().apply(corners), noisy)
             seen.append((name, view, symmetries))
-    poses = _located(cameras, [(name, view) for name, view, _ in seen])
+    located = _located(cameras, [(name, view) for name, view, _ in seen])
     views = [
         LocatedView(name, view.shot, board.name, view.points, view.pixels, pose, symmetries)
-        for (name, view, symmetries), pose in zip(seen, poses, strict=True)
+        for (name, view, symmetries), pose in zip(seen, located, strict=True)
     ]
     return views, truth
 

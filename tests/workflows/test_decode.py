@@ -150,7 +150,7 @@ def test_a_sequence_that_fails_is_a_note_and_notes_are_in_the_order_of_shots(
     def decoded(sequence: ImageSequence, *_: object, **__: object) -> Any:
         if sequence.pair == "p2" and sequence.shot == "a":
             raise DecodingFailed("is bad", where="pair p2, shot a")
-        return SimpleNamespace(crossing_fault="an image is missing", response=None, crossing=None)
+        return SimpleNamespace(crossing_fault="an image is missing", crossing=None)
 
     monkeypatch.setattr(decode, "decode_sequence", decoded)
     monkeypatch.setattr(decode, "boundaries_near", lambda *_: "boundaries")

@@ -21,7 +21,7 @@ from bodyscan.workflows import range_images
 from bodyscan.workflows.range_images import reconstruct_range_images, reconstruct_sequence
 from bodyscan.workflows.scan_person import require_one_moment
 
-STRIPES = SimpleNamespace(crossing=None, response=None, crossing_fault="")
+STRIPES = SimpleNamespace(crossing=None, crossing_fault="")
 
 
 def range_image() -> RangeImage:
@@ -48,7 +48,7 @@ def test_a_range_image_holds_at_the_time_of_the_finest_pattern(
     for times, expected in ((frame_ms, 35.0), (None, None)):
         captures: Any = SimpleNamespace(frame_ms=lambda *_, times=times: times)
         sequence: Any = SimpleNamespace(pair="p", shot="s")
-        image, *_ = reconstruct_sequence(calibration, captures, sequence)
+        image, _ = reconstruct_sequence(calibration, captures, sequence)
         assert image.time_ms == expected
 
 

@@ -39,6 +39,10 @@ def decode_bits(
     codes = code.stripes(read_words(code, images, stripes, variance))
     fine_bit = code.bit_two_wide(len(images.patterns))
     usable, coded = find_usable_pixels(images, codes, variance, stripes, fine_bit)
+    # Where the light ends blur moves boundaries, and what is scattered beyond keeps the last code. The
+    # outermost stripe may be dark, and blur is hardly wider than one.
+    inside = (codes >= 2) & (codes < stripes - 2)
+    usable, coded = usable & inside, coded & inside
     white = cv2.subtract(images.lit, images.dark) >= np.float32(MIN_CONTRAST)
     white &= (images.lit >= SATURATED) & (codes >= 0) & (codes < stripes)
     beyond = None

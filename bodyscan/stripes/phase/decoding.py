@@ -25,8 +25,6 @@ from bodyscan.stripes.gray.decoding import read_words
 from bodyscan.stripes.grey_noise import measure_noise
 from bodyscan.stripes.phase.projector_response import (
     MIN_PERIODS,
-    PhaseError,
-    compute_response_share,
     correct_wave,
     estimate_error,
     estimate_error_against,
@@ -90,16 +88,14 @@ def decode_wave(
     usable &= measured.amplitude >= np.maximum(floor, MIN_CONTRAST_TO_NOISE * noise)
     coarse = (halves.astype(np.float32) + 0.5) / 2.0
     check_phase(measured.turn, coarse, usable)
-    error = estimate_error(measured, usable, stripes)
-    turn = correct_wave(measured, error).turn
+    turn = correct_wave(measured, estimate_error(measured, usable, stripes)).turn
     period = np.float32(wave.period)
     s = (turn + np.rint(coarse - turn)) * period
     sigma = measured.sigma(noise)
     s[~usable] = np.nan
     s, sigma = smooth_phase(s, np.where(usable, sigma * period, np.float32(np.nan)))
     result = assemble_from_pixels(images, lit, s, sigma, variance, stripes)
-    response = compute_response_share(error, measured, result.sigma)
-    return replace(result, response=response, correlation_px=(CORRELATION_PX, CORRELATION_PX))
+    return replace(result, correlation_px=(CORRELATION_PX, CORRELATION_PX))
 
 
 def check_wave_images(images: ScanLines, waves: Greys, usable: Mask) -> None:
@@ -204,7 +200,7 @@ def decode_waves(
     good = bright & (brightest < SATURATED)
     check_several_waves(measured, stacks, good, stripes)
     usable = good & ~find_half_covered_pixels(contrast, bright)
-    corrected, error = _correct_waves(measured, usable, stripes)
+    corrected = _correct_waves(measured, usable, stripes)
     order = find_phase_order(corrected, [wave.sigma(noise) for wave in corrected], usable, stripes)
     check_agreement(order)
     halves = np.floor(2.0 * np.nan_to_num(order.s) / corrected[0].wave.period).astype(np.int32)
@@ -215,21 +211,18 @@ def decode_waves(
     white, black = (convert_like(grey, lines) for grey in estimate_white_and_black(measured))
     light = ScanLines(white, black, lines[:0], None, transposed)
     result = assemble_from_pixels(light, lit, s, sigma, variance, stripes)
-    response = compute_response_share(error, corrected[0], result.sigma)
-    return replace(result, response=response, correlation_px=(CORRELATION_PX, CORRELATION_PX))
+    return replace(result, correlation_px=(CORRELATION_PX, CORRELATION_PX))
 
 
-def _correct_waves(
-    waves: list[MeasuredWave], usable: Mask, stripes: int
-) -> tuple[list[MeasuredWave], PhaseError | None]:
-    """Correct waves, the finest first, for the projector's response; also the finest's error."""
+def _correct_waves(waves: list[MeasuredWave], usable: Mask, stripes: int) -> list[MeasuredWave]:
+    """Correct waves, the finest first, for the projector's response."""
     errors = [estimate_error(wave, usable, stripes) for wave in waves]
     corrected = [correct_wave(*each) for each in zip(waves, errors, strict=True)]
     for k, wave in enumerate(corrected):
         if k and errors[k] is None:
             error = estimate_error_against(wave, corrected[0], usable, stripes)
             corrected[k] = correct_wave(wave, error)
-    return corrected, errors[0]
+    return corrected
 
 
 def check_several_waves(

@@ -17,7 +17,6 @@ import numpy as np
 from bodyscan.arrays import Array, Floats, Mask
 from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
 from bodyscan.stripes.phase.waves import MeasuredWave
-from bodyscan.stripes.stripe_map import ResponseShare
 
 MULTIPLES = (1, 2, 3, 4)
 """j above: more are far below the noise; with three steps and a gamma of 2.2, two are not enough."""
@@ -53,19 +52,6 @@ def correct_wave(wave: MeasuredWave, error: PhaseError | None) -> MeasuredWave:
     if error is None:
         return wave
     return replace(wave, turn=(wave.turn - error.evaluate(wave.turn)) % np.float32(1.0))
-
-
-def compute_response_share(
-    error: PhaseError | None, wave: MeasuredWave, sigma: Floats
-) -> ResponseShare | None:
-    """Compute the error of s (stripes) that was corrected, and that due to noise, where sigma is
-    known."""
-    known = np.isfinite(sigma)
-    if error is None or not known.any():
-        return None
-    turns = np.sqrt(np.sum(np.square([error.cosines, error.sines])) / 2.0)
-    noise = float(np.sqrt(np.mean(np.square(sigma[known]))))
-    return ResponseShare(float(turns * wave.wave.period), noise)
 
 
 def estimate_error(wave: MeasuredWave, usable: Mask, stripes: int) -> PhaseError | None:

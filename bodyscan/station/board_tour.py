@@ -1,0 +1,180 @@
+"""A board carried round a rig: what each camera has covered, what ties pairs together, how well each
+pair is known, and where to hold the board next.
+
+Boards are found shot by shot, as the images come, and the advice that follows from what pictures cover
+is there at once. The joint solve of all shots so far takes longer; it comes when it is ready.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import networkx as nx
+import numpy as np
+
+from bodyscan.arrays import Array, Indices
+from bodyscan.boards.view import BoardView
+from bodyscan.captures.folder import Captures, open_captures
+from bodyscan.errors import BodyscanError
+from bodyscan.optional import optional
+from bodyscan.registration.advice import pair_sigma_mm, suggest_shots
+from bodyscan.registration.rig_solve import solve_rig
+from bodyscan.rig.pair import Pair
+from bodyscan.rig.rig import load_rig
+from bodyscan.workflows.find_boards import calibrate_cameras, find_all_boards, locate_views
+
+COLUMNS, ROWS = 4, 3
+"""Cells of a picture: a person can tell one from another when told where to hold the board."""
+BOARDS = 6
+"""Boards that each pair should see: three determine a camera, six show when one is bad."""
+
+
+@dataclass
+class BoardTour:
+    """The calibration captures that a rig file names, looked at again and again.
+
+    views: boards found so far. seen: shots in which they were looked for.
+    """
+
+    rig_file: Path
+    views: list[BoardView] = field(default_factory=list)
+    seen: set[str] = field(default_factory=set)
+    missed: dict[str, list[str]] = field(default_factory=dict)
+    solved: dict[str, Any] = field(default_factory=dict)
+    _pending: dict[str, int] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.rig = load_rig(self.rig_file)
+
+    def look(self) -> list[str]:
+        """Find boards in the shots that have come since, and return their names.
+
+        A shot is looked at when its lit images are there and no more came since the look before.
+        """
+        try:
+            captures = open_captures(self.rig, self.rig_file)
+        except BodyscanError:
+            return []  # nothing yet
+        fresh = []
+        for shot in captures.shots:
+            if shot in self.seen:
+                continue
+            there = sum(s.board_path.exists() for s in captures.shot_sequences(shot))
+            if there and there == self._pending.get(shot):
+                fresh.append(shot)
+            self._pending[shot] = there
+        for shot in fresh:
+            self._find(captures, shot)
+        return fresh
+
+    def _find(self, captures: Captures, shot: str) -> None:
+        sequences = tuple(s for s in captures.shot_sequences(shot) if s.board_path.exists())
+        found = find_all_boards(self.rig, replace(captures, shots=(shot,), sequences=sequences))
+        self.views += found.value
+        seeing = {view.pair for view in found.value}
+        self.missed[shot] = sorted({s.pair for s in sequences} - seeing)
+        self.seen.add(shot)
+
+    def solve(self) -> None:
+        """Solve for all cameras and poses by the boards so far; what fails is a line of advice."""
+        notes: list[str] = []
+        sigmas: dict[str, float] = {}
+        shots = len(self.seen)
+        with optional("sigmas", notes.append):
+            cameras = calibrate_cameras(self.rig, self.views, folder=self.rig_file.parent).value
+            located = locate_views(self.rig, self.views, cameras).value
+            if located:
+                lenses = {name: one.camera for name, one in cameras.items()}
+                solution = solve_rig(self.rig, located, lenses).value
+                sigmas = {name: pair_sigma_mm(solution, name) for name in solution.rig_from_camera}
+                worst = max(sorted(sigmas), key=lambda name: sigmas[name])
+                notes += suggest_shots(self.rig, solution, worst)
+        finite = {name: sigma for name, sigma in sigmas.items() if np.isfinite(sigma)}
+        self.solved = {"shots": shots, "sigmas_mm": finite, "advice": notes}
+
+    def describe(self) -> dict[str, Any]:
+        """Everything that a page shows of it."""
+        cells = {pair.name: self._cells(pair) for pair in self.rig.pairs}
+        by_pair = {
+            pair.name: [v for v in self.views if v.pair == pair.name] for pair in self.rig.pairs
+        }
+        last = list(self.missed)[-1:]
+        next_hold = self._next_hold(cells, {name: len(found) for name, found in by_pair.items()})
+        return {
+            "shots": len(self.seen),
+            "last": last[0] if last else None,
+            "missed": self.missed[last[0]] if last else [],
+            "pairs": [
+                {
+                    "name": name,
+                    "boards": len(found),
+                    "cells": cells[name].astype(int).ravel().tolist(),
+                    "sigma_mm": self.solved.get("sigmas_mm", {}).get(name),
+                }
+                for name, found in by_pair.items()
+            ],
+            "groups": self._groups(),
+            "shared": self._shared(),
+            "next": next_hold,
+            "advice": self.solved.get("advice", []),
+            "solved_shots": self.solved.get("shots", 0),
+            "wanted": BOARDS,
+        }
+
+    def _cells(self, pair: Pair) -> Indices:
+        """How many boards have shown in each cell of a pair's picture (ROWS, COLUMNS)."""
+        counts = np.zeros((ROWS, COLUMNS), np.int64)
+        size = np.array([pair.camera.width, pair.camera.height])
+        for view in self.views:
+            if view.pair == pair.name:
+                cell = np.clip(view.pixels / size, 0.0, 0.999) * [COLUMNS, ROWS]
+                column, row = cell.astype(int).T
+                counts.ravel()[np.unique(row * COLUMNS + column)] += 1
+        return counts
+
+    def _shared(self) -> list[tuple[str, str, int]]:
+        """Pairs of pairs, and how many shots they share."""
+        counts: dict[tuple[str, str], int] = {}
+        for shot in self.seen:
+            names = sorted({view.pair for view in self.views if view.shot == shot})
+            for k, first in enumerate(names):
+                for second in names[k + 1 :]:
+                    counts[first, second] = counts.get((first, second), 0) + 1
+        return [(first, second, count) for (first, second), count in sorted(counts.items())]
+
+    def _groups(self) -> list[list[str]]:
+        """Pairs that shots tie together, the largest group first."""
+        graph = nx.Graph()
+        graph.add_nodes_from(pair.name for pair in self.rig.pairs)
+        graph.add_edges_from((first, second) for first, second, _ in self._shared())
+        return sorted(map(sorted, nx.connected_components(graph)), key=lambda one: (-len(one), one))
+
+    def _next_hold(self, cells: dict[str, Indices], boards: dict[str, int]) -> dict[str, Any]:
+        """Where to hold the board next, as words' keys and what goes into them: first where it was
+        hardly seen, then what ties groups together, then what pictures lack, then nothing."""
+        groups = self._groups()
+        barest_pair = min(boards, key=lambda name: boards[name])
+        if len(groups) > 1 and min(boards.values()) >= 2:
+            return {"say": "tie", "one": groups[0], "other": groups[1]}
+        share = {name: float(np.mean(each > 0)) for name, each in cells.items()}
+        barest = min(share, key=lambda name: share[name])
+        target = barest_pair if boards[barest_pair] < BOARDS else barest
+        if boards[barest_pair] >= BOARDS and share[barest] >= 0.8:
+            return {"say": "enough"}
+        row, column = divmod(int(np.argmin(_inner_first(cells[target]))), COLUMNS)
+        return {
+            "say": "hold",
+            "pair": target,
+            "row": row,
+            "column": column,
+            "boards": boards[target],
+        }
+
+
+def _inner_first(counts: Indices) -> Array:
+    """Counts with a little added towards the rim, so that of equal cells the inner one is named."""
+    rows, columns = np.indices(counts.shape)
+    away = np.hypot(rows - (ROWS - 1) / 2.0, columns - (COLUMNS - 1) / 2.0)
+    return np.asarray(counts + 0.01 * away)

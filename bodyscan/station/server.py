@@ -1,0 +1,243 @@
+"""The station's addresses and what they answer: Starlette behind the guard, served by uvicorn."""
+
+from __future__ import annotations
+
+import base64
+import re
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from functools import partial
+from importlib.resources import files
+from typing import Any
+
+import cv2
+import numpy as np
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import Request
+from starlette.responses import FileResponse, JSONResponse, Response, StreamingResponse
+from starlette.routing import Route
+
+from bodyscan.captures.folder import open_scan
+from bodyscan.errors import BadInput, BodyscanError
+from bodyscan.files.reading import read_regular
+from bodyscan.station.day import Day, Row, table_csv
+from bodyscan.station.feed import Feed
+from bodyscan.station.guard import Guard, TooLarge
+from bodyscan.station.operation import Operation
+from bodyscan.station.rig_drift import describe_rig, find_series
+
+KINDS = {
+    "html": "text/html",
+    "css": "text/css",
+    "js": "text/javascript",
+    "json": "application/json",
+}
+READERS = 40
+"""Open pages: more than a rig has people around it, fewer than exhaust a computer."""
+REPORT_POLICY = (
+    "sandbox allow-scripts; default-src 'none'; img-src data:; style-src 'unsafe-inline'; "
+    "script-src 'unsafe-inline'"
+)
+"""A report carries its script inside; it may do nothing in the station's name."""
+
+
+@dataclass
+class Station:
+    """One station's answers."""
+
+    operation: Operation
+    readers: int = 0
+
+    @property
+    def day(self) -> Day:
+        return self.operation.day
+
+    @property
+    def feed(self) -> Feed:
+        return self.operation.feed
+
+    async def state(self, request: Request) -> Response:
+        operation = self.operation
+        return JSONResponse({
+            "number": self.feed.number,
+            "rows": self.day.rows(),
+            "capture": operation.capturing,
+            "can_capture": operation.can_capture,
+            "has_rig": operation.rig_file is not None,
+            "trouble": operation.trouble,
+            "rig": await run_in_threadpool(describe_rig, operation.watched.calibration),
+        })  # fmt: skip
+
+    async def events(self, request: Request) -> Response:
+        last = request.headers.get("last-event-id") or request.query_params.get("after", "0")
+        if self.readers >= READERS:
+            return JSONResponse({"what": "too many pages are open"}, 503)
+        after = int(last) if last.isdecimal() and len(last) < 16 else 0
+        return StreamingResponse(self._read(after), media_type="text/event-stream")
+
+    async def _read(self, after: int) -> AsyncIterator[str]:
+        self.readers += 1
+        try:
+            async for text in self.feed.read(after):
+                yield text
+        finally:
+            self.readers -= 1
+
+    async def start(self, request: Request) -> Response:
+        subject = (await _object(request)).get("subject")
+        if not isinstance(subject, str) or not re.fullmatch(r"\w[\w.-]{0,59}", subject):
+            raise BadInput("a pseudonym has letters, digits, '_', '-' and '.' only, 60 at most")
+        return JSONResponse({"scan": self.operation.request_person(subject)})
+
+    async def board(self, request: Request) -> Response:
+        return JSONResponse({"shot": self.operation.request_board()})
+
+    async def boards(self, request: Request) -> Response:
+        return JSONResponse(await run_in_threadpool(self.operation.tour_boards))
+
+    async def decide(self, request: Request) -> Response:
+        row = self.day.decide(request.path_params["job"], await _object(request))
+        self.feed.publish({"kind": "scan", "row": row})
+        return JSONResponse(row)
+
+    async def body(self, request: Request) -> Response:
+        model = await run_in_threadpool(self.day.body, self._row(request)["job"])
+        return JSONResponse(model) if model else _absent()
+
+    async def picture(self, request: Request) -> Response:
+        scan = self.day.out / self._row(request)["job"] / "scan"
+        found = [path for name in ("cloud.png", "mesh.png") if (path := scan / name).is_file()]
+        return FileResponse(found[0], media_type="image/png") if found else _absent()
+
+    async def report(self, request: Request) -> Response:
+        path = self.day.out / self._row(request)["job"] / "report" / "report.html"
+        policy = {"content-security-policy": REPORT_POLICY}
+        return (
+            FileResponse(path, media_type="text/html", headers=policy)
+            if path.is_file()
+            else _absent()
+        )
+
+    async def pair(self, request: Request) -> Response:
+        look = partial(self._look, self._row(request), request.path_params["pair"])
+        seen = await run_in_threadpool(look)
+        return JSONResponse(seen) if seen else _absent()
+
+    async def csv(self, request: Request) -> Response:
+        attached = {"content-disposition": "attachment; filename=day.csv"}
+        return Response(table_csv(self.day.rows()), media_type="text/csv", headers=attached)
+
+    async def rig(self, request: Request) -> Response:
+        folders = [self.day.out / row["job"] for row in self.day.rows() if row["state"] == "done"]
+        return JSONResponse({
+            "calibration": await run_in_threadpool(describe_rig, self.operation.watched.calibration),
+            "series": await run_in_threadpool(find_series, folders),
+        })  # fmt: skip
+
+    def _row(self, request: Request) -> Row:
+        """The row that an address names. Raises KeyError for anything else."""
+        return self.day.row(request.path_params["job"])
+
+    def _look(self, row: Row, pair: str) -> dict[str, Any] | None:
+        """A pair's lit image, small, and how bright it is; None if it is not there."""
+        rig = self.operation.rig
+        captures = open_scan(rig, self.operation.watched.inbox / row["scan"])
+        paths = [s.board_path for s in captures.pair_sequences(pair) if s.board_path.is_file()]
+        if not paths:
+            return None
+        data = np.frombuffer(read_regular(paths[0], 200_000_000), np.uint8)
+        image = cv2.imdecode(data, cv2.IMREAD_REDUCED_GRAYSCALE_2)
+        if image is None:
+            return None
+        width = 240
+        small = cv2.resize(image, (width, max(1, width * image.shape[0] // image.shape[1])))
+        packed = base64.b64encode(cv2.imencode(".jpg", small)[1].tobytes()).decode("ascii")
+        bright = float(np.quantile(image, 0.99)) / 255.0
+        saturated = float(np.mean(image >= 254))
+        return {"picture": packed, "bright": bright, "saturated": saturated}
+
+
+def make_app(operation: Operation, hosts: set[str], token: str | None = None) -> Guard:
+    """The whole application; the operation's threads run as long as it does."""
+    station = Station(operation)
+    scan = "/api/scans/{job}"
+
+    @asynccontextmanager
+    async def run(_: Starlette) -> AsyncIterator[None]:
+        operation.start()
+        yield
+        await run_in_threadpool(operation.stop)
+
+    app = Starlette(
+        routes=[
+            *pages(),
+            Route("/api/state", station.state),
+            Route("/api/events", station.events),
+            Route("/api/start", station.start, methods=["POST"]),
+            Route("/api/board", station.board, methods=["POST"]),
+            Route("/api/boards", station.boards),
+            Route("/api/rig", station.rig),
+            Route("/api/day.csv", station.csv),
+            Route(scan, station.decide, methods=["POST"]),
+            Route(f"{scan}/body", station.body),
+            Route(f"{scan}/picture", station.picture),
+            Route(f"{scan}/report", station.report),
+            Route(f"{scan}/pairs/{{pair}}", station.pair),
+        ],
+        exception_handlers={
+            BodyscanError: _explain,
+            KeyError: _unknown,
+            TooLarge: _too_large,
+        },
+        lifespan=run,
+    )
+    return Guard(app, hosts, token)
+
+
+def pages() -> list[Route]:
+    """What a browser shows: the files of this package by name, and nothing else."""
+    room = files("bodyscan.station") / "pages"
+    names = [f"languages/{one.name}" for one in (room / "languages").iterdir()]
+    places = {name: room / name for name in ("station.css", "station.js", *names)}
+    places |= {"": room / "index.html", "viewer.js": files("bodyscan.report") / "viewer.js"}
+
+    def route(name: str) -> Route:
+        kind = KINDS[places[name].name.rpartition(".")[2]]
+        content = places[name].read_bytes()
+
+        async def answer(request: Request) -> Response:
+            return Response(content, media_type=kind)
+
+        return Route(f"/{name}", answer)
+
+    return [route(name) for name in places]
+
+
+async def _object(request: Request) -> dict[str, Any]:
+    """The JSON object in a request's body. Raises BadInput for anything else."""
+    try:
+        content = await request.json()
+    except (ValueError, RecursionError):
+        content = None
+    if not isinstance(content, dict):
+        raise BadInput("send a JSON object")
+    return content
+
+
+async def _explain(request: Request, error: Exception) -> Response:
+    assert isinstance(error, BodyscanError)
+    return JSONResponse({"what": error.what, "remedy": error.remedy}, 409)
+
+
+async def _unknown(request: Request, error: Exception) -> Response:
+    return _absent()
+
+
+async def _too_large(request: Request, error: Exception) -> Response:
+    return JSONResponse({"what": "too long"}, 413)
+
+
+def _absent() -> Response:
+    return JSONResponse({"what": "there is no such thing here"}, 404)

@@ -1,0 +1,162 @@
+"""The station: who may ask, what a page is told, what is kept; and a page in a browser."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from required import missing
+
+from bodyscan.errors import BadInput
+from bodyscan.jobs.pipeline import Pipeline
+from bodyscan.jobs.watching import Watched
+from bodyscan.station.day import Day, table_csv
+from bodyscan.station.feed import BACKLOG, Feed
+from bodyscan.station.operation import Operation
+from bodyscan.station.serving import make_operation, names_of_host
+
+try:
+    from starlette.testclient import TestClient
+
+    from bodyscan.station.server import make_app
+except ImportError:
+    TestClient = None
+
+STORED = Path(__file__).parents[1] / "data" / "stored-0.1.0" / "calibration"
+ENDED = {"event": "job", "job": "anna", "state": "done"}
+
+
+class Quiet(Operation):
+    """Without threads: nothing happens but what a test does."""
+
+    def start(self) -> None:
+        pass
+
+    can_capture = True
+
+
+@pytest.fixture
+def operation(tmp_path: Path) -> Operation:
+    if TestClient is None:
+        missing("starlette or httpx2 is not installed (pip install '.[station,dev]')")
+    (tmp_path / "inbox").mkdir()
+    pipeline = Pipeline(name="watch", kind="fuse")
+    watched = Watched(tmp_path / "inbox", tmp_path / "out", STORED, pipeline)
+    made = make_operation(watched, None)
+    return Quiet(watched, None, made.rig, made.day, made.feed)
+
+
+def put_job(out: Path, name: str, **facts: Any) -> None:
+    """A job that has ended, with a scan of these facts."""
+    (out / name / "scan").mkdir(parents=True)
+    (out / name / "job.json").write_text(
+        json.dumps({"subject": name, "source": f"../../inbox/{name}"})
+    )
+    (out / name / "state.json").write_text(json.dumps({"state": "done", "seconds": 3.0}))
+    (out / name / "scan" / "scan.json").write_text(json.dumps(facts))
+
+
+JSON = {"content-type": "application/json"}
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "headers", "body", "status"),
+    [
+        ("GET", "/", {}, b"", 200),
+        ("GET", "/api/state", {"host": "evil.example:8765"}, b"", 421),
+        ("GET", "/api/state", {"sec-fetch-site": "cross-site"}, b"", 403),
+        (
+            "GET",
+            "/",
+            {"sec-fetch-site": "cross-site"},
+            b"",
+            200,
+        ),  # a link to the page may be followed
+        ("POST", "/api/start", {**JSON, "origin": "http://evil.example"}, b'{"subject": "a"}', 403),
+        ("POST", "/api/start", {"content-type": "text/plain"}, b'{"subject": "a"}', 415),
+        ("POST", "/api/start", {**JSON, "content-length": "1000000000"}, b"{}", 413),
+        ("POST", "/api/start", JSON, b'{"subject": "../../etc"}', 409),
+        ("POST", "/api/start", JSON, b'{"subject": "<script>"}', 409),
+        ("POST", "/api/start", JSON, b"[" * 9000, 409),
+        ("POST", "/api/scans/..%2F..%2Fetc", JSON, b'{"decision": "keep"}', 404),
+        ("GET", "/api/scans/..%2F..%2Fetc/report", {}, b"", 404),
+        ("GET", "/api/scans/../../pyproject.toml", {}, b"", 404),
+        ("GET", "/languages/../server.py", {}, b"", 404),
+        ("GET", "/languages/ja.json", {}, b"", 200),
+    ],
+)
+def test_only_the_stations_own_pages_are_answered(
+    operation: Operation, method: str, path: str, headers: dict[str, str], body: bytes, status: int
+) -> None:
+    app = make_app(operation, names_of_host("127.0.0.1", 8765))
+    with TestClient(app, base_url="http://127.0.0.1:8765") as client:
+        answer = client.request(method, path, headers=headers, content=body)
+        assert answer.status_code == status, answer.text
+        assert "default-src 'none'" in answer.headers["content-security-policy"]
+        sent = client.post("/api/start", headers=JSON, content=(b" " * 9000 for _ in range(9)))
+        assert sent.status_code == 413, "longer than it said"
+    assert list(operation.watched.inbox.iterdir()) == []
+
+
+def test_from_another_computer_the_token_of_the_link_is_needed(operation: Operation) -> None:
+    app = make_app(operation, names_of_host("10.0.0.5", 8765), "secret")
+    with TestClient(app, base_url="http://10.0.0.5:8765", follow_redirects=False) as client:
+        for wrong in ("/", "/?token=", "/?token=secreT", "/api/state", "/api/state?token=secret"):
+            assert client.get(wrong).status_code == 401
+        client.cookies.set("bodyscan-station", "secreT")
+        assert client.get("/api/state").status_code == 401
+        client.cookies.clear()
+        entered = client.get("/?token=secret")
+        assert (entered.status_code, entered.headers["location"]) == (303, "/")
+        assert {"HttpOnly", "SameSite=Strict"} <= set(entered.headers["set-cookie"].split("; "))
+        assert client.get("/api/state").json()["rows"] == []
+
+
+def test_a_page_that_was_away_is_told_what_it_missed_or_to_begin_anew() -> None:
+    async def read(feed: Feed, after: int, count: int) -> list[str]:
+        reader = feed.read(after, pulse_s=0.01)
+        return [await anext(reader) for _ in range(count)]
+
+    feed = Feed()
+    for number in range(3 * BACKLOG):
+        feed.publish({"number": number})
+    assert feed.number == 3 * BACKLOG
+    last = asyncio.run(read(feed, feed.number - 2, 3))
+    assert [text.split("\n")[0] for text in last[:2]] == [
+        f"id: {feed.number - 1}",
+        f"id: {feed.number}",
+    ]
+    assert last[2].startswith(":"), "a sign of life"
+    for lost in (0, BACKLOG, 10**9):
+        assert "event: anew" in asyncio.run(read(feed, lost, 1))[0]
+
+
+def test_what_people_decide_stays_and_what_is_taken_again_begins_anew(
+    operation: Operation,
+) -> None:
+    out, day = operation.watched.out, operation.day
+    operation.listen({"event": "images", "job": "anna", "scan": "anna", "pairs": {"p": [1, 9]}})
+    with pytest.raises(BadInput, match="no such scan"):
+        day.decide("anna", {"decision": "keep"})
+    verdict = {"grade": "repeat", "reasons": ["moved 14 mm"]}
+    put_job(out, "anna", verdict=verdict, alignment={"motion_mm": {"p": 14.0}}, person=None)
+    operation.listen(ENDED)
+    row = day.row("anna")
+    assert (row["mark"], row["sway_mm"], row["pairs"]) == ("bad", 14.0, {"p": [1, 9]})
+    with pytest.raises(BadInput):
+        day.decide("anna", {"decision": "burn"})
+    day.decide("anna", {"decision": "discard", "note": "=HYPERLINK(1)<b>"})
+    again = Day(out)
+    assert (again.row("anna")["decision"], again.row("anna")["grade"]) == ("discard", "repeat")
+    assert ",'=HYPERLINK(1)<b>," in table_csv(again.rows())
+    operation.listen({"event": "images", "job": "anna", "scan": "anna", "pairs": {"p": [2, 9]}})
+    assert (day.row("anna")["grade"], day.row("anna")["state"]) == (None, "arriving")
+
+
+def test_of_two_who_press_start_at_once_one_is_told_to_wait(operation: Operation) -> None:
+    assert operation.request_person("anna") == "anna-01"
+    with pytest.raises(BadInput, match="already"):
+        operation.request_person("bea")
