@@ -302,11 +302,12 @@ def calibrate_widest(
     fits = [calibrate_camera(views, width, height, kind()) for kind in ordinary[-1:]]
     if Fisheye in kinds:
         fits.append(calibrate_camera(views, width, height, Fisheye()))
-    folds = [_folds(fit, views) for fit in fits]
-    if len(fits) == 1 or folds == [False, True]:
-        return fits[0]
-    if folds == [True, False]:
-        return fits[1]
+    whole = [fit for fit in fits if not _folds(fit, views)]
+    if not whole:  # boards that leave the richest open beyond them may still show a simpler one
+        simpler = (calibrate_camera(views, width, height, kind()) for kind in ordinary[-2::-1])
+        whole = [next((fit for fit in simpler if not _folds(fit, views)), fits[0])]
+    if len(whole) == 1:
+        return whole[0]
     needed = -MIN_GAIN if _is_wide(fits[1].camera, views) else MIN_GAIN
     better_by = gain(_compare_fits(fits[0], fits[1], views, cluster_poses(views)))
     return fits[1] if better_by > needed else fits[0]
@@ -338,8 +339,10 @@ def choose_lens(
         tried = _fit(kind, camera, poses, views)
         if _folds(tried, views):
             continue
-        # A fisheye has half of a rational lens's coefficients: where it does as well, it is right.
+        # A fisheye has half of a rational lens's coefficients: where it does as well, it is right. So
+        # is what does as well and has rays where the other folds.
         simpler = kind is Fisheye and type(chosen.camera.lens) is Rational
+        simpler |= tried.camera.ray_share() > chosen.camera.ray_share() + 0.05
         # Whether Brown's was close is asked for all cameras of a make together.
         needed = simpler or kind is kinds[1]
         if not needed and gain(_compare_fits(chosen, tried, views, cluster)) < MIN_GAIN:
@@ -386,8 +389,10 @@ def _compare_fits(
 
 
 def _folds(fit: CameraCalibration, views: Sequence[PlanarView]) -> bool:
-    """Whether a lens folds over before the outermost corner: what it does there is no camera's."""
-    return not np.isfinite(_corner_rays(fit.camera, views)).all()
+    """Whether a lens folds over before the outermost corner, or over most of the picture: what it does
+    there is no camera's."""
+    seen = np.isfinite(_corner_rays(fit.camera, views)).all()
+    return not seen or fit.camera.folds
 
 
 def _is_wide(camera: Camera, views: Sequence[PlanarView]) -> bool:

@@ -96,6 +96,21 @@ class Camera:
         u, v = np.meshgrid(np.arange(self.width, dtype=float), np.arange(self.height, dtype=float))
         return self.rays(np.stack([u, v], axis=-1))
 
+    @property
+    def folds(self) -> bool:
+        """Whether the lens folds over more than half of the picture: a slip, not a lens."""
+        return self.ray_share() < 0.5
+
+    def ray_share(self) -> float:
+        """Share of the picture that rays pass through: less than 1 where the lens folds within it, less
+        than 75 degrees from its axis: the black around a fisheye's picture is no fold."""
+        if self.lens.fold_radius > 3.7:
+            return 1.0
+        across = (np.arange(9) + 0.5) / 9.0
+        pixels = np.stack(np.meshgrid(across * self.width, across * self.height), axis=-1)
+        with np.errstate(all="ignore"):
+            return float(np.isfinite(self.rays(pixels)).all(axis=-1).mean())
+
     def jacobians(self, points: Array) -> tuple[Array, Array]:
         """d(pixels)/d(parameters) (N, 2, P) and d(pixels)/d(points) (N, 2, 3), points (N, 3) mm."""
         z = points[:, 2]

@@ -76,8 +76,7 @@ def find_camera_faults(camera: Camera, pair: Pair, where: str) -> Iterator[Fault
         # It may lie outside an image that was cropped from a larger one.
         if not -length < value < 2.0 * length:
             yield f"{where}.{name}", f"lies far outside of the picture (got {value:g})"
-    # Rays must pass through half of the image: less is a slip, not a lens.
-    if not _is_finite(camera.lens.coefficients) or _compute_ray_share(camera) < 0.5:
+    if not _is_finite(camera.lens.coefficients) or camera.folds:
         values = ", ".join(f"{value:g}" for value in camera.lens.coefficients)
         yield where, f"has a lens that folds its picture over (got {values})"
 
@@ -207,11 +206,3 @@ def _find_corner_faults(corners: ObservedCorners, boards: int, where: str) -> It
 
 def _is_finite(*arrays: Array | Floats) -> bool:
     return all(np.all(np.isfinite(array)) for array in arrays)
-
-
-def _compute_ray_share(camera: Camera) -> float:
-    """Share of the image that rays pass through."""
-    across = (np.arange(9) + 0.5) / 9.0
-    pixels = np.stack(np.meshgrid(across * camera.width, across * camera.height), axis=-1)
-    with np.errstate(all="ignore"):
-        return float(np.isfinite(camera.rays(pixels)).all(axis=-1).mean())

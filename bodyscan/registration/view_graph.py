@@ -97,7 +97,8 @@ def initial_poses(
                 ties[i, j] = _tie(groups[i], groups[j], targets, reach)
         found = {key: tie for key, tie in ties.items() if tie is not None}
         (i, j), best = max(found.items(), key=lambda item: item[1].strength)
-        if not best.decided:
+        # Three shots that agree are a start even where others contradict them: the solve weighs views.
+        if not best.decided and (best.ambiguous or best.votes < 3):
             if any(tie.ambiguous for tie in found.values()):
                 raise _open_tie(groups[i], groups[j], best)
             return _keep_majority(groups, best)

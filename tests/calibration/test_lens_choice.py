@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from picture_boards import NOISE_PX, calibrate_with_lenses, seen
+from picture_boards import HEIGHT, NOISE_PX, WIDTH, calibrate_with_lenses, seen
 
 from bodyscan.calibration.board_views import PlanarView
-from bodyscan.calibration.camera import cluster_poses
+from bodyscan.calibration.camera import calibrate_widest, choose_lens, cluster_poses
+from bodyscan.geometry.lenses import FAMILY
 from bodyscan.geometry.lenses.fisheye import Fisheye
 from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.lenses.opencv import Brown, Radial, Rational
@@ -16,7 +17,7 @@ CASES = [
     (Radial(-0.3, 0.1), 800.0, "radial"),
     (Brown(-0.3, 0.1, 1.5e-3, -1e-3, 0.0), 800.0, "brown"),
     # Its radial factor levels out towards the corners, where no polynomial of three terms does.
-    (Rational(0.2, 0.05, 1e-3, -1e-3, 0.0, 1.1, 0.3, 0.0), 800.0, "rational"),
+    (Rational(0.2, 0.05, 1e-3, -1e-3, 0.0, 0.9, 0.2, 0.0), 800.0, "rational"),
     # Corners are up to 70 degrees off the axis, where Brown's lens is no better than the chapter's.
     (Fisheye(0.04, -0.03, 0.01, -0.002), 250.0, "fisheye"),
 ]
@@ -34,6 +35,19 @@ def test_the_lens_that_there_is_is_chosen(lens: Lens, focal: float, kind: str, s
     simpler = found.trials[: found.trials.index(chosen)]
     # Of a fisheye a rational lens, with twice its coefficients, may be as good.
     assert all(one.rms_px > 0.99 * chosen.rms_px for one in simpler)
+
+
+@pytest.mark.parametrize(("reach", "seed"), [(0.3, 0), (0.3, 1), (0.6, 0), (0.6, 1)])
+def test_of_lenses_that_do_as_well_one_that_does_not_fold_is_chosen(
+    reach: float, seed: int
+) -> None:
+    """Boards before the middle of a fisheye: beyond them richer polynomials turn back."""
+    views = seen(Fisheye(0.02, -0.01, 0.003, 0.0), shots=20, seed=seed, focal=380.0, reach=reach)
+    start = calibrate_widest(FAMILY, views, WIDTH, HEIGHT)
+    assert start.camera.ray_share() > 0.5
+    chosen = choose_lens(FAMILY, start.camera, start.poses, views).fit
+    assert chosen.camera.ray_share() > 0.9
+    assert chosen.rms_px == pytest.approx(np.sqrt(2.0) * NOISE_PX, rel=0.15)
 
 
 def test_a_board_whose_corners_are_mixed_up_does_not_choose() -> None:

@@ -10,15 +10,11 @@ import pytest
 
 from bodyscan.boards.view import ViewKey
 from bodyscan.calibration.board_views import LocatedView
-from bodyscan.calibration.camera import LensTrial
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.outcome import Outcome
 from bodyscan.registration import view_consistency
 from bodyscan.registration.joint_solve import JointSolution
-from bodyscan.registration.rig_lenses import (
-    lens_notes,
-)
 from bodyscan.registration.rig_solve import RigSolution, collect_corners
 from bodyscan.registration.view_consistency import (
     ConsistentSolve,
@@ -101,22 +97,6 @@ def test_wrong_views_are_left_out_and_come_back_where_they_fit(
     assert found.wrong == keys_of(wrong)
     assert found.notes == (f"{sorted(judged[-1])}",)
     assert found.select_consistent(VIEWS) == [one for k, one in enumerate(VIEWS) if k not in wrong]
-
-
-def test_lenses_that_boards_call_for_are_told_with_what_speaks_for_them() -> None:
-    brown = LensTrial("brown", 0.051, 8.4, True)
-    trials = {
-        "p": (LensTrial("radial", 0.082), brown, LensTrial("rational", 0.051, 0.3)),
-        "q": (LensTrial("radial", 0.060, None, True), LensTrial("brown", 0.060, 1.0)),
-        "r": (LensTrial("radial", 0.061), LensTrial("brown", 0.060, 2.9, True)),
-        "s": (LensTrial("radial", 0.061), LensTrial("brown", 0.060, 3.0, True)),
-    }
-    assert lens_notes(trials) == [
-        "p: lens brown, by 8 standard errors: boards held out fit to 0.051 px with it, 0.082 with "
-        "radial",
-        "s: lens brown, by 3 standard errors: boards held out fit to 0.060 px with it, 0.061 with "
-        "radial",
-    ]
 
 
 class PinholeOfOne:

@@ -18,10 +18,16 @@ MIDDLE = np.array([72.0, 108.0, 0.0])
 
 
 def seen(
-    lens: Lens, *, shots: int = 12, seed: int = 0, again: int = 1, focal: float = FOCAL
+    lens: Lens,
+    *,
+    shots: int = 12,
+    seed: int = 0,
+    again: int = 1,
+    focal: float = FOCAL,
+    reach: float = 1.0,
 ) -> list[PlanarView]:
-    """Boards all over the picture, each `again` times in the same place."""
-    rng, widen = np.random.default_rng(seed), FOCAL / focal
+    """Boards all over the picture, or that part of it, each `again` times in the same place."""
+    rng, widen = np.random.default_rng(seed), reach * FOCAL / focal
     camera = Camera(focal, focal + 1.0, -0.5, 645.0, 508.0, lens, WIDTH, HEIGHT)
     views: list[PlanarView] = []
     while len(views) < shots * again:
