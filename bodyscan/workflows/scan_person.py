@@ -5,8 +5,9 @@ Range images are cleaned, aligned, merged, judged and meshed.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -17,7 +18,7 @@ import numpy as np
 from bodyscan.alignment.icp import align
 from bodyscan.alignment.sway_prior import SwayPrior, select_tighter
 from bodyscan.captures.folder import Captures, ImageSequence, open_scan
-from bodyscan.errors import CaptureError, ScanFailed
+from bodyscan.errors import BodyscanError, CaptureError, ScanFailed
 from bodyscan.fusion.cleaning import clean, require_subject
 from bodyscan.fusion.consistency import Contradictions
 from bodyscan.fusion.merging import MergedCloud, merge
@@ -31,6 +32,7 @@ from bodyscan.fusion.verdict.evidence import ImageEvidence, RigEvidence, ScanEvi
 from bodyscan.fusion.verdict.overlaps import find_seams
 from bodyscan.fusion.verdict.rig import (
     find_compressed,
+    find_exchanged,
     find_floor,
     find_misplaced,
     find_silent_poles,
@@ -50,7 +52,12 @@ from bodyscan.registration.storage import calibration_id, load_calibration
 from bodyscan.report.pictures import Pictures, draw_pictures, write_pictures
 from bodyscan.settings import AlignmentSettings, FusionSettings, ScanSettings
 from bodyscan.verdict import Announce, say_nothing
-from bodyscan.workflows.range_images import Preparation, Reconstructed, reconstruct_range_images
+from bodyscan.workflows.range_images import (
+    Preparation,
+    Reconstructed,
+    reconstruct_range_images,
+    reconstruct_sequence,
+)
 
 
 def scan_person(
@@ -78,9 +85,17 @@ def scan_person(
         calibration, captures, progress, made=reconstructed, volume_only=True
     )
     nobody = empty and reconstruct_range_images(calibration, empty, progress, volume_only=True)
+
+    def read_as(one: str, other: str) -> RangeImage | None:
+        sequence = next(s for s in captures.pair_sequences(one) if s.has_stripes)
+        with suppress(BodyscanError):
+            exchanged = replace(sequence, pair=other)
+            return reconstruct_sequence(calibration, captures, exchanged, volume_only=True)[0]
+        return None
+
     return fuse(
         calibration, images, settings, progress,
-        empty=nobody.value if nobody else (), announce=announce, made=made,
+        empty=nobody.value if nobody else (), announce=announce, made=made, read_as=read_as,
     )  # fmt: skip
 
 
@@ -198,6 +213,7 @@ def fuse(
     empty: Sequence[RangeImage] = (),
     announce: Announce = say_nothing,
     made: Made = no_use,
+    read_as: Callable[[str, str], RangeImage | None] = lambda one, other: None,
 ) -> Scan:
     """Fuse range images of one person, background included, to a body model and mesh.
 
@@ -205,6 +221,7 @@ def fuse(
     empty: as in `clean`.
     announce: called with the verdict on the points alone, before the mesh is made.
     made: called with the cloud while the mesh is made, and with the mesh while it is judged.
+    read_as: gives the range image of one pair's images read as another's, if they can be.
 
     Raises ScanFailed if they show no body.
     """
@@ -221,21 +238,19 @@ def fuse(
     with step(progress, "merging"):
         merged = _merge(subject, settings.fusion)
     with step(progress, "judging"):
-        evidence = ScanEvidence(
-            merged.cloud,
-            RigEvidence.from_calibration(calibration),
-            _image_evidence(calibration, measured, cleaned, subject, merged.contradictions),
-            settings.use,
-            subject.aligned,
-            subject.person,
-        )
+        images = _image_evidence(calibration, measured, cleaned, subject, merged.contradictions)
+        rig, facts = RigEvidence.from_calibration(calibration), (subject.aligned, subject.person)
+        evidence = ScanEvidence(merged.cloud, rig, images, settings.use, *facts)
+        if grade_scan(evidence).grade == "repeat":
+            exchanged = find_exchanged(measured.value, calibrated, volume, read_as)
+            evidence = replace(evidence, images=replace(images, exchanged=exchanged))
         announce(grade_scan(evidence), final=False)
     with step(progress, "meshing"):
         cloud, mesh = _mesh(merged.cloud, measured.value, subject, settings, made)
         # Also by the images of pairs that saw nothing of the subject.
         carried = {image.pair: image for image in subject.images}
-        images = [carried.get(image.pair, image) for image in cleaned]
-        coverage = measure_coverage(mesh, images, subject.rig_from_camera, calibration.pairs)
+        every = [carried.get(image.pair, image) for image in cleaned]
+        coverage = measure_coverage(mesh, every, subject.rig_from_camera, calibration.pairs)
         verdict = grade_scan(replace(evidence, mesh=mesh, coverage=coverage))
     return Scan(
         cloud,

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from ray_cast_scan import cast_scan, load_body, load_rig
 
 from bodyscan.arrays import Array
-from bodyscan.fusion.verdict.rig import find_floor, find_misplaced
+from bodyscan.fusion.verdict.rig import find_exchanged, find_floor, find_misplaced
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.reconstruction.range_image import RangeImage
 
 WITHIN: Any = SimpleNamespace(radius_mm=700.0, bottom_mm=0.0, top_mm=2200.0)
 STRAIGHT_UP = np.array([0.0, 0.0, 1.0])
@@ -111,3 +114,17 @@ def test_a_pair_that_gave_nothing_is_named_if_its_pose_looks_past_the_volume() -
         found = find_misplaced([image], (), {"a": pose}, WITHIN)
         assert ("a" in found) == named
         assert not named or "looks past the scan volume" in found["a"]
+
+
+@pytest.mark.parametrize(("one", "other"), [("p1-2", "p3-3"), ("p1-2", "p1-3"), ("p2-2", "p2-2")])
+def test_pairs_that_have_each_other_s_images_are_named(one: str, other: str) -> None:
+    scan = cast_scan(load_body(), load_rig(), scale=0.25)
+    right = {image.pair: image for image in scan.range_images}
+    files = right | {one: right[other], other: right[one]}
+
+    def read_as(pair: str, calibration: str) -> RangeImage:
+        return replace(files[pair], pair=calibration)
+
+    given = [read_as(name, name) for name in files]
+    found = find_exchanged(given, scan.rig_from_camera, WITHIN, read_as)
+    assert found == ({one: other, other: one} if one != other else {})

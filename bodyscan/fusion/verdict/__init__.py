@@ -8,7 +8,8 @@ from bodyscan.optional import optional
 from bodyscan.verdict import Grade, Verdict
 
 CHECKS: tuple[Check, ...] = (
-    *(rig.check_pairs, rig.check_calibration, rig.check_nominal_size, rig.check_stripe_directions),
+    *(rig.check_exchanged, rig.check_pairs, rig.check_calibration, rig.check_nominal_size),
+    rig.check_stripe_directions,
     *(motion.check_common_error, motion.check_times, rig.check_floor, coverage.check_brightness),
     *(coverage.check_exposure, coverage.check_views, rig.check_silent_poles),
     *(

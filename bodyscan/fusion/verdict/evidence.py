@@ -111,6 +111,7 @@ class ImageEvidence:
     saturated: of overexposed pairs, the share of their pixels in the volume that are white.
     absent: calibrated pairs that measured nothing of the subject.
     compressed: pairs with images as JPEG leaves them, see `find_compressed`.
+    exchanged: pairs whose images are another's, and whose: see `find_exchanged`.
     agreements: of pairs that project stripes of two directions.
     seams: see `find_seams`.
     contradictions: see `merge`.
@@ -126,6 +127,7 @@ class ImageEvidence:
     contradictions: Contradictions | None = None
     floor_mm: float | None = None
     compressed: tuple[str, ...] = ()
+    exchanged: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def compression(self) -> str:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Container, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Container, Iterator, Mapping, Sequence
+from itertools import permutations
 
 import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
 from bodyscan.arrays import Array
 from bodyscan.errors import group_reasons
@@ -23,6 +25,72 @@ def check_pairs(scan: ScanEvidence) -> Iterator[Finding]:
     for names, reason in group_reasons(scan.images.failed):
         lost = frozenset(names)
         yield Finding("usable", f"{LEFT_OUT}{', '.join(names)}: {reason}", lost, lost)
+
+
+def find_exchanged(
+    images: Sequence[RangeImage],
+    rig_from_camera: Mapping[str, RigidTransform],
+    volume: Volume,
+    read_as: Callable[[str, str], RangeImage | None],
+) -> dict[str, str]:
+    """Pairs whose images another pair took, and which: what exchanged cables or folders leave.
+
+    images: as decoded.
+    read_as: one pair's images read with another's calibration; None if they cannot be.
+
+    Of a pair that is right, 20 % and more of the points lie within 10 mm of what the others
+    measured; of a wrong one some 5 %, by chance.
+    """
+    inside = {image.pair: _points_inside(image, rig_from_camera, volume) for image in images}
+
+    def share_near(points: Array, left_out: Collection[str]) -> float:
+        rest = [inside[name] for name in inside if name not in left_out]
+        if not rest or not len(points):
+            return 0.0
+        near = cKDTree(np.concatenate(rest)).query(points, distance_upper_bound=10.0)[0]
+        return float(np.isfinite(near).mean())
+
+    own = {name: share_near(points, [name]) for name, points in inside.items()}
+    # Six are 30 to read again; if more are wrong, so is what they are compared with.
+    suspects = sorted((name for name in own if own[name] < 0.3), key=lambda name: own[name])[:6]
+    found = {}
+    for one, other in permutations(suspects, 2):
+        image = read_as(one, other)
+        if image is None:
+            continue
+        points = _points_inside(image, rig_from_camera, volume)
+        if share_near(points, suspects) > max(0.2, 3.0 * share_near(inside[one], suspects)):
+            found[one] = other
+    return found if set(found) == set(found.values()) else {}
+
+
+def _points_inside(
+    image: RangeImage, rig_from_camera: Mapping[str, RigidTransform], volume: Volume
+) -> Array:
+    """Points (N, 3) of one pixel in 16 that are in the scan volume and not on the floor, rig frame."""
+    some = image.subsample(4)
+    points = image.points[some][image.valid[some]].astype(np.float64)
+    points = rig_from_camera[image.pair].apply(points)
+    above = (points[:, 2] > 30.0) & (points[:, 2] < volume.top_mm)
+    return np.asarray(points[above & (np.hypot(*points[:, :2].T) < volume.radius_mm)])
+
+
+def check_exchanged(scan: ScanEvidence) -> Iterator[Finding]:
+    """Pairs that have each other's images: nothing else needs to be wrong."""
+    taken = scan.images.exchanged
+    if not taken:
+        return
+    swapped = sorted({tuple(sorted(two)) for two in taken.items() if taken[two[1]] == two[0]})
+    names = [f"{one} and {other} were exchanged" for one, other in swapped]
+    names += [f"{one} are those of {of}" for one, of in taken.items() if taken[of] != one]
+    yield Finding(
+        "repeat",
+        f"the images of {', '.join(names)}: read as such, they show what the other pairs measured. "
+        "Exchange the cables, or the names of the folders, and scan again",
+        frozenset(taken),
+        frozenset(taken),
+        spoils=True,
+    )
 
 
 def check_refused(scan: ScanEvidence) -> Iterator[Finding]:
