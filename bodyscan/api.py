@@ -46,6 +46,7 @@ from bodyscan.verdict import Verdict
 
 if TYPE_CHECKING:
     from bodyscan.arrays import Bytes as Bytes
+    from bodyscan.evaluation.surface import Comparison
     from bodyscan.fusion.storage import Scan, StoredScan
     from bodyscan.measurement.measurements import Measurements
     from bodyscan.mesh.body import BodyCloud, BodyMesh
@@ -58,6 +59,7 @@ AnyPath: TypeAlias = str | PathLike[str]
 _HOMES = {
     "BodyCloud": "bodyscan.mesh.body",
     "BodyMesh": "bodyscan.mesh.body",
+    "Comparison": "bodyscan.evaluation.surface",
     "Bytes": "bodyscan.arrays",
     "Measurements": "bodyscan.measurement.measurements",
     "RangeImage": "bodyscan.reconstruction.range_image",
@@ -74,6 +76,7 @@ __all__ = [
     "BodyCloud",
     "BodyMesh",
     "BodyscanError",
+    "Comparison",
     "ExportSettings",
     "FailedWork",
     "FusionSettings",
@@ -88,6 +91,7 @@ __all__ = [
     "StoredScan",
     "Verdict",
     "calibrate_rig",
+    "compare",
     "export_scan",
     "import_calibration",
     "load_calibration",
@@ -290,16 +294,38 @@ def measure(
     return measure_mesh(body if isinstance(body, BodyMesh) else body.mesh, heights_mm, named=named)
 
 
+def compare(
+    body: bodyscan.Scan | bodyscan.StoredScan | bodyscan.BodyMesh,
+    other: AnyPath | bodyscan.Scan | bodyscan.StoredScan | bodyscan.BodyMesh,
+    *,
+    fit: bool = False,
+) -> bodyscan.Comparison:
+    """Signed distances (mm, outside positive) of what a scan measured from another surface.
+
+    other: a scan, its folder, or the path of a mesh (PLY, OBJ, STL) in mm, z up.
+    fit: fit the scan to the other first. Raises BadInput if `other` is of no such subject.
+    """
+    from bodyscan.evaluation.surface import compare_surfaces
+    from bodyscan.mesh.body import BodyMesh
+
+    mesh = body if isinstance(body, BodyMesh) else body.mesh
+    if isinstance(other, str | PathLike):
+        return compare_surfaces(mesh, Path(other))[fit]
+    return compare_surfaces(mesh, other if isinstance(other, BodyMesh) else other.mesh)[fit]
+
+
 def export_scan(
     stored: bodyscan.StoredScan,
     folder: AnyPath,
     settings: ExportSettings = ExportSettings(),
     *,
     frame: Literal["rig", "body"] = "rig",
+    up: Literal["z", "y"] = "z",
 ) -> list[Path]:
     """Write a scan for other programs, each file with a JSON beside it; return the paths.
 
     frame: the rig's, or the body's own (origin beneath the body, x the way it faces).
+    up: the axis that points up in PLY, OBJ and STL; in GLB it is y.
 
     Raises BadInput for an unknown format; FailedWork if a face is to be removed but no neck is
     found.
@@ -316,6 +342,7 @@ def export_scan(
         settings.versions,
         deface=settings.deface,
         frame=frame,
+        up=up,
     )
 
 

@@ -32,6 +32,7 @@ from bodyscan.progress import step
 from bodyscan.settings import AlignmentSettings, ExportSettings, FusionSettings, ScanSettings
 
 if TYPE_CHECKING:
+    from bodyscan.fusion.storage import StoredScan
     from bodyscan.jobs.job import Job
     from bodyscan.jobs.object_storage import Store
     from bodyscan.jobs.pipeline import Pipeline
@@ -220,7 +221,11 @@ def measure(
     path = out or result / "measurements.json"
     if path.suffix.lower() == ".csv":
         by_name = measured.named
-        table = named_csv(by_name, stored.facts) if by_name else measurements_csv(content)
+        table = (
+            named_csv(by_name, stored.facts)
+            if by_name
+            else measurements_csv(measured, stored.facts)
+        )
         write_text(path, table)
     else:
         write_json(path, content)
@@ -232,6 +237,7 @@ def measure(
             # As beside an export, so that `bodyscan forget` knows whose it is.
             write_json(one.with_name(f"{one.name}.json"), {"subject": content["subject"]})
     output.show(*tables(measured))
+    _show_grade(output, stored)
     output.figures(**content)
     output.add_files("measurements", *written)
 
@@ -260,6 +266,10 @@ def export(
     frame: Annotated[
         str, typer.Option(help="rig, or body (origin under the body, x the way it faces).")
     ] = "rig",
+    up: Annotated[
+        Literal["z", "y"],
+        typer.Option(help="Axis that points up in PLY, OBJ and STL (mm); GLB is y up, in metres."),
+    ] = "z",
     anyway: Anyway = False,
 ) -> None:
     """Export a scan's mesh as PLY, OBJ, STL and GLB for other programs."""
@@ -274,9 +284,17 @@ def export(
             refuse_repeat(result, stored.facts)
         versions = (*ExportSettings().versions, *(["registered"] if registered else []))
         chosen = formats.split(",")
-        written = export_scan(stored, folder, chosen, versions, deface=deface, frame=frame)
+        written = export_scan(stored, folder, chosen, versions, deface=deface, frame=frame, up=up)
+    _show_grade(output, stored)
     for path in written:
         output.add_files("export", path)
+    output.say(f"PLY, OBJ and STL are in mm, {up} up; GLB is in metres, y up")
+
+
+def _show_grade(output: Output, scan: StoredScan) -> None:
+    """Show the verdict of a scan that is not good: what is made of it may lack whole parts."""
+    if scan.verdict and scan.verdict.grade != "good":
+        output.verdict(scan.verdict)
 
 
 BatchOut = Annotated[

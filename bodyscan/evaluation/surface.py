@@ -136,18 +136,22 @@ class Comparison:
     other_from_scan: RigidTransform
 
 
-def compare_surfaces(mesh: BodyMesh, other: Path) -> list[Comparison]:
-    """Compare the mesh's measured part with `other`, a scan's folder or a PLY in mm, rig frame.
+def compare_surfaces(mesh: BodyMesh, other: Path | BodyMesh) -> list[Comparison]:
+    """Compare the mesh's measured part with `other`: a mesh, a scan's folder, a PLY in mm.
 
     First as they stand, then with the scan fitted to the other as a whole. Raises ResultError or
     BadInput if `other` cannot be read, or cannot be the same subject.
     """
-    vertices, faces = _surface(other, np.ptp(mesh.vertices, axis=0))
+    if isinstance(other, BodyMesh):
+        name, is_scan, vertices, faces = "the other", True, other.vertices, other.faces
+    else:
+        name, is_scan = _name(other), _is_scan(other)
+        vertices, faces = _surface(other, np.ptp(mesh.vertices, axis=0))
     measured = np.unique(mesh.faces[~mesh.filled])
     points = mesh.vertices[measured]
     fit = fit_to_surface(points, vertices, faces)
     return [
-        Comparison(_name(other), _is_scan(other), measured, signed, deviation(signed), fitted, pose)
+        Comparison(name, is_scan, measured, signed, deviation(signed), fitted, pose)
         for pose, fitted in ((RigidTransform.identity(), False), (fit, True))
         for signed in (signed_distances(pose.apply(points), vertices, faces),)
     ]

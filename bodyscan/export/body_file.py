@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,8 @@ class Provenance:
     defaced: the head was replaced by a plain one.
     found: the scan's findings (verdict, sway, pairs left out).
     rig_from_body: the pose of the body frame, if the body is given in that.
+    up: z, or y (x to the subject's left) for programs that expect it; formats whose standard names
+        the axes have those.
     """
 
     subject: str | None
@@ -36,6 +38,7 @@ class Provenance:
     defaced: bool = False
     found: Mapping[str, Any] = field(default_factory=dict)
     rig_from_body: RigidTransform | None = None
+    up: str = "z"
 
 
 def write_body(path: Path, body: BodyCloud | BodyMesh | SkinnedBody, origin: Provenance) -> None:
@@ -52,15 +55,18 @@ def write_body(path: Path, body: BodyCloud | BodyMesh | SkinnedBody, origin: Pro
         what = name or "a file without suffix"
         raise unknown_format_error(f"a {kind}", what, able, where=str(path))
     format_ = BODY_FORMATS.find(name)
+    up = (origin.up,) if format_.free_axes else ()
     if isinstance(body, SkinnedBody):
         if format_.write_skinned is None:
-            format_.write(path, body.mesh)
+            format_.write(path, body.mesh, *up)
         else:
-            format_.write_skinned(path, body)
+            format_.write_skinned(path, body, *up)
         body = body.mesh
     else:
         body = collapse_slivers(body) if isinstance(body, BodyMesh) else body
-        format_.write(path, body)
+        format_.write(path, body, *up)
+    if up == ("y",):
+        format_ = replace(format_, axes=("left", "up", "front"))
     write_json(path.with_name(f"{path.name}.json"), describe_body(path.name, format_, body, origin))
 
 

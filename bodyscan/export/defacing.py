@@ -42,6 +42,10 @@ def find_neck(vertices: Array, faces: Indices) -> Neck:
     is what is highest above the body's middle, so that a raised hand is not mistaken for it. Raises
     FailedWork if there is no such slice.
     """
+    remedy = "look at the mesh: does the subject stand upright, arms not overhead?"
+    not_found = FailedWork("no neck was found, so the face cannot be removed", remedy=remedy)
+    if len(vertices) < 1000:  # a head alone has more, even of the light version
+        raise not_found
     axis, top = _find_crown(vertices)
     stature = top - float(vertices[:, 2].min())
     # From crown to neck: 9 % of a tall adult's stature, 24 % of a small child's.
@@ -58,8 +62,7 @@ def find_neck(vertices: Array, faces: Indices) -> Neck:
     inside = 0 < narrowest < len(girths) - 1 and 180.0 < neck < 700.0
     # Wrists of arms held overhead are narrow too, but have no head above and no shoulders below.
     if not (inside and head > 400.0 and head > 1.1 * neck and shoulders > 1.5 * neck):
-        remedy = "look at the mesh: does the subject stand upright, arms not overhead?"
-        raise FailedWork("no neck was found, so the face cannot be removed", remedy=remedy)
+        raise not_found
     return Neck(float(heights[narrowest]), axis)
 
 

@@ -41,6 +41,7 @@ def export_scan(
     *,
     deface: bool = False,
     frame: str = "rig",
+    up: str = "z",
 ) -> list[Path]:
     """Write the mesh in each format (see `BODY_FORMATS`) and version; returns the paths.
 
@@ -49,15 +50,17 @@ def export_scan(
     deface: replace the subject's head by a plain one; below the neck nothing changes. The JSON then
         has neither pseudonym nor date.
     frame: rig, or body (origin under the body, x the way it faces).
+    up: the axis that points up, z or y; in GLB always y.
 
-    Raises BadInput for an unknown format, version or frame, for a registered body that shows a face
-    or fits nobody; FailedWork if no neck is found.
+    Raises BadInput for an unknown format, version, frame or axis, for a registered body that shows a
+    face or fits nobody; FailedWork if no neck is found.
     """
     names = [name.strip().lower().removeprefix(".") for name in formats]
     for name in names:
         BODY_FORMATS.find(name)
     every = (*VERSIONS, "registered")
-    for name, known in [*((version, every) for version in versions), (frame, ("rig", "body"))]:
+    choices = [*((version, every) for version in versions), (frame, ("rig", "body"))]
+    for name, known in [*choices, (up, ("z", "y"))]:
         if name not in known:
             what = f"there is no {name!r} to export{did_you_mean(name, known)}"
             raise BadInput(what, remedy=f"Choose from {', '.join(known)}.")
@@ -66,7 +69,7 @@ def export_scan(
         raise BadInput(what, remedy="Leave out one of `registered` and `deface`.")
     pose = find_body_frame(scan.mesh.vertices).rig_from_body if frame == "body" else None
     subject, identity = None if deface else scan.facts.get("subject"), scan.facts["calibration_id"]
-    origin = Provenance(subject, identity, deface, _find_facts(scan.facts, deface), pose)
+    origin = Provenance(subject, identity, deface, _find_facts(scan.facts, deface), pose, up)
     neck = find_neck(scan.mesh.vertices, scan.mesh.faces) if deface else None
     written = []
     for version in versions:

@@ -113,6 +113,11 @@ class StoredScan:
     mesh: BodyMesh
     facts: dict[str, Any]
 
+    @property
+    def verdict(self) -> Verdict | None:
+        """The verdict; None for scans from before there were any."""
+        return stored_verdict(self.facts)
+
 
 def make_room(folder: Path, overwrite: bool) -> None:
     """Raise ResultError if `folder` holds a model that may not be replaced."""

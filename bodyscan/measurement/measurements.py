@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -113,6 +114,24 @@ class Measurements:
     def measures(self) -> Mapping[str, Measure]:
         """Measures by name, such as "waist girth"; empty if they were not asked for."""
         return {} if self.named is None else self.named.measures
+
+    def to_records(self) -> list[dict[str, Any]]:
+        """One record for each part of each slice, as tables take them: `pandas.DataFrame(records)`.
+
+        Lengths in mm; ranges as `girth_low_mm`, `girth_high_mm`, `tape_low_mm`, `tape_high_mm`.
+        """
+        whole = {name: getattr(self, name) for name in ("stature_mm", "volume_l", "area_m2")}
+        whole["at_mean_breath"] = self.at_mean_breath
+        part = ("part", "girth_mm", "tape_mm", "width_mm", "depth_mm", "area_mm2", "measured")
+        ends = ("girth_low_mm", "girth_high_mm", "tape_low_mm", "tape_high_mm")
+        return [
+            whole
+            | {"height_mm": level.height_mm}
+            | {name: getattr(girth, name) for name in part}
+            | dict(zip(ends, (*girth.girth_range_mm, *girth.tape_range_mm), strict=True))
+            for level in self.slices
+            for girth in level.girths
+        ]
 
 
 def measure(

@@ -337,9 +337,12 @@ def find_body_frame(vertices: Array) -> BodyFrame:
     """Find the frame of a standing body from evenly spread vertices (V, 3) mm, z up from the floor.
 
     The upper body is widest from side to side. Toes point forward: feet reach beyond their ankles.
+    Of less than an upper body it is the rig frame.
     """
-    heights = vertices[:, 2] / vertices[:, 2].max()
+    heights = vertices[:, 2] / np.maximum(vertices[:, 2].max(initial=0.0), 1e-9)
     upper = vertices[heights > 0.45, :2]  # hips, trunk and arms, which together are wider than deep
+    if len(upper) < 3:
+        return BodyFrame(RigidTransform.identity(), False)
     middle = 0.5 * (np.percentile(upper, 2, axis=0) + np.percentile(upper, 98, axis=0))
     _, axes = np.linalg.eigh(np.cov((upper - upper.mean(axis=0)).T))
     feet, ankles = vertices[heights < 0.03, :2], vertices[(heights > 0.05) & (heights < 0.15), :2]

@@ -49,20 +49,34 @@ def _layout(what: str, *, breath: bool = False, regions: bool = False) -> Layout
     return {"vertex": (*vertex, *extra), "face": ("vertex_indices", "filled", *known)}
 
 
-def write_ply(path: Path, body: BodyCloud | BodyMesh) -> None:
-    """Write a cloud or a mesh in mm, rig frame.
+def describe_axes(up: str = "z") -> str:
+    """Unit and axes of a body of which z points up, or y, as its file's header states them."""
+    first = "the way the subject faces" if up == "z" else "to the subject's left"
+    return f"bodyscan: mm, x {first}, {up} up, floor at {up} = 0"
+
+
+def lay_axes(vectors: Floats | Array, up: str) -> Array:
+    """Vectors (..., 3), whose axes point front, left, up, as a file has them (left, up, front)."""
+    return np.asarray(vectors)[..., [0, 1, 2] if up == "z" else [1, 2, 0]]
+
+
+def write_ply(path: Path, body: BodyCloud | BodyMesh, up: str = "z") -> None:
+    """Write a cloud or a mesh in mm; up: see `describe_axes`.
 
     A mesh's faces have a uchar `filled` (0 or 1); points, vertices and faces have a uchar `region`
     (index into `REGION_NAMES`) if it is known.
     """
-    parts: dict[str, NDArray[Any]] = {"normals": body.normals.T, "colours": body.colours.T}
+    parts: dict[str, NDArray[Any]] = {
+        "normals": lay_axes(body.normals, up).T,
+        "colours": body.colours.T,
+    }
     if isinstance(body, BodyCloud):
         layout = _layout("cloud", regions=body.regions is not None)
         vertices: dict[str, Any] = {"pairs_seen": body.pairs_seen}
-        parts["positions"] = body.points.T
+        parts["positions"] = lay_axes(body.points, up).T
     else:
         layout = _layout("mesh", breath=body.breath is not None, regions=body.regions is not None)
-        vertices, parts["positions"] = {}, body.vertices.T
+        vertices, parts["positions"] = {}, lay_axes(body.vertices, up).T
         if body.breath is not None:
             parts["breath"] = np.stack([body.breath.mm, body.breath.sigma_mm])
     vertices |= {"sigma_mm": body.sigma_mm, "region": body.regions}
@@ -80,7 +94,7 @@ def write_ply(path: Path, body: BodyCloud | BodyMesh) -> None:
         for name in names:
             records[-1][name] = values[name]
     with atomic_replacement(Path(path)) as temporary, temporary.open("wb") as stream:
-        stream.write(_header(layout, [len(rows) for rows in records]))
+        stream.write(_header(layout, [len(rows) for rows in records], up))
         for rows in records:
             stream.write(rows.data)
 
@@ -129,9 +143,8 @@ def _fields(names: Sequence[str]) -> np.dtype[Any]:
     return np.dtype([(name, _TYPES[name][0]) for name in names])
 
 
-def _header(layout: Layout, counts: Sequence[int]) -> bytes:
-    lines = ["ply", "format binary_little_endian 1.0"]
-    lines += ["comment bodyscan: mm, x the way the subject faces, z up, floor at z = 0"]
+def _header(layout: Layout, counts: Sequence[int], up: str = "z") -> bytes:
+    lines = ["ply", "format binary_little_endian 1.0", f"comment {describe_axes(up)}"]
     for (element, names), count in zip(layout.items(), counts, strict=False):
         lines += [f"element {element} {count}"]
         lines += [f"property {_TYPES[name][1]} {name}" for name in names]

@@ -233,18 +233,9 @@ def _describe(measure: Measure) -> dict[str, Any]:
     return asdict(measure) | {"path_mm": np.round(measure.path_mm, 1)}
 
 
-def measurements_csv(content: Mapping[str, Any]) -> str:
-    """The `measurements_document` as CSV: a row for each part of each slice, beside what is of the
-    whole body; lengths in mm, ranges as `low` and `high`."""
-    keys = ("subject", "when", "stature_mm", "volume_l", "area_m2", "at_mean_breath")
-    body = {key: content[key] for key in keys}
-    body |= {"grade": (content["verdict"] or {}).get("grade")}
-    ends = ("girth_low_mm", "girth_high_mm", "tape_low_mm", "tape_high_mm")
-    part = ("part", "girth_mm", "tape_mm", "width_mm", "depth_mm", "area_mm2", "measured")
-    rows = []
-    for level in content["slices"]:
-        for girth in level["girths"]:
-            between = (*girth["girth_range_mm"], *girth["tape_range_mm"])
-            row = body | girth | {"height_mm": level["height_mm"]}
-            rows.append(row | dict(zip(ends, between, strict=True)))
-    return _write_csv((*body, "height_mm", *part, *ends), rows)
+def measurements_csv(measured: Measurements, facts: Mapping[str, Any]) -> str:
+    """Measurements as CSV: `Measurements.to_records`, each with the scan's subject, date and grade."""
+    scan = {"subject": facts.get("subject"), "when": facts.get("when")}
+    scan["grade"] = (facts.get("verdict") or {}).get("grade")
+    records = [scan | record for record in measured.to_records()]
+    return _write_csv(tuple(records[0] if records else scan), records)

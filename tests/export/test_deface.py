@@ -147,6 +147,8 @@ def test_arms_overhead_are_refused_and_not_taken_for_a_neck(body: BodyMesh) -> N
 def test_no_neck_no_export(body: BodyMesh) -> None:
     with pytest.raises(FailedWork, match="no neck"):
         find_neck(*arrays(o3d.geometry.TriangleMesh.create_sphere(500.0, 40)))
+    with pytest.raises(FailedWork, match="no neck"):
+        find_neck(*arrays(o3d.geometry.TriangleMesh.create_tetrahedron(900.0)))
     with pytest.raises(FailedWork, match="nothing above the neck"):
         deface(body, Neck(3000.0, np.zeros(2)))
 

@@ -112,6 +112,10 @@ def test_girths_are_those_at_mean_breath_and_say_how_well_it_is_known() -> None:
 def test_no_body_at_that_height(subject: BodyMesh) -> None:
     with pytest.raises(BadInput, match="no body at a height of 2500"):
         measure(subject, [2500.0])
+    corner = mesh_of(np.vstack([np.zeros(3), 90.0 * np.eye(3)]), np.array([[0, 2, 1], [0, 1, 3]]))
+    assert measure(corner).slices == ()
+    with pytest.raises(BadInput, match="no body at a height of 100"):
+        measure(corner, [100.0])
 
 
 def test_table_and_document_say_the_same(subject: BodyMesh) -> None:
@@ -120,6 +124,9 @@ def test_table_and_document_say_the_same(subject: BodyMesh) -> None:
     assert said["stature_mm"] == found.stature_mm
     assert said["slices"][0]["girths"][-1]["tape_mm"] == tape_mm(found.slices[0], "trunk")
     assert [table.row_count for table in tables(found)] == [4, 3]
+    parts = {record["part"]: record["tape_mm"] for record in found.to_records()}
+    assert len(parts) == 3
+    assert parts["trunk"] == tape_mm(found.slices[0], "trunk")
 
 
 def test_of_a_body_seen_from_the_knees_up_the_slices_there_are_are_given(subject: BodyMesh) -> None:

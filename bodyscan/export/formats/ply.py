@@ -8,4 +8,5 @@ from bodyscan.mesh.ply import write_ply
 FORMAT = BodyFormat(
     write_ply,
     holds=frozenset({"mesh", "cloud", "colours", "normals", "sigma", "filled", "regions"}),
+    free_axes=True,
 )
