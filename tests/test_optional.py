@@ -30,12 +30,6 @@ def test_a_failure_is_a_line_that_names_it_and_the_work_goes_on(
     assert "Traceback" in caplog.text
 
 
-@pytest.mark.parametrize("stop", [KeyboardInterrupt, SystemExit])
-def test_whoever_stops_the_work_stops_it(stop: type[BaseException]) -> None:
-    with pytest.raises(stop), optional("pictures", print):
-        raise stop
-
-
 @pytest.mark.parametrize("debug", [False, True])
 def test_debug_shows_where_it_failed(debug: bool) -> None:
     code = (
