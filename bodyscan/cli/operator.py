@@ -208,7 +208,6 @@ def measure(
     from bodyscan.report.measurement_table import (
         measurements_csv,
         measurements_document,
-        named_csv,
         tables,
         write_landmarks,
     )
@@ -220,13 +219,7 @@ def measure(
     content = measurements_document(measured, stored.facts)
     path = out or result / "measurements.json"
     if path.suffix.lower() == ".csv":
-        by_name = measured.named
-        table = (
-            named_csv(by_name, stored.facts)
-            if by_name
-            else measurements_csv(measured, stored.facts)
-        )
-        write_text(path, table)
+        write_text(path, measurements_csv(measured, stored.facts))
     else:
         write_json(path, content)
     if landmarks is not None and measured.named is not None:

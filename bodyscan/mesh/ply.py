@@ -55,9 +55,9 @@ def describe_axes(up: str = "z") -> str:
     return f"bodyscan: mm, x {first}, {up} up, floor at {up} = 0"
 
 
-def lay_axes(vectors: Floats | Array, up: str) -> Array:
+def lay_axes(vectors: NDArray[Any], up: str) -> NDArray[Any]:
     """Vectors (..., 3), whose axes point front, left, up, as a file has them (left, up, front)."""
-    return np.asarray(vectors)[..., [0, 1, 2] if up == "z" else [1, 2, 0]]
+    return vectors[..., [0, 1, 2] if up == "z" else [1, 2, 0]]
 
 
 def write_ply(path: Path, body: BodyCloud | BodyMesh, up: str = "z") -> None:

@@ -234,7 +234,10 @@ def _describe(measure: Measure) -> dict[str, Any]:
 
 
 def measurements_csv(measured: Measurements, facts: Mapping[str, Any]) -> str:
-    """Measurements as CSV: `Measurements.to_records`, each with the scan's subject, date and grade."""
+    """Measurements as CSV: `Measurements.to_records`, each with the scan's subject, date and grade; or
+    those by name, if they were asked for."""
+    if measured.named is not None:
+        return named_csv(measured.named, facts)
     scan = {"subject": facts.get("subject"), "when": facts.get("when")}
     scan["grade"] = (facts.get("verdict") or {}).get("grade")
     records = [scan | record for record in measured.to_records()]

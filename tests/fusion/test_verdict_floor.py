@@ -125,6 +125,6 @@ def test_pairs_that_have_each_other_s_images_are_named(one: str, other: str) -> 
     def read_as(pair: str, calibration: str) -> RangeImage:
         return replace(files[pair], pair=calibration)
 
-    given = [read_as(name, name) for name in files]
-    found = find_exchanged(given, scan.rig_from_camera, WITHIN, read_as)
+    images = [read_as(name, name) for name in files]
+    found = find_exchanged(images, scan.rig_from_camera, WITHIN, read_as)
     assert found == ({one: other, other: one} if one != other else {})

@@ -114,8 +114,6 @@ def test_no_body_at_that_height(subject: BodyMesh) -> None:
         measure(subject, [2500.0])
     corner = mesh_of(np.vstack([np.zeros(3), 90.0 * np.eye(3)]), np.array([[0, 2, 1], [0, 1, 3]]))
     assert measure(corner).slices == ()
-    with pytest.raises(BadInput, match="no body at a height of 100"):
-        measure(corner, [100.0])
 
 
 def test_table_and_document_say_the_same(subject: BodyMesh) -> None:
