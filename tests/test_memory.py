@@ -78,7 +78,6 @@ def test_a_small_address_space_ends_in_an_error_and_never_hangs(
 
 @pytest.mark.parametrize("command", ["measure", "export", "report"])
 def test_small_results_are_read_without_open3d_and_colmap(command: str, tmp_path: Path) -> None:
-    """Open3D asks for libEGL and libGL, which a server may not have."""
     make_scan(tmp_path)
     program = (
         "import sys; sys.modules |= {'open3d': None, 'pycolmap': None}\n"

@@ -123,7 +123,6 @@ def test_table_and_document_say_the_same(subject: BodyMesh) -> None:
     assert said["slices"][0]["girths"][-1]["tape_mm"] == tape_mm(found.slices[0], "trunk")
     assert [table.row_count for table in tables(found)] == [4, 3]
     parts = {record["part"]: record["tape_mm"] for record in found.to_records()}
-    assert len(parts) == 3
     assert parts["trunk"] == tape_mm(found.slices[0], "trunk")
 
 
