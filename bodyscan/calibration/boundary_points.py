@@ -19,7 +19,6 @@ from bodyscan.geometry.camera_tables import Table, look_up, ray_table
 from bodyscan.geometry.light_planes import Axis
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.rig.board import Board
-from bodyscan.rig.pair import CameraSpec
 from bodyscan.stripes.stripe_code import StripeCode
 from bodyscan.stripes.stripe_map import StripeMap
 
@@ -256,32 +255,23 @@ def compute_print_box(camera: Camera, board: Board, view: LocatedView) -> Box:
     )
 
 
-def band_step(code: StripeCode, boxes: Sequence[Box]) -> int:
-    """Compute the step between bands of BIN_PX along the stripes that leaves as many bins as a fit
-    uses, even if half of all stripes miss the boards."""
-    along = 0 if code.direction == "horizontal" else 1
-    pieces = sum(float(high[along] - low[along]) / BIN_PX for low, high in boxes)
-    return max(int(0.5 * code.stripes * pieces / FIT_BINS), 1)
-
-
-def keep_bands(
-    boundaries: BoardBoundaries, direction: Axis, every: int, turn: int
+def thin_bands(
+    boundaries: BoardBoundaries, direction: Axis, views: int, turn: int
 ) -> BoardBoundaries:
-    """Keep those in one of `every` bands of BIN_PX along the stripes."""
+    """Keep means of a view in one of so many bands of BIN_PX along the stripes that `views` like it
+    have as many as a fit uses.
+
+    turn: number of the view; views take turns. Of each, four bands are left: sheets bow across their
+    width.
+    """
     along = boundaries.pixels[:, 0 if direction == "horizontal" else 1]
-    kept = np.floor(along / BIN_PX) % every == turn % every
+    band = np.floor(along / BIN_PX)
+    every = max(min(len(band) * views // FIT_BINS, len(np.unique(band)) // 4), 1)
+    kept = band % every == turn % every
     other: Axis = "vertical" if direction == "horizontal" else "horizontal"
-    crossing = boundaries.crossing and keep_bands(boundaries.crossing, other, every, turn)
+    crossing = boundaries.crossing and thin_bands(boundaries.crossing, other, views, turn)
     rest = boundaries.index[kept], boundaries.pixels[kept], boundaries.sigma_px[kept]
     return BoardBoundaries(*rest, crossing)
-
-
-def max_band_step(boxes: Sequence[Box], camera: CameraSpec) -> int:
-    """Compute the largest band step that leaves four bands across the visible part of every board:
-    sheets bow across their width."""
-    size = np.array([camera.width, camera.height])
-    visible = [np.minimum(high, size) - np.maximum(low, 0.0) for low, high in boxes]
-    return max(int(np.min(visible) / (4 * BIN_PX)), 1)
 
 
 def locate_boundaries_on_boards(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -14,14 +14,12 @@ from bodyscan.calibration.boundary_points import (
     BoardBoundaries,
     Box,
     StripedView,
-    band_step,
     boundaries_near,
     compute_box,
     compute_print_box,
     crop_around,
-    keep_bands,
-    max_band_step,
     on_print,
+    thin_bands,
 )
 from bodyscan.calibration.camera import CameraCalibration
 from bodyscan.captures.folder import Captures, ImageSequence
@@ -110,21 +108,16 @@ class PrintAreas:
         return compute_print_box(camera, board, self.located[view.key])
 
     def select(
-        self, view: BoardView, boundaries: BoardBoundaries, bands: tuple[int, int]
+        self, view: BoardView, boundaries: BoardBoundaries, views: int, turn: int
     ) -> BoardBoundaries:
-        """The boundaries on the print of a view's board, in one of so many bands (see `keep_bands`)."""
+        """Means of the boundaries on the print of a view's board, one of so many of its pair: see
+        `thin_bands`."""
         code = self.rig.pair(view.pair).projector
         assert code is not None
-        boundaries = keep_bands(boundaries, code.direction, *bands)
         shot = StripedView(self.located[view.key], self.rig.board(view.board), boundaries)
         camera = self.cameras[view.pair].camera
-        return on_print(camera, code, shot.board, shot.camera_from_face, boundaries)
-
-    def band_step(self, pair: Pair, views: Sequence[BoardView]) -> int:
-        """Use one in this many bands of BIN_PX along the stripes of a pair."""
-        if pair.projector is None or len(self.cameras) < 2:
-            return 1
-        return band_step(pair.projector, [self.box(view) for view in views])
+        means = on_print(camera, code, shot.board, shot.camera_from_face, boundaries)
+        return means if len(self.cameras) < 2 else thin_bands(means, code.direction, views, turn)
 
 
 def decode_on_boards(
@@ -146,12 +139,7 @@ def decode_on_boards(
         wanted[view.pair, view.shot].append(view)
     sequences = [s for s in captures.sequences if s.has_stripes and (s.pair, s.shot) in wanted]
     box: Callable[[BoardView], Box] = prints.box if prints else compute_box
-    step = {
-        name: prints.band_step(rig.pair(name), [view for view in views if view.pair == name])
-        if prints
-        else 1
-        for name in {sequence.pair for sequence in sequences}
-    }
+    count = Counter(view.pair for view in views)
     # Shots take turns in bands.
     turn = {s: captures.pair_sequences(s.pair).index(s) for s in sequences}
 
@@ -159,15 +147,14 @@ def decode_on_boards(
         pair, group = rig.pair(sequence.pair), wanted[sequence.pair, sequence.shot]
         boxes = [box(view) for view in group]
         crop = crop_around(boxes)
-        every = min(step[pair.name], max_band_step(boxes, pair.camera))
         stripes = decode_sequence(sequence, pair, crop=crop)
         near = {
             view.key: boundaries_near(stripes, around, crop)
             for view, around in zip(group, boxes, strict=True)
         }
         if prints:
-            bands = every, turn[sequence]
-            near = {view.key: prints.select(view, near[view.key], bands) for view in group}
+            share = count[pair.name], turn[sequence]
+            near = {view.key: prints.select(view, near[view.key], *share) for view in group}
         return BoardStripes(near, stripes.crossing_fault)
 
     found, errors = attempt_each(

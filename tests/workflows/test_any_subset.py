@@ -141,7 +141,7 @@ def test_any_subset_of_images_with_stripes_does_too(
         _rig: Rig, _captures: Captures, wanted: Views, _: Progress, *, prints: PrintAreas
     ) -> Outcome[dict[ViewKey, BoardBoundaries]]:
         return Outcome(
-            {v.key: prints.select(v, striped[v.key], (1, 0)) for v in wanted if v.key in striped}
+            {v.key: prints.select(v, striped[v.key], 1, 0) for v in wanted if v.key in striped}
         )
 
     with pytest.MonkeyPatch.context() as patched:

@@ -154,7 +154,6 @@ def test_a_sequence_that_fails_is_a_note_and_notes_are_in_the_order_of_shots(
 
     monkeypatch.setattr(decode, "decode_sequence", decoded)
     monkeypatch.setattr(decode, "boundaries_near", lambda *_: "boundaries")
-    monkeypatch.setattr(decode, "max_band_step", lambda *_: 1)
     views = [BoardView(s.pair, s.shot, "board", np.arange(4), np.zeros((4, 2))) for s in sequences]
     every = decode.decode_on_boards(rig, captures, views)
     assert list(every.value) == [("p1", "a", "board"), ("p2", "b", "board"), ("p1", "b", "board")]
