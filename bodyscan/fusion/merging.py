@@ -16,9 +16,9 @@ from bodyscan.arrays import Array, Floats
 from bodyscan.compiled import compiled
 from bodyscan.fusion.brightness import EqualizedGrey, equalize_brightness
 from bodyscan.fusion.consistency import Consistency, Contradictions, compare_with_surface
-from bodyscan.fusion.quadratic_fit import NORMAL_MEDIAN
 from bodyscan.fusion.smoothing import Numbers, SmoothSurface, smooth
 from bodyscan.fusion.voxel_thinning import Samples, take_samples
+from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.mesh.body import BodyCloud
@@ -150,7 +150,7 @@ def estimate_sigma_inflation(
             variance += _pose_variance(samples, index, surfaces, surface.pair, poses)
         ratios.append(np.abs(shift_mm) / np.sqrt(variance))
     every = np.concatenate(ratios)
-    return max(1.0, float(np.median(every)) / NORMAL_MEDIAN) if every.size else 1.0
+    return max(1.0, SIGMAS_PER_MEDIAN * float(np.median(every))) if every.size else 1.0
 
 
 def _pose_variance(

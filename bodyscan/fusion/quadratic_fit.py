@@ -15,9 +15,7 @@ from numpy.typing import NDArray
 
 from bodyscan.arrays import Array, Floats, Mask
 from bodyscan.compiled import compiled
-
-NORMAL_MEDIAN = 0.6745
-"""Median of the absolute value of a standard normal variable."""
+from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,4 +254,4 @@ def _noise_scale(inverse: Floats, noise: Floats, fit: QuadraticFit, full: Mask) 
     # A residual lacks the part of the pixel's noise that the fit absorbed.
     absorbed = np.square(fit.sigma[::8][there][0] / noise[::8][there][0])
     typical = np.median(np.abs(residual)) / np.sqrt(1.0 - absorbed)
-    return np.float32(max(1.0, typical / NORMAL_MEDIAN))
+    return np.float32(max(1.0, SIGMAS_PER_MEDIAN * typical))

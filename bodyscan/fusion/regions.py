@@ -80,7 +80,7 @@ class _Grid:
 
     def compute_medians(self, values: Floats, cell: Indices) -> Array:
         """Median (count,) of the values (N,) in each cell, by the cell (N,) of each; 0 if none."""
-        return _group_medians(values, cell, self.count)
+        return group_medians(values, cell, self.count)
 
     def find_majority(self, mask: Mask, among: Mask) -> Mask:
         """(count,): cells around which more than half of the `among` cells are in `mask`."""
@@ -225,7 +225,7 @@ def measure_roughness(
 
 
 @compiled
-def _group_medians(values: Floats, group: Indices, count: int) -> Array:
+def group_medians(values: Floats | Array, group: Indices, count: int) -> Array:
     """Median (count,) of the values (N,) of each group, by the number (N,) of each; 0 if none.
 
     Values are brought together by counting: scipy's median sorts all of them, in twenty times the time.

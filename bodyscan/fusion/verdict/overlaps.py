@@ -22,7 +22,8 @@ from bodyscan.alignment.matching import (
     sample_points,
 )
 from bodyscan.alignment.overlaps import find_connected_groups
-from bodyscan.arrays import Array, Indices
+from bodyscan.arrays import Array
+from bodyscan.fusion.regions import group_medians
 from bodyscan.fusion.verdict.evidence import GIRTH_PER_MM, Finding, ScanEvidence, Seam, SeamReport
 from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
 from bodyscan.geometry.transforms import RigidTransform
@@ -83,22 +84,13 @@ def patch_medians(matches: Matches) -> tuple[Array, Array]:
     # 4096 patches reach from one end of any volume to the other.
     key = (x * 4096 + y) * 4096 + z
     _, number, count = np.unique(key, return_inverse=True, return_counts=True)
-    median = _group_medians(matches.distances, number, count)
-    deviation = _group_medians(np.abs(matches.distances - median[number]), number, count)
+    median = group_medians(matches.distances, number, len(count))
+    deviation = group_medians(np.abs(matches.distances - median[number]), number, len(count))
     # 1.2533: sigma of a median over that of a mean. 5 neighbouring matches share their errors.
     independent = np.maximum(count / 5.0, 1.0)
     sigma = 1.2533 * SIGMAS_PER_MEDIAN * deviation / np.sqrt(independent)
     enough = count >= 8
     return np.abs(median[enough]), sigma[enough]
-
-
-def _group_medians(values: Array, group: Indices, count: Indices) -> Array:
-    """Median of the values of each group, numbered from 0."""
-    ascending = np.argsort(values)
-    # There are few patches, and 16-bit numbers are sorted in one pass.
-    small = group[ascending].astype(np.min_scalar_type(len(count)))
-    ordered = values[ascending[np.argsort(small, kind="stable")]]
-    return ordered[np.cumsum(count) - count + count // 2]
 
 
 @dataclass(frozen=True)
