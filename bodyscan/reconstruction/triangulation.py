@@ -27,20 +27,9 @@ def reconstruct_range_image(pair: PairCalibration, stripes: StripeMap) -> RangeI
     """Triangulate points, with normals and sigmas, on the camera's pixel grid, camera frame, mm.
 
     Stripes of both directions are used if they were projected and calibrated. Raises BadInput if
-    the pair has no projector, the image size differs, or the directions contradict each other as
-    with a wrong calibration.
+    the directions contradict each other as with a wrong calibration.
     """
-    camera = pair.camera
-    if pair.sheets is None:
-        raise BadInput("this pair has no projector, it cannot scan", where=f"pair {pair.name}")
-    if stripes.s.shape != (camera.height, camera.width):
-        height, width = stripes.s.shape
-        raise BadInput(
-            f"images of {width} x {height} px, but the pair was calibrated with "
-            f"{camera.width} x {camera.height} px",
-            where=f"pair {pair.name}",
-            remedy="scan with the camera settings of the calibration, or calibrate again",
-        )
+    assert pair.sheets is not None  # its stripes would not have been decoded
     one = _triangulate(pair, pair.sheets, stripes.s, stripes.sigma)
     (points, sigma_mm, common_mm), agreement = one, None
     correlation_px = stripes.correlation_px
@@ -59,7 +48,7 @@ def reconstruct_range_image(pair: PairCalibration, stripes: StripeMap) -> RangeI
         _require_fit(pair, stripes, agreement)
     return RangeImage(
         pair.name,
-        camera,
+        pair.camera,
         points,
         grid_normals(points, np.isfinite(sigma_mm)),
         sigma_mm,

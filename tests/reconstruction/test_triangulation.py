@@ -5,7 +5,6 @@ import pytest
 from ball import ball_points
 from small_pair import CAMERA, pair, stripe_map
 
-from bodyscan.errors import BadInput
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.uncertainty import COLUMNS, ROWS, RayUncertainty
@@ -108,10 +107,3 @@ def test_normals_are_those_of_planes_fitted_to_the_windows() -> None:
         normal = -np.append(slope[:2], rest)
         # float32 sums of 25 numbers near 1, of which differences of 1e-2 are taken.
         assert np.allclose(normals[v, u], normal / np.linalg.norm(normal), atol=1e-4)
-
-
-def test_another_image_size_is_refused() -> None:
-    stripes = stripe_map(np.full((CAMERA.height, CAMERA.width), 480.0))
-    small = StripeMap(**{**vars(stripes), "s": stripes.s[:100]})
-    with pytest.raises(BadInput, match="160 x 100"):
-        reconstruct_range_image(pair(), small)

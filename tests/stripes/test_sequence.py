@@ -98,15 +98,6 @@ def test_a_rim_where_one_bit_alone_flips_is_no_wrong_order() -> None:
         read(reordered(scene, [0, 1, 2, 4, 3, 5, 6]))
 
 
-def test_a_sequence_of_the_wrong_length_or_size_is_refused(good: Sequence) -> None:
-    with pytest.raises(DecodingFailed, match="13 images of the code, but it has 14"):
-        read(replace(good, patterns=good.patterns[1:]))
-    with pytest.raises(DecodingFailed, match="images of"):
-        read(replace(good, lit=good.lit[:-1]))
-    with pytest.raises(DecodingFailed, match="dark frame of"):
-        read(replace(good, dark=good.dark[:-1]))
-
-
 def test_exposures_that_cannot_be_read_are_refused(good: Sequence) -> None:
     def brighter(factor: float) -> Sequence:
         lit, dark, patterns, inverses = (
