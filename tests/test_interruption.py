@@ -69,7 +69,6 @@ def test_ctrl_c_ends_the_work(busy: str, whole_group: bool) -> None:
 
 
 def test_two_signals_at_once_are_one() -> None:
-    """Both are pending when Python looks: it handles one after the other."""
     process = start(BUSY["waiting"])
     child_of(process)
     for number in (signal.SIGSTOP, signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGCONT):

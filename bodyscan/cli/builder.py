@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -79,12 +80,21 @@ def check(output: Output, rig_file: RigFile) -> None:
     from bodyscan.captures.check import format_report
     from bodyscan.rig.rig import load_rig
 
-    known_errors: list[str] = []
-    if any(pair.known for pair in load_rig(rig_file).pairs):
+    rig, known_errors = load_rig(rig_file), []
+    if any(pair.known for pair in rig.pairs):
         from bodyscan.workflows.import_rig import find_known_errors
 
         known_errors = find_known_errors(rig_file)
     found = look_over(rig_file, known_errors=known_errors)
+    if found.ok and found.folders and rig.rig_frame.shot:
+        from bodyscan.captures.folder import open_captures
+        from bodyscan.workflows.find_boards import choose_frame
+
+        try:
+            framed = choose_frame(rig, open_captures(rig, rig_file))
+            found = replace(found, warnings=(*found.warnings, *framed.notes))
+        except BadInput as error:
+            found = replace(found, errors=(str(error),))
     output.say(*format_report(found), wrong=not found.ok)
     output.figures(images=found.images, shots=len(found.shots))
     output.exit_code = 0 if found.ok else 2

@@ -37,6 +37,7 @@ from bodyscan.workflows.find_boards import (
     HERE,
     FoundBoards,
     calibrate_cameras,
+    choose_frame,
     find_all_boards,
     locate_views,
     no_pair_calibrated,
@@ -56,9 +57,16 @@ def calibrate_rig(
     FailedWork if no pair is left (of a rig with projectors: none that has one), RigDisconnected if
     nothing ties the pairs together, BadInput if nothing fixes the rig frame.
     """
-    refuse_without_frame_shot(rig, captures.shots)
-    boards = find_all_boards(rig, captures, progress)
+    rig, boards = _find_boards(rig, captures, progress)
     return add_remarks(solve_boards(rig, captures, boards, progress, folder=folder), progress)
+
+
+def _find_boards(rig: Rig, captures: Captures, progress: Progress) -> tuple[Rig, FoundBoards]:
+    """The boards, and the rig with a frame that can be fixed: that is found out first, in seconds."""
+    refuse_without_frame_shot(rig, captures.shots)
+    framed = choose_frame(rig, captures)
+    boards = find_all_boards(rig, captures, progress)
+    return framed.value, replace(boards, notes=(*framed.notes, *boards.notes))
 
 
 def calibrate_folder(
@@ -72,8 +80,7 @@ def calibrate_folder(
     """
     rig = load_rig(rig_file)
     captures = open_captures(rig, rig_file)
-    refuse_without_frame_shot(rig, captures.shots)
-    boards = find_all_boards(rig, captures, progress)
+    rig, boards = _find_boards(rig, captures, progress)
     solved = solve_boards(rig, captures, boards, progress, folder=Path(rig_file).parent)
     remarked = add_remarks(solved, progress)
     archive_previous(folder)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -50,6 +51,7 @@ from bodyscan.registration.board_checks import (
 )
 from bodyscan.registration.sanity_checks import find_camera_faults
 from bodyscan.rig.board import Board
+from bodyscan.rig.gauge import RigFrame
 from bodyscan.rig.pair import AUTO, Pair
 from bodyscan.rig.rig import Rig
 from bodyscan.stripes.decoding import describe_step
@@ -139,6 +141,38 @@ def _refuse_other_markers(
             where=f"board {board.name}: {sequence.board_path}",
             remedy="correct first_marker in the rig file",
         )
+
+
+def choose_frame(rig: Rig, captures: Captures) -> Outcome[Rig]:
+    """The rig with a frame that its captures can fix: where no image of the shot that is to fix it
+    shows the board, a pair at its nominal pose does instead, and a note says so.
+
+    Raises BadInput if there is no such pair.
+    """
+    shot, board = rig.rig_frame.shot, rig.frame_board
+    if shot is None or board is None:
+        return Outcome(rig)
+    for sequence in captures.shot_sequences(shot):
+        if captures.corners.get(sequence.board_path):
+            return Outcome(rig)
+        with suppress(BodyscanError):  # images that cannot be read are told of together
+            image = read_board_image(sequence, rig.pair(sequence.pair))
+            if find_boards(image, [board], pair=sequence.pair, shot=shot):
+                return Outcome(rig)
+    fault = (
+        f"rig_frame.shot: no image of '{shot}' shows board {board.name}, which fixes the rig frame"
+    )
+    holder = next((pair for pair in rig.pairs if pair.nominal), None)
+    if holder is None:
+        raise BadInput(
+            fault,
+            where=f"rig {rig.name}",
+            remedy="capture the board where it fixes the rig frame, lit and in view of a camera; or "
+            "fix the frame by a pair (rig_frame: {pair: NAME})",
+        )
+    frame = RigFrame() if holder is rig.pairs[0] else RigFrame(pair=holder.name)
+    note = f"{fault}; pair {holder.name} at its nominal pose does: heights are as exact as that"
+    return Outcome(rig.model_copy(update={"rig_frame": frame}), (note,))
 
 
 def _given_view(rig: Rig, captures: Captures, sequence: ImageSequence) -> list[BoardView]:
