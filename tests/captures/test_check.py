@@ -202,11 +202,8 @@ def test_the_shot_that_fixes_the_rig_frame_must_be_complete(rig_path: Path) -> N
     assert lines_with(rig_path, "no shot 'b22' (did you mean 'b2'?)")
     write(rig_path, RIG + "rig_frame: {shot: b2}\n")
     assert check(rig_path).ok
-    for nominal, code in (
-        ("", 2),
-        ("    nominal: {position_mm: [9, 0, 0], look_at_mm: [0, 0, 0]}\n", 0),
-    ):
-        text = RIG.replace("  - name: p2\n", f"{nominal}  - name: p2\n")
+    placed = "    nominal: {position_mm: [9, 0, 0], look_at_mm: [0, 0, 0]}\n  - name: p2\n"
+    for text, code in (RIG, 2), (RIG.replace("  - name: p2\n", placed), 0):
         done = run("check", write(rig_path, text + "rig_frame: {shot: b2}\n"))
         assert ("no image of 'b2' shows board board" in done.output, done.exit_code) == (True, code)
     for pair in ("p1", "p2", "cam"):
