@@ -51,8 +51,14 @@ class Day:
             self._rows[folder.parent.name] = read_row(folder.parent)
 
     def rows(self) -> list[Row]:
-        """All rows, to be read only."""
+        """All rows, to be read only; those whose files were removed, as `forget` does, are gone."""
         with self._lock:
+            ended = [
+                job for job, row in self._rows.items() if row["state"] in ("done", "set aside")
+            ]
+            for job in ended:
+                if not (self.out / job / JOB).exists():
+                    del self._rows[job]
             return list(self._rows.values())
 
     def row(self, job: str) -> Row:

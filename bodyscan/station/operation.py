@@ -95,6 +95,10 @@ class Operation:
         """Have a shot of the board taken; return its name. Raises BadInput if that cannot be now."""
         if self.rig_file is None or not self.rig.calibration:
             raise BadInput("the rig file names no calibration captures")
+        if self.rig.capture is not None and self.rig.capture.camera["kind"] == "simulated":
+            raise BadInput(
+                "the simulated camera shows people, not boards: `simulate` renders these"
+            )
         folder = capture_path(self.rig_file, self.rig.calibration[0])
         there = {path.name for path in folder.glob("*")}
         name = next(name for k in range(1, 10_000) if (name := f"b{k:02d}") not in there)

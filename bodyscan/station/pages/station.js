@@ -188,6 +188,7 @@
     const lasts = Object.entries(series).map(([pair, points]) => [pair, points[points.length - 1]]);
     const moved = lasts.filter(([, point]) => point.moved).map(([pair]) => pair);
     $("moved").textContent = moved.length ? say("moved", { pairs: moved.join(", ") }) : lasts.length ? say("steady") : say("few");
+    $("axis").textContent = lasts.length ? say("driftAxis") : "";
     $("series").replaceChildren(...Object.entries(series).map(([pair, points]) => driftChart(pair, points)));
   }
 
@@ -213,7 +214,7 @@
       mark.append(part("title", {}, `${p.job}: ${number(p.mm, 2)} mm`));
       svg.append(mark);
     });
-    return make("figure", {}, make("strong", {}, title), svg, make("figcaption", {}, say("driftAxis")));
+    return make("figure", {}, make("strong", {}, title), svg);
   }
 
   // -- Calibrating
