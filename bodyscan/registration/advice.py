@@ -10,7 +10,7 @@ from bodyscan.geometry.uncertainty import position_sigma
 from bodyscan.registration.cluster_covariance import normal_equations
 from bodyscan.registration.rig_frame import frame_target
 from bodyscan.registration.rig_solve import RigSolution
-from bodyscan.registration.view_graph import Target, by_target, view_graph
+from bodyscan.registration.view_graph import Target, by_target
 from bodyscan.rig.rig import Rig
 
 MAX_SHOTS = 10
@@ -18,20 +18,11 @@ MAX_SHOTS = 10
 
 
 def advise(rig: Rig, solution: RigSolution) -> list[str]:
-    """What ties a rig together, where it is weak, and the most useful further shots, in words."""
+    """What ties a rig together, and the most useful further shots, in words."""
     lines = []
     if shots := find_articulation_shots(solution):
         names = ", ".join(f"{shot} ({board})" for shot, board in shots)
         lines.append(f"without any one of these shots the rig is disconnected: {names}")
-    chain = list(best_links(solution).edges(data=True))
-    median = float(np.median([link["sigma_mm"] for _, _, link in chain])) if chain else 0.0
-    lines += [
-        f"weak link: sigma of {second} relative to {first} is {link['sigma_mm']:.3f} mm "
-        f"({_count_shots(len(link['targets']))} in common), and no other link between their parts is "
-        "better"
-        for first, second, link in sorted(chain, key=lambda edge: -edge[2]["sigma_mm"])
-        if link["sigma_mm"] > 2.0 * median
-    ]
     sigmas = {name: pair_sigma_mm(solution, name) for name in solution.rig_from_camera}
     worst = max(sorted(sigmas), key=lambda name: sigmas[name])
     lines.append(f"{worst} has the largest sigma in the rig frame: {sigmas[worst]:.3f} mm")
@@ -42,17 +33,6 @@ def pair_sigma_mm(solution: RigSolution, name: str) -> float:
     """Sigma of a camera's position over all axes, mm."""
     position = solution.rig_from_camera[name].translation
     return float(np.linalg.norm(position_sigma(solution.covariance, name, position)))
-
-
-def best_links(solution: RigSolution) -> nx.Graph:
-    """The `view_graph`'s minimum spanning tree by sigma: the links that tie all pairs together best.
-
-    Edge attribute sigma_mm: of the second pair's position relative to the first, by all boards.
-    """
-    graph = view_graph(solution.views, sorted(solution.rig_from_camera))
-    for first, second, link in graph.edges(data=True):
-        link["sigma_mm"] = solution.relative_sigma_mm(first, second)
-    return nx.minimum_spanning_tree(graph, weight="sigma_mm")
 
 
 def find_articulation_shots(solution: RigSolution) -> tuple[Target, ...]:
@@ -113,7 +93,3 @@ def suggest_shots(rig: Rig, solution: RigSolution, pair: str) -> list[str]:
         f"tilted differently each time, seen by {', '.join(visible_to[best])}) would "
         f"{'halve' if gain <= 0.5 else 'improve'} the sigma of {pair}: {effect}"
     ]
-
-
-def _count_shots(count: int) -> str:
-    return "1 shot" if count == 1 else f"{count} shots"

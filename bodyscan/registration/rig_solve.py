@@ -22,7 +22,7 @@ from bodyscan.calibration.camera import CORNERS, LensTrial, locate_board
 from bodyscan.calibration.pair import LocatedPair, PairCalibration
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.geometry.uncertainty import PoseCovariance, RayUncertainty, point_covariance
+from bodyscan.geometry.uncertainty import PoseCovariance, RayUncertainty
 from bodyscan.outcome import Outcome
 from bodyscan.registration.board_motion import estimate_motions
 from bodyscan.registration.board_shape import estimate_board_shapes
@@ -105,12 +105,6 @@ class RigSolution:
             name: float(np.sqrt(2.0 * CORNERS.mean_square(one))) if one.size else float("nan")
             for name, one in residuals.items()
         }
-
-    def relative_sigma_mm(self, first: str, second: str) -> float:
-        """Sigma of the second camera's position in the frame of the first, over all axes, mm."""
-        motion = self.covariance.relative(first, second)
-        position = self.rig_from_camera[second].translation
-        return float(np.sqrt(np.trace(point_covariance(motion, position))))
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,6 +21,7 @@ from benchmarks.free_triangulation import (
 from benchmarks.held_out_boards import hold_out_boards
 from bodyscan.boards.view import BoardView
 from bodyscan.captures.folder import Captures, open_captures
+from bodyscan.geometry.uncertainty import point_covariance
 from bodyscan.rig.rig import Rig, load_rig
 from bodyscan.workflows.calibrate_rig import calibrate_rig
 from bodyscan.workflows.find_boards import find_all_boards
@@ -136,7 +137,12 @@ def test_two_calibrations_from_different_shots_differ_as_they_say(
             (half.rig_from_camera[a].inverse() @ half.rig_from_camera[b]).translation
             for half in (one, other)
         )
-        sigma = np.hypot(one.relative_sigma_mm(a, b), other.relative_sigma_mm(a, b))
+        variances = [
+            np.trace(point_covariance(half.covariance.relative(a, b), at.translation))
+            for half in (one, other)
+            for at in [half.rig_from_camera[b]]
+        ]
+        sigma = np.sqrt(sum(variances))
         ratios.append(np.linalg.norm(second - first) / sigma)
     # Either half has few places: 1 +- 0.3, twice over.
     assert 0.4 < np.sqrt(np.mean(np.square(ratios))) < 1.6
