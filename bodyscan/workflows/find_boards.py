@@ -167,8 +167,7 @@ def choose_frame(rig: Rig, captures: Captures) -> Outcome[Rig]:
         raise BadInput(
             fault,
             where=f"rig {rig.name}",
-            remedy="capture the board where it fixes the rig frame, lit and in view of a camera; or "
-            "fix the frame by a pair (rig_frame: {pair: NAME})",
+            remedy="capture it again, lit and in view of a camera, or name a pair in rig_frame",
         )
     frame = RigFrame() if holder is rig.pairs[0] else RigFrame(pair=holder.name)
     note = f"{fault}; pair {holder.name} at its nominal pose does: heights are as exact as that"

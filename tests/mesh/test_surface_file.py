@@ -61,6 +61,14 @@ def test_what_is_no_mesh_is_refused_by_vertex_or_face(tmp_path: Path) -> None:
         read_surface(write(tmp_path, unknown, FACES))
     with pytest.raises(BadInput, match="face 5 names vertex 99999"):
         read_surface(write(tmp_path, VERTICES, wrong))
+    quad = tmp_path / "quad.ply"  # at which Open3D's reader ends its process
+    head = "ply\nformat ascii 1.0\nelement vertex 4\n" + "".join(
+        f"property float {x}\n" for x in "xyz"
+    )
+    head += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    quad.write_text(f"{head}0 0 0\n1 0 0\n1 1 0\n0 1 0\n4 0 1 2 99999999\n")
+    with pytest.raises(BadInput, match="no surface can be read"):
+        read_surface(quad)
 
 
 @pytest.mark.parametrize(
