@@ -238,7 +238,7 @@ def _ours(workspace: Path, folder: Path) -> Step:
 
 
 def _mesh(workspace: Path, folder: Path) -> Step:
-    from bodyscan.fusion.meshing import mesh
+    from bodyscan.fusion.meshing import attach_attributes, closed_surface
 
     images, _, _, placing, cloud = _kept(folder / "ours")
 
@@ -249,7 +249,11 @@ def _mesh(workspace: Path, folder: Path) -> Step:
             **versions(found),
         }
 
-    return lambda: mesh(cloud, SETTINGS.mesh, images, placing), finish
+    def make() -> Any:
+        shape = closed_surface(cloud, SETTINGS.mesh, images, placing)
+        return attach_attributes(*shape, cloud, SETTINGS.mesh.reach_mm)
+
+    return make, finish
 
 
 def versions(full: Any) -> Figures:

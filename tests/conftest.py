@@ -112,7 +112,8 @@ def cloud(
 
 @pytest.fixture(scope="session")
 def body(scan: Scan, cloud: BodyCloud, tmp_path_factory: pytest.TempPathFactory) -> BodyMesh:
-    from bodyscan.fusion.meshing import mesh
+    from meshed import mesh
+
     from bodyscan.settings import MeshSettings
 
     def make() -> BodyMesh:

@@ -25,30 +25,19 @@ from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.settings import MeshSettings
 
 
-def mesh(
-    cloud: BodyCloud,
-    settings: MeshSettings,
-    range_images: Sequence[RangeImage] = (),
-    rig_from_camera: dict[str, RigidTransform] | None = None,
-) -> BodyMesh:
-    """One closed manifold surface around a cloud, with faces outward.
-
-    range_images: as measured, background included; gaps that they see through are not webbed over.
-
-    A vertex farther than `settings.reach_mm` from every point counts as not measured. Raises
-    ScanFailed if no closed surface comes out.
-    """
-    shape = closed_surface(cloud, settings, range_images, rig_from_camera)
-    return attach_attributes(*shape, cloud, settings.reach_mm)
-
-
 def closed_surface(
     cloud: BodyCloud,
     settings: MeshSettings,
     range_images: Sequence[RangeImage] = (),
     rig_from_camera: dict[str, RigidTransform] | None = None,
 ) -> tuple[Array, Indices]:
-    """Vertices (V, 3) mm and faces (F, 3) of the mesh, only as exact as the grid; see `mesh`."""
+    """One closed manifold surface around a cloud, with faces outward: vertices (V, 3) mm, only as
+    exact as the grid, and faces (F, 3).
+
+    range_images: as measured, background included; gaps that they see through are not webbed over.
+
+    Raises ScanFailed if no closed surface comes out.
+    """
     if len(cloud.points) < 1000:
         raise ScanFailed(
             f"a cloud of {len(cloud.points)} points is too small for a mesh",
@@ -90,7 +79,7 @@ def attach_attributes(
     vertices: Array, faces: Indices, cloud: BodyCloud, reach_mm: float
 ) -> BodyMesh:
     """Fit the mesh to the points, along its normals, and attach normals, the points' attributes
-    and what was filled."""
+    and what was filled: vertices farther than `reach_mm` from every point were not measured."""
     normals = vertex_normals(vertices, faces)
     around = measure_support(vertices, normals, cloud, reach_mm)
     vertices = fit_to_points(vertices, faces, normals, around)

@@ -9,11 +9,11 @@ import numpy as np
 import open3d as o3d
 import pytest
 from made_bodies import cloud_of
+from meshed import mesh
 from ray_cast_scan import looking, nominal_camera
 
 from bodyscan.arrays import Array, Mask
 from bodyscan.fusion.hole_filling import Crown, PartialSurface, find_free_points, find_gaps
-from bodyscan.fusion.meshing import mesh
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.transforms import RigidTransform

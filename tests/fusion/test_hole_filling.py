@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from made_bodies import cloud_of
+from meshed import mesh
 from ray_cast_scan import looking, nominal_camera
 
 from bodyscan.arrays import Array
@@ -15,7 +16,6 @@ from bodyscan.fusion.hole_filling import (
     fill_distances,
     fill_harmonically,
 )
-from bodyscan.fusion.meshing import mesh
 from bodyscan.fusion.signed_distances import (
     Distances,
     find_crossed_bricks,

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import open3d as o3d
 import pytest
+from meshed import mesh
 from ray_cast_scan import Scan, Truth
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -14,7 +15,6 @@ from scipy.sparse.csgraph import connected_components
 from benchmarks.self_intersections import self_intersections
 from bodyscan.errors import ScanFailed
 from bodyscan.evaluation.surface import deviation, signed_distances
-from bodyscan.fusion.meshing import mesh
 from bodyscan.fusion.signed_distances import REACH_CELLS, find_near_bricks
 from bodyscan.mesh.body import HAIR, SKIN, UNSURE, BodyCloud, BodyMesh
 from bodyscan.mesh.surface_nets import SIDE
