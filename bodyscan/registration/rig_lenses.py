@@ -27,17 +27,6 @@ from bodyscan.rig.pair import AUTO
 from bodyscan.rig.rig import Rig
 
 
-def lens_notes(trials: Mapping[str, Sequence[LensTrial]]) -> list[str]:
-    """One line for each camera that the chapter's lens clearly does not describe."""
-    return [
-        f"{name}: lens {chosen.kind}, by {chosen.gain:.0f} standard errors: boards held out fit to "
-        f"{chosen.rms_px:.3f} px with it, {tried[0].rms_px:.3f} with {tried[0].kind}"
-        for name, tried in trials.items()
-        for chosen in tried
-        if chosen.chosen and chosen.gain is not None and chosen.gain >= MIN_GAIN
-    ]
-
-
 @dataclass(frozen=True, eq=False)
 class ChosenLenses:
     """The solution with the chosen lenses.

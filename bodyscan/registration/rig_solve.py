@@ -39,7 +39,7 @@ from bodyscan.registration.rig_frame import (
     frame_target,
     hold_frame,
 )
-from bodyscan.registration.rig_lenses import ChosenLenses, choose_lenses, lens_notes
+from bodyscan.registration.rig_lenses import ChosenLenses, choose_lenses
 from bodyscan.registration.view_consistency import (
     ConsistentSolve,
     error_limit,
@@ -139,8 +139,7 @@ def solve_rig(
     if _are_unsynchronised(solved.views, solved.judged.wrong):
         solved = _solve(rig, shared, own, start, weigh=True)
     solution = _transfer_to_rig_frame(rig, solved)
-    notes = (*solved.judged.notes, *solved.notes, *lens_notes(solution.lenses))
-    return Outcome(solution, notes, left_out)
+    return Outcome(solution, (*solved.judged.notes, *solved.notes), left_out)
 
 
 def _solve(

@@ -45,8 +45,7 @@ def test_each_camera_gets_its_own_lens_and_no_view_is_lost(views: list[BoardView
         name: "brown" if name == BENT else "radial" for name in CAMERAS
     }
     assert len(placed.views) == located
-    assert next(note for note in notes if "lens" in note).startswith(f"{BENT}: lens brown, by ")
-    assert len(notes) == 1
+    assert not notes
     for name, placing in PLACINGS.items():
         off = placed.rig_from_camera[name].translation - placing.translation
         sigma = position_sigma(placed.covariance, name, placing.translation)
@@ -58,13 +57,10 @@ def test_what_no_camera_proves_by_itself_all_may_together() -> None:
     """Decentred by 2e-4 each, 0.06 px at the rim: left out it hides in the principal points."""
     lens = {name: Brown(-0.1, 0.05, 2e-4 * (-1) ** k, 2e-4, 0.0) for k, name in enumerate(CAMERAS)}
     cameras = {name: replace(camera, lens=lens[name]) for name, camera in CAMERAS.items()}
-    placed, notes, _ = solved(
-        ring_rig(PLACINGS), as_found(ring_views(PLACINGS, cameras, seed=3)[0])
-    )
+    placed, _, _ = solved(ring_rig(PLACINGS), as_found(ring_views(PLACINGS, cameras, seed=3)[0]))
     assert {camera.lens.kind for camera in placed.cameras.values()} == {"brown"}
     gains = {n: next(t.gain for t in tried if t.chosen) for n, tried in placed.lenses.items()}
     assert max(gain for gain in gains.values() if gain is not None) < 3.0
-    assert not any("lens" in note for note in notes), "no camera's own boards call for it"
     for name, camera in placed.cameras.items():
         off = camera.parameters - cameras[name].parameters
         sigma = np.sqrt(np.diag(placed.camera_covariances[name]))
