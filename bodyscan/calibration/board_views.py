@@ -14,7 +14,6 @@ from bodyscan.boards.view import BoardView, ViewKey
 from bodyscan.geometry.robust import rms, rms_length
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 from bodyscan.rig.board import Board
-from bodyscan.rig.rig import Rig
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,20 +249,3 @@ def measure_covered_share(pixels: Sequence[Array], width: int, height: int) -> f
         hull = cv2.convexHull(((corners + 0.5) * scale - 0.5).astype(np.float32))
         cv2.fillConvexPoly(mask, np.rint(hull).astype(np.int32), 1)
     return float(mask.mean())
-
-
-def coverage_notes(rig: Rig, views: Sequence[BoardView]) -> list[str]:
-    """One line that names the cameras whose boards cover too little of the image to determine the
-    lens."""
-    narrow = []
-    for pair in rig.pairs:
-        pixels = [view.pixels for view in views if view.pair == pair.name]
-        share = measure_covered_share(pixels, pair.camera.width, pair.camera.height)
-        if pixels and share < 0.2:
-            narrow.append(f"{100 * share:.0f} % of {pair.name}'s")
-    if not narrow:
-        return []
-    return [
-        f"in all views together the board covers only {', '.join(narrow)} picture, so that lens and "
-        "focal length are poorly known there: bring the board closer, and into the corners"
-    ]

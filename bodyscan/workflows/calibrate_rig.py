@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from bodyscan.boards.view import BoardView, ViewKey
-from bodyscan.calibration.board_views import LocatedView, coverage_notes
+from bodyscan.calibration.board_views import LocatedView
 from bodyscan.calibration.boundary_points import BoardBoundaries
 from bodyscan.calibration.camera import CameraCalibration
 from bodyscan.calibration.pair import PairCalibration, calibrate_pair
@@ -243,8 +243,6 @@ def add_remarks(solved: SolvedRig, progress: Progress = silent) -> RigCalibratio
     found = solved.calibration
     notes: list[str] = list(found.notes)
     advice: list[str] = []
-    with optional("coverage of the pictures", notes.append):
-        notes += coverage_notes(found.rig, solved.views)
     with optional("boards that were not found", notes.append):
         notes += boards_not_found(found.rig, solved.views, solved.images)
     if len(solved.solution.rig_from_camera) > 1 and not found.failed:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -14,7 +12,6 @@ from bodyscan.calibration.board_views import (
     BoardFace,
     LocatedView,
     board_symmetries,
-    coverage_notes,
     has_enough_corners,
     match_corners,
     max_displacement_mm,
@@ -23,7 +20,6 @@ from bodyscan.calibration.board_views import (
 )
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.rig.board import Board
-from bodyscan.rig.rig import load_rig
 
 BOARD = Board(name="b", kind="checkerboard", columns=9, rows=8, square_mm=30)
 WIDE = 8  # corners in a row
@@ -120,30 +116,3 @@ def test_the_covered_share_of_the_picture_is_that_of_the_hulls() -> None:
     for views, share in (([one], 0.25), ([one, one], 0.25), ([one, next_to], 0.5)):
         assert measure_covered_share(views, 640, 480) == pytest.approx(share, abs=0.04)
     assert measure_covered_share([corners(0, 0, 639, 479)], 640, 480) == 1.0
-
-
-@pytest.mark.parametrize(("size", "named"), [(0.22, True), (0.6, False)])
-def test_only_a_small_board_is_noted(tmp_path: Path, size: float, named: bool) -> None:
-    rig = load_rig(Path("rigs/one-pair.yaml"))
-    (pair,) = rig.pairs
-    pairs = (pair, pair.model_copy(update={"name": "other"}))
-    rig = rig.model_copy(update={"pairs": pairs})
-    width, height = pair.camera.width, pair.camera.height
-    views = [
-        BoardView(
-            pair=name,
-            shot=f"shot{number}",
-            board=rig.boards[0].name,
-            corner_ids=np.arange(48),
-            pixels=corners(0.2 * width, 0.2 * height, size * width, size * height),
-        )
-        for number in range(3)
-        for name in (pair.name, "other")
-    ]
-    notes = coverage_notes(rig, views)
-    assert len(notes) == named, "one line for all cameras"
-    if named:
-        assert pair.name in notes[0]
-        assert "other" in notes[0]
-        assert "5 %" in notes[0]
-        assert "closer" in notes[0]
