@@ -114,10 +114,7 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 
 
 def _hear_no_more() -> None:
-    """Once is enough: what tidies up is not to be disturbed.
-
-    By a function of ours: Python reports a signal that it was handling when that became SIG_IGN.
-    """
+    """Once is enough. With SIG_IGN Python would report signals that are pending."""
     for number in (*_StopRequest.signals, STOP_SIGNAL):
         if signal.getsignal(number) in (_raise_request, _interrupt):
             signal.signal(number, lambda number, frame: None)

@@ -202,7 +202,7 @@ def measure(
 ) -> None:
     """Measure a scan's mesh: stature, girths of horizontal slices, volume, area."""
     from bodyscan.files.atomic import write_json, write_text
-    from bodyscan.fusion.storage import load_scan, refuse_repeat
+    from bodyscan.fusion.storage import load_scan, refuse_own_file, refuse_repeat
     from bodyscan.measurement.measurements import heights_from
     from bodyscan.measurement.measurements import measure as measure_mesh
     from bodyscan.report.measurement_table import (
@@ -215,9 +215,10 @@ def measure(
     stored, levels = load_scan(result), None if heights is None else heights_from(heights)
     if not anyway:
         refuse_repeat(result, stored.facts)
+    path = out or result / "measurements.json"
+    refuse_own_file(path, result)
     measured = measure_mesh(stored.mesh, levels, named=named)
     content = measurements_document(measured, stored.facts)
-    path = out or result / "measurements.json"
     if path.suffix.lower() == ".csv":
         write_text(path, measurements_csv(measured, stored.facts))
     else:

@@ -129,6 +129,12 @@ def make_room(folder: Path, overwrite: bool) -> None:
         )
 
 
+def refuse_own_file(path: Path, folder: Path) -> None:
+    """Raise ResultError if writing `path` would replace a file of the result in `folder`."""
+    if path.resolve() in {(folder / n).resolve() for n in (FILE_NAME, CLOUD_NAME, MESH_NAME)}:
+        raise ResultError("is of the result itself", where=str(path), remedy="give another --out")
+
+
 def clear(folder: Path) -> None:
     """Remove a result and what was made of it, so that no two persons' files stay side by side.
 

@@ -29,6 +29,7 @@ def write_report(
     path = path or folder / calibrations.REPORT_NAME
     if path.is_dir():
         raise BadInput("is a folder", where=str(path), remedy="give --out the name of a file")
+    scans.refuse_own_file(path, folder)
     page = build_page(result, other)
     write_text(path, render(page))
     # As beside an export, so that `bodyscan forget` knows whom it shows.

@@ -145,10 +145,7 @@ def _refuse_other_markers(
 
 def choose_frame(rig: Rig, captures: Captures) -> Outcome[Rig]:
     """The rig with a frame that its captures can fix: where no image of the shot that is to fix it
-    shows the board, a pair at its nominal pose does instead, and a note says so.
-
-    Raises BadInput if there is no such pair.
-    """
+    shows the board, a pair at its nominal pose does instead, with a note; else BadInput is raised."""
     shot, board = rig.rig_frame.shot, rig.frame_board
     if shot is None or board is None:
         return Outcome(rig)

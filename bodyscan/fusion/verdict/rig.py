@@ -35,8 +35,7 @@ def find_exchanged(
 ) -> dict[str, str]:
     """Pairs whose images another pair took, and which: what exchanged cables or folders leave.
 
-    images: as decoded.
-    read_as: one pair's images read with another's calibration; None if they cannot be.
+    images: as decoded. read_as: one pair's read with another's calibration, None if they cannot be.
 
     Of a pair that is right, 20 % and more of the points lie within 10 mm of what the others
     measured; of a wrong one some 5 %, by chance.
@@ -56,9 +55,7 @@ def find_exchanged(
     found = {}
     for one, other in permutations(suspects, 2):
         image = read_as(one, other)
-        if image is None:
-            continue
-        points = _points_inside(image, rig_from_camera, volume)
+        points = _points_inside(image, rig_from_camera, volume) if image else np.empty((0, 3))
         if share_near(points, suspects) > max(0.2, 3.0 * share_near(inside[one], suspects)):
             found[one] = other
     return found if set(found) == set(found.values()) else {}
