@@ -18,20 +18,14 @@ imported calibration's lack all of its own) and cannot weight the directions."""
 class Agreement:
     """How well the two directions agree.
 
-    pixels: number of pixels that have both depths.
-    offset_mm: robust sigma of their difference along the rays, mm.
-    offset_sigmas: the same in units of the sigmas of both depths.
-    dropped: pixels that disagree and get no point.
+    offset_sigmas: robust sigma of the difference of both depths along the rays, in their own sigmas.
     offset_stripes: the same in stripes of the less depth-sensitive direction.
     stripes: number of stripes of that direction.
     """
 
-    pixels: int
-    offset_mm: float
     offset_sigmas: float
-    dropped: int
-    offset_stripes: float = np.nan
-    stripes: int = 0
+    offset_stripes: float
+    stripes: int
 
     @property
     def unusual(self) -> bool:
@@ -58,12 +52,6 @@ class Agreement:
 
     def _exceeds(self, share: float) -> bool:
         return self.offset_sigmas > MAX_RATIO and self.offset_stripes > share * self.stripes
-
-    def __str__(self) -> str:
-        return (
-            f"stripes of both directions agree to {self.description} at {self.pixels} pixels; "
-            f"{self.dropped} that disagree were dropped"
-        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,6 @@ they differ only by errors of decoding and calibration: a check that needs no bo
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -38,13 +37,13 @@ def reconstruct_range_image(pair: PairCalibration, stripes: StripeMap) -> RangeI
         other = _triangulate(pair, pair.crossing, crossing.s, crossing.sigma)
         # Crossing stripes are decoded everywhere, not only in the scan volume.
         alone = np.full(sigma_mm.shape, stripes.beyond is None)
-        (points, sigma_mm, common_mm), agreement = combine_directions(one, other, alone=alone)
-        if agreement is not None:
+        (points, sigma_mm, common_mm), sigmas = combine_directions(one, other, alone=alone)
+        if sigmas is not None:
             # Noise is correlated along another direction in each: in their mean it hardly is.
             correlation_px = (0.0, 0.0)
             offset, is_other = _measure_offset(one, other, (stripes.sigma, crossing.sigma))
             count = (pair.sheets, pair.crossing)[is_other].stripes
-            agreement = replace(agreement, offset_stripes=offset, stripes=count)
+            agreement = Agreement(sigmas, offset, count)
         _require_fit(pair, stripes, agreement)
     return RangeImage(
         pair.name,
@@ -67,12 +66,13 @@ Depths = tuple[Floats, Floats, Floats]
 
 def combine_directions(
     primary: Depths, crossing: Depths, *, alone: Mask
-) -> tuple[Depths, Agreement | None]:
-    """Combine the depths of both directions.
+) -> tuple[Depths, float | None]:
+    """Combine the depths of both directions; also return the robust sigma of their difference, in
+    their sigmas.
 
     alone: where the crossing stripes may give a point by themselves, (H, W).
 
-    NaN where there are none; the agreement is None if fewer than 100 pixels have both. Both directions
+    NaN where there are none; the sigma is None if fewer than 100 pixels have both. Both directions
     share a camera and boards, and their calibrations' errors are taken as one and the same. However
     much less they have in common, the mean that follows is no worse than the better of the two: its
     variance is convex in the weight of the worse, and the best weight is larger. If the sigmas are too
@@ -85,8 +85,7 @@ def combine_directions(
     alone = alone & ~np.isfinite(sigma_mm) & np.isfinite(crossing[1])
     for part, other in zip((points, sigma_mm, common_mm), crossing, strict=True):
         part[alone] = other[alone]
-    pixels = int(np.count_nonzero(both))
-    if pixels < 100:
+    if np.count_nonzero(both) < 100:
         return (points, sigma_mm, common_mm), None
     one, other = points[both], crossing[0][both]
     variances = np.square([sigma_mm[both], crossing[1][both]])
@@ -108,9 +107,7 @@ def combine_directions(
     merged = np.sqrt(np.sum(shares**2 * separate, axis=0) + shared)
     sigma_mm[both] = np.where(wrong, np.float32(np.nan), merged)
     common_mm[both] = np.sum(shares * commons, axis=0)
-    offset = SIGMAS_PER_MEDIAN * float(np.median(np.abs(difference)))
-    agreement = Agreement(pixels, offset, sigmas, int(np.count_nonzero(wrong)))
-    return (points, sigma_mm, common_mm), agreement
+    return (points, sigma_mm, common_mm), sigmas
 
 
 def _measure_offset(

@@ -103,9 +103,8 @@ def reconstruct_range_images(
     if not found:
         raise ScanFailed(f"no pair gave a range image:{format_list(failed)}")
     images = [image for image, _ in found.values()]
-    notes = [f"{image.pair}: {image.agreement}" for image in images if image.agreement is not None]
     empty = (image.pair for image in images if not np.isfinite(image.points).any())
-    notes += [f"{pair}: nothing that it measured lies inside the rig's `volume`" for pair in empty]
+    notes = [f"{pair}: nothing that it measured lies inside the rig's `volume`" for pair in empty]
     faults = {sequence: fault for sequence, (_, fault) in found.items()}
     notes += map(captures.relative, crossing_notes(faults))
     return Outcome(images, tuple(notes), failed)

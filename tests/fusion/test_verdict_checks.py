@@ -135,7 +135,7 @@ FINDINGS: dict[str, tuple[dict[str, Any], str, str]] = {
         {"alignment": Alignment({}, {"p1": 0.1}, {"p2": 7.0}, ())}, "repeat", "pair p2 does not fit"),
     "an imported calibration": ({"unjudged": ("p1", "p2")}, "usable", "calibration of p1, p2 was imp"),
     "two stripe directions": (
-        {"agreements": {"p1": Agreement(9, 0.3, 5.0, 0, 2.0, 160)}}, "usable", "two stripe directions"),
+        {"agreements": {"p1": Agreement(5.0, 2.0, 160)}}, "usable", "two stripe directions"),
     "pairs in place": ({"search": displaced(0.25)}, "good", ""),
     "pairs displaced": ({"search": displaced(0.5)}, "usable", "the pairs are displaced by 0.5 mm RMS"),
     "pairs displaced, as calibrated": (

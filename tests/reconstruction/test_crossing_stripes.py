@@ -92,8 +92,7 @@ def test_points_of_both_ways_are_better_than_of_either_and_say_by_how_much() -> 
     assert abs(rms(errors(both) / both.sigma_mm[both.valid]) - 1.0) < 0.03
     assert both.agreement is not None
     assert abs(both.agreement.offset_sigmas - 1.0) < 0.03
-    assert both.agreement.pixels == HEIGHT * WIDTH
-    assert both.agreement.dropped < 3  # beyond 5 sigmas
+    assert both.valid.sum() > HEIGHT * WIDTH - 3  # beyond 5 sigmas
 
 
 def test_noise_is_alike_along_the_way_across_stripes_but_hardly_of_two_ways_together() -> None:
@@ -110,11 +109,8 @@ def test_wrong_codes_disagree_and_are_left_out() -> None:
     s = seen.s.copy()
     s[40:60, 30:50] += 8.0  # as a wrong coarse bit would
     image = reconstruct_range_image(pair(), replace(seen, s=s))
-    assert image.agreement is not None
-    assert 400 <= image.agreement.dropped < 403
     assert not image.valid[40:60, 30:50].any()
     assert image.valid.sum() > HEIGHT * WIDTH - 403
-    assert "400" in str(image.agreement)
 
 
 def test_a_calibration_that_is_off_everywhere_costs_no_pixels() -> None:
@@ -125,7 +121,7 @@ def test_a_calibration_that_is_off_everywhere_costs_no_pixels() -> None:
     image = reconstruct_range_image(pair(), off)
     assert image.agreement is not None
     assert image.agreement.offset_sigmas > 5.0
-    assert image.agreement.dropped == 0
+    assert image.valid.all()
 
 
 def test_one_way_tells_where_the_other_does_not() -> None:
@@ -152,11 +148,9 @@ def test_ways_that_differ_by_more_than_their_sigmas_are_not_averaged() -> None:
     nowhere = np.zeros(shape, bool)
     none = np.zeros(shape, np.float32)
     better, worse = (points, fine, none), (wrong, rough, none)
-    (found, sigma_mm, _), agreement = combine_directions(better, worse, alone=nowhere)
+    (found, sigma_mm, _), _ = combine_directions(better, worse, alone=nowhere)
     np.testing.assert_array_equal(found, points)
     np.testing.assert_array_equal(sigma_mm, fine)
-    assert agreement is not None
-    assert agreement.offset_mm > 1.0
     (swapped, sigma_mm, _), _ = combine_directions(worse, better, alone=nowhere)
     np.testing.assert_allclose(swapped, points, rtol=1e-6)
     np.testing.assert_allclose(sigma_mm, fine, rtol=1e-6)
@@ -176,7 +170,7 @@ def test_what_a_calibration_is_off_is_told_in_stripes(off: float, unusual: bool)
     agreement = reconstruct_range_image(pair(), shifted(off)).agreement
     assert agreement is not None
     assert agreement.unusual == unusual
-    assert f"{agreement.offset_stripes:.1f} of 160 stripes" in str(agreement)
+    assert f"{agreement.offset_stripes:.1f} of 160 stripes" in agreement.description
     if unusual:  # 1.48 medians, and columns' noise
         assert abs(agreement.offset_stripes / (1.4826 * off) - 1.0) < 0.05
 
@@ -243,12 +237,12 @@ def test_a_way_off_by_five_sigmas_is_dropped_where_most_agree_better_than_they_c
     nowhere = np.zeros((10, 20), bool)
     none = np.zeros_like(sigma)
     own, other = (rays * np.float32(700.0), sigma, none), (crossing, sigma, none)
-    (_, sigma_mm, _), agreement = combine_directions(own, other, alone=nowhere)
-    assert agreement is not None
-    assert agreement.dropped == 1
+    (_, sigma_mm, _), sigmas = combine_directions(own, other, alone=nowhere)
+    assert np.isnan(sigma_mm).sum() == 1
     assert np.isnan(sigma_mm[5, 6])
     np.testing.assert_allclose(sigma_mm[np.isfinite(sigma_mm)], np.sqrt(0.5), rtol=1e-6)
-    assert (agreement.pixels, agreement.offset_sigmas < 0.2) == (200, True)
+    assert sigmas is not None
+    assert sigmas < 0.2
     few = np.where(np.arange(200).reshape(10, 20) < 99, sigma, np.float32(np.nan))
     assert combine_directions((own[0], few, none), other, alone=nowhere)[1] is None
 
