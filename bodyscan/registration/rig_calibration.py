@@ -132,14 +132,8 @@ def nominal_size(rig: Rig, rig_from_camera: Mapping[str, RigidTransform]) -> Nom
     return NominalSize(float(np.median(ratios)), rig.boards) if ratios else None
 
 
-def check_nominal_size(rig: Rig, rig_from_camera: Mapping[str, RigidTransform]) -> list[str]:
-    """A note if the cameras stand farther apart, or closer, than they are meant to.
-
-    Raises FailedWork if they are off by more than any tape measure errs.
-    """
+def refuse_wrong_size(rig: Rig, rig_from_camera: Mapping[str, RigidTransform]) -> None:
+    """Raise FailedWork if the size is off by more than any tape measure errs."""
     size = nominal_size(rig, rig_from_camera)
-    if size is None or size.mark == "good":
-        return []
-    if size.mark == "bad":
+    if size is not None and size.mark == "bad":
         raise FailedWork(size.words, where=f"rig {rig.name}", remedy=size.remedy)
-    return [f"{size.words}: {size.remedy}"]

@@ -20,7 +20,7 @@ from bodyscan.progress import Progress, attempt_each, silent, step
 from bodyscan.registration.advice import advise
 from bodyscan.registration.board_checks import boards_not_found, correct_stretch
 from bodyscan.registration.references import find_rig_size, rescale_boards, select_solving_views
-from bodyscan.registration.rig_calibration import RigCalibration, check_nominal_size
+from bodyscan.registration.rig_calibration import RigCalibration, refuse_wrong_size
 from bodyscan.registration.rig_frame import hold_frame, refuse_without_frame_shot
 from bodyscan.registration.rig_solve import (
     RigSolution,
@@ -172,7 +172,8 @@ def _bundle_adjust(
         located = locate_views(rig, select_solving_views(rig, boards), cameras.value)
         solution = _solve_rig(rig, located.value, cameras)
     framed = hold_frame(rig, solution.value.views, solution.value.rig_from_camera)
-    notes = [*size.notes, *check_nominal_size(rig, solution.value.rig_from_camera)]
+    refuse_wrong_size(rig, solution.value.rig_from_camera)
+    notes = list(size.notes)
     if framed is not rig:
         notes.append(
             f"pair {rig.pairs[0].name}, the first in the rig file, could not be calibrated: the rig "

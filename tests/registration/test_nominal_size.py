@@ -7,7 +7,7 @@ import pytest
 
 from bodyscan.errors import FailedWork
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.registration.rig_calibration import check_nominal_size, nominal_size
+from bodyscan.registration.rig_calibration import nominal_size, refuse_wrong_size
 from bodyscan.rig.board import Board
 from bodyscan.rig.rig import Rig
 
@@ -36,27 +36,29 @@ def placed(factor: float) -> dict[str, RigidTransform]:
 
 
 def test_squares_of_another_size_show_in_the_size_of_the_rig() -> None:
-    (note,) = check_nominal_size(RIG, placed(1.04))
-    assert "1.040 times" in note
-    assert "48.08 would fit" in note
-    assert not check_nominal_size(RIG, placed(1.02))
-    (note,) = check_nominal_size(RIG, placed(0.96))
-    assert "0.960 times" in note
+    for factor, mark in ((1.04, "usable"), (1.02, "good"), (0.96, "usable")):
+        size = nominal_size(RIG, placed(factor))
+        assert size is not None
+        assert size.mark == mark
+        assert f"{factor:.3f} times" in size.words
+        refuse_wrong_size(RIG, placed(factor))
+        if factor == 1.04:
+            assert "48.08 would fit" in size.remedy
 
 
 @pytest.mark.parametrize("factor", [0.1, 0.89, 1.11, 10.0])
 def test_a_size_that_no_tape_measure_errs_by_is_refused(factor: float) -> None:
     """Centimetres for millimetres; a print scaled to another paper."""
     with pytest.raises(FailedWork, match=f"{factor:.3f} times as far apart") as refused:
-        check_nominal_size(RIG, placed(factor))
+        refuse_wrong_size(RIG, placed(factor))
     assert "square_mm may be wrong" in str(refused.value)
 
 
 def test_a_rig_without_boards_is_told_as_well() -> None:
     """What another program calibrated: only `nominal` can be mended here."""
-    (note,) = check_nominal_size(RIG.model_copy(update={"boards": ()}), placed(1.05))
-    assert "1.050 times" in note
-    assert "correct `nominal`" in note
+    size = nominal_size(RIG.model_copy(update={"boards": ()}), placed(1.05))
+    assert size is not None
+    assert "correct `nominal`" in size.remedy
 
 
 def rig_of(places: dict[str, tuple[float, float, float]]) -> Rig:
