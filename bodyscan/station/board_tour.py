@@ -7,6 +7,7 @@ is there at once. The joint solve of all shots so far takes longer; it comes whe
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -35,12 +36,14 @@ BOARDS = 6
 class BoardTour:
     """The calibration captures that a rig file names, looked at again and again.
 
-    views: boards found so far. seen: shots in which they were looked for.
+    views: boards found so far. seen: shots in which they were looked for. lit: pairs and shots of which
+        only the lit image was taken: it places a board, but shows no stripes on it.
     """
 
     rig_file: Path
     views: list[BoardView] = field(default_factory=list)
     seen: set[str] = field(default_factory=set)
+    lit: set[tuple[str, str]] = field(default_factory=set)
     missed: dict[str, list[str]] = field(default_factory=dict)
     solved: dict[str, Any] = field(default_factory=dict)
     _pending: dict[str, int] = field(default_factory=dict)
@@ -72,6 +75,10 @@ class BoardTour:
     def _find(self, captures: Captures, shot: str) -> None:
         sequences = tuple(s for s in captures.shot_sequences(shot) if s.board_path.exists())
         found = find_all_boards(self.rig, replace(captures, shots=(shot,), sequences=sequences))
+        projecting = {pair.name for pair in self.rig.pairs if pair.projector}
+        self.lit |= {
+            (s.pair, shot) for s in sequences if s.pair in projecting and not s.has_stripes
+        }
         self.views += found.value
         seeing = {view.pair for view in found.value}
         self.missed[shot] = sorted({s.pair for s in sequences} - seeing)
@@ -96,10 +103,8 @@ class BoardTour:
 
     def describe(self) -> dict[str, Any]:
         """Everything that a page shows of it."""
-        cells = {pair.name: self._cells(pair) for pair in self.rig.pairs}
-        by_pair = {
-            pair.name: [v for v in self.views if v.pair == pair.name] for pair in self.rig.pairs
-        }
+        by_pair = {pair.name: self._calibrating(pair.name) for pair in self.rig.pairs}
+        cells = {pair.name: _count_cells(pair, by_pair[pair.name]) for pair in self.rig.pairs}
         last = list(self.missed)[-1:]
         next_hold = self._next_hold(cells, {name: len(found) for name, found in by_pair.items()})
         return {
@@ -123,16 +128,9 @@ class BoardTour:
             "wanted": BOARDS,
         }
 
-    def _cells(self, pair: Pair) -> Indices:
-        """How many boards have shown in each cell of a pair's picture (ROWS, COLUMNS)."""
-        counts = np.zeros((ROWS, COLUMNS), np.int64)
-        size = np.array([pair.camera.width, pair.camera.height])
-        for view in self.views:
-            if view.pair == pair.name:
-                cell = np.clip(view.pixels / size, 0.0, 0.999) * [COLUMNS, ROWS]
-                column, row = cell.astype(int).T
-                counts.ravel()[np.unique(row * COLUMNS + column)] += 1
-        return counts
+    def _calibrating(self, pair: str) -> list[BoardView]:
+        """Boards that calibrate a pair: those on which it took its stripes, if it has any."""
+        return [v for v in self.views if v.pair == pair and (pair, v.shot) not in self.lit]
 
     def _shared(self) -> list[tuple[str, str, int]]:
         """Pairs of pairs, and how many shots they share."""
@@ -158,7 +156,8 @@ class BoardTour:
         barest_pair = min(boards, key=lambda name: boards[name])
         if len(groups) > 1 and min(boards.values()) >= 2:
             return {"say": "tie", "one": groups[0], "other": groups[1]}
-        share = {name: float(np.mean(each > 0)) for name, each in cells.items()}
+        # Twice in a cell: once may be by a corner of the board, and says nothing of the lens there.
+        share = {name: float(np.mean(each > 1)) for name, each in cells.items()}
         barest = min(share, key=lambda name: share[name])
         target = barest_pair if boards[barest_pair] < BOARDS else barest
         if boards[barest_pair] >= BOARDS and share[barest] >= 0.8:
@@ -171,6 +170,16 @@ class BoardTour:
             "column": column,
             "boards": boards[target],
         }
+
+
+def _count_cells(pair: Pair, views: Sequence[BoardView]) -> Indices:
+    """How many boards have shown in each cell of a pair's picture (ROWS, COLUMNS)."""
+    counts = np.zeros((ROWS, COLUMNS), np.int64)
+    size = np.array([pair.camera.width, pair.camera.height])
+    for view in views:
+        column, row = (np.clip(view.pixels / size, 0.0, 0.999) * [COLUMNS, ROWS]).astype(int).T
+        counts.ravel()[np.unique(row * COLUMNS + column)] += 1
+    return counts
 
 
 def _inner_first(counts: Indices) -> Array:
