@@ -7,12 +7,15 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from required import missing
 
+from bodyscan.boards.view import BoardView
 from bodyscan.errors import BadInput
 from bodyscan.jobs.pipeline import Pipeline
 from bodyscan.jobs.watching import Watched
+from bodyscan.station.board_tour import BoardTour
 from bodyscan.station.day import Day, table_csv
 from bodyscan.station.feed import BACKLOG, Feed
 from bodyscan.station.operation import Operation
@@ -25,7 +28,8 @@ try:
 except ImportError:
     TestClient = None
 
-STORED = Path(__file__).parents[1] / "data" / "stored-0.1.0" / "calibration"
+PROJECT = Path(__file__).parents[2]
+STORED = PROJECT / "tests" / "data" / "stored-0.1.0" / "calibration"
 ENDED = {"event": "job", "job": "anna", "state": "done"}
 
 
@@ -160,3 +164,23 @@ def test_of_two_who_press_start_at_once_one_is_told_to_wait(operation: Operation
     assert operation.request_person("anna") == "anna-01"
     with pytest.raises(BadInput, match="already"):
         operation.request_person("bea")
+
+
+def test_the_board_is_held_where_stripes_are_lacking_until_it_was_everywhere() -> None:
+    tour = BoardTour(PROJECT / "rigs" / "three-pole-12.yaml")
+    assert tour.describe()["next"]["boards"] == 0
+    names = [pair.name for pair in tour.rig.pairs]
+    for number in range(24):
+        shot, cell = f"b{number}", divmod(number % 12, 4)
+        for pair in tour.rig.pairs:
+            size = np.array([pair.camera.width / 4, pair.camera.height / 3])
+            pixels = (np.array([cell[1], cell[0]]) + 0.5)[None] * size
+            tour.views.append(BoardView(pair.name, shot, "board", np.zeros(1, int), pixels))
+        tour.seen.add(shot)
+    assert tour.describe()["next"] == {"say": "enough"}
+    tour.lit |= {("p2-3", f"b{number}") for number in range(20)}
+    held = tour.describe()["next"]
+    assert (held["say"], held["pair"], held["boards"]) == ("hold", "p2-3", 4)
+    tour.lit.clear()
+    tour.views = [v for v in tour.views if (v.pair in names[:6]) == (int(v.shot[1:]) % 2 == 0)]
+    assert tour.describe()["next"] == {"say": "tie", "one": names[:6], "other": names[6:]}
