@@ -250,7 +250,8 @@ class _Solution:
         persons = [self.motion.with_times([f * s for s in times], f * middle_s) for f in factors]
         fields = self.motion.find_fields([kind.name for kind in persons[0].kinds])
         projected = {both: system.select(fields) for both, system in self.projected.items()}
-        stated, *others = (person.solve_projected(projected).log_evidence for person in persons)
+        solved = map_threads(lambda person: person.solve_projected(projected), persons)
+        stated, *others = (person.log_evidence for person in solved)
         fits = [TimeFit(f, e - stated) for f, e in zip(factors[1:], others, strict=True)]
         best = max(fits, key=lambda one: one.log_ratio)
         return best if best.log_ratio > MIN_LOG_RATIO else TimeFit()
