@@ -83,7 +83,7 @@ class Scene:
         self._ball = _bounding_ball(standing)
         # Open3D holds Python's lock while it casts: threads of Python would take turns.
         self._rays = o3d.t.geometry.RaycastingScene(nthreads=2)
-        self._corners = [_corner_values(surface) for surface in self.surfaces]
+        self._varied = [_list_varied(surface) for surface in self.surfaces]
         for surface in self.surfaces:
             self._rays.add_triangles(
                 Tensor(surface.vertices.astype(np.float32)),
@@ -100,14 +100,15 @@ class Scene:
         normals, print_xy = facets.copy(), np.zeros((len(depth), 2), np.float32)
         surface = np.minimum(found["geometry_ids"], len(self.surfaces))
         albedo, skin = np.zeros((len(depth), 1), np.float32), np.zeros((len(depth), 1), np.float32)
-        for number, corners in enumerate(self._corners):
+        for number, varied in enumerate(self._varied):
             chosen = np.flatnonzero(surface == number)
-            triangles, uv = found["primitive_ids"][chosen], found["primitive_uvs"][chosen]
+            hit, uv = found["primitive_ids"][chosen], found["primitive_uvs"][chosen]
+            corners = self.surfaces[number].triangles.take(hit, axis=0)
             for name, values in (
                 ("albedo", albedo), ("normals", normals), ("skin", skin), ("print_xy", print_xy)
             ):  # fmt: skip
-                if name in corners:
-                    values[chosen] = _interpolate(corners[name], triangles, uv)
+                if name in varied:
+                    values[chosen] = _interpolate(varied[name], corners, uv)
         points = directions * np.where(np.isfinite(depth), depth, np.float32(0.0))[:, None]
         return Hits(depth, points, normals, albedo[:, 0], surface, skin[:, 0], facets, print_xy)
 
@@ -161,29 +162,25 @@ def dot(a: Floats, b: Floats) -> Floats:
     return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]
 
 
-def _corner_values(surface: Surface) -> dict[str, Floats]:
-    """List what varies over a surface, at its triangles' corners, in the form for rendering:
-    (T, 3, k) the value at the first corner, and the differences of the other two from it."""
+def _list_varied(surface: Surface) -> dict[str, Floats]:
+    """List what varies over a surface, at its vertices, (N, k)."""
     varied = {
         "albedo": np.broadcast_to(surface.albedo, len(surface.vertices)),
         "normals": surface.normals,
         "skin": surface.skin,
         "print_xy": None if surface.printed is None else surface.print_xy,
     }
-    corners = {}
-    for name, values in varied.items():
-        if values is not None:
-            rows = values.reshape(len(values), -1)
-            first, second, third = (rows[surface.triangles[:, i]] for i in range(3))
-            stacked = np.stack([first, second - first, third - first], axis=1)
-            corners[name] = stacked.astype(np.float32)
-    return corners
+    return {
+        name: values.reshape(len(values), -1).astype(np.float32)
+        for name, values in varied.items()
+        if values is not None
+    }
 
 
-def _interpolate(corners: Floats, triangles: NDArray[np.integer], uv: Floats) -> Floats:
-    """Interpolate (N, k) at barycentric coordinates uv (N, 2) of the triangles hit."""
-    picked = corners.take(triangles, axis=0)
-    return picked[:, 0] + uv[:, :1] * picked[:, 1] + uv[:, 1:] * picked[:, 2]
+def _interpolate(values: Floats, corners: NDArray[np.integer], uv: Floats) -> Floats:
+    """Interpolate (N, k) at barycentric coordinates uv (N, 2) of triangles with corners (N, 3)."""
+    first, second, third = (values.take(vertices, axis=0) for vertices in corners.T)
+    return first + uv[:, :1] * (second - first) + uv[:, 1:] * (third - first)
 
 
 def grid_surface(
