@@ -145,23 +145,19 @@ def _search(
 def _measure_again(
     displaced: Sequence[DisplacedPole], motions: Mapping[str, Array]
 ) -> tuple[DisplacedPole, ...]:
-    """Displacements relative to the poles that were not displaced, once all of them are free."""
-    all_pairs = _pairs_of(displaced)
-    return tuple(
-        replace(
-            DisplacedPole.from_motions(
-                one.name,
-                one.pairs,
-                {
-                    name: twist
-                    for name, twist in motions.items()
-                    if name not in all_pairs - one.pairs
-                },
-            ),
-            all_moved=one.all_moved,
-        )
-        for one in displaced
-    )
+    """Displacements relative to the poles that were not displaced, once all of them are free.
+
+    What overlaps no longer connect to those keeps the displacement that it was found with.
+    """
+    standing = {name: motions[name] for name in motions.keys() - _pairs_of(displaced)}
+    again = []
+    for one in displaced:
+        own = {name: motions[name] for name in motions.keys() & one.pairs}
+        if own and standing:
+            measured = DisplacedPole.from_motions(one.name, one.pairs, own | standing)
+            one = replace(measured, all_moved=one.all_moved)
+        again.append(one)
+    return tuple(again)
 
 
 def _connected_motions(

@@ -135,17 +135,25 @@ def step(name: str, *pairs: str, all_moved: bool = False) -> DisplacedPole:
 
 
 @pytest.mark.parametrize(
-    ("followed", "told", "freed"),
+    ("followed", "told", "freed", "connected", "shift_mm"),
     [
         # Nobody was followed, or what they did says nothing of places: what stands off by itself.
-        (None, "places", ["pole a"]),
-        (FOLLOWED, None, ["pole a"]),
+        (None, "places", ["pole a"], ("a1", "a2", "b1"), 0.0),
+        (FOLLOWED, None, ["pole a"], ("a1", "a2", "b1"), 0.0),
+        # Where no overlap connects it to the others at last, it is as it was found.
+        (FOLLOWED, None, ["pole a"], ("b1",), 3.0),
+        (FOLLOWED, None, ["pole a"], ("a1",), 3.0),
         # Else what a person's whole motion leaves for poles to explain.
-        (FOLLOWED, "places", ["pole b"]),
+        (FOLLOWED, "places", ["pole b"], ("a1", "a2", "b1"), 0.0),
     ],
 )
 def test_poles_are_set_free_one_after_the_other(
-    monkeypatch: pytest.MonkeyPatch, followed: Any, told: Any, freed: list[str]
+    monkeypatch: pytest.MonkeyPatch,
+    followed: Any,
+    told: Any,
+    freed: list[str],
+    connected: tuple[str, ...],
+    shift_mm: float,
 ) -> None:
     by_search, by_motion = (
         [step("pole a", "a1", "a2")],
@@ -173,13 +181,14 @@ def test_poles_are_set_free_one_after_the_other(
     )
     monkeypatch.setattr(person_alignment, "align", aligned)
     monkeypatch.setattr(
-        person_alignment, "_connected_motions", lambda *of: dict.fromkeys(names, np.zeros(6))
+        person_alignment, "_connected_motions", lambda *of: dict.fromkeys(connected, np.zeros(6))
     )
     nothing: Any = None
     found = person_alignment.align_person(
         nothing, nothing, nothing, boards, {"a1": "a", "a2": "a"}, nothing
     )
     assert [one.name for one in found.displaced] == freed
+    assert [one.shift_mm for one in found.displaced] == [shift_mm]
     if freed == ["pole a"]:
         assert found.common_error is None
         assert [one.tolist() for one in given] == [[True, True, False]]
