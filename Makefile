@@ -41,7 +41,7 @@ station: $(SHOWN)/calibration/calibration.json
 
 $(SHOWN)/calibration/calibration.json: | setup
 	rm -rf $(SHOWN)
-	$(BIN)/bodyscan simulate rigs/three-pole-12.yaml --out $(SHOWN) --scale 0.4 --board-shots 20
+	$(BIN)/bodyscan simulate rigs/three-pole-12.yaml --out $(SHOWN) --scale 0.5
 	printf 'capture:\n  camera: {kind: simulated, subject: %s, samples: 2}\n' \
 		$(CURDIR)/data/subjects/woman_average.ply >> $(SHOWN)/rig.yaml
 	$(BIN)/bodyscan calibrate-rig $(SHOWN)/rig.yaml

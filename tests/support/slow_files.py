@@ -24,6 +24,7 @@ SLOW = (
     "registration/test_faults.py",
     "alignment/test_displaced_poles.py",
     "workflows/test_watch.py",
+    "workflows/test_station_page.py",
     "jobs/test_resuming.py",
     "jobs/test_isolation.py",
     "simulation/test_board_plan.py",
