@@ -53,10 +53,9 @@ class Day:
     def rows(self) -> list[Row]:
         """All rows, to be read only; those whose files were removed, as `forget` does, are gone."""
         with self._lock:
-            ended = [
-                job for job, row in self._rows.items() if row["state"] in ("done", "set aside")
-            ]
-            for job in ended:
+            # Of a job that was refused there never was a folder: it has no subject.
+            owned = [job for job, row in self._rows.items() if row["subject"] is not None]
+            for job in owned:
                 if not (self.out / job / JOB).exists():
                     del self._rows[job]
             return list(self._rows.values())
@@ -92,7 +91,8 @@ class Day:
         if event["state"] == "running":
             subject = read_record(self.out / job / JOB).get("subject")
             return {"state": "running", "part": "", "subject": subject}
-        return {**read_row(self.out / job), "scan": row["scan"], "pairs": row["pairs"]}
+        known = {key: event[key] for key in ("state", "seconds", "reason") if key in event}
+        return {**read_row(self.out / job), **known, "scan": row["scan"], "pairs": row["pairs"]}
 
     def decide(self, job: str, changes: Mapping[str, Any]) -> Row:
         """Record what a person decided of a scan: `decision` and `note`.

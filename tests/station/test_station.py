@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -156,6 +157,9 @@ def test_what_people_decide_stays_and_what_is_taken_again_begins_anew(
     again = Day(out)
     assert (again.row("anna")["decision"], again.row("anna")["grade"]) == ("discard", "repeat")
     assert ",'=HYPERLINK(1)<b>," in table_csv(again.rows())
+    again.take({"event": "job", "job": "b", "state": "set aside", "reason": "is a link"})
+    shutil.rmtree(out / "anna")  # as `forget` does
+    assert [(row["job"], row["state"]) for row in again.rows()] == [("b", "set aside")]
     operation.listen({"event": "images", "job": "anna", "scan": "anna", "pairs": {"p": [2, 9]}})
     assert (day.row("anna")["grade"], day.row("anna")["state"]) == (None, "arriving")
 
