@@ -24,7 +24,7 @@ PARALLEL := -n auto --dist loadfile --no-loadscope-reorder
 
 demo: setup
 	rm -rf $(OUT)
-	$(BIN)/bodyscan simulate rigs/three-pole-12.yaml --out $(OUT) --scale 0.5 \
+	$(BIN)/bodyscan simulate rigs/three-pole-12.yaml --out $(OUT) --scale 0.5 --board-shots 24 \
 		--subject data/subjects/woman_average.ply
 	$(BIN)/bodyscan check $(OUT)/rig.yaml
 	$(BIN)/bodyscan calibrate-rig $(OUT)/rig.yaml
