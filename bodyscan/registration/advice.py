@@ -55,6 +55,7 @@ def suggest_shots(rig: Rig, solution: RigSolution, pair: str) -> list[str]:
         solution.rig_from_board,
         fixed_pair=rig.frame_pair.name if rig.frame_pair else None,
         fixed_target=frame_target(rig),
+        motions=solution.motions,
     )
     visible_to = {
         target: sorted({view.pair for view in views})

@@ -23,6 +23,7 @@ from bodyscan.registration.joint_solve import (
     refine_solution,
 )
 from bodyscan.registration.view_consistency import ConsistentSolve, fit_board
+from bodyscan.registration.view_graph import by_target
 
 
 def estimate_board_shapes(
@@ -115,13 +116,15 @@ def _hold_out(
         flat = refine_solution(others, start, root=root, equal_noise=True)
         start = replace(flat, shapes=shapes)
         shaped = refine_solution(others, start, root=root, equal_noise=True)
-        for target in sorted(left_out):
-            of_board = [view for view in views if view.target == target]
-            true = [apply_shape(view, shaped.shapes) for view in of_board]
-            root_from_board = solution.root_from_board[target]
-            flat_residuals.append(np.concatenate(fit_board(of_board, flat, root_from_board)))
+        groups = [group for target, group in by_target(views).items() if target in left_out]
+        if solution.motions:  # then each view shows its board where only it saw it
+            groups = [[view] for group in groups for view in group]
+        for group in groups:
+            true = [apply_shape(view, shaped.shapes) for view in group]
+            root_from_board = solution.root_from_board[group[0].target]
+            flat_residuals.append(np.concatenate(fit_board(group, flat, root_from_board)))
             shaped_residuals.append(np.concatenate(fit_board(true, shaped, root_from_board)))
-            part.append(np.full(len(flat_residuals[-1]), targets.index(target)))
+            part.append(np.full(len(flat_residuals[-1]), targets.index(group[0].target)))
     every = ResidualPair(
         np.concatenate(flat_residuals), np.concatenate(shaped_residuals), np.concatenate(part)
     )

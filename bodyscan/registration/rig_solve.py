@@ -73,6 +73,7 @@ class RigSolution:
     variance_inflation: factor by which variances exceed those of independent corners, estimated
         from clusters of board poses.
     rays: by camera, how well each pixel's ray is known.
+    motions: of boards between the pictures of one shot, as in `JointSolution`.
     """
 
     rig_from_camera: dict[str, RigidTransform]
@@ -85,6 +86,7 @@ class RigSolution:
     camera_covariances: dict[str, Array] = field(default_factory=dict)
     variance_inflation: float = 1.0
     rays: dict[str, RayUncertainty] = field(default_factory=dict)
+    motions: Mapping[ViewKey, Array] = field(default_factory=dict)
 
     def residuals(self, name: str) -> Array:
         """Projected less seen corners (N, 2) px of a pair's views."""
@@ -266,6 +268,7 @@ def _transfer_to_rig_frame(rig: Rig, solved: _Solved) -> RigSolution:
             name: rays.inflate_noise(covariance.variance_inflation)
             for name, rays in (solved.lenses.rays if solved.lenses else {}).items()
         },
+        solution.motions,
     )
 
 

@@ -11,6 +11,7 @@ from ring import CHARUCO, ring_of_cameras, ring_rig, ring_views
 from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import LocatedView, PlanarView
 from bodyscan.calibration.camera import locate_board
+from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.outcome import Outcome
 from bodyscan.registration.rig_solve import RigSolution, solve_rig
 
@@ -26,14 +27,18 @@ def really(points: Array) -> Array:
     return np.column_stack([middle + 1.001 * (x - middle), y, z + bow])
 
 
-def bent_views(shots: int = 30) -> tuple[list[LocatedView], list[LocatedView]]:
-    """`ring_views` of that board, and of the flat one."""
+def bent_views(
+    shots: int = 30, moved_mm: float = 0.0
+) -> tuple[list[LocatedView], list[LocatedView]]:
+    """`ring_views` of that board, and of the flat one; moved_mm: sigma of what it moves by between
+    the pictures of one shot."""
     rng = np.random.default_rng(3)
     flat, truth = ring_views(PLACINGS, CAMERAS, shots=shots)
     bent = []
     for view in flat:
         camera = CAMERAS[view.pair]
-        camera_from_board = PLACINGS[view.pair].inverse() @ truth[view.target]
+        moved = RigidTransform.from_translation(rng.normal(0.0, moved_mm, 3)) @ truth[view.target]
+        camera_from_board = PLACINGS[view.pair].inverse() @ moved
         pixels = camera.project(camera_from_board.apply(really(view.points)))
         pixels += rng.normal(0.0, 0.03, pixels.shape)
         pose, _ = locate_board(camera, PlanarView(view.shot, view.points, pixels))
@@ -54,6 +59,12 @@ def rms(placed: Outcome[RigSolution]) -> float:
         for name, true in PLACINGS.items()
     ]
     return float(np.sqrt(np.mean(np.sum(np.square(errors), axis=1))))
+
+
+def test_a_bent_board_is_found_out_by_cameras_that_are_not_synchronised() -> None:
+    found = solve_rig(ring_rig(PLACINGS), bent_views(moved_mm=4.0)[0], CAMERAS)
+    assert "not taken together" in found.notes[0]
+    assert found.value.board_shapes["board"].out_of_plane_mm == pytest.approx(0.605, abs=0.06)
 
 
 def test_the_bend_and_the_stretch_are_measured(placed: Placed) -> None:
