@@ -77,7 +77,7 @@ def faults() -> Iterator[Fault]:
     for mm in (2.0, 5.0, 15.0):
         yield _moved("pair p1-2", f"out {mm:g} mm", mm, 0, 0.0)
     yield _moved("pair p1-2", "turned 2 deg", 0.0, 0, 2.0)
-    yield Fault("pairs p2-2 and p2-3 exchanged", ("exchanged",), _exchanged)
+    yield Fault("pairs p2-2 and p2-3 exchanged", ("exchanged", "swapped"), _exchanged)
     yield Fault("pair p2-2: focal length edited by 1 %", ("p2-2", "p2 "), _edited)
     yield from _image_faults()
     yield Fault("two people hand in hand", ("two people", "two bodies", "person"), _two_people)

@@ -25,11 +25,10 @@ MIN_SQUARES = 4
 
 
 def find_checkerboard(image: Bytes, board: Board, *, quick: bool = False) -> DetectedCorners | None:
-    """Find the inner corners of a checkerboard in view as a whole, numbered as stated above.
+    """Find the inner corners of a checkerboard that is wholly in view; None if it is not.
 
-    quick: use the two quickest detectors only, on any board.
-
-    Raises BadInput for a board that no detector finds.
+    Numbered by the convention in the module's docstring. Raises BadInput, unless `quick` (the two
+    quickest detectors only), for a board of fewer than MIN_SQUARES in one direction.
     """
     if not quick and min(board.columns, board.rows) < MIN_SQUARES:
         raise BadInput(

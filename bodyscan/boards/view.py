@@ -97,7 +97,7 @@ def number_corners(
         raise CaptureError(
             f"has corners outside of {size[0]} x {size[1]} px",
             where=where,
-            remedy="give the corners of this camera, in pixels of its whole picture",
+            remedy="give the corners of this camera, in pixels of its whole image",
         )
     grid = pixels.reshape(-1, columns, 2)
     along, across = np.diff(grid, axis=1)[:-1], np.diff(grid, axis=0)[:, :-1]

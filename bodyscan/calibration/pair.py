@@ -282,7 +282,7 @@ def find_odd_board(data: BoundaryPoints, stripes: int, direction: Axis) -> tuple
         if min(ratios) < min(1.0, ratio / 3.0):
             return int(boards[np.argmin(ratios)]), rms_mm
     raise PairFailed(
-        f"the sheets of light of {len(boards)} boards disagree by {rms_mm:.2g} mm, and leaving "
+        f"the light sheets of {len(boards)} boards disagree by {rms_mm:.2g} mm, and leaving "
         "out one does not help. Possible causes: the projector moved against its camera between them; "
         "images of several shots are mixed up; `stripes` or `direction` in the rig file is wrong",
         remedy="fasten the projector and capture the boards again, or delete the shots from before "

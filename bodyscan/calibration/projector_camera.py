@@ -167,8 +167,8 @@ def fit_projector(
     for sheets in (light, crossing or light):
         if not isinstance(sheets, LensSheets):
             raise BadInput(
-                f"its light sheets ({sheets.kind}) are not those of a projector with a lens, which "
-                "held-out boards refused"
+                f"the chosen sheet model is {sheets.kind}; only the lens model can be written as a "
+                "camera"
             )
     assert isinstance(light, LensSheets)
     projector, from_camera = projector_from_sheets(light)
@@ -197,7 +197,7 @@ def _sample(camera: Camera, sheets: LensSheets) -> _Samples:
         raise BadInput(
             f"its light sheets are known at {known.sum()} of {len(points)} points in its camera's "
             "view, too few for a projector with a lens",
-            remedy="calibrate the pair with boards over more of its picture",
+            remedy="calibrate the pair with boards over more of its image",
         )
     axis = 0 if sheets.direction == "vertical" else 1
     # The floor is a fifth of what the best codes leave uncertain in a pixel of the camera.
@@ -213,9 +213,8 @@ def _with_crossing_axis(
     focal, centre = np.polyfit(real, other.s - 0.5, 1, w=1.0 / other.sigma).tolist()
     if focal <= 0.0:
         raise BadInput(
-            "its rows and columns are those of a mirrored picture, which no camera has",
-            remedy="if the projector's picture is not flipped, exchange the order of the patterns of "
-            "one direction",
+            "row and column codes form a mirrored image",
+            remedy="reverse the pattern order of one direction, if nothing flips the projector's image",
         )
     if other.axis == 0:
         return replace(projector, alpha=focal, u0=centre, width=stripes)
@@ -251,9 +250,8 @@ def _refine(
     predicted = float(np.sqrt(len(sigma) / np.sum(sigma**-2.0)))
     if not misfit < 3.0:
         raise BadInput(
-            f"no projector with a lens explains its light sheets: the best fit has an RMS misfit of "
-            f"{predicted * misfit:.2g} of its pixels, the noise of the sheets explains "
-            f"{predicted:.2g}"
+            f"no lens model fits the projector's light sheets: RMS {predicted * misfit:.2g} projector "
+            f"px, {predicted:.2g} px expected from noise"
         )
     return FittedProjector(*perturb(solved.x), predicted * misfit, predicted)
 

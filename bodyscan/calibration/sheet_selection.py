@@ -69,7 +69,7 @@ def fit_light_sheets(bins: BoundaryPoints, stripes: int, direction: Axis) -> She
     if boards < 2 or len(bins.index) < 50:
         raise PairFailed(
             f"{len(bins.index)} points of stripe boundaries on {boards} boards are too few for "
-            "sheets of light",
+            "light sheets",
             remedy="capture the stripe sequence on the board in three or more poses",
         )
     few = subsample(bins, 4000)
@@ -97,7 +97,7 @@ def fit_light_sheets(bins: BoundaryPoints, stripes: int, direction: Axis) -> She
         missed = any(figure.chosen and figure.measured < 0.5 for figure in figures)
         if missed or not np.isfinite(sheets.covariance).all():
             raise PairFailed(
-                f"the stripes on {boards} boards fit no sheets of light",
+                f"the stripes on {boards} boards fit no light sheets",
                 remedy="capture the stripe sequence on the board in more poses, nearer and farther",
             )
     else:

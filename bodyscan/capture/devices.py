@@ -60,7 +60,7 @@ def require_capture(rig: Rig) -> CapturePlan:
         raise BadInput("it does not say which devices take its images", where=where, remedy=remedy)
     if rig.exposures:
         raise BadInput(
-            "it takes every image with several exposures, which `capture` does not",
+            "`capture` does not support several exposures per image",
             where=where,
             remedy="take one exposure, or let the cameras' own program fill the folder",
         )

@@ -26,8 +26,8 @@ def list_frames(rig: Rig, pair: Pair) -> tuple[str, ...]:
 def plan_turns(rig: Rig, order: Order) -> tuple[Turn, ...]:
     """The turns of a shot, by `CapturePlan.order`.
 
-    Poles at once means that the k-th pairs of all poles project at the same time; a pair on no pole
-    is one by itself.
+    poles: the k-th pairs of all poles project at the same time; a pair without a pole is treated as
+    a pole with one pair. interleaved: one turn; frame k of every pair in succession.
     """
     frames = {pair.name: list_frames(rig, pair) for pair in rig.pairs}
     if order == "one-after-another":

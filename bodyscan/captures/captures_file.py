@@ -178,7 +178,7 @@ def _find_timing_problems(timing: Timing, rig: Rig) -> Iterator[Problem]:
 
 
 def compute_frame_times(timing: Timing, rig: Rig, sequences: Sequences, folder: Path) -> FrameTimes:
-    """Compute the times of all frames. Raises CaptureError, by line, for a wrong file of times."""
+    """Times in ms of the middle of each frame. Raises CaptureError, by line, for a wrong times file."""
     if timing.times is not None:
         return _read_times(folder / timing.times, rig, sequences)
     times: dict[tuple[str, str], dict[str, float]] = {}

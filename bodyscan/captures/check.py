@@ -197,8 +197,8 @@ def _find_warnings(
             why = "its two faces are equal" if board.faces == 2 else sides
             yield (
                 f"board {board.name} looks the same rotated by 180 degrees ({why}): cameras may "
-                "number its corners from different ends; better is an odd number of columns with an "
-                "even one of rows, or ChArUco"
+                "number its corners from different ends; prefer an odd number of columns and an even "
+                "number of rows, or ChArUco"
             )
     for count in counts if captures and not rig.is_known else ():
         if 3 <= count.poses < 6:
@@ -220,7 +220,7 @@ def _warn_of_jpeg(sequences: Iterable[ImageSequence]) -> Iterator[str]:
     if coarse:
         yield (
             f"images of {', '.join(sorted(coarse))} are JPEG of low quality: they err by up to "
-            f"{max(errors.values()):.0f} grey levels, and stripes' boundaries with them; save PNG, "
+            f"{max(errors.values()):.0f} grey levels, which shifts stripe boundaries; save PNG, "
             "or JPEG of a quality of 95 or more"
         )
 

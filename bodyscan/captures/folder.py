@@ -317,7 +317,9 @@ def _read_times(captures: Captures, listing: Listing, timing: Timing) -> FrameTi
 
 
 def _discover_shots(rig: Rig, listing: Listing, template: str) -> tuple[str, ...]:
-    """Find shots by the names of files: those with a lit image or a code's first image."""
+    """Find shots by the names of files: those with a lit or board image or a code's first image; names
+    that are too long are dropped. Without `{shot}` the folder's own name is the only shot; raises
+    CaptureError if that is no valid one."""
     if not has_field(template, "shot"):
         name = listing.root.resolve().name
         if re.fullmatch(SHOT, name) and len(name) <= MAX_SHOT_LENGTH:

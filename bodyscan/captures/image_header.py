@@ -86,6 +86,7 @@ def read_header(path: Path) -> ImageHeader:
 
 
 def _read_by_pillow(stream: BinaryIO, kind: str) -> ImageHeader:
+    """Size and depth; of JPEG also completeness, and the quantisation error in grey levels."""
     # The classes themselves: Image.open refuses large images before it says how large they are.
     plugin = import_module(f"PIL.{kind}ImagePlugin")
     image: Any = getattr(plugin, f"{kind}ImageFile")(stream)

@@ -498,7 +498,7 @@ def verify(
     folder: Annotated[
         Path,
         typer.Argument(
-            metavar="FOLDER", help="Folder that batch wrote, or one job's folder in it."
+            metavar="FOLDER", help="Folder that batch or watch wrote, or a job's in it."
         ),
     ],
 ) -> None:

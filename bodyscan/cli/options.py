@@ -12,10 +12,11 @@ RigFile = Annotated[Path, typer.Argument(metavar="RIG.YAML", help="The rig file.
 ScanFolder = Annotated[Path, typer.Argument(metavar="FOLDER", help="Captures of one scan.")]
 Result = Annotated[Path, typer.Argument(metavar="RESULT", help="Folder that `scan` wrote.")]
 CalibrationArgument = Annotated[
-    Path, typer.Argument(metavar="CALIBRATION", help="Calibration that calibrate-rig wrote.")
+    Path,
+    typer.Argument(metavar="CALIBRATION", help="What calibrate-rig, import or refine-rig wrote."),
 ]
 Calibration = Annotated[
-    Path, typer.Option("--calibration", help="Calibration that calibrate-rig wrote.")
+    Path, typer.Option("--calibration", help="What calibrate-rig, import or refine-rig wrote.")
 ]
 OutFolder = Annotated[Path, typer.Option("--out", help="Folder to write into.")]
 Overwrite = Annotated[

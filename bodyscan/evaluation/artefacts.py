@@ -105,8 +105,8 @@ def require_spheres(readings: Sequence[SphereReading], radius_mm: float, centres
     worst = float(errors[np.argmax(np.abs(errors))]) if len(errors) else 0.0
     if abs(worst) > radius_mm:
         raise FailedWork(
-            f"the spheres were not found: the distance of two candidates is {abs(worst):.0f} mm too "
-            f"{'large' if worst > 0.0 else 'small'}, more than a radius",
+            "the spheres could not be identified: the distance between two candidates is off by "
+            f"{worst:+.0f} mm, more than one radius",
             remedy=remedy,
         )
 
@@ -128,7 +128,7 @@ def read_plate(points: Array, normals: Array) -> PlateReading:
         near = np.abs(points @ normal - offset) < PLATE_REACH_MM
         near &= np.abs(normals @ normal) > MIN_COSINE
         if near.sum() < MIN_PLATE_POINTS:
-            raise FailedWork("no plate is among the points")
+            raise FailedWork("no plate found in the point cloud")
         normal, offset = fit_plane(points[near])
     on_plate = points[near]
     flat = on_plate @ null_space(normal[None])
@@ -137,14 +137,14 @@ def read_plate(points: Array, normals: Array) -> PlateReading:
     inward = -(flat[joined] @ hull.equations[:, :2].T + hull.equations[:, 2])
     kept = on_plate[joined][inward.min(axis=1) > 12.0]  # mm from the rim
     if len(kept) < MIN_PLATE_POINTS:
-        raise FailedWork("no plate is among the points")
+        raise FailedWork("no plate found in the point cloud")
     normal, offset = fit_plane(kept)
     residual = kept @ normal - offset
     # Points anywhere within reach of a plane have 2.3 mm RMS, and a person's back 2.2.
     if rms(residual) > 1.2:
         raise FailedWork(
-            f"no plate is among the points: the flattest surface is {rms(residual):.1f} mm RMS off a "
-            "plane",
+            "no plate found in the point cloud: the flattest surface is "
+            f"{rms(residual):.1f} mm RMS off a plane",
             remedy="check that the folder shows the plate",
         )
     return PlateReading(
@@ -168,7 +168,7 @@ def _largest_plane(points: Array, rng: np.random.Generator) -> tuple[Array, floa
     wide = doubled_area[:, 0] > 10.0**2  # three in one position or line: no plane
     normals, a = normals[wide] / doubled_area[wide], a[wide]
     if not len(normals):
-        raise FailedWork("no plate is among the points")
+        raise FailedWork("no plate found in the point cloud")
     offsets = np.einsum("kc,kc->k", normals, a)
     votes = np.sum(np.abs(some @ normals.T - offsets) < PLATE_REACH_MM, axis=0)
     best = int(np.argmax(votes))

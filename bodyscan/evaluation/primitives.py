@@ -172,7 +172,7 @@ def find_spheres(points: Array, normals: Array, radius: float, count: int) -> li
         sphere = _find_sphere(flat, votes, radius)
         if sphere is None:
             what = f"{len(found)} spheres of radius {radius:g} mm found, {count} were expected"
-            raise FailedWork(what, remedy="see that all spheres are in the picture and lit")
+            raise FailedWork(what, remedy="see that all spheres are in view and lit")
         found.append(sphere)
         rest = np.linalg.norm(flat - sphere.centre, axis=1) > 1.15 * radius
         flat, votes = flat[rest], votes[rest]

@@ -146,7 +146,7 @@ def compare_surfaces(mesh: BodyMesh, other: Path | BodyMesh) -> list[Comparison]
         name, is_scan, vertices, faces = "the other", True, other.vertices, other.faces
     else:
         name, is_scan = _name(other), _is_scan(other)
-        vertices, faces = _surface(other, np.ptp(mesh.vertices, axis=0))
+        vertices, faces = _load_reference(other, np.ptp(mesh.vertices, axis=0))
     measured = np.unique(mesh.faces[~mesh.filled])
     points = mesh.vertices[measured]
     fit = fit_to_surface(points, vertices, faces)
@@ -189,8 +189,9 @@ def _name(path: Path) -> str:
     return whole.name if path.is_dir() else f"{whole.parent.name}/{whole.name}"
 
 
-def _surface(path: Path, sides_mm: Array) -> tuple[Array, Indices]:
-    """Vertices (V, 3) mm and faces (F, 3) of what may be the subject of a scan of these sides (3,)."""
+def _load_reference(path: Path, sides_mm: Array) -> tuple[Array, Indices]:
+    """Vertices (V, 3) mm and faces (F, 3) to compare a scan of these sides (3,) with; raises BadInput
+    if the size does not fit such a scan: 0.2 to 5 times the longest side."""
     if _is_scan(path):
         mesh = load_scan(path if path.is_dir() else path.parent).mesh
         return mesh.vertices, mesh.faces

@@ -104,7 +104,7 @@ def _describe_projector(pair: PairCalibration, fitted: FittedProjector) -> str:
     text = f"its projector is written as a camera, {projector_name(pair.name)}"
     if fitted.predicted_px:
         text += (
-            f", {fitted.misfit_px:.2g} of its pixels RMS off its sheets of light (noise explains "
+            f", {fitted.misfit_px:.2g} of its pixels RMS off its light sheets (noise explains "
             f"{fitted.predicted_px:.2g})"
         )
     if pair.crossing is None:

@@ -41,24 +41,25 @@ def equalize_brightness(
         for surface, centre in zip(surfaces, centres, strict=True)
     ]
     parts = [slice(start, end) for start, end in pairwise(samples.starts)]
-    shades = [
+    log_irradiances = [
         log_irradiance(samples.points[part], samples.normals[part], centre)
         for part, centre in zip(parts, centres, strict=True)
     ]
-    of_samples = np.concatenate(shades)
+    of_samples = np.concatenate(log_irradiances)
     overlaps = find_overlaps(samples, surfaces, consistency, of_samples, of_surfaces)
     power = estimate_light_power([(overlap.ratio, overlap.shade) for overlap in overlaps])
     ratios = [(o.a, o.b, float(np.median(o.ratio - power * o.shade)), o.spots) for o in overlaps]
     gain = solve_gains(ratios, len(surfaces))
     typical = float(np.mean(of_samples)) if len(of_samples) else 0.0
 
-    def normalize(colours: list[Bytes], shades: list[Floats]) -> list[Floats]:
+    def normalize(colours: list[Bytes], log_irradiances: list[Floats]) -> list[Floats]:
+        """Divide out each pair's gain, and the irradiance relative to the typical one."""
         return [
-            grey * (factor * np.exp(np.float32(-power) * (shade - np.float32(typical))))
-            for grey, shade, factor in zip(colours, shades, gain, strict=True)
+            grey * (factor * np.exp(np.float32(-power) * (light - np.float32(typical))))
+            for grey, light, factor in zip(colours, log_irradiances, gain, strict=True)
         ]
 
-    of_parts = normalize([samples.colours[part] for part in parts], shades)
+    of_parts = normalize([samples.colours[part] for part in parts], log_irradiances)
     return EqualizedGrey(
         np.concatenate(of_parts), normalize([one.colours for one in surfaces], of_surfaces)
     )

@@ -115,7 +115,9 @@ def _add_surface(
 ) -> None:
     """Add a surface's points `at`, shifted from the samples `index`, to the sums (N, 10).
 
+    shift_mm: signed, along the sample's normal.
     surface: weights, sigmas, grey levels and normals of its points.
+    sums: columns as listed in `average`.
     """
     weights, sigma_mm, grey, normals = surface
     for n in range(len(index)):

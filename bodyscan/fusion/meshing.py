@@ -47,7 +47,7 @@ def closed_surface(
     bricks, distances = compute_distances(cloud, cell_mm, range_images, poses)
     vertices, faces = extract_surface(bricks, distances)
     if not len(faces):
-        raise ScanFailed("no surface came out of the cloud: its points contradict each other")
+        raise ScanFailed("no surface could be extracted: the points are inconsistent")
     some = cloud.points[:: -(-len(cloud.points) // 20_000)]
     vertices, faces = extract_largest_piece(vertices, faces, some)
     if not check_manifold(faces, len(vertices))[1]:

@@ -123,9 +123,9 @@ def make_room(folder: Path, overwrite: bool) -> None:
     """Raise ResultError if `folder` holds a model that may not be replaced."""
     if (folder / FILE_NAME).exists() and (folder / CLOUD_NAME).exists() and not overwrite:
         raise ResultError(
-            "a scan's result lies here already",
+            "a result already exists here",
             where=str(folder),
-            remedy="give another --out, or say --overwrite: it and all that was made of it go",
+            remedy="give another --out; --overwrite deletes it and everything derived from it",
         )
 
 
@@ -314,7 +314,7 @@ def refuse_repeat(folder: Path, facts: Mapping[str, Any]) -> None:
         raise FailedWork(
             f"this scan is to be repeated:{reasons}",
             where=str(folder),
-            remedy="scan again; or say --anyway, and take what comes of it for what it is",
+            remedy="scan again, or use --anyway at your own risk",
         )
 
 

@@ -28,7 +28,7 @@ def sheets_to_arrays(sheets: LightSheets) -> dict[str, Array]:
             "parameters": sheets.parameters,
             "covariance": sheets.covariance,
         }
-    raise TypeError(f"no sheets of light: {type(sheets).__name__}")
+    raise TypeError(f"no light sheets: {type(sheets).__name__}")
 
 
 def sheets_from_arrays(kind: str, arrays: Mapping[str, Any], direction: Axis) -> LightSheets:
@@ -39,7 +39,7 @@ def sheets_from_arrays(kind: str, arrays: Mapping[str, Any], direction: Axis) ->
     if kind == "planes":
         return LightPlanes(arrays["planes"], arrays["covariance"], direction)
     if kind not in ("smooth-planes", "bowed", "lens"):
-        raise ValueError(f"sheets of light of an unknown kind, {kind!r}")
+        raise ValueError(f"light sheets of an unknown kind, {kind!r}")
     matrix, parameters = arrays["projector_from_camera"], arrays["parameters"]
     frame = RigidTransform(matrix[:3, :3].copy(), matrix[:3, 3].copy())
     stripes, middle, covariance = int(arrays["stripes"]), arrays["middle"], arrays["covariance"]
@@ -51,7 +51,7 @@ def sheets_from_arrays(kind: str, arrays: Mapping[str, Any], direction: Axis) ->
     bow, over = divmod(len(parameters) - 3 * (PLANE_DEGREE + 1) - 1, BOW_DEGREE + 1)
     if bow < 1 or over or (bow > 1 and kind == "smooth-planes"):
         count = len(arrays["parameters"])
-        raise ValueError(f"{count} parameters do not make {kind} sheets of light")
+        raise ValueError(f"wrong number of parameters for {kind} light sheets: {count}")
     return BowedSheets(frame, middle, stripes, direction, parameters, covariance)
 
 

@@ -165,7 +165,7 @@ class ForeignFile:
         """Width and height of an image, px."""
         width, height = self.numbers(value, name, 2)
         if width != int(width) or height != int(height) or width < 1 or height < 1:
-            raise self.error(f"is not the size of a picture ({width:g} x {height:g})", name)
+            raise self.error(f"is not the size of an image ({width:g} x {height:g})", name)
         return int(width), int(height)
 
     def pose(self, rotation: Any, translation: Any, *names: str) -> RigidTransform:

@@ -54,8 +54,8 @@ class FoundCamera:
             and -margin * height < v0 < (1.0 + margin) * height
         ):
             raise CalibrationFileError(
-                f"has its principal point at ({u0:.1f}, {v0:.1f}), outside of a picture of "
-                f"{width} x {height} px: it is of another camera, or of pictures of another size",
+                f"has its principal point at ({u0:.1f}, {v0:.1f}), outside of an image of "
+                f"{width} x {height} px: it is of another camera, or of images of another size",
                 where=self.where,
                 remedy=remedy,
             )
@@ -76,7 +76,7 @@ class FoundCamera:
         inner = np.stack(np.meshgrid(shares, shares), axis=-1) * [width - 1.0, height - 1.0]
         if not np.isfinite(camera.rays(inner)).all():
             raise CalibrationFileError(
-                f"has a lens that folds inside a picture of {width} x {height} px: distortion and "
+                f"its distortion is not invertible within {width} x {height} px: distortion and "
                 "matrix do not belong together, or both belong to another device",
                 where=self.where,
                 remedy="name each device's matrix and distortion in the rig file, and check that "

@@ -275,6 +275,7 @@ def _make_e_rows(
 
 
 def _format_table_1(calibrated: Calibrations) -> str:
+    """The camera's parameters by both calibrations; "off by" is in sigmas."""
     zhang, ours = calibrated.reference, calibrated.ours.camera
     estimates = (
         (zhang.camera.parameters, np.sqrt(np.diag(zhang.covariance))),

@@ -168,7 +168,7 @@ def measure(
     slices = []
     for height in (height for height in heights if height not in missing):
         pieces = sorted(parts.slices[height], key=lambda piece: piece.part)
-        slices.append(Slice(height, tuple(_girth(piece, mesh, breath) for piece in pieces)))
+        slices.append(Slice(height, tuple(_describe_loop(piece, mesh, breath) for piece in pieces)))
     areas = face_areas(mesh.vertices, mesh.faces)
     crown = mesh.vertices[mesh.faces, 2].max(axis=1) > stature - CROWN_MM
     kinds, crown_measured = mesh.face_regions, _share(areas, ~mesh.filled, crown)
@@ -236,7 +236,8 @@ def _share(areas: Array, which: Mask, among: Mask) -> float:
     return float(areas[which & among].sum() / max(areas[among].sum(), 1e-12))
 
 
-def _girth(piece: Piece, mesh: BodyMesh, breath: BreathAt | None) -> Girth:
+def _describe_loop(piece: Piece, mesh: BodyMesh, breath: BreathAt | None) -> Girth:
+    """Girth, tape, width, depth, area, 95 % ranges and shares of regions of a slice's loop."""
     loop, kinds = piece.loop, mesh.face_regions
     known = loop.faces >= 0
     corners = mesh.faces[loop.faces]

@@ -289,7 +289,7 @@ def _find_hidden_arms(
         for (lower, upper), (one, other) in zip(pairwise(stretches), pairwise(ends), strict=True):
             if one[1] and other[0] and lower[-1].height_mm < upper[0].height_mm:
                 zones.append((arm, lower[-1].height_mm, upper[0].height_mm))
-        if not stretches and not _reaches_out(graph, arm, top):
+        if not stretches and not _may_be_raised(graph, arm, top):
             zones.append((arm, (ARMPIT - 0.36) * top, ARMPIT * top))
         if stretches and ends[0][0] and stretches[0][0].area_mm2 > 1000.0:  # a wrist; fingers end
             low_mm = stretches[0][0].height_mm
@@ -299,8 +299,9 @@ def _find_hidden_arms(
     return zones
 
 
-def _reaches_out(graph: nx.DiGraph[_Node], arm: str, top: float) -> bool:
-    """Whether a body has no legs, or reaches out on an arm's side by more than a hanging arm."""
+def _may_be_raised(graph: nx.DiGraph[_Node], arm: str, top: float) -> bool:
+    """Whether an arm that is not seen may be raised instead of hidden by the trunk: the trunk reaches
+    over 0.3 `top` to the arm's side, front or back, or there are no legs."""
     sign = 1.0 if arm.startswith(SIDES[0]) else -1.0
     trunk = [node.loop.segments for node in graph if node.part == "trunk"]
     reach = [max((sign * ends[..., 1]).max(), np.abs(ends[..., 0]).max()) for ends in trunk]

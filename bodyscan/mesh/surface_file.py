@@ -78,8 +78,8 @@ def refuse_size(
             factor = UNITS_MM[meant] / UNITS_MM[unit]
             remedy += f"; if this one is in {meant}, multiply its coordinates by {factor:.6g}"
         raise BadInput(
-            f"is {size * UNITS_MM[unit]:,.4g} mm long, read as {unit}; "
-            f"{lowest:,.0f} to {highest:,.0f} mm can be right",
+            f"is {size * UNITS_MM[unit]:,.4g} mm long if read as {unit}; "
+            f"expected {lowest:,.0f} to {highest:,.0f} mm",
             where=str(path),
             remedy=remedy,
         )
@@ -98,7 +98,7 @@ def _mend(vertices: Array, faces: Indices) -> tuple[Array, Indices, list[str]]:
     places, same = np.unique(vertices, axis=0, return_inverse=True)
     if len(places) < len(vertices):
         doubled = len(vertices) - len(places)
-        notes.append(f"{doubled} vertices lie where another does, and are joined")
+        notes.append(f"merged {doubled} duplicate vertices")
         vertices, faces = places, same.reshape(-1)[faces]
     flat = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
     if flat.any():
@@ -108,9 +108,9 @@ def _mend(vertices: Array, faces: Indices) -> tuple[Array, Indices, list[str]]:
     count = len(vertices)
     vertices, faces, _ = drop_unused_vertices(vertices, faces)
     if len(vertices) < count:
-        notes.append(f"{count - len(vertices)} vertices belong to no face: dropped")
+        notes.append(f"removed {count - len(vertices)} unreferenced vertices")
     closed, _ = check_manifold(faces, len(vertices))
     if closed and signed_volume(vertices - vertices.mean(axis=0), faces) < 0.0:
-        notes.append("all faces run inwards: turned")
+        notes.append("faces pointed inwards: flipped")
         faces = np.ascontiguousarray(faces[:, ::-1])
     return vertices, faces, notes

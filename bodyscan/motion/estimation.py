@@ -182,16 +182,17 @@ def estimate_motion(
     # Overlaps that motion brings no closer are apart because of the pairs' own calibrations.
     no_closer = moved.rms_after_mm > 0.95 * aligned.rms_after_mm
     still = no_closer and _is_rigid_negligible(motion, observed, settings)
-    found = _from_middle(images, motion, cells, observed)
+    found = _describe_motion(images, motion, cells, observed)
     if still or not found.significant:
         return aligned, None, evidence
     return moved, replace(found, times=solution.fit_times(seconds, middle_s)), evidence
 
 
-def _from_middle(
+def _describe_motion(
     images: Sequence[RangeImage], motion: BodyMotion, cells: BodyCells, observed: Mask
 ) -> EstimatedMotion:
-    """The motion between each pair's moment and the middle of the scan."""
+    """Displacements, mm, from each pair's moment to the middle of the scan, with the sigmas of what
+    is left in shape and girth, and the offset to mean breath."""
     moment_ms = _middle_of_scan(images)
     sigma_mm, girth_sigma_mm = shape_sigmas(motion, cells, observed)
     warps = motion.non_rigid(from_middle=True)

@@ -100,7 +100,7 @@ def correct_stretch(
                 boards[k] = board.model_copy(update={"stretch": board.stretch * float(found.x)})
                 notes.append(
                     f"board {board.name}: squares are {found.x:.4f} times as high as wide, by views of "
-                    "the turned board; used so: measure both sides, and write `stretch` in the rig file"
+                    "the turned board; using that: measure both sides, write `stretch` in the rig file"
                 )
     return rig.model_copy(update={"boards": tuple(boards)}), notes
 
@@ -168,14 +168,14 @@ def _notes_of_board(board: Board, views: Sequence[BoardView]) -> Iterator[str]:
     mirrored = [view for view in views if view.appearance.mirrored]
     other = [view for view in views if view.appearance.other_layout]
     if inverted:
-        yield f"board {board.name} is white on black in {where(inverted)}; used so"
+        yield f"board {board.name} is white on black in {where(inverted)}; using that"
     if mirrored:
         cameras = {view.pair for view in mirrored} != {view.pair for view in views}
         yield (
             f"board {board.name} is mirrored in {where(mirrored)}, as in a mirror or through the "
-            "glass it is printed on; used so"
+            "glass it is printed on; using that"
             + (
-                ". Other cameras see it as printed: if none looks at it from behind, the pictures "
+                ". Other cameras see it as printed: if none looks at it from behind, the images "
                 "of these are flipped"
                 if cameras
                 else ""
@@ -185,5 +185,5 @@ def _notes_of_board(board: Board, views: Sequence[BoardView]) -> Iterator[str]:
         layout = "false" if board.legacy_layout else "true"
         yield (
             f"board {board.name} has the other of OpenCV's two layouts (legacy_layout: {layout}) in "
-            f"{where(other)}; used so"
+            f"{where(other)}; using that"
         )

@@ -31,7 +31,7 @@ LIMITS = {
     # Corners are found to less than a tenth of a pixel in sharp, well-lit images.
     "corners_rms_px": Limit(0.3, "corner residuals are {:.3g} px RMS"),
     "poses": Limit(6, "was calibrated from {:.3g} board poses", at_least=True),
-    "covered_percent": Limit(40.0, "boards covered {:.3g} % of its picture", at_least=True),
+    "covered_percent": Limit(40.0, "boards covered {:.3g} % of its image", at_least=True),
     # A scan whose overlaps disagree by 0.4 mm is no longer good (fusion/verdict/overlaps.py).
     "sheets_rms_mm": Limit(0.3, "light sheets have residuals of {:.3g} mm RMS"),
     "held_out_mm": Limit(0.5, "held-out boards are missed by {:.3g} mm"),

@@ -209,12 +209,12 @@ def linearize_reprojection(
     rig_from_camera: Mapping[str, RigidTransform],
     rig_from_board: Mapping[Target, RigidTransform],
 ) -> tuple[Array, Callable[[], Array]]:
-    """Reprojection errors (2N,) px of one pair's views, and a function for their Jacobian.
+    """Reprojection errors (2N,) px (projected - observed) of a pair's views; computes their Jacobian.
 
     views: with points where the boards' corners really lie.
 
-    The Jacobian (2N, 12 + P + 3) is by the camera's motion, each board's motion, the camera's
-    parameters, and the corner's place on its board. A corner q in the rig frame is observed at
+    The Jacobian (2N, 12 + P + 3) is by the camera's and its board's twist in the rig frame, the
+    camera's parameters, and the corner's place on its board. A corner q in the rig frame is observed at
     R^T (q - t): a motion of the board and the opposite motion of the camera have the same effect.
     """
     pair = views[0].pair

@@ -88,12 +88,13 @@ def find_rig_size(rig: Rig, solution: RigSolution, views: Sequence[BoardView]) -
     _refuse_contradictions(rig, found, size)
     if abs(size.factor - 1.0) > MAX_SIZE_ERROR:
         notes.append(f"{size.words}, more than prints are off: is square_mm right, and length_mm?")
-    notes.append(f"size by references: {_format_size(size)}; every length is as uncertain")
+    shared = "the same relative uncertainty applies to every length"
+    notes.append(f"scale from references: {_format_size(size)}; {shared}")
     return Outcome(size, tuple(notes))
 
 
 def rescale_boards(rig: Rig, factor: float) -> Rig:
-    """The rig with the square sizes that its boards turned out to have."""
+    """The rig with its boards' true square sizes; certified boards stay, unless all are certified."""
     certified = {name for reference in rig.references for name in reference.boards}
     alone = certified.issuperset(board.name for board in rig.boards)
 
@@ -125,7 +126,7 @@ def _refuse_contradictions(rig: Rig, found: dict[str, Size], size: Size) -> None
                 f"{other}: {_format_size(other_size)}" for other, other_size in found.items()
             )
             raise FailedWork(
-                f"the references contradict each other: {figures}",
+                f"the references disagree: {figures}",
                 where=f"rig {rig.name}",
                 remedy=f"measure {name} anew, or leave out the one that is wrong",
             )

@@ -75,7 +75,7 @@ class RigCalibration:
         if not named and not np.array_equal(pose.matrix, np.eye(4)):
             return "that of the imported files, wherever it lies"
         return (
-            f"that of camera {pair.name}: x to the right in its picture, y down, z the way it looks"
+            f"that of camera {pair.name}: x to the right in its image, y down, z the way it looks"
         )
 
 

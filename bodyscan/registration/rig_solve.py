@@ -208,7 +208,7 @@ def _weigh_views(
     largest = max(rms_mm.values())
     moved = [f"{name} by {mm:.2g} mm" for name, mm in rms_mm.items() if mm > 0.1 * largest]
     note = (
-        f"the board had moved when these took their pictures (RMS): {', '.join(moved)}. They were not "
+        f"the board had moved when these took their images (RMS): {', '.join(moved)}. They were not "
         "taken together with the others'. All views are used, weighted by how well they agree, with "
         "sigmas to match; synchronise the cameras, or hold the board still"
     )

@@ -75,10 +75,10 @@ def find_camera_faults(camera: Camera, pair: Pair, where: str) -> Iterator[Fault
     for name, value, length in zip(("u0", "v0"), (camera.u0, camera.v0), size, strict=True):
         # It may lie outside an image that was cropped from a larger one.
         if not -length < value < 2.0 * length:
-            yield f"{where}.{name}", f"lies far outside of the picture (got {value:g})"
+            yield f"{where}.{name}", f"lies far outside of the image (got {value:g})"
     if not _is_finite(camera.lens.coefficients) or camera.folds:
         values = ", ".join(f"{value:g}" for value in camera.lens.coefficients)
-        yield where, f"has a lens that folds its picture over (got {values})"
+        yield where, f"has a lens that folds its image over (got {values})"
 
 
 def find_pose_faults(pose: RigidTransform, where: str) -> Iterator[Fault]:

@@ -56,9 +56,9 @@ def refuse_existing(folder: Path, overwrite: bool) -> None:
     """Raise CalibrationFileError if `folder` holds a calibration that may not be replaced."""
     if (folder / FILE_NAME).exists() and not overwrite:
         raise CalibrationFileError(
-            "a calibration lies here already",
+            "a calibration already exists here",
             where=str(folder),
-            remedy="give another --out, or say --overwrite: this one then moves into its "
+            remedy="give another --out, or use --overwrite: this one then moves into its "
             f"`{HISTORY}`, where scans made with it are found again",
         )
 
@@ -310,7 +310,7 @@ def _read_quality(content: dict[str, Any]) -> PairQuality:
 
 
 def _transform(matrix: Any) -> RigidTransform:
-    """Read a transform exactly, to the last bit: no orthonormalisation."""
+    """Read a transform to the last bit. Raises ValueError; does not check that it is a rotation."""
     array = np.array(matrix)
     if array.shape != (4, 4) or array.dtype.kind not in "fiu" or any(array[3] != (0, 0, 0, 1)):
         raise ValueError(f"{matrix} is not a 4 x 4 matrix of a rigid motion")

@@ -72,8 +72,8 @@ def _examine_board(
         if error > limit_px:
             bad.append(view)
             notes.append(
-                f"{view.pair}: board {board} in shot {shot} fits no pose ({error:.2f} px) with any "
-                "lens that the other views allow; corners may be mixed up; not used"
+                f"{view.pair}: board {board} in shot {shot}: no pose fits (RMS {error:.2f} px), with "
+                "any lens that the other views allow: view discarded, corners may be misnumbered"
             )
     kept = [view for view in group if view not in bad]
     errors = _fit_from_two_starts(kept, solution, start) if kept else np.zeros(1)
@@ -83,9 +83,9 @@ def _examine_board(
         bad += others
         notes.append(
             f"shot {shot}: the pose of board {board} differs for "
-            f"{', '.join(sorted(view.pair for view in others))} ({errors.max():.2f} px, limit "
+            f"{', '.join(sorted(view.pair for view in others))} (RMS {errors.max():.2f} px, limit "
             f"{limit_px:.2f}, with any lens); not used. Possible causes: the board moved, the "
-            "pictures were not taken at the same moment, or its square_mm is not that of the rig file"
+            "images were not taken at the same moment, or its square_mm is not that of the rig file"
         )
     return Outcome(bad, tuple(notes))
 

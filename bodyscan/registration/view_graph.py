@@ -120,7 +120,7 @@ def describe_unsynchronised(names: Iterable[str]) -> str:
     """The message on pairs whose views agree with those of others in too few shots."""
     return (
         f"the relative pose of {', '.join(sorted(names))} that follows from shared boards differs "
-        "from shot to shot: their pictures were not taken together with the others', or the board "
+        "from shot to shot: their images were not taken together with the others', or the board "
         "moved meanwhile"
     )
 
@@ -133,7 +133,7 @@ def _keep_majority(groups: Sequence[Group], best: RelativePose) -> tuple[Group, 
         raise RigDisconnected(
             describe_unsynchronised([*largest, *others]),
             remedy="synchronise the cameras, or hold the board still until all have taken their "
-            f"picture (at best {best.votes} of {len(best.targets)} shots agree)",
+            f"image (at best {best.votes} of {len(best.targets)} shots agree)",
         )
     return largest, {name: describe_unsynchronised([name]) for name in others}
 
@@ -281,9 +281,9 @@ def _open_tie(first: Group, second: Group, tie: RelativePose) -> RigDisconnected
         f"the relative pose of {', '.join(sorted(first))} and {', '.join(sorted(second))} stays "
         "open: their shared board may be numbered from either end, and their views do not settle "
         f"which (shots {_shots(tie.targets)}; at best {_shots(tie.agreeing)} agree). Possible "
-        "causes: too few shared shots, pictures not taken together, or shots named differently in "
+        "causes: too few shared shots, images not taken together, or shots named differently in "
         "different cameras",
-        remedy="look whether these pictures were taken together and bear the same shots' names. "
+        remedy="look whether these images were taken together and bear the same shots' names. "
         "Then capture one or two more shots that both see, the board tilted differently; or use a "
         "ChArUco board, or one whose columns and rows differ in parity",
     )

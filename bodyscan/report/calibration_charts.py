@@ -261,7 +261,7 @@ def sigma_chart(calibration: RigCalibration) -> bytes:
         )
     if len(calibration.pairs) == 1:
         raise BadInput(
-            "a single pair defines the rig frame, so its pose has no error",
+            "with one pair there is no pose uncertainty to map",
             where=f"rig {calibration.rig.name}",
             remedy="its accuracy is in the report's table of pairs and in the sigmas of a scan",
         )
@@ -293,7 +293,8 @@ def sigma_chart(calibration: RigCalibration) -> bytes:
 
 
 def write_sigma_map(calibration: Path, path: Path | None = None) -> Path:
-    """Draw the map of a stored calibration and return the picture's path, beside it if none is given.
+    """Draw the position sigma (mm) due to the pairs' poses, in the planes x = 0 and y = 0; return the
+    image's path, beside the stored calibration if none is given.
 
     Raises BadInput for a path that does not end in .png and where no sigma is known,
     CalibrationFileError.

@@ -31,7 +31,7 @@ from bodyscan.report.page import (
 TITLES = {
     "corners_rms_px": ("corners", "px RMS", "distance of corners from where camera and pose put them."),
     "poses": ("poses", "", "views of a board that were used."),
-    "covered_percent": ("covered", "% of picture",
+    "covered_percent": ("covered", "% of image",
                         "by the boards' corners; the lens is extrapolated beyond."),
     "sheets_rms_mm": ("sheets", "mm RMS", "distance of stripe boundaries on boards from their sheet."),
     "held_out_mm": ("held out", "mm mean", "distance of points from boards that the light was not "
@@ -72,7 +72,7 @@ def calibration_page(folder: Path) -> Page:
         "How well the pairs are connected, and what would help": lambda: [
             Lines(calibration.advice or (f"No advice: {why}.",))
         ],
-        "Boards in the pictures": lambda: _show_boards(calibration),
+        "Boards in the images": lambda: _show_boards(calibration),
         "Light sheets": lambda: _show_planes(calibration),
         "Who shares boards with whom": lambda: _show_shared_boards(calibration),
         "How well each place is known": lambda: _show_sigma(calibration),
@@ -111,7 +111,7 @@ def _describe_lenses(calibration: RigCalibration) -> Iterator[str]:
             f"held-out corners, RMS: {'; '.join(tried)}"
             if tried
             else "none was tried on held-out boards (it was given, or boards stood in fewer than "
-            f"{MIN_CLUSTERS} places of the picture)"
+            f"{MIN_CLUSTERS} places of the image)"
         )
 
 
@@ -142,22 +142,22 @@ def _show_boards(calibration: RigCalibration) -> list[Block]:
             "tests it with a few."
             if calibration.is_import
             else "This calibration was stored without its corners: calibrate again to see where the "
-            "boards lay in each picture, and their residuals."
+            "boards lay in each image, and their residuals."
         )
         return [why]
     residuals, times = draw.residual_chart(calibration)
     return [
         Picture(
             "Coverage of each camera by boards",
-            "Each camera's picture, and the hull of the corners of every board seen in it. Empty "
-            "corners of a picture are where its lens is known least.",
+            "Each camera's image, and the hull of the corners of every board seen in it. Empty "
+            "corners of an image are where its lens is known least.",
             draw.coverage_chart(calibration),
         ),
         Picture(
             "Residuals of corners",
-            "Colour: RMS over each part of the picture, px. Arrows: their mean, "
+            "Colour: RMS over each part of the image, px. Arrows: their mean, "
             f"enlarged {times:,.0f} times; arrows that all point the same way in a part of the "
-            "picture mean that the lens model does not fit there. Empty: fewer than three corners.",
+            "image mean that the lens model does not fit there. Empty: fewer than three corners.",
             residuals,
         ),
     ]

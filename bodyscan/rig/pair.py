@@ -84,7 +84,7 @@ class KnownCamera(Model):
     def problems(self) -> Iterator[Problem]:
         for keys, what in (
             (("rotation", "translation"), "a pose is a rotation and a translation"),
-            (("width", "height"), "a picture has a width and a height"),
+            (("width", "height"), "an image has a width and a height"),
         ):
             absent = [key for key in keys if getattr(self, key) is None]
             if len(absent) == 1:

@@ -104,7 +104,7 @@ class Rig(Model):
         yield from _find_marker_overlaps(self.boards)
         yield from _find_wrong_frames(self)
         yield from _find_template_problems(self)
-        yield from _find_unknown_references(self)
+        yield from _find_rig_frame_problems(self)
         yield from _find_wrong_references(self)
         names = [pair.name for pair in self.pairs]
         for name in self.capture.pairs if self.capture else ():
@@ -231,7 +231,7 @@ def _find_template_problems(rig: Rig) -> Iterator[Problem]:
             yield where, fault
 
 
-def _find_unknown_references(rig: Rig) -> Iterator[Problem]:
+def _find_rig_frame_problems(rig: Rig) -> Iterator[Problem]:
     frame = rig.rig_frame
     for key, parts in (("pair", rig.pairs), ("board", rig.boards)):
         wanted, names = getattr(frame, key), [part.name for part in parts]

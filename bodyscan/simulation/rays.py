@@ -202,7 +202,8 @@ def interpolate(
 def mean_light(
     weight: Floats, index: np.ndarray[tuple[int, ...], np.dtype[np.int32]], table: Floats
 ) -> Floats:
-    """Average weight (R, C, K) times light at entries (R, C, K) of a table over the samples."""
+    """(R, C): mean over a pixel's K samples of weight x table[index], both (R, C, K); divides by K, not
+    by the sum of weights."""
     rows, columns, samples = weight.shape
     mean = np.empty((rows, columns), np.float32)
     for r in range(rows):

@@ -98,9 +98,9 @@ def check_illumination(bright: Mask, lit: NDArray[Any]) -> None:
     share = np.mean(bright)
     if share < 1e-3:
         raise DecodingFailed(
-            f"the projector lights only {share:.2%} of the picture",
+            f"the projector lights only {share:.2%} of the image",
             remedy="check that the projector is on, that lit and dark frames differ, and that no frame "
-            "is missing, so that those after it moved up",
+            "is missing: a missing frame shifts all later ones",
         )
     saturated = np.mean(lit[bright] >= SATURATED)
     if saturated > 0.5:
@@ -120,7 +120,7 @@ def check_direction(numbers: NDArray[Any], good: Mask, transposed: bool) -> None
     if across > 2.0 * along:
         actual, given = ("vertical", "horizontal") if transposed else ("horizontal", "vertical")
         raise WrongDirection(
-            f"the stripes run {actual}ly in the picture, not {given}ly",
+            f"the stripes run {actual}ly in the image, not {given}ly",
             remedy=f"write `direction: {actual}` in the rig file if this camera stands so; with "
             "`crossing`, check first whether its frames and the others are exchanged",
         )

@@ -262,6 +262,6 @@ def stripe_board_notes(pairs: Mapping[str, PairCalibration]) -> Iterator[str]:
         mean = sum(mean for mean, _ in boards.values()) / len(boards)
         rms = (sum(rms**2 for _, rms in boards.values()) / len(boards)) ** 0.5
         yield (
-            f"measured by the stripes, boards lie {mean:+z.3f} mm (mean) and {rms:.3f} mm (RMS) from "
-            f"where the corners put them; worst: {worst}, {boards[worst][1]:.3f} mm"
+            f"boards measured by stripes against by corners: mean {mean:+z.3f}, RMS {rms:.3f} mm; "
+            f"worst pair {worst}, {boards[worst][1]:.3f} mm RMS"
         )

@@ -376,8 +376,8 @@ def locate_views(
         # Real corners are good to a few tenths of a pixel: this is another board, or a mix-up.
         if rms > max(1.0, 6.0 * cameras[view.pair].rms_px):
             notes.append(
-                f"{view.pair}: board {board.name} in shot {view.shot} fits no pose ({rms:.2f} px); "
-                "not used"
+                f"{view.pair}: board {board.name} in shot {view.shot}: no pose fits (RMS "
+                f"{rms:.2f} px): view discarded, corners may be misnumbered"
             )
             continue
         symmetries = board_symmetries(board) if view.turnable else board_symmetries(board)[:1]

@@ -96,8 +96,8 @@ def find_known_errors(rig_file: Path) -> list[str]:
 
 
 def _needs_pose(rig: Rig, pair: Pair) -> bool:
-    """Whether a pair's camera needs a pose: all but the only one whose nodes are named without it,
-    which is the world of the others."""
+    """A pair needs a pose unless it is the rig's only pair, or the only one whose `known` names no
+    rotation: that camera is then the world frame."""
     worlds = [
         one.name
         for one in rig.pairs

@@ -108,8 +108,8 @@ def require_one_moment(captures: Captures) -> None:
     pair, taken = max(shots.items(), key=lambda one: len(one[1]), default=("", []))
     if len(taken) > 1:
         raise CaptureError(
-            f"pair {pair} took its stripes in {len(taken)} shots ({', '.join(taken[:3])}): a scan is "
-            "of one person at one moment",
+            f"pair {pair} has stripe sequences from {len(taken)} shots ({', '.join(taken[:3])}); a "
+            "scan uses one",
             where=str(captures.folders[0]),
             remedy="put each shot into a folder of its own, or name the one that counts in its "
             f"captures.yaml: `shots: [{{name: {taken[0]}}}]`",

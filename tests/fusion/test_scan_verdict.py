@@ -213,7 +213,7 @@ def test_half_the_pairs_give_half_a_body(images: list[RangeImage]) -> None:
     one_pole = [image for image in images if image.pair in ("p2-2", "p2-3")]
     scan = fused(one_pole, failed={"p1-2": "is missing", "p3-2": "is missing"})
     assert scan.verdict.grade == "repeat"
-    assert "of the surface is filled" in said(scan)
+    assert "of the surface was not measured" in said(scan)
     assert "saw nobody" not in said(scan)
 
 
@@ -253,7 +253,7 @@ def test_what_no_camera_of_the_rig_could_see_is_no_reason_to_repeat(
     scan = fused([image for image in images if image.pair in one_side], placed=one_side)
     assert scan.verdict.grade == "usable"
     assert "one side only was seen" in said(scan)
-    assert "of the surface is filled" not in said(scan)
+    assert "of the surface was not measured" not in said(scan)
     assert "stature" not in said(scan)
 
 
@@ -275,7 +275,7 @@ def test_two_pairs_exchanged(images: list[RangeImage]) -> None:
     placed["p2-2"], placed["p2-3"] = placed["p2-3"], placed["p2-2"]
     scan = fused(untimed(images), placed=placed)
     assert scan.verdict.grade == "repeat"
-    assert "pole p2 and the others contradict each other" in said(scan)
+    assert "pole p2 and the others disagree" in said(scan)
     assert "exchanged" in said(scan)
 
 

@@ -23,7 +23,7 @@ def result(tmp_path: Path) -> Path:
 
 
 def test_a_result_is_not_replaced_unasked(result: Path, tmp_path: Path) -> None:
-    with pytest.raises(ResultError, match="lies here already"):
+    with pytest.raises(ResultError, match="already exists here"):
         make_room(result, overwrite=False)
     make_room(result, overwrite=True)
     make_room(tmp_path / "new", overwrite=False)

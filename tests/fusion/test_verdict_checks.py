@@ -106,7 +106,7 @@ FINDINGS: dict[str, tuple[dict[str, Any], str, str]] = {
     "contradictions by noise": ({"contradictions": everywhere(0.03, 0.026)}, "good", ""),
     "contradictions": ({"contradictions": everywhere(0.01)}, "usable", "the pairs contradict"),
     "JPEG": ({"contradictions": everywhere(0.01), "compressed": ("p1",)}, "usable", "causes: images w"),
-    "many contradictions": ({"contradictions": everywhere(0.03)}, "repeat", "contradict each other"),
+    "many contradictions": ({"contradictions": everywhere(0.03)}, "repeat", "disagree: at"),
     # A focal length wrong by 1 %, taken for a pole that moved, costs 16.6 mm of girth.
     "contradictions of an aligned pole": (
         {"contradictions": everywhere(0.009), "displaced": [step()]}, "repeat", "even with the"),
@@ -122,7 +122,7 @@ FINDINGS: dict[str, tuple[dict[str, Any], str, str]] = {
         {"common_error": CommonError((0.3, 0.0, 0.4), 0.02)}, "usable", "one cause, not poles"),
     "all pairs alike by much": (
         {"common_error": CommonError((0.0, 2.0, 0.0), 0.0)}, "repeat", "warm up and calibrate again"),
-    "times ten times too long": ({"time_factor": 0.1}, "usable", "frame times 0.1 times as long"),
+    "times ten times too long": ({"time_factor": 0.1}, "usable", "frame times 0.1 x those"),
     "nominal size": ({"nominal": NominalSize(0.98)}, "good", ""),
     "doubtful size": ({"nominal": NominalSize(1.04)}, "usable", "1.040 times as far apart"),
     "wrong size": ({"nominal": NominalSize(1.11)}, "repeat", "1.110 times as far apart"),
@@ -242,9 +242,9 @@ def coverage(filled: Mask, **pair: float) -> Coverage:
     ("given", "grade", "words"),
     [
         (coverage(FACE < 10), "good", ""),
-        (coverage(FACE < 20), "usable", "20% of the surface is filled"),
-        (coverage(FACE < 60), "repeat", "60% of the surface is filled"),
-        (coverage(FACE < 100), "repeat", "next to nothing was measured: 0.0 cm2 in all"),
+        (coverage(FACE < 20), "usable", "20% of the surface was not measured"),
+        (coverage(FACE < 60), "repeat", "60% of the surface was not measured"),
+        (coverage(FACE < 100), "repeat", "next to nothing was measured: 0.0 cm² in all"),
         (coverage((BANDS < 50.0) | (FACE < 2)), "good", ""),  # soles are never seen
         (coverage((FACE < 60) & (BANDS == 625.0)), "usable", "measured from 600 to 650 mm"),
         (coverage((FACE < 40) & (BANDS == 625.0)), "good", ""),

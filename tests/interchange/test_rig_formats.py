@@ -506,7 +506,7 @@ def test_a_size_may_be_given_by_two_nodes(tmp_path: Path) -> None:
     path.write_text(storage("yaml") + "w: 1280\nh: 720\nhalf: 0.5\n")
     apart = {what: name for what, name in NODES.items() if what != "size"}
     assert read_nodes(path, apart | {"width": "w", "height": "h"}).size == (1280, 720)
-    with pytest.raises(CalibrationFileError, match="w: is not the size of a picture"):
+    with pytest.raises(CalibrationFileError, match="w: is not the size of an image"):
         read_nodes(path, apart | {"width": "w", "height": "half"})
 
 

@@ -35,11 +35,11 @@ def test_a_sound_mesh_is_read_as_it_is(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("vertices", "faces", "said"),
     [
-        (VERTICES, FACES[:, ::-1], "all faces run inwards"),
-        (VERTICES + 1e4, FACES[:, ::-1], "all faces run inwards"),
-        (np.vstack([VERTICES, [[9e3, 0, 0], [0, 0, -9e3]]]), FACES, "2 vertices belong to no face"),
+        (VERTICES, FACES[:, ::-1], "faces pointed inwards"),
+        (VERTICES + 1e4, FACES[:, ::-1], "faces pointed inwards"),
+        (np.vstack([VERTICES, [[9e3, 0, 0], [0, 0, -9e3]]]), FACES, "2 unreferenced vertices"),
         (VERTICES, np.vstack([FACES, [[4, 4, 5]]]), f"twice (the first is {len(FACES)})"),
-        (VERTICES[FACES].reshape(-1, 3), np.arange(FACES.size).reshape(-1, 3)[:, ::-1], "joined"),
+        (VERTICES[FACES].reshape(-1, 3), np.arange(FACES.size).reshape(-1, 3)[:, ::-1], "merged"),
     ],
 )
 def test_what_can_mean_one_thing_is_mended_and_said(

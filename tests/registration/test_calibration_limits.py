@@ -23,7 +23,7 @@ def test_a_pair_at_its_limits_is_good_and_what_is_not_known_is_not_judged() -> N
     [
         ("corners_rms_px", 0.33, 1.1, "corner residuals are 0.33 px RMS (at most 0.3 is good)"),
         ("poses", 3, 2.0, "was calibrated from 3 board poses (at least 6 is good)"),
-        ("covered_percent", 16.0, 2.5, "boards covered 16 % of its picture (at least 40 is good)"),
+        ("covered_percent", 16.0, 2.5, "boards covered 16 % of its image (at least 40 is good)"),
         (
             "sheets_rms_mm",
             0.6,

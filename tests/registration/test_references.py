@@ -152,7 +152,7 @@ def test_references_count_by_their_sigmas_and_may_differ_by_four(
     )
     views = bar_views(np.random.default_rng(0), noise_px=1e-6)
     if refused:
-        with pytest.raises(FailedWork, match=r"contradict each other: bar: .*steel: "):
+        with pytest.raises(FailedWork, match=r"disagree: bar: .*steel: "):
             find_rig_size(small_rig(bar(), steel), placed(1.0), views)
         return
     size = find_rig_size(small_rig(bar(), steel), placed(1.0), views).value
@@ -208,7 +208,7 @@ def test_a_size_that_no_print_is_off_by_is_asked_about_and_a_tenth_off_refused(
         return
     found = find_rig_size(small_rig(bar()), placed(scale), views)
     assert found.value.factor == pytest.approx(1.0 / scale, abs=1e-3)
-    assert "size by references" in found.notes[-1]
+    assert "scale from references" in found.notes[-1]
     assert ("is square_mm right" in " ".join(found.notes)) == (judged == "asked about")
 
 

@@ -46,9 +46,9 @@ def messages(faults: Any) -> str:
         ({"beta": 27600.0}, "here.beta is not a focal length"),
         ({"beta": 1410.0}, "here has focal lengths too unlike (got 700, 1410)"),
         ({"gamma": -71.0}, "here.gamma is more skew than a sensor has (got -71)"),
-        ({"u0": -641.0}, "here.u0 lies far outside of the picture (got -641)"),
+        ({"u0": -641.0}, "here.u0 lies far outside of the image (got -641)"),
         ({"v0": 961.0}, "here.v0 lies far outside"),
-        ({"lens": Radial(-8.0, 0.0)}, "here has a lens that folds its picture over (got -8, 0)"),
+        ({"lens": Radial(-8.0, 0.0)}, "here has a lens that folds its image over (got -8, 0)"),
         ({"lens": Radial(np.nan, 0.0)}, "has a lens that folds"),
     ],
 )

@@ -110,7 +110,7 @@ def test_no_map_is_drawn_of_what_is_not_known() -> None:
         sigma_chart(calibration)
     assert "--sigma-px" in caught.value.remedy
     one = {"p1-1": placings["p1-1"]}
-    with pytest.raises(BadInput, match="a single pair defines the rig frame"):
+    with pytest.raises(BadInput, match="no pose uncertainty to map"):
         sigma_chart(calibrated(one, cameras, shifts(one, 0.0)))
 
 

@@ -81,7 +81,7 @@ def phase() -> Read:
 
 @pytest.mark.parametrize("bit", range(6))
 def test_a_missing_pattern_without_inverse_is_noticed(plain_gray: Read, bit: int) -> None:
-    with pytest.raises(DecodingFailed, match="do not make a stripe code") as caught:
+    with pytest.raises(DecodingFailed, match="do not form a valid code") as caught:
         plain_gray(replaced(bit, "dark"))
     assert caught.value.where == "pair a"
 

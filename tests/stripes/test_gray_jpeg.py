@@ -109,7 +109,7 @@ class Broken(NamedTuple):
 BROKEN = {
     "frames of two bits exchanged": Broken(
         (("00-07-00", "00-06-00"), ("00-07-01", "00-06-01")),
-        said="frames are exchanged",
+        said="swapped, missing or out of order",
     ),
     "pattern exchanged with another bit's": Broken(
         (("00-08-00", "00-05-00"),),

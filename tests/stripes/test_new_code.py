@@ -116,7 +116,7 @@ def test_a_name_that_is_taken_is_refused() -> None:
 
     with pytest.raises(ValueError, match="a stripe code 'gray' already"):
         codes.register(Another)
-    with pytest.raises(ValueError, match="kind 'pattern' are others already"):
+    with pytest.raises(ValueError, match="kind 'pattern' is already registered"):
         codes.register(Clash)
     assert Clash.kinds[0] not in codes.image_kinds()
     assert issubclass(Clash, StripeCode)

@@ -33,7 +33,7 @@ def exposed(lit: Bytes, dark: Bytes | int = 20, patterns: Sequence[Bytes] = ()) 
 def test_a_projector_that_lights_next_to_nothing_or_too_much_is_refused() -> None:
     lit = np.full((100, 100), 200)
     check_illumination(first_pixels(0.001), lit)
-    with pytest.raises(DecodingFailed, match=r"lights only 0\.09% of the picture"):
+    with pytest.raises(DecodingFailed, match=r"lights only 0\.09% of the image"):
         check_illumination(first_pixels(0.0009), lit)
     saturated = np.where(first_pixels(0.31), 255, 200)
     with pytest.raises(DecodingFailed, match="52% of the lit pixels are saturated"):
@@ -73,7 +73,7 @@ def test_stripes_that_change_more_often_from_line_to_line_run_the_other_way(
     numbers = np.minimum(x, 2) + 20 * np.minimum(x, 5)[:, None]
     check_direction(numbers - 20 * (x[:, None] >= 5), good, transposed)
     actual, given = ("vertical", "horizontal") if transposed else ("horizontal", "vertical")
-    with pytest.raises(WrongDirection, match=f"run {actual}ly in the picture, not {given}ly"):
+    with pytest.raises(WrongDirection, match=f"run {actual}ly in the image, not {given}ly"):
         check_direction(numbers, good, transposed)
     good[1::2] = False  # no two neighbouring lines are known
     check_direction(numbers, good, transposed)
@@ -123,7 +123,7 @@ def exchange(words: Indices, first: int, second: int) -> Indices:
 def test_exchanged_bits_are_refused_with_the_measured_disagreement(
     code: WordCode, inverses: bool, bits: tuple[int, int]
 ) -> None:
-    message = r"exchanged, lost or moved \(where bit \d changes, only \d+% of neighbouring pixels"
+    message = r"missing or out of order \(where bit \d changes, only \d+% of neighbouring pixels"
     with pytest.raises(DecodingFailed, match=message):
         check(exchange(encoded(UP, code), *bits), code, inverses=inverses)
 

@@ -109,7 +109,7 @@ def test_spheres_are_told_apart_whatever_their_order() -> None:
     ("squeeze", "apart", "said"),
     [
         (0.8, 1.0, "sphere 1 of radius 60 mm was not found: .* lies in a shell of"),
-        (1.0, 0.7, "distance of two candidates is 150 mm too small"),
+        (1.0, 0.7, "between two candidates is off by -150 mm"),
     ],
 )
 def test_what_is_no_sphere_or_stands_elsewhere_is_not_read(

@@ -85,7 +85,7 @@ def test_where_nothing_can_be_told_the_causes_are(workspace: Workspace, board_sh
     )
     assert isinstance(result.exception, BoardNotFound)
     assert "no board is seen by two calibrated pairs" in str(result.exception)
-    assert "the patterns do not make a stripe code" in str(result.exception)
+    assert "frames do not form a valid code" in str(result.exception)
 
 
 def test_a_scan_of_a_person_is_checked_too(workspace: Workspace) -> None:

@@ -69,7 +69,7 @@ class OpenCvCamera(Camera):
     def take(self, timeout_s: float) -> Picture:
         there, image = self._video.read()
         if not there:
-            raise FrameLost("no picture came", where=f"pair {self._pair}")
+            raise FrameLost("no frame received", where=f"pair {self._pair}")
         return Picture(image, self._triggered_ms, now_ms())
 
     def close(self) -> None:

@@ -35,7 +35,7 @@ class LineKind(ProjectorKind):
             raise BadInput(
                 f"the port {self.port} cannot be opened: {error.strerror}",
                 where=f"pair {place.pair.name}",
-                remedy="plug the adapter in; its user must be in the group `dialout` on Linux",
+                remedy="plug the adapter in; your user must be in the group `dialout` on Linux",
             ) from error
         return Line(self, handle)
 

@@ -198,8 +198,8 @@ def check_rings(scan: ScanEvidence) -> Iterator[Finding]:
         absent = ", ".join(sorted(scan.images.absent))
         yield Finding(
             "repeat",
-            f"no girth is measured all round at {share:.0%} of the heights: 15 % of it or more lies "
-            f"where {absent} look, which measured nothing",
+            f"at {share:.0%} of the heights 15 % or more of the girth is unmeasured, where {absent} "
+            "should have seen it",
             scan.images.absent,
         )
 
@@ -210,7 +210,7 @@ def check_gaps(scan: ScanEvidence) -> Iterator[Finding]:
     measured_mm2 = np.inf if coverage is None else coverage.areas_mm2[~coverage.filled].sum()
     if measured_mm2 < 2000.0:  # less than three fingers
         yield Finding(
-            "repeat", f"next to nothing was measured: {measured_mm2 / 100.0:.1f} cm2 in all"
+            "repeat", f"next to nothing was measured: {measured_mm2 / 100.0:.1f} cm² in all"
         )
     if scan.mesh and _sees_one_side(scan):
         yield Finding(
@@ -228,7 +228,7 @@ def check_gaps(scan: ScanEvidence) -> Iterator[Finding]:
     if coverage.filled_share > MAX_FILLED:
         yield Finding(
             "repeat" if coverage.filled_share > 0.5 else "usable",
-            f"{coverage.filled_share:.0%} of the surface is filled: nothing was measured there",
+            f"{coverage.filled_share:.0%} of the surface was not measured and is filled in",
             lost,
         )
     area = coverage.sum_bands(coverage.areas_mm2)

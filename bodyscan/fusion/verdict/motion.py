@@ -33,9 +33,9 @@ def check_displaced_poles(scan: ScanEvidence) -> Iterator[Finding]:
         if step.rotation_deg > 5.0 and step.shift_mm < 0.25 * lever_mm:
             yield Finding(
                 "repeat",
-                f"the person turned by {step.rotation_deg:.0f} degrees before or after {step.name} "
-                f"fired: a pole that turned as much would have displaced the body by {lever_mm:.0f} "
-                f"mm, not by {step.shift_mm:.0f} mm",
+                f"the person turned by {step.rotation_deg:.0f} degrees between captures (turning "
+                f"{step.name} by that much would have shifted the body by {lever_mm:.0f} mm, not "
+                f"{step.shift_mm:.0f})",
                 step.pairs,
                 step.pairs,
                 spoils=True,
@@ -86,8 +86,8 @@ def check_times(scan: ScanEvidence) -> Iterator[Finding]:
     if factor != 1.0 and scan.alignment:
         yield Finding(
             "usable",
-            f"the person's motion fits frame times {factor:g} times as long as `timing` states. They "
-            "were not used: correct the unit of `frame_ms` in captures.yaml, or of its file `times`",
+            f"the motion suggests frame times {factor:g} x those in `timing`; they were not changed. "
+            "Correct the unit of `frame_ms` in captures.yaml, or of its file `times`",
             explains=frozenset(scan.alignment.rig_from_camera),
         )
 
@@ -122,7 +122,7 @@ def check_motion(scan: ScanEvidence) -> Iterator[Finding]:
             yield Finding(
                 "repeat" if girth_mm > 3.0 * usable_mm else "usable",
                 f"the {part.name} moved by {part.moved_mm:.1f} mm during the scan, of which "
-                f"{part.left_mm:.1f} mm are left after correction: repeat if you need it better",
+                f"{part.left_mm:.1f} mm are left after correction: rescan if that is too much",
             )
     if scan.person or alignment is None or not alignment.motion_mm:
         return

@@ -195,7 +195,7 @@ def check_contradictions(scan: ScanEvidence) -> Iterator[Finding]:
     if scan.poses_corrected:
         yield Finding(
             "repeat",
-            f"the pairs contradict each other at {found.share:.1%} of their common points, even with "
+            f"the pairs disagree at {found.share:.1%} of their common points, even with "
             "the displaced poles aligned. Possible causes: a lens or a projector was touched; the "
             "calibration was edited",
         )
@@ -203,7 +203,7 @@ def check_contradictions(scan: ScanEvidence) -> Iterator[Finding]:
     outlier = found.find_outlier(report.groups) if report else ""
     yield Finding(
         "repeat" if found.beyond_noise > 0.02 else "usable",
-        f"{f'{outlier} and the others' if outlier else 'the pairs'} contradict each other: at "
+        f"{f'{outlier} and the others' if outlier else 'the pairs'} disagree: at "
         f"{found.share:.1%} of the pairs' common points one sees no surface where the other does. "
         f"Possible causes: {scan.images.compression}"
         + (

@@ -78,7 +78,7 @@ def check_exchanged(scan: ScanEvidence) -> Iterator[Finding]:
     if not taken:
         return
     swapped = sorted({tuple(sorted(two)) for two in taken.items() if taken[two[1]] == two[0]})
-    names = [f"{one} and {other} were exchanged" for one, other in swapped]
+    names = [f"{one} and {other} are swapped" for one, other in swapped]
     names += [f"{one} are those of {of}" for one, of in taken.items() if taken[of] != one]
     yield Finding(
         "repeat",
@@ -184,7 +184,7 @@ def check_calibration(scan: ScanEvidence) -> Iterator[Finding]:
         yield Finding(
             "usable",
             f"the calibration of {', '.join(scan.rig.unjudged)} was imported, and its accuracy is "
-            "unknown: sigmas include the decoding alone",
+            "unknown: sigmas cover decoding noise only",
         )
 
 
@@ -206,8 +206,8 @@ def check_stripe_directions(scan: ScanEvidence) -> Iterator[Finding]:
             yield Finding(
                 "usable",
                 f"pair {name}: depths from the two stripe directions differ by "
-                f"{agreement.description}. Its calibration is wrong by as much, which sigmas do "
-                "not include",
+                f"{agreement.description}. Its calibration is off by this much; sigmas do not "
+                "include it",
             )
 
 

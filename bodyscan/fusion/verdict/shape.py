@@ -87,7 +87,7 @@ def check_posture(scan: ScanEvidence) -> Iterator[Finding]:
         yield Finding(
             "usable",
             f"the body is {width:.0f} mm wide and {height:.0f} mm tall. Possible causes: the person "
-            "lies or bends. Girths are of level sections",
+            "lies or bends. Girths are horizontal sections",
         )
 
 

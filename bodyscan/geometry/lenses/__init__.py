@@ -24,4 +24,4 @@ def lens_from_opencv(coefficients: Array) -> Lens:
         lens = kind.from_opencv(coefficients)
         if lens is not None:
             return lens
-    raise ValueError(f"no lens here has all of the distortion coefficients {coefficients.tolist()}")
+    raise ValueError(f"no supported lens model has distortion coefficients {coefficients.tolist()}")

@@ -73,7 +73,7 @@ def read_kalibr(path: Path) -> FoundCameras:
     cameras = {key: entry for key, entry in chain.items() if isinstance(entry, dict)}
     if "cam0" not in cameras:
         remedy = "give camchain-....yaml, which kalibr_calibrate_cameras wrote"
-        raise file.error("is not a camchain of Kalibr's: it has no cam0", remedy=remedy)
+        raise file.error("not a Kalibr camchain: no cam0", remedy=remedy)
     readers = {}
     for number in range(len(cameras)):
         key = f"cam{number}"

@@ -34,7 +34,7 @@ def register(*codes: type[StripeCode]) -> None:
         known = {kind.name: kind for kind in image_kinds()}
         for kind in code.kinds:
             if known.get(kind.name, kind) != kind:
-                raise ValueError(f"images of kind {kind.name!r} are others already")
+                raise ValueError(f"image kind {kind.name!r} is already registered differently")
         _CODES[name] = code
 
 

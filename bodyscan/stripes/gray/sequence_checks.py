@@ -76,7 +76,7 @@ def check_words(
         )
     if fault:
         raise DecodingFailed(
-            f"the patterns do not make a stripe code: frames are exchanged, lost or moved ({fault})",
+            f"frames do not form a valid code: swapped, missing or out of order ({fault})",
             remedy="check that frames are in their order, that none is missing or taken twice, that "
             "pattern and inverse lists are not exchanged, and that `stripes` and `first_code` are "
             "right; if the stripes are finer than camera or projector can show, project half as many",
@@ -113,7 +113,7 @@ def _find_fault(
         for bit in range(1, bits):
             first, second = images.patterns[bit - 1 : bit + 1, ::step, ::step].astype(np.float32)
             if np.mean(np.abs(first - second)) < 0.05 * light:  # others differ by half
-                return f"the patterns of bits {bit - 1} and {bit} are the same picture"
+                return f"the patterns of bits {bit - 1} and {bit} are the same image"
         return (
             f"where bit {worst} changes, only {shares[worst]:.0%} of neighbouring pixels are in "
             "neighbouring stripes"
