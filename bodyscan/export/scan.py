@@ -22,8 +22,8 @@ from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.measurement.landmarks import find_landmarks
 from bodyscan.measurement.sections import BodySections
 from bodyscan.mesh.body import BodyMesh
-from bodyscan.mesh.body_parts import find_body_frame
 from bodyscan.mesh.repair import decimate
+from bodyscan.mesh.sliced_parts import find_body_frame
 from bodyscan.settings import ExportSettings
 
 VERSIONS: dict[str, tuple[str, Callable[[BodyMesh], BodyMesh]]] = {

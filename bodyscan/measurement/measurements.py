@@ -24,7 +24,7 @@ from bodyscan.mesh.body import (
     compute_region_shares,
     select_regions,
 )
-from bodyscan.mesh.body_parts import Piece, find_body_frame, find_parts
+from bodyscan.mesh.sliced_parts import Piece, find_body_frame, find_parts
 from bodyscan.mesh.slices import MeshSlicer
 from bodyscan.mesh.topology import face_areas, signed_volume
 

@@ -18,8 +18,8 @@ from scipy.spatial import cKDTree
 from bodyscan.arrays import Array, Bytes, Floats
 from bodyscan.files.atomic import write_bytes
 from bodyscan.mesh.body import BodyCloud, BodyMesh
-from bodyscan.mesh.body_parts import find_body_frame
 from bodyscan.mesh.depth_buffer import nearest_faces, nearest_points
+from bodyscan.mesh.sliced_parts import find_body_frame
 from bodyscan.optional import optional
 from bodyscan.outcome import Outcome
 

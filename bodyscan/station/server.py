@@ -26,7 +26,7 @@ from bodyscan.station.day import Day, Row, table_csv
 from bodyscan.station.feed import Feed
 from bodyscan.station.guard import Guard, TooLarge
 from bodyscan.station.operation import Operation
-from bodyscan.station.rig_drift import describe_rig, find_series
+from bodyscan.station.rig_history import describe_rig, find_series
 
 KINDS = {
     "html": "text/html",

@@ -13,7 +13,7 @@ from bodyscan.alignment.sway_prior import centre_sigmas
 from bodyscan.arrays import Array, Mask
 from bodyscan.fusion.consistency import Contradictions
 from bodyscan.mesh.body import BodyCloud, BodyMesh
-from bodyscan.mesh.body_parts import BodyParts, find_body_frame, find_parts
+from bodyscan.mesh.sliced_parts import BodyParts, find_body_frame, find_parts
 from bodyscan.mesh.slices import MeshSlicer
 from bodyscan.motion.person_alignment import PersonAlignment
 from bodyscan.motion.person_motion import PersonMotion

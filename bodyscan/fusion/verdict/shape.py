@@ -9,7 +9,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from bodyscan.fusion.verdict.evidence import Finding, ScanEvidence
-from bodyscan.mesh.body_parts import ARMPIT
+from bodyscan.mesh.sliced_parts import ARMPIT
 
 SECOND_BODY = 0.4
 """of the first one's height: as tall, it is a body and not a thing beside one."""
