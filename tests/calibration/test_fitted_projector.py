@@ -71,7 +71,7 @@ def test_light_that_held_out_boards_found_to_be_no_projector_with_a_lens_is_refu
     columns = sheets(projector("none"), "vertical")
     planes = LightPlanes.from_planes(columns.tangent_planes(np.arange(1281.0)), "vertical")
     for light, crossing in ((planes, None), (columns, BowedSheets.from_pinhole(columns, 1))):
-        with pytest.raises(BadInput, match="not those of a projector with a lens"):
+        with pytest.raises(BadInput, match="only the lens model can be written"):
             fit_projector(CAMERA, light, crossing)
 
 

@@ -104,7 +104,7 @@ FINDINGS: dict[str, tuple[dict[str, Any], str, str]] = {
         {"seams": SeamReport((), {}, (("p3-1", "p3-2"),))}, "usable", "p3-1, p3-2 shares no surface"),
     "noise": ({"alignment": alignment(0.1, 0.45)}, "usable", "disagree by 0.45 mm RMS"),
     "contradictions by noise": ({"contradictions": everywhere(0.03, 0.026)}, "good", ""),
-    "contradictions": ({"contradictions": everywhere(0.01)}, "usable", "the pairs contradict"),
+    "contradictions": ({"contradictions": everywhere(0.01)}, "usable", "the pairs disagree"),
     "JPEG": ({"contradictions": everywhere(0.01), "compressed": ("p1",)}, "usable", "causes: images w"),
     "many contradictions": ({"contradictions": everywhere(0.03)}, "repeat", "disagree: at"),
     # A focal length wrong by 1 %, taken for a pole that moved, costs 16.6 mm of girth.
