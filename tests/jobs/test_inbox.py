@@ -115,9 +115,10 @@ def test_a_retake_waits_until_every_image_is_new(rig: Rig, tmp_path: Path) -> No
     assert since > 0
     assert find_earlier(tmp_path / "anna", state) is None
     scan = IncomingScan(tmp_path / "anna", rig, since)
-    assert scan.look(0.0, QUIET_S) == Arrival(("a",), False)
+    images = dict.fromkeys("ab", (len(frames(rig)), len(frames(rig))))  # old and new
+    assert scan.look(0.0, QUIET_S) == Arrival(("a",), False, images)
     put_image(tmp_path, rig, "anna", "b", last, IMAGE)
-    assert scan.look(0.1, QUIET_S) == Arrival(("a", "b"), True)
+    assert scan.look(0.1, QUIET_S) == Arrival(("a", "b"), True, images)
 
 
 def test_a_result_that_is_gone_or_was_changed_is_made_again(tmp_path: Path) -> None:
