@@ -31,6 +31,7 @@ from benchmarks import (
     independent_people,
     lens,
     mutants,
+    named_measures,
     people,
     png,
     procam,
@@ -52,6 +53,7 @@ BENCHMARKS: dict[str, Callable[[], str]] = {
     "living": full_size.living,
     "skin": skin.report,
     "people": people.report,
+    "named-measures": named_measures.report,
     "sigmas": sigmas.report,
     "sigmas-rigs": rig_sigmas.known,
     "sigmas-fresh": rig_sigmas.fresh,
@@ -69,7 +71,7 @@ BENCHMARKS: dict[str, Callable[[], str]] = {
     "lens": lens.report,
     "mutants": mutants.report,
 }
-SLOW = ("mutants", "day", "sigmas-rigs", "sigmas-fresh")
+SLOW = ("mutants", "named-measures", "day", "sigmas-rigs", "sigmas-fresh")
 """Run only when named."""
 
 

@@ -61,6 +61,8 @@ class FittedBody:
     shape: (K,) of the template, and posed: its body in that shape and pose, before the residual.
     distance_mm: (V,), from each vertex to the surface along its normal; NaN where nothing was measured.
     rms_mm: of the distances of shape and pose alone: what the basis could not make.
+    agreement: share of the template that lies on the surface, and of the surface that lies on the
+        template, the mean of the two.
     """
 
     template: BodyTemplate
@@ -69,6 +71,7 @@ class FittedBody:
     posed: PosedBody
     distance_mm: Array
     rms_mm: float
+    agreement: float = 1.0
 
     @property
     def rest_joints(self) -> Array:
@@ -125,7 +128,10 @@ def fit_body(template: BodyTemplate, surface: Surface) -> FittedBody:
     vertices = _fit_residual(template, surface, tree, posed.vertices)
     distance = _measure_distance(template, surface, tree, vertices)
     rms_mm = rms(missed) if missed.size else float("nan")
-    return FittedBody(template, vertices, body.shape, posed, distance, rms_mm)
+    normals = _compute_normals(template, vertices)
+    back = _match_back(template, surface, vertices, normals, 10.0).weights > 0.0
+    agreement = 0.5 * float(np.isfinite(distance[~template.hidden]).mean() + back.mean())
+    return FittedBody(template, vertices, body.shape, posed, distance, rms_mm, agreement)
 
 
 def _measure_distance(

@@ -29,6 +29,9 @@ from bodyscan.mesh.topology import vertex_normals
 
 SAMPLES = 80_000
 """Points of the mesh that the template is fitted to: one in 5 mm."""
+MIN_AGREEMENT = 0.85
+"""Of template and scan. A heavy man with hair and shorts is fitted at 0.87, 36 random bodies at 0.94
+and above; four fitted facing aside, or with arms beside theirs, agreed to 0.82 and less."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +91,8 @@ def vote_on_faces(corners: Bytes) -> Bytes:
 def register_body(mesh: BodyMesh) -> RegisteredBody:
     """Lay the template over a scanned body that stands, at mean breath if that is known.
 
-    Raises BadInput if it does not fit: nobody stands there, or too little was seen of them.
+    Raises BadInput if it does not fit: nobody stands there, or too little was seen of them. Without
+    feet it is refused before it is fitted, since a fit may face backwards then.
     """
     breath, mesh = mesh.breath, mesh.at_mean_breath()
     stature = float(mesh.vertices[:, 2].max())
@@ -96,19 +100,33 @@ def register_body(mesh: BodyMesh) -> RegisteredBody:
     if not 600.0 < stature < 2500.0:  # of anybody who can stand
         what = f"no standing body: the scan's highest point is {stature:.0f} mm above the floor"
         raise BadInput(what, remedy=remedy)
-    rig_from_body = find_body_frame(mesh.vertices).rig_from_body
-    template = load_template()
-    fitted = fit_body(template, _sample(mesh, rig_from_body.inverse()))
-    known = np.isfinite(fitted.distance_mm[~template.hidden])
-    if known.mean() < 0.65 or not fitted.rms_mm < 2.0 * BASIS_MM:
+    frame = find_body_frame(mesh.vertices)
+    if not frame.known:
+        what = "no standing body: no feet show which way it faces"
+        raise BadInput(what, remedy=remedy)
+    rig_from_body, fitted = _fit_facing(mesh, frame.rig_from_body)
+    if fitted.agreement < MIN_AGREEMENT or not fitted.rms_mm < 2.0 * BASIS_MM:
         raise BadInput(
-            f"no standing body fits the scan: {100.0 * known.mean():.0f} % of one lies on its surface,"
+            f"no standing body fits the scan: {100.0 * fitted.agreement:.0f} % of both agree,"
             f" {fitted.rms_mm:.0f} mm off in shape",
             remedy=remedy,
         )
     turn = _find_facing(fitted)
     sigma = np.zeros(len(mesh.vertices)) if breath is None else breath.sigma_mm.astype(np.float64)
     return RegisteredBody(mesh, rig_from_body @ turn, fitted.transform(turn.inverse()), sigma)
+
+
+def _fit_facing(mesh: BodyMesh, rig_from_body: RigidTransform) -> tuple[RigidTransform, FittedBody]:
+    """Fit the template as the feet face; if it does not agree, also facing the other ways."""
+    tried = []
+    for degrees in (0.0, 90.0, -90.0, 180.0):
+        turn = RigidTransform.from_rotation_vector([0.0, 0.0, np.radians(degrees)], np.zeros(3))
+        frame = rig_from_body @ turn
+        tried.append((frame, fit_body(load_template(), _sample(mesh, frame.inverse()))))
+        # One that faced backwards agreed to 0.91; bare bodies agree to 0.94 and more.
+        if tried[-1][1].agreement >= 0.93:
+            break
+    return max(tried, key=lambda one: one[1].agreement)
 
 
 def _find_facing(fitted: FittedBody) -> RigidTransform:

@@ -20,7 +20,6 @@ from bodyscan.files.model import did_you_mean
 from bodyscan.fusion.storage import StoredScan
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.measurement.landmarks import find_landmarks
-from bodyscan.measurement.sections import BodySections
 from bodyscan.mesh.body import BodyMesh
 from bodyscan.mesh.repair import decimate
 from bodyscan.mesh.sliced_parts import find_body_frame
@@ -90,7 +89,7 @@ def export_scan(
 def _register(mesh: BodyMesh, rig_from_frame: RigidTransform | None) -> SkinnedBody:
     """Lay the parametric body over a scan's mesh, with its landmarks."""
     registered = register_body(mesh)
-    landmarks = find_landmarks(BodySections(registered)).values()
+    landmarks = find_landmarks(registered).values()
     carried = [(one.name, np.array(one.position_mm), one.sigma_mm, one.found) for one in landmarks]
     frame = RigidTransform.identity() if rig_from_frame is None else rig_from_frame.inverse()
     return make_skinned(registered, carried, frame)

@@ -21,7 +21,6 @@ JOB, STATE, LOG, LOCK, MANIFEST = "job.json", "state.json", "log.txt", "lock", "
 KEPT = "kept-"  # begins the name of a folder with what people added to a result that is gone
 STAGE = "stage.json"  # in every stage's folder: what it was made from, and its hashes
 SUMMARY, MEASURES, BATCH_LOCK = "summary.csv", "measures.csv", "batch.lock"
-MEASURES_FILE = f"measures/{MEASURES}"  # a job's, from its folder
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,6 @@ from bodyscan.jobs.job import (
     LOCK,
     MANIFEST,
     MEASURES,
-    MEASURES_FILE,
     STAGE,
     SUMMARY,
     Job,
@@ -129,7 +128,12 @@ def fetch_figures(jobs: Sequence[Job], store: Store) -> None:
     for job in jobs:
         with _answering(store.job(job.name)):
             files = _open(store.job(job.name))
-            for name in ("scan/scan.json", MEASURES_FILE, "calibration/calibration.json", MANIFEST):
+            for name in (
+                "scan/scan.json",
+                f"measures/{MEASURES}",
+                "calibration/calibration.json",
+                MANIFEST,
+            ):
                 _fetch_one(files, name, job.folder / name)
 
 

@@ -15,7 +15,7 @@ from bodyscan.alignment.displaced_poles import PairDrift, estimate_drift
 from bodyscan.arrays import Array
 from bodyscan.files.atomic import write_json, write_text
 from bodyscan.files.hashing import file_hash
-from bodyscan.jobs.job import MANIFEST, MEASURES, MEASURES_FILE, SUMMARY, Job, read_record
+from bodyscan.jobs.job import MANIFEST, MEASURES, SUMMARY, Job, read_record
 from bodyscan.jobs.supervision import JobResult
 from bodyscan.settings import BODY_CENTRE_MM
 
@@ -60,7 +60,9 @@ def write_day_measures(jobs: Sequence[Job], out: Path) -> Path | None:
     text, table = io.StringIO(), None
     for job in jobs:
         try:
-            rows = csv.DictReader(io.StringIO((job.folder / MEASURES_FILE).read_text("utf-8")))
+            rows = csv.DictReader(
+                io.StringIO((job.folder / "measures" / MEASURES).read_text("utf-8"))
+            )
         except OSError:
             continue
         if table is None:

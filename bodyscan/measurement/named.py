@@ -139,7 +139,7 @@ def measure_by_name(mesh: BodyMesh) -> NamedMeasures:
 def take_measures(registered: RegisteredBody) -> NamedMeasures:
     """Take every named measure of a mesh over which a template lies."""
     sections = BodySections(registered)
-    landmarks = find_landmarks(sections)
+    landmarks = find_landmarks(registered)
     to_body = registered.rig_from_body.inverse()
     places = {name: to_body.apply(np.array(one.position_mm)) for name, one in landmarks.items()}
     body = _Body(sections, places, {name: one.sigma_mm for name, one in landmarks.items()})

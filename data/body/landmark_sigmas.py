@@ -16,14 +16,13 @@ from random_bodies import TEMPLATE, Array, lay_truth, make_bodies, scan_body
 
 from bodyscan.body_model.registered import RegisteredBody, register_body
 from bodyscan.measurement.landmarks import find_landmarks
-from bodyscan.measurement.sections import BodySections
 
 SEEDS = range(100, 120)
 
 
 def locate(body: RegisteredBody) -> Array:
     """Positions (L, 3) of all landmarks, in the template's order."""
-    found = find_landmarks(BodySections(body))
+    found = find_landmarks(body)
     return np.array([found[name].position_mm for name in TEMPLATE.landmarks])
 
 

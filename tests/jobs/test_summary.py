@@ -13,8 +13,15 @@ from cheap_batch import jobs_of
 
 from bodyscan.arrays import Array
 from bodyscan.jobs.job import Job
-from bodyscan.jobs.summary import find_drift, scans_to_repeat, write_summary
+from bodyscan.jobs.summary import (
+    find_drift,
+    scans_to_repeat,
+    write_day_measures,
+    write_summary,
+)
 from bodyscan.jobs.supervision import JobResult
+from bodyscan.measurement.named import read_definitions
+from bodyscan.report.measurement_table import named_csv
 from bodyscan.settings import BODY_CENTRE_MM
 
 NAMES = [f"s{number}" for number in range(9)]
@@ -73,6 +80,15 @@ def test_a_scan_has_a_row_of_figures(day: tuple[list[Job], Path]) -> None:
     assert table[0]["pairs_measured"] == "1"
     assert table[3]["verdict_reasons"] == "moved, a lot"
     assert scans_to_repeat(jobs) == ["s3"]
+    for job in jobs[:2]:
+        (job.folder / "measures").mkdir()
+        text = named_csv("nobody stands there", {"subject": None})
+        (job.folder / "measures" / "measures.csv").write_text(text, "utf-8")
+    write_day_measures(jobs, out)
+    measures = list(csv.DictReader((out / "measures.csv").open(newline="", encoding="utf-8")))
+    assert len(measures) == 2 * len(read_definitions())
+    assert {row["subject"] for row in measures} == {job.subject for job in jobs[:2]}
+    assert {(row["value"], row["reason"]) for row in measures} == {("", "nobody stands there")}
 
 
 def test_a_pair_that_all_scans_move_alike_is_told_from_one_that_sways(

@@ -22,8 +22,7 @@ def make_body(
 ) -> tuple[Array, Array, PosedBody]:
     """Vertices (V, 3), shape (K,) and posed body of somebody in a scanning pose.
 
-    arms_deg: how much farther off the trunk than 15 degrees below the template's the arms are.
-    bumps_mm: RMS of what no shape of the template's can make.
+    arms_deg: off the trunk beyond 15 below the template's; bumps_mm: RMS of what is no shape of its.
     """
     rng = np.random.default_rng(seed)
     rotations = rng.normal(0.0, np.radians(3.0), TEMPLATE.joints.shape)

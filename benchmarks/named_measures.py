@@ -1,0 +1,114 @@
+"""Landmarks and measures by name on random bodies, against the same definitions on the true surface.
+
+Needs `anny` and torch, as data/body/README.md says:
+
+    PYTHONPATH=/tmp/anny/lib/python3.11/site-packages python -m benchmarks named-measures
+
+Half of the bodies have surface that the template's shapes cannot make; other seeds than those that
+the landmarks' sigmas were measured on. Synthetic agreement: the shapes are of the same population.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+
+from bodyscan.body_model.registered import register_body
+from bodyscan.errors import BadInput
+from bodyscan.measurement.named import Measure, NamedMeasures, take_measures
+
+SEEDS = range(200, 240)
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """One body's measures, found and true, and what they took; found is None if it was refused."""
+
+    outside: bool
+    found: NamedMeasures | None
+    true: NamedMeasures | None
+    cpu_s: float
+
+
+def report(seeds: Sequence[int] = SEEDS) -> str:
+    """The section of docs/results.md."""
+    sys.path.insert(0, str(Path(__file__).parents[1] / "data" / "body"))
+    bodies = import_module("random_bodies")
+    trials = []
+    for body in bodies.make_bodies(seeds):
+        mesh, start = bodies.scan_body(body), time.process_time()
+        try:
+            registered = register_body(mesh)
+        except BadInput:
+            trials.append(Trial(body.outside, None, None, 0.0))
+            continue
+        found, seconds = take_measures(registered), time.process_time() - start
+        true = take_measures(bodies.lay_truth(body, registered))
+        trials.append(Trial(body.outside, found, true, seconds))
+    return write_section(trials)
+
+
+def write_section(trials: Sequence[Trial]) -> str:
+    """A table of both halves of the bodies."""
+    rows = [
+        "## Measures by name on random bodies (synthetic agreement)",
+        "",
+        f"{len(trials)} bodies of MakeHuman's shapes in random poses, seen by three poles (`benchmarks/"
+        "named_measures.py`): against the same definitions on the true surface, mm.",
+        "",
+        "| bodies | landmarks: median, 95 % | girths: mean, 95 % | heights and lengths: mean, 95 % "
+        "| intervals that hold | bust, waist, hip a number | refused | CPU s |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for name, outside in (("within the shapes", False), ("outside of them", True)):
+        rows.append(f"| {name} | {_summarize([t for t in trials if t.outside == outside])} |")
+    return "\n".join(rows) + "\n"
+
+
+def _summarize(trials: Sequence[Trial]) -> str:
+    pairs = [(t.found, t.true) for t in trials if t.found is not None and t.true is not None]
+    off = np.concatenate([_landmark_errors(found, true) for found, true in pairs])
+    girths = np.concatenate([_errors(a.measures, b.measures, True) for a, b in pairs])
+    lengths = np.concatenate([_errors(a.measures, b.measures, False) for a, b in pairs])
+    held = [
+        one.interval_mm[0] <= true.measures[name].mm <= one.interval_mm[1]
+        for found, true in pairs
+        for name, one in found.measures.items()
+        if name in true.measures
+    ]
+    names = ("bust girth", "waist girth", "hip girth")
+    sure = sum(all(not found.measures[name].is_range for name in names) for found, _ in pairs)
+    seconds = np.median([t.cpu_s for t in trials if t.found is not None])
+    return " | ".join((
+        f"{np.median(off):.1f}, {np.quantile(off, 0.95):.1f}",
+        f"{girths.mean():.1f}, {np.quantile(girths, 0.95):.1f}",
+        f"{lengths.mean():.1f}, {np.quantile(lengths, 0.95):.1f}",
+        f"{100.0 * np.mean(held):.0f} %",
+        f"{sure} of {len(trials)}",
+        str(len(trials) - len(pairs)),
+        f"{seconds:.0f}",
+    ))  # fmt: skip
+
+
+def _landmark_errors(found: NamedMeasures, true: NamedMeasures) -> np.ndarray:
+    """Distances (L,) mm of landmarks from the true ones."""
+    a, b = (
+        np.array([one.position_mm for _, one in sorted(named.landmarks.items())])
+        for named in (found, true)
+    )
+    return np.asarray(np.linalg.norm(a - b, axis=1))
+
+
+def _errors(found: Mapping[str, Measure], true: Mapping[str, Measure], girths: bool) -> np.ndarray:
+    """Absolute errors (M,) mm of the girths, or of all others, that both have."""
+    return np.array([
+        abs(one.mm - true[name].mm)
+        for name, one in found.items()
+        if name in true and (one.kind == "girth") == girths
+    ])  # fmt: skip
