@@ -10,6 +10,7 @@ import pytest
 
 from bodyscan.errors import BadInput
 from bodyscan.files.atomic import write_json
+from bodyscan.jobs.stages import KINDS
 from bodyscan.jobs.supervision import JobResult
 from bodyscan.jobs.watching import (
     STABLE_S,
@@ -124,7 +125,7 @@ def test_a_retake_waits_until_every_image_is_new(rig: Rig, tmp_path: Path) -> No
 def test_a_result_that_is_gone_or_was_changed_is_made_again(tmp_path: Path) -> None:
     source, job = tmp_path / "anna", tmp_path / "out" / "anna"
     source.mkdir()
-    for stage in ("scan", "export", "report"):
+    for stage in (each.name for each in KINDS["fuse"]):
         write_json(job / stage / "stage.json", {"outputs": {"a.ply": "sha"}})
         (job / stage / "a.ply").write_text("x")
     (job / "scan" / "measurements.json").write_text("{}")  # a person's
