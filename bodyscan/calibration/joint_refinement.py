@@ -207,7 +207,7 @@ def refine_jointly(
         tolerance=1e-2,  # within a tenth of a sigma in every unknown
         damping=1e-6,
     )
-    state, covariance = solution.state, solution.covariance
+    state, covariance = solution.state, solution.covariance_by_freedoms
     camera_columns = state.columns[0]
     corners = np.concatenate([_corner_residuals(state, k, one) for k, one in enumerate(boards)])
     return JointFit(

@@ -69,7 +69,7 @@ class BodyMotion:
         breaths = Breaths.from_modes(kinds[-1].modes, seconds, middle_s)
         return BodyMotion(kinds, fields, vector, matrix, vector, matrix, np.ones(count), breaths)
 
-    def with_times(self, seconds: Sequence[float], middle_s: float) -> BodyMotion:
+    def with_times(self, seconds: Sequence[float | None], middle_s: float) -> BodyMotion:
         """At rest at other times, without the motion of parts.
 
         seconds: each pair's moment.

@@ -92,11 +92,15 @@ def estimate_breath(
     middle: the modes in the middle of the scan, (J,).
 
     How large a breath is shows in the common fields; what varies from place to place, and what is not
-    periodic, has its typical size.
+    periodic, has its typical size. If no moment is known all is irregular, and as large as it shows.
     """
     system = system * 0.3  # neighbouring cells share errors of calibrations: three count as one
     modes, fields = len(middle), system.size // len(middle)
     variances, typical = SIZES_MM**2, float(np.mean(SIZES_MM**2))
+    if not breaths.waves.any():
+        log_evidence = system.log_evidence(variances)
+        likely = np.exp(log_evidence - log_evidence.max())
+        typical = float(likely @ variances / likely.sum())
     waves = breaths.waves
     any_wave = np.einsum("k,kai,kbi->ab", breaths.priors, waves, waves)
     local = np.arange(fields)[:, None, None] >= COMMON

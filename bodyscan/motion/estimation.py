@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from types import MappingProxyType
 from typing import TypeVar
 
 import numpy as np
@@ -137,11 +138,13 @@ def estimate_motion(
     aligned: Alignment,
     prior: PoseCovariance,
     settings: AlignmentSettings,
+    poles: Mapping[str, str] = MappingProxyType({}),
 ) -> tuple[Alignment, EstimatedMotion | None, PoseEvidence | None]:
     """Estimate the motion of a person, and the poses of the pairs, from all overlaps.
 
     images, rig_from_camera, prior, settings: as given to `align`.
     aligned: its result.
+    poles: the pole of each pair that is mounted on one.
 
     Returns the alignment with sway as a function of time; the non-rigid motion, None (and the
     alignment unchanged) for a person who stood still or if too little overlaps; and the evidence on
@@ -159,10 +162,8 @@ def estimate_motion(
     observed = np.array(
         [np.bincount(view.cell, minlength=len(cells.centres)) > 0 for view in views]
     )
-    sway = np.repeat([np.radians(settings.sway_deg), settings.sway_mm], 3)
-    boards = SwayPrior(0.0, 0.0, 0.0, 0.0).covariance(names, prior)
-    middle_s = 1e-3 * (_middle_of_scan(images) or 0.0)
-    at_rest = BodyMotion.at_rest(cells, seconds, middle_s, boards, sway)
+    sides = [poles.get(name, name) for name in names]
+    at_rest = _begin(images, (views, cells), prior, sides, settings)
     solution = _solve(views, (at_rest, cells), observed, settings)
     if solution is None:
         return aligned, None, None
@@ -185,7 +186,11 @@ def estimate_motion(
     found = _describe_motion(images, motion, cells, observed)
     if still or not found.significant:
         return aligned, None, evidence
-    return moved, replace(found, times=solution.fit_times(seconds, middle_s)), evidence
+    return (
+        moved,
+        replace(found, times=solution.fit_times(seconds, 1e-3 * (_middle_of_scan(images) or 0.0))),
+        evidence,
+    )
 
 
 def _describe_motion(
@@ -256,6 +261,67 @@ class _Solution:
         fits = [TimeFit(f, e - stated) for f, e in zip(factors[1:], others, strict=True)]
         best = max(fits, key=lambda one: one.log_ratio)
         return best if best.log_ratio > MIN_LOG_RATIO else TimeFit()
+
+
+def _begin(
+    images: Sequence[RangeImage],
+    person: tuple[Sequence[_View], BodyCells],
+    prior: PoseCovariance,
+    sides: Sequence[str],
+    settings: AlignmentSettings,
+) -> BodyMotion:
+    """The person at rest, seen at the moments stated, or if none is in an order that shows.
+
+    sides: the poles of the pairs.
+    """
+    views, cells = person
+    sway = np.repeat([np.radians(settings.sway_deg), settings.sway_mm], 3)
+    boards = SwayPrior(0.0, 0.0, 0.0, 0.0).covariance([image.pair for image in images], prior)
+    seconds = [None if image.time_ms is None else 1e-3 * image.time_ms for image in images]
+    middle_s = 1e-3 * (_middle_of_scan(images) or 0.0)
+    at_rest = BodyMotion.at_rest(cells, seconds, middle_s, boards, sway)
+    if any(second is not None for second in seconds):
+        return at_rest
+    ordered = _find_order(views, (at_rest, cells), _candidate_orders(sides), settings)
+    if ordered is None:
+        return at_rest
+    return BodyMotion.at_rest(cells, ordered, 0.5 * max(ordered), boards, sway)
+
+
+def _candidate_orders(sides: Sequence[str]) -> list[list[float]]:
+    """Moments, s, at which pairs on these poles may have fired: one after another as the rig lists
+    them, or so on each pole, all poles at once; 0.1 or 0.2 s apart."""
+    numbers = list(range(len(sides))), [sides[:k].count(side) for k, side in enumerate(sides)]
+    return [[step * k for k in number] for number in numbers for step in (0.1, 0.2)]
+
+
+def _find_order(
+    views: Sequence[_View],
+    person: tuple[BodyMotion, BodyCells],
+    orders: Sequence[Sequence[float]],
+    settings: AlignmentSettings,
+) -> Sequence[float] | None:
+    """The moments that explain the motion best; None if none does beyond doubt.
+
+    A posture hardly changes from a moment to the next, in the right order alone: of a man whose pairs
+    fired in turn the log evidence rose by 160, in other orders it fell by thousands.
+    """
+    motion, cells = person
+    linearize = partial(
+        CellEquations.from_matches, centres=cells.centres, correlated=settings.correlated
+    )
+    coarse = [view.select(COARSE) for view in views]
+    equations = _map_matches(linearize, coarse, person, settings.reach_mm, settings)
+    if not equations:
+        return None
+    persons = [motion.with_times([None] * len(views), 0.0)]
+    persons += [motion.with_times(order, 0.5 * max(order)) for order in orders]
+    fields = motion.find_fields([kind.name for kind in persons[0].kinds])
+    projected = motion.project(_combine_directions(equations))
+    chosen = {both: system.select(fields) for both, system in projected.items()}
+    unknown, *found = (person.solve_projected(chosen).log_evidence for person in persons)
+    best = int(np.argmax(found))
+    return orders[best] if found[best] > unknown + MIN_LOG_RATIO else None
 
 
 def _solve(

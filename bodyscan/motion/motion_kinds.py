@@ -95,7 +95,7 @@ def build_kinds(
 
 
 def retime_kinds(
-    kinds: Sequence[MotionKind], seconds: Sequence[float], middle_s: float
+    kinds: Sequence[MotionKind], seconds: Sequence[float | None], middle_s: float
 ) -> tuple[MotionKind, ...]:
     """All kinds but `parts` with the modes of other moments, the breath of unit variance.
 

@@ -73,7 +73,7 @@ def align_person(
     while True:
         search = _search(images, rig_from_camera, aligned, poles, displaced)
         alignment, motion, evidence = estimate_motion(
-            images, rig_from_camera, aligned, boards, settings
+            images, rig_from_camera, aligned, boards, settings, poles
         )
         found: DisplacedPole | ScaleError | CommonError | None = None
         if motion is None or evidence is None:

@@ -64,8 +64,8 @@ class PersonMotion:
             return ""
         remaining = np.sqrt(np.mean([part.left_mm**2 for part in self.parts]))
         missing = (
-            "`timing` is missing in captures.yaml: with it moving arms are measured to two thirds of "
-            "the error, and the breath can be told; "
+            "`timing` is missing in captures.yaml: with it the breath can be told, and moving arms are "
+            "measured better if pairs fire in no usual order; "
         )
         summary = (
             f"{missing if self.moment_ms is None else ''}"
