@@ -8,12 +8,7 @@ import pytest
 from bodyscan.arrays import Array, Indices
 from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
 from bodyscan.motion.breath import SIZES_MM, estimate_breath
-from bodyscan.motion.temporal_modes import (
-    IRREGULAR,
-    Breaths,
-    TemporalModes,
-    breath_correlation,
-)
+from bodyscan.motion.temporal_modes import IRREGULAR, Breaths, TemporalModes, breath_correlation
 
 SECONDS = np.linspace(0.1, 2.9, 16)
 MIDDLE_S = 1.5
@@ -91,7 +86,6 @@ def test_of_a_short_scan_a_breath_is_known_as_well_as_is_said(span_s: float) -> 
 def test_a_breath_is_as_deep_as_it_shows(deep_mm: float) -> None:
     system, _ = seen(3.6, deep_mm, np.arange(16))
     alike = estimate_breath(system, BREATHS, COURSES.middle).mode_covariance
-    # Sizes are tried in steps of 1.4; three fields tell it to a half.
     mean = COURSES.values @ alike @ COURSES.values.T
     assert np.sqrt(np.mean(np.diag(mean))) == pytest.approx(deep_mm, rel=0.6)
 

@@ -63,7 +63,6 @@ def test_one_body_comes_of_many_moments(
     truth = standing.at(standing.middle_s)
     rigid = errors_mm(truth, surface(standing, aligned, None))
     carried = errors_mm(truth, surface(standing, alignment, followed))
-    # With pixels of 4 mm, fingers are a few pixels wide.
     assert rms(carried) < 0.3
     assert rms(carried) < 0.25 * rms(rigid)
     assert np.median(np.abs(carried)) < 0.1
@@ -93,7 +92,6 @@ def test_the_operator_hears_what_each_part_did(
     times = standing.seconds.values()
     most = np.max([np.linalg.norm(standing.at(s).vertices - still, axis=1) for s in times], axis=0)
     arm = standing.body.limbs[1].weights > 0.9
-    # Along the arm nothing shows how far it moved.
     assert 0.5 < moved["left arm"] / np.percentile(most[arm], 95) < 1.3
     assert "left arm: moved by" in person.lines[2]
 
@@ -127,8 +125,7 @@ def test_the_way_to_mean_breath_is_told(
     front = breath_along_normals(cells) > 0.5
     true = float(np.mean(np.sum((now - mean)[near] * cells.normals, axis=1)[front]))
     person = PersonMotion.from_motion(followed)
-    assert person.fuller_mm is not None
-    assert person.fuller_sigma_mm is not None
+    assert person.fuller_mm is not None and person.fuller_sigma_mm is not None  # noqa: PT018
     assert abs(true) > 0.25  # or the seed says nothing
     assert abs(person.fuller_mm - true) < 0.7 * abs(true)
     # Fourteen people were off by 1.16 of it, RMS.
