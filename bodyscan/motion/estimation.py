@@ -292,7 +292,7 @@ def _candidate_orders(sides: Sequence[str]) -> list[list[float]]:
     """Moments, s, at which pairs on these poles may have fired: one after another as the rig lists
     them, or so on each pole, all poles at once; 0.1 or 0.2 s apart."""
     numbers = list(range(len(sides))), [sides[:k].count(side) for k, side in enumerate(sides)]
-    return [[step * k for k in number] for number in numbers for step in (0.1, 0.2)]
+    return [[step * k for k in number] for number in numbers if any(number) for step in (0.1, 0.2)]
 
 
 def _find_order(

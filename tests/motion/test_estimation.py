@@ -146,17 +146,13 @@ def middle(scan: LivingScan) -> LivingScan:
     )
 
 
-def test_without_times_the_order_shows_in_the_motion(standing: LivingScan) -> None:
-    """In the right one arms are as good as with times, a wrong one is not believed."""
-    known, errors = middle(standing), []
-    shuffled = replace(known, images=[known.images[k] for k in (0, 5, 2, 7, 4, 1, 6, 3)])
-    for scan, timed in ((known, True), (known, False), (shuffled, False)):
-        _, alignment, followed = together(scan, timed=timed)
-        assert followed is not None
-        found = surface(scan, alignment, followed)
-        errors.append(rms(errors_mm(standing.at(standing.middle_s), found)))
-    assert errors[1] < 1.2 * errors[0]
-    assert errors[2] < 2.5 * errors[0]
+def test_without_times_in_no_order_every_pair_has_a_free_stance(standing: LivingScan) -> None:
+    half = middle(standing)
+    shuffled = replace(half, images=[half.images[k] for k in (0, 5, 2, 7, 4, 1, 6, 3)])
+    aligned, alignment, followed = together(shuffled, timed=False)
+    assert followed is not None
+    # Its moment is the mean of all, which nobody knows: how well overlaps agree is what there is.
+    assert alignment.rms_after_mm < 0.6 * aligned.rms_after_mm
 
 
 def test_a_mannequin_is_not_bent() -> None:
@@ -183,10 +179,12 @@ def test_a_figure_before_two_cameras_without_times_is_still(relief_mm: float) ->
     assert found[:2] == (aligned, None)
 
 
-def test_who_only_sways_is_carried_along_time() -> None:
-    """The back, which on three poles no other pole sees, is put where a smooth sway had it."""
+@pytest.mark.parametrize("timed", [True, False])
+def test_who_only_sways_is_carried_along_time(timed: bool) -> None:
+    """The back, which on three poles no other pole sees, is put where a smooth sway had it; without
+    times the order in which pairs fired shows in the sway."""
     scan = cast_living(load_rig(), Person(sway_mm_s=10.0), seed=1, scale=SCALE)
-    aligned, alignment, followed = together(scan)
+    aligned, alignment, followed = together(scan, timed=timed)
     truth = scan.at(scan.middle_s)
     rigid = errors_mm(truth, surface(scan, aligned, None))
     assert rms(errors_mm(truth, surface(scan, alignment, followed))) < 0.6 * rms(rigid)
