@@ -179,12 +179,12 @@ def test_a_figure_before_two_cameras_without_times_is_still(relief_mm: float) ->
     assert found[:2] == (aligned, None)
 
 
-@pytest.mark.parametrize("timed", [True, False])
-def test_who_only_sways_is_carried_along_time(timed: bool) -> None:
+@pytest.mark.parametrize(("timed", "share"), [(True, 0.6), (False, 0.9)])
+def test_who_only_sways_is_carried_along_time(timed: bool, share: float) -> None:
     """The back, which on three poles no other pole sees, is put where a smooth sway had it; without
     times the order in which pairs fired shows in the sway."""
     scan = cast_living(load_rig(), Person(sway_mm_s=10.0), seed=1, scale=SCALE)
     aligned, alignment, followed = together(scan, timed=timed)
     truth = scan.at(scan.middle_s)
     rigid = errors_mm(truth, surface(scan, aligned, None))
-    assert rms(errors_mm(truth, surface(scan, alignment, followed))) < 0.6 * rms(rigid)
+    assert rms(errors_mm(truth, surface(scan, alignment, followed))) < share * rms(rigid)
