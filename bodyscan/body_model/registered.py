@@ -123,8 +123,8 @@ def _fit_facing(mesh: BodyMesh, rig_from_body: RigidTransform) -> tuple[RigidTra
         turn = RigidTransform.from_rotation_vector([0.0, 0.0, np.radians(degrees)], np.zeros(3))
         frame = rig_from_body @ turn
         tried.append((frame, fit_body(load_template(), _sample(mesh, frame.inverse()))))
-        # One that faced backwards agreed to 0.91; bare bodies agree to 0.94 and more.
-        if tried[-1][1].agreement >= 0.93:
+        # Where the feet were wrong the best decides: one that then faced backwards agreed to 0.91.
+        if tried[0][1].agreement >= MIN_AGREEMENT:
             break
     return max(tried, key=lambda one: one[1].agreement)
 
