@@ -68,8 +68,9 @@ def describe_step(code: StripeCode, lit: Greys | None, dark: Greys | None, coded
     is_lit, is_dark = (np.mean(x, axis=1) > 0.9 for x in (shares > 0.8, shares < 0.2))
     by_bit = files.reshape(2, -1).T.ravel() if len(files) % 2 == 0 else files
     orders = [[0, 1, *(2 + np.array(order))] for order in (files, by_bit, code.show_order)]
-    for late in (0, 1, -1, *range(2, len(files) + 1)):  # begun one early, the lit image is lost
-        if any((late < 0 or is_lit[o[late]]) and is_dark[o[late + 1]] for o in orders):
+    early = not is_lit[1]  # begun one early, the lit image is lost; else dark and lit are exchanged
+    for late in (0, 1, -1, *range(2, len(files) + 1)):
+        if any((is_lit[o[late]] if late > -1 else early) and is_dark[o[late + 1]] for o in orders):
             side = f"{late} before" if late > 0 else "1 after"
             step = f"the frames are out of step by {abs(late)}: each file holds that {side} its own"
             return step if late else ""
