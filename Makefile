@@ -23,7 +23,7 @@ PARALLEL := -n auto --dist loadfile --no-loadscope-reorder
 .DELETE_ON_ERROR:
 
 demo: setup
-	@test ! -e $(OUT) || test -d $(OUT)/truth || { echo "$(OUT) holds no demo: give another OUT=" >&2; exit 1; }
+	@test ! -e $(OUT) || test -d $(OUT)/truth || { echo "$(OUT) holds no demo: remove it, or give another OUT=" >&2; exit 1; }
 	rm -rf $(OUT)
 	$(BIN)/bodyscan simulate rigs/three-pole-12.yaml --out $(OUT) --scale 0.5 --board-shots 24 \
 		--subject data/subjects/woman_average.ply
