@@ -12,6 +12,7 @@ from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import datetime
+from itertools import zip_longest
 from pathlib import Path
 from typing import Literal
 
@@ -19,7 +20,6 @@ from pydantic import ValidationError
 
 from bodyscan.capture.cameras import HOST, FrameLost, Picture
 from bodyscan.capture.devices import Devices
-from bodyscan.capture.turns import Step, Turn, plan_turns
 from bodyscan.captures.captures_file import (
     FILE_NAME,
     CapturesFile,
@@ -33,6 +33,8 @@ from bodyscan.files.atomic import write_text
 from bodyscan.files.model import describe_first_error
 from bodyscan.jobs.watching import put_image
 from bodyscan.progress import Progress, background, silent
+from bodyscan.rig.devices import Order
+from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig import Rig
 
 TIMES = "times.csv"
@@ -40,6 +42,10 @@ _HEADER = "shot,pair,frame,ms"
 
 Frame = tuple[str, str]
 """A pair and the name of a frame."""
+Step = tuple[Frame, ...]
+"""Pairs, each with the frame that it takes; all of a step at the same time."""
+Turn = tuple[Step, ...]
+"""Steps that belong together: images of a turn are written when all of it is taken."""
 
 
 @dataclass(frozen=True)
@@ -117,6 +123,41 @@ def refuse_existing_shot(rig: Rig, shot: Shot, overwrite: bool = False) -> None:
             where=str(shot.folder),
             remedy="give another --out (of a board: another name), or --overwrite to take it again",
         )
+
+
+def list_frames(rig: Rig, pair: Pair) -> tuple[str, ...]:
+    """Names of a pair's frames in the order in which they are shown."""
+    code, names = pair.projector, rig.frames
+    if code is None:
+        return names.sequence_names(None)
+    dark = names.dark if any(one.uses_dark for one in code.directions) else None
+    return (*filter(None, (names.board, names.lit, dark)), *names.shown_names(code))
+
+
+def plan_turns(rig: Rig, order: Order) -> tuple[Turn, ...]:
+    """The turns of a shot, by `CapturePlan.order`.
+
+    poles: the k-th pairs of all poles project at the same time; a pair without a pole is treated as
+    a pole with one pair. interleaved: one turn; frame k of every pair in succession.
+    """
+    frames = {pair.name: list_frames(rig, pair) for pair in rig.pairs}
+    if order == "one-after-another":
+        groups = [[name] for name in frames]
+    elif order == "interleaved":
+        groups = [list(frames)]
+    else:
+        poles: dict[str, list[str]] = {}
+        for pair in rig.pairs:
+            poles.setdefault(pair.pole or f"/{pair.name}", []).append(pair.name)
+        groups = [list(filter(None, group)) for group in zip_longest(*poles.values())]
+    turns = []
+    for group in groups:
+        rounds = zip_longest(*([(name, frame) for frame in frames[name]] for name in group))
+        steps = [tuple(filter(None, one)) for one in rounds]
+        if order == "interleaved":
+            steps = [(each,) for step in steps for each in step]
+        turns.append(tuple(steps))
+    return tuple(turns)
 
 
 def take_turn(

@@ -27,10 +27,9 @@ from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.mesh.body import BodyMesh, BreathAt
 from bodyscan.motion.body_cells import BodyCells, evaluate_field
-from bodyscan.motion.body_motion import BodyMotion
+from bodyscan.motion.body_motion import BodyMotion, girth_sigmas, shape_sigmas
 from bodyscan.motion.body_parts import LIMBS
 from bodyscan.motion.cell_equations import CellEquations
-from bodyscan.motion.motion_uncertainty import girth_sigmas, shape_sigmas
 from bodyscan.progress import map_threads
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.settings import AlignmentSettings

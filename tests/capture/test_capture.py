@@ -17,8 +17,13 @@ from bodyscan.capture.cameras import CAMERAS, Camera, CameraKind, FrameLost, Pic
 from bodyscan.capture.devices import load_capture_rig, open_devices
 from bodyscan.capture.exposure import find_exposures, measure_delays
 from bodyscan.capture.projectors import PROJECTORS, Projector, ProjectorKind
-from bodyscan.capture.session import Shot, capture_shot, refuse_existing_shot
-from bodyscan.capture.turns import list_frames, plan_turns
+from bodyscan.capture.session import (
+    Shot,
+    capture_shot,
+    list_frames,
+    plan_turns,
+    refuse_existing_shot,
+)
 from bodyscan.captures.folder import open_scan
 from bodyscan.errors import BadInput, CaptureError, FailedWork, RigFileError
 from bodyscan.rig.devices import Order

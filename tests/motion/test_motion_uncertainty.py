@@ -11,8 +11,7 @@ from living_body import LivingScan
 from bodyscan.alignment.overlaps import OverlapPoints
 from bodyscan.geometry.robust import rms
 from bodyscan.motion.body_cells import BodyCells
-from bodyscan.motion.body_motion import BodyMotion
-from bodyscan.motion.motion_uncertainty import girth_sigmas, shape_sigmas
+from bodyscan.motion.body_motion import BodyMotion, girth_sigmas, shape_sigmas
 from bodyscan.settings import AlignmentSettings
 
 

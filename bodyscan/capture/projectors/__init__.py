@@ -1,12 +1,12 @@
 """Projectors by kind: each is one file in this folder, with its FORMAT, or another package's entry
-point in the group `bodyscan.capture.projectors`.
+point in the group `bodyscan.capture.projectors`; `elsewhere`, which shows nothing, is here.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -62,4 +62,22 @@ class ProjectorKind(Model):
         """Open the projector of a pair. Raises BadInput if it is not there."""
 
 
-PROJECTORS: Registry[type[ProjectorKind]] = Registry(__name__, "a projector", "cannot be of kind")
+class ElsewhereKind(ProjectorKind):
+    """One that this program does not drive: another program's, or the simulator's."""
+
+    kind: Literal["elsewhere"]
+
+    def open(self, place: Place) -> Projector:
+        return Elsewhere()
+
+
+class Elsewhere(Projector):
+    """Shows nothing."""
+
+    def show(self, frame: str) -> None:
+        pass
+
+
+PROJECTORS: Registry[type[ProjectorKind]] = Registry(
+    __name__, "a projector", "cannot be of kind", {"elsewhere": ElsewhereKind}
+)
