@@ -3,8 +3,10 @@
 from typing import Literal
 
 import numpy as np
-import open3d as o3d
 import pytest
+from living_body import known_to
+from made_bodies import ellipsoid
+from ray_cast_scan import Truth, cast_rays, scene_of
 from ring import looking_at
 
 from bodyscan.alignment.icp import Alignment, Overlap, align
@@ -14,7 +16,6 @@ from bodyscan.errors import FailedWork
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.motion.object_refinement import refine_on_object
 from bodyscan.progress import map_threads
 from bodyscan.reconstruction.range_image import RangeImage
@@ -28,13 +29,11 @@ NOISE_MM = 0.2
 @pytest.fixture(scope="module")
 def scanned() -> tuple[list[RangeImage], dict[str, RigidTransform]]:
     """Four cameras at 90 degrees around a lumpy body (two ellipsoids), and their true placings."""
-    body = o3d.geometry.TriangleMesh.create_sphere(1.0, resolution=120)
-    points = np.asarray(body.vertices) * [110.0, 170.0, 300.0]
+    points, faces = ellipsoid((110.0, 170.0, 300.0), resolution=120)
     points[:, 0] += 25.0 * np.sin(points[:, 2] / 60.0)
     points[:, 1] += 30.0 * np.cos(points[:, 2] / 80.0 + 1.0)
     points[:, 2] += 900.0
-    scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(points.astype(np.float32), np.asarray(body.triangles).astype(np.uint32))
+    scene = scene_of(Truth(points, faces))
     rng = np.random.default_rng(3)
     images, placings = [], {}
     for k, angle in enumerate(np.radians([20.0, 110.0, 200.0, 290.0])):
@@ -43,9 +42,7 @@ def scanned() -> tuple[list[RangeImage], dict[str, RigidTransform]]:
             [1300.0 * np.cos(angle), 1300.0 * np.sin(angle), 950.0], [0.0, 0.0, 900.0]
         )
         rays = CAMERA.pixel_rays()
-        ahead = place.rotate(rays)
-        cast = np.concatenate([np.broadcast_to(place.translation, ahead.shape), ahead], axis=-1)
-        depth = scene.cast_rays(cast.astype(np.float32))["t_hit"].numpy().astype(float)
+        depth = cast_rays(scene, place.translation, place.rotate(rays))["t_hit"].astype(float)
         depth = np.where(np.isfinite(depth), depth, np.nan) + rng.normal(0, NOISE_MM, depth.shape)
         seen = (rays * depth[..., None]).astype(np.float32)
         sigma = np.where(np.isfinite(depth), NOISE_MM, np.nan).astype(np.float32)
@@ -53,14 +50,6 @@ def scanned() -> tuple[list[RangeImage], dict[str, RigidTransform]]:
         images.append(RangeImage(name, CAMERA, seen, grid_normals(seen), sigma, grey))
         placings[name] = place
     return images, placings
-
-
-def known_to(names: dict[str, RigidTransform], mm: float, deg: float) -> PoseCovariance:
-    """Independent errors of the pairs, about the body's middle."""
-    carry = np.eye(6)
-    carry[3:, :3] = [[0.0, 900.0, 0.0], [-900.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
-    own = carry @ np.diag([np.radians(deg) ** 2] * 3 + [mm**2] * 3) @ carry.T
-    return PoseCovariance(tuple(names), np.kron(np.eye(len(names)), own).astype(float))
 
 
 def pushed(

@@ -9,7 +9,7 @@ import open3d as o3d
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from made_bodies import cylinder, mesh_of
+from made_bodies import cylinder, ellipsoid, mesh_of
 from surface_coverage import coverage
 
 from bodyscan.errors import BadInput
@@ -72,9 +72,7 @@ def test_a_point_beyond_a_corner_is_outside_however_obtuse_the_faces(seed: int) 
 def test_points_on_one_side_of_a_round_surface_are_laid_onto_its_faces() -> None:
     """Seen from one side, as by one pair: the nearest corner's tangent plane lies outside a round
     surface, and would draw all of them that way."""
-    ball = o3d.geometry.TriangleMesh.create_sphere(60.0, 30)
-    vertices = np.asarray(ball.vertices) * [1.0, 1.3, 2.0] + [300.0, 100.0, 900.0]
-    faces = np.asarray(ball.triangles).astype(np.int64)
+    vertices, faces = ellipsoid((60.0, 78.0, 120.0), (300.0, 100.0, 900.0), 30)
     points, normals = sample_surface(vertices, faces, 60_000)
     points = points[normals[:, 0] > 0.3]
     off = RigidTransform.from_rotation_vector([0.0, 0.002, 0.001], [-2.0, 1.0, 0.5])
@@ -85,11 +83,10 @@ def test_points_on_one_side_of_a_round_surface_are_laid_onto_its_faces() -> None
 
 def uneven_body() -> tuple[np.ndarray, np.ndarray]:
     """No motion brings it onto itself, and its box's middle is not that of its vertices."""
-    ball = o3d.geometry.TriangleMesh.create_sphere(1.0, 40)
-    vertices = np.asarray(ball.vertices) * [60.0, 80.0, 130.0]
+    vertices, faces = ellipsoid((60.0, 80.0, 130.0), resolution=40)
     vertices[:, 0] *= np.where(vertices[:, 0] > 0.0, 1.8, 1.0)
     vertices[:, 2] *= np.where(vertices[:, 2] > 0.0, 1.5, 1.0)
-    return vertices + [300.0, 100.0, 900.0], np.asarray(ball.triangles).astype(np.int64)
+    return vertices + [300.0, 100.0, 900.0], faces
 
 
 def test_a_scan_that_stands_centimetres_off_is_laid_onto_the_surface() -> None:

@@ -80,7 +80,7 @@ def shown(columns: np.ndarray) -> RangeImage:
     return RangeImage("p", FLAT, points, points, sigma, np.zeros(depth.shape, np.uint8))
 
 
-COLUMN, COLUMN_OF_160 = np.arange(60), np.arange(160)
+COLUMN = np.arange(60)
 BETWEEN = (0.5, 20.5, 1000.0, False), (20.5, 39.5, 1000.0, True), (39.5, 59.5, 1000.0, False)
 
 

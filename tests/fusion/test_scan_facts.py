@@ -1,4 +1,4 @@
-"""A scan.json that is not one is refused before anything is read off it."""
+"""Results in a folder: a scan.json that is not one is refused, none is mixed with another."""
 
 from __future__ import annotations
 
@@ -12,10 +12,13 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from made_scan import make_scan
+from small_workspace import run
 
-from bodyscan.errors import BodyscanError, ResultError
+from bodyscan.errors import BodyscanError, FailedWork, ResultError
 from bodyscan.export.scan import export_scan
-from bodyscan.fusion.storage import load_scan, read_facts
+from bodyscan.files.atomic import write_json
+from bodyscan.fusion.storage import clear, load_scan, make_room, read_facts
 
 STORED = Path(__file__).parents[1] / "data" / "stored-0.1.0" / "scan"
 
@@ -81,3 +84,58 @@ def test_the_first_fault_is_named_and_a_calibration_has_a_name(tmp_path: Path) -
     facts |= {"calibration_id": "7", "failed": {}, "oblique_light": light}
     (tmp_path / "scan.json").write_text(json.dumps(facts), "utf-8")
     assert read_facts(tmp_path) == facts
+
+
+@pytest.fixture
+def result(tmp_path: Path) -> Path:
+    for name in ("scan.json", "cloud.ply", "mesh.ply", "mesh.png", "report.html", "notes.txt"):
+        (tmp_path / name).write_text("somebody's")
+    (tmp_path / "export").mkdir()
+    (tmp_path / "export" / "body.obj").write_text("somebody's")
+    (tmp_path / "holiday.png").write_text("not ours")
+    return tmp_path
+
+
+def test_a_result_is_not_replaced_unasked(result: Path, tmp_path: Path) -> None:
+    with pytest.raises(ResultError, match="already exists here"):
+        make_room(result, overwrite=False)
+    make_room(result, overwrite=True)
+    make_room(tmp_path / "new", overwrite=False)
+    (result / "cloud.ply").unlink()  # a scan that found nobody may be tried again
+    make_room(result, overwrite=False)
+
+
+def test_nothing_of_one_person_stays_beside_anothers(result: Path) -> None:
+    clear(result)
+    assert sorted(path.name for path in result.iterdir()) == ["holiday.png", "notes.txt"]
+
+
+def test_a_folder_without_a_result_is_left_as_it_is(result: Path) -> None:
+    (result / "scan.json").unlink()
+    before = sorted(result.iterdir())
+    clear(result)
+    assert sorted(result.iterdir()) == before
+
+
+@pytest.fixture
+def bad_scan(tmp_path: Path) -> Path:
+    """An egg whose verdict is to scan again."""
+    folder = make_scan(tmp_path / "scan").folder
+    facts = json.loads((folder / "scan.json").read_text("utf-8"))
+    verdict = {"grade": "repeat", "reasons": ["the person walked away"]}
+    write_json(folder / "scan.json", facts | {"verdict": verdict})
+    return folder
+
+
+@pytest.mark.parametrize("command", ["measure", "export"])
+def test_nothing_is_made_of_a_scan_to_be_repeated_unless_that_is_said(
+    command: str, bad_scan: Path
+) -> None:
+    before = sorted(bad_scan.rglob("*"))
+    refused = run(command, bad_scan)
+    assert isinstance(refused.exception, FailedWork)
+    assert refused.exception.exit_code == 1
+    assert "the person walked away" in str(refused.exception)
+    assert "--anyway" in refused.exception.remedy
+    assert sorted(bad_scan.rglob("*")) == before
+    assert run(command, bad_scan, "--anyway").exit_code == 0

@@ -7,8 +7,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import open3d as o3d
 import pytest
+from made_bodies import ellipsoid, together
 from ray_cast_scan import Truth, cast_scan, load_body, load_rig, nominal_placings
 
 from bodyscan.arrays import Array, Indices
@@ -42,16 +42,7 @@ def moved(truth: Truth, shift: list[float]) -> Truth:
 
 
 def joined(*truths: Truth) -> Truth:
-    starts = np.cumsum([0, *(len(truth.vertices) for truth in truths)])
-    return Truth(
-        np.concatenate([truth.vertices for truth in truths]),
-        np.concatenate([t.faces + start for t, start in zip(truths, starts, strict=False)]),
-    )
-
-
-def ball(centre: list[float], radius: float) -> Truth:
-    made = o3d.geometry.TriangleMesh.create_sphere(radius, resolution=40)
-    return Truth(np.asarray(made.vertices) + centre, np.asarray(made.triangles).astype(np.int64))
+    return Truth(*together(*((truth.vertices, truth.faces) for truth in truths)))
 
 
 @pytest.fixture(scope="module")
@@ -149,7 +140,7 @@ def test_two_people_hand_in_hand(person: Truth) -> None:
 
 def test_what_always_stands_there_is_cut_away_by_an_empty_scan(person: Truth) -> None:
     """A post beside the person: part of the model, unless a scan of the empty rig shows it."""
-    post = ball([-350.0, 350.0, 1000.0], 120.0)
+    post = Truth(*ellipsoid((120.0, 120.0, 120.0), (-350.0, 350.0, 1000.0), 40))
     with_post = photographed(joined(person, post))
     empty = photographed(post)
     taken = fused(with_post, settings=NOT_FOLLOWED)

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-import open3d as o3d
 import pytest
-from made_bodies import cloud_of
+from made_bodies import cloud_of, ellipsoid
 
 from bodyscan.fusion.support import Support, fit_to_points, measure_support
 from bodyscan.mesh.body import BodyCloud
@@ -77,13 +76,8 @@ def test_a_point_that_faces_away_has_no_say_in_the_shift() -> None:
     assert found.shift_mm[0] == pytest.approx(-0.2, abs=1e-6)
 
 
-def ball(radius: float) -> tuple[np.ndarray, np.ndarray]:
-    sphere = o3d.geometry.TriangleMesh.create_sphere(radius, resolution=40)
-    return np.asarray(sphere.vertices), np.asarray(sphere.triangles).astype(np.int64)
-
-
 def test_a_surface_settles_on_its_points() -> None:
-    vertices, faces = ball(50.0)
+    vertices, faces = ellipsoid((50.0, 50.0, 50.0), resolution=40)
     rng = np.random.default_rng(0)
     ways = rng.normal(size=(60_000, 3))
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
@@ -100,7 +94,7 @@ def test_a_surface_settles_on_its_points() -> None:
 
 def test_no_face_folds_over() -> None:
     """Slivers are narrower than the moves of their corners."""
-    vertices, faces = ball(50.0)
+    vertices, faces = ellipsoid((50.0, 50.0, 50.0), resolution=40)
     rng = np.random.default_rng(0)
     count = len(vertices)
     normals = vertex_normals(vertices, faces)
@@ -159,7 +153,7 @@ def told(**values: list[float]) -> Support:
 def test_a_vertex_moves_by_a_quarter_of_the_reach_at_most_and_less_where_points_end(
     shift: float, weight: float, moved_mm: float
 ) -> None:
-    vertices, faces = ball(50.0)
+    vertices, faces = ellipsoid((50.0, 50.0, 50.0), resolution=40)
     count = len(vertices)
     around = told(shift_mm=[shift] * count, weight=[weight] * count)
     normals = (vertices / 50.0).astype(np.float32)

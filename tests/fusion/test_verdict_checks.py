@@ -28,11 +28,8 @@ from bodyscan.motion.person_motion import PartMotion, PersonMotion
 from bodyscan.reconstruction.range_image import Agreement
 from bodyscan.registration.rig_calibration import NominalSize
 from bodyscan.rig.rig import Volume
-from bodyscan.settings import UseLimits
 from bodyscan.verdict import Verdict
 
-NO_LIMITS = UseLimits(good_girth_mm=100.0, usable_girth_mm=200.0)
-WIDE = UseLimits(good_girth_mm=4.0, usable_girth_mm=8.0)
 TALL_MM = 1700.0
 
 

@@ -1,4 +1,4 @@
-"""Kinds of motion on three cells and two pairs, against sums written out."""
+"""Kinds of motion on three cells and two pairs, against sums written out; and what sigmas hold."""
 
 from __future__ import annotations
 
@@ -7,17 +7,21 @@ from typing import Any
 
 import numpy as np
 import pytest
+from living_body import LivingScan
 from scipy import sparse
 
+from bodyscan.alignment.overlaps import OverlapPoints
 from bodyscan.arrays import Array
 from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
+from bodyscan.geometry.robust import rms
 from bodyscan.motion import body_motion
 from bodyscan.motion.body_cells import BodyCells
-from bodyscan.motion.body_motion import BodyMotion
+from bodyscan.motion.body_motion import BodyMotion, girth_sigmas, shape_sigmas
 from bodyscan.motion.body_parts import ankles
 from bodyscan.motion.breath import BreathEstimate
 from bodyscan.motion.motion_kinds import MotionKind, build_kinds
 from bodyscan.motion.temporal_modes import Breaths, TemporalModes
+from bodyscan.settings import AlignmentSettings
 
 PAIRS, CELLS = 2, 3
 RNG = np.random.default_rng(5)
@@ -182,3 +186,49 @@ def test_what_is_asked_of_poses_is_what_any_motion_leaves() -> None:
     mixed = (misfit(step[0] + step[7]) - misfit(step[0] - step[7])) / 2.0 / 1e-6
     mixed -= slope[7] / 1e-3
     assert mixed == pytest.approx(information[0, 7], rel=1e-2, abs=1e-3)
+
+
+@pytest.fixture(scope="module")
+def cells(standing: LivingScan) -> BodyCells:
+    """Of a person, as all pairs together show them."""
+    spacing_mm = AlignmentSettings().spacing_mm
+    both = [
+        (standing.rig_from_camera[one.pair], OverlapPoints.from_image(one, spacing_mm))
+        for one in standing.exact
+    ]
+    points = [place.apply(seen.inner.points) for place, seen in both]
+    normals = [place.rotate(seen.inner.normals) for place, seen in both]
+    return BodyCells.from_points(np.concatenate(points), np.concatenate(normals))[0]
+
+
+def test_a_girth_is_uncertain_by_what_all_around_it_shares() -> None:
+    """Errors of many cells, each by itself, cancel around a girth; one of them all does not."""
+    height = np.repeat([1000.0, 1200.0], 50)
+    alone, together = np.eye(100), np.ones((100, 1))
+    np.testing.assert_allclose(girth_sigmas(together, height), 1.0)
+    np.testing.assert_allclose(girth_sigmas(alone, height), 50.0**-0.5)
+
+
+def certain(motion: BodyMotion) -> BodyMotion:
+    """With amplitudes that are known."""
+    pose, *others = motion.kinds
+    known = (replace(kind, precision=1e8 * np.eye(kind.count)) for kind in others)
+    return replace(motion, kinds=(pose, *known))
+
+
+def test_a_place_that_two_saw_alike_is_as_uncertain_as_one_and_one_that_errs_by_itself_less(
+    cells: BodyCells,
+) -> None:
+    """Pairs' own errors average out over those who saw a place."""
+    boards = np.diag(np.tile([1e-12] * 3 + [0.1**2] * 3, 4))
+    motion = certain(
+        BodyMotion.at_rest(cells, [0.0, 0.0, 0.0, 0.0], 0.0, boards, np.full(6, 1e-3))
+    )._solve()
+    seen = np.zeros((4, len(cells.centres)), bool)
+    left = cells.centres[:, 1] > 0.0
+    seen[0, left], seen[1, ~left] = True, True
+    once, girth = shape_sigmas(motion, cells, seen)
+    seen[2, left], seen[3, ~left] = True, True
+    twice, _ = shape_sigmas(motion, cells, seen)
+    assert 0.0 < rms(girth) < rms(once)
+    assert rms(twice) == pytest.approx(rms(once) / np.sqrt(2.0), rel=0.05)

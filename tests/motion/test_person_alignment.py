@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from living_body import LivingScan
+from living_body import LivingScan, known_to
 from ray_cast_scan import load_rig
 
 from bodyscan.alignment.displaced_poles import DisplacedPole, DisplacementSearch
@@ -52,11 +52,7 @@ def together(
         replace(image, time_ms=1e3 * scan.seconds[image.pair] if timed else None)
         for image in scan.images
     ]
-    # Places known to 0.03 mm and 0.002 degrees about the body's middle.
-    carry = np.eye(6)
-    carry[3:, :3] = [[0.0, 900.0, 0.0], [-900.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
-    own = carry @ np.diag([np.radians(0.002) ** 2] * 3 + [0.03**2] * 3) @ carry.T
-    boards = PoseCovariance(tuple(placed), np.kron(np.eye(len(placed)), own).astype(float))
+    boards = known_to(placed, 0.03, 0.002)
     settings = AlignmentSettings()
     aligned = align(images, placed, boards, settings)
     return align_person(images, placed, aligned, boards, RIG.poles, settings)

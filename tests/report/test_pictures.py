@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-import open3d as o3d
 import pytest
+from made_bodies import ellipsoid
 
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.mesh.topology import vertex_normals
@@ -21,9 +21,7 @@ STEP = (2.0 * RADIUS + 40.0) / 300  # mm a pixel of a picture 300 px high
 
 def ball() -> BodyMesh:
     """Its left half (y > 0) was made up."""
-    sphere = o3d.geometry.TriangleMesh.create_sphere(RADIUS, 30)
-    vertices = np.asarray(sphere.vertices) + CENTRE
-    faces = np.asarray(sphere.triangles).astype(np.int64)
+    vertices, faces = ellipsoid((RADIUS, RADIUS, RADIUS), CENTRE, 30)
     filled = (vertices[faces].mean(axis=1)[:, 1]) > 7.0
     return BodyMesh(
         vertices,

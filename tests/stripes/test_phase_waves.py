@@ -1,4 +1,4 @@
-"""Waves of several periods without any Gray code: which s, how sure, and what is refused."""
+"""Waves of several periods without Gray code: which s, how sure, when they repeat, what is refused."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from stripe_rendering import code_light, render
 
 from bodyscan.errors import DecodingFailed
 from bodyscan.stripes.codes import parse_stripe_code
-from bodyscan.stripes.codes.phase_shift import PhaseShift
+from bodyscan.stripes.codes.phase_shift import PhaseShift, find_repetition
 from bodyscan.stripes.decoding import decode_stripes
 from bodyscan.stripes.stripe_map import StripeMap
 
@@ -242,3 +242,23 @@ def test_wrong_periods_are_refused() -> None:
 
 def test_periods_may_be_counted() -> None:
     assert described({"periods": (12, 1)}).waves == described({"period": (20, 240)}).waves
+
+
+@pytest.mark.parametrize(
+    ("periods", "stripes", "again"),
+    [
+        ((20.0, 240.0), 240, None),
+        ((20.0, 240.0), 241, 240.0),
+        ((20.0,), 20, None),
+        ((20.0,), 21, 20.0),
+        ((12.0, 18.0), 100, 36.0),
+        ((12.0, 18.0), 36, None),
+        ((18.0, 12.0), 37, 36.0),
+        # 17 / 17.17 is a hundredth of a period less than one.
+        ((17.0, 17.17), 1000, 17.0),
+    ],
+)
+def test_waves_repeat_after_their_common_multiple(
+    periods: tuple[float, ...], stripes: int, again: float | None
+) -> None:
+    assert find_repetition(periods, stripes, 0.05) == again

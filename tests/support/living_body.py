@@ -5,6 +5,7 @@ The body at every moment is known. Nothing is rendered: depths are cast from a d
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -120,13 +121,16 @@ def _cast(truth: Truth, pair: Pair, camera: Camera, pose: RigidTransform) -> Ran
     )
 
 
-def boards(scan: LivingScan) -> PoseCovariance:
-    """Pairs known to 0.03 mm and 0.002 degrees about the body's middle, each by itself."""
+def known_to(names: Collection[str], mm: float, deg: float) -> PoseCovariance:
+    """Independent errors of the pairs, about the body's middle."""
     carry = np.eye(6)
     carry[3:, :3] = [[0.0, 900.0, 0.0], [-900.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
-    own = carry @ np.diag([np.radians(0.002) ** 2] * 3 + [0.03**2] * 3) @ carry.T
-    names = tuple(scan.rig_from_camera)
-    return PoseCovariance(names, np.kron(np.eye(len(names)), own).astype(float))
+    own = carry @ np.diag([np.radians(deg) ** 2] * 3 + [mm**2] * 3) @ carry.T
+    return PoseCovariance(tuple(names), np.kron(np.eye(len(names)), own).astype(float))
+
+
+def boards(scan: LivingScan) -> PoseCovariance:
+    return known_to(scan.rig_from_camera, 0.03, 0.002)
 
 
 def images_of(scan: LivingScan, *, timed: bool = True) -> list[RangeImage]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import open3d as o3d
+from numpy.typing import ArrayLike
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.mesh.body import BodyCloud, BodyMesh
@@ -40,8 +41,8 @@ def arrays(made: o3d.geometry.TriangleMesh) -> tuple[np.ndarray, np.ndarray]:
 
 
 def ellipsoid(
-    axes: tuple[float, float, float],
-    centre: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    axes: ArrayLike,
+    centre: ArrayLike = (0.0, 0.0, 0.0),
     resolution: int = 200,
 ) -> tuple[np.ndarray, np.ndarray]:
     vertices, faces = arrays(o3d.geometry.TriangleMesh.create_sphere(1.0, resolution=resolution))

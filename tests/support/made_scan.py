@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import open3d as o3d
+from made_bodies import ellipsoid
 
 from bodyscan.files.atomic import write_json
 from bodyscan.mesh.body import BodyCloud, BodyMesh
@@ -28,9 +28,7 @@ class MadeScan:
 
 def egg(resolution: int = 60, grown_mm: float = 0.0) -> BodyMesh:
     """An egg as tall as a person, its lowest part made up; grown: larger on all sides by so much."""
-    sphere = o3d.geometry.TriangleMesh.create_sphere(1.0, resolution)
-    vertices = np.asarray(sphere.vertices) * (SEMI_AXES_MM + grown_mm) + MIDDLE_MM
-    faces = np.asarray(sphere.triangles).astype(np.int64)
+    vertices, faces = ellipsoid(SEMI_AXES_MM + grown_mm, MIDDLE_MM, resolution)
     sigma = (0.03 + 0.05 * (vertices[:, 1] > 0)).astype(np.float32)
     sigma[vertices[:, 2] < SOLES_MM] = np.nan
     tint = np.clip(255 * (vertices - vertices.min(axis=0)) / np.ptp(vertices, axis=0), 0, 255)

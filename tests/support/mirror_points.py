@@ -18,7 +18,6 @@ from bodyscan.simulation.files import describe_camera
 
 LENS = camera_from_fields(describe_camera(apparatus.CAMERA))
 MIRROR = apparatus.chapter_setup(apparatus.ideal_settings(1)).projector
-TRUE_PLANES = apparatus.true_planes(apparatus.chapter_setup(apparatus.ideal_settings(1)))
 STRIPES = apparatus.PROJECTOR.stripes
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
@@ -160,18 +160,3 @@ def _mix_silhouettes(depth: Array, valid: Mask, flying: float, rng: np.random.Ge
     chosen = rim & (rng.random(depth.shape) < flying * valid.sum() / max(rim.sum(), 1))
     reach = np.where(high - low > 15.0, np.minimum(high - low, 300.0), 60.0)
     return np.where(chosen, low + reach * rng.random(depth.shape), depth)
-
-
-def without(
-    image: RangeImage, rig_from_camera: RigidTransform, low_mm: float, high_mm: float
-) -> RangeImage:
-    """The range image with nothing measured between two heights: black cloth, hair."""
-    height = rig_from_camera.apply(image.points.astype(float))[..., 2]
-    gone = (height > low_mm) & (height < high_mm)
-    nan = np.float32(np.nan)
-    return replace(
-        image,
-        points=np.where(gone[..., None], nan, image.points),
-        normals=np.where(gone[..., None], nan, image.normals),
-        sigma_mm=np.where(gone, nan, image.sigma_mm),
-    )

@@ -46,7 +46,6 @@ SLOW = (
     "workflows/test_check_calibration.py",
     "registration/test_known_cameras.py",
     "calibration/test_joint_refinement.py",
-    "jobs/test_full_disk.py",
     "fusion/test_cleaning.py",
     "report/test_report.py",
     "workflows/test_nothing_is_lost.py",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-import open3d as o3d
+from made_bodies import ellipsoid
 
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.mesh.topology import vertex_normals
@@ -11,9 +11,7 @@ from bodyscan.mesh.topology import vertex_normals
 
 def ball(resolution: int = 20, radius_mm: float = 120.0) -> BodyMesh:
     """A ball that stands on the floor off the middle; its lowest part was measured by nobody."""
-    sphere = o3d.geometry.TriangleMesh.create_sphere(radius_mm, resolution)
-    vertices = np.asarray(sphere.vertices) + np.array([30.0, -40.0, radius_mm])
-    faces = np.asarray(sphere.triangles).astype(np.int64)
+    vertices, faces = ellipsoid((radius_mm,) * 3, (30.0, -40.0, radius_mm), resolution)
     rng = np.random.default_rng(1)
     sigma_mm = rng.uniform(0.01, 0.3, len(vertices)).astype(np.float32)
     sigma_mm[vertices[:, 2] < 40.0] = np.nan

@@ -48,10 +48,6 @@ def boundary_errors(seen: StripeMap, s_at: Field) -> np.ndarray:
     return (s_at(u, v) - seen.boundary_index) / slope
 
 
-def robust(errors: np.ndarray) -> float:
-    return float(np.median(np.abs(errors))) / 0.6745
-
-
 def white(u: np.ndarray, v: np.ndarray) -> np.ndarray:
     return np.ones_like(u)
 

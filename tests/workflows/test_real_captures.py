@@ -19,10 +19,15 @@ from benchmarks.free_triangulation import (
     without_shots,
 )
 from benchmarks.held_out_boards import hold_out_boards
+from bodyscan.arrays import Array
+from bodyscan.boards.detection import find_boards
 from bodyscan.boards.view import BoardView
 from bodyscan.captures.folder import Captures, open_captures
+from bodyscan.captures.images import read_board_image, read_sequence
 from bodyscan.geometry.uncertainty import point_covariance
 from bodyscan.rig.rig import Rig, load_rig
+from bodyscan.stripes.decoding import decode_stripes
+from bodyscan.stripes.stripe_map import StripeMap
 from bodyscan.workflows.calibrate_rig import calibrate_rig
 from bodyscan.workflows.find_boards import find_all_boards
 
@@ -180,3 +185,28 @@ def test_wide_lenses_are_fitted_by_a_lens_for_them(captures: Path, tmp_path: Pat
     assert fisheye.camera.lens.kind == "fisheye"
     # Of 21; of img000, whose squares are 160 px, no lattice of saddles is seen.
     assert fisheye.quality.poses >= 20
+
+
+def seen(rig_file: Path) -> tuple[Array, StripeMap]:
+    """Corners of the board, and stripes."""
+    rig = load_rig(rig_file)
+    (pair,) = rig.pairs
+    assert pair.projector is not None
+    (sequence,) = open_captures(rig, rig_file).sequences
+    (view,) = find_boards(read_board_image(sequence, pair), rig.boards, pair="p", shot="s")
+    images = read_sequence(sequence, pair.camera)
+    return view.pixels, decode_stripes(pair.projector, images.lit, images.dark, images.coded)
+
+
+def test_the_patterns_tell_what_lit_and_dark_images_do(captures: Path, tmp_path: Path) -> None:
+    rig_file = real_rig_file("procam-board", captures, tmp_path, ["capture_0"])
+    corners, stripes = seen(rig_file)
+    rig = json.loads(rig_file.read_text("utf-8"))
+    rig["frames"] |= {"lit": None, "dark": None}
+    rig_file.write_text(json.dumps(rig), "utf-8")
+    made_corners, made_stripes = seen(rig_file)
+    # Corners are good to some hundredths of a pixel, boundaries too; 0.02 px and 0.002 were seen.
+    assert np.linalg.norm(made_corners - corners, axis=1).mean() < 0.05
+    both = np.isfinite(stripes.s) & np.isfinite(made_stripes.s)
+    assert both.sum() > 0.98 * np.isfinite(stripes.s).sum()
+    assert np.median(np.abs((made_stripes.s - stripes.s)[both])) < 0.005

@@ -1,4 +1,4 @@
-"""Descriptions of images in which a board was not found."""
+"""Boards located by the markers that agree, and images in which none was found, described."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ import pytest
 
 from bodyscan.arrays import Array, Bytes
 from bodyscan.boards import detection_failure
+from bodyscan.boards.aprilgrid import locate_grid
 from bodyscan.boards.board_layout import marker_corners
-from bodyscan.boards.charuco import Markers
+from bodyscan.boards.charuco import Markers, fit_markers, locate_face
 from bodyscan.boards.detection_failure import describe_unfound
 from bodyscan.boards.view import AS_PRINTED, Appearance
 from bodyscan.rig.board import Board
@@ -27,10 +28,11 @@ def checkered(columns: int, rows: int) -> Bytes:
     return np.asarray(cv2.GaussianBlur(np.pad(squares, 40, constant_values=200), (0, 0), 0.9))
 
 
-def image_of(points: Array) -> Array:
+def image_of(points: Array, scale: float = 1.0) -> Array:
+    """A board that leans back a little."""
     x, y = points[..., 0], points[..., 1]
     away = 1.0 + 2e-4 * x + 1e-4 * y
-    return np.asarray(np.stack([300.0 + x, 200.0 + y], axis=-1) / away[..., None])
+    return np.asarray(np.stack([300.0 + scale * x, 200.0 + scale * y], axis=-1) / away[..., None])
 
 
 def shown(board: Board, count: int | None = None, wrong: int = 0) -> Markers:
@@ -115,3 +117,67 @@ def test_at_a_glance_squares_that_are_not_whole_are_told_from_none() -> None:
     empty = describe_unfound(np.full((240, 320), 90, np.uint8), board, quick=True)
     assert empty == "not whole, nor anything like a board's squares"
     assert describe_unfound(IMAGE, BOARD, quick=True) == ""
+
+
+def printed() -> Array:
+    return np.asarray(marker_corners(BOARD)[1])[..., :2]
+
+
+def test_markers_off_their_place_do_not_agree() -> None:
+    pixels = image_of(printed(), 1.2)
+    pixels[17, :, 0] += 10.0  # a sixth of a square, which appears 57 px wide
+    fit = fit_markers(printed(), pixels, BOARD)
+    assert fit is not None
+    assert np.flatnonzero(~fit[1]).tolist() == [17]
+    mirrored = pixels[:2].copy()
+    mirrored[1] = mirrored[1, ::-1]  # no board shows both so
+    assert fit_markers(printed()[:2], mirrored, BOARD) is None
+
+
+def test_a_board_is_located_by_some_of_its_markers() -> None:
+    ids, points = marker_corners(BOARD)
+    pixels = image_of(points[..., :2], 1.0)
+    some = np.arange(3, 36, 4)
+    position = locate_face(BOARD, Markers(np.asarray(ids)[some], pixels[some]))
+    assert position is not None
+    assert (position.agreeing, position.detected, position.face, position.valid) == (9, 9, 0, True)
+    corner = np.array([[200.0, 150.0]])
+    np.testing.assert_allclose(position.board_map.apply(corner), image_of(corner, 1.0), atol=0.01)
+    one = Markers(np.asarray(ids)[:1], pixels[:1])
+    assert locate_face(BOARD, one) is None
+
+
+TAGS = Board(name="t", kind="aprilgrid", columns=6, rows=5, square_mm=120, marker_mm=90)
+
+
+def tags(turn: int = 0, *, from_top: bool = False, wrong: int = 0, count: int = 30) -> Markers:
+    """As a grid's first tags appear, each turned in its place; the wrong ones lie elsewhere."""
+    ids, points = marker_corners(TAGS)
+    order = points.reshape(5, 6, 4, 2)
+    order = order[::-1] if from_top else order
+    pixels = image_of(np.roll(order.reshape(-1, 4, 2), turn, axis=1), 0.5)
+    pixels[:wrong] += np.random.default_rng(1).uniform(60.0, 200.0, (wrong, 1, 2))
+    return Markers(np.asarray(ids)[:count], pixels[:count])
+
+
+@pytest.mark.parametrize("turn", range(4))
+@pytest.mark.parametrize("from_top", [False, True])
+def test_a_grid_is_placed_however_its_tags_are_turned_and_counted(
+    turn: int, from_top: bool
+) -> None:
+    position = locate_grid(TAGS, tags(turn, from_top=from_top))
+    assert position is not None
+    assert position.agreeing == 30
+    corner = np.array([[200.0, 150.0]])
+    np.testing.assert_allclose(position.board_map.apply(corner), image_of(corner, 0.5), atol=0.01)
+
+
+def test_three_tags_and_six_of_ten_have_to_agree() -> None:
+    assert locate_grid(TAGS, tags(count=2)) is None
+    position = locate_grid(TAGS, tags(count=3))
+    assert position is not None
+    assert position.agreeing == 3
+    position = locate_grid(TAGS, tags(wrong=11))
+    assert position is not None
+    assert position.agreeing == 19
+    assert locate_grid(TAGS, tags(wrong=13)) is None

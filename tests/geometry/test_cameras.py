@@ -111,3 +111,13 @@ def test_equal_cameras_share_their_tables() -> None:
     assert projection_table(SCANNER) is projection_table(again)
     other = SCANNER.retract(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1e-3, 0.0]))
     assert projection_table(SCANNER) is not projection_table(other)
+
+
+@given(cameras)
+def test_slopes_of_rays_are_derivatives_by_their_pixels(camera: Camera) -> None:
+    pixels = np.random.default_rng(3).uniform([100.0, 100.0], [500.0, 400.0], (50, 2))
+    slopes = camera.rays_by_pixels(camera.rays(pixels))
+    for axis, step in enumerate(1e-3 * np.eye(2)):
+        apart = camera.rays(pixels + step) - camera.rays(pixels - step)
+        # A lens bends by less than 1e-6 of the slope over so little, and rays are good to 1e-14.
+        np.testing.assert_allclose(slopes[..., axis], apart[:, :2] / 2e-3, atol=1e-10)
