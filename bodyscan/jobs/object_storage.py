@@ -141,9 +141,10 @@ def put_summary(out: Path, store: Store) -> str:
     """Put back the table and the manifest over all jobs; returns the table's URL."""
     with _answering(store.out):
         files = _open(store.out)
-        for name in (SUMMARY, MEASURES, MANIFEST):
-            if (out / name).exists():
-                _put(files, name, out / name)
+        for name in (SUMMARY, MANIFEST):
+            _put(files, name, out / name)
+        if (out / MEASURES).exists():
+            _put(files, MEASURES, out / MEASURES)
     return store.job(SUMMARY)
 
 

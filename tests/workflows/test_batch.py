@@ -89,9 +89,9 @@ def test_good_scans_are_fused_and_bad_ones_are_named(
     good = {"anna", odd, "hurt"}
     assert {n for n, end in endings(second).items() if end["state"] == "done"} == good
     assert endings(first)["anna"]["stages"] == ["scan"]
-    assert endings(second)["anna"]["stages"] == ["export", "report"]
+    assert endings(second)["anna"]["stages"] == ["measures", "export", "report"]
     for name in (odd, "hurt"):
-        assert endings(second)[name]["stages"] == ["scan", "export", "report"]
+        assert endings(second)[name]["stages"] == ["scan", "measures", "export", "report"]
     for name, said in {
         "laughs": "captures.yaml",
         "climbing": "shots[0].name",
