@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from bodyscan.arrays import Array, Bytes
 from bodyscan.mesh.body import BodyCloud, BodyMesh
+from bodyscan.mesh.sliced_parts import find_body_frame
 
 Legend = dict[str, Any]
 
@@ -40,11 +41,12 @@ def pack(
     *,
     strokes: Strokes | None = None,
     labels: Sequence[tuple[str, Array]] = (),
-    view_deg: tuple[float, float] = (25.0, 6.0),
+    view_deg: tuple[float, float] | None = None,
 ) -> dict[str, Any]:
     """Pack a model for `viewer.js`: a mesh, or points that are drawn as squares.
 
-    view_deg: where the viewer stands at first: azimuth from x towards y, and elevation.
+    view_deg: where the viewer stands at first: azimuth from x towards y, and elevation. None: before
+        a body, a little to its left.
 
     A coordinate is `low + step * integer`, in steps of 1/65,535 of the longest side. Raises
     ValueError for a mesh of more than 65,536 vertices.
@@ -54,6 +56,9 @@ def pack(
         vertices = shape.points if isinstance(shape, BodyCloud) else shape.vertices
     if vertices is not None and len(vertices) > 65_536:
         raise ValueError(f"{len(vertices)} vertices; 16-bit indices address 65,536")
+    if view_deg is None:
+        x, y, _ = np.eye(3)[0] if vertices is None else _find_forward(vertices)
+        view_deg = (25.0 + float(np.degrees(np.arctan2(y, x))), 6.0)
     coordinates = [vertices] if vertices is not None else []
     coordinates += [strokes.ends.reshape(-1, 3)] if strokes is not None else []
     everything = np.concatenate(coordinates)
@@ -90,6 +95,11 @@ def pack(
             "colours": encode(np.repeat(strokes.colours, 2, axis=0)),
         }
     return packed
+
+
+def _find_forward(vertices: Array) -> Array:
+    """Where a body faces, (3,)."""
+    return find_body_frame(vertices).rig_from_body.rotation[:, 0]
 
 
 def pack_cloud(cloud: BodyCloud) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from browser import browser_page, find_browser
 from made_scan import MIDDLE_MM, SEMI_AXES_MM, MadeScan, egg, make_scan
 from required import missing
 from small_workspace import run
+from standing_body import hanging, standing_body
 from typer.testing import CliRunner
 
 from bodyscan.cli.main import app
@@ -24,6 +25,7 @@ from bodyscan.errors import BadInput, ResultError
 from bodyscan.evaluation.surface import compare_surfaces
 from bodyscan.files.atomic import write_json
 from bodyscan.fusion.storage import Origin
+from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.jobs.forgetting import find_subject
 from bodyscan.mesh.body import HAIR, SKIN, BodyCloud, find_filled_patches
 from bodyscan.report.model import Layer, pack
@@ -130,6 +132,15 @@ def test_a_mesh_too_large_for_its_indices_is_refused() -> None:
     many = np.zeros((65_537, 3))
     with pytest.raises(ValueError, match="65537"):
         pack(replace(egg(20), vertices=many), [Layer("", many.astype(np.uint8))])
+
+
+def test_a_body_is_first_seen_from_before_wherever_it_faces() -> None:
+    vertices, faces = standing_body(hanging(25.0))
+    for heading in (0.0, -90.0, 150.0):
+        turn = RigidTransform.from_rotation_vector([0.0, 0.0, np.radians(heading)], [0.0, 0.0, 0.0])
+        body = replace(egg(20), vertices=turn.apply(vertices), faces=faces, normals=vertices)
+        azimuth = np.degrees(pack(body)["view"]["azimuth"])
+        assert azimuth == pytest.approx(heading + 25.0, abs=3.0)
 
 
 def test_holes_are_found_where_nothing_was_measured() -> None:
