@@ -269,7 +269,8 @@ class BodyMotion:
             if kind.precision is None:
                 determined = kind.count - np.sum(variances[block]) / kind.size**2
                 square = np.sum(self.amplitudes[block] ** 2) + 6.0 * kind.standing_size**2
-                kind = replace(kind, size=float(np.sqrt(square / (max(determined, 0.0) + 6.0))))
+                size = float(np.sqrt(square / (max(determined, 0.0) + 6.0)))
+                kind = replace(kind, size=max(size, 1e-6))  # what stands still moves by a nanometre
             kinds.append(kind)
         return replace(self, kinds=tuple(kinds))
 

@@ -141,6 +141,7 @@ def test_sway_is_found_whatever_its_size(
         assert max(found.motion_mm.values()) < 0.3
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_a_rig_is_refined_on_a_still_object(
     scanned: tuple[list[RangeImage], dict[str, RigidTransform]],
 ) -> None:

@@ -138,7 +138,8 @@ def test_a_body_is_first_seen_from_before_wherever_it_faces() -> None:
     vertices, faces = standing_body(hanging(25.0))
     for heading in (0.0, -90.0, 150.0):
         turn = RigidTransform.from_rotation_vector([0.0, 0.0, np.radians(heading)], [0.0, 0.0, 0.0])
-        body = replace(egg(20), vertices=turn.apply(vertices), faces=faces, normals=vertices)
+        upwards = np.zeros(vertices.shape, np.float32)
+        body = replace(egg(20), vertices=turn.apply(vertices), faces=faces, normals=upwards)
         azimuth = np.degrees(pack(body)["view"]["azimuth"])
         assert azimuth == pytest.approx(heading + 25.0, abs=3.0)
 
