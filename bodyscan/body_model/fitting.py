@@ -23,6 +23,7 @@ from bodyscan.body_model.template import (
     BodyShapeAndPose,
     BodyTemplate,
     PosedBody,
+    drop_side,
     pose_body,
 )
 from bodyscan.geometry.robust import rms
@@ -123,22 +124,22 @@ def fit_body(template: BodyTemplate, surface: Surface) -> FittedBody:
         (35.0, 30.0, 25.0, 22.0, 20.0, 18.0, 16.0, 14.0, 12.0, 10.0, 10.0, 10.0),
     )
     posed = pose_body(template, body)
-    missed = _measure_distance(template, surface, tree, posed.vertices)
+    normals = _compute_normals(template, posed.vertices)
+    missed = _measure_distance(template, surface, tree, posed.vertices, normals)
     missed = missed[np.isfinite(missed)]
     vertices = _fit_residual(template, surface, tree, posed.vertices)
-    distance = _measure_distance(template, surface, tree, vertices)
-    rms_mm = rms(missed) if missed.size else float("nan")
     normals = _compute_normals(template, vertices)
+    distance = _measure_distance(template, surface, tree, vertices, normals)
+    rms_mm = rms(missed) if missed.size else float("nan")
     back = _match_back(template, surface, vertices, normals, 10.0).weights > 0.0
     agreement = 0.5 * float(np.isfinite(distance[~template.hidden]).mean() + back.mean())
     return FittedBody(template, vertices, body.shape, posed, distance, rms_mm, agreement)
 
 
 def _measure_distance(
-    template: BodyTemplate, surface: Surface, tree: KDTree, vertices: Array
+    template: BodyTemplate, surface: Surface, tree: KDTree, vertices: Array, normals: Array
 ) -> Array:
     """Signed distance (V,) mm of vertices from the surface, along its normals; NaN without a match."""
-    normals = _compute_normals(template, vertices)
     matches = _match(template, surface, tree, vertices, normals, 10.0)
     distance = np.einsum("vi,vi->v", vertices - matches.points, matches.normals)
     distance[matches.weights == 0.0] = np.nan
@@ -264,8 +265,7 @@ def _step(
 
 
 def _joint_precision(template: BodyTemplate) -> Array:
-    names = [name.removeprefix("left ").removeprefix("right ") for name in template.joint_names]
-    return np.array([np.radians(JOINT_DEG[name]) ** -2.0 for name in names])
+    return np.array([np.radians(JOINT_DEG[drop_side(one)]) ** -2.0 for one in template.joint_names])
 
 
 def differentiate(

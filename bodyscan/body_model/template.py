@@ -95,6 +95,11 @@ class PosedBody:
     joints: Array
 
 
+def drop_side(name: str) -> str:
+    """The name of a joint or landmark without the side that it begins with."""
+    return name.removeprefix("left ").removeprefix("right ")
+
+
 def pose_body(template: BodyTemplate, body: BodyShapeAndPose) -> PosedBody:
     """Shape and pose a template by linear blend skinning."""
     shaped = template.vertices + np.tensordot(body.shape, template.shapes, axes=1)

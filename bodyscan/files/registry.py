@@ -36,13 +36,14 @@ class Registry(Generic[Format]):
 
     def find(self, name: str) -> Format:
         """The format of that name. Raises BadInput, with the list, if there is none."""
-        if name not in self.names():
-            raise unknown_format_error(self.what, name, self.names(), refusal=self.refusal)
         if name in self.registered:
             return self.registered[name]
         if name in self._modules():
             return cast(Format, import_module(f"{self.package}.{name}").FORMAT)
-        return cast(Format, next(iter(entry_points(group=self.package, name=name))).load())
+        # Last: every installed package is asked.
+        for added in entry_points(group=self.package, name=name):
+            return cast(Format, added.load())
+        raise unknown_format_error(self.what, name, self.names(), refusal=self.refusal)
 
     def _modules(self) -> list[str]:
         return [one.name for one in pkgutil.iter_modules(import_module(self.package).__path__)]

@@ -15,6 +15,7 @@ import numpy as np
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.body_model.registered import RegisteredBody
+from bodyscan.body_model.template import drop_side
 
 PROMINENT = {
     "bust point": (1.0, 0.0, 0.0),
@@ -71,7 +72,7 @@ def find_landmarks(body: RegisteredBody) -> dict[str, Landmark]:
         for name, vertex in template.landmarks.items()
     }
     for name, vertex in template.landmarks.items():
-        base = name.removeprefix("left ").removeprefix("right ")
+        base = drop_side(name)
         outward = -1.0 if name.startswith("right ") else 1.0
         if base in PROMINENT and spots[name].found == "surface":
             direction = np.array(PROMINENT[base]) * [1.0, outward, 1.0]
@@ -108,27 +109,27 @@ def _climb(body: RegisteredBody, part: int, direction: Array, start: _Spot) -> _
     along = np.eye(3)[int(np.argmin(np.abs(direction)))]
     first = np.cross(direction, along)
     tangents = np.stack([first, np.cross(direction, first)])
-    place = start.position
+    position = start.position
     for _ in range(3):
-        near = _near(body, part, place, WINDOW_MM)
+        near = _near(body, part, position, WINDOW_MM)
         if len(near) < 30:
             return start
-        offset = body.vertices[near] - place
+        offset = body.vertices[near] - position
         (u, v), height = tangents @ offset.T, offset @ direction
         columns = np.stack([np.ones_like(u), u, v, 0.5 * u**2, u * v, 0.5 * v**2], axis=1)
         level, a, b, uu, uv, vv = np.linalg.lstsq(columns, height, rcond=None)[0]
         curvatures, axes = np.linalg.eigh(np.array([[uu, uv], [uv, vv]]))
         curvatures = np.minimum(curvatures, 0.0)
-        slope, home = axes.T @ (a, b), axes.T @ tangents @ (start.position - place)
+        slope, home = axes.T @ (a, b), axes.T @ tangents @ (start.position - position)
         gradient = home / SEARCH_MM**2 - curvatures * slope / SLOPE**2
         step = gradient / (SEARCH_MM**-2 + (curvatures / SLOPE) ** 2)
         size = float(np.linalg.norm(step))
         step *= min(1.0, 0.6 * WINDOW_MM / max(size, 1e-9))
         rise = level + step @ slope + 0.5 * step**2 @ curvatures
-        place = place + (axes @ step) @ tangents + rise * direction
+        position = position + (axes @ step) @ tangents + rise * direction
         if size < 0.5:
             break
-    return _Spot(place, "refined")
+    return _Spot(position, "refined")
 
 
 def _find_ends(body: RegisteredBody, spots: Mapping[str, _Spot]) -> dict[str, _Spot]:

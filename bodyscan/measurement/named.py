@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, cached_property
 from importlib import resources
 from itertools import pairwise
 from typing import Any
@@ -89,9 +89,15 @@ class _Body:
     landmarks: Mapping[str, Array]
     sigma_mm: Mapping[str, float]
 
-    @property
+    @cached_property
     def noise_mm(self) -> float:
+        """Sigma of the surface at a point."""
         return float(np.median(self.sections.noise_mm))
+
+    @property
+    def length_noise_mm(self) -> float:
+        """Sigma of the distance between two points of the surface."""
+        return float(np.sqrt(2.0)) * self.noise_mm
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,9 +147,9 @@ def take_measures(registered: RegisteredBody) -> NamedMeasures:
     sections = BodySections(registered)
     landmarks = find_landmarks(registered)
     to_body = registered.rig_from_body.inverse()
-    places = {name: to_body.apply(np.array(one.position_mm)) for name, one in landmarks.items()}
-    body = _Body(sections, places, {name: one.sigma_mm for name, one in landmarks.items()})
-    posture = find_posture(registered.fitted, places)
+    positions = {name: to_body.apply(np.array(one.position_mm)) for name, one in landmarks.items()}
+    body = _Body(sections, positions, {name: one.sigma_mm for name, one in landmarks.items()})
+    posture = find_posture(registered.fitted, positions)
     measures, missing = {}, {}
     for definition in read_definitions():
         try:
@@ -189,16 +195,16 @@ def _take(body: _Body, definition: Mapping[str, Any], posture: Posture) -> Measu
 def _height(body: _Body, definition: Mapping[str, Any], shift_mm: float) -> _Taken:
     if definition.get("top"):
         vertices, mesh = body.sections.body.vertices, body.sections.body.mesh
-        place = vertices[int(np.argmax(vertices[:, 2]))]
-        crown = vertices[mesh.faces, 2].max(axis=1) > place[2] - CROWN_MM
+        position = vertices[int(np.argmax(vertices[:, 2]))]
+        crown = vertices[mesh.faces, 2].max(axis=1) > position[2] - CROWN_MM
         # A crown that nobody saw is closed by a guess, which may be off by as much.
         measured = float((~mesh.filled[crown]).mean())
         noise = body.noise_mm if measured > 0.5 else CROWN_MM / 1.96
     else:
-        place = np.mean([body.landmarks[name] for name in definition["landmarks"]], axis=0)
+        position = np.mean([body.landmarks[name] for name in definition["landmarks"]], axis=0)
         measured, noise = 1.0, body.noise_mm
-    path = np.array([place * [1.0, 1.0, 0.0], place])
-    return _Taken(float(place[2]), measured, noise, path)
+    path = np.array([position * [1.0, 1.0, 0.0], position])
+    return _Taken(float(position[2]), measured, noise, path)
 
 
 def _distance(body: _Body, definition: Mapping[str, Any], shift_mm: float) -> _Taken:
@@ -206,13 +212,13 @@ def _distance(body: _Body, definition: Mapping[str, Any], shift_mm: float) -> _T
     axis = definition.get("axis")
     gap = other - one if axis is None else (other - one)["xyz".index(axis)]
     length = float(np.linalg.norm(gap))
-    return _Taken(length, 1.0, float(np.sqrt(2.0)) * body.noise_mm, np.array([one, other]))
+    return _Taken(length, 1.0, body.length_noise_mm, np.array([one, other]))
 
 
 def _chain(body: _Body, definition: Mapping[str, Any], shift_mm: float) -> _Taken:
     points = np.array([body.landmarks[name] for name in definition["landmarks"]])
     length = float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
-    return _Taken(length, 1.0, float(np.sqrt(2.0)) * body.noise_mm, points)
+    return _Taken(length, 1.0, body.length_noise_mm, points)
 
 
 def _girth(body: _Body, definition: Mapping[str, Any], shift_mm: float) -> _Taken:
@@ -280,7 +286,7 @@ def _tape(body: _Body, definition: Mapping[str, Any], shift_mm: float) -> _Taken
         outer = outer[: int(np.argmax(outer == 1)) + 1]
         total += float(np.linalg.norm(np.diff(chain[outer], axis=0), axis=1).sum())
         paths.append(a + chain[outer][::-1] @ np.stack([along, out]))
-    return _Taken(total, 1.0, float(np.sqrt(2.0)) * body.noise_mm, np.concatenate(paths))
+    return _Taken(total, 1.0, body.length_noise_mm, np.concatenate(paths))
 
 
 _KINDS = {

@@ -7,14 +7,14 @@ is there at once. The joint solve of all shots so far takes longer; it comes whe
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import networkx as nx
 import numpy as np
 
+from bodyscan.alignment.overlaps import find_connected_groups
 from bodyscan.arrays import Array, Indices
 from bodyscan.boards.view import BoardView
 from bodyscan.captures.folder import Captures, open_captures
@@ -106,7 +106,9 @@ class BoardTour:
         by_pair = {pair.name: self._calibrating(pair.name) for pair in self.rig.pairs}
         cells = {pair.name: _count_cells(pair, by_pair[pair.name]) for pair in self.rig.pairs}
         last = list(self.missed)[-1:]
-        next_hold = self._next_hold(cells, {name: len(found) for name, found in by_pair.items()})
+        shared = self._count_shared_shots()
+        groups = self._find_groups((first, second) for first, second, _ in shared)
+        boards = {name: len(found) for name, found in by_pair.items()}
         return {
             "shots": len(self.seen),
             "last": last[0] if last else None,
@@ -120,9 +122,9 @@ class BoardTour:
                 }
                 for name, found in by_pair.items()
             ],
-            "groups": self._groups(),
-            "shared": self._shared(),
-            "next": next_hold,
+            "groups": groups,
+            "shared": shared,
+            "next": _choose_next_hold(cells, boards, groups),
             "advice": self.solved.get("advice", []),
             "solved_shots": self.solved.get("shots", 0),
             "wanted": BOARDS,
@@ -132,7 +134,7 @@ class BoardTour:
         """Boards that calibrate a pair: those on which it took its stripes, if it has any."""
         return [v for v in self.views if v.pair == pair and (pair, v.shot) not in self.lit]
 
-    def _shared(self) -> list[tuple[str, str, int]]:
+    def _count_shared_shots(self) -> list[tuple[str, str, int]]:
         """Pairs of pairs, and how many shots they share."""
         counts: dict[tuple[str, str], int] = {}
         for shot in self.seen:
@@ -142,34 +144,38 @@ class BoardTour:
                     counts[first, second] = counts.get((first, second), 0) + 1
         return [(first, second, count) for (first, second), count in sorted(counts.items())]
 
-    def _groups(self) -> list[list[str]]:
+    def _find_groups(self, ties: Iterable[tuple[str, str]]) -> list[list[str]]:
         """Pairs that shots tie together, the largest group first."""
-        graph = nx.Graph()
-        graph.add_nodes_from(pair.name for pair in self.rig.pairs)
-        graph.add_edges_from((first, second) for first, second, _ in self._shared())
-        return sorted(map(sorted, nx.connected_components(graph)), key=lambda one: (-len(one), one))
+        groups = find_connected_groups([pair.name for pair in self.rig.pairs], ties)
+        return sorted(map(sorted, groups), key=lambda one: (-len(one), one))
 
-    def _next_hold(self, cells: dict[str, Indices], boards: dict[str, int]) -> dict[str, Any]:
-        """Where to hold the board next, as words' keys and what goes into them: first where it was
-        hardly seen, then what ties groups together, then what pictures lack, then nothing."""
-        groups = self._groups()
-        barest_pair = min(boards, key=lambda name: boards[name])
-        if len(groups) > 1 and min(boards.values()) >= 2:
-            return {"say": "tie", "one": groups[0], "other": groups[1]}
-        # Twice in a cell: once may be by a corner of the board, and says nothing of the lens there.
-        share = {name: float(np.mean(each > 1)) for name, each in cells.items()}
-        barest = min(share, key=lambda name: share[name])
-        target = barest_pair if boards[barest_pair] < BOARDS else barest
-        if boards[barest_pair] >= BOARDS and share[barest] >= 0.8:
-            return {"say": "enough"}
-        row, column = divmod(int(np.argmin(_inner_first(cells[target]))), COLUMNS)
-        return {
-            "say": "hold",
-            "pair": target,
-            "row": row,
-            "column": column,
-            "boards": boards[target],
-        }
+
+def _choose_next_hold(
+    cells: Mapping[str, Indices], boards: Mapping[str, int], groups: Sequence[Sequence[str]]
+) -> dict[str, Any]:
+    """Where to hold the board next, as words' keys and what goes into them: first where it was
+    hardly seen, then what ties groups together, then what images lack, then nothing.
+
+    cells: of each pair, see `_count_cells`. boards: how many calibrate each pair. groups: of pairs that
+        shots tie together.
+    """
+    barest_pair = min(boards, key=lambda name: boards[name])
+    if len(groups) > 1 and min(boards.values()) >= 2:
+        return {"say": "tie", "one": groups[0], "other": groups[1]}
+    # Twice in a cell: once may be by a corner of the board, and says nothing of the lens there.
+    share = {name: float(np.mean(each > 1)) for name, each in cells.items()}
+    barest = min(share, key=lambda name: share[name])
+    target = barest_pair if boards[barest_pair] < BOARDS else barest
+    if boards[barest_pair] >= BOARDS and share[barest] >= 0.8:
+        return {"say": "enough"}
+    row, column = divmod(int(np.argmin(_inner_first(cells[target]))), COLUMNS)
+    return {
+        "say": "hold",
+        "pair": target,
+        "row": row,
+        "column": column,
+        "boards": boards[target],
+    }
 
 
 def _count_cells(pair: Pair, views: Sequence[BoardView]) -> Indices:

@@ -51,7 +51,7 @@ from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.storage import calibration_id, load_calibration
 from bodyscan.report.pictures import Pictures, draw_pictures, write_pictures
 from bodyscan.settings import AlignmentSettings, FusionSettings, ScanSettings
-from bodyscan.verdict import Announce, say_nothing
+from bodyscan.verdict import Announce, Verdict, say_nothing
 from bodyscan.workflows.range_images import (
     Preparation,
     Reconstructed,
@@ -241,10 +241,8 @@ def fuse(
         images = _image_evidence(calibration, measured, cleaned, subject, merged.contradictions)
         rig, facts = RigEvidence.from_calibration(calibration), (subject.aligned, subject.person)
         evidence = ScanEvidence(merged.cloud, rig, images, settings.use, *facts)
-        if grade_scan(evidence).grade == "repeat":
-            exchanged = find_exchanged(measured.value, calibrated, volume, read_as)
-            evidence = replace(evidence, images=replace(images, exchanged=exchanged))
-        announce(grade_scan(evidence), final=False)
+        evidence, verdict = _judge_points(evidence, measured.value, calibration, read_as)
+        announce(verdict, final=False)
     with step(progress, "meshing"):
         cloud, mesh = _mesh(merged.cloud, measured.value, subject, settings, made)
         # Also by the images of pairs that saw nothing of the subject.
@@ -264,6 +262,23 @@ def fuse(
         subject.person,
         measured.notes,
     )
+
+
+def _judge_points(
+    evidence: ScanEvidence,
+    images: Sequence[RangeImage],
+    calibration: RigCalibration,
+    read_as: Callable[[str, str], RangeImage | None],
+) -> tuple[ScanEvidence, Verdict]:
+    """Grade a scan by its points; of one that is to be repeated, also ask whether images of pairs were
+    exchanged. Returns the evidence with that, and the verdict."""
+    verdict = grade_scan(evidence)
+    if verdict.grade != "repeat":
+        return evidence, verdict
+    poses, volume = calibration.rig_from_camera, calibration.rig.volume
+    exchanged = find_exchanged(images, poses, volume, read_as)
+    evidence = replace(evidence, images=replace(evidence.images, exchanged=exchanged))
+    return evidence, grade_scan(evidence)
 
 
 def _align(
