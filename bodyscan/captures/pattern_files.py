@@ -55,9 +55,8 @@ def write_patterns(rig: Rig, out: Path, width: int, height: int) -> tuple[Path, 
             if any(pair.projector for pair in rig.pairs)
             else "give its pairs a `projector`: docs/formats.md shows how",
         )
-    names: dict[
-        StripeCode, str
-    ] = {}  # such as gray-640-horizontal, numbered if they would be equal
+    # Such as gray-640-horizontal, numbered if they would be equal.
+    names: dict[StripeCode, str] = {}
     for kind in kinds:
         directions = "-".join(f"{one.stripes}-{one.direction}" for one in kind.directions)
         name = f"{kind.code}-{directions}"

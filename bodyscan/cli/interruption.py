@@ -21,10 +21,12 @@ STOP_SIGNAL = signal.SIGUSR1
 """Stops the child: COLMAP, where it is imported, answers a SIGTERM with a stack trace."""
 
 
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""Signals that ask a command to end."""
+
+
 class _StopRequest(Exception):
     """The command is to end, because of a signal of that number."""
-
-    signals = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 def run_interruptibly(work: Callable[[], int]) -> int:
@@ -36,10 +38,9 @@ def run_interruptibly(work: Callable[[], int]) -> int:
         return work()
     sys.stdout.flush()
     sys.stderr.flush()
-    signal.pthread_sigmask(
-        signal.SIG_BLOCK, _StopRequest.signals
-    )  # until both processes know what to do
-    for number in _StopRequest.signals:
+    # Until both processes know what to do.
+    signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+    for number in SIGNALS:
         if signal.getsignal(number) != signal.SIG_IGN:
             signal.signal(number, _raise_request)
     parent = os.getpid()
@@ -47,7 +48,7 @@ def run_interruptibly(work: Callable[[], int]) -> int:
     if child == 0:
         _work(work, parent)
     try:
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, _StopRequest.signals)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
         return _code(os.waitpid(child, 0)[1])
     except _StopRequest as request:
         with suppress(ChildProcessError, ProcessLookupError):  # it has ended meanwhile
@@ -63,7 +64,7 @@ def _work(work: Callable[[], int], parent: int) -> NoReturn:
         signal.signal(number, _interrupt)
     _end_with(parent)
     try:
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, _StopRequest.signals)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
         code = work()
     except KeyboardInterrupt:
         code = STOPPED
@@ -115,7 +116,7 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 
 def _hear_no_more() -> None:
     """Once is enough. With SIG_IGN Python would report signals that are pending."""
-    for number in (*_StopRequest.signals, STOP_SIGNAL):
+    for number in (*SIGNALS, STOP_SIGNAL):
         if signal.getsignal(number) in (_raise_request, _interrupt):
             signal.signal(number, lambda number, frame: None)
 

@@ -206,6 +206,7 @@ def measure(
     from bodyscan.measurement.measurements import heights_from
     from bodyscan.measurement.measurements import measure as measure_mesh
     from bodyscan.report.measurement_table import (
+        MEASUREMENTS,
         measurements_csv,
         measurements_document,
         tables,
@@ -215,7 +216,7 @@ def measure(
     stored, levels = load_scan(result), None if heights is None else heights_from(heights)
     if not anyway:
         refuse_repeat(result, stored.facts)
-    path = out or result / "measurements.json"
+    path = out or result / MEASUREMENTS
     refuse_own_file(path, result)
     measured = measure_mesh(stored.mesh, levels, named=named)
     content = measurements_document(measured, stored.facts)
@@ -223,13 +224,13 @@ def measure(
         write_text(path, measurements_csv(measured, stored.facts))
     else:
         write_json(path, content)
+    written = [path]
     if landmarks is not None and measured.named is not None:
         write_landmarks(landmarks, measured.named, stored.facts)
-    written = [path, *([landmarks] if landmarks is not None and named else [])]
-    for one in written:
-        if one.suffix != ".json":
-            # As beside an export, so that `bodyscan forget` knows whose it is.
-            write_json(one.with_name(f"{one.name}.json"), {"subject": content["subject"]})
+        written.append(landmarks)
+    for one in (file for file in written if file.suffix != ".json"):
+        # As beside an export, so that `bodyscan forget` knows whose it is.
+        write_json(one.with_name(f"{one.name}.json"), {"subject": content["subject"]})
     output.show(*tables(measured))
     _show_grade(output, stored)
     output.figures(**content)

@@ -65,6 +65,12 @@ class BodyFrame:
     rig_from_body: RigidTransform
     known: bool
 
+    @property
+    def view_axes(self) -> Array:
+        """Columns (3, 3), rig frame: forward, left and up in pictures; the rig's own axes where the
+        facing is not known."""
+        return self.rig_from_body.rotation if self.known else np.eye(3)
+
 
 @dataclass(frozen=True, eq=False)
 class BodyParts:

@@ -10,9 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from bodyscan.arrays import Array, Floats, Indices
-from bodyscan.compiled import compiled
 
 RIM = -1  # no face on the other side
 UNSOUND = -2  # several faces run along the edge the same way, or it has no length
@@ -101,29 +102,14 @@ def directed_edges(faces: Indices) -> Indices:
     return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
 
 
-@compiled
 def connect(edges: Indices, count: int) -> tuple[int, NDArray[np.int32]]:
-    """Find the number of connected components of a graph, and the component (count,) of each node,
-    by union-find (Tarjan 1975).
+    """Find the number of connected components of a graph, and the component (count,) of each node.
 
     edges: (N, 2), pairs of nodes 0 to count - 1.
     """
-    parent = np.arange(count)  # a node of a smaller number, or the node itself
-    for n in range(len(edges)):
-        one, other = edges[n, 0], edges[n, 1]
-        while parent[one] != one:
-            parent[one] = one = parent[parent[one]]
-        while parent[other] != other:
-            parent[other] = other = parent[parent[other]]
-        parent[max(one, other)] = min(one, other)
-    labels, number = np.empty(count, np.int32), 0
-    for node in range(count):
-        if parent[node] == node:
-            labels[node] = number
-            number += 1
-        else:
-            labels[node] = labels[parent[node]]
-    return number, labels
+    graph = coo_array((np.ones(len(edges), np.int8), tuple(edges.T)), shape=(count, count))
+    number, labels = connected_components(graph, directed=False)
+    return int(number), labels
 
 
 def label_components(faces: Indices, vertex_count: int) -> NDArray[np.int32]:

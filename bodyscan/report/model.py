@@ -57,7 +57,7 @@ def pack(
     if vertices is not None and len(vertices) > 65_536:
         raise ValueError(f"{len(vertices)} vertices; 16-bit indices address 65,536")
     if view_deg is None:
-        x, y, _ = np.eye(3)[0] if vertices is None else _find_forward(vertices)
+        x, y, _ = (np.eye(3) if vertices is None else find_body_frame(vertices).view_axes)[:, 0]
         view_deg = (25.0 + float(np.degrees(np.arctan2(y, x))), 6.0)
     coordinates = [vertices] if vertices is not None else []
     coordinates += [strokes.ends.reshape(-1, 3)] if strokes is not None else []
@@ -95,11 +95,6 @@ def pack(
             "colours": encode(np.repeat(strokes.colours, 2, axis=0)),
         }
     return packed
-
-
-def _find_forward(vertices: Array) -> Array:
-    """Where a body faces, (3,)."""
-    return find_body_frame(vertices).rig_from_body.rotation[:, 0]
 
 
 def pack_cloud(cloud: BodyCloud) -> dict[str, Any]:

@@ -199,10 +199,9 @@ def _frames(points: Array, views: Sequence[str], height_px: int) -> list[_Frame]
     step = float((high - low).max() + 40.0) / height_px
     middle = 0.5 * (low[2] + high[2])
     body = find_body_frame(points[:: max(1, len(points) // 50_000)])
-    turn = body.rig_from_body.rotation if body.known else np.eye(3)
     frames = []
     for view in views:
-        axes = _axes(view) @ turn.T
+        axes = _axes(view) @ body.view_axes.T
         across = points @ axes[0]
         ends = np.array([across.min(), across.max()])
         width = int(np.ceil((np.ptp(ends) + 40.0) / step))

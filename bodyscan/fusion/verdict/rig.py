@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from bodyscan.arrays import Array
 from bodyscan.errors import group_reasons
+from bodyscan.fusion.cleaning import find_inside
 from bodyscan.fusion.verdict.evidence import Finding, ScanEvidence
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
@@ -49,9 +50,10 @@ def find_exchanged(
         near = cKDTree(np.concatenate(rest)).query(points, distance_upper_bound=10.0)[0]
         return float(np.isfinite(near).mean())
 
-    own = {name: share_near(points, [name]) for name, points in inside.items()}
+    shares = {name: share_near(points, [name]) for name, points in inside.items()}
     # Six are 30 to read again; if more are wrong, so is what they are compared with.
-    suspects = sorted((name for name in own if own[name] < 0.3), key=lambda name: own[name])[:6]
+    doubtful = [name for name, share in shares.items() if share < 0.3]
+    suspects = sorted(doubtful, key=lambda name: shares[name])[:6]
     found = {}
     for one, other in permutations(suspects, 2):
         image = read_as(one, other)
@@ -65,11 +67,10 @@ def _points_inside(
     image: RangeImage, rig_from_camera: Mapping[str, RigidTransform], volume: Volume
 ) -> Array:
     """Points (N, 3) of one pixel in 16 that are in the scan volume and not on the floor, rig frame."""
-    some = image.subsample(4)
-    points = image.points[some][image.valid[some]].astype(np.float64)
-    points = rig_from_camera[image.pair].apply(points)
-    above = (points[:, 2] > 30.0) & (points[:, 2] < volume.top_mm)
-    return np.asarray(points[above & (np.hypot(*points[:, :2].T) < volume.radius_mm)])
+    above = Volume.model_construct(radius_mm=volume.radius_mm, bottom_mm=30.0, top_mm=volume.top_mm)
+    some, pose = image.subsample(4), rig_from_camera[image.pair]
+    points = image.points[some][find_inside(image, pose, above)[some]]
+    return pose.apply(points.astype(np.float64))
 
 
 def check_exchanged(scan: ScanEvidence) -> Iterator[Finding]:
