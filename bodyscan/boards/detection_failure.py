@@ -29,7 +29,9 @@ def describe_unfound(image: Bytes, board: Board, *, quick: bool = False) -> str:
     """
     if board.kind == "checkerboard":
         return (
-            f"not whole, {_say_lattice(image, board)}" if quick else _describe_grids(image, board)
+            f"not whole, {_describe_lattice(image, board)}"
+            if quick
+            else _describe_grids(image, board)
         )
     if quick:
         return ""
@@ -71,8 +73,8 @@ def estimate_first_marker(board: Board, markers: Markers) -> int:
     best, found = board.first_marker, _count_agreeing(board, markers)
     middle = int(np.median(markers.ids)) if len(markers.ids) else 0
     for first in range(max(0, middle - board.marker_count + 1), middle + 1):
-        shown = (markers.ids >= first) & (markers.ids < first + board.marker_count)
-        if np.count_nonzero(shown) < found + 2:
+        in_range = (markers.ids >= first) & (markers.ids < first + board.marker_count)
+        if np.count_nonzero(in_range) < found + 2:
             continue
         agreeing = _count_agreeing(board.model_copy(update={"first_marker": first}), markers)
         if agreeing >= found + 2:
@@ -138,11 +140,11 @@ def _describe_grids(image: Bytes, board: Board) -> str:
                 f"no grid of {wanted}, but one of {columns - 1} x {rows - 1}: {columns} columns x "
                 f"{rows} rows of squares"
             )
-    seen = _say_lattice(image, board)
-    return f"no grid of {wanted}, nor of one more or fewer in either direction, {seen}"
+    lattice = _describe_lattice(image, board)
+    return f"no grid of {wanted}, nor of one more or fewer in either direction, {lattice}"
 
 
-def _say_lattice(image: Bytes, board: Board) -> str:
+def _describe_lattice(image: Bytes, board: Board) -> str:
     if shows_lattice(image, (board.columns - 1, board.rows - 1)):
         return "but squares like a board's: some may be cut off, covered, blurred or too dark"
     return "nor anything like a board's squares"

@@ -391,8 +391,8 @@ def _compare_fits(
 def _folds(fit: CameraCalibration, views: Sequence[PlanarView]) -> bool:
     """Whether a lens folds over before the outermost corner, or over most of the picture: what it does
     there is no camera's."""
-    seen = np.isfinite(_corner_rays(fit.camera, views)).all()
-    return not seen or fit.camera.folds
+    valid = np.isfinite(_corner_rays(fit.camera, views)).all()
+    return not valid or fit.camera.folds
 
 
 def _is_wide(camera: Camera, views: Sequence[PlanarView]) -> bool:

@@ -90,13 +90,13 @@ def find_device_problems(rig: Rig) -> Iterator[Problem]:
 def _find_key_problems(
     plan: CapturePlan, pair: str, role: Literal["camera", "projector"], kinds: Registry[type[Kind]]
 ) -> Iterator[Problem]:
-    own = getattr(plan.pairs.get(pair), role, {})
+    keys = getattr(plan.pairs.get(pair), role, {})
     try:
         _parse(kinds, plan.device(role, pair))
     except ValidationError as refused:
         errors = [(each["loc"], each["msg"]) for each in refused.errors(include_url=False)]
         for loc, text in errors:
-            in_pair = "kind" in own or loc[0] in own
+            in_pair = "kind" in keys or loc[0] in keys
             inside = ("pairs", pair, role) if in_pair else (role,)
             yield ("capture", *inside, *loc), text[:1].lower() + text[1:]
 

@@ -100,7 +100,7 @@ def capture_shot(devices: Devices, shot: Shot, progress: Progress = silent) -> C
             one.result()
     if lost:
         write_text(shot.folder / "done", "")
-    return Captured(shot, total - len(lost), retaken, _lost_by_pair(lost))
+    return Captured(shot, total - len(lost), retaken, _describe_lost(lost))
 
 
 def refuse_existing_shot(rig: Rig, shot: Shot, overwrite: bool = False) -> None:
@@ -293,7 +293,7 @@ def _describe(devices: Devices, shot: Shot) -> None:
     write_captures_file(shot.folder, described)
 
 
-def _lost_by_pair(lost: Mapping[Frame, str]) -> dict[str, str]:
+def _describe_lost(lost: Mapping[Frame, str]) -> dict[str, str]:
     """Why each pair misses frames, and how many."""
     counts: dict[str, list[str]] = {}
     for (pair, _), reason in lost.items():

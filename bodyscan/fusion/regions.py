@@ -234,10 +234,10 @@ def group_medians(values: Floats | Array, group: Indices, count: int) -> Array:
     for number in group:
         ends[number + 1] += 1
     ends = np.cumsum(ends)
-    place, gathered = ends.copy(), np.empty_like(values)
+    following, gathered = ends.copy(), np.empty_like(values)
     for n in range(len(values)):
-        gathered[place[group[n]]] = values[n]
-        place[group[n]] += 1
+        gathered[following[group[n]]] = values[n]
+        following[group[n]] += 1
     medians = np.zeros(count)
     for k in range(count):
         if ends[k] < ends[k + 1]:

@@ -57,8 +57,8 @@ def find_near_bricks(points: Array, origin: Array, cell_mm: float, shape: tuple[
     first, last = np.empty(3, np.int64), np.empty(3, np.int64)
     for n in range(len(points)):
         for axis in range(3):
-            place = (points[n, axis] - origin[axis]) / cell_mm
-            first[axis], last[axis] = (place - margin) // SIDE, (place + margin) // SIDE
+            at = (points[n, axis] - origin[axis]) / cell_mm
+            first[axis], last[axis] = (at - margin) // SIDE, (at + margin) // SIDE
         for i in range(first[0], last[0] + 1):
             for j in range(first[1], last[1] + 1):
                 near[i, j, first[2] : last[2] + 1] = True
@@ -126,9 +126,9 @@ def _interpolate(values: Floats, indices: NDArray[np.int32], ratio: float) -> Fl
     for brick in range(len(indices)):
         for axis in range(3):
             for node in range(SIDE):
-                place = min((SIDE * indices[brick, axis] + node) * ratio, values.shape[axis] - 1.0)
-                first[axis, node] = min(int(place), values.shape[axis] - 2)
-                share[axis, node] = place - first[axis, node]
+                at = min((SIDE * indices[brick, axis] + node) * ratio, values.shape[axis] - 1.0)
+                first[axis, node] = min(int(at), values.shape[axis] - 2)
+                share[axis, node] = at - first[axis, node]
         for i in range(SIDE):
             for j in range(SIDE):
                 a, b, p, q = first[0, i], first[1, j], share[0, i], share[1, j]

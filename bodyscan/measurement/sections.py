@@ -25,14 +25,15 @@ UP = np.array([0.0, 0.0, 1.0])
 class Section:
     """A section of some parts by a plane.
 
-    points: (N, 2) mm, in the plane, the two ends of each segment; seen: (N,) whether it was measured.
+    points: (N, 2) mm, in the plane, the two ends of each segment.
+    observed: (N,), whether the scan measured them.
     axes: (3, 3), the plane's two axes and its normal, body frame. level_mm: along the normal.
     measured: share of its length that was measured.
     sigma_mm: standard deviation of its tape girth.
     """
 
     points: Array
-    seen: Mask
+    observed: Mask
     axes: Array
     level_mm: float
     measured: float
@@ -47,7 +48,7 @@ class Section:
     def tape_measured(self) -> float:
         """Share of the tape that touches measured skin or spans hollows between it: what was not
         measured and lies within BASIS_MM of the tape might touch it."""
-        ends = self.points.reshape(-1, 2, 2)[~self.seen[::2]]
+        ends = self.points.reshape(-1, 2, 2)[~self.observed[::2]]
         hull = ConvexHull(self.points)
         inside = -(hull.equations[:, :2] @ ends.mean(axis=1).T + hull.equations[:, 2:]).max(axis=0)
         lengths = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
@@ -56,7 +57,7 @@ class Section:
     @cached_property
     def min_tape_mm(self) -> float:
         """The least that the girth can be: straight across what was not measured."""
-        return hull_perimeter(self.points[self.seen]) if self.seen.any() else 0.0
+        return hull_perimeter(self.points[self.observed]) if self.observed.any() else 0.0
 
     @property
     def positions(self) -> Array:
@@ -97,24 +98,22 @@ class BodySections:
         names = [parts] if isinstance(parts, str) else parts
         wanted = [self.body.fitted.template.part_names.index(name) for name in names]
         of_scan, of_template = self._face_parts
-        seen = _select(scan.slice(level_mm), of_scan, wanted)
-        made = _select(template.slice(level_mm), of_template, wanted)
-        if made is None:
-            made = seen
-        if made is None:
+        scanned = _select(scan.slice(level_mm), of_scan, wanted)
+        whole = _select(template.slice(level_mm), of_template, wanted) or scanned
+        if whole is None:
             return None
         points, noise, breath = np.zeros((0, 2)), 0.0, 0.0
-        if seen is not None and (seen[1] & seen[0].measured).any():
-            loop, mine = seen[0], seen[1] & seen[0].measured
+        if scanned is not None and (scanned[1] & scanned[0].measured).any():
+            loop, mine = scanned[0], scanned[1] & scanned[0].measured
             points = loop.segments[mine].reshape(-1, 2)
             corners = self.body.mesh.faces[loop.faces[mine]]
             noise = float(self.noise_mm[corners].mean())
             breath = float(self.body.breath_sigma_mm[corners].mean())
-        loop, mine = made
+        loop, mine = whole
         known = mine & loop.measured if len(points) else np.zeros_like(mine)
         measured = float(loop.lengths[known].sum() / loop.lengths[mine].sum())
         closed = loop.segments[mine & ~known].reshape(-1, 2)
-        # Noise is alike over a quarter of the girth; breath all around it; the template's surface
+        # Noise is correlated over a quarter of the girth; breath all around it; the template's surface
         # differs from a body's all over what nobody saw.
         sigma = np.pi * np.array([noise, 2.0 * breath, 2.0 * BASIS_MM * (1.0 - measured)])
         return Section(

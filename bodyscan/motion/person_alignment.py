@@ -152,9 +152,9 @@ def _measure_again(
     standing = {name: motions[name] for name in motions.keys() - _pairs_of(displaced)}
     again = []
     for one in displaced:
-        own = {name: motions[name] for name in motions.keys() & one.pairs}
-        if own and standing:
-            measured = DisplacedPole.from_motions(one.name, one.pairs, own | standing)
+        moved = {name: motions[name] for name in motions.keys() & one.pairs}
+        if moved and standing:
+            measured = DisplacedPole.from_motions(one.name, one.pairs, moved | standing)
             one = replace(measured, all_moved=one.all_moved)
         again.append(one)
     return tuple(again)

@@ -37,15 +37,17 @@ def refuse_other_pitch(board: Board, views: Sequence[BoardView]) -> None:
     Whatever homography and lens a view has, it shows the ratio of tag and distance, to a few parts in
     ten thousand. Views of less than 40 corners do not determine the lens.
     """
-    seen = [v for v in views if v.board == board.name and len(v.pixels) >= 40]
-    seen = sorted(seen, key=lambda view: -len(view.pixels))[:10]
-    if board.kind != "aprilgrid" or board.marker_mm is None or not seen:
+    complete = [v for v in views if v.board == board.name and len(v.pixels) >= 40]
+    complete = sorted(complete, key=lambda view: -len(view.pixels))[:10]
+    if board.kind != "aprilgrid" or board.marker_mm is None or not complete:
         return
 
     def misfit(square_mm: float) -> float:
         tried = corner_points(board.model_copy(update={"square_mm": square_mm}))[:, :2]
-        fits = ((tried[v.corner_ids], v.pixels) for v in seen)
-        errors = [fit_board_map(printed, seen).apply(printed) - seen for printed, seen in fits]
+        fits = ((tried[v.corner_ids], v.pixels) for v in complete)
+        errors = [
+            fit_board_map(printed, pixels).apply(printed) - pixels for printed, pixels in fits
+        ]
         return float(np.median(np.abs(np.concatenate(errors))))
 
     side, square_mm = board.marker_mm, board.square_mm
@@ -111,9 +113,9 @@ def _misfit_of_stretch(
     """Sum of the squared residuals, px2, of cameras calibrated with squares so many times as high."""
     tried, total = board.model_copy(update={"stretch": board.stretch * stretch}), 0.0
     for camera, views in groups:
-        seen = [planar_view(view, tried) for view in views if has_enough_corners(view, tried)]
-        found = calibrate_camera(seen, camera.width, camera.height, type(camera.lens)())
-        total += found.rms_px**2 * sum(len(view.pixels) for view in seen)
+        planar = [planar_view(view, tried) for view in views if has_enough_corners(view, tried)]
+        found = calibrate_camera(planar, camera.width, camera.height, type(camera.lens)())
+        total += found.rms_px**2 * sum(len(view.pixels) for view in planar)
     return total
 
 

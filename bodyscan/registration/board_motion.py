@@ -1,9 +1,9 @@
 """How far a board moved between the cameras' pictures of one shot, where these are not synchronised.
 
-Each view shows its board a small motion away from where the shot has it: a random effect, normal with
-a spread of each camera's own, along the board's path through the shots and in any direction. Spreads
-maximize the likelihood of the poses that single views give (EM), with Student's t for the tails, since
-boards are carried and held still by turns. The joint solve marginalizes the motions:
+Each view shows its board a small motion away from where the shot has it: a random effect, normal, with
+standard deviations of each camera's own along the board's path through the shots and in any
+direction. These maximize the likelihood of the poses that single views give (EM), with Student's t for
+the tails, since boards are carried and held still by turns. The joint solve marginalizes the motions:
 lenses follow each view by itself, poses the mean over the shots.
 
 Source: Laird and Ware, Random-Effects Models for Longitudinal Data, Biometrics 38, 1982; Lange, Little
@@ -28,7 +28,7 @@ from bodyscan.registration.joint_solve import JointSolution, linearize_reproject
 
 @dataclass(frozen=True, eq=False)
 class _Motions:
-    """What each of V views says of its board's motion from where the shot has it.
+    """Estimates by each of V views of its board's motion from where the shot has it.
 
     basis: (V, 6, 6) columns: turns about the board's middle that move its corners by 1 mm, and shifts
         by 1 mm, board frame.
@@ -52,11 +52,11 @@ def estimate_motions(
 
     views: of boards as described. noise_px: sigma of a corner's coordinate.
     """
-    seen = _observe_motions(views, solution, noise_px)
-    root, weight = _maximize_likelihood(seen)
-    motions = seen.basis @ root / (noise_px * np.sqrt(weight))[:, None, None]
-    square, number = np.sum(root[:, 3:] ** 2, axis=(1, 2)), np.bincount(seen.camera)
-    rms = np.sqrt(np.bincount(seen.camera, square) / number).tolist()
+    estimates = _observe_motions(views, solution, noise_px)
+    root, weight = _maximize_likelihood(estimates)
+    motions = estimates.basis @ root / (noise_px * np.sqrt(weight))[:, None, None]
+    square, number = np.sum(root[:, 3:] ** 2, axis=(1, 2)), np.bincount(estimates.camera)
+    rms = np.sqrt(np.bincount(estimates.camera, square) / number).tolist()
     names = sorted({view.pair for view in views})
     by_view = {view.key: motion for view, motion in zip(views, motions, strict=True)}
     return by_view, dict(zip(names, rms, strict=True))
@@ -103,36 +103,40 @@ def _observe_motions(
     )
 
 
-def _maximize_likelihood(seen: _Motions) -> tuple[Array, Array]:
-    """Roots (V, 6, 7) of the motions' covariances, mm: a spread in any direction, then one along the
+def _maximize_likelihood(estimates: _Motions) -> tuple[Array, Array]:
+    """Roots (V, 6, 7) of the motions' covariances, mm: in any direction, then one along the
     path, both of the camera; and the weights (V,) of Student's t, by which variances are divided."""
-    camera, shared = seen.camera, np.bincount(seen.target)[seen.target] > 1
+    camera, shared = estimates.camera, np.bincount(estimates.target)[estimates.target] > 1
     # A camera's own pose follows one of its views.
     count = np.maximum(np.bincount(camera, shared) - 1, 1)
-    spread = np.full(len(count), max(np.sqrt(np.median(seen.observed[shared] ** 2)), 1e-6))
+    sigma = np.full(len(count), max(np.sqrt(np.median(estimates.observed[shared] ** 2)), 1e-6))
     along, weight = np.full(len(count), 0.1), np.ones(len(camera))
-    freedoms = 4.0  # one view in twenty moves more than 2.8 spreads
+    freedoms = 4.0  # one view in twenty moves more than 2.8 sigmas
     for _ in range(40):
-        free, path = spread[camera][:, None, None] * np.eye(6), along[camera][:, None] * seen.path
+        free, path = (
+            sigma[camera][:, None, None] * np.eye(6),
+            along[camera][:, None] * estimates.path,
+        )
         root = np.concatenate([free, path[..., None]], axis=2)
-        square = _expect_squares(seen, root / np.sqrt(weight)[:, None, None])
-        spread *= np.sqrt(np.bincount(camera, shared * square[:, :6].mean(axis=1)) / count)
+        square = _expect_squares(estimates, root / np.sqrt(weight)[:, None, None])
+        sigma *= np.sqrt(np.bincount(camera, shared * square[:, :6].mean(axis=1)) / count)
         along *= np.sqrt(np.bincount(camera, shared * square[:, 6]) / count)
         weight = (freedoms + 7.0) / (freedoms + square.sum(axis=1) / weight)
     # The information of a Student t of six dimensions is less than its weights say.
     return root, weight * (freedoms + 6.0) / (freedoms + 8.0)
 
 
-def _expect_squares(seen: _Motions, root: Array) -> Array:
+def _expect_squares(estimates: _Motions, root: Array) -> Array:
     """Expected squares (V, 7) of the independent normal variables z of motions `root` z, root
     (V, 6, 7), with the boards' poses unknown."""
-    known = np.linalg.inv(seen.covariance + root @ root.transpose(0, 2, 1))
-    whole, vector = np.zeros((seen.target.max() + 1, 6, 6)), np.zeros((seen.target.max() + 1, 6))
-    np.add.at(whole, seen.target, known)
-    np.add.at(vector, seen.target, np.einsum("vij,vj->vi", known, seen.observed))
+    known = np.linalg.inv(estimates.covariance + root @ root.transpose(0, 2, 1))
+    count = estimates.target.max() + 1
+    whole, vector = np.zeros((count, 6, 6)), np.zeros((count, 6))
+    np.add.at(whole, estimates.target, known)
+    np.add.at(vector, estimates.target, np.einsum("vij,vj->vi", known, estimates.observed))
     inverse = np.linalg.inv(whole)
-    off = seen.observed - np.einsum("tij,tj->ti", inverse, vector)[seen.target]
+    residual = estimates.observed - np.einsum("tij,tj->ti", inverse, vector)[estimates.target]
     gain = root.transpose(0, 2, 1) @ known
-    variance = gain @ inverse[seen.target] @ gain.transpose(0, 2, 1) - gain @ root
-    found = np.einsum("vij,vj->vi", gain, off)
+    variance = gain @ inverse[estimates.target] @ gain.transpose(0, 2, 1) - gain @ root
+    found = np.einsum("vij,vj->vi", gain, residual)
     return np.asarray(found**2 + 1.0 + np.einsum("vii->vi", variance))

@@ -136,10 +136,10 @@ def solve_rig(
     """
     start, left_out = initial_poses(views, sorted(cameras))
     shared = [view for view in views if view.pair in start]
-    own = {name: cameras[name] for name in sorted(start)}
-    solved = _solve(rig, shared, own, start)
+    joined = {name: cameras[name] for name in sorted(start)}
+    solved = _solve(rig, shared, joined, start)
     if _are_unsynchronised(solved.views, solved.judged.wrong):
-        solved = _solve(rig, shared, own, start, weigh=True)
+        solved = _solve(rig, shared, joined, start, weigh=True)
     solution = _transfer_to_rig_frame(rig, solved)
     return Outcome(solution, (*solved.judged.notes, *solved.notes), left_out)
 

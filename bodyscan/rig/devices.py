@@ -40,9 +40,9 @@ class CapturePlan(Model):
     def device(self, role: Literal["camera", "projector"], pair: str) -> Keys:
         """The keys of one pair's device; a pair with another kind shares no keys with the rest."""
         shared: Keys = getattr(self, role)
-        own: Keys = getattr(self.pairs.get(pair, PairDevices()), role)
-        differs = own.get("kind", shared.get("kind")) != shared.get("kind")
-        return dict(own) if differs else {**shared, **own}
+        given: Keys = getattr(self.pairs.get(pair, PairDevices()), role)
+        differs = given.get("kind", shared.get("kind")) != shared.get("kind")
+        return dict(given) if differs else {**shared, **given}
 
     def problems(self) -> Iterator[Problem]:
         for role, keys in (("camera", self.camera), ("projector", self.projector)):

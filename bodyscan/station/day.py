@@ -26,17 +26,10 @@ DECIDED = "station.json"
 
 Row = dict[str, Any]
 
-COLUMNS: tuple[str, ...] = (
-    "job",
-    "subject",
-    "when",
-    "state",
-    "grade",
-    "reasons",
-    "decision",
-    "note",
+COLUMNS = (
+    *("job", "subject", "when", "state", "grade", "reasons", "decision", "note"),
+    *("sway_mm", "breath_mm", "coverage_percent", "stature_mm", "points", "seconds", "reason"),
 )
-COLUMNS += ("sway_mm", "breath_mm", "coverage_percent", "stature_mm", "points", "seconds", "reason")
 
 
 class Day:
@@ -81,7 +74,7 @@ class Day:
             started = {**empty_row(job), "note": row["note"]} if begins else {}
             return {**started, "scan": event["scan"], "pairs": event["pairs"]}
         if what == "verdict":
-            return judged(event["grade"], event["reasons"]) | {"final": event["final"]}
+            return make_verdict_cells(event["grade"], event["reasons"]) | {"final": event["final"]}
         if what == "stage":
             keys = ("part", "done", "total")
             return {"part": event["stage"]} | {key: event[key] for key in keys if key in event}
@@ -131,7 +124,7 @@ def empty_row(job: str) -> Row:
     return row | {"final": False, "body": None, "part": "", "done": 0, "total": 0}
 
 
-def judged(grade: str, reasons: Iterable[str]) -> Row:
+def make_verdict_cells(grade: str, reasons: Iterable[str]) -> Row:
     """The cells that a verdict fills."""
     return {"grade": grade, "mark": MARKS.get(grade, "bad"), "reasons": list(reasons)}
 
@@ -149,7 +142,8 @@ def read_row(folder: Path) -> Row:
         return row
     verdict, counts = facts.get("verdict") or {}, facts.get("counts") or {}
     motion = (facts.get("alignment") or {}).get("motion_mm") or {}
-    row |= judged(verdict.get("grade", "usable"), verdict.get("reasons", ())) | {"final": True}
+    row |= make_verdict_cells(verdict.get("grade", "usable"), verdict.get("reasons", ()))
+    row["final"] = True
     row["body"] = "mesh" if (folder / "report" / "report.html").is_file() else None
     row["when"] = facts.get("when") or row["when"]
     row["sway_mm"] = max(motion.values(), default=None)

@@ -61,7 +61,7 @@ class Guard:
         elif self.token is not None and not self._has_cookie(headers):
             await self._require_token(scope, send)
         else:
-            await self.app(scope, _limited(receive), _with_headers(send))
+            await self.app(scope, _limit_body(receive), _add_headers(send))
 
     def _refuse(self, scope: Scope, headers: dict[str, str]) -> tuple[int, str] | None:
         """Status and reason if the request is not from a page of ours."""
@@ -113,11 +113,11 @@ def _equal(given: str, wanted: str) -> bool:
     return hmac.compare_digest(given.encode(), wanted.encode())
 
 
-def _limited(receive: Receive) -> Receive:
+def _limit_body(receive: Receive) -> Receive:
     """Receive no more than MAX_BODY_BYTES, whatever the length was said to be."""
     got = 0
 
-    async def limited() -> MutableMapping[str, Any]:
+    async def receive_limited() -> MutableMapping[str, Any]:
         nonlocal got
         message = await receive()
         got += len(message.get("body", b""))
@@ -125,16 +125,16 @@ def _limited(receive: Receive) -> Receive:
             raise TooLarge
         return message
 
-    return limited
+    return receive_limited
 
 
-def _with_headers(send: Send) -> Send:
+def _add_headers(send: Send) -> Send:
     """Add HEADERS to an answer, except those that it has itself."""
 
     async def sending(message: MutableMapping[str, Any]) -> None:
         if message["type"] == "http.response.start":
-            own = {name.lower() for name, _ in message["headers"]}
-            more = [(n.encode(), v.encode()) for n, v in HEADERS.items() if n.encode() not in own]
+            given = {name.lower() for name, _ in message["headers"]}
+            more = [(n.encode(), v.encode()) for n, v in HEADERS.items() if n.encode() not in given]
             message = {**message, "headers": [*message["headers"], *more]}
         await send(message)
 
@@ -146,6 +146,6 @@ async def _answer(
 ) -> None:
     kind = [(b"content-type", b"text/plain; charset=utf-8")]
     start = {"type": "http.response.start", "status": status, "headers": [*kind, *(headers or [])]}
-    send = _with_headers(send)
+    send = _add_headers(send)
     await send(start)
     await send({"type": "http.response.body", "body": text.encode()})

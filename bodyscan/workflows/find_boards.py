@@ -124,12 +124,12 @@ def _refuse_other_markers(
     They are looked at again only if a border of the board's corners is in no view, as where numbers
     are shifted.
     """
-    seen = [view for view in views if view.board == board.name]
-    if board.kind == "checkerboard" or board.faces == 2 or not seen:
+    found = [view for view in views if view.board == board.name]
+    if board.kind == "checkerboard" or board.faces == 2 or not found:
         return
-    ids, (columns, rows) = np.concatenate([view.corner_ids for view in seen]), corner_grid(board)
+    ids, (columns, rows) = np.concatenate([view.corner_ids for view in found]), corner_grid(board)
     whole = {0, columns - 1} <= set(ids % columns) and {0, rows - 1} <= set(ids // columns)
-    pair, shot, _ = max(seen, key=lambda view: len(view.pixels)).key
+    pair, shot, _ = max(found, key=lambda view: len(view.pixels)).key
     sequence = next(s for s in captures.pair_sequences(pair) if s.shot == shot)
     if whole or sequence.board_path in captures.corners:
         return

@@ -108,7 +108,7 @@ class PylonCamera(Camera):
 
         # Triggered before it is ready, a camera swallows the trigger.
         if not self._handle.WaitForFrameTriggerReady(2000, pylon.TimeoutHandling_Return):
-            raise self._lost("was not ready for its trigger")
+            raise self._make_lost("was not ready for its trigger")
         self._triggered_ms = now_ms()
         self._handle.ExecuteSoftwareTrigger()
 
@@ -120,7 +120,7 @@ class PylonCamera(Camera):
         number, picture = self._early
         expected, self._next = self._next, (number if self._next is None else self._next) + 1
         if self._kind.line is not None and expected is not None and number > expected:
-            raise self._lost(f"frame {expected} was lost on its way")
+            raise self._make_lost(f"frame {expected} was lost on its way")
         self._early = None
         return picture
 
@@ -131,9 +131,9 @@ class PylonCamera(Camera):
         milliseconds = int(1000.0 * timeout_s)
         with self._handle.RetrieveResult(milliseconds, pylon.TimeoutHandling_Return) as buffer:
             if not buffer.IsValid():
-                raise self._lost("a frame has not come")
+                raise self._make_lost("a frame has not come")
             if not buffer.GrabSucceeded():
-                raise self._lost(f"a frame is damaged: {buffer.ErrorDescription}")
+                raise self._make_lost(f"a frame is damaged: {buffer.ErrorDescription}")
             image, received_ms = np.array(buffer.Array), now_ms()
             ticks, exposure_ms = buffer.TimeStamp, self.exposure_ms or 0.0
             began_ms, clock = ticks / TICKS_PER_MS, f"camera {self._pair}"
@@ -143,7 +143,7 @@ class PylonCamera(Camera):
                     began_ms = self._triggered_ms
             return buffer.BlockID, Picture(image, began_ms, received_ms, exposure_ms, clock)
 
-    def _lost(self, what: str) -> FrameLost:
+    def _make_lost(self, what: str) -> FrameLost:
         return FrameLost(what, where=f"pair {self._pair}")
 
     def close(self) -> None:
