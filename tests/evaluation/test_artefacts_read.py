@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from bodyscan.errors import FailedWork
-from bodyscan.evaluation.artefacts import locate_spheres, read_plate, read_sphere, spacing_errors
+from bodyscan.evaluation.artefacts import (
+    locate_spheres,
+    read_plate,
+    read_sphere,
+    require_spheres,
+    spacing_errors,
+)
 from bodyscan.evaluation.primitives import Sphere
 
 CENTRE, RADIUS = np.array([30.0, -20.0, 900.0]), 50.0
@@ -65,6 +73,31 @@ def test_spheres_are_told_apart_by_their_distances() -> None:
     np.testing.assert_allclose(spacing_errors(readings, longer), [-0.3, 0.2, hypotenuse], atol=0.01)
 
 
+@pytest.mark.parametrize(
+    ("squeeze", "separation_mm", "message"),
+    [
+        (0.8, 500.0, "sphere 1 of radius 50 mm was not found: .* lies in a shell of"),
+        (1.0, 350.0, "between two candidates is off by -150 mm"),
+    ],
+)
+def test_what_is_no_sphere_or_stands_elsewhere_is_not_read(
+    squeeze: float, separation_mm: float, message: str
+) -> None:
+    """A head is an egg. A rig of a wrong size, some hundredths, has its spheres read."""
+    out, wanted = directions(1000), np.array([[0.0, 0.0, 0.0], [500.0, 0.0, 0.0]])
+    readings = [
+        read_sphere(RADIUS * out * [squeeze, 1.0, 1.0] + at, out, Sphere(at, RADIUS), RADIUS)
+        for at in np.array([[0.0, 0.0, 0.0], [separation_mm, 0.0, 0.0]])
+    ]
+    with pytest.raises(FailedWork, match=message):
+        require_spheres(readings, RADIUS, wanted)
+    scaled = [
+        replace(reading, fitted=Sphere(1.05 * at, RADIUS), shell_mm=2.4)
+        for reading, at in zip(readings, wanted, strict=True)
+    ]
+    require_spheres(scaled, RADIUS, wanted)
+
+
 def plate(width: float = 300.0, height: float = 200.0, spacing: float = 4.0) -> np.ndarray:
     x, y = np.meshgrid(np.arange(0.0, width + 0.1, spacing), np.arange(0.0, height + 0.1, spacing))
     return np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 700.0)])
@@ -114,3 +147,6 @@ def test_too_few_points_and_no_plane_are_refused() -> None:
         read_plate(rng.uniform(0, 500, (2000, 3)), facing(plate()[:2000]))
     with pytest.raises(FailedWork, match="no plate"):
         read_plate(np.zeros((400, 3)), facing(plate()[:400]))
+    waved = plate() + 3.0 * np.cos(plate()[:, :1] / 15.0) * UP
+    with pytest.raises(FailedWork, match=r"the flattest surface is [12].* mm RMS off a plane"):
+        read_plate(waved, facing(waved))

@@ -11,7 +11,7 @@ from ray_cast_scan import Scan, cast_scan, load_body, load_rig
 
 from bodyscan.arrays import Bytes, Mask
 from bodyscan.fusion.regions import Regions, find_head, label_regions
-from bodyscan.mesh.body import DARK_CLOTH, HAIR, SKIN, UNSURE, BodyCloud, compute_cover_shares
+from bodyscan.mesh.body import DARK_CLOTH, HAIR, SKIN, UNSURE, BodyCloud
 from bodyscan.motion.body_parts import NECK
 from bodyscan.reconstruction.range_image import RangeImage
 
@@ -224,12 +224,6 @@ def test_where_it_cannot_be_known_what_is_skin_all_is_unsure(seen: Seen, why: st
 
     found = np.concatenate(seen.labels([shown(image) for image in seen.images]))
     assert np.all(found == UNSURE)
-
-
-def test_of_what_covers_the_skin_is_spoken_where_it_is_more_than_moles() -> None:
-    regions = np.repeat(np.array([SKIN, HAIR, DARK_CLOTH, UNSURE], np.uint8), [700, 200, 97, 3])
-    assert compute_cover_shares(regions) == pytest.approx({"hair": 0.2, "dark cloth": 0.097})
-    assert compute_cover_shares(None) == {}
 
 
 def test_a_head_is_above_the_neck_and_near_the_middle_of_the_upper_body() -> None:

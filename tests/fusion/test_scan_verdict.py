@@ -16,7 +16,6 @@ from bodyscan.errors import ScanFailed
 from bodyscan.fusion.cleaning import apply_mask
 from bodyscan.fusion.meshing import closed_surface
 from bodyscan.fusion.storage import Scan
-from bodyscan.fusion.verdict.rig import find_floor
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.outcome import Outcome
@@ -169,20 +168,6 @@ def lifted(z_mm: float) -> dict[str, RigidTransform]:
         n: RigidTransform(at.rotation, at.translation + [0, 0, z_mm])
         for n, at in placings().items()
     }
-
-
-@pytest.mark.parametrize("z_mm", [-20.0, 0.0, 30.0])
-def test_the_floor_is_found_where_it_is(images: list[RangeImage], z_mm: float) -> None:
-    found = find_floor(images, lifted(z_mm), RIG.volume)
-    assert found == pytest.approx(z_mm, abs=0.02)  # medians of thousands of points, 0.1 mm each
-
-
-def test_who_sees_no_floor_says_so(images: list[RangeImage]) -> None:
-    high = [image for image in images if not image.pair.endswith("-1")]
-    assert find_floor(high, placings(), RIG.volume) is None
-    one = [image for image in images if image.pair in ("p1-1", "p1-2")]
-    assert find_floor(one, placings(), RIG.volume) is None
-    assert find_floor(images, lifted(200.0), RIG.volume) is None  # something to stand on
 
 
 def test_a_failed_pair_is_named_and_so_are_a_doubtful_size_and_floor(

@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bodyscan.evaluation.primitives import find_spheres
 from bodyscan.laboratory import apparatus
 from bodyscan.laboratory.apparatus import ChapterCaptures, take_captures
 from bodyscan.laboratory.approaches import Calibrations, calibrate_all
@@ -17,7 +16,6 @@ from bodyscan.laboratory.measuring import (
     triangulate_pixels,
 )
 from bodyscan.laboratory.reproduce import Reproduction, draw, figure_names, reproduction_text
-from bodyscan.reconstruction.triangulation import grid_normals
 
 Measured = dict[bool, dict[str, ApproachAccuracy]]
 
@@ -131,16 +129,6 @@ def test_table_1_is_recovered(calibrated: Calibrations) -> None:
     errors = found.parameters - [getattr(apparatus.CAMERA, name) for name in found.parameter_names]
     # Three sigmas is the bound; a fixed seed makes it no matter of chance.
     assert np.all(np.abs(errors) < 3.0 * sigmas), np.array(errors) / sigmas
-
-
-def test_the_spheres_are_found_without_knowing_where_they_are(
-    captures: ChapterCaptures, calibrated: Calibrations
-) -> None:
-    s = captures.spheres.stripes.s
-    points = triangulate_pixels(calibrated.ours, s).reshape(*s.shape, 3).astype(np.float32)
-    found = find_spheres(points.astype(float), grid_normals(points).astype(float), 25.0, 5)
-    places = np.stack([sphere.centre for sphere in found])
-    assert np.allclose(places, apparatus.CENTRES, atol=0.8)
 
 
 def test_points_are_as_far_off_as_they_say(

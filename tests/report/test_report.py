@@ -11,7 +11,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import open3d as o3d
 import pytest
 from browser import browser_page, find_browser
 from made_scan import MIDDLE_MM, SEMI_AXES_MM, MadeScan, egg, make_scan
@@ -27,7 +26,7 @@ from bodyscan.files.atomic import write_json
 from bodyscan.fusion.storage import Origin
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.jobs.forgetting import find_subject
-from bodyscan.mesh.body import HAIR, SKIN, BodyCloud, find_filled_patches
+from bodyscan.mesh.body import HAIR, SKIN, BodyCloud
 from bodyscan.report.model import Layer, pack
 from bodyscan.report.page import Column, render
 from bodyscan.report.result_page import build_page
@@ -142,23 +141,6 @@ def test_a_body_is_first_seen_from_before_wherever_it_faces() -> None:
         body = replace(egg(20), vertices=turn.apply(vertices), faces=faces, normals=upwards)
         azimuth = np.degrees(pack(body)["view"]["azimuth"])
         assert azimuth == pytest.approx(heading + 25.0, abs=3.0)
-
-
-def test_holes_are_found_where_nothing_was_measured() -> None:
-    mesh = egg()
-    height = mesh.vertices[mesh.faces][:, :, 2].mean(axis=1)
-    (sole, crown) = height < 80.0, height > 1600.0
-    both = replace(mesh, filled=sole | crown)
-    found = sorted(find_filled_patches(both), key=lambda hole: hole.centre[2])
-    assert len(found) == 2
-    for hole, chosen in zip(found, (sole, crown), strict=True):
-        patch = o3d.geometry.TriangleMesh(
-            o3d.utility.Vector3dVector(mesh.vertices),
-            o3d.utility.Vector3iVector(mesh.faces[chosen]),
-        )
-        assert hole.area_mm2 == pytest.approx(patch.get_surface_area(), rel=1e-9)
-        assert height[chosen].min() < hole.centre[2] < height[chosen].max()
-    assert find_filled_patches(replace(mesh, filled=np.zeros_like(mesh.filled))) == []
 
 
 def test_a_larger_body_lies_outside_of_a_smaller_one(tmp_path: Path) -> None:

@@ -240,10 +240,6 @@ def test_wrong_periods_are_refused() -> None:
         read({"period": (21.5, 240), "steps": 3}, lit, coded)
 
 
-def test_periods_may_be_counted() -> None:
-    assert described({"periods": (12, 1)}).waves == described({"period": (20, 240)}).waves
-
-
 @pytest.mark.parametrize(
     ("periods", "stripes", "again"),
     [
