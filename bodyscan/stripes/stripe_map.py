@@ -31,6 +31,7 @@ class StripeMap:
     crossing, crossing_fault: the map of the stripes that run the other way, or why there is none.
     correlation_px: distance along rows and along columns within which pixels share noise.
     saturated: share of the pixels lit by wanted stripes that are white; 0 if not counted.
+    flash: which frames other light reached, see `replace_flashed`; "" if none.
     """
 
     s: Floats
@@ -45,6 +46,18 @@ class StripeMap:
     crossing_fault: str = ""
     correlation_px: tuple[float, float] = (0.0, 0.0)
     saturated: float = 0.0
+    flash: str = ""
+
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """What was wrong with the images and could be left out."""
+        crossing = "stripes of the first direction alone are used, not those of `crossing`: "
+        found = (
+            self.flash,
+            crossing + self.crossing_fault if self.crossing_fault else "",
+            self.crossing.flash if self.crossing else "",
+        )
+        return tuple(fault for fault in found if fault)
 
 
 def assemble_map(

@@ -35,7 +35,7 @@ from bodyscan.stripes.stripe_code import StripeCode
 from bodyscan.stripes.stripe_limits import StripeLimits
 from bodyscan.stripes.stripe_map import StripeMap
 
-NUMBER = re.compile(r"\d[\d.]*%?(, \d[\d.]*%?)*")
+NUMBER = re.compile(r"(?<!bit )\b\d[\d.]*%?(, \d[\d.]*%?)*")
 """Figures in an error's text, left out to tell whether two shots failed for the same reason."""
 
 
@@ -83,11 +83,11 @@ class BoardStripes:
     """What one sequence shows on boards.
 
     boundaries: near each view.
-    crossing_fault: why the stripes that cross are not used; "" if they are, or there are none.
+    faults: see `StripeMap.faults`.
     """
 
     boundaries: Mapping[ViewKey, BoardBoundaries]
-    crossing_fault: str = ""
+    faults: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,7 +155,7 @@ def decode_on_boards(
         if prints:
             share = count[pair.name], turn[sequence]
             near = {view.key: prints.select(view, near[view.key], *share) for view in group}
-        return BoardStripes(near, stripes.crossing_fault)
+        return BoardStripes(near, stripes.faults)
 
     found, errors = attempt_each(
         decode, sequences, BodyscanError, stage="decoding stripes", progress=progress
@@ -163,8 +163,8 @@ def decode_on_boards(
     boundaries = {key: near for one in found.values() for key, near in one.boundaries.items()}
     failed, failure_notes = describe_failures(errors, {pair for pair, _, _ in boundaries})
     failed |= _without_stripes(rig, views, {sequence.pair for sequence in sequences})
-    faults = {sequence: one.crossing_fault for sequence, one in found.items()}
-    return Outcome(boundaries, (*failure_notes, *crossing_notes(faults)), failed)
+    faults = {sequence: one.faults for sequence, one in found.items()}
+    return Outcome(boundaries, (*failure_notes, *fault_notes(faults)), failed)
 
 
 def _without_stripes(rig: Rig, views: Iterable[BoardView], decoded: set[str]) -> dict[str, str]:
@@ -181,15 +181,12 @@ def _without_stripes(rig: Rig, views: Iterable[BoardView], decoded: set[str]) ->
     }
 
 
-def crossing_notes(faults: Mapping[ImageSequence, str]) -> Iterator[str]:
-    """One line for each pair and each reason why its crossing stripes are not used."""
-    found = ((sequence, fault) for sequence, fault in faults.items() if fault)
+def fault_notes(faults: Mapping[ImageSequence, Sequence[str]]) -> Iterator[str]:
+    """One line for each pair and each fault of its images, see `StripeMap.faults`."""
+    found = ((sequence, fault) for sequence, several in faults.items() for fault in several)
     for (pair, fault), group in sorted(_group_faults(found).items()):
         names = ", ".join(sequence.shot for sequence in group)
-        yield (
-            f"{pair}: stripes of the first direction alone are used in "
-            f"shot{'s' if len(group) > 1 else ''} {names}, not those of `crossing`: {fault}"
-        )
+        yield f"{pair}, shot{'s' if len(group) > 1 else ''} {names}: {fault}"
 
 
 def _group_faults(

@@ -27,10 +27,10 @@ from bodyscan.reconstruction.scan_volume import stripes_in_volume
 from bodyscan.reconstruction.triangulation import reconstruct_range_image
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.storage import load_calibration
-from bodyscan.workflows.decode import crossing_notes, decode_sequence
+from bodyscan.workflows.decode import decode_sequence, fault_notes
 
-Reconstructed = tuple[RangeImage, str]
-"""A range image, and why the crossing stripes were not used."""
+Reconstructed = tuple[RangeImage, tuple[str, ...]]
+"""A range image, and what was wrong with the images, see `StripeMap.faults`."""
 
 
 def reconstruct_sequence(
@@ -58,7 +58,7 @@ def reconstruct_sequence(
         image = replace(image, time_ms=moment, span_ms=span)
     if volume_only:
         image = cut_to_volume(image, at, calibration.rig.volume)
-    return image, stripes.crossing_fault
+    return image, stripes.faults
 
 
 def reconstruct_range_images(
@@ -105,8 +105,8 @@ def reconstruct_range_images(
     images = [image for image, _ in found.values()]
     empty = (image.pair for image in images if not np.isfinite(image.points).any())
     notes = [f"{pair}: nothing that it measured lies inside the rig's `volume`" for pair in empty]
-    faults = {sequence: fault for sequence, (_, fault) in found.items()}
-    notes += map(captures.relative, crossing_notes(faults))
+    faults = {sequence: several for sequence, (_, several) in found.items()}
+    notes += map(captures.relative, fault_notes(faults))
     return Outcome(images, tuple(notes), failed)
 
 

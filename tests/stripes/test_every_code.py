@@ -239,7 +239,9 @@ def test_frames_out_of_step_are_counted(late: int, by_bit: bool) -> None:
     moved = np.roll(np.stack([lit, dark, *coded[order]]), late, axis=0)
     with pytest.raises(DecodingFailed, match=f"out of step by {abs(late)}: each file holds"):
         decode_stripes(spec_of(GRAY, 60), moved[0], moved[1], moved[2:][np.argsort(order)])
-    with pytest.raises(DecodingFailed, match="patterns of bits 2 and 3 are the same image"):
+    with pytest.raises(
+        DecodingFailed, match="pattern of bit 2 and the pattern of bit 3 are the same"
+    ):
         decode_stripes(
             spec_of(GRAY, 60), lit, dark, coded[[0, 1, 2, 2, *range(4, 8), 8, 8, 10, 11]]
         )

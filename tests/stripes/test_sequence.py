@@ -64,6 +64,26 @@ def test_a_frame_taken_twice_or_missing_is_named(good: Sequence, bit: int) -> No
             read(with_frame(good, "inverses", bit, good.patterns[bit + 1]))
 
 
+@pytest.mark.parametrize(("name", "bit", "added"), [("patterns", 5, 40), ("inverses", 3, 90)])
+def test_a_frame_that_a_flash_lit_is_named_and_made_from_the_other(
+    good: Sequence, name: str, bit: int, added: int
+) -> None:
+    lit = np.minimum(getattr(good, name)[bit].astype(int) + added, 255).astype(np.uint8)
+    found, calm = read(with_frame(good, name, bit, lit)), read(good)
+    (fault,) = found.faults
+    assert f"the {name[:-1]} of bit {bit} is" in fault
+    assert not calm.faults
+    known = np.isfinite(found.s) & np.isfinite(calm.s)
+    assert known.sum() > 0.99 * np.isfinite(calm.s).sum()
+    assert np.sqrt(np.mean((found.s - calm.s)[known] ** 2)) < 0.01
+
+
+def test_a_finest_bit_taken_twice_is_named(good: Sequence) -> None:
+    for name in ("patterns", "inverses"):
+        with pytest.raises(DecodingFailed, match=f"{name[:-1]} of bit 6 are the same image"):
+            read(with_frame(good, name, BITS - 1, getattr(good, name)[BITS - 2]))
+
+
 def test_a_missing_first_bit_is_named_in_the_remedy(good: Sequence) -> None:
     """Codes of the other half read as stripes beyond the last, or count back."""
     half = replace(good, patterns=good.patterns[1:], inverses=good.inverses[1:])

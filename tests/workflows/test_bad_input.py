@@ -103,8 +103,6 @@ FAULTS: dict[str, tuple[Callable[[Path], None], str, str]] = {
         lambda s: changed(s, lambda i: 0.0 * i + 12.0, "p2-2/*"), "usable", "out: p2-2: .*lights only"),
     "upside down": (
         lambda s: changed(s, lambda i: i[::-1, ::-1], "p2-2/*"), "repeat", "p2-2 .*upside down"),
-    "a flash": (
-        lambda s: changed(s, lambda i: i + 200.0, "p2-2/bit03"), "usable", "out: p2-2: .*of bit 3 is"),
 }  # fmt: skip
 
 

@@ -16,7 +16,7 @@ from bodyscan.captures.folder import ImageSequence, open_scan
 from bodyscan.errors import BodyscanError, DecodingFailed, ImageError
 from bodyscan.rig.rig import Rig, load_rig
 from bodyscan.workflows import decode
-from bodyscan.workflows.decode import crossing_notes, decode_sequence, describe_failures
+from bodyscan.workflows.decode import decode_sequence, describe_failures, fault_notes
 
 TWO_WAYS = """
 version: 1
@@ -115,7 +115,7 @@ def test_a_shot_without_its_crossing_images_keeps_the_others(tmp_path: Path) -> 
     known = np.isfinite(found.s)
     assert known.mean() > 0.9
     assert np.median(np.abs(found.s - s)[known]) < 0.1  # stripes; they are 3 pixels wide
-    (note,) = crossing_notes({sequence: found.crossing_fault})
+    (note,) = fault_notes({sequence: found.faults})
     assert "row0.png" in note
     scan, projector = tmp_path / "scan", rig.pairs[0].projector
     assert projector is not None
@@ -150,7 +150,7 @@ def test_a_sequence_that_fails_is_a_note_and_notes_are_in_the_order_of_shots(
     def decoded(sequence: ImageSequence, *_: object, **__: object) -> Any:
         if sequence.pair == "p2" and sequence.shot == "a":
             raise DecodingFailed("is bad", where="pair p2, shot a")
-        return SimpleNamespace(crossing_fault="an image is missing", crossing=None)
+        return SimpleNamespace(faults=("an image is missing",), crossing=None)
 
     monkeypatch.setattr(decode, "decode_sequence", decoded)
     monkeypatch.setattr(decode, "boundaries_near", lambda *_: "boundaries")
@@ -158,5 +158,5 @@ def test_a_sequence_that_fails_is_a_note_and_notes_are_in_the_order_of_shots(
     every = decode.decode_on_boards(rig, captures, views)
     assert list(every.value) == [("p1", "a", "board"), ("p2", "b", "board"), ("p1", "b", "board")]
     assert every.notes[0].startswith("pair p2, shot a: is bad")
-    assert "in shots a, b" in every.notes[1]
+    assert "shots a, b: an image is missing" in every.notes[1]
     assert every.failures == {}

@@ -21,7 +21,7 @@ from bodyscan.workflows import range_images
 from bodyscan.workflows.range_images import reconstruct_range_images, reconstruct_sequence
 from bodyscan.workflows.scan_person import require_one_moment
 
-STRIPES = SimpleNamespace(crossing=None, crossing_fault="")
+STRIPES = SimpleNamespace(crossing=None, faults=())
 
 
 def range_image() -> RangeImage:

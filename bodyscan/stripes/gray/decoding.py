@@ -15,7 +15,7 @@ from bodyscan.errors import DecodingFailed
 from bodyscan.stripes.albedo_edges import Brightness, correct_across_lines
 from bodyscan.stripes.boundaries import find_boundaries
 from bodyscan.stripes.gray.bit_words import WordCode
-from bodyscan.stripes.gray.sequence_checks import check_exposure, check_words
+from bodyscan.stripes.gray.sequence_checks import check_exposure, check_words, replace_flashed
 from bodyscan.stripes.grey_noise import measure_noise
 from bodyscan.stripes.scan_lines import ScanLines
 from bodyscan.stripes.stripe_coordinates import (
@@ -35,6 +35,7 @@ def decode_bits(
 
     Raises DecodingFailed if the images are inconsistent.
     """
+    images, flash = replace_flashed(images)
     variance = measure_noise(images)
     codes = code.stripes(read_words(code, images, stripes, variance))
     fine_bit = code.bit_two_wide(len(images.patterns))
@@ -67,6 +68,7 @@ def decode_bits(
         result,
         correlation_px=(0.0, along) if images.transposed else (along, 0.0),
         saturated=int(np.count_nonzero(white)) / max(observed, 1),
+        flash=flash,
     )
 
 

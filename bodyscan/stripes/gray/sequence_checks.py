@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -68,12 +69,6 @@ def check_words(
     of the coarsest pattern and its inverse shows only in codes beyond the last stripe.
     """
     fault = _find_fault(images, words, code, stripes, variance)
-    flash = _find_flash(images) if fault else ""
-    if flash:
-        raise DecodingFailed(
-            f"{flash}, so that no stripe can be read",
-            remedy="a flash, a lamp or automatic exposure? Take the shot again",
-        )
     if fault:
         raise DecodingFailed(
             f"frames do not form a valid code: swapped, missing or out of order ({fault})",
@@ -109,12 +104,7 @@ def _find_fault(
     min_share = 0.75 if images.inverses is None else 0.5 if code.single else 0.6
     worst = min(shares, key=lambda bit: shares[bit], default=0)
     if shares and shares[worst] < min_share:
-        light = float(contrast[good].mean())
-        for bit in range(1, bits):
-            first, second = images.patterns[bit - 1 : bit + 1, ::step, ::step].astype(np.float32)
-            if np.mean(np.abs(first - second)) < 0.05 * light:  # others differ by half
-                return f"the patterns of bits {bit - 1} and {bit} are the same image"
-        return (
+        return _find_repeated(images, good) or (
             f"where bit {worst} changes, only {shares[worst]:.0%} of neighbouring pixels are in "
             "neighbouring stripes"
         )
@@ -122,28 +112,82 @@ def _find_fault(
     beyond = float(np.mean((numbers < 0) | (numbers >= stripes))) if numbers.size else 0.0
     if beyond > 0.05:
         return f"{beyond:.0%} of the codes lie beyond the last stripe"
+    if code.single and (repeated := _find_repeated(images, good)):
+        return repeated
     opposite = _measure_folds(code.stripes(words[:: 2 * step]), good[:: 2 * step])
     if opposite > 0.15:
         return f"{opposite:.0%} of the pixels count stripes the other way, as without bit 0"
     return ""
 
 
-def _find_flash(images: ScanLines) -> str:
-    """Describe a bit whose pattern and inverse show more light than lit and dark frame; "" if none."""
+def _find_repeated(images: ScanLines, good: Mask) -> str:
+    """Describe two images of the code that are one image; "" if all differ.
+
+    good: (L, P) pixels to compare. No two change at the same places in a Gray code; those that hardly
+    change there may be equal.
+    """
+    step = max(1, round(math.sqrt(np.count_nonzero(good) / 5_000)))
+    some = (..., slice(None, None, step), slice(None, None, step))
+    lit, dark = (image[some][good[some]].astype(np.float32) for image in (images.lit, images.dark))
+    names = [f"pattern of bit {bit}" for bit in range(len(images.patterns))]
+    shares = (images.patterns[some][:, good[some]] - dark) / (lit - dark)
+    if images.inverses is not None:
+        names += [f"inverse of bit {bit}" for bit in range(len(images.inverses))]
+        shares = np.concatenate(
+            [shares, (images.inverses[some][:, good[some]] - dark) / (lit - dark)]
+        )
+    white, black = np.mean(shares > 0.75, axis=1), np.mean(shares < 0.25, axis=1)
+    changing = np.flatnonzero(np.minimum(white, black) > 0.2)
+    for k, one in enumerate(changing):
+        for other in changing[k + 1 :]:
+            if np.mean(np.abs(shares[one] - shares[other])) < 0.05:  # others differ by half
+                return f"the {names[one]} and the {names[other]} are the same image"
+    return ""
+
+
+def replace_flashed(images: ScanLines) -> tuple[ScanLines, str]:
+    """Make frames that some other light brightened or darkened from their inverses, or inverses from
+    their patterns; returns the images and which frames those are, "" if none.
+
+    What is added to one frame of the two moves their boundaries, by as many hundredths of a pixel as of
+    the contrast where light blurs by one. What a projector's optics do to fine stripes is done to both.
+    """
     if images.inverses is None:
-        return ""
+        return images, ""
     step = max(1, round(math.sqrt(images.lit.size / 50_000)))
     some = (..., slice(None, None, step), slice(None, None, step))
     contrast = images.lit[some].astype(np.float32) - images.dark[some]
-    bright = contrast >= np.median(contrast[contrast >= MIN_CONTRAST])
-    both = images.patterns[some][:, bright].astype(np.float32) + images.inverses[some][:, bright]
-    light = images.lit[some][bright].astype(np.float32) + images.dark[some][bright]
-    for bit, away in enumerate((both - light) / contrast[bright]):
-        # A frame taken twice is as much darker in the other half of the picture; where the picture is
-        # bright a flash may be cut off at white.
-        if np.mean(away > 0.15) > 0.4 and np.mean(away < -0.15) < 0.02:
-            return f"a frame of bit {bit} is brighter than pattern and inverse can be"
-    return ""
+    lit = contrast >= MIN_CONTRAST
+    if not lit.any():
+        return images, ""
+    bright = contrast >= np.median(contrast[lit])
+    black, contrast = images.dark[some][bright].astype(np.float32), contrast[bright]
+    frames = {"pattern": images.patterns, "inverse": images.inverses}
+    found = []
+    for bit in range(len(images.patterns)):
+        shares = {
+            name: (stack[bit][some][bright] - black) / contrast for name, stack in frames.items()
+        }
+        added = float(np.median(shares["pattern"] + shares["inverse"] - 1.0))
+        own = {name: abs(_measure_offset(share)) for name, share in shares.items()}
+        sound, flashed = sorted(own, key=lambda name: own[name])
+        if abs(added) > 0.05 and own[sound] < 0.25 * abs(added) < own[flashed]:
+            stack = frames[flashed] = frames[flashed].copy()
+            light = images.lit.astype(np.float32) + images.dark - frames[sound][bit]
+            stack[bit] = np.clip(light, 0.0, 255.0).astype(stack.dtype)
+            found.append(
+                f"the {flashed} of bit {bit} is {abs(added):.0%} of the contrast "
+                f"{'brighter' if added > 0.0 else 'darker'} than lit and dark image allow (a flash, a "
+                f"lamp, automatic exposure?) and is made from its {sound}"
+            )
+    return replace(images, patterns=frames["pattern"], inverses=frames["inverse"]), "; ".join(found)
+
+
+def _measure_offset(share: Floats) -> float:
+    """By how much what is white or black in a frame (N,) is brighter than 1 or 0; blur cancels out."""
+    white = share > 0.5
+    parts = [(share[white] - 1.0), share[~white]]
+    return float(np.mean([np.median(part) for part in parts if part.size > 0.05 * share.size]))
 
 
 def _find_clear(patterns: Greys, inverses: Greys, variance: Floats) -> Mask:
