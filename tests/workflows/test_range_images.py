@@ -80,5 +80,5 @@ def test_a_pair_that_measured_nothing_in_the_volume_is_named() -> None:
     calibration: Any = SimpleNamespace(rig=rig, pairs={"p": None}, failed={})
     every = [taken]
     captures: Any = SimpleNamespace(sequences=every, pair_sequences=lambda _: every, relative=str)
-    found = reconstruct_range_images(calibration, captures, made={taken: (image, "")})
+    found = reconstruct_range_images(calibration, captures, made={taken: (image, ())})
     assert "p: nothing that it measured lies inside" in found.notes[0]
