@@ -31,6 +31,7 @@ NO_INVERSES = (
 class ImageHeader:
     """Width and height in pixels, bits per sample; complete: whether a PNG or JPEG has its end.
 
+    colour: whether pixels have red, green and blue.
     rounding_error: of JPEG, RMS in grey levels, for an image with sharp edges everywhere, such as
         stripes.
     fault: of TIFF, what this program does not read.
@@ -40,6 +41,7 @@ class ImageHeader:
     height: int
     bits: int
     complete: bool
+    colour: bool = False
     rounding_error: float = 0.0
     fault: str = ""
 
@@ -64,12 +66,12 @@ def read_header(path: Path) -> ImageHeader:
         if start.startswith(b"\x89PNG\r\n\x1a\n"):
             if len(start) < 33:
                 raise NotAnImage("is cut short")
-            length, kind, width, height, bits = struct.unpack_from(">I4sIIB", start, 8)
+            length, kind, width, height, bits, colour = struct.unpack_from(">I4sIIBB", start, 8)
             (checksum,) = struct.unpack_from(">I", start, 29)
             if (length, kind) != (13, b"IHDR") or zlib.crc32(start[12:29]) != checksum:
                 raise NotAnImage("is damaged (its PNG header is wrong)")
             complete = _ends_with(stream, 33, b"\x00\x00\x00\x00IEND\xaeB`\x82")
-            return ImageHeader(width, height, bits, complete)
+            return ImageHeader(width, height, bits, complete, bool(colour & 2))
         kinds = {b"\xff\xd8\xff": "Jpeg", b"BM": "Bmp", b"II*\0": "Tiff", b"MM\0*": "Tiff"}
         kind = next((kind for magic, kind in kinds.items() if start.startswith(magic)), None)
         if kind is None:
@@ -91,17 +93,18 @@ def _read_by_pillow(stream: BinaryIO, kind: str) -> ImageHeader:
     plugin = import_module(f"PIL.{kind}ImagePlugin")
     image: Any = getattr(plugin, f"{kind}ImageFile")(stream)
     width, height = image.size
+    colour = image.mode not in ("1", "L")
     # OpenCV decodes no BMP or TIFF that is cut short.
     if kind == "Tiff":
         return _read_tiff_header(image)
     if kind == "Bmp":
-        return ImageHeader(width, height, 8, True)
+        return ImageHeader(width, height, 8, True, colour)
     # A coefficient rounded to multiples of q errs by q / sqrt(12); the transform preserves squares.
     # Table 0 is that of brightness.
     squares = [step**2 for step in image.quantization.get(0, [0])]
     rounding_error = (sum(squares) / len(squares) / 12) ** 0.5
     complete = _ends_with(stream, stream.tell(), b"\xff\xd9")
-    return ImageHeader(width, height, 8, complete, rounding_error)
+    return ImageHeader(width, height, 8, complete, colour, rounding_error)
 
 
 def _read_tiff_header(image: Any) -> ImageHeader:
@@ -116,7 +119,8 @@ def _read_tiff_header(image: Any) -> ImageHeader:
         image.seek(number)
         pages += not image.tag_v2.get(254, 0)  # not a thumbnail or mask
     fault = f"holds {pages} images: save each as a file of its own" if pages > 1 else fault
-    return ImageHeader(tags[256], tags[257], max(tags.get(258, (1,))), True, fault=fault)
+    colour, bits = tags.get(262, 1) > 1, max(tags.get(258, (1,)))  # 0 and 1: white or black is zero
+    return ImageHeader(tags[256], tags[257], bits, True, colour, fault=fault)
 
 
 def store_upright(tiff: bytes) -> bytes:

@@ -22,6 +22,7 @@ from bodyscan.captures.image_header import (
     find_header_fault,
     image_error,
     missing_error,
+    read_header,
     store_upright,
 )
 from bodyscan.errors import ImageError
@@ -109,6 +110,32 @@ def read_sequence(
     return StripeImages(lit, dark, coded)
 
 
+def read_colours(sequence: ImageSequence, camera: CameraSpec) -> Bytes | None:
+    """Read the lit image of a colour camera, (H, W, 3) uint8, red, green, blue; of several exposures
+    the shortest.
+
+    None if no lit image was taken, if it is grey, and for a projector of one colour: where the rig
+    file names a channel, and another has less than a quarter of its light (filters let through up to
+    a fifth), the image shows the projector's colour and not the subject's.
+
+    Raises ImageError as `read_image`.
+    """
+    path = sequence.lit
+    if path is None or not read_header(path).colour:
+        return None
+    raw = _decode(_read_file(path, camera, sequence.where), cv2.IMREAD_COLOR_RGB)
+    if raw is None or raw.shape != (camera.height, camera.width, 3):
+        raise image_error("cannot be decoded", path, sequence.where)
+    # The lit image is the brightest of its sequence, so that it shows the scale by itself.
+    colours = whole_grey(convert_to_greys(raw, _find_scale([raw], camera, path, sequence.where)))
+    if camera.channel_number is not None:
+        light = colours[..., camera.channel_number]
+        levels = np.median(colours[light > light.mean()], axis=0)
+        if levels.min() < 0.25 * levels[camera.channel_number]:
+            return None
+    return colours
+
+
 def _read_stack(sequence: ImageSequence, camera: CameraSpec, crop: Crop, workers: int) -> Greys:
     """Read grey levels (F, H, W) of one exposure: lit, dark if they exist, then the code's."""
     taken = [path for path in (sequence.lit, sequence.dark) if path is not None]
@@ -156,28 +183,41 @@ def _read_raw(path: Path, camera: CameraSpec, where: str, rows: int | None = Non
     missing, no image, of the wrong size or depth, cut short, damaged, or without the channel.
     """
     width, height = camera.width, camera.height
-    fault = find_header_fault(path, width, height)
-    data = b"" if fault else read_regular(path)
-    is_png = data.startswith(b"\x89PNG")
-    fault = fault or (png_damage(data) if is_png else None)
-    if fault:
-        raise image_error(fault, path, where)
-    image = decode_grey_png(data, width, height, rows) if is_png else None
-    if image is not None and camera.channel == "grey":
+    data = _read_file(path, camera, where)
+    image = decode_grey_png(data, width, height, rows)
+    channel = camera.channel_number
+    if image is not None and channel is None:
         return image
-    colour = cv2.IMREAD_GRAYSCALE if camera.channel == "grey" else cv2.IMREAD_ANYCOLOR
-    flags = colour | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-    data = store_upright(data) if data[:2] in (b"II", b"MM") else data
-    found = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    readable = found is not None and found.dtype in (np.uint8, np.uint16)
-    if not readable or found.shape[:2] != (height, width):
+    found = _decode(data, cv2.IMREAD_GRAYSCALE if channel is None else cv2.IMREAD_ANYCOLOR)
+    if found is None or found.shape[:2] != (height, width):
         raise image_error("cannot be decoded", path, where)
-    if found.ndim == 3:
-        found = found[:, :, ("blue", "green", "red").index(camera.channel)]
-    elif camera.channel != "grey":
+    if channel is not None and found.ndim == 3:
+        found = found[:, :, 2 - channel]  # OpenCV's order is blue, green, red
+    elif channel is not None:
         what = f"is grey, but the rig file says `channel: {camera.channel}`"
         raise image_error(what, path, where, remedy="Leave `channel` out for this camera.")
     return cast(Raw, np.ascontiguousarray(found))
+
+
+def _read_file(path: Path, camera: CameraSpec, where: str) -> bytes:
+    """Read a file whose header, and if it is a PNG whose checksums, are sound."""
+    fault = find_header_fault(path, camera.width, camera.height)
+    data = b"" if fault else read_regular(path)
+    fault = fault or (png_damage(data) if data.startswith(b"\x89PNG") else None)
+    if fault:
+        raise image_error(fault, path, where)
+    return data
+
+
+def _decode(data: bytes, colour: int) -> Raw | None:
+    """Decode an image file by OpenCV, as stored; None if it cannot.
+
+    colour: OpenCV's flag.
+    """
+    data = store_upright(data) if data[:2] in (b"II", b"MM") else data
+    flags = colour | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    found = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    return found if found is not None and found.dtype in (np.uint8, np.uint16) else None
 
 
 def measure_mosaic(image: Bytes) -> float:

@@ -23,8 +23,9 @@ def write_e57(
     """Write every range image as a scan named after its pair; returns how many points each has.
 
     Metres, as the standard requires; points in the camera frame, with its pose in the rig frame;
-    grey levels as colour; row and column of each point's pixel. E57 wants a random number in every
-    file, so two files of the same scan differ in that. Raises BadInput without the package pye57.
+    colours as the camera saw them, or grey levels; row and column of each point's pixel. E57 wants a
+    random number in every file, so two files of the same scan differ in that. Raises BadInput without
+    the package pye57.
     """
     try:
         import pye57
@@ -43,10 +44,11 @@ def write_e57(
             if not len(rows):
                 continue
             x, y, z = image.points[rows, columns].astype(np.float64).T / 1000.0
-            grey = image.colours[rows, columns]
             data = {"cartesianX": x, "cartesianY": y, "cartesianZ": z}
             data |= {"rowIndex": image.corner[0] + rows, "columnIndex": image.corner[1] + columns}
-            data |= {f"color{name}": grey for name in ("Red", "Green", "Blue")}
+            seen = (image.colours[..., None] if image.rgb is None else image.rgb)[rows, columns]
+            channels = np.broadcast_to(seen, (len(rows), 3)).T
+            data |= dict(zip(("colorRed", "colorGreen", "colorBlue"), channels, strict=True))
             pose = rig_from_camera[image.pair]
             turn = Rotation.from_matrix(pose.rotation).as_quat(scalar_first=True)
             shift = pose.translation / 1000.0

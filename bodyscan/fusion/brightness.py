@@ -1,9 +1,10 @@
-"""Even out the pairs' grey levels, so that a body's colour shows no seam between pairs.
+"""Even out the pairs' colours, so that a body's colour shows no seam between pairs.
 
-Cameras that see the same spot differ in two ways: their exposures, and how squarely each one's
-projector, which stands beside it, lights the spot. A matt surface is as bright as the cosine of the
-light's incidence, over the squared distance; light of the room weakens that dependence, by a power
-from 0 to 1. The overlaps determine that power and the exposures.
+Cameras that see the same spot differ in two ways: their exposures and white balances, a factor for
+each channel, and how squarely each one's projector, which stands beside it, lights the spot. A matt
+surface is as bright as the cosine of the light's incidence, over the squared distance; light of the
+room weakens that dependence, by a power from 0 to 1. The overlaps determine that power and the
+factors.
 """
 
 from __future__ import annotations
@@ -20,21 +21,25 @@ from bodyscan.fusion.smoothing import SmoothSurface
 from bodyscan.fusion.voxel_thinning import Samples
 
 MIN_GREY = 8
-"""Grey level below which a pixel carries no information about the light."""
+"""Level below which a pixel carries no information about the light."""
 
 
 @dataclass(frozen=True, eq=False)
-class EqualizedGrey:
-    """Equalized grey levels, float32: of the samples, (N,), and of each surface's points."""
+class EqualizedColours:
+    """Equalized colours, float32: of the samples, (N, C), and of each surface's points, (n, C)."""
 
     samples: Floats
     surfaces: list[Floats]
 
 
-def equalize_brightness(
+def equalize_colours(
     samples: Samples, surfaces: Sequence[SmoothSurface], consistency: Sequence[Consistency]
-) -> EqualizedGrey:
-    """Correct grey levels to equal exposure of all pairs and even light on the body."""
+) -> EqualizedColours:
+    """Correct colours to equal exposure and white balance of all pairs and even light on the body.
+
+    A grey camera among colour ones, whose channels are equal, gets the mean colour of what it shows
+    in common with them.
+    """
     centres = [surface.rig_from_camera.translation for surface in surfaces]
     of_surfaces = [
         log_irradiance(surface.points, surface.normals, centre)
@@ -46,21 +51,26 @@ def equalize_brightness(
         for part, centre in zip(parts, centres, strict=True)
     ]
     of_samples = np.concatenate(log_irradiances)
-    overlaps = find_overlaps(samples, surfaces, consistency, of_samples, of_surfaces)
-    power = estimate_light_power([(overlap.ratio, overlap.shade) for overlap in overlaps])
-    ratios = [(o.a, o.b, float(np.median(o.ratio - power * o.shade)), o.spots) for o in overlaps]
-    gain = solve_gains(ratios, len(surfaces))
+    overlaps = [
+        find_overlaps(samples, surfaces, consistency, of_samples, of_surfaces, channel)
+        for channel in range(samples.colours.shape[1])
+    ]
+    power = estimate_light_power([(one.ratio, one.shade) for found in overlaps for one in found])
+    gains = np.stack([_solve_channel(found, power, len(surfaces)) for found in overlaps], axis=1)
+    coloured = [bool((one.colours != one.colours[:, :1]).any()) for one in surfaces]
+    if any(coloured):  # whose white balance the body has
+        gains /= np.exp(np.log(gains[coloured]).mean(axis=0))
     typical = float(np.mean(of_samples)) if len(of_samples) else 0.0
 
     def normalize(colours: list[Bytes], log_irradiances: list[Floats]) -> list[Floats]:
-        """Divide out each pair's gain, and the irradiance relative to the typical one."""
+        """Divide out each pair's gains, and the irradiance relative to the typical one."""
         return [
-            grey * (factor * np.exp(np.float32(-power) * (light - np.float32(typical))))
-            for grey, light, factor in zip(colours, log_irradiances, gain, strict=True)
+            levels * (gain * np.exp(np.float32(-power) * (light - np.float32(typical)))[:, None])
+            for levels, light, gain in zip(colours, log_irradiances, gains, strict=True)
         ]
 
     of_parts = normalize([samples.colours[part] for part in parts], log_irradiances)
-    return EqualizedGrey(
+    return EqualizedColours(
         np.concatenate(of_parts), normalize([one.colours for one in surfaces], of_surfaces)
     )
 
@@ -69,7 +79,7 @@ def equalize_brightness(
 class Overlap:
     """Spots shown by both surfaces a and b, and how many these stand for.
 
-    ratio, shade: logarithms (N,) of b's grey level over a's, and of the light that falls there.
+    ratio, shade: logarithms (N,) of b's level over a's, and of the light that falls there.
     """
 
     a: int
@@ -85,8 +95,10 @@ def find_overlaps(
     consistency: Sequence[Consistency],
     of_samples: Floats,
     of_surfaces: Sequence[Floats],
+    channel: int,
 ) -> list[Overlap]:
-    """Compare grey levels where surfaces agree with samples of others, in up to 5000 spots a pair.
+    """Compare a channel's levels where surfaces agree with samples of others, in up to 5000 spots a
+    pair.
 
     of_samples, of_surfaces: logarithms of irradiance.
     """
@@ -96,7 +108,7 @@ def find_overlaps(
         for a, (start, end) in enumerate(pairwise(starts)):
             step = 1 + (end - start) // 5000
             here, there = one.index[start:end:step], one.at[start:end:step]
-            ours, theirs = samples.colours[here], surface.colours[there]
+            ours, theirs = samples.colours[here, channel], surface.colours[there, channel]
             clear = (np.minimum(ours, theirs) > MIN_GREY) & (np.maximum(ours, theirs) < 250)
             if np.count_nonzero(clear) < 200:
                 continue
@@ -106,10 +118,18 @@ def find_overlaps(
     return found
 
 
-def estimate_light_power(overlaps: Sequence[tuple[Floats, Floats]]) -> float:
-    """Estimate the power, 0 to 1, of irradiance to which grey levels are proportional.
+def _solve_channel(overlaps: Sequence[Overlap], power: float, count: int) -> Floats:
+    """Solve for the factors (count,) of one channel, given the power of irradiance."""
+    logs = [float(np.median(one.ratio - power * one.shade)) for one in overlaps]
+    return solve_gains(
+        [(one.a, one.b, log, one.spots) for one, log in zip(overlaps, logs, strict=True)], count
+    )
 
-    overlaps: logarithms (N,) of one camera's grey levels over another's, and of the light's. Fitted
+
+def estimate_light_power(overlaps: Sequence[tuple[Floats, Floats]]) -> float:
+    """Estimate the power, 0 to 1, of irradiance to which levels are proportional.
+
+    overlaps: logarithms (N,) of one camera's levels over another's, and of the light's. Fitted
         within each overlap by the least sum of absolute errors.
     """
     if not overlaps:
@@ -129,10 +149,9 @@ def estimate_light_power(overlaps: Sequence[tuple[Floats, Floats]]) -> float:
 
 
 def solve_gains(ratios: Sequence[tuple[int, int, float, int]], count: int) -> Floats:
-    """Solve for the factors (count,) that bring the pairs' grey levels together, with geometric
-    mean 1.
+    """Solve for the factors (count,) that bring the pairs' levels together, with geometric mean 1.
 
-    ratios: (a, b, log of b's grey level over a's at common spots, number of spots).
+    ratios: (a, b, log of b's level over a's at common spots, number of spots).
     """
     # Pairs without overlap keep their brightness.
     normal, right = 1e-3 * np.eye(count), np.zeros(count)

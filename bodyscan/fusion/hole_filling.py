@@ -65,7 +65,7 @@ def fill_distances(
     bound = np.full(values.shape, -np.inf, np.float32)
     certain = 0.75 * reach  # so far from the surface a coarser grid has the side right
     guess = np.maximum(fill_harmonically(values, fixed, bound, certain), -height)
-    dark, grey = np.zeros(values.shape, bool), cloud.colours[:, 0]
+    dark, grey = np.zeros(values.shape, bool), cloud.grey
     points = cloud.points[grey < DARK * np.median(grey)]
     dark[tuple(np.rint((points - bricks.origin) / cell_mm).astype(int).T)] = True
     dark = _dilate(dark, 2)

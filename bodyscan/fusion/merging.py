@@ -14,7 +14,7 @@ import numpy as np
 
 from bodyscan.arrays import Array, Floats
 from bodyscan.compiled import compiled
-from bodyscan.fusion.brightness import EqualizedGrey, equalize_brightness
+from bodyscan.fusion.brightness import EqualizedColours, equalize_colours
 from bodyscan.fusion.consistency import Consistency, Contradictions, compare_with_surface
 from bodyscan.fusion.smoothing import Numbers, SmoothSurface, smooth
 from bodyscan.fusion.voxel_thinning import Samples, take_samples
@@ -50,8 +50,11 @@ def merge(
     a double surface within `settings.double_mm` the heavier one stays. Raises ScanFailed for images
     that show next to nothing.
     """
+    channels = 1 if all(image.rgb is None for image in range_images) else 3
     smoothed = map_threads(
-        lambda image: smooth(image, rig_from_camera[image.pair], settings.window_mm),
+        lambda image: smooth(
+            image, rig_from_camera[image.pair], settings.window_mm, channels=channels
+        ),
         range_images,
     )
     surfaces = [surface for surface in smoothed if surface is not None]
@@ -62,8 +65,8 @@ def merge(
         ),
         range(len(surfaces)),
     )
-    grey = equalize_brightness(samples, surfaces, consistency)
-    cloud = average(samples, surfaces, consistency, grey, poses)
+    colours = equalize_colours(samples, surfaces, consistency)
+    cloud = average(samples, surfaces, consistency, colours, poses)
     pairs = [surface.pair for surface in surfaces]
     contradictions = Contradictions.count(
         pairs, consistency, samples, surfaces, settings.agreement_mm
@@ -75,32 +78,32 @@ def average(
     samples: Samples,
     surfaces: Sequence[SmoothSurface],
     consistency: Sequence[Consistency],
-    grey: EqualizedGrey,
+    colours: EqualizedColours,
     poses: PoseCovariance | None = None,
 ) -> BodyCloud:
     """Average each sample with the surfaces that agree with it; outvoted samples are dropped."""
     weight, sigma_mm = samples.weight, samples.sigma_mm
-    # Of weights, shifts, their squares, grey, normals, variances, surfaces, and contradictions.
-    sums = np.zeros((len(weight), 10))
-    sums[:, 0], sums[:, 3], sums[:, 8] = weight, weight * grey.samples, 1.0
-    sums[:, 4:7], sums[:, 7] = weight[:, None] * samples.normals, (weight * sigma_mm) ** 2
-    for surface, one, levels in zip(surfaces, consistency, grey.surfaces, strict=True):
+    # Of weights, shifts, their squares, variances, surfaces, contradictions, normals, and colours.
+    sums = np.zeros((len(weight), 9 + colours.samples.shape[1]))
+    sums[:, 0], sums[:, 3], sums[:, 4] = weight, (weight * sigma_mm) ** 2, 1.0
+    sums[:, 6:9], sums[:, 9:] = weight[:, None] * samples.normals, weight[:, None] * colours.samples
+    for surface, one, levels in zip(surfaces, consistency, colours.surfaces, strict=True):
         observed = surface.weight, surface.sigma_mm, levels, surface.normals
         _add_surface(one.index, one.at, one.shift_mm, observed, sums)
-        np.add.at(sums[:, 9], one.against_index, surface.weight[one.against_at])
-    kept = sums[:, 9] < sums[:, 0]
-    total, shift, square, brightness, *normal, variance, count, _ = sums[kept].T
+        np.add.at(sums[:, 5], one.against_index, surface.weight[one.against_at])
+    kept = sums[:, 5] < sums[:, 0]
+    total, shift, square, variance, count = sums[kept, :5].T
+    normals, levels = sums[kept, 6:9], sums[kept, 9:] / total[:, None]
     mean = shift / total
     # Differences of more than three sigmas enlarge sigmas beyond the inflation of all.
     chi2 = (square - total * mean**2) / np.maximum(count - 1.0, 1.0)
     inflation = estimate_sigma_inflation(samples, surfaces, consistency, poses) ** 2
     sigma_mm = np.sqrt(variance * np.maximum(inflation, chi2 / 9.0)) / total
-    normals = np.stack(normal, axis=1)
     return BodyCloud(
         samples.points[kept] + mean[:, None] * samples.normals[kept],
         (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32),
         sigma_mm.astype(np.float32),
-        np.repeat(np.clip(np.rint(brightness / total), 0.0, 255.0).astype(np.uint8)[:, None], 3, 1),
+        np.clip(np.rint(levels), 0.0, 255.0).astype(np.uint8).repeat(3 // levels.shape[1], axis=1),
         count.astype(np.uint8),
     )
 
@@ -113,24 +116,25 @@ def _add_surface(
     surface: tuple[Floats, Floats, Floats, Floats],
     sums: Array,
 ) -> None:
-    """Add a surface's points `at`, shifted from the samples `index`, to the sums (N, 10).
+    """Add a surface's points `at`, shifted from the samples `index`, to the sums (N, 9 + C).
 
     shift_mm: signed, along the sample's normal.
-    surface: weights, sigmas, grey levels and normals of its points.
+    surface: weights, sigmas, colours (n, C) and normals of its points.
     sums: columns as listed in `average`.
     """
-    weights, sigma_mm, grey, normals = surface
+    weights, sigma_mm, colours, normals = surface
     for n in range(len(index)):
         into, k, shift = sums[index[n]], at[n], np.float64(shift_mm[n])
         weight = np.float64(weights[k])
         into[0] += weight
         into[1] += weight * shift
         into[2] += weight * shift * shift
-        into[3] += weight * grey[k]
+        into[3] += (weight * sigma_mm[k]) ** 2
+        into[4] += 1.0
         for c in range(3):
-            into[4 + c] += weight * normals[k, c]
-        into[7] += (weight * sigma_mm[k]) ** 2
-        into[8] += 1.0
+            into[6 + c] += weight * normals[k, c]
+        for c in range(colours.shape[1]):
+            into[9 + c] += weight * colours[k, c]
 
 
 def estimate_sigma_inflation(

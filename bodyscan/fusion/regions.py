@@ -113,7 +113,7 @@ def label_regions(
     All points are unsure if the images are too dark, or if more than a tenth is so bright that the
     rest would be dark beside it: it is then open which part is skin.
     """
-    grey = cloud.colours[:, 0].astype(np.float32)
+    grey = cloud.grey.astype(np.float32)
     typical = float(np.median(grey))
     if DARK * typical < MIN_GREY or np.mean(grey > typical / DARK) > 0.1:
         unsure = np.full(len(grey), UNSURE, np.uint8)

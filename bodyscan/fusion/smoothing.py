@@ -33,7 +33,7 @@ class SmoothSurface:
     sigma_mm: (n,) float32, standard deviation along the normal, of noise that smoothing leaves and
         of everything that pixels share.
     rim, weight: (n,) float32, from near 0 at the rim to 1 well inside, and rim / sigma^2.
-    colours: (n,) uint8.
+    colours: (n, C) uint8: grey, or red, green and blue.
     warped: whether points were moved off the rays of their pixels.
     """
 
@@ -52,10 +52,13 @@ class SmoothSurface:
 
 
 def smooth(
-    image: RangeImage, rig_from_camera: RigidTransform, window_mm: float
+    image: RangeImage, rig_from_camera: RigidTransform, window_mm: float, *, channels: int = 1
 ) -> SmoothSurface | None:
     """Fit a quadratic in a square window of about `window_mm` around every pixel; None for an
-    image that shows nothing."""
+    image that shows nothing.
+
+    channels: C of its colours, 1 or 3; a grey camera's are then equal.
+    """
     box = find_crop(image.valid)
     if box is None:
         return None
@@ -64,7 +67,7 @@ def smooth(
     pixel_mm = estimate_pixel_size(inverse, image.camera)
     reach = window_reach(pixel_mm, window_mm)
     fit, fitted = fit_quadratics(inverse, noise, reach, pixel_mm, image.correlation_px)
-    return _build_surface(image, rig_from_camera, fit, fitted, reach)
+    return _build_surface(image, rig_from_camera, fit, fitted, reach, channels)
 
 
 def estimate_pixel_size(inverse: Floats, camera: Camera) -> float:
@@ -84,6 +87,7 @@ def _build_surface(
     fit: QuadraticFit,
     fitted: Mask,
     reach: int,
+    channels: int,
 ) -> SmoothSurface:
     depth, number = np.zeros_like(fit.value), np.full(fitted.shape, -1, np.int32)
     size = int(np.count_nonzero(fitted))
@@ -113,9 +117,16 @@ def _build_surface(
         sigma,
         rim,
         rim / (sigma * sigma),
-        image.colours[there],
+        _colours(image, there, channels),
         image.warped,
     )
+
+
+def _colours(image: RangeImage, there: Mask, channels: int) -> Bytes:
+    """Colours (n, channels) of the pixels `there` (h, w)."""
+    if image.rgb is not None and channels == 3:
+        return image.rgb[there]
+    return np.repeat(image.colours[there][:, None], channels, axis=1)
 
 
 def distance_to_rim(depth: Floats, jump: float) -> Floats:

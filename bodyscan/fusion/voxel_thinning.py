@@ -21,7 +21,7 @@ class Samples:
     """N points taken from the surfaces, surface by surface, rig frame.
 
     starts: where each surface's points begin, (surfaces + 1,).
-    weight: as in SmoothSurface.
+    weight, colours: as in SmoothSurface.
     """
 
     points: Floats

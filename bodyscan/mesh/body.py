@@ -6,6 +6,7 @@ from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
 
+import cv2
 import numpy as np
 
 from bodyscan.arrays import Array, Bytes, Floats, Indices, Mask
@@ -34,6 +35,11 @@ class BodyCloud:
     colours: Bytes
     pairs_seen: Bytes
     regions: Bytes | None = None
+
+    @property
+    def grey(self) -> Bytes:
+        """Grey level (N,) of each point: luma."""
+        return np.asarray(cv2.cvtColor(self.colours[None], cv2.COLOR_RGB2GRAY)[0], np.uint8)
 
     @property
     def region_shares(self) -> dict[str, float] | None:

@@ -75,6 +75,7 @@ class RangeImage:
     warped: whether points were displaced to another moment, off the rays of their pixels.
     corner: row and column of the camera's image at which the kept part begins.
     saturated: share of the pixels lit by stripes of the scan volume that are white.
+    rgb: (h, w, 3) uint8, red, green and blue of the lit image; None of a grey camera.
     whole_depth, whole_colours: `open_depth` and `lit` from before cropping.
     correlation_px: distance along rows and columns within which noise is correlated, because depths
         come from the same stripe boundaries; 0 if it is independent.
@@ -97,6 +98,7 @@ class RangeImage:
     whole_colours: Bytes | None = None
     correlation_px: tuple[float, float] = (0.0, 0.0)
     saturated: float = 0.0
+    rgb: Bytes | None = None
 
     @property
     def valid(self) -> Mask:
@@ -148,6 +150,7 @@ class RangeImage:
             normals=self.normals[box].copy(),
             sigma_mm=self.sigma_mm[box].copy(),
             colours=self.colours[box].copy(),
+            rgb=None if self.rgb is None else self.rgb[box].copy(),
             common_mm=common,
             beyond=None,
             corner=(top + box[0].start, left + box[1].start),

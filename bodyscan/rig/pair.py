@@ -30,6 +30,11 @@ class CameraSpec(Model):
     channel: Literal["grey", "red", "green", "blue"] = "grey"
     lens: str = AUTO
 
+    @property
+    def channel_number(self) -> int | None:
+        """Which of red, green and blue is used, from 0; None for all of them."""
+        return None if self.channel == "grey" else ("red", "green", "blue").index(self.channel)
+
     def problems(self) -> Iterator[Problem]:
         if self.lens == AUTO:
             return

@@ -18,6 +18,7 @@ import numpy as np
 
 from bodyscan.captures.captures_file import FILE_NAME
 from bodyscan.captures.folder import Captures, ImageSequence, open_scan
+from bodyscan.captures.images import read_colours
 from bodyscan.errors import BadInput, BodyscanError, ScanFailed, format_list
 from bodyscan.fusion.cleaning import cut_to_volume
 from bodyscan.outcome import Outcome
@@ -50,7 +51,7 @@ def reconstruct_sequence(
     limits = stripes_in_volume(pair, at, calibration.rig.volume)
     spec = calibration.rig.pair(sequence.pair)
     stripes = decode_sequence(sequence, spec, limits=limits)
-    image = reconstruct_range_image(pair, stripes)
+    image = replace(reconstruct_range_image(pair, stripes), rgb=read_colours(sequence, spec.camera))
     frame_ms = captures.frame_ms(sequence.shot, sequence.pair)
     if frame_ms is not None and spec.projector is not None:
         moment = calibration.rig.frames.moment_ms(spec.projector, frame_ms)

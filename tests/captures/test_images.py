@@ -6,6 +6,7 @@ import os
 import struct
 import zlib
 from contextlib import suppress
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,7 @@ from bodyscan.captures.image_header import NotAnImage, read_header
 from bodyscan.captures.images import (
     measure_mosaic,
     read_board_image,
+    read_colours,
     read_image,
     read_sequence,
 )
@@ -88,6 +90,39 @@ def test_colour_becomes_grey_and_exif_turns_are_not_applied(tmp_path: Path) -> N
     turned = jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + jpeg[2:]
     plain = read(write(tmp_path / "x.jpg", jpeg))
     np.testing.assert_array_equal(read(write(tmp_path / "y.jpg", turned)), plain)
+
+
+RGB = np.dstack([NOISE, NOISE // 2, NOISE // 3])
+GREEN = np.dstack([NOISE // 6, NOISE, NOISE // 8])
+
+
+@pytest.mark.parametrize(
+    ("suffix", "lit", "channel", "expected"),
+    [
+        *((suffix, RGB, "grey", RGB) for suffix in (".png", ".tif", ".bmp")),
+        *((suffix, NOISE, "grey", None) for suffix in (".png", ".tif", ".bmp", ".jpg")),
+        (".png", RGB.astype(np.uint16) * 256 + 17, "grey", RGB),
+        (".png", RGB, "green", RGB),
+        (
+            ".png",
+            GREEN,
+            "green",
+            None,
+        ),  # of a projector of one colour, through the camera's filters
+        (".png", GREEN, "grey", GREEN),
+    ],
+)
+def test_the_lit_image_is_read_in_colour_where_it_has_any(
+    tmp_path: Path, suffix: str, lit: np.ndarray, channel: Any, expected: np.ndarray | None
+) -> None:
+    sequence = first_sequence(tmp_path)
+    path = write(tmp_path / f"lit{suffix}", lit[..., ::-1] if lit.ndim == 3 else lit)
+    camera = CameraSpec(width=WIDTH, height=HEIGHT, channel=channel)
+    found = read_colours(replace(sequence, lit=path), camera)
+    assert (found is None) is (expected is None)
+    if found is not None and expected is not None:
+        assert np.abs(found.astype(int) - expected).max() <= int(lit.dtype == np.uint16)
+    assert read_colours(replace(sequence, lit=None), camera) is None
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -36,6 +37,8 @@ def test_points_pose_and_colour_come_back(tmp_path: Path) -> None:
     pye57 = pytest.importorskip("pye57")
     path = tmp_path / "raw.e57"
     one = image("p1-1")
+    rgb = np.dstack([one.colours[::-1], one.colours, one.colours // 2])
+    one = replace(one, rgb=rgb)
     poses = {"p1-1": RIG_FROM_CAMERA, "p1-2": RigidTransform.identity(), "p1-3": RIG_FROM_CAMERA}
     counts = write_e57(path, [one, image("p1-2"), image("p1-3", visible=False)], poses)
     assert counts == {"p1-1": 1160, "p1-2": 1160, "p1-3": 0}
@@ -45,7 +48,10 @@ def test_points_pose_and_colour_come_back(tmp_path: Path) -> None:
     world = np.stack([read[f"cartesian{axis}"] for axis in "XYZ"], axis=-1)
     expected = RIG_FROM_CAMERA.apply(one.points[one.valid].astype(float)) / 1000.0
     np.testing.assert_allclose(world, expected, atol=1e-6)  # written as float32: 0.1 um at 1 m
-    np.testing.assert_array_equal(read["colorGreen"], one.colours[one.valid])
+    for channel, name in enumerate(("Red", "Green", "Blue")):
+        np.testing.assert_array_equal(read[f"color{name}"], rgb[one.valid][:, channel])
+    grey = file.read_scan(1, colors=True, ignore_missing_fields=True)
+    np.testing.assert_array_equal(grey["colorBlue"], one.colours[one.valid])
     np.testing.assert_array_equal(
         np.stack([read["rowIndex"], read["columnIndex"]]), np.nonzero(one.valid)
     )

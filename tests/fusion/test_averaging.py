@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from flat_walls import ASIDE, WALL_MM, wall
 
-from bodyscan.fusion.brightness import EqualizedGrey
+from bodyscan.fusion.brightness import EqualizedColours
 from bodyscan.fusion.consistency import Consistency, compare_with_surface
 from bodyscan.fusion.merging import average, estimate_sigma_inflation
 from bodyscan.fusion.smoothing import SmoothSurface
@@ -18,10 +18,10 @@ from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.mesh.body import BodyCloud
 
 
-def as_seen(samples: Samples, surfaces: list[SmoothSurface]) -> EqualizedGrey:
+def as_seen(samples: Samples, surfaces: list[SmoothSurface]) -> EqualizedColours:
     """Grey levels as the cameras gave them."""
     own = [surface.colours.astype(np.float32) for surface in surfaces]
-    return EqualizedGrey(samples.colours.astype(np.float32), own)
+    return EqualizedColours(samples.colours.astype(np.float32), own)
 
 
 def known_to(surface: SmoothSurface, sigma_mm: float, rim: float = 1.0) -> SmoothSurface:

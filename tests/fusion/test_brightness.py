@@ -1,4 +1,4 @@
-"""Grey levels of pairs with other exposures and other light: a cloud without seams."""
+"""Colours of pairs with other exposures, white balances and light: a cloud without seams."""
 
 from __future__ import annotations
 
@@ -69,6 +69,31 @@ def test_no_seams_between_exposures(scan: Scan, cleaned: list[RangeImage]) -> No
     assert grey.std() / grey.mean() < 0.02
 
 
+@pytest.mark.parametrize("grey_pairs", [0, 2])
+def test_one_white_balance_of_pairs_that_have_others(
+    scan: Scan, cleaned: list[RangeImage], grey_pairs: int
+) -> None:
+    """A body whose left half has another colour keeps both; if it has one colour all over, grey
+    cameras among the others take it on."""
+    halves = np.array([[170.0, 110.0, 80.0], [60.0, 90.0, 140.0]])[[0, 0 if grey_pairs else 1]]
+    balance = np.random.default_rng(2).uniform(0.7, 1.3, (len(cleaned), 3))
+    balance[grey_pairs:] /= np.exp(np.log(balance[grey_pairs:]).mean(axis=0))
+    images = []
+    for number, (image, factors) in enumerate(zip(cleaned, balance, strict=True)):
+        left = scan.rig_from_camera[image.pair].apply(image.points.astype(float))[..., 1] > 0
+        rgb = np.rint(halves[left.astype(int)] * factors).astype(np.uint8)
+        images.append(replace(image, rgb=None if number < grey_pairs else rgb))
+        if number < grey_pairs:
+            images[-1] = replace(images[-1], colours=np.full_like(image.colours, 90 + 60 * number))
+    cloud = merge(images, scan.rig_from_camera, FusionSettings(points=100_000)).cloud
+    for side, colour in zip((-1.0, 1.0), halves, strict=True):
+        found = cloud.colours[side * cloud.points[:, 1] > 10.0].astype(float)
+        ratios = found[:, [0, 2]] / found[:, [1]]
+        # Levels are rounded twice: 1 % of 60. Unbalanced, ratios scatter by 20 %.
+        np.testing.assert_allclose(np.median(ratios, axis=0), colour[[0, 2]] / colour[1], rtol=0.02)
+        assert (np.std(ratios, axis=0) < 0.02 * ratios.mean(axis=0)).all()
+
+
 def test_no_seams_where_one_pair_looks_squarely_and_another_along(
     scan: Scan, cleaned: list[RangeImage]
 ) -> None:
@@ -100,15 +125,15 @@ def overlap(ours: Array, theirs: Array, shade: float = 0.3) -> list[Any]:
     """What the second of two pairs says of the first's samples, whose grey levels are `ours`."""
     count = len(ours)
     samples: Any = SimpleNamespace(
-        colours=np.concatenate([ours, np.full(7, 99)]).astype(np.uint8),
+        colours=np.concatenate([ours, np.full(7, 99)]).astype(np.uint8)[:, None],
         starts=np.array([0, count, count + 7]),
     )
-    surfaces: Any = [SimpleNamespace(colours=np.zeros(0)), SimpleNamespace(colours=theirs)]
+    surfaces: Any = [SimpleNamespace(colours=part[:, None]) for part in (np.zeros(0), theirs)]
     none = SimpleNamespace(index=np.zeros(0, np.int64), at=np.zeros(0, np.int64))
     seen: Any = [none, SimpleNamespace(index=np.arange(count), at=np.arange(count))]
     of_samples = np.full(count + 7, 0.1, np.float32)
     of_surfaces = [np.zeros(0, np.float32), np.full(count, 0.1 + shade, np.float32)]
-    return list(find_overlaps(samples, surfaces, seen, of_samples, of_surfaces))
+    return list(find_overlaps(samples, surfaces, seen, of_samples, of_surfaces, 0))
 
 
 def test_an_overlap_tells_how_much_brighter_one_pair_is_than_the_other() -> None:

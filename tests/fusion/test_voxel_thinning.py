@@ -96,7 +96,7 @@ def numbered(*counts: int) -> tuple[list[Any], np.ndarray]:
                 normals=points[:, ::-1].astype(np.float32),
                 sigma_mm=own.astype(np.float32),
                 weight=-own.astype(np.float32),
-                colours=(own % 256).astype(np.uint8),
+                colours=(own[:, None] % 256).astype(np.uint8),
                 rim=np.ones(count, np.float32),
             )
         )
@@ -115,7 +115,7 @@ def test_a_sample_has_all_that_belongs_to_its_point_surface_by_surface(wanted: i
     np.testing.assert_array_equal(found.points, points[number])
     np.testing.assert_array_equal(found.normals, points[number, ::-1])
     np.testing.assert_array_equal(found.weight, -found.sigma_mm)
-    np.testing.assert_array_equal(found.colours, number % 256)
+    np.testing.assert_array_equal(found.colours[:, 0], number % 256)
     assert (found.starts[0], found.starts[-1], len(found.starts)) == (0, len(number), 4)
     for k, (first, end) in enumerate(((0, 700), (700, 1200), (1200, 2100))):
         own = number[found.starts[k] : found.starts[k + 1]]

@@ -41,8 +41,9 @@ def test_a_range_image_holds_at_the_time_of_the_finest_pattern(
     monkeypatch.setattr(range_images, "decode_sequence", lambda *_, **__: STRIPES)
     monkeypatch.setattr(range_images, "reconstruct_range_image", lambda *_: found)
     monkeypatch.setattr(range_images, "stripes_in_volume", lambda *_: None)
+    monkeypatch.setattr(range_images, "read_colours", lambda *_: found.points.astype(np.uint8))
     rig = SimpleNamespace(
-        volume=None, pair=lambda _: SimpleNamespace(projector=code), frames=frames
+        volume=None, pair=lambda _: SimpleNamespace(projector=code, camera=None), frames=frames
     )
     calibration: Any = SimpleNamespace(pairs={"p": None}, rig_from_camera={"p": None}, rig=rig)
     for times, expected in ((frame_ms, 35.0), (None, None)):
@@ -50,6 +51,7 @@ def test_a_range_image_holds_at_the_time_of_the_finest_pattern(
         sequence: Any = SimpleNamespace(pair="p", shot="s")
         image, _ = reconstruct_sequence(calibration, captures, sequence)
         assert image.time_ms == expected
+        assert image.rgb is not None
 
 
 def test_cameras_alone_are_told_what_they_lack() -> None:

@@ -139,7 +139,7 @@ def check_exposure(scan: ScanEvidence) -> Iterator[Finding]:
 
 def check_brightness(scan: ScanEvidence) -> Iterator[Finding]:
     """Images so dark that hair and cloth cannot be told from skin, whose relief sigmas then lack."""
-    grey = float(np.median(scan.cloud.colours[:, 0]))
+    grey = float(np.median(scan.cloud.grey))
     if 0.0 < grey * DARK < MIN_GREY:
         yield Finding(
             "usable",
