@@ -18,7 +18,6 @@ from bodyscan.alignment.matching import Matches
 from bodyscan.alignment.overlaps import (
     COARSE,
     OverlapPoints,
-    find_connected_groups,
     linearize,
     map_overlaps,
     match_overlap,
@@ -32,6 +31,7 @@ from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.progress import map_threads
 from bodyscan.reconstruction.range_image import RangeImage
+from bodyscan.rig.rig import find_connected_groups
 from bodyscan.settings import AlignmentSettings
 
 Result = TypeVar("Result")

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from itertools import permutations
 from typing import TypeVar
 
-import networkx as nx
 import numpy as np
 
 from bodyscan.alignment.matching import (
@@ -25,7 +24,6 @@ from bodyscan.progress import map_threads
 from bodyscan.reconstruction.range_image import RangeImage
 
 Result = TypeVar("Result")
-Name = TypeVar("Name", int, str)
 
 COARSE = slice(None, None, 4)
 """The points used in early rounds of alignment."""
@@ -90,16 +88,6 @@ def map_overlaps(
         for both, result in zip(index_pairs, results, strict=True)
         if result is not None
     }
-
-
-def find_connected_groups(
-    names: Iterable[Name], edges: Iterable[tuple[Name, Name]]
-) -> list[set[Name]]:
-    """Connected components of a graph, in the order of each component's first name."""
-    graph = nx.Graph()
-    graph.add_nodes_from(names)
-    graph.add_edges_from(edges)
-    return list(nx.connected_components(graph))
 
 
 def linearize(matches: Matches, correlated: float) -> LinearGaussianSystem:

@@ -28,7 +28,7 @@ from bodyscan.errors import BadInput, CaptureError
 from bodyscan.files.messages import describe_similar_shots
 from bodyscan.progress import map_threads
 from bodyscan.rig.pair import Pair
-from bodyscan.rig.rig import Rig, find_unusual_lengths, load_rig
+from bodyscan.rig.rig import Rig, find_connected_groups, find_unusual_lengths, load_rig
 
 WORKERS = 8  # threads, which wait for a disk or a server, not for a processor
 
@@ -227,11 +227,9 @@ def _warn_of_jpeg(sequences: Iterable[ImageSequence]) -> Iterator[str]:
 
 def _find_separate_groups(good: list[ImageSequence]) -> list[str]:
     """The error if there are groups of pairs without a common shot: nothing can join them."""
-    groups: list[set[str]] = []
-    for shot in {sequence.shot for sequence in good}:
-        pairs = {sequence.pair for sequence in good if sequence.shot == shot}
-        connected = [group for group in groups if group & pairs]
-        groups = [group for group in groups if not group & pairs] + [pairs.union(*connected)]
+    one_of = {sequence.shot: sequence.pair for sequence in good}
+    edges = [(one_of[sequence.shot], sequence.pair) for sequence in good]
+    groups = find_connected_groups((pair for _, pair in edges), edges)
     if len(groups) < 2:
         return []
     named = " | ".join(sorted(", ".join(sorted(group)) for group in groups))

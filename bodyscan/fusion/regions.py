@@ -15,11 +15,10 @@ import numpy as np
 from scipy import ndimage
 
 from bodyscan.arrays import Array, Bytes, Crop, Floats, Indices, Mask, find_crop
-from bodyscan.compiled import compiled
 from bodyscan.fusion.brightness import MIN_GREY
 from bodyscan.fusion.quadratic_fit import fit_full_windows, window_basis
 from bodyscan.fusion.smoothing import compute_inverse_depths, estimate_pixel_size, window_reach
-from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
+from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN, group_medians
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import DARK_CLOTH, HAIR, SKIN, UNSURE, BodyCloud
 from bodyscan.motion.body_parts import NECK
@@ -222,24 +221,3 @@ def measure_roughness(
     left = np.float32(np.sqrt(1.0 - absorbed))
     points_rig = rig_from_camera.apply(points.astype(np.float64))
     return Roughness(points_rig, np.abs(residual) * length, left * noise[full] * length)
-
-
-@compiled
-def group_medians(values: Floats | Array, group: Indices, count: int) -> Array:
-    """Median (count,) of the values (N,) of each group, by the number (N,) of each; 0 if none.
-
-    Values are brought together by counting: scipy's median sorts all of them, in twenty times the time.
-    """
-    ends = np.zeros(count + 1, np.int64)
-    for number in group:
-        ends[number + 1] += 1
-    ends = np.cumsum(ends)
-    following, gathered = ends.copy(), np.empty_like(values)
-    for n in range(len(values)):
-        gathered[following[group[n]]] = values[n]
-        following[group[n]] += 1
-    medians = np.zeros(count)
-    for k in range(count):
-        if ends[k] < ends[k + 1]:
-            medians[k] = np.median(gathered[ends[k] : ends[k + 1]])
-    return medians

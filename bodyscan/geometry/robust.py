@@ -1,10 +1,11 @@
-"""Robust spread of residuals, and weights that let wrong ones count for little."""
+"""Robust spread of residuals, medians, and weights that let wrong ones count for little."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from bodyscan.arrays import Array
+from bodyscan.arrays import Array, Floats, Indices
+from bodyscan.compiled import compiled
 
 SIGMAS_PER_MEDIAN = 1.4826
 """Standard deviation over median absolute value of normal residuals, 1 / 0.6745."""
@@ -22,6 +23,27 @@ def rms_length(vectors: Array) -> float:
 def robust_scale(residuals: Array, min_scale: float = 1e-12) -> float:
     """Robust standard deviation from the median absolute value; at least `min_scale`."""
     return max(SIGMAS_PER_MEDIAN * float(np.median(np.abs(residuals))), min_scale)
+
+
+@compiled
+def group_medians(values: Floats | Array, group: Indices, count: int) -> Array:
+    """Median (count,) of the values (N,) of each group, by the number (N,) of each; 0 if none.
+
+    Values are brought together by counting: scipy's median sorts all of them, in twenty times the time.
+    """
+    ends = np.zeros(count + 1, np.int64)
+    for number in group:
+        ends[number + 1] += 1
+    ends = np.cumsum(ends)
+    following, gathered = ends.copy(), np.empty_like(values)
+    for n in range(len(values)):
+        gathered[following[group[n]]] = values[n]
+        following[group[n]] += 1
+    medians = np.zeros(count)
+    for k in range(count):
+        if ends[k] < ends[k + 1]:
+            medians[k] = np.median(gathered[ends[k] : ends[k + 1]])
+    return medians
 
 
 def cauchy_weights(residuals: Array, group: int, scale: float) -> Array:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeVar
 
 from pydantic import Field, PositiveFloat
 
@@ -22,6 +22,8 @@ from bodyscan.rig.pair import Pair
 from bodyscan.rig.templates import template_faults
 from bodyscan.stripes.codes import image_kinds
 from bodyscan.stripes.stripe_code import StripeCode
+
+Node = TypeVar("Node", int, str)
 
 
 class Volume(Model):
@@ -261,3 +263,14 @@ def _find_wrong_references(rig: Rig) -> Iterator[Problem]:
                 wrong += "part in placing the rig"
             if wrong:
                 yield (*where, k), wrong
+
+
+def find_connected_groups(
+    names: Iterable[Node], edges: Iterable[tuple[Node, Node]]
+) -> list[set[Node]]:
+    """Connected components of a graph, such as of pairs that share shots, in the order of `names`."""
+    groups = {name: {name} for name in names}
+    for one, other in edges:
+        joined = groups[one] | groups[other]
+        groups |= dict.fromkeys(joined, joined)
+    return list({id(group): group for group in groups.values()}.values())

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from bodyscan.alignment.overlaps import find_connected_groups
 from bodyscan.arrays import Array, Indices
 from bodyscan.boards.view import BoardView
 from bodyscan.captures.folder import Captures, open_captures
@@ -23,7 +22,7 @@ from bodyscan.optional import optional
 from bodyscan.registration.advice import pair_sigma_mm, suggest_shots
 from bodyscan.registration.rig_solve import solve_rig
 from bodyscan.rig.pair import Pair
-from bodyscan.rig.rig import load_rig
+from bodyscan.rig.rig import find_connected_groups, load_rig
 from bodyscan.workflows.find_boards import calibrate_cameras, find_all_boards, locate_views
 
 COLUMNS, ROWS = 4, 3

@@ -19,7 +19,6 @@ from bodyscan.alignment.displaced_poles import (
     motions_between,
 )
 from bodyscan.alignment.icp import Alignment, align
-from bodyscan.alignment.overlaps import find_connected_groups
 from bodyscan.alignment.sway_prior import BODY_CENTRE
 from bodyscan.arrays import Array
 from bodyscan.boards.view import BoardView
@@ -37,6 +36,7 @@ from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, silent, step
 from bodyscan.registration.drift import Drift, Move, find_drift, observe_pose
 from bodyscan.registration.rig_calibration import RigCalibration
+from bodyscan.rig.rig import find_connected_groups
 from bodyscan.settings import AlignmentSettings
 from bodyscan.workflows.decode import decode_on_boards
 from bodyscan.workflows.find_boards import find_all_boards, locate_views

@@ -20,7 +20,6 @@ from bodyscan.alignment.matching import (
 )
 from bodyscan.alignment.overlaps import (
     OverlapPoints,
-    find_connected_groups,
     map_overlaps,
     match_overlap,
 )
@@ -28,6 +27,7 @@ from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
+from bodyscan.rig.rig import find_connected_groups
 
 CAMERA = Camera(400.0, 404.0, -1.0, 158.0, 130.0, Radial(-0.12, 0.03), 320, 256)
 CENTRE, RADIUS = np.array([0.0, 0.0, 900.0]), 250.0

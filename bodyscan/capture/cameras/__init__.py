@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import monotonic_ns
@@ -99,6 +99,20 @@ class CameraKind(Model):
     @abstractmethod
     def open(self, place: Place) -> Camera:
         """Open the camera of a pair. Raises BadInput if it is not there, or its library is not."""
+
+
+def fix_nodes(nodes: Any, value: str, line: str | None, **fixed: object) -> None:
+    """Put a GenICam camera into trigger mode and switch off what it would change by itself.
+
+    value: what a node's value is called. line: the input of triggers; None: by software.
+    fixed: more nodes and their values, such as Gain, which can be set once GainAuto is off. What a
+        model does not have is passed over.
+    """
+    off = dict.fromkeys(("ExposureAuto", "GainAuto", "BalanceWhiteAuto"), "Off")
+    trigger = {"TriggerSelector": "FrameStart", "TriggerMode": "On"}
+    for name, wanted in {**off, **fixed, **trigger, "TriggerSource": line or "Software"}.items():
+        with suppress(Exception):
+            setattr(getattr(nodes, name), value, wanted)
 
 
 def now_ms() -> float:

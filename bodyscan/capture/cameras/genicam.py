@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
 from typing import Any, Literal
 
 import numpy as np
 
-from bodyscan.capture.cameras import HOST, Camera, CameraKind, FrameLost, Picture, Place, now_ms
+from bodyscan.capture.cameras import (
+    HOST,
+    Camera,
+    CameraKind,
+    FrameLost,
+    Picture,
+    Place,
+    fix_nodes,
+    now_ms,
+)
 from bodyscan.errors import BadInput
 
 
@@ -64,17 +72,7 @@ class GenicamCamera(Camera):
         self._kind, self._pair, self._handle = kind, pair, handle
         self._nodes = handle.remote_device.node_map
         self._triggered_ms = 0.0
-        for name, value in {
-            "ExposureAuto": "Off",
-            "GainAuto": "Off",
-            "BalanceWhiteAuto": "Off",
-            "Gain": kind.gain_db,
-            "TriggerSelector": "FrameStart",
-            "TriggerMode": "On",
-            "TriggerSource": kind.line or "Software",
-        }.items():
-            with suppress(Exception):  # not every model has every node
-                getattr(self._nodes, name).value = value
+        fix_nodes(self._nodes, "value", kind.line, Gain=kind.gain_db)
         self.exposure_ms = self._nodes.ExposureTime.value / 1000.0
 
     def expose(self, exposure_ms: float) -> None:

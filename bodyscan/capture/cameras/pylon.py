@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
 from typing import Any, Literal
 
 import numpy as np
 
-from bodyscan.capture.cameras import HOST, Camera, CameraKind, FrameLost, Picture, Place, now_ms
+from bodyscan.capture.cameras import (
+    HOST,
+    Camera,
+    CameraKind,
+    FrameLost,
+    Picture,
+    Place,
+    fix_nodes,
+    now_ms,
+)
 from bodyscan.errors import BadInput
 
 TICKS_PER_MS = 1e6
@@ -70,22 +78,12 @@ class PylonCamera(Camera):
         self._early: tuple[int, Picture] | None = None
         self._triggered_ms = 0.0
         handle.Open()
-        nodes: dict[str, Any] = {
-            "PixelFormat": f"Mono{kind.bits}",
-            "ExposureAuto": "Off",
-            "GainAuto": "Off",
-            "Gain": kind.gain_db,
-            "TriggerSelector": "FrameStart",
-            "TriggerMode": "On",
-            "TriggerSource": kind.line or "Software",
-        }
+        nodes: dict[str, object] = {"PixelFormat": f"Mono{kind.bits}", "Gain": kind.gain_db}
         if kind.images is not None:
             size = {"Width": place.pair.camera.width, "Height": place.pair.camera.height}
             nodes |= {"ImageFilename": str(place.base / kind.images), "ImageFileMode": "On"}
             nodes |= {"TestImageSelector": "Off", **size}
-        for name, value in nodes.items():
-            with suppress(Exception):  # not every model has every node
-                getattr(handle, name).Value = value
+        fix_nodes(handle, "Value", kind.line, **nodes)
         self.exposure_ms = handle.ExposureTime.Value / 1000.0
 
     def expose(self, exposure_ms: float) -> None:

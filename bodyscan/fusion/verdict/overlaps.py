@@ -21,14 +21,13 @@ from bodyscan.alignment.matching import (
     match_projected,
     sample_points,
 )
-from bodyscan.alignment.overlaps import find_connected_groups
 from bodyscan.arrays import Array
-from bodyscan.fusion.regions import group_medians
 from bodyscan.fusion.verdict.evidence import GIRTH_PER_MM, Finding, ScanEvidence, Seam, SeamReport
-from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
+from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN, group_medians
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.progress import map_threads
 from bodyscan.reconstruction.range_image import RangeImage
+from bodyscan.rig.rig import find_connected_groups
 
 MAX_DISAGREEMENT_MM = 0.4
 """RMS distance of overlapping surfaces in a good scan, if their sigmas do not predict more."""
