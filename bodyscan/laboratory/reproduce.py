@@ -213,7 +213,9 @@ def _plot_residuals(axis: Axes, residuals_mm: Array) -> None:
 def reproduction_text(found: Reproduction) -> str:
     """Fill in the whole report, `reproduction.md.j2`, as Markdown."""
     template = (files("bodyscan.laboratory") / "reproduction.md.j2").read_text("utf-8")
-    page = Environment(undefined=StrictUndefined, keep_trailing_newline=True).from_string(template)
+    page = Environment(
+        undefined=StrictUndefined, keep_trailing_newline=True, trim_blocks=True
+    ).from_string(template)
     sixth, seventh = figure_names(found.real_light)
     whole_times, fine_times = _times(found.whole), _times(found.fine)
     numbers = [f"No. {number}" for number in range(1, 6)]
