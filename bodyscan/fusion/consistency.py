@@ -161,14 +161,24 @@ def _compare(
     limits_mm: of agreement, and of a double surface.
     """
     points, normals = samples
-    surface_points, surface_normals, _ = surface
+    surface_points, surface_normals, numbers = surface
     index, at, shifts, against_index, against_at = found
     centre = -camera_from_rig[0].T @ camera_from_rig[1]
     agreed = contradicted = 0
     for n in range(len(points)):
-        if excluded[0] <= n < excluded[1] or not _faces(points[n], normals[n], centre):
+        if excluded[0] <= n < excluded[1] or not _faces(points, normals, n, centre):
             continue
-        there = _find_point(points[n], surface, corner, projection, camera_from_rig, warped)
+        x, y, z = _in_camera(points, n, camera_from_rig)
+        if z <= 1.0:  # mm
+            continue
+        u, v = look_up(projection, x / z, y / z)
+        column, row = int(np.rint(u)) - corner[0], int(np.rint(v)) - corner[1]
+        there = _number_at(numbers, row, column)
+        if warped and there >= 0:
+            x, y, z = _in_camera(surface_points, there, camera_from_rig)
+            at_u, at_v = look_up(projection, x / z, y / z)
+            column, row = column + int(np.rint(u - at_u)), row + int(np.rint(v - at_v))
+            there = _number_at(numbers, row, column)
         if there < 0:
             continue
         cosine = outward = 0.0
@@ -190,53 +200,31 @@ def _compare(
 
 
 @compiled
-def _find_point(
-    point: Floats,
-    surface: tuple[Floats, Floats, Numbers],
-    corner: tuple[int, int],
-    projection: Table,
-    camera_from_rig: tuple[Array, Array],
-    warped: bool,
-) -> int:
-    """Number of the surface's point at the pixel that shows a point of the rig frame, or -1."""
-    surface_points, _, numbers = surface
-    x, y, z = _in_camera(point, camera_from_rig)
-    if z <= 1.0:  # mm
-        return -1
-    u, v = look_up(projection, x / z, y / z)
-    column, row = int(np.rint(u)) - corner[0], int(np.rint(v)) - corner[1]
-    there = _number_at(numbers, row, column)
-    if warped and there >= 0:
-        x, y, z = _in_camera(surface_points[there], camera_from_rig)
-        at_u, at_v = look_up(projection, x / z, y / z)
-        column, row = column + int(np.rint(u - at_u)), row + int(np.rint(v - at_v))
-        there = _number_at(numbers, row, column)
-    return there
-
-
-@compiled
 def _number_at(numbers: Numbers, row: int, column: int) -> int:
     inside = 0 <= column < numbers.shape[1] and 0 <= row < numbers.shape[0]
     return int(numbers[row, column]) if inside else -1
 
 
 @compiled
-def _faces(point: Floats, normal: Floats, centre: Array) -> bool:
-    """Whether a camera sees a point not edge-on: n.(centre - point) > 0.1 distance."""
+def _faces(points: Floats, normals: Floats, n: int, centre: Array) -> bool:
+    """Whether a camera sees point n not edge-on: n.(centre - point) > 0.1 distance."""
     towards = distance2 = 0.0
     for k in range(3):
-        away = centre[k] - point[k]
-        towards += normal[k] * away
+        away = centre[k] - points[n, k]
+        towards += normals[n, k] * away
         distance2 += away * away
     return towards > 0 and towards * towards > 0.1**2 * distance2
 
 
 @compiled
-def _in_camera(point: Floats, camera_from_rig: tuple[Array, Array]) -> tuple[float, float, float]:
-    """A point of the rig frame in the camera frame."""
+def _in_camera(
+    points: Floats, n: int, camera_from_rig: tuple[Array, Array]
+) -> tuple[float, float, float]:
+    """Point n of the rig frame in the camera frame."""
     r, t = camera_from_rig
+    x, y, z = points[n, 0], points[n, 1], points[n, 2]
     return (
-        r[0, 0] * point[0] + r[0, 1] * point[1] + r[0, 2] * point[2] + t[0],
-        r[1, 0] * point[0] + r[1, 1] * point[1] + r[1, 2] * point[2] + t[1],
-        r[2, 0] * point[0] + r[2, 1] * point[1] + r[2, 2] * point[2] + t[2],
+        r[0, 0] * x + r[0, 1] * y + r[0, 2] * z + t[0],
+        r[1, 0] * x + r[1, 1] * y + r[1, 2] * z + t[1],
+        r[2, 0] * x + r[2, 1] * y + r[2, 2] * z + t[2],
     )

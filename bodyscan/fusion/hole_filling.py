@@ -16,7 +16,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
-from scipy.optimize import linprog
 
 from bodyscan.arrays import Array, Floats, Indices, Mask
 from bodyscan.compiled import compiled
@@ -347,6 +346,8 @@ class Crown:
     def unknown_mm(self) -> float:
         """By how much the head may end higher than was measured; inf if nothing bounds it: the
         highest point below all planes, a linear program."""
+        from scipy.optimize import linprog  # imported here because not every scan needs it
+
         if not len(self.offsets):
             return np.inf
         room = [(-CROWN_RADIUS_MM, CROWN_RADIUS_MM)] * 2 + [(0.0, None)]

@@ -5,7 +5,7 @@ Orthographic views side by side in one PNG.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from bodyscan.arrays import Array, Bytes, Floats
+from bodyscan.arrays import Array, Bytes, Floats, Indices
 from bodyscan.files.atomic import write_bytes
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.mesh.depth_buffer import nearest_faces, nearest_points
@@ -34,13 +34,16 @@ AZIMUTHS_DEG = {"front": 0.0, "side": 90.0, "back": 180.0}
 def draw_pictures(body: BodyCloud | BodyMesh) -> Pictures:
     """Draw a cloud by photo, sigma and number of pairs, or a mesh with its filled faces marked;
     pictures that fail are noted."""
+    drawn: dict[str, bytes] = {}
+    notes: list[str] = []
+    tasks: dict[str, Callable[[], bytes]] = {}
     if isinstance(body, BodyMesh):
         tasks = {"mesh.png": partial(draw_mesh, body)}
     else:
-        colours = {"cloud.png": "photo", "sigma.png": "sigma", "pairs.png": "pairs_seen"}
-        tasks = {name: partial(draw_cloud, body, colour=colour) for name, colour in colours.items()}
-    drawn: dict[str, bytes] = {}
-    notes: list[str] = []
+        with optional("pictures of the cloud", notes.append):
+            visible = VisiblePoints.from_points(body.points, body.normals)
+            colours = {"cloud.png": "photo", "sigma.png": "sigma", "pairs.png": "pairs_seen"}
+            tasks = {name: partial(draw_cloud, body, visible, c) for name, c in colours.items()}
     for name, draw in tasks.items():
         with optional(name, notes.append):
             drawn[name] = draw()
@@ -123,52 +126,50 @@ def _label_margin(
         write_label(canvas, callout.text, (edge if at_right else edge - width, round(place)))
 
 
-def draw_cloud(
-    cloud: BodyCloud,
-    views: Sequence[str] = tuple(AZIMUTHS_DEG),
-    *,
-    colour: str = "photo",
-    height_px: int = 900,
-) -> bytes:
-    """Pictures of a cloud; `colour` is photo, sigma or pairs_seen."""
-    points, normals, values = cloud.points, cloud.normals, cloud.sigma_mm
+@dataclass(frozen=True, eq=False)
+class VisiblePoints:
+    """The point that each pixel of some views shows: the nearest of those that face the viewer.
+
+    numbers: an image (H, W) a view; -1 where there is none.
+    """
+
+    views: tuple[str, ...]
+    numbers: tuple[Indices, ...]
+
+    @staticmethod
+    def from_points(
+        points: Array,
+        normals: NDArray[np.floating],
+        views: Sequence[str] = tuple(AZIMUTHS_DEG),
+        *,
+        height_px: int = 900,
+    ) -> VisiblePoints:
+        """Of points (N, 3) with normals (N, 3), mm, rig frame."""
+        dot_mm, frames = _dot_size(points), _frames(points, views, height_px)
+        numbers = tuple(_find_visible(points, normals, frame, dot_mm) for frame in frames)
+        return VisiblePoints(tuple(views), numbers)
+
+    def draw(self, colours: Bytes, *more: Bytes) -> bytes:
+        """A picture of all views, by colours (N, 3) blue, green, red; more panels go to the right."""
+        coloured = np.vstack([colours, np.array([BACKGROUND], np.uint8)])  # which -1 selects
+        return png([*(coloured[number] for number in self.numbers), *more], self.views)
+
+    def draw_values(self, values: NDArray[np.floating], scale: Scale) -> bytes:
+        """A picture by a number for each point, with the scale's bar."""
+        return self.draw(scale.colours(values), colour_bar(scale, len(self.numbers[0])))
+
+
+def draw_cloud(cloud: BodyCloud, visible: VisiblePoints, colour: str = "photo") -> bytes:
+    """Picture of a cloud; `colour` is photo, sigma or pairs_seen."""
     if colour == "photo":
-        return png(_draw_points(points, normals, cloud.colours[:, ::-1], views, height_px), views)
+        return visible.draw(cloud.colours[:, ::-1])
     if colour == "sigma":
-        scale = Scale(0.0, float(np.percentile(values[::10], 98)), "sigma, mm", turbo())
-    elif colour == "pairs_seen":
-        scale, values = Scale(0.0, 6.0, "pairs", turbo()), cloud.pairs_seen.astype(np.float32)
-    else:
-        raise ValueError(f"colour is photo, sigma or pairs_seen, not {colour!r}")
-    return draw_values(points, normals, values, scale, views, height_px=height_px)
-
-
-def draw_values(
-    points: Array,
-    normals: NDArray[np.floating],
-    values: NDArray[np.floating],
-    scale: Scale,
-    views: Sequence[str] = tuple(AZIMUTHS_DEG),
-    *,
-    height_px: int = 900,
-) -> bytes:
-    """Points (N, 3) coloured by a number each, with the scale's bar."""
-    colours = scale.colours(values)
-    panels = _draw_points(points, normals, colours, views, height_px)
-    return png([*panels, colour_bar(scale, height_px)], views)
-
-
-def _draw_points(
-    points: Array,
-    normals: NDArray[np.floating],
-    colours: Bytes,
-    views: Sequence[str],
-    height_px: int,
-) -> list[Bytes]:
-    """Draw points (N, 3) with colours (N, 3) blue, green, red; those facing away are left out."""
-    dot_mm = _dot_size(points)
-    frames = _frames(points, views, height_px)
-    return [_splat_view(points, normals, colours, frame, dot_mm) for frame in frames]
+        limit = float(np.percentile(cloud.sigma_mm[::10], 98))
+        return visible.draw_values(cloud.sigma_mm, Scale(0.0, limit, "sigma, mm", turbo()))
+    if colour == "pairs_seen":
+        pairs = cloud.pairs_seen.astype(np.float32)
+        return visible.draw_values(pairs, Scale(0.0, 6.0, "pairs", turbo()))
+    raise ValueError(f"colour is photo, sigma or pairs_seen, not {colour!r}")
 
 
 @dataclass(frozen=True)
@@ -233,17 +234,15 @@ def _draw_faces(mesh: BodyMesh, base: Bytes, frame: _Frame) -> Bytes:
     return canvas
 
 
-def _splat_view(
-    points: Array, normals: NDArray[np.floating], colours: Bytes, frame: _Frame, dot_mm: float
-) -> Bytes:
-    """Draw points that face the viewer as squares of dot_mm."""
+def _find_visible(
+    points: Array, normals: NDArray[np.floating], frame: _Frame, dot_mm: float
+) -> Indices:
+    """Number (H, W) of the point that a pixel shows if points are squares of dot_mm; -1 for none."""
     front = np.flatnonzero(normals @ frame.axes[2].astype(normals.dtype) > 0)
     size = max(1, int(np.ceil(dot_mm / frame.step_mm)))
     projected = frame.project(points.take(front, axis=0))
-    number = nearest_points(projected, size, frame.height, frame.width)
-    canvas = np.full((*number.shape, 3), BACKGROUND, np.uint8)
-    canvas[number >= 0] = colours[front[number[number >= 0]]]
-    return canvas
+    nearest = nearest_points(projected, size, frame.height, frame.width)
+    return np.append(front, -1)[nearest]
 
 
 def _dot_size(points: Array) -> float:

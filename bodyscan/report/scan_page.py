@@ -46,7 +46,14 @@ from bodyscan.report.page import (
     is_synthetic,
     make_sections,
 )
-from bodyscan.report.pictures import FILLED_TINT, UNKNOWN, Scale, draw_pictures, draw_values, turbo
+from bodyscan.report.pictures import (
+    FILLED_TINT,
+    UNKNOWN,
+    Scale,
+    VisiblePoints,
+    draw_pictures,
+    turbo,
+)
 from bodyscan.verdict import Verdict
 
 SKIN = (214, 210, 205)
@@ -275,7 +282,8 @@ def _compare(
     fit = found[-1].other_from_scan
     moved = float(np.linalg.norm(fit.apply(points.mean(axis=0)) - points.mean(axis=0)))
     scale = Scale(-limit, limit, "deviation, mm", charts.diverging()[:, ::-1])
-    deviation_map = draw_values(points, mesh.normals[shown.vertices], shown.signed_mm, scale)
+    visible = VisiblePoints.from_points(points, mesh.normals[shown.vertices])
+    deviation_map = visible.draw_values(shown.signed_mm, scale)
     return [
         f"Distances of the {len(points):,} measured vertices of this scan's mesh from the surface of "
         f"{shown.name}; what was filled is left out. To fit it, the scan was moved by {moved:.2f} mm "

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy.optimize import isotonic_regression
 
 from bodyscan.arrays import Array, Floats, Greys, Indices, Mask
 from bodyscan.compiled import compiled
@@ -62,6 +61,8 @@ def fit_variance(grey: Array, variance: Array, count: Array, dtype: np.dtype[Any
     if not len(grey):
         return np.ones(256, np.float32)
     if dtype != np.uint8:
+        from scipy.optimize import isotonic_regression  # imported here: 8 bits do not need it
+
         fitted = isotonic_regression(variance, weights=count).x
         return np.maximum(np.interp(np.arange(256), grey, fitted), min_variance).astype(np.float32)
     rise, base = 0.0, float(np.average(variance, weights=count))

@@ -12,7 +12,7 @@ from made_bodies import ellipsoid
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.mesh.topology import vertex_normals
 from bodyscan.report.charts import diverging
-from bodyscan.report.pictures import Scale, draw_cloud, draw_mesh, draw_values
+from bodyscan.report.pictures import Scale, VisiblePoints, draw_cloud, draw_mesh
 
 RADIUS = 100.0
 CENTRE = np.array([5.0, 7.0, 900.0])
@@ -43,6 +43,10 @@ def dots(count: int = 200_000) -> BodyCloud:
         np.where(normals[:, :1] > 0, [[200, 30, 30]], [[30, 30, 200]]).astype(np.uint8),
         np.where(normals[:, 1] > 0, 1, 5).astype(np.uint8),
     )
+
+
+def visible(*views: str) -> VisiblePoints:
+    return VisiblePoints.from_points(dots().points, dots().normals, views, height_px=300)
 
 
 def read(png: bytes) -> np.ndarray:
@@ -93,7 +97,7 @@ def test_faces_turned_inside_out_are_magenta() -> None:
 
 
 def test_the_side_facing_away_is_hidden() -> None:
-    picture = read(draw_cloud(dots(), ["front", "back"], height_px=300))
+    picture = read(draw_cloud(dots(), visible("front", "back")))
     front, back = np.split(picture, 2, axis=1)
     # The front half is red, the back half blue; at the outline either may show.
     for half, channel in ((front, 2), (back, 0)):
@@ -102,7 +106,7 @@ def test_the_side_facing_away_is_hidden() -> None:
 
 
 def test_a_ball_of_points_has_no_holes() -> None:
-    shown = ~background(read(draw_cloud(dots(), ["side"], height_px=300)))
+    shown = ~background(read(draw_cloud(dots(), visible("side"))))
     area = np.count_nonzero(shown) * STEP**2
     # Four of them fall on the 2 x 2 pixels that each paints: 2 % are left; a pixel of outline.
     assert area == pytest.approx(np.pi * RADIUS**2, rel=0.05)
@@ -110,7 +114,7 @@ def test_a_ball_of_points_has_no_holes() -> None:
 
 def test_sigma_and_pairs_have_their_colours_and_a_bar() -> None:
     photo, sigma, pairs = (
-        read(draw_cloud(dots(), ["front"], colour=colour, height_px=300))
+        read(draw_cloud(dots(), visible("front"), colour))
         for colour in ("photo", "sigma", "pairs_seen")
     )
     width = photo.shape[1]
@@ -125,9 +129,7 @@ def test_deviations_are_red_outside_and_blue_inside() -> None:
     cloud = dots()
     signed = np.where(cloud.points[:, 2] > 900.0, 0.8, -0.8)
     scale = Scale(-1.0, 1.0, "deviation, mm", diverging()[:, ::-1])
-    picture = read(
-        draw_values(cloud.points, cloud.normals, signed, scale, ["front"], height_px=300)
-    )
+    picture = read(visible("front").draw_values(signed, scale))
     # Random points leave a few gaps.
     middle = (picture.shape[1] - 130) // 2
     assert strongly(picture[80:140, middle], 2, 0).mean() > 0.9
