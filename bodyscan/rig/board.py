@@ -39,6 +39,8 @@ class Board(Model):
     """A flat board.
 
     columns, rows: number of squares, not of corners; of an aprilgrid, number of tags.
+    scale: how many times larger than described the print is; on reading it goes into square_mm and
+        marker_mm, and is 1 afterwards.
     square_mm: side of a square; of an aprilgrid, the distance from one tag to the next.
     stretch: how many times as high as wide the squares are; square_mm is their width.
 
@@ -51,6 +53,7 @@ class Board(Model):
     columns: Annotated[int, Field(ge=3, le=200)]
     rows: Annotated[int, Field(ge=3, le=200)]
     square_mm: PositiveFloat
+    scale: Annotated[float, Field(gt=0.8, lt=1.25)] = 1.0
     stretch: Annotated[float, Field(gt=0.8, lt=1.25)] = 1.0
     marker_mm: PositiveFloat | None = None
     dictionary: str = "DICT_4X4_1000"
@@ -96,6 +99,17 @@ class Board(Model):
         if isinstance(keys, dict) and keys.get("kind") == "aprilgrid":
             return {"dictionary": "DICT_APRILTAG_36h11", **keys}
         return keys
+
+    @model_validator(mode="before")
+    @classmethod
+    def _apply_scale(cls, keys: Any) -> Any:
+        """Put a valid scale into the lengths of the print."""
+        scale = keys.get("scale") if isinstance(keys, dict) else None
+        if not isinstance(scale, float) or not 0.8 < scale < 1.25:
+            return keys
+        lengths = {key: keys.get(key) for key in ("square_mm", "marker_mm")}
+        scaled = {k: v * scale for k, v in lengths.items() if isinstance(v, int | float)}
+        return {**keys, **scaled, "scale": 1.0}
 
     def problems(self) -> Iterator[Problem]:
         if self.faces == 1 and self.thickness_mm > 0:

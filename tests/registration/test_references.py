@@ -107,6 +107,8 @@ def test_a_reference_that_nobody_saw_leaves_the_size_and_is_named() -> None:
     found = find_rig_size(small_rig(bar()), placed(1.0), [])
     assert found.value.factor == 1.0
     assert "reference bar was measured in no shot" in found.notes[0]
+    (note,) = find_rig_size(small_rig(), placed(1.0), []).notes
+    assert "all lengths rest on square_mm (" in note
 
 
 def test_the_rig_has_its_size_after_a_second_solve() -> None:

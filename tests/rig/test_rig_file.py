@@ -53,6 +53,11 @@ def test_a_rig_file_is_read_as_meant(tmp_path: Path) -> None:
     assert rig.pair("p2").camera.width == 40
     assert rig.pair("cam").projector is None
     assert rig.board("board").square_mm == 30
+    scaled = load_rig(
+        write(tmp_path / "scaled.yaml", changed("square_mm: 30", "square_mm: 30, scale: 1.01"))
+    )
+    write_rig(tmp_path / "again.yaml", scaled)  # a scale counts once
+    assert load_rig(tmp_path / "again.yaml").board("board").square_mm == pytest.approx(30.3)
     assert rig.files == "{shot}/{pair}/{frame}.png"
     assert rig.frame_pair is rig.pairs[0]
     assert rig.frame_board is None
