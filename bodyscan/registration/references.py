@@ -66,8 +66,8 @@ def find_rig_size(rig: Rig, solution: RigSolution, views: Sequence[BoardView]) -
         squares = ", ".join(f"{board.name}: {board.square_mm:g}" for board in rig.boards)
         notes.append(
             f"all lengths rest on square_mm ({squares}), and no residual shows an error of it: half "
-            "a percent is 5 mm of a girth of 1 m. Measure ten squares of the print, or name a certified "
-            "length under `references`"
+            "a percent is 5 mm of a girth of 1 m. Measure ten squares of the print, or name a "
+            "certified length under `references`"
         )
     for reference in rig.references:
         readings = list(_readings(rig, reference, solution, views))
