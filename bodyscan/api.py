@@ -341,6 +341,7 @@ def export_scan(
         settings.formats,
         settings.versions,
         deface=settings.deface,
+        texture_px=settings.texture_px,
         frame=frame,
         up=up,
     )

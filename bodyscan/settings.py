@@ -21,7 +21,7 @@ from bodyscan.files.model import Model, Problem
 from bodyscan.progress import THREADS
 
 Millimetres = Annotated[float, Field(gt=0)]
-MeshVersion = Literal["full", "light", "open", "registered"]
+MeshVersion = Literal["full", "light", "open", "registered", "textured"]
 
 BODY_CENTRE_MM = (0.0, 0.0, 900.0)
 """Rig frame, mm: roughly the middle of a standing person. A pair's motion is stated at this point,
@@ -157,7 +157,11 @@ class ExportSettings(Model):
 
     versions: tuple[MeshVersion, ...] = Field(default=("full", "light"), min_length=1)
     """full; light: 50,000 faces, which any viewer can turn; open: without the filled faces; registered:
-    a parametric body laid over it, in one topology for all people, with parts, landmarks, skeleton."""
+    a parametric body laid over it, in one topology for all people, with parts, landmarks, skeleton;
+    textured: light, its colours in an image (GLB and OBJ; needs the extra `texture`)."""
+
+    texture_px: int = Field(default=4096, ge=256, le=16384)
+    """px: side of the image of `textured`."""
 
     deface: bool = False
     """remove the face, for sharing; everything below the neck stays as it is."""

@@ -258,6 +258,16 @@ def export(
             "landmarks, skeleton.",
         ),
     ] = False,
+    texture: Annotated[
+        bool,
+        typer.Option(
+            "--texture",
+            help="Also write the light mesh with its colours in an image (GLB, OBJ; needs xatlas).",
+        ),
+    ] = False,
+    texture_px: Annotated[
+        int, typer.Option(min=256, max=16384, help="Side of that image, pixels.")
+    ] = ExportSettings().texture_px,
     frame: Annotated[
         str, typer.Option(help="rig, or body (origin under the body, x the way it faces).")
     ] = "rig",
@@ -277,9 +287,12 @@ def export(
         stored = load_scan(result)
         if not anyway:
             refuse_repeat(result, stored.facts)
-        versions = (*ExportSettings().versions, *(["registered"] if registered else []))
-        chosen = formats.split(",")
-        written = export_scan(stored, folder, chosen, versions, deface=deface, frame=frame, up=up)
+        extra = {"registered": registered, "textured": texture}
+        written = export_scan(
+            stored, folder, formats.split(","),
+            (*ExportSettings().versions, *(version for version, wanted in extra.items() if wanted)),
+            texture_px=texture_px, deface=deface, frame=frame, up=up,
+        )  # fmt: skip
     _show_grade(output, stored)
     for path in written:
         output.add_files("export", path)

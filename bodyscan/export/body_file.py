@@ -12,6 +12,7 @@ import numpy as np
 from bodyscan.arrays import Array
 from bodyscan.body_model.skinned import SkinnedBody
 from bodyscan.export.formats import BODY_FORMATS, BodyFormat
+from bodyscan.export.texture import TexturedBody
 from bodyscan.files.atomic import write_json
 from bodyscan.files.registry import unknown_format_error
 from bodyscan.geometry.transforms import RigidTransform
@@ -41,13 +42,15 @@ class Provenance:
     up: str = "z"
 
 
-def write_body(path: Path, body: BodyCloud | BodyMesh | SkinnedBody, origin: Provenance) -> None:
+def write_body(
+    path: Path, body: BodyCloud | BodyMesh | SkinnedBody | TexturedBody, origin: Provenance
+) -> None:
     """Write `body` in the format that `path`'s suffix names, and `<path>.json` beside it.
 
     A mesh is written without its faces of zero area; a registered body has all of them. Raises
     BadInput for a suffix that is not that of a format, or of one that cannot hold a cloud.
     """
-    path = Path(path)
+    path, found = Path(path), {}
     kind = "cloud" if isinstance(body, BodyCloud) else "mesh"
     name = path.suffix.lower().removeprefix(".")
     able = [known for known in BODY_FORMATS.names() if kind in BODY_FORMATS.find(known).holds]
@@ -62,12 +65,19 @@ def write_body(path: Path, body: BodyCloud | BodyMesh | SkinnedBody, origin: Pro
         else:
             format_.write_skinned(path, body, *up)
         body = body.mesh
+    elif isinstance(body, TexturedBody):
+        assert format_.write_textured is not None
+        format_.write_textured(path, body, *up)
+        companions = [path.with_suffix(suffix).name for suffix in (".mtl", ".png")]
+        found = {"texture_px": len(body.image), "companions": companions if name == "obj" else []}
+        body = body.mesh
     else:
         body = collapse_slivers(body) if isinstance(body, BodyMesh) else body
         format_.write(path, body, *up)
     if up == ("y",):
         format_ = replace(format_, axes=("left", "up", "front"))
-    write_json(path.with_name(f"{path.name}.json"), describe_body(path.name, format_, body, origin))
+    described = describe_body(path.name, format_, body, origin) | found
+    write_json(path.with_name(f"{path.name}.json"), described)
 
 
 def describe_body(

@@ -13,15 +13,16 @@ from bodyscan.body_model.registered import register_body
 from bodyscan.body_model.skinned import SkinnedBody, make_skinned
 from bodyscan.errors import BadInput
 from bodyscan.export.body_file import Provenance, write_body
+from bodyscan.export.defacing import Neck, find_neck
 from bodyscan.export.defacing import deface as replace_head
-from bodyscan.export.defacing import find_neck
 from bodyscan.export.formats import BODY_FORMATS
+from bodyscan.export.texture import TexturedBody, texture_mesh
 from bodyscan.files.model import did_you_mean
 from bodyscan.fusion.storage import StoredScan
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.measurement.landmarks import find_landmarks
 from bodyscan.mesh.body import BodyMesh
-from bodyscan.mesh.repair import decimate
+from bodyscan.mesh.repair import collapse_slivers, decimate
 from bodyscan.mesh.sliced_parts import find_body_frame
 from bodyscan.settings import ExportSettings
 
@@ -29,6 +30,7 @@ VERSIONS: dict[str, tuple[str, Callable[[BodyMesh], BodyMesh]]] = {
     "full": ("body", lambda mesh: mesh),
     "light": ("body-light", decimate),
     "open": ("body-open", BodyMesh.measured_part),
+    "textured": ("body-textured", decimate),
 }
 
 
@@ -38,6 +40,7 @@ def export_scan(
     formats: Sequence[str],
     versions: Sequence[str] = ExportSettings().versions,
     *,
+    texture_px: int = ExportSettings().texture_px,
     deface: bool = False,
     frame: str = "rig",
     up: str = "z",
@@ -45,7 +48,8 @@ def export_scan(
     """Write the mesh in each format (see `BODY_FORMATS`) and version; returns the paths.
 
     versions: full, light (50,000 faces), open (without filled faces), registered (a parametric body
-        laid over the scan). Each file has a JSON beside it.
+        laid over the scan), textured (light, with an image of `texture_px` a side instead of vertex
+        colours; in formats that hold it). Each file has a JSON beside it.
     deface: replace the subject's head by a plain one; below the neck nothing changes. The JSON then
         has neither pseudonym nor date.
     frame: rig, or body (origin under the body, x the way it faces).
@@ -55,8 +59,9 @@ def export_scan(
     face or fits nobody; FailedWork if no neck is found.
     """
     names = [name.strip().lower().removeprefix(".") for name in formats]
-    for name in names:
-        BODY_FORMATS.find(name)
+    able = [name for name in names if BODY_FORMATS.find(name).write_textured]
+    if "textured" in versions and not able:
+        raise BadInput(f"{', '.join(names)} holds no texture", remedy="Add `glb` or `obj`.")
     every = (*VERSIONS, "registered")
     choices = [*((version, every) for version in versions), (frame, ("rig", "body"))]
     for name, known in [*choices, (up, ("z", "y"))]:
@@ -72,18 +77,40 @@ def export_scan(
     neck = find_neck(scan.mesh.vertices, scan.mesh.faces) if deface else None
     written = []
     for version in versions:
-        body: BodyMesh | SkinnedBody
+        body: BodyMesh | SkinnedBody | TexturedBody
         if version == "registered":
             stem, body = "body-registered", _register(scan.mesh, pose)
         else:
             stem, convert = VERSIONS[version]
-            body = convert(scan.mesh)
-            body = body if neck is None else replace_head(body, neck)
-            body = body if pose is None else transform_mesh(body, pose.inverse())
-        for name in names:
+            mesh = convert(scan.mesh)
+            mesh = mesh if neck is None else replace_head(mesh, neck)
+            if version == "textured":
+                body = _texture(scan, mesh, neck, pose, texture_px)
+            else:
+                body = _place(mesh, pose)
+        for name in able if version == "textured" else names:
             written.append(folder / f"{stem}.{name}")
             write_body(written[-1], body, origin)
     return written
+
+
+def _place(mesh: BodyMesh, rig_from_frame: RigidTransform | None) -> BodyMesh:
+    return mesh if rig_from_frame is None else transform_mesh(mesh, rig_from_frame.inverse())
+
+
+def _texture(
+    scan: StoredScan, mesh: BodyMesh, neck: Neck | None, pose: RigidTransform | None, size: int
+) -> TexturedBody:
+    """Texture a mesh, in the rig frame, with the colours of a scan's points.
+
+    neck: of a mesh without its face. pose: of the frame in which the mesh is written.
+    """
+    points, colours = scan.cloud.points, scan.cloud.colours
+    if neck is not None:  # the points show the face
+        shown = replace_head(scan.mesh, neck)
+        points, colours = shown.vertices, shown.colours
+    textured = texture_mesh(collapse_slivers(mesh), points, colours, size)
+    return replace(textured, mesh=_place(textured.mesh, pose))
 
 
 def _register(mesh: BodyMesh, rig_from_frame: RigidTransform | None) -> SkinnedBody:

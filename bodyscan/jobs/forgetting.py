@@ -210,7 +210,7 @@ def _find_exports(folder: Path, names: list[str], subject: str) -> set[str]:
             is_ours = str(content.get("schema")).startswith("bodyscan-")
             whose = (content.get("subject"), content.get("compared_with"))
             if subject in whose and (described in names or is_ours):
-                found |= {name, described} & {*names}
+                found |= {name, described, *map(str, content.get("companions") or ())} & {*names}
     return found
 
 

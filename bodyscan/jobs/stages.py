@@ -107,7 +107,10 @@ def run_export(job: Job, out: Path, progress: Progress, announce: Announce) -> N
     settings = job.pipeline.export
     with step(progress, "exporting"):
         scan = load_scan(job.folder / "scan")
-        export_scan(scan, out, settings.formats, settings.versions, deface=settings.deface)
+        export_scan(
+            scan, out, settings.formats, settings.versions,
+            deface=settings.deface, texture_px=settings.texture_px,
+        )  # fmt: skip
 
 
 def run_report(job: Job, out: Path, progress: Progress, announce: Announce) -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import open3d as o3d
 import pytest
@@ -15,7 +17,7 @@ from bodyscan.errors import FailedWork
 from bodyscan.export.defacing import Neck, deface, find_neck
 from bodyscan.export.scan import export_scan
 from bodyscan.fusion.storage import StoredScan
-from bodyscan.mesh.body import BodyMesh
+from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.mesh.ply import read_ply_mesh
 from bodyscan.mesh.topology import compute_topology, vertex_normals
 
@@ -168,3 +170,14 @@ def test_exported_files_state_that_they_are_defaced(body: BodyMesh, tmp_path: Pa
         assert not set(map(bytes, mesh.vertices[mesh.vertices[:, 2] > 1430.0])) & set(
             map(bytes, body.vertices)
         )
+
+
+def test_a_texture_shows_no_face_either(body: BodyMesh, neck: Neck, tmp_path: Path) -> None:
+    pytest.importorskip("xatlas")
+    red = np.where(body.vertices[:, 2:] > neck.height_mm, [255, 0, 0], [0, 90, 90]).astype(np.uint8)
+    cloud = BodyCloud(body.vertices, body.normals, body.sigma_mm, red, red[:, 0])
+    scan = StoredScan(cloud, replace(body, colours=red), {"calibration_id": "c"})
+    export_scan(scan, tmp_path, ["obj"], ["textured"], texture_px=512, deface=True)
+    image = cv2.imread(str(tmp_path / "body-textured.png"))[..., ::-1].astype(int)
+    assert (image[..., 0] <= image[..., 1].clip(min=150)).all()
+    assert (image == 150).all(axis=-1).any()  # the plain head

@@ -15,11 +15,12 @@ from scipy.spatial.transform import Rotation
 from bodyscan.arrays import Array, Bytes, Indices
 from bodyscan.body_model.skinned import SkinnedBody
 from bodyscan.export.formats import BodyFormat
+from bodyscan.export.texture import TexturedBody
 from bodyscan.files.atomic import atomic_replacement
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.mesh.topology import vertex_normals
 
-MATERIALS = {
+MATERIALS: dict[str, list[dict[str, Any]]] = {
     "materials": [
         {"name": "body", "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.9}}
     ]
@@ -41,20 +42,23 @@ class _Buffer:
 
         target: 34962 for vertices, 34963 for indices, None for what a graphics card does not hold.
         """
-        data = values.tobytes()
-        size = sum(map(len, self.chunks))
-        view = {"buffer": 0, "byteOffset": size, "byteLength": len(data)}
-        self.views.append(view if target is None else view | {"target": target})
+        view = self.add_view(values.tobytes(), **({} if target is None else {"target": target}))
         self.accessors.append({
-            "bufferView": len(self.views) - 1,
+            "bufferView": view,
             # FLOAT, UNSIGNED_BYTE, UNSIGNED_SHORT, UNSIGNED_INT
             "componentType": {"f4": 5126, "u1": 5121, "u2": 5123, "u4": 5125}[values.dtype.str[1:]],
             "count": len(values) if kind != "SCALAR" else values.size,
             "type": kind,
             **extra,
         })  # fmt: skip
-        self.chunks.append(data + b"\0" * (-len(data) % 4))
         return len(self.accessors) - 1
+
+    def add_view(self, data: bytes, **extra: Any) -> int:
+        """Add bytes; returns the number of their view."""
+        size = sum(map(len, self.chunks))
+        self.views.append({"buffer": 0, "byteOffset": size, "byteLength": len(data), **extra})
+        self.chunks.append(data + b"\0" * (-len(data) % 4))
+        return len(self.views) - 1
 
     def write(self, path: Path, content: dict[str, Any]) -> None:
         """Write the file; content: scenes, nodes and meshes of the JSON part."""
@@ -97,6 +101,33 @@ def write_glb(path: Path, body: BodyCloud | BodyMesh) -> None:
     nodes = [{"mesh": 0, "name": "body"}]
     content = {"scenes": [{"nodes": [0]}], "nodes": nodes, "meshes": meshes}
     buffer.write(path, content | MATERIALS)
+
+
+def write_textured_glb(path: Path, body: TexturedBody) -> None:
+    """Write a mesh with its texture inside, and no vertex colours, which would multiply it."""
+    mesh, buffer = body.mesh, _Buffer()
+    attributes = {
+        "POSITION": _y_up(mesh.vertices[body.vertex]) / 1000.0,
+        "NORMAL": _y_up(mesh.normals[body.vertex]),
+        "TEXCOORD_0": body.uv,
+        "_FILLED": np.isnan(mesh.sigma_mm[body.vertex]),
+    }
+    if mesh.regions is not None:
+        attributes["_REGION"] = mesh.regions[body.vertex]
+    primitive = _add_primitive(buffer, attributes, body.faces)
+    (plain,) = MATERIALS["materials"]
+    surface = plain["pbrMetallicRoughness"] | {"baseColorTexture": {"index": 0}}
+    linear, mipmaps, clamp = 9729, 9987, 33071
+    sampler = {"magFilter": linear, "minFilter": mipmaps, "wrapS": clamp, "wrapT": clamp}
+    buffer.write(path, {
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "name": "body"}],
+        "meshes": [{"primitives": [primitive], "name": "body"}],
+        "materials": [plain | {"pbrMetallicRoughness": surface}],
+        "textures": [{"sampler": 0, "source": 0}],
+        "samplers": [sampler],
+        "images": [{"bufferView": buffer.add_view(body.png), "mimeType": "image/png"}],
+    })  # fmt: skip
 
 
 def write_skinned_glb(path: Path, body: SkinnedBody) -> None:
@@ -208,7 +239,8 @@ def _add_primitive(
         ends = {}
         if name == "POSITION":
             ends = {"min": floats.min(axis=0).tolist(), "max": floats.max(axis=0).tolist()}
-        numbers[name] = buffer.add(floats, "SCALAR" if floats.ndim == 1 else "VEC3", **ends)
+        kind = "SCALAR" if floats.ndim == 1 else f"VEC{floats.shape[1]}"
+        numbers[name] = buffer.add(floats, kind, **ends)
     primitive: dict[str, Any] = {"attributes": numbers, "material": 0, "mode": 0}  # POINTS
     if indices is not None:
         primitive["mode"] = 4  # TRIANGLES
@@ -220,6 +252,7 @@ def _add_primitive(
 FORMAT = BodyFormat(
     write_glb,
     write_skinned=write_skinned_glb,
+    write_textured=write_textured_glb,
     holds=frozenset({"mesh", "cloud", "colours", "normals", "filled", "regions"}),
     unit="m",
     axes=("left", "up", "front"),

@@ -1,4 +1,4 @@
-"""Wavefront OBJ with vertex colours ("v x y z r g b", which most programs understand)."""
+"""Wavefront OBJ with vertex colours ("v x y z r g b", which most programs understand) or a texture."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ import numpy as np
 from bodyscan.arrays import Indices
 from bodyscan.body_model.skinned import SkinnedBody
 from bodyscan.export.formats import BodyFormat
-from bodyscan.files.atomic import atomic_replacement
+from bodyscan.export.texture import TexturedBody
+from bodyscan.files.atomic import atomic_replacement, write_bytes, write_text
 from bodyscan.mesh.body import BodyMesh
 from bodyscan.mesh.ply import describe_axes, lay_axes
 
@@ -38,9 +39,27 @@ def write_skinned_obj(path: Path, body: SkinnedBody, up: str = "z") -> None:
             stream.write(lines.encode("ascii"))
 
 
-def _write_vertices(stream: IO[bytes], mesh: BodyMesh, up: str) -> None:
+def write_textured_obj(path: Path, body: TexturedBody, up: str = "z") -> None:
+    """Write a mesh whose colours are in a PNG, which an MTL names, both beside it."""
+    path = Path(path)
+    image, material = path.with_suffix(".png"), path.with_suffix(".mtl")
+    write_bytes(image, body.png)
+    lines = ("newmtl body", "Ka 1 1 1", "Kd 1 1 1", "Ks 0 0 0", "illum 1", f"map_Kd {image.name}")
+    write_text(material, "\n".join((*lines, "")))
+    with atomic_replacement(path) as temporary, temporary.open("wb") as stream:
+        stream.write(f"mtllib {material.name}\n".encode())
+        _write_vertices(stream, body.mesh, up, coloured=False)
+        # Images have their origin at the top, OBJ below.
+        np.savetxt(stream, np.column_stack([body.uv[:, 0], 1.0 - body.uv[:, 1]]), "vt %.6f %.6f")
+        stream.write(b"usemtl body\n")
+        corners = np.stack([body.mesh.faces, body.faces, body.mesh.faces], axis=2) + 1
+        np.savetxt(stream, corners.reshape(-1, 9), "f" + " %d/%d/%d" * 3)
+
+
+def _write_vertices(stream: IO[bytes], mesh: BodyMesh, up: str, *, coloured: bool = True) -> None:
     stream.write(f"# {describe_axes(up)}\no body\n".encode("ascii"))
-    points = np.column_stack([lay_axes(mesh.vertices, up), mesh.colours / 255.0])
+    points = lay_axes(mesh.vertices, up)
+    points = np.column_stack([points, mesh.colours / 255.0]) if coloured else points
     for word, rows in (("v", points), ("vn", lay_axes(mesh.normals, up))):
         # Adding 0 makes 0 of -0.
         rounded = np.round(rows.astype(np.float64), 4) + 0.0
@@ -55,5 +74,6 @@ FORMAT = BodyFormat(
     write_obj,
     holds=frozenset({"mesh", "colours", "normals"}),
     write_skinned=write_skinned_obj,
+    write_textured=write_textured_obj,
     free_axes=True,
 )
