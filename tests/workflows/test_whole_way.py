@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections import defaultdict
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
-from small_workspace import Workspace
+from small_workspace import COARSE, Workspace, run
 
 import bodyscan
 from bodyscan.arrays import Array
@@ -92,6 +94,31 @@ def test_exports_are_there_and_say_what_they_are(workspace: Workspace) -> None:
     assert shape.closed
     assert shape.components == 1
     assert shape.volume_mm3 > 0, "faces look outwards"
+
+
+def test_cameras_that_see_colour_give_the_body_one_colour(
+    workspace: Workspace, tmp_path: Path
+) -> None:
+    """The grey captures through cameras of which each has its own white balance."""
+    shutil.copytree(workspace.folder / "captures" / "person", tmp_path / "person")
+    rng = np.random.default_rng(4)
+    balance: dict[str, Array] = defaultdict(lambda: rng.uniform(0.7, 1.0, 3) * [1.0, 0.8, 0.6])
+    for path in sorted((tmp_path / "person").rglob("*.png")):
+        grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        rgb = np.rint(grey[..., None] * balance[path.parent.name]).astype(np.uint8)
+        cv2.imwrite(str(path), rgb[..., ::-1])
+    at = ("--calibration", workspace.folder / "calibration", "--out", tmp_path / "scan")
+    result = run("scan", tmp_path / "person", *at, "--points", 110_000, *COARSE)
+    assert result.exit_code == 0, result.output
+    stored = load_scan(tmp_path / "scan")
+    assert deviation(distances(stored.cloud.points, workspace)).median_mm < 0.4
+    expected = np.exp(np.mean(np.log(list(balance.values())), axis=0))
+    for colours in (stored.cloud.colours, stored.mesh.colours):
+        bright = colours[colours.min(axis=1) > 20].astype(float)
+        ratios = bright[:, [0, 2]] / bright[:, [1]] / (expected[[0, 2]] / expected[1])
+        # Levels of 20 to 130 are rounded three times.
+        np.testing.assert_allclose(np.median(ratios, axis=0), 1.0, atol=0.02)
+        assert (np.std(ratios, axis=0) < 0.03).all()
 
 
 def test_a_person_who_moved_is_held_against_the_body_of_that_moment(
