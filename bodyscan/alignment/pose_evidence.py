@@ -7,8 +7,8 @@ leg: once the body's motion is estimated, little is left that only displaced pol
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -61,35 +61,64 @@ class CommonError:
         return float(np.linalg.norm(self.shift))
 
 
+@dataclass(frozen=True)
+class PostureStep:
+    """The subject held another posture while one pole fired: drew the belly in, lifted an arm.
+
+    pole: or poles, if it may have been another.
+    kinds: of motion, whose fields the step is a sum of.
+    moved_mm: largest amplitude.
+    size_mm: prior standard deviation of the amplitudes.
+    """
+
+    pole: str
+    pairs: frozenset[str]
+    kinds: tuple[str, ...]
+    moved_mm: float
+    size_mm: float
+
+
+Displacement = DisplacedPole | ScaleError | CommonError | PostureStep
+Equations = Callable[[Mask], LinearGaussianSystem]
+
+
 @dataclass(frozen=True, eq=False)
 class PoseEvidence:
     """Normal equations of the pose errors of P pairs, marginalized over the subject's motion.
 
     system: of the 6P twists, pair after pair, beyond the calibration's uncertainty.
+    postures: by kinds of motion, the same of a step of posture in the views of some pairs (P,).
     """
 
     names: tuple[str, ...]
     system: LinearGaussianSystem
+    postures: Mapping[tuple[str, ...], Equations] = field(default_factory=dict)
 
     def fit(self, basis: Array) -> _DisplacementFit:
-        """Fit displacements along `basis` (6P, k), with the prior size in mm of the best evidence."""
-        steps = self.system.project(basis)
-        log_evidence = steps.log_evidence(STEPS_MM**2)
-        best = int(np.argmax(log_evidence))
-        prior = LinearGaussianSystem.from_prior(np.eye(steps.size) / STEPS_MM[best] ** 2)
-        posterior = steps + prior
-        return _DisplacementFit(
-            float(log_evidence[best]), posterior.solve(), posterior.covariance()
-        )
+        """Fit displacements along `basis` (6P, k)."""
+        return _DisplacementFit.from_system(self.system.project(basis))
 
 
 @dataclass(frozen=True, eq=False)
 class _DisplacementFit:
-    """log_ratio: log likelihood ratio against none.  steps (k,) mm, with covariance (k, k)."""
+    """log_ratio: log likelihood ratio against none.  steps (k,) mm, with covariance (k, k) and prior
+    standard deviation."""
 
     log_ratio: float
     steps: Array
     covariance: Array
+    size_mm: float
+
+    @staticmethod
+    def from_system(system: LinearGaussianSystem) -> _DisplacementFit:
+        """With the prior size of the best evidence."""
+        log_evidence = system.log_evidence(STEPS_MM**2)
+        best = int(np.argmax(log_evidence))
+        size_mm = float(STEPS_MM[best])
+        posterior = system + LinearGaussianSystem.from_prior(np.eye(system.size) / size_mm**2)
+        return _DisplacementFit(
+            float(log_evidence[best]), posterior.solve(), posterior.covariance(), size_mm
+        )
 
 
 def detect_displacement(
@@ -98,11 +127,11 @@ def detect_displacement(
     poles: Mapping[str, str],
     displaced: Collection[str] = (),
     rival: float = 0.0,
-) -> DisplacedPole | ScaleError | CommonError | None:
-    """Find the displacement that explains a scan better than any motion of the subject.
+) -> Displacement | None:
+    """Find the displacement that explains a scan better than any smooth motion of the subject.
 
     Candidates are one pole or pair; every pole by itself (`all_moved`); all poles farther out or
-    nearer; all pairs alike in their cameras' frames.
+    nearer; all pairs alike in their cameras' frames; another posture while one pole fired.
 
     rig_from_camera: as calibrated.
     poles: the pole of each pair that is mounted on one.
@@ -112,13 +141,15 @@ def detect_displacement(
     sides = [poles.get(name, name) for name in evidence.names]
     if len(set(sides)) < 2 or not set(evidence.names) - set(displaced):
         return None
-    candidates: list[tuple[float, DisplacedPole | ScaleError | CommonError]] = []
+    candidates: list[tuple[float, Displacement]] = []
     for name, pairs in group_by_pole(evidence.names, poles).items():
         # Among few pairs, any single one could be displaced.
         identifiable = len(pairs) > 1 or len(evidence.names) >= MIN_PAIRS
         if identifiable and pairs.isdisjoint(displaced):
             fit = evidence.fit(_rigid_basis(np.isin(evidence.names, list(pairs))))
             candidates.append((fit.log_ratio, _displaced_pole(name, pairs, fit.steps)))
+            if len(pairs) > 1:
+                candidates += _fit_postures(evidence, name, pairs)
     if not displaced:
         bases = {side: _rigid_basis(np.equal(sides, side)) for side in dict.fromkeys(sides)}
         each = evidence.fit(np.hstack(list(bases.values())))
@@ -136,10 +167,33 @@ def detect_displacement(
         turn_deg = float(np.degrees(np.linalg.norm(lever) / LEVER_MM))
         candidates.append((common.log_ratio, CommonError(tuple(shift.tolist()), turn_deg)))
     log_ratio, best = max(candidates, key=lambda one: one[0], default=(0.0, None))
+    if isinstance(best, PostureStep):
+        either = [
+            one.pole
+            for ratio, one in candidates
+            if isinstance(one, PostureStep) and ratio > log_ratio - MIN_LOG_RATIO
+        ]
+        best = replace(best, pole=" or ".join(dict.fromkeys(either)))
     return best if best and log_ratio > max(MIN_LOG_RATIO, rival) and _is_harmful(best) else None
 
 
-def _is_harmful(found: DisplacedPole | ScaleError | CommonError) -> bool:
+def _fit_postures(
+    evidence: PoseEvidence, pole: str, pairs: frozenset[str]
+) -> list[tuple[float, PostureStep]]:
+    """Log likelihood ratios of other postures while these pairs fired."""
+    members = np.isin(evidence.names, list(pairs))
+    found = []
+    for kinds, equations in evidence.postures.items():
+        fit = _DisplacementFit.from_system(equations(members))
+        moved_mm = float(np.abs(fit.steps).max(initial=0.0))
+        step = PostureStep(pole, pairs, kinds, moved_mm, fit.size_mm)
+        found.append((fit.log_ratio, step))
+    return found
+
+
+def _is_harmful(found: Displacement) -> bool:
+    if isinstance(found, PostureStep):
+        return found.moved_mm > MIN_STEP_MM
     if isinstance(found, ScaleError):
         return abs(found.outward_mm) > MIN_OUTWARD_MM
     lever = LEVER_MM * np.radians(found.rotation_deg)

@@ -25,7 +25,7 @@ from bodyscan.motion.body_cells import BodyCells
 from bodyscan.motion.breath import BreathEstimate, estimate_breath
 from bodyscan.motion.cell_equations import CellEquations
 from bodyscan.motion.motion_kinds import MotionKind, build_kinds, retime_kinds
-from bodyscan.motion.temporal_modes import Breaths
+from bodyscan.motion.temporal_modes import Breaths, TemporalModes
 from bodyscan.progress import map_threads
 
 MODEL_ERROR_MM = 0.07
@@ -81,6 +81,21 @@ class BodyMotion:
         fields = np.concatenate([kind.fields for kind in kinds], axis=2)
         breaths = Breaths.from_modes(kinds[-1].modes, seconds, middle_s)
         return replace(self, kinds=kinds, fields=fields, amplitudes=vector, breaths=breaths)
+
+    def with_step(self, names: Sequence[str], members: Mask, size_mm: float) -> BodyMotion:
+        """At rest, with one more kind `step`: a displacement along the named kinds' fields in the views
+        of the member pairs (P,) alone.
+
+        size_mm: prior standard deviation of its amplitudes.
+        """
+        fields = np.concatenate([kind.fields for kind in self.kinds if kind.name in names], axis=2)
+        modes = TemporalModes(members.astype(float)[:, None], np.zeros(1))
+        precision = np.eye(fields.shape[2]) / size_mm**2
+        step = MotionKind("step", fields, modes, precision=precision)
+        kinds = (*self.kinds[:-1], step, self.kinds[-1])
+        vector = np.zeros(sum(kind.count for kind in kinds))
+        fields = np.concatenate([kind.fields for kind in kinds], axis=2)
+        return replace(self, kinds=kinds, fields=fields, amplitudes=vector)
 
     @cached_property
     def slices(self) -> tuple[slice, ...]:
@@ -205,6 +220,38 @@ class BodyMotion:
         vector = self.vector[pose] - columns.T @ self.amplitudes
         by_pair = np.arange(len(vector)).reshape(6, -1).T.ravel()
         return LinearGaussianSystem(information, vector).select(by_pair)
+
+    def step_equations(
+        self,
+        projected: Mapping[tuple[int, int], LinearGaussianSystem],
+        names: Sequence[str],
+        members: Mask,
+    ) -> LinearGaussianSystem:
+        """Normal equations of a step: a displacement along the named kinds' K fields in the views of
+        the member pairs (P,) alone, marginalized over the motion and the poses.
+
+        projected: by pairs (a, b), see `project`.
+        """
+        fields = self.find_fields(names)
+        sign = np.array([float(members[a]) - float(members[b]) for a, b in projected])
+        matrices = np.array([system.information[fields] for system in projected.values()])
+        vector = sign @ np.array([system.vector[fields] for system in projected.values()])
+        first, second = np.array(list(projected)).T
+        ends = np.cumsum([0, *(kind.fields.shape[2] for kind in self.kinds)])
+        cross = np.hstack(
+            [
+                np.einsum(
+                    "okm,oj->kmj",
+                    matrices[:, :, ends[g] : ends[g + 1]],
+                    sign[:, None] * (kind.modes.values[first] - kind.modes.values[second]),
+                ).reshape(len(fields), -1)
+                for g, kind in enumerate(self.kinds)
+            ]
+        )
+        information = np.tensordot(sign**2, matrices[:, :, fields], 1)
+        return LinearGaussianSystem(
+            information - cross @ self.covariance @ cross.T, vector - cross @ self.amplitudes
+        )
 
     def observation_matrix(self, pair: int, cells: Indices, normals: Array) -> Array:
         """Jacobian (c, n) of displacements along normals (c, 3) from the middle to a pair's moment."""

@@ -18,7 +18,7 @@ import numpy as np
 from bodyscan.alignment.icp import Alignment
 from bodyscan.alignment.matching import Matches, SampledPoints
 from bodyscan.alignment.overlaps import COARSE, OverlapPoints, map_overlaps, match_overlap
-from bodyscan.alignment.pose_evidence import MIN_LOG_RATIO, PoseEvidence
+from bodyscan.alignment.pose_evidence import MIN_LOG_RATIO, PoseEvidence, PostureStep
 from bodyscan.alignment.sway_prior import SwayPrior, centre_shifts
 from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
@@ -37,7 +37,7 @@ from bodyscan.settings import AlignmentSettings
 Result = TypeVar("Result")
 
 RIGID = ("lean", "sway")
-NON_RIGID = (*LIMBS, "parts", "breath")
+NON_RIGID = (*LIMBS, "parts", "step", "breath")
 ROUNDS = 3  # the last with all points
 
 
@@ -81,6 +81,8 @@ class EstimatedMotion:
     moment_ms: the middle of the scan; None (the mean of all) if no pair's moment is known.
     breath: without moments it is 0, as uncertain as people breathe; None for no estimate.
     times: whether other moments would explain the motion better.
+    step: displacements (C, 3) mm from the posture while one pole fired to that at other times; None
+        without a `PostureStep`.
     """
 
     cells: BodyCells
@@ -91,6 +93,7 @@ class EstimatedMotion:
     moment_ms: float | None
     breath: BreathOffset | None = None
     times: TimeFit = TimeFit()
+    step: Array | None = None
 
     @property
     def significant(self) -> bool:
@@ -137,12 +140,14 @@ def estimate_motion(
     prior: PoseCovariance,
     settings: AlignmentSettings,
     poles: Mapping[str, str] = MappingProxyType({}),
+    step: PostureStep | None = None,
 ) -> tuple[Alignment, EstimatedMotion | None, PoseEvidence | None]:
     """Estimate the motion of a person, and the poses of the pairs, from all overlaps.
 
     images, rig_from_camera, prior, settings: as given to `align`.
     aligned: its result.
     poles: the pole of each pair that is mounted on one.
+    step: another posture while one pole fired, to be estimated too.
 
     Returns the alignment with sway as a function of time; the non-rigid motion, None (and the
     alignment unchanged) for a person who stood still or if too little overlaps; and the evidence on
@@ -162,12 +167,13 @@ def estimate_motion(
     )
     sides = [poles.get(name, name) for name in names]
     at_rest = _begin(images, (views, cells), prior, sides, settings)
+    if step is not None:
+        at_rest = at_rest.with_step(step.kinds, np.isin(names, [*step.pairs]), step.size_mm)
     solution = _solve(views, (at_rest, cells), observed, settings)
     if solution is None:
         return aligned, None, None
     motion = solution.motion
-    known = PoseEvidence(tuple(names), motion.pose_equations())
-    evidence = None if None in seconds else known
+    evidence = None if None in seconds else solution.pose_evidence(names)
     if solution.negligible:
         return aligned, None, evidence
     distances = _map_matches(
@@ -184,11 +190,9 @@ def estimate_motion(
     found = _describe_motion(images, motion, cells, observed)
     if still or not found.significant:
         return aligned, None, evidence
-    return (
-        moved,
-        replace(found, times=solution.fit_times(seconds, 1e-3 * (_middle_of_scan(images) or 0.0))),
-        evidence,
-    )
+    times = solution.fit_times(seconds, 1e-3 * (_middle_of_scan(images) or 0.0))
+    found = _add_step(found, motion, step) if step else found
+    return moved, replace(found, times=times), evidence
 
 
 def _describe_motion(
@@ -208,6 +212,17 @@ def _describe_motion(
         moment_ms,
         _offset_to_mean_breath(motion, cells, girth_sigma_mm, timed=moment_ms is not None),
     )
+
+
+def _add_step(found: EstimatedMotion, motion: BodyMotion, step: PostureStep) -> EstimatedMotion:
+    """The other posture, and girths that may be of either if the trunk's shape changed."""
+    displaced = (motion.kind("step").fields @ motion.amplitudes_at("step", np.ones(1)))[:, :3]
+    breath = found.breath
+    if breath is not None and "breath" in step.kinds:
+        # Of the posture taken for the person's own, or as far on either side as the other: uniform.
+        either = np.abs(np.sum(displaced * found.cells.normals, axis=1)) / np.sqrt(3.0)
+        breath = replace(breath, sigma_mm=np.hypot(breath.sigma_mm, either))
+    return replace(found, breath=breath, step=displaced)
 
 
 def _middle_of_scan(images: Sequence[RangeImage]) -> float | None:
@@ -243,6 +258,14 @@ class _Solution:
     reach_mm: float
     projected: Mapping[tuple[int, int], LinearGaussianSystem]
     negligible: bool = False
+
+    def pose_evidence(self, names: Sequence[str]) -> PoseEvidence:
+        """Of the pairs of these names; of other postures as long as no step is estimated."""
+        known = any(kind.name == "step" for kind in self.motion.kinds)
+        steps: tuple[tuple[str, ...], ...] = () if known else (("breath",), LIMBS)
+        equations = partial(self.motion.step_equations, self.projected)
+        postures = {kinds: partial(equations, kinds) for kinds in steps}
+        return PoseEvidence(tuple(names), self.motion.pose_equations(), postures)
 
     def fit_times(self, seconds: Sequence[float | None], middle_s: float) -> TimeFit:
         """By the evidence of the motion: a posture hardly changes within a tenth of a second, and does

@@ -105,7 +105,7 @@ def retime_kinds(
     breathing = TemporalModes.from_correlation(breath_correlation, seconds, middle_s)
     retimed = []
     for kind in kinds:
-        if kind.name == "pose":
+        if kind.name in ("pose", "step"):
             retimed.append(kind)
         elif kind.name == "breath":
             identity = np.eye(kind.fields.shape[2] * breathing.count)

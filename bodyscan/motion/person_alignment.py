@@ -17,6 +17,8 @@ from bodyscan.alignment.displaced_poles import (
 from bodyscan.alignment.icp import Alignment, align
 from bodyscan.alignment.pose_evidence import (
     CommonError,
+    Displacement,
+    PostureStep,
     ScaleError,
     common_basis,
     detect_displacement,
@@ -38,6 +40,7 @@ class PersonAlignment:
     common_error: of all pairs, if one displacement of them all explains the scan.
     time_factor: other than 1 if the pairs' moments, multiplied by it, explain the motion far better;
         they were then left out.
+    posture: another one than at other times, while one pole fired.
     search: for further displaced poles.
     """
 
@@ -47,6 +50,7 @@ class PersonAlignment:
     common_error: ScaleError | CommonError | None
     search: DisplacementSearch
     time_factor: float = 1.0
+    posture: PostureStep | None = None
 
 
 def align_person(
@@ -69,23 +73,22 @@ def align_person(
     """
     displaced: list[DisplacedPole] = []
     common_error: ScaleError | CommonError | None = None
-    time_factor = 1.0
+    posture: PostureStep | None = None
+    factor = 1.0
     while True:
         search = _search(images, rig_from_camera, aligned, poles, displaced)
         alignment, motion, evidence = estimate_motion(
-            images, rig_from_camera, aligned, boards, settings, poles
+            images, rig_from_camera, aligned, boards, settings, poles, posture
         )
-        found: DisplacedPole | ScaleError | CommonError | None = None
+        found: Displacement | None = None
         if motion is None or evidence is None:
             found = search.found
         if found is None and evidence is not None and common_error is None:
-            rival = motion.times.log_ratio if motion is not None else 0.0
-            found = detect_displacement(
-                evidence, rig_from_camera, poles, _pairs_of(displaced), rival
-            )
+            rival, known = motion.times.log_ratio if motion else 0.0, _pairs_of(displaced)
+            found = detect_displacement(evidence, rig_from_camera, poles, known, rival)
         warped = isinstance(common_error, CommonError)  # as by motion within moments
         if found is None and motion is not None and motion.times.factor != 1.0 and not warped:
-            time_factor = motion.times.factor
+            factor = motion.times.factor
             images = [replace(image, time_ms=None, span_ms=None) for image in images]
             continue
         if found is None:
@@ -93,9 +96,11 @@ def align_person(
                 # Offsets caused by a tracked head or arm are not pose errors.
                 again = _search(images, rig_from_camera, alignment, poles, displaced)
                 search = replace(search, offset_mm=again.offset_mm)
-            motions = _connected_motions(rig_from_camera, alignment)
-            final = _measure_again(displaced, motions)
-            return PersonAlignment(alignment, motion, final, common_error, search, time_factor)
+            final = _measure_again(displaced, _connected_motions(rig_from_camera, alignment))
+            return PersonAlignment(alignment, motion, final, common_error, search, factor, posture)
+        if isinstance(found, PostureStep):
+            posture = found
+            continue
         if isinstance(found, ScaleError):
             common_error = found
             for side in _pairs_by_pole(boards.names, poles):

@@ -105,6 +105,25 @@ class PersonMotion:
         )
 
 
+def describe_step(motion: EstimatedMotion) -> str:
+    """What stood elsewhere while one pole fired, where that was farthest: "the belly was 8 mm or
+    more farther in"; empty without a step of posture."""
+    if motion.step is None:
+        return ""
+    length = np.linalg.norm(motion.step, axis=1)
+    farthest = int(np.argmax(length))
+    part = PARTS[name_parts(motion.cells)[farthest]]
+    if part != "trunk":
+        return f"the {part} was {length[farthest]:.0f} mm or more elsewhere"
+    # They meet between the navel and the end of the sternum.
+    belly = motion.cells.centres[farthest, 2] < 0.64 * motion.cells.centres[:, 2].max()
+    outward = -np.sum(motion.step * motion.cells.normals, axis=1)
+    largest = outward[np.abs(outward) > 0.5 * np.abs(outward).max()]
+    where = "in" if np.all(largest < 0.0) else "out" if np.all(largest > 0.0) else "in or out"
+    name = "belly" if belly else "chest"
+    return f"the {name} was {length[farthest]:.0f} mm or more farther {where}"
+
+
 def summarize_parts(motion: EstimatedMotion) -> tuple[PartMotion, ...]:
     """Motions of the parts that were measured, from the trunk outwards."""
     part = name_parts(motion.cells)

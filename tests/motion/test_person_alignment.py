@@ -21,6 +21,7 @@ from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.motion import person_alignment
 from bodyscan.motion.estimation import TimeFit
 from bodyscan.motion.person_alignment import PersonAlignment, align_person
+from bodyscan.motion.person_motion import describe_step
 from bodyscan.settings import AlignmentSettings
 
 RIG = load_rig("four-pole-16")
@@ -94,6 +95,36 @@ def test_a_pole_that_moved_while_a_person_sways_is_found(standing: LivingScan) -
     found = together(standing, {"p1": 5.0})
     assert [step.name for step in found.displaced] == ["pole p1"]
     assert found.common_error is None
+
+
+def draw_belly_in(scan: LivingScan, pole: str, mm: float) -> LivingScan:
+    """While the pole fired; she faces x."""
+    images = []
+    for image in scan.images:
+        if RIG.poles[image.pair] == pole:
+            pose = scan.rig_from_camera[image.pair]
+            points = pose.apply(image.points.astype(float))
+            x, y, z = np.moveaxis(points, -1, 0)
+            front = np.clip(x / 60.0, 0.0, 1.0) * (np.abs(y) < 200.0)
+            points[..., 0] -= mm * front * np.exp(-(((z - 1000.0) / 100.0) ** 2))
+            image = replace(image, points=pose.inverse().apply(points).astype(np.float32))
+        images.append(image)
+    return replace(scan, images=images)
+
+
+def test_a_belly_drawn_in_while_one_pole_fired_is_no_pole(
+    standing: LivingScan, sound: PersonAlignment
+) -> None:
+    """The mean of both was graded good, with girths 8 mm off and known to 0.1."""
+    found = together(draw_belly_in(standing, "p1", 10.0), {})
+    assert (sound.posture, found.displaced, found.common_error) == (None, (), None)
+    assert found.posture is not None
+    assert found.posture.pole == "pole p1"
+    assert found.motion is not None
+    assert describe_step(found.motion).startswith("the belly was")
+    assert describe_step(found.motion).endswith("farther in")
+    assert found.motion.breath is not None
+    assert found.motion.breath.sigma_mm.max() > 3.0, "girths hold both"
 
 
 def test_all_cameras_that_see_too_far_right_are_one_cause(standing: LivingScan) -> None:

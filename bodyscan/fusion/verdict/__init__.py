@@ -14,6 +14,7 @@ CHECKS: tuple[Check, ...] = (
     *(coverage.check_exposure, coverage.check_views, rig.check_silent_poles),
     *(
         motion.check_displaced_poles,
+        motion.check_posture_step,
         rig.check_refused,
         overlaps.check_seams,
         motion.check_displaced_pairs,

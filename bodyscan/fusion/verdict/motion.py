@@ -9,6 +9,7 @@ import numpy as np
 from bodyscan.alignment.displaced_poles import STILL_MM
 from bodyscan.alignment.pose_evidence import ScaleError
 from bodyscan.fusion.verdict.evidence import GIRTH_PER_MM, Finding, ScanEvidence
+from bodyscan.motion.person_motion import describe_step
 from bodyscan.settings import UseLimits
 
 UNCORRECTED_SHARE = 0.2
@@ -47,6 +48,19 @@ def check_displaced_poles(scan: ScanEvidence) -> Iterator[Finding]:
             "from its calibrated pose, alone and in one step, which no motion of a person explains; it "
             "was aligned with the others. Calibrate again, unless `timing` of captures.yaml is wrong",
         )
+
+
+def check_posture_step(scan: ScanEvidence) -> Iterator[Finding]:
+    """Another posture while one pole fired: what it changed in shape may be of either."""
+    found = scan.person_alignment
+    if found is None or found.posture is None or found.motion is None:
+        return
+    yield Finding(
+        "usable",
+        f"{describe_step(found.motion)} while {found.posture.pole} fired than while others did: it was "
+        "aligned with theirs, and girths there hold both. Stand still, breathe quietly and scan again",
+        explains=found.posture.pairs,
+    )
 
 
 def check_common_error(scan: ScanEvidence) -> Iterator[Finding]:
