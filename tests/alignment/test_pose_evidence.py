@@ -8,6 +8,7 @@ import pytest
 from bodyscan.alignment.displaced_poles import DisplacedPole
 from bodyscan.alignment.pose_evidence import (
     CommonError,
+    Displacement,
     PoseEvidence,
     ScaleError,
     common_basis,
@@ -47,9 +48,7 @@ def evidence(shifts: Array, seed: int = 0, noise: float = 1.0) -> PoseEvidence:
     return PoseEvidence(NAMES, LinearGaussianSystem(information, information @ twists + astray))
 
 
-def off(
-    shifts: Array, seed: int = 0, displaced: tuple[str, ...] = ()
-) -> DisplacedPole | ScaleError | CommonError | None:
+def off(shifts: Array, seed: int = 0, displaced: tuple[str, ...] = ()) -> Displacement | None:
     return detect_displacement(evidence(shifts, seed), PLACED, POLES, displaced)
 
 
