@@ -8,7 +8,7 @@ from typing import Any
 import networkx as nx
 import numpy as np
 import pytest
-from ball import ball_points
+from ball import ball_points, range_image_of
 from ring import looking_at
 
 from bodyscan.alignment import overlaps
@@ -40,15 +40,8 @@ def seen(name: str, rig_from_camera: RigidTransform) -> RangeImage:
     centre = rig_from_camera.inverse().apply(CENTRE)
     points = ball_points(CAMERA, centre, RADIUS)
     points[HOLE] = np.nan
-    sigma = np.where(np.isfinite(points[..., 2]), SIGMA_MM, np.nan)
-    return RangeImage(
-        name,
-        CAMERA,
-        points.astype(np.float32),
-        ((points - centre) / RADIUS).astype(np.float32),
-        sigma.astype(np.float32),
-        np.full(sigma.shape, 150, np.uint8),
-    )
+    normals = (points - centre) / RADIUS
+    return range_image_of(CAMERA, points, normals, sigma_mm=SIGMA_MM, pair=name, grey=150)
 
 
 @pytest.fixture(scope="module")

@@ -1,3 +1,7 @@
+"""One camera from its boards: what least squares start from, and what they find."""
+
+from __future__ import annotations
+
 from collections.abc import Iterable, Sequence
 
 import numpy as np
@@ -6,8 +10,17 @@ from table_one import CAMERA, POINTS, TURNS
 
 from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import PlanarView
-from bodyscan.calibration.camera import calibrate_camera, locate_board
+from bodyscan.calibration.camera import (
+    calibrate_camera,
+    estimate_pose,
+    find_homography,
+    locate_board,
+    refuse_parallel,
+)
+from bodyscan.calibration.sheet_fit import fit_pinhole
 from bodyscan.errors import DegeneratePoses
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.transforms import RigidTransform
 
 
@@ -68,3 +81,87 @@ def test_a_board_is_located_from_either_face(plane_z: float) -> None:
     found, residuals = locate_board(CAMERA, view)
     assert np.allclose(found.matrix, pose.matrix, atol=1e-6)
     assert np.max(np.abs(residuals)) < 1e-6
+
+
+WIDTH, HEIGHT = 1280, 1024
+GRID = np.stack(np.meshgrid(30.0 * np.arange(9), 30.0 * np.arange(6)), axis=-1).reshape(-1, 2)
+
+
+def posed(*turn: float, z: float = 700.0) -> RigidTransform:
+    pose = RigidTransform.from_rotation_vector(turn, [0.0, 0.0, 0.0])
+    middle = np.array([120.0, 75.0, 0.0])
+    return RigidTransform(pose.rotation, [20.0, -10.0, z] - pose.rotation @ middle)
+
+
+POSES = [
+    posed(0.4, 0.1, 0.2),
+    posed(-0.3, 0.35, -0.5),
+    posed(0.1, -0.45, 1.0),
+    posed(-0.4, -0.2, 0),
+]
+
+
+def seen(matrix: np.ndarray, pose: RigidTransform, plane_z: float = 0.0) -> PlanarView:
+    points = np.column_stack([GRID, np.full(len(GRID), plane_z)])
+    ahead = pose.apply(points) @ matrix.T
+    return PlanarView("", points, ahead[:, :2] / ahead[:, 2:])
+
+
+def matrix(alpha: float, beta: float, gamma: float, u0: float, v0: float) -> np.ndarray:
+    return np.array([[alpha, gamma, u0], [0.0, beta, v0], [0.0, 0.0, 1.0]])
+
+
+USUAL = matrix(1500.0, 1480.0, 4.0, 655.0, 500.0)
+
+
+def test_planes_that_turn_by_less_than_three_degrees_are_one_plane() -> None:
+    for degrees, refused in ((2.5, True), (3.6, False)):
+        turned = [posed(0.3, 0.1, 0.0), posed(0.3 + np.radians(degrees), 0.1, 0.0, z=800.0)]
+        views = [seen(matrix(1536, 1536, 0, 640, 512), pose) for pose in turned]
+        homographies = [find_homography(view) for view in views]
+        if refused:
+            with pytest.raises(DegeneratePoses, match="the 2 board poses differ by a translation"):
+                refuse_parallel(homographies, WIDTH, HEIGHT)
+        else:
+            refuse_parallel(homographies, WIDTH, HEIGHT)
+
+
+@pytest.mark.parametrize(
+    "true",
+    [
+        USUAL,
+        matrix(900.0, 1200.0, 0.0, 640.0, 512.0),
+        matrix(1200.0, 880.0, -80.0, 360.0, 800.0),
+        matrix(1500.0, 1500.0, 160.0, 640.0, 512.0),  # skew of a tenth
+        matrix(1500.0, 1500.0, 0.0, 1270.0, 512.0),  # half of the width off the middle
+    ],
+)
+def test_any_camera_is_found_from_a_start_with_its_axis_in_the_middle(true: np.ndarray) -> None:
+    for count in (3, 4):
+        found = calibrate_camera([seen(true, pose) for pose in POSES[:count]], WIDTH, HEIGHT).camera
+        np.testing.assert_allclose(found.matrix, true, rtol=1e-6, atol=1e-4)
+
+
+@pytest.mark.parametrize("pose", POSES)
+@pytest.mark.parametrize("plane_z", [0.0, 6.0])
+def test_a_boards_pose_follows_from_its_corners(pose: RigidTransform, plane_z: float) -> None:
+    camera = Camera(1500.0, 1480.0, 4.0, 655.0, 500.0, Radial(), WIDTH, HEIGHT)
+    found = estimate_pose(camera, seen(USUAL, pose, plane_z))
+    np.testing.assert_allclose(found.matrix, pose.matrix, atol=1e-4)
+
+
+def test_a_projector_without_lens_is_found_from_its_stripes() -> None:
+    true = np.array([[3.0, 0.2, 0.9, 120.0], [0.1, -0.05, 1.0, 60.0]])
+    true /= np.linalg.norm(true[1, :3])
+    rng = np.random.default_rng(0)
+    points = rng.uniform([-200, -200, 700], [200, 200, 1100], (400, 3))
+    above, below = (points @ true[:, :3].T + true[:, 3]).T
+    s = above / below
+    found = fit_pinhole(points, s)
+    np.testing.assert_allclose(found, true, rtol=1e-5, atol=1e-5)
+    assert below.min() > 0.0, "it shines forward"
+    # One in ten is off by 0.7: plainly they would pull the others by 0.07 in the mean.
+    wrong = s + np.where(np.arange(400) % 10 == 0, 0.7, 0.0) + 1e-4 * rng.normal(size=400)
+    fitted = fit_pinhole(points, wrong)
+    above, below = (points @ fitted[:, :3].T + fitted[:, 3]).T
+    assert np.mean(np.abs(above / below - s)) < 0.035

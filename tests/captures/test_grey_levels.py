@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import struct
 import zlib
-from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -13,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.strategies._internal.core import DataObject
-from small_captures import encoded, write
+from small_captures import encoded, png, write
 
 from bodyscan.captures.grey_png import decode_grey_png
 from bodyscan.captures.images import convert_to_greys, find_full_scale, read_image
@@ -105,22 +103,6 @@ def test_a_video_is_named_with_the_command_that_unpacks_it() -> None:
 
 
 FILTERS = 5
-
-
-def chunk(kind: bytes, content: bytes) -> bytes:
-    checksum = zlib.crc32(kind + content)
-    return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", checksum)
-
-
-def png(
-    size: tuple[int, int], packed: bytes, *, parts: int = 1, kind: tuple[int, ...] = (8, 0, 0)
-) -> bytes:
-    """A PNG file of width and height; kind: bits, colour type, interlace."""
-    bits, colour, interlace = kind
-    header = struct.pack(">IIBBBBB", *size, bits, colour, 0, 0, interlace)
-    cuts = np.linspace(0, len(packed), parts + 1).astype(int)
-    data = b"".join(chunk(b"IDAT", packed[start:end]) for start, end in pairwise(cuts))
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + data + chunk(b"IEND", b"")
 
 
 def filtered(image: np.ndarray, kinds: list[int]) -> bytes:

@@ -17,7 +17,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
-from small_captures import BITS, FRAMES, HEIGHT, STRIPES, WIDTH, encoded, picture, write
+from small_captures import BITS, FRAMES, HEIGHT, STRIPES, WIDTH, encoded, picture, png, write
 from small_captures import write_small_captures as small
 
 from bodyscan.captures.check import check, format_report
@@ -50,20 +50,6 @@ def first_sequence(folder: Path) -> ImageSequence:
 
 def read(path: Path, **options: bool) -> np.ndarray:
     return read_image(path, CAMERA, pair="p1", shot="b1", **options)
-
-
-def png(width: int, height: int, bits: int = 8) -> bytes:
-    """A PNG of a header, one empty data chunk and an end, all checksums right."""
-
-    def chunk(kind: bytes, content: bytes) -> bytes:
-        checksum = zlib.crc32(kind + content)
-        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", checksum)
-
-    header = struct.pack(">IIBBBBB", width, height, bits, 0, 0, 0, 0)
-    data = zlib.compress(b"")
-    return (
-        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
-    )
 
 
 def tiff(**options: Any) -> bytes:
@@ -147,7 +133,7 @@ def test_the_lit_image_is_read_in_colour_where_it_has_any(
         (encoded(NOISE)[:20], "is cut short"),
         (encoded(NOISE, ".jpg")[:-20], "is cut short"),
         (encoded(NOISE, ".jpg")[:30], "is cut short"),
-        (png(WIDTH, HEIGHT), "cannot be decoded"),
+        (png((WIDTH, HEIGHT), zlib.compress(b"")), "cannot be decoded"),
         (b"\x89PNG\r\n\x1a\n" + bytes(50), "is damaged (its PNG header is wrong)"),
         (b"\xff\xd8\xff\xe0\x00\x01" + bytes(50), "or damaged (its JPEG header cannot be read)"),
     ],
@@ -167,7 +153,7 @@ def test_bad_images_are_refused(tmp_path: Path, content: bytes | None, what: str
 def test_a_huge_image_is_refused_by_its_header(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = write(tmp_path / "x.png", png(60_000, 60_000))
+    path = write(tmp_path / "x.png", png((60_000, 60_000), zlib.compress(b"")))
     monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))
     with pytest.raises(ImageError, match="is 60000 x 60000 pixels, but the rig file says"):
         read(path)

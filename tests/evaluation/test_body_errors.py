@@ -19,8 +19,7 @@ from bodyscan.evaluation.body import (
 from bodyscan.geometry.camera import Camera, camera_to_fields
 from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.mesh.body import BodyMesh, BreathAt
-from bodyscan.mesh.topology import vertex_normals
+from bodyscan.mesh.body import BreathAt
 
 CAMERA = Camera(300.0, 300.0, 0.0, 160.0, 128.0, Radial(), 320, 256)
 
@@ -53,15 +52,7 @@ def test_breath_stays_in_unless_the_truth_is_at_mean_breath() -> None:
 def test_what_was_filled_is_not_judged() -> None:
     vertices, faces = column(150.0)
     thick, _ = column(160.0)
-    filled = np.ones(len(faces), bool)
-    body = BodyMesh(
-        thick,
-        faces,
-        vertex_normals(thick, faces),
-        np.zeros((len(thick), 3), np.uint8),
-        np.zeros(len(thick), np.float32),
-        filled,
-    )
+    body = mesh_of(thick, faces, np.ones(len(faces), bool))
     assert girth_errors(body, true_girths(vertices, faces)).heights == 0
 
 

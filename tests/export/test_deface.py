@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import open3d as o3d
 import pytest
-from made_bodies import arrays, together
+from made_bodies import arrays, mesh_of, together
 from small_bodies import points
 
 from bodyscan.errors import FailedWork
@@ -19,7 +19,7 @@ from bodyscan.export.scan import export_scan
 from bodyscan.fusion.storage import StoredScan
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.mesh.ply import read_ply_mesh
-from bodyscan.mesh.topology import compute_topology, vertex_normals
+from bodyscan.mesh.topology import compute_topology
 
 SUBJECT = Path(__file__).parents[2] / "data" / "subjects" / "woman_average.ply"
 
@@ -32,14 +32,7 @@ def body() -> BodyMesh:
     rng = np.random.default_rng(3)
     sigma_mm = rng.uniform(0.01, 0.1, len(vertices)).astype(np.float32)
     sigma_mm[(vertices[:, 2] < 10.0) | (np.abs(vertices[:, 2] - 1550.0) < 15.0)] = np.nan
-    return BodyMesh(
-        vertices,
-        faces,
-        vertex_normals(vertices, faces),
-        rng.integers(0, 256, vertices.shape).astype(np.uint8),
-        sigma_mm,
-        np.any(np.isnan(sigma_mm)[faces], axis=1),
-    )
+    return mesh_of(vertices, faces, colours=rng.integers(0, 256, vertices.shape), sigma_mm=sigma_mm)
 
 
 @pytest.fixture(scope="module")

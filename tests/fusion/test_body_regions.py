@@ -7,11 +7,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from made_bodies import cloud_of
 from ray_cast_scan import Scan, cast_scan, load_body, load_rig
 
 from bodyscan.arrays import Bytes, Mask
 from bodyscan.fusion.regions import Regions, find_head, label_regions
-from bodyscan.mesh.body import DARK_CLOTH, HAIR, SKIN, UNSURE, BodyCloud
+from bodyscan.mesh.body import DARK_CLOTH, HAIR, SKIN, UNSURE
 from bodyscan.motion.body_parts import NECK
 from bodyscan.reconstruction.range_image import RangeImage
 
@@ -41,14 +42,8 @@ class Seen:
             [self.in_rig(image)[v] for image, v in zip(images, valid, strict=True)]
         )
         grey = np.concatenate([image.colours[v] for image, v in zip(images, valid, strict=True)])
-        count = len(points)
-        cloud = BodyCloud(
-            points,
-            np.zeros((count, 3), np.float32),
-            np.full(count, NOISE_MM, np.float32),
-            np.repeat(grey[:, None], 3, axis=1),
-            np.ones(count, np.uint8),
-        )
+        cloud = cloud_of(points, np.zeros(3), NOISE_MM)
+        cloud = replace(cloud, colours=np.repeat(grey[:, None], 3, axis=1))
         return label_regions(cloud, images, self.scan.rig_from_camera, 7.0)
 
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import open3d as o3d
 import pytest
+from ball import range_image_of
 from made_bodies import cloud_of
 from meshed import mesh
 from ray_cast_scan import looking, nominal_camera
@@ -28,9 +29,7 @@ POSE = looking(PLACING)
 
 
 def seen(depth: np.ndarray) -> RangeImage:
-    points = (CAMERA.pixel_rays() * depth[..., None]).astype(np.float32)
-    sigma = np.where(np.isfinite(depth), np.float32(0.1), np.float32(np.nan))
-    return RangeImage("p", CAMERA, points, points, sigma, np.zeros(depth.shape, np.uint8))
+    return range_image_of(CAMERA, CAMERA.pixel_rays() * depth[..., None])
 
 
 def test_a_wall_and_something_beyond_the_volume_are_seen_through_alike() -> None:
@@ -75,9 +74,7 @@ def plates(*parts: tuple[float, float, float, bool]) -> PartialSurface:
 def shown(columns: np.ndarray) -> RangeImage:
     """A wall at 1000 mm, measured in some columns (60,)."""
     depth = np.where(columns, 1000.0, np.nan)[None].repeat(20, axis=0)
-    points = (FLAT.pixel_rays() * depth[..., None]).astype(np.float32)
-    sigma = np.where(np.isfinite(depth), np.float32(0.1), np.float32(np.nan))
-    return RangeImage("p", FLAT, points, points, sigma, np.zeros(depth.shape, np.uint8))
+    return range_image_of(FLAT, FLAT.pixel_rays() * depth[..., None])
 
 
 COLUMN = np.arange(60)

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from ball import range_image_of
 from made_bodies import cloud_of
 from meshed import mesh
 from ray_cast_scan import looking, nominal_camera
@@ -25,7 +26,6 @@ from bodyscan.fusion.signed_distances import (
 from bodyscan.mesh.body import BodyCloud
 from bodyscan.mesh.surface_nets import SIDE, Bricks, join_bricks
 from bodyscan.mesh.topology import compute_topology
-from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.rig.pair import NominalPose
 from bodyscan.settings import MeshSettings
 
@@ -141,9 +141,7 @@ def test_what_was_seen_through_is_half_a_cell_outside() -> None:
     pose = looking(NominalPose(position_mm=(1500.0, 0.0, 900.0), look_at_mm=(0.0, 0.0, 900.0)))
     rays = camera.pixel_rays()
     between = np.abs(1500.0 * rays[..., 0]) < 25.0
-    points = np.where(between[..., None], 3000.0 * rays, np.nan).astype(np.float32)
-    sigma = np.where(between, np.float32(0.1), np.float32(np.nan))
-    wall = RangeImage("p", camera, points, points, sigma, np.zeros(between.shape, np.uint8))
+    wall = range_image_of(camera, np.where(between[..., None], 3000.0 * rays, np.nan))
     guessed, seen = (fill_distances(rods, 1.0, images, {"p": pose}) for images in ([], [wall]))
     _, y, height = guessed.origin[:, None, None, None] + CELL_MM * np.indices(guessed.values.shape)
     gap = (np.abs(y) < 20.0) & (np.abs(height - 900.0) < 60.0) & (guessed.values < 0.0)

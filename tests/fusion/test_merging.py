@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from ray_cast_scan import Scan, scene_of
@@ -145,14 +147,7 @@ def test_points_in_front_of_what_others_see_go(scan: Scan, cleaned: list[RangeIm
 
 def test_nothing_to_merge_is_an_error(scan: Scan, cleaned: list[RangeImage]) -> None:
     nothing = np.full_like(cleaned[0].sigma_mm, np.nan)
-    image = RangeImage(
-        "p1-1",
-        cleaned[0].camera,
-        cleaned[0].points,
-        cleaned[0].normals,
-        nothing,
-        cleaned[0].colours,
-    )
+    image = replace(cleaned[0], sigma_mm=nothing)
     for images in ([], [image]):
         with pytest.raises(ScanFailed, match="next to nothing"):
             merge(images, scan.rig_from_camera, SETTINGS)

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from made_bodies import cloud_of
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.fusion.pose_variance import add_motion_variance, add_pose_variance
@@ -21,14 +22,7 @@ def cloud() -> BodyCloud:
     outward = np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
     normals = np.vstack([outward, [[0.0, 0.0, 1.0]]])
     points = np.vstack([150.0 * outward + [0, 0, 900.0], [[0.0, 0.0, 1700.0]]])
-    count = len(points)
-    return BodyCloud(
-        points,
-        normals.astype(np.float32),
-        np.full(count, 0.03, np.float32),
-        np.zeros((count, 3), np.uint8),
-        np.ones(count, np.uint8),
-    )
+    return cloud_of(points, normals, 0.03)
 
 
 def placed(*places: list[float]) -> dict[str, RigidTransform]:
@@ -89,10 +83,8 @@ def test_a_mean_of_three_pairs_spreads_by_its_error_bar(cloud: BodyCloud) -> Non
     root = rng.normal(size=(18, 18)) * np.tile([1e-5] * 3 + [0.02] * 3, 3)[:, None]
     places = placed([1300, 100, 900], [1300, -100, 900], [1300, 0, 1200])
     front = cloud.normals[:, 0] > 0.9
-    chosen = BodyCloud(
-        cloud.points[front], cloud.normals[front], np.zeros(front.sum(), np.float32),
-        cloud.colours[front], np.full(front.sum(), 3, np.uint8),
-    )  # fmt: skip
+    chosen = cloud_of(cloud.points[front], cloud.normals[front], 0.0)
+    chosen = replace(chosen, pairs_seen=np.full_like(chosen.pairs_seen, 3))
     sigma = add_pose_variance(
         chosen, places, PoseCovariance(("p0", "p1", "p2"), root @ root.T)
     ).sigma_mm

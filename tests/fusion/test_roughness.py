@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from ball import range_image_of
 
 from bodyscan.arrays import Array
 from bodyscan.fusion.regions import measure_roughness
@@ -25,9 +26,7 @@ def seen(depth: Array, noise_mm: float = NOISE_MM) -> RangeImage:
     rays = CAMERA.pixel_rays()
     length = np.linalg.norm(rays, axis=-1)
     noise = noise_mm * np.random.default_rng(1).standard_normal(depth.shape)
-    points = (rays * (depth + noise / length)[..., None]).astype(np.float32)
-    sigma = np.where(np.isfinite(depth), np.float32(NOISE_MM), np.float32(np.nan))
-    return RangeImage("p", CAMERA, points, points, sigma, np.zeros(depth.shape, np.uint8))
+    return range_image_of(CAMERA, rays * (depth + noise / length)[..., None], sigma_mm=NOISE_MM)
 
 
 def slanted() -> Array:

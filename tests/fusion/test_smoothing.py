@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from ball import range_image_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -28,16 +29,7 @@ def image_of(depth: np.ndarray, noise_mm: float = 0.0, seed: int = 0) -> RangeIm
     length = np.linalg.norm(RAYS, axis=-1)
     noise = noise_mm * np.random.default_rng(seed).normal(size=depth.shape)
     points = RAYS * (depth + noise / length)[..., None]
-    sigma = np.where(np.isfinite(depth), max(noise_mm, 0.05), np.nan)
-    grey = np.full(depth.shape, 128, np.uint8)
-    return RangeImage(
-        "pair",
-        CAMERA,
-        points.astype(np.float32),
-        np.full_like(points, np.nan, np.float32),
-        sigma.astype(np.float32),
-        grey,
-    )
+    return range_image_of(CAMERA, points, sigma_mm=max(noise_mm, 0.05), grey=128)
 
 
 def plane_depth(normal: np.ndarray, distance: float = DISTANCE) -> np.ndarray:

@@ -11,7 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from made_bodies import cylinder, ellipsoid, mesh_of, together
+from made_bodies import cloud_of, cylinder, ellipsoid, mesh_of, together
 from made_scan import MadeScan, egg, make_scan
 from standing_body import HAND_ON_HIP, hanging, standing_body
 from verdict_given import verdict_given
@@ -280,11 +280,8 @@ Column = tuple[tuple[float, float], tuple[float, float], float, float]
 """Centre and sides in the plane, lowest and highest mm."""
 
 
-def cloud_of(points: Array) -> BodyCloud:
-    ones = np.ones(len(points), np.float32)
-    normals = np.tile(np.array([1.0, 0.0, 0.0], np.float32), (len(points), 1))
-    grey = np.zeros((len(points), 3), np.uint8)
-    return BodyCloud(points, normals, ones, grey, ones.astype(np.uint8))
+def facing_x(points: Array) -> BodyCloud:
+    return cloud_of(points, np.array([1.0, 0.0, 0.0]), 1.0)
 
 
 def scattered(columns: Sequence[Column], counts: Sequence[int]) -> BodyCloud:
@@ -294,7 +291,7 @@ def scattered(columns: Sequence[Column], counts: Sequence[int]) -> BodyCloud:
         rng.uniform([x - a / 2, y - b / 2, low], [x + a / 2, y + b / 2, high], (count, 3))
         for ((x, y), (a, b), low, high), count in zip(columns, counts, strict=True)
     ]
-    return cloud_of(np.concatenate(parts))
+    return facing_x(np.concatenate(parts))
 
 
 def square(area: float) -> tuple[float, float]:
@@ -327,7 +324,7 @@ def beside(thing: tuple[Array, Indices]) -> tuple[Array, Indices]:
 )
 def test_shapes(body: tuple[Array, Indices], grade: str, words: str) -> None:
     mesh = mesh_of(*body)
-    found = verdict_given(cloud_of(mesh.vertices[:: 1 if words.startswith("1700") else 2]), mesh)
+    found = verdict_given(facing_x(mesh.vertices[:: 1 if words.startswith("1700") else 2]), mesh)
     shape = [line for line in found.reasons if any(one in line for one in SHAPES)]
     assert words in str(shape)
     assert (grade == "good") == (not shape)
@@ -379,4 +376,4 @@ def test_points_without_a_surface_in_the_mesh(share: float, away_mm: float, grad
     mesh = egg()
     out = np.random.default_rng(0).random(len(mesh.vertices)) < share
     points = mesh.vertices + away_mm * out[:, None] * mesh.normals
-    assert verdict_given(cloud_of(points), mesh).grade == grade
+    assert verdict_given(facing_x(points), mesh).grade == grade

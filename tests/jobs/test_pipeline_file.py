@@ -1,4 +1,4 @@
-"""Pipeline files: those that come with bodyscan, wrong ones, and one-off changes."""
+"""Pipeline files: bodyscan's own, wrong ones, one-off changes; how cores and memory are shared out."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ import pytest
 import yaml
 
 from bodyscan.errors import BadInput
+from bodyscan.jobs.batch import allocate
 from bodyscan.jobs.pipeline import (
     SECTIONS,
     Pipeline,
     load_pipeline,
 )
-from bodyscan.settings import AlignmentSettings, ScanSettings
+from bodyscan.settings import AlignmentSettings, Resources, ScanSettings
 
 PIPELINES = sorted((Path(__file__).parents[2] / "pipelines").glob("*.yaml"))
 FUSE = next(path for path in PIPELINES if path.stem == "fuse")
@@ -82,3 +83,25 @@ def test_settings_of_earlier_releases_keep_their_meaning() -> None:
     new = {"min_reach_mm": 2.0, "min_matches": 40, "min_sway": 0.2, "max_sway": 3.0}
     validate = AlignmentSettings.model_validate
     assert validate(old) == validate(new) != AlignmentSettings()
+
+
+NEEDS = Resources(threads=2, memory_mb=4000)
+
+
+@pytest.mark.parametrize(
+    ("jobs", "workers", "cores_", "memory_mb", "wanted"),
+    [
+        (40, None, 16, 100_000, (8, 2)),  # by cores
+        (40, None, 16, 13_000, (3, 2)),  # by memory
+        (40, None, 1, 2_000, (1, 1)),  # there is always one
+        (3, None, 16, 100_000, (3, 2)),  # no more than jobs
+        (40, 16, 16, 100_000, (16, 1)),  # as asked for, with fewer threads
+        (40, 16, 16, 13_000, (3, 2)),  # but never more memory than there is
+        (40, 1, 16, 100_000, (1, 2)),
+    ],
+)
+def test_shares(
+    jobs: int, workers: int | None, cores_: int, memory_mb: int, wanted: tuple[int, int]
+) -> None:
+    shares = allocate(NEEDS, jobs, workers, cores_, memory_mb)
+    assert (shares.workers, shares.threads) == wanted

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from ball import ball_points
+from ball import ball_points, range_image_of
 from normal_field import normal_field
 from ring import looking_at
 
@@ -29,17 +29,8 @@ PLACE = looking_at([900.0, 700.0, 1000.0], CENTRE)
 def ball() -> tuple[RangeImage, BodyCells]:
     centre = PLACE.inverse().apply(CENTRE)
     points = ball_points(CAMERA, centre, RADIUS)
-    sigma = np.where(np.isfinite(points[..., 2]), 0.1, np.nan)
-    grey = np.full(sigma.shape, 150, np.uint8)
     normals = (points - centre) / RADIUS
-    image = RangeImage(
-        "p",
-        CAMERA,
-        points.astype(np.float32),
-        normals.astype(np.float32),
-        sigma.astype(np.float32),
-        grey,
-    )
+    image = range_image_of(CAMERA, points, normals, grey=150)
     there = image.valid
     cells, _ = BodyCells.from_points(PLACE.apply(points[there]), PLACE.rotate(normals[there]))
     return image, cells

@@ -175,6 +175,12 @@ def stored_now(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture
+def mine(stored_now: Path, tmp_path: Path) -> Path:
+    """A copy of it, to be edited."""
+    return Path(shutil.copytree(stored_now, tmp_path / "mine"))
+
+
 @pytest.mark.slow
 @given(st.data())
 def test_no_value_is_changed_unseen(stored_now: Path, data: st.DataObject) -> None:
@@ -198,55 +204,48 @@ def test_no_value_is_changed_unseen(stored_now: Path, data: st.DataObject) -> No
 
 
 @pytest.mark.parametrize("part", ["camera", "rig_from_camera", "quality"])
-def test_parts_exchanged_between_pairs_are_noticed(
-    part: str, stored_now: Path, tmp_path: Path
-) -> None:
-    content = read(stored_now)
+def test_parts_exchanged_between_pairs_are_noticed(part: str, mine: Path) -> None:
+    content = read(mine)
     exchange(content, part)
-    write(tmp_path, content)
-    shutil.copy(stored_now / "calibration.npz", tmp_path)
+    write(mine, content)
     with pytest.raises(CalibrationFileError, match="was changed after it was stored"):
-        load_calibration(tmp_path)
+        load_calibration(mine)
 
 
-def test_an_edit_that_is_meant_is_stored_with_a_note(stored_now: Path, tmp_path: Path) -> None:
-    content = read(stored_now)
+def test_an_edit_that_is_meant_is_stored_with_a_note(mine: Path) -> None:
+    content = read(mine)
     content["pairs"]["p1-2"]["rig_from_camera"][0][3] += 2.0
-    write(tmp_path, content)
-    shutil.copy(stored_now / "calibration.npz", tmp_path)
-    refused = run("export-rig", tmp_path, "--out", tmp_path.with_name("out"))
+    write(mine, content)
+    refused = run("export-rig", mine, "--out", mine.with_name("out"))
     assert isinstance(refused.exception, CalibrationFileError)
     assert "bodyscan accept-changed" in refused.exception.remedy
-    assert run("accept-changed", tmp_path).exit_code == 0
-    found = load_calibration(tmp_path)
+    assert run("accept-changed", mine).exit_code == 0
+    found = load_calibration(mine)
     assert found.rig_from_camera["p1-2"].translation[0] == pytest.approx(652.0)
     assert "edited by hand" in found.notes[-1]
 
 
-def test_a_calibration_that_nobody_edited_stays_as_it_is(stored_now: Path, tmp_path: Path) -> None:
-    copy = shutil.copytree(stored_now, tmp_path / "copy")
-    before = {path.name: path.read_bytes() for path in copy.iterdir()}
-    done = run("accept-changed", copy)
+def test_a_calibration_that_nobody_edited_stays_as_it_is(mine: Path) -> None:
+    before = {path.name: path.read_bytes() for path in mine.iterdir()}
+    done = run("accept-changed", mine)
     assert done.exit_code == 0
     assert "was not edited" in done.output
-    assert {path.name: path.read_bytes() for path in copy.iterdir()} == before
+    assert {path.name: path.read_bytes() for path in mine.iterdir()} == before
 
 
-def test_an_edit_that_cannot_be_right_is_not_accepted(stored_now: Path, tmp_path: Path) -> None:
-    content = read(stored_now)
+def test_an_edit_that_cannot_be_right_is_not_accepted(mine: Path) -> None:
+    content = read(mine)
     content["pairs"]["p1-2"]["camera"]["alpha"] *= -1.0
-    write(tmp_path, content)
-    shutil.copy(stored_now / "calibration.npz", tmp_path)
+    write(mine, content)
     with pytest.raises(CalibrationFileError, match=r"p1-2\.camera\.alpha is not a focal length"):
-        accept_calibration(tmp_path)
+        accept_calibration(mine)
 
 
-def test_a_key_given_twice_is_refused(stored_now: Path, tmp_path: Path) -> None:
-    text = (stored_now / "calibration.json").read_text("utf-8")
-    (tmp_path / "calibration.json").write_text(text.replace("{", '{"notes": ["a"],', 1), "utf-8")
-    shutil.copy(stored_now / "calibration.npz", tmp_path)
+def test_a_key_given_twice_is_refused(mine: Path) -> None:
+    path = mine / "calibration.json"
+    path.write_text(path.read_text("utf-8").replace("{", '{"notes": ["a"],', 1), "utf-8")
     with pytest.raises(CalibrationFileError, match="'notes' is given twice"):
-        load_calibration(tmp_path)
+        load_calibration(mine)
 
 
 def bomb(says: int) -> bytes:

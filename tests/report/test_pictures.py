@@ -7,10 +7,9 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from made_bodies import ellipsoid
+from made_bodies import ellipsoid, mesh_of
 
 from bodyscan.mesh.body import BodyCloud, BodyMesh
-from bodyscan.mesh.topology import vertex_normals
 from bodyscan.report.charts import diverging
 from bodyscan.report.pictures import Scale, VisiblePoints, draw_cloud, draw_mesh
 
@@ -23,14 +22,7 @@ def ball() -> BodyMesh:
     """Its left half (y > 0) was made up."""
     vertices, faces = ellipsoid((RADIUS, RADIUS, RADIUS), CENTRE, 30)
     filled = (vertices[faces].mean(axis=1)[:, 1]) > 7.0
-    return BodyMesh(
-        vertices,
-        faces,
-        vertex_normals(vertices, faces),
-        np.full(vertices.shape, 90, np.uint8),
-        np.full(len(vertices), 0.1, np.float32),
-        filled,
-    )
+    return mesh_of(vertices, faces, filled, colours=90)
 
 
 def dots(count: int = 200_000) -> BodyCloud:

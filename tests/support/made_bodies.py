@@ -23,16 +23,24 @@ def cloud_of(points: np.ndarray, normals: np.ndarray, sigma_mm: float = 0.1) -> 
     )
 
 
-def mesh_of(vertices: np.ndarray, faces: np.ndarray, filled: np.ndarray | None = None) -> BodyMesh:
-    """Grey, measured everywhere unless said otherwise."""
-    count = len(vertices)
+def mesh_of(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    filled: np.ndarray | None = None,
+    *,
+    colours: ArrayLike = 128,
+    sigma_mm: ArrayLike = 0.1,
+) -> BodyMesh:
+    """Grey, of one sigma and measured everywhere unless said otherwise; faces are filled that have a
+    vertex without a sigma."""
+    sigma = np.broadcast_to(np.asarray(sigma_mm, np.float32), len(vertices)).copy()
     return BodyMesh(
         np.asarray(vertices, float),
         np.asarray(faces, np.int64),
         vertex_normals(vertices, faces),
-        np.full((count, 3), 128, np.uint8),
-        np.full(count, 0.1, np.float32),
-        np.zeros(len(faces), bool) if filled is None else filled,
+        np.broadcast_to(np.asarray(colours), (len(vertices), 3)).astype(np.uint8),
+        sigma,
+        np.isnan(sigma)[faces].any(axis=1) if filled is None else filled,
     )
 
 

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from made_bodies import ellipsoid
+from made_bodies import ellipsoid, mesh_of
 
 from bodyscan.files.atomic import write_json
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.mesh.ply import write_ply
-from bodyscan.mesh.topology import vertex_normals
 
 SEMI_AXES_MM = np.array([120.0, 180.0, 850.0])
 MIDDLE_MM = np.array([15.0, -20.0, 870.0])
@@ -32,14 +31,7 @@ def egg(resolution: int = 60, grown_mm: float = 0.0) -> BodyMesh:
     sigma = (0.03 + 0.05 * (vertices[:, 1] > 0)).astype(np.float32)
     sigma[vertices[:, 2] < SOLES_MM] = np.nan
     tint = np.clip(255 * (vertices - vertices.min(axis=0)) / np.ptp(vertices, axis=0), 0, 255)
-    return BodyMesh(
-        vertices,
-        faces,
-        vertex_normals(vertices, faces),
-        tint.astype(np.uint8),
-        sigma,
-        np.isnan(sigma)[faces].any(axis=1),
-    )
+    return mesh_of(vertices, faces, colours=tint, sigma_mm=sigma)
 
 
 def make_scan(folder: Path, subject: str = "s-17", grown_mm: float = 0.0) -> MadeScan:

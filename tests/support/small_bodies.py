@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from made_bodies import ellipsoid
+from made_bodies import ellipsoid, mesh_of
 
 from bodyscan.mesh.body import BodyCloud, BodyMesh
-from bodyscan.mesh.topology import vertex_normals
 
 
 def ball(resolution: int = 20, radius_mm: float = 120.0) -> BodyMesh:
@@ -15,14 +14,8 @@ def ball(resolution: int = 20, radius_mm: float = 120.0) -> BodyMesh:
     rng = np.random.default_rng(1)
     sigma_mm = rng.uniform(0.01, 0.3, len(vertices)).astype(np.float32)
     sigma_mm[vertices[:, 2] < 40.0] = np.nan
-    return BodyMesh(
-        vertices + rng.normal(0.0, 1e-3, vertices.shape),
-        faces,
-        vertex_normals(vertices, faces),
-        rng.integers(0, 256, vertices.shape).astype(np.uint8),
-        sigma_mm,
-        np.any(np.isnan(sigma_mm)[faces], axis=1),
-    )
+    vertices += rng.normal(0.0, 1e-3, vertices.shape)
+    return mesh_of(vertices, faces, colours=rng.integers(0, 256, vertices.shape), sigma_mm=sigma_mm)
 
 
 def points(count: int = 500) -> BodyCloud:

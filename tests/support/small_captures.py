@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import struct
+import zlib
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -62,3 +65,19 @@ def write_small_captures(folder: Path, shots: int = 3) -> Path:
                 write(folder / "captures" / f"b{shot}" / pair / f"{frame}.png", picture(frame))
         write(folder / "captures" / f"b{shot}" / "cam" / "lit.png", picture("lit"))
     return write(folder / "rig.yaml", RIG)
+
+
+def chunk(kind: bytes, content: bytes) -> bytes:
+    checksum = zlib.crc32(kind + content)
+    return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", checksum)
+
+
+def png(
+    size: tuple[int, int], packed: bytes, *, parts: int = 1, kind: tuple[int, ...] = (8, 0, 0)
+) -> bytes:
+    """A PNG file of width and height; kind: bits, colour type, interlace."""
+    bits, colour, interlace = kind
+    header = struct.pack(">IIBBBBB", *size, bits, colour, 0, 0, interlace)
+    cuts = np.linspace(0, len(packed), parts + 1).astype(int)
+    data = b"".join(chunk(b"IDAT", packed[start:end]) for start, end in pairwise(cuts))
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + data + chunk(b"IEND", b"")

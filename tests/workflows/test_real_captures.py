@@ -1,8 +1,10 @@
-"""Real images, read in place: where they are missing, skipped; in CI, failed."""
+"""Real images, and a person of an independent renderer (BODYSCAN_PEOPLE), read in place: where they are
+missing, skipped; in CI, failed."""
 
 from __future__ import annotations
 
 import json
+import os
 from itertools import combinations
 from pathlib import Path
 
@@ -10,6 +12,8 @@ import numpy as np
 import pytest
 import yaml
 from real_captures import real_rig_file
+from required import missing
+from small_workspace import PROJECT, run
 
 from benchmarks.free_triangulation import (
     FreeTriangulation,
@@ -19,11 +23,13 @@ from benchmarks.free_triangulation import (
     without_shots,
 )
 from benchmarks.held_out_boards import hold_out_boards
+from benchmarks.independent_people import load_truth, measure_rms_without_hair
 from bodyscan.arrays import Array
 from bodyscan.boards.detection import find_boards
 from bodyscan.boards.view import BoardView
 from bodyscan.captures.folder import Captures, open_captures
 from bodyscan.captures.images import read_board_image, read_sequence
+from bodyscan.fusion.storage import load_scan
 from bodyscan.geometry.uncertainty import point_covariance
 from bodyscan.rig.rig import Rig, load_rig
 from bodyscan.stripes.decoding import decode_stripes
@@ -210,3 +216,17 @@ def test_the_patterns_tell_what_lit_and_dark_images_do(captures: Path, tmp_path:
     both = np.isfinite(stripes.s) & np.isfinite(made_stripes.s)
     assert both.sum() > 0.98 * np.isfinite(stripes.s).sum()
     assert np.median(np.abs((made_stripes.s - stripes.s)[both])) < 0.005
+
+
+@pytest.mark.slow
+def test_the_cloud_of_the_woman_lies_on_the_true_body(tmp_path: Path) -> None:
+    people = Path(os.environ.get("BODYSCAN_PEOPLE", PROJECT.parent / "shared" / "people"))
+    if not (people / "woman").is_dir():
+        missing(f"people not found at {people} (set BODYSCAN_PEOPLE)")
+    woman, out = people / "woman", tmp_path / "model"
+    run("scan", woman / "scan", "--calibration", woman / "calibration", "--out", out)
+    points = load_scan(out).cloud.points
+    some = np.random.default_rng(0).choice(len(points), min(len(points), 100_000), replace=False)
+    # It is 0.17 mm.
+    truth = load_truth(woman / "truth")
+    assert measure_rms_without_hair(points[some].astype(float), truth) < 0.20
