@@ -69,11 +69,25 @@ def describe_step(code: StripeCode, lit: Greys | None, dark: Greys | None, coded
     by_bit = files.reshape(2, -1).T.ravel() if len(files) % 2 == 0 else files
     orders = [[0, 1, *(2 + np.array(order))] for order in (files, by_bit, code.show_order)]
     early = not is_lit[1]  # begun one early, the lit image is lost; else dark and lit are exchanged
-    for late in (0, 1, -1, *range(2, len(files) + 1)):
-        if any((is_lit[o[late]] if late > -1 else early) and is_dark[o[late + 1]] for o in orders):
-            side = f"{late} before" if late > 0 else "1 after"
-            step = f"the frames are out of step by {abs(late)}: each file holds that {side} its own"
-            return step if late else ""
+    ends, inverted = is_lit | is_dark, [kind.name for kind in code.image_counts][1:] == ["inverse"]
+
+    def agree(order: list[int], late: int) -> bool:
+        """Whether patterns and inverses, taken from that many files later, complement one another."""
+        at = np.argsort(order)[2:].reshape(2, -1) + late
+        first, second = shares[np.array(order)[at[:, (at < len(order)).all(axis=0)]]]
+        return bool(np.mean(np.abs(first + second - 1.0)) < 0.25)
+
+    # Of sequences that are shown again and again, images that are lost in front are found at the end.
+    for late in sorted(range(-len(files), len(files) + 1), key=lambda late: (abs(late), late < 0)):
+        for o in orders:
+            # Where a bit is the same all over, its pattern and inverse are as lit and dark; but files
+            # that begin with later images do not end with stripes, and have inverses elsewhere.
+            sound = late < 1 or (not ends[o[-1]] and (not inverted or agree(o, late)))
+            begun = is_lit[o[late]] or (late == -1 and early)
+            if sound and begun and is_dark[o[late + 1]]:
+                side = f"{abs(late)} {'before' if late > 0 else 'after'}"
+                step = f"the frames are out of step by {abs(late)}: each file holds that {side} its own"
+                return step if late else ""
     return ""
 
 

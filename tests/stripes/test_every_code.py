@@ -232,7 +232,7 @@ def test_limits_do_not_change_s_within_them(code: Code, rising: bool) -> None:
     assert whole.beyond is None
 
 
-@pytest.mark.parametrize(("late", "by_bit"), [(1, False), (2, True), (-1, False)])
+@pytest.mark.parametrize(("late", "by_bit"), [(1, False), (2, True), (-1, False), (-2, True)])
 def test_frames_out_of_step_are_counted(late: int, by_bit: bool) -> None:
     lit, dark, coded, _ = captured(GRAY, wavy(2.2), 60)
     order = np.arange(12).reshape(2, 6).T.ravel() if by_bit else np.arange(12)
