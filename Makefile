@@ -3,7 +3,7 @@
 # make test         set up, run all tests on all cores
 # make test-quick   those that answer within seconds, for the loop of everyday work
 # make coverage     all tests again, with the lines of the package that they run
-# make wheel        build the wheel, install it into an empty environment, scan something small there
+# make wheel        build both wheels into dist, install each into an empty environment, scan something small
 # make check        format, lint, types, the directions of imports, words and the size of the house
 # make lock         the versions that CI installs, data/constraints.txt, made anew from the newest that fit
 # make bench        speed and accuracy at full size, written to docs/results.md, old sections marked
@@ -57,7 +57,7 @@ coverage: setup
 	$(BIN)/python -m pytest $(PARALLEL) --cov --cov-report=term:skip-covered
 
 wheel: setup
-	sh tests/wheel/try-wheel.sh "$(BIN)/python"
+	sh tests/wheel/try-wheel.sh "$(BIN)/python" dist
 
 check: setup
 	$(BIN)/ruff format --check .

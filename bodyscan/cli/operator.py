@@ -201,29 +201,29 @@ def measure(
     anyway: Anyway = False,
 ) -> None:
     """Measure a scan's mesh: stature, girths of horizontal slices, volume, area."""
-    from bodyscan.files.atomic import write_json, write_text
+    from bodyscan.files.atomic import write_json
     from bodyscan.fusion.storage import load_scan, refuse_own_file, refuse_repeat
     from bodyscan.measurement.measurements import heights_from
     from bodyscan.measurement.measurements import measure as measure_mesh
     from bodyscan.report.measurement_table import (
         MEASUREMENTS,
-        measurements_csv,
         measurements_document,
+        refuse_landmarks,
         tables,
         write_landmarks,
+        write_measurements,
     )
 
+    path = out or result / MEASUREMENTS
+    refuse_landmarks(landmarks, named=named)
+    for file in filter(None, (path, landmarks)):
+        refuse_own_file(file, result)
     stored, levels = load_scan(result), None if heights is None else heights_from(heights)
     if not anyway:
         refuse_repeat(result, stored.facts)
-    path = out or result / MEASUREMENTS
-    refuse_own_file(path, result)
     measured = measure_mesh(stored.mesh, levels, named=named)
     content = measurements_document(measured, stored.facts)
-    if path.suffix.lower() == ".csv":
-        write_text(path, measurements_csv(measured, stored.facts))
-    else:
-        write_json(path, content)
+    write_measurements(path, measured, stored.facts)
     written = [path]
     if landmarks is not None and measured.named is not None:
         write_landmarks(landmarks, measured.named, stored.facts)

@@ -48,6 +48,8 @@ def translate_failure(error: Exception) -> BodyscanError | None:
         "bodyscan"
     ):
         remedy = "install bodyscan again, with everything that it asks for"
+        if error.name in ("open3d", "pycolmap"):
+            remedy = f"pip install {error.name} (bodyscan-core comes without it)"
         return FailedWork(f"the Python package {error.name} is missing", remedy=remedy)
     if isinstance(error, OSError):
         return translate_os_error(error)

@@ -132,7 +132,7 @@ def make_room(folder: Path, overwrite: bool) -> None:
 def refuse_own_file(path: Path, folder: Path) -> None:
     """Raise ResultError if writing `path` would replace a file of the result in `folder`."""
     if path.resolve() in {(folder / n).resolve() for n in (FILE_NAME, CLOUD_NAME, MESH_NAME)}:
-        raise ResultError("is of the result itself", where=str(path), remedy="give another --out")
+        raise ResultError("is of the result itself", where=str(path), remedy="write elsewhere")
 
 
 def clear(folder: Path) -> None:

@@ -33,7 +33,7 @@ from bodyscan.mesh.topology import face_areas, signed_volume
 class Girth:
     """One part of the body in a horizontal slice.
 
-    part: trunk (neck and head too), left leg, right leg, left arm, right arm, other; "trunk and left
+    part: trunk, head (above the neck), left leg, right leg, left arm, right arm, other; "trunk and left
         arm" where the outline goes round both and nothing tells them apart.
     girth_mm: along the surface, closed straight where the part touches others.
     tape_mm: as a tape runs (convex hull).

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from fast_simplification import simplify
 from scipy.spatial import cKDTree
 
 from bodyscan.arrays import Array, Indices
@@ -107,13 +108,8 @@ def decimate(mesh: BodyMesh, *, faces: int = 50_000) -> BodyMesh:
     """
     if len(mesh.faces) <= faces:
         return mesh
-    import open3d as o3d  # takes seconds to load
-
-    corners_of = o3d.core.Tensor(mesh.faces.astype(np.int32))
-    full = o3d.t.geometry.TriangleMesh(o3d.core.Tensor(mesh.vertices), corners_of)
-    reduced = full.simplify_quadric_decimation(1.0 - faces / len(mesh.faces))
-    vertices = reduced.vertex.positions.numpy().astype(np.float64)
-    corners = reduced.triangle.indices.numpy().astype(np.int64)
+    vertices, corners = simplify(mesh.vertices, mesh.faces.astype(np.int32), target_count=faces)
+    corners = corners.astype(np.int64)
     shape = compute_topology(vertices, corners)
     if not shape.manifold or shape.components > 1:
         # Where surfaces nearly touch (between fingers) a collapse may fold one onto the other.

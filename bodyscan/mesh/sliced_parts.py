@@ -36,7 +36,7 @@ a hand, heights of the armpit and of a thigh surely below the crotch (Drillis an
 class Piece:
     """One part of a body in one slice.
 
-    part: trunk (neck and head too), left leg, right leg, left arm, right arm, or other; several,
+    part: trunk, head (above the neck), left leg, right leg, left arm, right arm, or other; several,
         joined by " and ", where they touch and no neck divides them.
     loop: its outline, closed straight where it was cut from others.
     touches: the parts that it was cut from.
@@ -102,6 +102,7 @@ def find_parts(slicer: MeshSlicer, heights_mm: Sequence[float] = ()) -> BodyPart
     graph = _link_layers(slicer, heights)
     _name_trunk_and_legs(graph, top)
     zones = _find_hidden_arms(graph, _name_limbs(graph, top), top)
+    _name_head(graph)
     layers: dict[float, list[_Node]] = {float(height): [] for height in heights}
     for node in graph:
         layers[node.height_mm].append(node)
@@ -277,6 +278,21 @@ def _name_limbs(graph: nx.DiGraph[_Node], top: float) -> dict[str, list[list[_No
         for node in nodes:
             node.part = part
     return arms
+
+
+def _name_head(graph: nx.DiGraph[_Node]) -> None:
+    """Name head what of the trunk is above the neck: its thinnest layer between chest and nose, at 0.76
+    to 0.92 of the crown's height (a child's chin is at 0.8, an adult's at 0.87)."""
+    trunk = [node for node in graph if node.part == "trunk"]
+    crown = max((node.height_mm for node in trunk), default=0.0)
+    areas: dict[float, float] = {}
+    for node in trunk:
+        if 0.76 * crown < node.height_mm < 0.92 * crown:
+            areas[node.height_mm] = areas.get(node.height_mm, 0.0) + node.area_mm2
+    neck_mm = min(areas, key=lambda height: areas[height], default=crown)
+    for node in trunk:
+        if node.height_mm > neck_mm:
+            node.part = "head"
 
 
 def _find_hidden_arms(

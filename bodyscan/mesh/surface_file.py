@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import io
 import math
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -32,19 +29,16 @@ def read_surface(path: Path) -> Outcome[tuple[Array, Indices]]:
     are dropped, and faces that all run inwards are turned; the notes say so. Raises BadInput, which
     names the vertex or face, counted from 0.
     """
-    # In a process of its own: Open3D's may end at a face of four corners of which one is not there.
-    program = (
-        "import os, sys; out = os.fdopen(os.dup(1), 'wb'); os.dup2(2, 1)\n"
-        "import numpy as np, open3d as o3d; read = o3d.io.read_triangle_mesh(sys.argv[1])\n"
-        "np.savez(out, vertices=read.vertices, faces=np.asarray(read.triangles, np.int64))"
-    )
-    line = [sys.executable, "-P", "-c", program, str(path)]
-    done = subprocess.run(line, capture_output=True, check=False) if path.is_file() else None
-    if done and done.returncode > 0:
-        import open3d  # noqa: F401  # which says what it lacks
-    read = np.load(io.BytesIO(done.stdout)) if done and not done.returncode else {}
-    vertices, faces = (read.get(name, np.zeros((0, 3))) for name in ("vertices", "faces"))
-    fault = find_fault(vertices, faces) if faces.size else "no surface can be read here"
+    from trimesh import load_mesh  # takes half a second to load
+
+    vertices, faces, cause = np.zeros((0, 3)), np.zeros((0, 3), np.int64), ""
+    if path.is_file():
+        try:
+            read = load_mesh(path, process=False)
+            vertices, faces = np.array(read.vertices, float), np.array(read.faces, np.int64)
+        except Exception as error:  # whatever a damaged file makes of its parser
+            cause = f" ({error})"
+    fault = find_fault(vertices, faces) if faces.size else f"no surface can be read here{cause}"
     if fault:
         remedy = "give a PLY with faces, sound where it was made, z up"
         raise BadInput(fault, where=str(path), remedy=remedy)

@@ -168,13 +168,29 @@ def landmarks_json(named: NamedMeasures, facts: Mapping[str, Any]) -> str:
 LANDMARK_FORMATS = {".csv": landmarks_csv, ".json": landmarks_json, ".lnd": landmarks_lnd}
 
 
-def write_landmarks(path: Path, named: NamedMeasures, facts: Mapping[str, Any]) -> None:
-    """Write landmarks as the path's suffix says. Raises BadInput for another suffix."""
+def refuse_landmarks(path: Path | None, *, named: bool) -> None:
+    """Raise BadInput if no landmarks are found, or none can be written with the path's suffix."""
+    if path is None:
+        return
+    if not named:
+        raise BadInput("--landmarks needs --named, which finds them", remedy="give both")
     if path.suffix.lower() not in LANDMARK_FORMATS:
         what = f"landmarks cannot be written as {path.suffix!r}"
-        remedy = f"Choose from {', '.join(LANDMARK_FORMATS)}."
+        remedy = f"choose from {', '.join(LANDMARK_FORMATS)}"
         raise BadInput(what, where=str(path), remedy=remedy)
+
+
+def write_landmarks(path: Path, named: NamedMeasures, facts: Mapping[str, Any]) -> None:
+    """Write landmarks as the path's suffix says, one of `LANDMARK_FORMATS`."""
     write_text(path, LANDMARK_FORMATS[path.suffix.lower()](named, facts))
+
+
+def write_measurements(path: Path, measured: Measurements, facts: Mapping[str, Any]) -> None:
+    """Write measurements as JSON, or as CSV if the path's suffix says so."""
+    if path.suffix.lower() == ".csv":
+        write_text(path, measurements_csv(measured, facts))
+    else:
+        write_json(path, measurements_document(measured, facts))
 
 
 def write_measures(stored: StoredScan, folder: Path) -> str:
@@ -186,7 +202,7 @@ def write_measures(stored: StoredScan, folder: Path) -> str:
     except BadInput as error:
         reason, measured = error.what, measure(stored.mesh)
     named = measured.named
-    write_json(folder / MEASUREMENTS, measurements_document(measured, stored.facts))
+    write_measurements(folder / MEASUREMENTS, measured, stored.facts)
     write_text(folder / "measures.csv", named_csv(named or reason, stored.facts))
     if named is not None:
         for suffix in LANDMARK_FORMATS:

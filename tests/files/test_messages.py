@@ -128,7 +128,7 @@ def test_too_little_memory_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     [
         (OSError("libEGL.so.1: cannot open shared object file: No such file"), "libEGL.so.1"),
         (ImportError("libGL.so.1: cannot open shared object file"), "apt-get install"),
-        (ModuleNotFoundError("No module named 'open3d'", name="open3d"), "package open3d"),
+        (ModuleNotFoundError("No module named 'open3d'", name="open3d"), "pip install open3d"),
         (ImportError("_qhull.so: failed to map segment from shared object"), "not enough memory"),
         (RuntimeError("can't start new thread"), "not enough memory"),
         (OSError(errno.ENOMEM, "Cannot allocate memory"), "Cannot allocate memory"),

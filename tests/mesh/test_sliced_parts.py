@@ -28,12 +28,13 @@ def tapes(parts: BodyParts, height: float) -> dict[str, float]:
 @pytest.mark.parametrize("scale", [1.0, 0.6])
 @pytest.mark.parametrize("stout", [0.85, 1.0, 1.25])
 def test_free_arms_and_legs_are_told_apart_at_any_size(scale: float, stout: float) -> None:
-    parts = parts_of(hanging(25.0), (400.0, 760.0, 1000.0), scale=scale, stout=stout)
+    parts = parts_of(hanging(25.0), (400.0, 760.0, 1000.0, 1600.0), scale=scale, stout=stout)
     assert {piece.part for piece in parts.slices[400.0 * scale]} == {"left leg", "right leg"}
     assert {"left leg", "right leg"} <= set(tapes(parts, 760.0 * scale))
     at_waist = tapes(parts, 1000.0 * scale)
     assert set(at_waist) == FREE
     assert at_waist["trunk"] == pytest.approx(trunk_tape(scale, stout), rel=3e-3)
+    assert set(tapes(parts, 1600.0 * scale)) == {"head"}
     assert at_waist["left arm"] == pytest.approx(at_waist["right arm"], rel=0.02)
     near = [c for c in parts.contacts if "leg" not in c.parts[0] and c.low_mm < 1150.0 * scale]
     assert not near

@@ -8,6 +8,7 @@ import numpy as np
 import open3d as o3d
 import pytest
 from small_bodies import ball
+from trimesh import Trimesh
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.errors import BadInput
@@ -61,14 +62,25 @@ def test_what_is_no_mesh_is_refused_by_vertex_or_face(tmp_path: Path) -> None:
         read_surface(write(tmp_path, unknown, FACES))
     with pytest.raises(BadInput, match="face 5 names vertex 99999"):
         read_surface(write(tmp_path, VERTICES, wrong))
-    quad = tmp_path / "quad.ply"  # at which Open3D's reader ends its process
-    head = "ply\nformat ascii 1.0\nelement vertex 4\n" + "".join(
-        f"property float {x}\n" for x in "xyz"
-    )
-    head += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
-    quad.write_text(f"{head}0 0 0\n1 0 0\n1 1 0\n0 1 0\n4 0 1 2 99999999\n")
-    with pytest.raises(BadInput, match="no surface can be read"):
-        read_surface(quad)
+    damaged = {
+        "quad.obj": "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 99999999\n",
+        "cloud.ply": "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n",
+        "body.glb": "glTF" + 100 * "x",
+        "body.fbx": "",
+    }
+    for name, text in damaged.items():
+        (tmp_path / name).write_text(text)
+        with pytest.raises(BadInput, match="no surface can be read"):
+            read_surface(tmp_path / name)
+
+
+@pytest.mark.parametrize("suffix", ["obj", "stl", "glb", "off", "ply"])
+def test_the_formats_of_other_programs_are_read(suffix: str, tmp_path: Path) -> None:
+    Trimesh(VERTICES, FACES, process=False).export(path := tmp_path / f"body.{suffix}")
+    vertices, faces = read_surface(path).value
+    assert len(vertices) == len(VERTICES)
+    # STL and GLB are float32, and joined vertices are in another order.
+    assert signed_volume(vertices, faces) == pytest.approx(signed_volume(VERTICES, FACES), rel=1e-5)
 
 
 @pytest.mark.parametrize(

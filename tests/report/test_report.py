@@ -270,3 +270,11 @@ def test_measurements_are_written_as_csv_by_their_suffix(tmp_path: Path) -> None
         assert float(row["stature_mm"]) == whole["stature_mm"]
     beside = json.loads((tmp_path / "girths.csv.json").read_text("utf-8"))
     assert beside == {"subject": whole["subject"]}
+
+
+def test_landmarks_that_cannot_be_written_are_refused_before_the_scan_is_read(
+    tmp_path: Path,
+) -> None:
+    for options, said in ((["--named"], "cannot be written as '.xyz'"), ([], "needs --named")):
+        refused = run("measure", tmp_path, *options, "--landmarks", "landmarks.xyz")
+        assert said in str(refused.exception)
