@@ -158,7 +158,8 @@ class ExportSettings(Model):
     versions: tuple[MeshVersion, ...] = Field(default=("full", "light"), min_length=1)
     """full; light: 50,000 faces, which any viewer can turn; open: without the filled faces; registered:
     a parametric body laid over it, in one topology for all people, with parts, landmarks, skeleton;
-    textured: light, its colours in an image (GLB and OBJ; needs the extra `texture`)."""
+    textured: light, its colours in an image (GLB and OBJ; needs the extra `texture`), as then has the
+    registered body."""
 
     texture_px: int = Field(default=4096, ge=256, le=16384)
     """px: side of the image of `textured`."""

@@ -260,10 +260,7 @@ def export(
     ] = False,
     texture: Annotated[
         bool,
-        typer.Option(
-            "--texture",
-            help="Also write the light mesh with its colours in an image (GLB, OBJ; needs xatlas).",
-        ),
+        typer.Option("--texture", help="Also write GLB and OBJ with their colours in an image."),
     ] = False,
     texture_px: Annotated[
         int, typer.Option(min=256, max=16384, help="Side of that image, pixels.")

@@ -12,7 +12,7 @@ import numpy as np
 from bodyscan.arrays import Array
 from bodyscan.body_model.skinned import SkinnedBody
 from bodyscan.export.formats import BODY_FORMATS, BodyFormat
-from bodyscan.export.texture import TexturedBody
+from bodyscan.export.texture import Texture
 from bodyscan.files.atomic import write_json
 from bodyscan.files.registry import unknown_format_error
 from bodyscan.geometry.transforms import RigidTransform
@@ -43,14 +43,18 @@ class Provenance:
 
 
 def write_body(
-    path: Path, body: BodyCloud | BodyMesh | SkinnedBody | TexturedBody, origin: Provenance
+    path: Path,
+    body: BodyCloud | BodyMesh | SkinnedBody,
+    origin: Provenance,
+    texture: Texture | None = None,
 ) -> None:
     """Write `body` in the format that `path`'s suffix names, and `<path>.json` beside it.
 
-    A mesh is written without its faces of zero area; a registered body has all of them. Raises
-    BadInput for a suffix that is not that of a format, or of one that cannot hold a cloud.
+    A mesh is written without its faces of zero area, unless it has a texture; a registered body has
+    all of them. Raises BadInput for a suffix that is not that of a format, or of one that cannot hold
+    a cloud.
     """
-    path, found = Path(path), {}
+    path = Path(path)
     kind = "cloud" if isinstance(body, BodyCloud) else "mesh"
     name = path.suffix.lower().removeprefix(".")
     able = [known for known in BODY_FORMATS.names() if kind in BODY_FORMATS.find(known).holds]
@@ -59,21 +63,22 @@ def write_body(
         raise unknown_format_error(f"a {kind}", what, able, where=str(path))
     format_ = BODY_FORMATS.find(name)
     up = (origin.up,) if format_.free_axes else ()
+    found: dict[str, Any] = {}
+    if texture is not None:
+        companions = [path.with_suffix(suffix).name for suffix in (".mtl", ".png")]
+        found["texture_px"] = len(texture.image)
+        found["companions"] = companions if name == "obj" else []
+    shown = {} if texture is None else {"texture": texture}
     if isinstance(body, SkinnedBody):
         if format_.write_skinned is None:
-            format_.write(path, body.mesh, *up)
+            format_.write(path, body.mesh, *up, **shown)
         else:
-            format_.write_skinned(path, body, *up)
-        body = body.mesh
-    elif isinstance(body, TexturedBody):
-        assert format_.write_textured is not None
-        format_.write_textured(path, body, *up)
-        companions = [path.with_suffix(suffix).name for suffix in (".mtl", ".png")]
-        found = {"texture_px": len(body.image), "companions": companions if name == "obj" else []}
+            format_.write_skinned(path, body, *up, **shown)
         body = body.mesh
     else:
-        body = collapse_slivers(body) if isinstance(body, BodyMesh) else body
-        format_.write(path, body, *up)
+        if isinstance(body, BodyMesh) and texture is None:
+            body = collapse_slivers(body)
+        format_.write(path, body, *up, **shown)
     if up == ("y",):
         format_ = replace(format_, axes=("left", "up", "front"))
     described = describe_body(path.name, format_, body, origin) | found

@@ -9,14 +9,16 @@ from typing import Any
 
 import numpy as np
 
+from bodyscan.arrays import Array
 from bodyscan.body_model.registered import register_body
 from bodyscan.body_model.skinned import SkinnedBody, make_skinned
+from bodyscan.body_model.template import load_template
 from bodyscan.errors import BadInput
 from bodyscan.export.body_file import Provenance, write_body
 from bodyscan.export.defacing import Neck, find_neck
 from bodyscan.export.defacing import deface as replace_head
 from bodyscan.export.formats import BODY_FORMATS
-from bodyscan.export.texture import TexturedBody, texture_mesh
+from bodyscan.export.texture import Texture, make_texture
 from bodyscan.files.model import did_you_mean
 from bodyscan.fusion.storage import StoredScan
 from bodyscan.geometry.transforms import RigidTransform
@@ -49,7 +51,7 @@ def export_scan(
 
     versions: full, light (50,000 faces), open (without filled faces), registered (a parametric body
         laid over the scan), textured (light, with an image of `texture_px` a side instead of vertex
-        colours; in formats that hold it). Each file has a JSON beside it.
+        colours, in formats that hold it; then registered has one too). Each has a JSON beside it.
     deface: replace the subject's head by a plain one; below the neck nothing changes. The JSON then
         has neither pseudonym nor date.
     frame: rig, or body (origin under the body, x the way it faces).
@@ -59,58 +61,69 @@ def export_scan(
     face or fits nobody; FailedWork if no neck is found.
     """
     names = [name.strip().lower().removeprefix(".") for name in formats]
-    able = [name for name in names if BODY_FORMATS.find(name).write_textured]
+    able = [name for name in names if "texture" in BODY_FORMATS.find(name).holds]
+    every = (*VERSIONS, "registered")
+    _require_known(
+        *((version, every) for version in versions), (frame, ("rig", "body")), (up, ("z", "y"))
+    )
     if "textured" in versions and not able:
         raise BadInput(f"{', '.join(names)} holds no texture", remedy="Add `glb` or `obj`.")
-    every = (*VERSIONS, "registered")
-    choices = [*((version, every) for version in versions), (frame, ("rig", "body"))]
-    for name, known in [*choices, (up, ("z", "y"))]:
-        if name not in known:
-            what = f"there is no {name!r} to export{did_you_mean(name, known)}"
-            raise BadInput(what, remedy=f"Choose from {', '.join(known)}.")
     if deface and "registered" in versions:
-        what = "a registered body shows the face, which is to be removed"
-        raise BadInput(what, remedy="Leave out one of `registered` and `deface`.")
+        remedy = "Leave out one of `registered` and `deface`."
+        raise BadInput("a registered body shows the face, which is to be removed", remedy=remedy)
     pose = find_body_frame(scan.mesh.vertices).rig_from_body if frame == "body" else None
     subject, identity = None if deface else scan.facts.get("subject"), scan.facts["calibration_id"]
     origin = Provenance(subject, identity, deface, _find_facts(scan.facts, deface), pose, up)
     neck = find_neck(scan.mesh.vertices, scan.mesh.faces) if deface else None
     written = []
     for version in versions:
-        body: BodyMesh | SkinnedBody | TexturedBody
+        body: BodyMesh | SkinnedBody
+        texture = None
         if version == "registered":
             stem, body = "body-registered", _register(scan.mesh, pose)
+            rest = load_template().vertices
+            if "textured" in versions:
+                texture = _texture(scan, body.mesh, neck, pose, texture_px, rest)
         else:
             stem, convert = VERSIONS[version]
-            mesh = convert(scan.mesh)
-            mesh = mesh if neck is None else replace_head(mesh, neck)
+            body = convert(scan.mesh)
+            body = body if neck is None else replace_head(body, neck)
+            body = body if pose is None else transform_mesh(body, pose.inverse())
             if version == "textured":
-                body = _texture(scan, mesh, neck, pose, texture_px)
-            else:
-                body = _place(mesh, pose)
+                body = collapse_slivers(body)
+                texture = _texture(scan, body, neck, pose, texture_px, body.vertices)
         for name in able if version == "textured" else names:
             written.append(folder / f"{stem}.{name}")
-            write_body(written[-1], body, origin)
+            write_body(written[-1], body, origin, texture if name in able else None)
     return written
 
 
-def _place(mesh: BodyMesh, rig_from_frame: RigidTransform | None) -> BodyMesh:
-    return mesh if rig_from_frame is None else transform_mesh(mesh, rig_from_frame.inverse())
+def _require_known(*choices: tuple[str, Sequence[str]]) -> None:
+    """Raise BadInput for a name that is none of those beside it."""
+    for name, known in choices:
+        if name not in known:
+            what = f"there is no {name!r} to export{did_you_mean(name, known)}"
+            raise BadInput(what, remedy=f"Choose from {', '.join(known)}.")
 
 
 def _texture(
-    scan: StoredScan, mesh: BodyMesh, neck: Neck | None, pose: RigidTransform | None, size: int
-) -> TexturedBody:
-    """Texture a mesh, in the rig frame, with the colours of a scan's points.
+    scan: StoredScan,
+    mesh: BodyMesh,
+    neck: Neck | None,
+    rig_from_frame: RigidTransform | None,
+    size: int,
+    rest: Array,
+) -> Texture:
+    """Make a texture of the colours of a scan's points for a mesh in another frame than the rig's.
 
-    neck: of a mesh without its face. pose: of the frame in which the mesh is written.
+    neck: of a mesh without its face. rest: see `make_texture`.
     """
     points, colours = scan.cloud.points, scan.cloud.colours
     if neck is not None:  # the points show the face
         shown = replace_head(scan.mesh, neck)
         points, colours = shown.vertices, shown.colours
-    textured = texture_mesh(collapse_slivers(mesh), points, colours, size)
-    return replace(textured, mesh=_place(textured.mesh, pose))
+    points = points if rig_from_frame is None else rig_from_frame.inverse().apply(points)
+    return make_texture(mesh.vertices, mesh.faces, points, colours, size, rest=rest)
 
 
 def _register(mesh: BodyMesh, rig_from_frame: RigidTransform | None) -> SkinnedBody:

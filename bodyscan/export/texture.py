@@ -6,6 +6,7 @@ A texture is sRGB to every program. glTF's vertex colours are linear, which some
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -14,14 +15,13 @@ from scipy.spatial import cKDTree
 from bodyscan.arrays import Array, Bytes, Floats, Indices
 from bodyscan.compiled import compiled
 from bodyscan.errors import BadInput
-from bodyscan.mesh.body import BodyMesh
 from bodyscan.mesh.depth_buffer import nearest_faces
 from bodyscan.progress import THREADS
 
 
 @dataclass(frozen=True, eq=False)
-class TexturedBody:
-    """A mesh whose colours are in an image. At seams of the atlas a vertex has several places in it.
+class Texture:
+    """Colours of a mesh in an image. At seams of the atlas a vertex has several places in it.
 
     uv: (T, 2) float32, place in the image: 0 to 1, to the right and down.
     vertex: (T,) index of the vertex at each place.
@@ -29,28 +29,28 @@ class TexturedBody:
     image: (S, S, 3) uint8, red, green, blue.
     """
 
-    mesh: BodyMesh
     uv: Floats
     vertex: Indices
     faces: Indices
     image: Bytes
 
-    @property
+    @cached_property
     def png(self) -> bytes:
         """The image as a PNG file."""
         return bytes(cv2.imencode(".png", self.image[..., ::-1])[1])
 
 
-def texture_mesh(mesh: BodyMesh, points: Array, colours: Bytes, size: int) -> TexturedBody:
+def make_texture(
+    vertices: Array, faces: Indices, points: Array, colours: Bytes, size: int, *, rest: Array
+) -> Texture:
     """Unwrap a mesh and bake the colours (N, 3) of points (N, 3), mm, into an image of so many
-    pixels a side. Raises BadInput without the package xatlas."""
-    uv, vertex, faces = _unwrap(mesh, size)
-    image = bake(size * uv - np.float32(0.5), faces, mesh.vertices[vertex], points, colours, size)
-    return TexturedBody(mesh, uv, vertex, faces, image)
+    pixels a side.
 
+    rest: (V, 3), the vertices of the shape that is unwrapped: the mesh's own, or those of a template,
+        whose atlas all bodies then share.
 
-def _unwrap(mesh: BodyMesh, size: int) -> tuple[Floats, Indices, Indices]:
-    """Cut a mesh into charts and pack these: uv, vertex, faces of a TexturedBody."""
+    Raises BadInput without the package xatlas.
+    """
     try:
         import xatlas
     except ImportError as error:
@@ -59,16 +59,18 @@ def _unwrap(mesh: BodyMesh, size: int) -> tuple[Floats, Indices, Indices]:
             remedy="pip install 'bodyscan[texture]'",
         ) from error
     atlas = xatlas.Atlas()
-    atlas.add_mesh(mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32), mesh.normals)
+    atlas.add_mesh(rest.astype(np.float32), faces.astype(np.uint32))
     packing = xatlas.PackOptions()
-    packing.resolution, packing.padding = size, 4  # as far as smaller versions of the image blur
+    packing.resolution, packing.padding = 1024, 1  # 4 pixels of 4096, for smaller versions of it
     atlas.generate(xatlas.ChartOptions(), packing)
-    vertex, faces, uv = atlas[0]
-    return uv.astype(np.float32), vertex.astype(np.int64), faces.astype(np.int64)
+    vertex, corners, uv = atlas[0]
+    vertex, corners, pixels = vertex.astype(int), corners.astype(int), size * uv - 0.5
+    image = bake(pixels, corners, vertices[vertex], points, colours, size)
+    return Texture(uv.astype(np.float32), vertex, corners, image)
 
 
 def bake(
-    pixels: Floats, faces: Indices, positions: Array, points: Array, colours: Bytes, size: int
+    pixels: Array, faces: Indices, positions: Array, points: Array, colours: Bytes, size: int
 ) -> Bytes:
     """Bake colours (N, 3) of points (N, 3) into an image (size, size, 3).
 
@@ -77,9 +79,9 @@ def bake(
 
     pixels: (T, 2) column and row, and positions: (T, 3) mm, of the faces' (F, 3) corners.
     """
-    flat = np.column_stack([pixels, np.zeros(len(pixels), np.float32)])
+    flat = np.column_stack([pixels, np.zeros(len(pixels))]).astype(np.float32)
     face = nearest_faces(flat, faces, size, size)
-    origin, slope = _fit_faces(pixels.astype(np.float64)[faces], positions[faces])
+    origin, slope = _fit_faces(pixels[faces], positions[faces])
     tree, image = cKDTree(points), np.zeros((size, size, 3), np.uint8)
     band = max(1, 1_000_000 // size)
     for top in range(0, size, band):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import runpy
 from pathlib import Path
 from typing import Any
@@ -15,12 +16,13 @@ from scipy.spatial.transform import Rotation
 from bodyscan.arrays import Array
 from bodyscan.body_model.skinned import SkinnedBody, make_skinned
 from bodyscan.export.body_file import Provenance, write_body
+from bodyscan.export.texture import make_texture
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.measurement.landmarks import find_landmarks
 
 FRAME = RigidTransform.from_rotation_vector([0.0, 0.0, 0.7], [30.0, -50.0, 0.0])
 TYPES = {5121: "<u1", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-SIZES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+SIZES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 
 
 @pytest.fixture(scope="module")
@@ -114,3 +116,31 @@ def test_the_example_averages_people_in_one_pose(tmp_path: Path) -> None:
     found = np.load(tmp_path / "mean.npz")["mean"][:, [2, 0, 1]]
     # Bumps of 3 mm RMS are not in the shapes.
     assert np.sqrt(np.mean(np.sum((found - mean) ** 2, axis=1))) < 4.0
+
+
+def test_a_registered_body_with_a_texture(body: SkinnedBody, tmp_path: Path) -> None:
+    """Its atlas is the template's; split vertices keep their weights, and faces their groups."""
+    pytest.importorskip("xatlas")
+    mesh = body.mesh
+    source = mesh.vertices, mesh.faces, mesh.vertices, mesh.colours
+    texture = make_texture(*source, 256, rest=TEMPLATE.vertices)
+    np.testing.assert_array_equal(texture.vertex[texture.faces], TEMPLATE.faces)
+    found = []
+    for name, shown in (("plain", None), ("textured", texture)):
+        write_body(tmp_path / f"{name}.glb", body, Provenance(None, "3f2a"), shown)
+        write_body(tmp_path / f"{name}.obj", body, Provenance(None, "3f2a"), shown)
+        content, arrays = read_glb(tmp_path / f"{name}.glb")
+        (primitive,) = content["meshes"][0]["primitives"]
+        found.append({key: arrays[at] for key, at in primitive["attributes"].items()})
+    plain, textured = found
+    np.testing.assert_array_equal(textured.pop("TEXCOORD_0"), texture.uv)
+    assert textured.keys() == plain.keys() - {"COLOR_0"}
+    for key, values in textured.items():
+        np.testing.assert_array_equal(values, plain[key][texture.vertex])
+    lines, others = (
+        (tmp_path / f"{n}.obj").read_text().splitlines() for n in ("plain", "textured")
+    )
+    faces = [re.sub(r"/\d+/", "//", line) for line in others if line[0] in "gf"]
+    assert faces == [line for line in lines if line[0] in "gf"]
+    places = np.array([re.findall(r"/(\d+)/", line) for line in others if line[0] == "f"], int) - 1
+    assert set(map(tuple, places.tolist())) == set(map(tuple, texture.faces.tolist()))

@@ -20,7 +20,7 @@ from bodyscan.arrays import Array, Bytes
 from bodyscan.errors import BadInput
 from bodyscan.export.body_file import Provenance, write_body
 from bodyscan.export.scan import export_scan
-from bodyscan.export.texture import TexturedBody, texture_mesh
+from bodyscan.export.texture import Texture, make_texture
 from bodyscan.fusion.storage import StoredScan
 from bodyscan.jobs.forgetting import find_subject
 from bodyscan.mesh.body import BodyCloud, BodyMesh
@@ -47,8 +47,9 @@ def sprinkle(mesh: BodyMesh, count: int = 20_000) -> tuple[Array, Bytes]:
 
 
 @pytest.fixture(scope="module")
-def body() -> TexturedBody:
-    return texture_mesh(ball(), *sprinkle(ball()), SIZE)
+def texture() -> Texture:
+    mesh = ball()
+    return make_texture(mesh.vertices, mesh.faces, *sprinkle(mesh), SIZE, rest=mesh.vertices)
 
 
 def sample(image: Any, uv: Any) -> Array:
@@ -58,24 +59,24 @@ def sample(image: Any, uv: Any) -> Array:
     return np.asarray(found[0, :, :3], float)
 
 
-def test_every_face_keeps_its_vertices_and_no_seam_shows(body: TexturedBody) -> None:
-    np.testing.assert_array_equal(body.vertex[body.faces], body.mesh.faces)
-    assert len(body.vertex) > len(body.mesh.vertices)  # there are seams
-    expected = paint(body.mesh.vertices[body.vertex])
-    assert np.abs(sample(body.image, body.uv) - expected).max() < TOLERANCE
-    middles = body.mesh.vertices[body.mesh.faces].mean(axis=1)
-    found = sample(body.image, body.uv[body.faces].mean(axis=1))
+def test_every_face_keeps_its_vertices_and_no_seam_shows(texture: Texture) -> None:
+    np.testing.assert_array_equal(texture.vertex[texture.faces], ball().faces)
+    assert len(texture.vertex) > len(ball().vertices)  # there are seams
+    expected = paint(ball().vertices[texture.vertex])
+    assert np.abs(sample(texture.image, texture.uv) - expected).max() < TOLERANCE
+    middles = ball().vertices[ball().faces].mean(axis=1)
+    found = sample(texture.image, texture.uv[texture.faces].mean(axis=1))
     assert np.abs(found - paint(middles)).max() < TOLERANCE
 
 
 @pytest.mark.parametrize("suffix", ["glb", "obj"])
-def test_programs_show_the_same_colours(body: TexturedBody, suffix: str, tmp_path: Path) -> None:
+def test_programs_show_the_same_colours(texture: Texture, suffix: str, tmp_path: Path) -> None:
     path = tmp_path / f"body.{suffix}"
-    write_body(path, body, Provenance("S-0042", "3f2a"))
+    write_body(path, ball(), Provenance("S-0042", "3f2a"), texture)
     seen: Any = trimesh.load(path, force="mesh", process=False)
     material, uv = seen.visual.material, seen.visual.uv * [1.0, -1.0] + [0.0, 1.0]
     image = np.asarray(material.image if suffix == "obj" else material.baseColorTexture)
-    assert len(seen.faces) == len(body.faces)
+    assert len(seen.faces) == len(texture.faces)
     found = sample(image, uv)
     assert np.abs(found - paint(in_rig(np.asarray(seen.vertices), suffix))).max() < TOLERANCE
     other = o3d.io.read_triangle_mesh(str(path))
@@ -90,9 +91,9 @@ def in_rig(positions: Array, suffix: str) -> Array:
     return positions if suffix == "obj" else 1000.0 * positions[:, [2, 0, 1]]
 
 
-def test_a_browser_shows_the_image_inside_a_glb(body: TexturedBody, tmp_path: Path) -> None:
+def test_a_browser_shows_the_image_inside_a_glb(texture: Texture, tmp_path: Path) -> None:
     executable = find_browser() or missing("no chromium here (apt-get install chromium)")
-    write_body(tmp_path / "body.glb", body, Provenance(None, "3f2a"))
+    write_body(tmp_path / "body.glb", ball(), Provenance(None, "3f2a"), texture)
     data = base64.b64encode((tmp_path / "body.glb").read_bytes()).decode()
     script = f"""(async () => {{
         const bytes = Uint8Array.from(atob("{data}"), (letter) => letter.charCodeAt(0));
@@ -110,7 +111,7 @@ def test_a_browser_shows_the_image_inside_a_glb(body: TexturedBody, tmp_path: Pa
             "Runtime.evaluate", expression=script, awaitPromise=True, returnByValue=True
         )
     row = np.array(answer["result"]["value"], np.uint8).reshape(-1, 4)[:, :3]
-    np.testing.assert_array_equal(row, body.image[200])
+    np.testing.assert_array_equal(row, texture.image[200])
 
 
 @pytest.mark.parametrize("frame", ["rig", "body"])
@@ -144,4 +145,6 @@ def sprinkle_cloud(mesh: BodyMesh) -> tuple[Any, ...]:
 def test_without_the_library_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "xatlas", None)
     with pytest.raises(BadInput, match=r"bodyscan\[texture\]"):
-        texture_mesh(ball(), *sprinkle(ball()), SIZE)
+        make_texture(
+            np.zeros((3, 3)), np.zeros((0, 3), int), *sprinkle(ball()), SIZE, rest=np.eye(3)
+        )

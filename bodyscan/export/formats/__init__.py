@@ -8,7 +8,7 @@ from typing import Literal
 
 from bodyscan.files.registry import Registry
 
-Content = Literal["mesh", "cloud", "colours", "normals", "sigma", "filled", "regions"]
+Content = Literal["mesh", "cloud", "colours", "normals", "sigma", "filled", "regions", "texture"]
 
 
 @dataclass(frozen=True)
@@ -22,10 +22,10 @@ class BodyFormat:
     axes: where its x, y and z point, as the subject sees it.
     write_skinned: writes a registered body with its parts and what else the format holds of it; None
         if it is no more than its mesh to it.
-    write_textured: writes a mesh with its texture, all files whose names begin with the path's stem;
-        None if it holds no texture.
-    free_axes: whether its standard leaves the axes open. All functions then take a third argument,
+    free_axes: whether its standard leaves the axes open. Both functions then take a third argument,
         which axis of the file points up: see `lay_axes`.
+
+    If it holds textures, both functions take one as `texture`.
     """
 
     write: Callable[..., None]
@@ -33,7 +33,6 @@ class BodyFormat:
     unit: Literal["mm", "m"] = "mm"
     axes: tuple[str, str, str] = ("front", "left", "up")
     write_skinned: Callable[..., None] | None = None
-    write_textured: Callable[..., None] | None = None
     free_axes: bool = False
 
 

@@ -15,16 +15,10 @@ from scipy.spatial.transform import Rotation
 from bodyscan.arrays import Array, Bytes, Indices
 from bodyscan.body_model.skinned import SkinnedBody
 from bodyscan.export.formats import BodyFormat
-from bodyscan.export.texture import TexturedBody
+from bodyscan.export.texture import Texture
 from bodyscan.files.atomic import atomic_replacement
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.mesh.topology import vertex_normals
-
-MATERIALS: dict[str, list[dict[str, Any]]] = {
-    "materials": [
-        {"name": "body", "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.9}}
-    ]
-}
 
 
 @dataclass(eq=False)
@@ -80,9 +74,12 @@ class _Buffer:
                 stream.write(chunk)
 
 
-def write_glb(path: Path, body: BodyCloud | BodyMesh) -> None:
+def write_glb(path: Path, body: BodyCloud | BodyMesh, texture: Texture | None = None) -> None:
     """Write a mesh or a cloud. A mesh's vertices carry `_FILLED`, 1 where nothing was measured; all
-    carry `_REGION`, an index into `REGION_NAMES`, if it is known."""
+    carry `_REGION`, an index into `REGION_NAMES`, if it is known.
+
+    texture: instead of vertex colours, which would multiply it.
+    """
     points = body.points if isinstance(body, BodyCloud) else body.vertices
     attributes = {
         "POSITION": _y_up(points) / 1000.0,
@@ -96,41 +93,14 @@ def write_glb(path: Path, body: BodyCloud | BodyMesh) -> None:
         attributes["_FILLED"] = np.isnan(body.sigma_mm)
         indices = body.faces
     buffer = _Buffer()
-    primitive = _add_primitive(buffer, attributes, indices)
+    primitive = _add_primitive(buffer, attributes, indices, texture)
     meshes = [{"primitives": [primitive], "name": "body"}]
     nodes = [{"mesh": 0, "name": "body"}]
     content = {"scenes": [{"nodes": [0]}], "nodes": nodes, "meshes": meshes}
-    buffer.write(path, content | MATERIALS)
+    buffer.write(path, content | _add_materials(buffer, texture))
 
 
-def write_textured_glb(path: Path, body: TexturedBody) -> None:
-    """Write a mesh with its texture inside, and no vertex colours, which would multiply it."""
-    mesh, buffer = body.mesh, _Buffer()
-    attributes = {
-        "POSITION": _y_up(mesh.vertices[body.vertex]) / 1000.0,
-        "NORMAL": _y_up(mesh.normals[body.vertex]),
-        "TEXCOORD_0": body.uv,
-        "_FILLED": np.isnan(mesh.sigma_mm[body.vertex]),
-    }
-    if mesh.regions is not None:
-        attributes["_REGION"] = mesh.regions[body.vertex]
-    primitive = _add_primitive(buffer, attributes, body.faces)
-    (plain,) = MATERIALS["materials"]
-    surface = plain["pbrMetallicRoughness"] | {"baseColorTexture": {"index": 0}}
-    linear, mipmaps, clamp = 9729, 9987, 33071
-    sampler = {"magFilter": linear, "minFilter": mipmaps, "wrapS": clamp, "wrapT": clamp}
-    buffer.write(path, {
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "name": "body"}],
-        "meshes": [{"primitives": [primitive], "name": "body"}],
-        "materials": [plain | {"pbrMetallicRoughness": surface}],
-        "textures": [{"sampler": 0, "source": 0}],
-        "samplers": [sampler],
-        "images": [{"bufferView": buffer.add_view(body.png), "mimeType": "image/png"}],
-    })  # fmt: skip
-
-
-def write_skinned_glb(path: Path, body: SkinnedBody) -> None:
+def write_skinned_glb(path: Path, body: SkinnedBody, texture: Texture | None = None) -> None:
     """Write a registered body with its skeleton: the mesh in the rest pose, bones as the person stood,
     landmarks as nodes of the bones that carry them, and a clip to the rest pose and back.
 
@@ -147,11 +117,12 @@ def write_skinned_glb(path: Path, body: SkinnedBody) -> None:
         "_FILLED": np.isnan(body.mesh.sigma_mm),
         "_PART": body.parts,
     }
-    primitive = _add_primitive(buffer, attributes, body.mesh.faces)
+    primitive = _add_primitive(buffer, attributes, body.mesh.faces, texture)
+    at = slice(None) if texture is None else texture.vertex
     joints = np.where(weights > 0.0, four, 0).astype("u1")
     primitive["attributes"] |= {
-        "JOINTS_0": buffer.add(joints, "VEC4"),
-        "WEIGHTS_0": buffer.add(weights, "VEC4"),
+        "JOINTS_0": buffer.add(joints[at], "VEC4"),
+        "WEIGHTS_0": buffer.add(weights[at], "VEC4"),
     }
     inverse = np.tile(np.eye(4, dtype="<f4"), (count, 1, 1))
     inverse[:, 3, :3] = -_y_up(body.rest_joints) / 1000.0  # matrices are stored by columns
@@ -173,7 +144,7 @@ def write_skinned_glb(path: Path, body: SkinnedBody) -> None:
         "meshes": [mesh],
         "skins": [skin],
         "animations": [_make_clip(buffer, body)],
-    } | MATERIALS)  # fmt: skip
+    } | _add_materials(buffer, texture))  # fmt: skip
 
 
 def _list_bones(body: SkinnedBody) -> list[dict[str, Any]]:
@@ -226,10 +197,35 @@ def _linear(colours: Bytes) -> NDArray[np.uint16]:
     return np.concatenate([table[colours], np.full((len(colours), 1), 65535, np.uint16)], axis=1)
 
 
+def _add_materials(buffer: _Buffer, texture: Texture | None) -> dict[str, Any]:
+    """The material of all primitives, and the image that it shows if there is one."""
+    surface: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": 0.9}
+    content: dict[str, Any] = {
+        "materials": [{"name": "body", "pbrMetallicRoughness": surface}],
+    }
+    if texture is None:
+        return content
+    surface["baseColorTexture"] = {"index": 0}
+    linear, mipmaps, clamp = 9729, 9987, 33071
+    sampler = {"magFilter": linear, "minFilter": mipmaps, "wrapS": clamp, "wrapT": clamp}
+    return content | {
+        "textures": [{"sampler": 0, "source": 0}],
+        "samplers": [sampler],
+        "images": [{"bufferView": buffer.add_view(texture.png), "mimeType": "image/png"}],
+    }
+
+
 def _add_primitive(
-    buffer: _Buffer, attributes: dict[str, NDArray[Any]], indices: Indices | None
+    buffer: _Buffer,
+    attributes: dict[str, NDArray[Any]],
+    indices: Indices | None,
+    texture: Texture | None,
 ) -> dict[str, Any]:
     """Add attributes, and triangles if there are any; returns the primitive that has them."""
+    if texture is not None:
+        attributes = {name: values[texture.vertex] for name, values in attributes.items()}
+        del attributes["COLOR_0"]
+        attributes["TEXCOORD_0"], indices = texture.uv, texture.faces
     numbers = {}
     for name, values in attributes.items():
         if name == "COLOR_0":
@@ -252,8 +248,7 @@ def _add_primitive(
 FORMAT = BodyFormat(
     write_glb,
     write_skinned=write_skinned_glb,
-    write_textured=write_textured_glb,
-    holds=frozenset({"mesh", "cloud", "colours", "normals", "filled", "regions"}),
+    holds=frozenset({"mesh", "cloud", "colours", "normals", "filled", "regions", "texture"}),
     unit="m",
     axes=("left", "up", "front"),
 )
