@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
+from processes import has_ended, wait_for
 
 SOON_S = 2.0
 BUSY = {
@@ -85,12 +86,7 @@ def test_the_work_ends_with_who_waits_for_it() -> None:
     child = child_of(process)
     process.kill()
     process.wait()
-    until = time.monotonic() + 10.0
-    while Path(f"/proc/{child}").exists() and time.monotonic() < until:
-        if Path(f"/proc/{child}/stat").read_text().split()[2] == "Z":
-            return  # ended, though nobody has looked yet
-        time.sleep(0.02)
-    assert not Path(f"/proc/{child}").exists()
+    wait_for(lambda: has_ended(child), 10.0)
 
 
 def test_the_exit_code_is_that_of_the_work() -> None:

@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -17,6 +16,7 @@ from pathlib import Path
 import cheap_job
 import pytest
 from cheap_batch import jobs_of, results, run_cheap
+from processes import told_of, wait_for
 
 from bodyscan.errors import BodyscanError
 from bodyscan.jobs.batch import run_batch, run_on_cluster, run_on_worker, stage_versions
@@ -41,8 +41,7 @@ def test_a_lost_worker_loses_nothing_and_nothing_is_done_twice(
             target=lambda: outcomes.extend(run_batch(jobs_of(scans, out), out, run))
         )
         batch.start()
-        running = _a_running_job(out)
-        os.kill(_parent(running), signal.SIGKILL)
+        os.kill(int(told_of(_a_running_job(out))[1]), signal.SIGKILL)
         batch.join(timeout=60)
         assert not batch.is_alive()
     assert [outcome.state for outcome in outcomes] == ["done"] * 5, outcomes
@@ -66,9 +65,7 @@ def test_a_scheduler_that_dies_sets_the_rest_aside_with_a_remedy(
     command = ("-m", "distributed.cli.dask_scheduler", "--port", "0", "--no-dashboard")
     file = tmp_path / "scheduler.json"
     scheduler = _start(*command, "--scheduler-file", str(file))
-    end = time.monotonic() + 30.0
-    while not file.exists() and time.monotonic() < end:
-        time.sleep(0.05)
+    wait_for(file.exists)
     address = json.loads(file.read_text())["address"]
     worker = _start("-m", "distributed.cli.dask_worker", address, "--nthreads", "1", "--no-nanny")
     try:
@@ -135,14 +132,5 @@ def test_without_dask_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> Non
 
 def _a_running_job(out: Path) -> int:
     """The process that holds the lock of a job in the middle of its work."""
-    end = time.monotonic() + 30.0
-    while time.monotonic() < end:
-        for making in out.glob("*/.making-scan-*"):
-            return int((making.parent / "lock").read_text().split()[1])
-        time.sleep(0.02)
-    raise AssertionError("no job began")
-
-
-def _parent(process: int) -> int:
-    with open(f"/proc/{process}/stat") as stream:
-        return int(stream.read().rpartition(")")[2].split()[1])
+    making = wait_for(lambda: list(out.glob("*/.making-scan-*")))
+    return int((making[0].parent / "lock").read_text().split()[1])

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from cheap_batch import batch_command, jobs_of, results, run_cheap
+from processes import has_ended, wait_for
 
 from bodyscan.errors import BadInput
 from bodyscan.files.atomic import lock_file
@@ -28,12 +29,12 @@ def test_ten_kills_leave_the_same_bytes_as_none(
     for number in range(10):
         process = subprocess.Popen(batch_command(scans, out), stdout=subprocess.DEVNULL)
         if number % 2:  # once something more is there, however busy the machine is
-            _wait_for(partial(_is_more_there, out, len(there), process))
+            wait_for(partial(_is_more_there, out, len(there), process))
         else:
             time.sleep(moments.uniform(0.2, 0.7))
         process.kill()
         process.wait()
-        _wait_for(lambda: not any(_is_held(job.folder / "lock") for job in jobs_of(scans, out)))
+        wait_for(lambda: not any(_is_held(job.folder / "lock") for job in jobs_of(scans, out)))
         now = _made(out)
         assert there.items() <= now.items(), "what was there was made again"
         there = now
@@ -50,11 +51,11 @@ def test_the_processes_of_a_killed_batch_end_with_it(
     scans = make_scans(a="sleep 60")
     process = subprocess.Popen(batch_command(scans, tmp_path / "out"), stdout=subprocess.DEVNULL)
     lock = tmp_path / "out" / "a" / "lock"
-    _wait_for(lambda: lock.exists() and "process" in lock.read_text())
+    wait_for(lambda: lock.exists() and "process" in lock.read_text())
     child = int(lock.read_text().split()[1])
     process.kill()
     process.wait()
-    _wait_for(lambda: not _is_alive(child))
+    wait_for(lambda: has_ended(child))
     with lock_file(tmp_path / "out" / "batch.lock", wait=False):  # kill let it go
         pass
 
@@ -65,7 +66,7 @@ def test_a_second_batch_on_the_same_folder_is_refused(
     scans = make_scans(a="sleep 1.5")
     out = tmp_path / "out"
     first = subprocess.Popen(batch_command(scans, out), stdout=subprocess.DEVNULL)
-    _wait_for(lambda: (out / "a" / "lock").exists())
+    wait_for(lambda: (out / "a" / "lock").exists())
     second = run_cheap(scans, out)
     assert second.code != 0
     assert f"another batch is running here (process {first.pid}" in second.errors
@@ -107,22 +108,6 @@ def _is_held(lock: Path) -> bool:
             return False
     except BadInput:
         return True
-
-
-def _wait_for(true: Callable[[], bool], seconds: float = 30.0) -> None:
-    end = time.monotonic() + seconds
-    while not true():
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.02)
-
-
-def _is_alive(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    with open(f"/proc/{process}/stat") as stream:
-        return stream.read().rpartition(")")[2].split()[0] != "Z"
 
 
 @pytest.fixture
