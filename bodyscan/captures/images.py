@@ -31,6 +31,7 @@ from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
 from bodyscan.progress import THREADS, map_threads
 from bodyscan.rig.pair import CameraSpec, Pair
 from bodyscan.stripes.decoding import images_by_kind
+from bodyscan.stripes.usable_pixels import SATURATED
 
 Raw = NDArray[np.uint8] | NDArray[np.uint16]
 
@@ -63,7 +64,7 @@ def read_image(
     raw = _read_raw(path, camera, where)
     image = whole_grey(convert_to_greys(raw, _find_scale([raw], camera, path, where)))
     if lit:
-        _refuse_black(image, path, where)
+        _refuse_blank(image, path, where)
     return image
 
 
@@ -80,7 +81,7 @@ def read_board_image(sequence: ImageSequence, pair: Pair) -> Bytes:
     code = pair.projector.model_copy(update={"crossing": None})
     images = read_sequence(sequence.without_crossing, pair.camera)
     made = whole_grey(code.lit_from(images_by_kind(code, images.coded)[0]))
-    _refuse_black(made, sequence.board_path, sequence.where)
+    _refuse_blank(made, sequence.board_path, sequence.where)
     return made
 
 
@@ -105,7 +106,7 @@ def read_sequence(
     singles = iter(whole)
     lit, dark = (next(singles) if path else None for path in (sequence.lit, sequence.dark))
     if lit is not None and sequence.lit is not None:
-        _refuse_black(whole_grey(lit), sequence.lit, sequence.where)
+        _refuse_blank(whole_grey(lit), sequence.lit, sequence.where)
     coded = whole[len(whole) - len(sequence.coded) :]
     return StripeImages(lit, dark, coded)
 
@@ -227,11 +228,16 @@ def measure_mosaic(image: Bytes) -> float:
     return float(np.ptp(means) / max(np.mean(means), 1.0))
 
 
-def _refuse_black(image: Bytes, path: Path, where: str) -> None:
+def _refuse_blank(image: Bytes, path: Path, where: str) -> None:
     brightest = int(image.max())
     if brightest <= 8:  # the sensor's offset and noise
         what = f"shows nothing: its brightest pixel is {brightest} of 255"
         remedy = "Check the exposure, the lens cap, and that the projector was on; then retake."
+        raise image_error(what, path, where, remedy=remedy)
+    darkest = int(image.min())
+    if darkest >= SATURATED:
+        what = f"shows nothing but white: its darkest pixel is {darkest} of 255"
+        remedy = "Shorten the exposure, close the iris or dim the projector; then retake."
         raise image_error(what, path, where, remedy=remedy)
 
 

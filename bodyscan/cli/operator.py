@@ -208,14 +208,14 @@ def measure(
     from bodyscan.report.measurement_table import (
         MEASUREMENTS,
         measurements_document,
-        refuse_landmarks,
+        require_formats,
         tables,
         write_landmarks,
         write_measurements,
     )
 
     path = out or result / MEASUREMENTS
-    refuse_landmarks(landmarks, named=named)
+    require_formats(path, landmarks, named=named)
     for file in filter(None, (path, landmarks)):
         refuse_own_file(file, result)
     stored, levels = load_scan(result), None if heights is None else heights_from(heights)

@@ -60,6 +60,14 @@ def translate_failure(error: Exception) -> BodyscanError | None:
     return None
 
 
+def require_suffix(path: Path, suffixes: Iterable[str], what: str) -> None:
+    """Raise BadInput if `what` is not written to files with the path's suffix: another kind of file,
+    such as captures.yaml, is never replaced by it."""
+    if path.suffix.lower() not in suffixes:
+        written = f"{what} cannot be written as {path.suffix!r}"
+        raise BadInput(written, where=str(path), remedy=f"choose from {', '.join(suffixes)}")
+
+
 def require_writable(folder: Path, *inputs: Path | None) -> None:
     """Raise BadInput or FailedWork if nothing can, or may, be written into `folder`, which need not
     exist.

@@ -14,6 +14,7 @@ from rich.table import Table
 
 from bodyscan.errors import BadInput
 from bodyscan.files.atomic import json_text, write_json, write_text
+from bodyscan.files.messages import require_suffix
 from bodyscan.fusion.storage import StoredScan
 from bodyscan.measurement.measurements import Measurements, measure
 from bodyscan.measurement.named import MIN_MEASURED, Measure, NamedMeasures, read_definitions
@@ -168,16 +169,13 @@ def landmarks_json(named: NamedMeasures, facts: Mapping[str, Any]) -> str:
 LANDMARK_FORMATS = {".csv": landmarks_csv, ".json": landmarks_json, ".lnd": landmarks_lnd}
 
 
-def refuse_landmarks(path: Path | None, *, named: bool) -> None:
-    """Raise BadInput if no landmarks are found, or none can be written with the path's suffix."""
-    if path is None:
-        return
-    if not named:
-        raise BadInput("--landmarks needs --named, which finds them", remedy="give both")
-    if path.suffix.lower() not in LANDMARK_FORMATS:
-        what = f"landmarks cannot be written as {path.suffix!r}"
-        remedy = f"choose from {', '.join(LANDMARK_FORMATS)}"
-        raise BadInput(what, where=str(path), remedy=remedy)
+def require_formats(path: Path, landmarks: Path | None, *, named: bool) -> None:
+    """Raise BadInput if measurements or landmarks are not written to such files, or none are found."""
+    require_suffix(path, (".json", ".csv"), "measurements")
+    if landmarks is not None:
+        require_suffix(landmarks, LANDMARK_FORMATS, "landmarks")
+        if not named:
+            raise BadInput("--landmarks needs --named, which finds them", remedy="give both")
 
 
 def write_landmarks(path: Path, named: NamedMeasures, facts: Mapping[str, Any]) -> None:

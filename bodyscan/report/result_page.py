@@ -6,6 +6,7 @@ from pathlib import Path
 
 from bodyscan.errors import BadInput
 from bodyscan.files.atomic import write_json, write_text
+from bodyscan.files.messages import require_suffix
 from bodyscan.fusion import storage as scans
 from bodyscan.registration import storage as calibrations
 from bodyscan.report.page import Page, render
@@ -29,7 +30,7 @@ def write_report(
     path = path or folder / calibrations.REPORT_NAME
     if path.is_dir():
         raise BadInput("is a folder", where=str(path), remedy="give --out the name of a file")
-    scans.refuse_own_file(path, folder)
+    require_suffix(path, (".html", ".htm"), "a report")
     page = build_page(result, other)
     write_text(path, render(page))
     # As beside an export, so that `bodyscan forget` knows whom it shows.

@@ -64,6 +64,8 @@ def describe_step(code: StripeCode, lit: Greys | None, dark: Greys | None, coded
         return ""
     levels = np.stack([lit, dark, *coded[: len(files)]])[:, ::4, ::4].astype(np.float32)
     contrast = np.ptp(levels, axis=0)
+    if not (contrast > 20.0).any():
+        return ""
     shares = (levels - levels.min(axis=0))[:, contrast > 20.0] / contrast[contrast > 20.0]
     is_lit, is_dark = (np.mean(x, axis=1) > 0.9 for x in (shares > 0.8, shares < 0.2))
     by_bit = files.reshape(2, -1).T.ravel() if len(files) % 2 == 0 else files
@@ -74,8 +76,9 @@ def describe_step(code: StripeCode, lit: Greys | None, dark: Greys | None, coded
     def agree(order: list[int], late: int) -> bool:
         """Whether patterns and inverses, taken from that many files later, complement one another."""
         at = np.argsort(order)[2:].reshape(2, -1) + late
-        first, second = shares[np.array(order)[at[:, (at < len(order)).all(axis=0)]]]
-        return bool(np.mean(np.abs(first + second - 1.0)) < 0.25)
+        at = at[:, (at < len(order)).all(axis=0)]
+        first, second = shares[np.array(order)[at]]
+        return at.size > 0 and bool(np.mean(np.abs(first + second - 1.0)) < 0.25)
 
     # Of sequences that are shown again and again, images that are lost in front are found at the end.
     for late in sorted(range(-len(files), len(files) + 1), key=lambda late: (abs(late), late < 0)):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import struct
 import zlib
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
@@ -195,17 +195,29 @@ def test_a_raw_bayer_image_is_told_from_a_grey_one() -> None:
     assert measure_mosaic(grey) > 0.3
 
 
-@pytest.mark.parametrize(("level", "good"), [(0, False), (8, False), (9, True)])
-def test_a_black_lit_image_is_refused(tmp_path: Path, level: int, good: bool) -> None:
-    image = np.zeros((HEIGHT, WIDTH), np.uint8)
+@pytest.mark.parametrize(
+    ("rest", "level", "said"),
+    [
+        (0, 0, "brightest pixel is 0"),
+        (0, 8, "brightest pixel is 8"),
+        (0, 9, ""),
+        (255, 253, ""),
+        (255, 254, "nothing but white: its darkest pixel is 254"),
+    ],
+)
+def test_a_black_or_white_lit_image_is_refused(
+    tmp_path: Path, rest: int, level: int, said: str
+) -> None:
+    image = np.full((HEIGHT, WIDTH), rest, np.uint8)
     image[3, 4] = level
     path = write(tmp_path / "lit.png", image)
-    assert read(path).max() == level  # any other image may be black
-    if good:
-        assert read(path, lit=True).max() == level
-    else:
-        with pytest.raises(ImageError, match=rf"shows nothing: .* is {level} of 255"):
-            read(path, lit=True)
+    assert read(path)[3, 4] == level  # any other image may be so
+    with (
+        pytest.raises(ImageError, match=f"shows {'.*' * bool(said)}{said}")
+        if said
+        else nullcontext()
+    ):
+        assert read(path, lit=True)[3, 4] == level
 
 
 def test_a_sequence_comes_in_order(tmp_path: Path) -> None:

@@ -275,6 +275,9 @@ def test_measurements_are_written_as_csv_by_their_suffix(tmp_path: Path) -> None
 def test_landmarks_that_cannot_be_written_are_refused_before_the_scan_is_read(
     tmp_path: Path,
 ) -> None:
-    for options, said in ((["--named"], "cannot be written as '.xyz'"), ([], "needs --named")):
-        refused = run("measure", tmp_path, *options, "--landmarks", "landmarks.xyz")
+    for options, name, said in (
+        (["--named"], "landmarks.xyz", "cannot be written as '.xyz'"),
+        ([], "landmarks.csv", "needs --named"),
+    ):
+        refused = run("measure", tmp_path, *options, "--landmarks", name)
         assert said in str(refused.exception)

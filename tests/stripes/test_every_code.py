@@ -232,6 +232,7 @@ def test_limits_do_not_change_s_within_them(code: Code, rising: bool) -> None:
     assert whole.beyond is None
 
 
+@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(("late", "by_bit"), [(1, False), (2, True), (-1, False), (-2, True)])
 def test_frames_out_of_step_are_counted(late: int, by_bit: bool) -> None:
     lit, dark, coded, _ = captured(GRAY, wavy(2.2), 60)
@@ -239,6 +240,8 @@ def test_frames_out_of_step_are_counted(late: int, by_bit: bool) -> None:
     moved = np.roll(np.stack([lit, dark, *coded[order]]), late, axis=0)
     with pytest.raises(DecodingFailed, match=f"out of step by {abs(late)}: each file holds"):
         decode_stripes(spec_of(GRAY, 60), moved[0], moved[1], moved[2:][np.argsort(order)])
+    with pytest.raises(DecodingFailed, match="lights only"):  # and is out of step by nothing
+        decode_stripes(spec_of(GRAY, 60), dark, dark, np.stack([dark] * 12))
     with pytest.raises(
         DecodingFailed, match="pattern of bit 2 and the pattern of bit 3 are the same"
     ):
