@@ -10,6 +10,7 @@ import numpy as np
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.calibration.boundary_points import BoundaryPoints
+from bodyscan.compiled import compiled
 from bodyscan.geometry.least_squares import EXACT, Block, Noise, minimize
 from bodyscan.geometry.light_planes import Axis, LightPlanes, SmoothSheets
 from bodyscan.geometry.linear_gaussian import invert_scaled
@@ -82,12 +83,11 @@ def fit_sheets(
     board_error_mm: how well the boards' poses are known (see `BoardErrors`). It changes only the
         covariance: the errors of a board's points are correlated, however many they are.
     """
-    _, jacobian = start.linearize_prior()
     solution = minimize(
         start,
         lambda sheets: _blocks(sheets, data),
         lambda sheets, step: sheets.retract(step),
-        unknowns=jacobian.shape[1],
+        unknowns=len(start.covariance),
         steps=max_steps,
         tolerance=0.01,  # sheets a tenth of a standard deviation away would be as good
         damping=1e-6,
@@ -150,12 +150,22 @@ def _board_covariance(
     errors, boards = data.board_errors, int(data.board.max()) + 1
     residual = np.einsum("ni,ni->n", by_point, errors.along_ray)
     effects = np.nan_to_num(residual * weights)[:, None] * errors.effects
-    products = np.einsum("ni,nj->ijn", jacobian, effects)
     cell, cells = fit * boards + data.board, len(covariance) * boards
-    gradient = [[np.bincount(cell, column, cells) for column in row] for row in products]
-    by_board = np.transpose(gradient, (2, 0, 1)).reshape(len(covariance), boards, -1, 3)
+    by_board = _sum_products(cell, cells, jacobian, effects)
+    by_board = by_board.reshape(len(covariance), boards, -1, 3)
     change = board_error_mm * covariance[:, None] @ by_board
     return np.einsum("fbik,fbjk->fij", change, change)
+
+
+@compiled
+def _sum_products(group: Indices, groups: int, left: Array, right: Array) -> Array:
+    """Sum left^T right over the rows (N, P) and (N, K) of each group (N,): (groups, P, K)."""
+    total = np.zeros((groups, left.shape[1], right.shape[1]))
+    for n in range(len(group)):
+        for i in range(left.shape[1]):
+            for k in range(right.shape[1]):
+                total[group[n], i, k] += left[n, i] * right[n, k]
+    return total
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,11 +233,7 @@ def _weighted_planes(
     """Fit planes (count, 4); also return the ratio of the two variances of the points within each
     (0 on a line), and the moments (count, 4, 4)."""
     homogeneous = np.column_stack([data.points, np.ones(len(data.points))])
-    moments = np.empty((count, 4, 4))
-    for i in range(4):
-        for j in range(i, 4):
-            products = weights * homogeneous[:, i] * homogeneous[:, j]
-            moments[:, i, j] = moments[:, j, i] = np.bincount(data.index, products, count)
+    moments = _sum_products(data.index, count, homogeneous, weights[:, None] * homogeneous)
     total = np.maximum(moments[:, 3, 3], 1e-300)
     mean = moments[:, :3, 3] / total[:, None]
     scatter = moments[:, :3, :3] / total[:, None, None] - mean[:, :, None] * mean[:, None, :]

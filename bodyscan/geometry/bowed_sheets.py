@@ -109,7 +109,6 @@ class BowedSheets(SmoothSheets):
         return Offset(
             y - np.sum(sheet.value * terms, axis=-1),
             by_point @ self.projector_from_camera.rotation,
-            -np.sum(sheet.slope * terms, axis=-1),
             reach,
             self._by_parameter(sheet.basis, terms, by_point) if parameters else None,
         )

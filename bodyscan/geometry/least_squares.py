@@ -22,6 +22,7 @@ from typing import Generic, Literal, TypeVar
 import numpy as np
 
 from bodyscan.arrays import Array, Indices, Mask
+from bodyscan.compiled import compiled
 from bodyscan.geometry.linear_gaussian import invert_scaled, multiply_transposed, solve_scaled
 from bodyscan.geometry.robust import cauchy_cost, cauchy_weights, robust_scale
 
@@ -336,7 +337,9 @@ def _equations(parts: Iterable[tuple[Block, Array, float]], unknowns: int) -> tu
             continue
         weighted = block.jacobian * (weight / (block.sigma * size) ** 2)[:, None]
         if block.runs is not None:
-            _add_runs(block, weighted, normal, gradient)
+            assert not isinstance(block.columns, slice)
+            rows = np.ascontiguousarray(block.jacobian), weighted, block.residuals
+            _add_runs(rows, block.runs, block.columns, normal, gradient)
             continue
         by = block.columns
         square = (by, by) if isinstance(by, slice) else np.ix_(by, by)
@@ -345,22 +348,26 @@ def _equations(parts: Iterable[tuple[Block, Array, float]], unknowns: int) -> tu
     return normal, gradient
 
 
-def _add_runs(block: Block, weighted: Array, normal: Array, gradient: Array) -> None:
-    """Add a block of several runs to the equations; weighted: its weighted Jacobian (N, C)."""
-    assert block.runs is not None
-    assert not isinstance(block.columns, slice)
-    transposed = _stack_runs(weighted, block.runs).transpose(0, 2, 1)
-    parts = transposed @ _stack_runs(block.jacobian, block.runs)
-    vectors = transposed @ _stack_runs(block.residuals[:, None], block.runs)
-    unknowns, columns = len(gradient), block.columns
-    flat_index = columns[:, :, None] * unknowns + columns[:, None, :]
-    normal += np.bincount(flat_index.ravel(), parts.ravel(), normal.size).reshape(normal.shape)
-    gradient += np.bincount(columns.ravel(), vectors.ravel(), unknowns)
-
-
-def _stack_runs(rows: Array, runs: Indices) -> Array:
-    """Consecutive runs of rows (N, C) as (G, M, C), short ones padded with zeros."""
-    longest = int(runs.max())
-    stacked = np.zeros((len(runs), longest, rows.shape[1]))
-    stacked[np.arange(longest) < runs[:, None]] = rows
-    return stacked
+@compiled
+def _add_runs(
+    rows: tuple[Array, Array, Array],
+    runs: Indices,
+    columns: Indices,
+    normal: Array,
+    gradient: Array,
+) -> None:
+    """Add a block of several runs to the equations; rows: Jacobian, weighted Jacobian, residuals."""
+    (jacobian, weighted, residuals), first, size = rows, 0, columns.shape[1]
+    square = np.zeros((size, size))
+    for run in range(len(runs)):
+        by = columns[run]
+        for n in range(first, first + runs[run]):
+            for i in range(size):
+                gradient[by[i]] += weighted[n, i] * residuals[n]
+                for j in range(i + 1):
+                    square[i, j] += weighted[n, i] * jacobian[n, j]
+        first += runs[run]
+        for i in range(size):
+            for j in range(size):
+                normal[by[i], by[j]] += square[max(i, j), min(i, j)]
+        square[:] = 0.0

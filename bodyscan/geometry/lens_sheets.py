@@ -21,9 +21,8 @@ import numpy as np
 
 from bodyscan.arrays import Array
 from bodyscan.compiled import compiled
-from bodyscan.geometry.lenses.opencv import Rational
 from bodyscan.geometry.light_planes import Axis, Offset, SmoothSheets
-from bodyscan.geometry.transforms import RigidTransform, cross_matrix, twist_jacobian
+from bodyscan.geometry.transforms import RigidTransform, cross_matrix
 
 FRAME, SCALE = 6, 2
 CENTRE = FRAME + 1
@@ -109,34 +108,23 @@ class LensSheets(SmoothSheets):
         return self.offset(points, np.zeros(points.shape[:-1])).value
 
     def offset(self, points: Array, sheet: Array, *, parameters: bool = False) -> Offset:
-        in_projector = self.projector_from_camera.apply(points)
-        reach = in_projector[..., 2]
-        ideal = in_projector[..., :2] / reach[..., None]
-        (focal, centre), terms = self.parameters[:SCALE], self.parameters[SCALE:]
-        lens = Rational().with_coefficients(np.pad(terms, (0, len(LENS_SIGMAS) - len(terms))))
-        across, by_ideal = lens.distort(ideal)[..., 1], focal * lens.by_point(ideal)[..., 1, :]
-        by_z = -np.sum(by_ideal * ideal, axis=-1, keepdims=True)
-        by_point = np.concatenate([by_ideal, by_z], axis=-1) / reach[..., None]
-        by_parameter = None
-        if parameters:
-            by_motion = by_point[..., None, :] @ twist_jacobian(in_projector)
-            scale = np.stack([across, np.ones_like(across)], axis=-1)
-            by_lens = focal * lens.by_coefficients(ideal)[..., 1, : len(terms)]
-            by_parameter = np.concatenate([by_motion[..., 0, :], scale, by_lens], axis=-1)
-        return Offset(
-            focal * across + centre - sheet,
-            by_point @ self.projector_from_camera.rotation,
-            np.full(across.shape, -1.0),
-            reach,
-            by_parameter,
-        )
+        found = np.empty((*points.shape[:-1], 5 + len(self.covariance) * parameters))
+        flat = np.ascontiguousarray(points.reshape(-1, 3), np.float64)
+        _measure_points(*self._compiled_parameters, flat, found.reshape(-1, found.shape[-1]))
+        by_parameter = found[..., 5:] if parameters else None
+        return Offset(found[..., 0] - sheet, found[..., 1:4], found[..., 4], by_parameter)
+
+    @property
+    def _compiled_parameters(self) -> tuple[Array, Array]:
+        """The frame and the lens of compiled functions."""
+        lens = np.zeros(SCALE + len(LENS_SIGMAS))
+        lens[: len(self.parameters)] = self.parameters
+        return np.ascontiguousarray(self.projector_from_camera.matrix[:3]), lens
 
     def _intersect(self, rays: Array, s: Array, found: Array) -> None:
         covariance = self.covariance[np.triu_indices(len(self.covariance))]
-        lens = np.zeros(SCALE + len(LENS_SIGMAS))
-        lens[: len(self.parameters)] = self.parameters
-        frame = np.ascontiguousarray(self.projector_from_camera.matrix[:3])
-        measure_rays(frame, lens, covariance, self.distance_mm, self.stripes, rays, s, found)
+        camera = *self._compiled_parameters, covariance, self.distance_mm, self.stripes
+        measure_rays(*camera, rays, s, found)
 
 
 def _frame_and_scale(above: Array, below: Array, x: float) -> tuple[RigidTransform, Array]:
@@ -193,6 +181,21 @@ def measure_rays(
             _by_freedom(lens, point, image, jacobian)
             last, variance = point, variance_along(covariance, jacobian)
         found[0, n], found[1, n], found[2, n] = depth, per_stripe, variance * per_stripe**2
+
+
+@compiled
+def _measure_points(frame: Array, lens: Array, points: Array, found: Array) -> None:
+    """Fill `found` (N, 5 or 5 + P) with s, its derivatives by the point, and the reach, of points
+    (N, 3), and the derivatives by the freedoms."""
+    for n in range(len(points)):
+        point = _to_projector(frame, points[n, 0], points[n, 1], points[n, 2])
+        image = _distort(lens, point[0], point[1])
+        (x, y, reach), (slide, by_x, by_y), row = point, image, found[n]
+        row[0], row[4], by_z = lens[0] * slide + lens[1], reach, -(by_x * x + by_y * y)
+        for k in range(3):
+            row[1 + k] = (by_x * frame[0, k] + by_y * frame[1, k] + by_z * frame[2, k]) / reach
+        if len(row) > 5:
+            _by_freedom(lens, point, image, row[5:])
 
 
 @compiled

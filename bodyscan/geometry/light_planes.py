@@ -153,14 +153,12 @@ class Offset:
 
     value: (...).
     by_point: (..., 3), derivatives by the point, camera frame.
-    by_stripe: (...), derivatives by s.
     reach: (...), the points' distance from the projector along its axis, mm.
     by_parameter: (..., P), only when requested.
     """
 
     value: Array
     by_point: Array
-    by_stripe: Array
     reach: Array
     by_parameter: Array | None = None
 

@@ -35,11 +35,13 @@ def by_offset(
     model: SmoothSheets, rays: Array, s: Array, depth: Array
 ) -> tuple[Array, Array, Array]:
     """Depths (N,) after one more step of Newton's method, dz/ds and variance, all from the offset."""
-    offset = model.offset(rays * depth[:, None], model.evaluate(s), parameters=True)
+    points = rays * depth[:, None]
+    offset = model.offset(points, model.evaluate(s), parameters=True)
+    before, after = (model.offset(points, model.evaluate(s + by)).value for by in (-1e-3, 1e-3))
     along, jacobian = np.sum(offset.by_point * rays, axis=-1), offset.by_parameter
     assert jacobian is not None
     variance = np.sum((jacobian @ model.covariance) * jacobian, axis=-1)
-    return depth - offset.value / along, -offset.by_stripe / along, variance / along**2
+    return depth - offset.value / along, -500.0 * (after - before) / along, variance / along**2
 
 
 Sheets = TypeVar("Sheets", bound=SmoothSheets)
