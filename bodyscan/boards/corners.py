@@ -124,12 +124,12 @@ def _patches(
     offset = np.stack(np.meshgrid(across, across), axis=-1).reshape(-1, 2)
     pixels = np.rint(start)[:, None] + offset.astype(np.float64)
     height, width = image.shape
-    inside = np.all((pixels >= 0) & (pixels <= [width - 1, height - 1]), axis=-1)
-    column, row = np.clip(pixels, 0, [width - 1, height - 1]).astype(np.intp).transpose(2, 0, 1)
+    column, row = pixels.astype(np.intp).transpose(2, 0, 1)
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     from_corner = pixels - start[:, None]
-    squares = np.einsum("nij,npj->npi", np.linalg.pinv(along), from_corner)
-    weight = inside & np.all(np.abs(squares) < WINDOW_SQUARES, axis=-1)
-    weight &= np.sum(from_corner**2, axis=-1) <= radius_px**2
+    x, y = np.einsum("nij,npj->inp", np.linalg.pinv(along), from_corner)
+    weight = inside & (np.maximum(np.abs(x), np.abs(y)) < WINDOW_SQUARES)
+    weight &= np.einsum("npi,npi->np", from_corner, from_corner) <= radius_px**2
     # Along the diagonal the product of distances from the edges' normals is negative.
     rims = np.full((len(start), 3), np.inf)
     rims[:, 2] = np.where(bright_diagonal, -1.0, 1.0)
@@ -137,12 +137,12 @@ def _patches(
         # Distances in px from the edges along y and x through the corner, and where markers begin.
         lengths = np.abs(np.linalg.det(along))[:, None] / np.linalg.norm(along, axis=1)[:, ::-1]
         rims[:, :2] = marker_gap * lengths[:, ::-1]
-        from_edge = np.abs(squares) * lengths[:, None]
         # Clear of a marker's blurred rim, but never narrower than a pixel and a half.
-        clear = np.maximum(marker_gap * lengths - 1.4, 1.5)
-        white = (squares.prod(axis=-1) > 0) == bright_diagonal[:, None]
-        weight &= np.any(from_edge < clear[:, None], axis=-1) | ~white
-    return _Patches(pixels, image[row, column].astype(float), weight.astype(float), rims)
+        clear = (np.maximum(marker_gap * lengths - 1.4, 1.5) / lengths).T[:, :, None]
+        white = (x * y > 0) == bright_diagonal[:, None]
+        weight &= (np.abs(x) < clear[0]) | (np.abs(y) < clear[1]) | ~white
+    grey = image[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
+    return _Patches(pixels, grey.astype(float), weight.astype(float), rims)
 
 
 @dataclass(frozen=True, eq=False)

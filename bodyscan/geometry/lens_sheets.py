@@ -64,11 +64,9 @@ class LensSheets(SmoothSheets):
 
     def with_lens(self, terms: int) -> LensSheets:
         """The same projector with that many of k1, k2, p1, p2, ...; new ones start at 0."""
-        parameters = np.zeros(SCALE + terms)
-        kept = min(len(parameters), len(self.parameters))
-        parameters[:kept] = self.parameters[:kept]
-        size = FRAME + len(parameters)
-        return replace(self, parameters=parameters, covariance=np.full((size, size), np.nan))
+        parameters = np.append(self.parameters, np.zeros(len(LENS_SIGMAS)))[: SCALE + terms]
+        covariance = np.full((FRAME + SCALE + terms,) * 2, np.nan)
+        return replace(self, parameters=parameters, covariance=covariance)
 
     def rotate_to(self, centre: float) -> LensSheets:
         """Rotate about the line along its stripes so that its axis passes through s = centre."""
@@ -117,8 +115,7 @@ class LensSheets(SmoothSheets):
     @property
     def _compiled_parameters(self) -> tuple[Array, Array]:
         """The frame and the lens of compiled functions."""
-        lens = np.zeros(SCALE + len(LENS_SIGMAS))
-        lens[: len(self.parameters)] = self.parameters
+        lens = np.append(self.parameters, np.zeros(len(LENS_SIGMAS)))  # terms it lacks are 0
         return np.ascontiguousarray(self.projector_from_camera.matrix[:3]), lens
 
     def _intersect(self, rays: Array, s: Array, found: Array) -> None:
