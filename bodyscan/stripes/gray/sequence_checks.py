@@ -146,8 +146,8 @@ def _find_repeated(images: ScanLines, good: Mask) -> str:
 
 
 def replace_flashed(images: ScanLines) -> tuple[ScanLines, str]:
-    """Make frames that some other light brightened or darkened from their inverses, or inverses from
-    their patterns; returns the images and which frames those are, "" if none.
+    """Make frames that some other light reached from their inverses, or inverses from their patterns;
+    returns the images and which frames those are, "" if none.
 
     What is added to one frame of the two moves their boundaries, by as many hundredths of a pixel as of
     the contrast where light blurs by one. What a projector's optics do to fine stripes is done to both.
@@ -169,12 +169,12 @@ def replace_flashed(images: ScanLines) -> tuple[ScanLines, str]:
             name: (stack[bit][some][bright] - black) / contrast for name, stack in frames.items()
         }
         added = float(np.median(shares["pattern"] + shares["inverse"] - 1.0))
-        own = {name: abs(_measure_offset(share)) for name, share in shares.items()}
-        sound, flashed = sorted(own, key=lambda name: own[name])
-        if abs(added) > 0.05 and own[sound] < 0.25 * abs(added) < own[flashed]:
+        light = {name: abs(_measure_added_light(share)) for name, share in shares.items()}
+        sound, flashed = sorted(light, key=lambda name: light[name])
+        if abs(added) > 0.05 and light[sound] < 0.25 * abs(added) < light[flashed]:
             stack = frames[flashed] = frames[flashed].copy()
-            light = images.lit.astype(np.float32) + images.dark - frames[sound][bit]
-            stack[bit] = np.clip(light, 0.0, 255.0).astype(stack.dtype)
+            grey = images.lit.astype(np.float32) + images.dark - frames[sound][bit]
+            stack[bit] = np.clip(grey, 0.0, 255.0).astype(stack.dtype)
             found.append(
                 f"the {flashed} of bit {bit} is {abs(added):.0%} of the contrast "
                 f"{'brighter' if added > 0.0 else 'darker'} than lit and dark image allow (a flash, a "
@@ -183,11 +183,17 @@ def replace_flashed(images: ScanLines) -> tuple[ScanLines, str]:
     return replace(images, patterns=frames["pattern"], inverses=frames["inverse"]), "; ".join(found)
 
 
-def _measure_offset(share: Floats) -> float:
-    """By how much what is white or black in a frame (N,) is brighter than 1 or 0; blur cancels out."""
+def _measure_added_light(share: Floats) -> float:
+    """Light that both what is white and what is black in a frame (N,) has beyond 1 and 0: the lesser.
+
+    A projector or an exposure that flickers changes what is white alone; blur makes one brighter and
+    the other darker: both give 0.
+    """
     white = share > 0.5
-    parts = [(share[white] - 1.0), share[~white]]
-    return float(np.mean([np.median(part) for part in parts if part.size > 0.05 * share.size]))
+    parts = [part for part in (share[white] - 1.0, share[~white]) if part.size > 0.05 * share.size]
+    offsets = np.array([np.median(part) for part in parts])
+    same_sign = bool(np.all(offsets > 0.0) or np.all(offsets < 0.0))
+    return float(offsets[np.argmin(np.abs(offsets))]) if same_sign else 0.0
 
 
 def _find_clear(patterns: Greys, inverses: Greys, variance: Floats) -> Mask:
