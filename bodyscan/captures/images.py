@@ -113,28 +113,42 @@ def read_sequence(
 
 def read_colours(sequence: ImageSequence, camera: CameraSpec) -> Bytes | None:
     """Read the lit image of a colour camera, (H, W, 3) uint8, red, green, blue; of several exposures
-    the shortest.
+    the shortest. Where none was taken it is made from patterns and their inverses.
 
-    None if no lit image was taken, if it is grey, and for a projector of one colour: where the rig
-    file names a channel, and another has less than a quarter of its light (filters let through up to
-    a fifth), the image shows the projector's colour and not the subject's.
+    None if there are neither, if images are grey (files of three equal channels too), and for a
+    projector of one colour: where the rig file names a channel, and another has less than a quarter
+    of its light (filters let through up to a fifth), the image shows the projector's colour and not
+    the subject's.
 
     Raises ImageError as `read_image`.
     """
-    path = sequence.lit
-    if path is None or not read_header(path).colour:
+    paths = [sequence.lit] if sequence.lit else _list_complements(sequence.without_crossing)
+    if not paths or not read_header(paths[0]).colour:
         return None
-    raw = _decode(_read_file(path, camera, sequence.where), cv2.IMREAD_COLOR_RGB)
-    if raw is None or raw.shape != (camera.height, camera.width, 3):
-        raise image_error("cannot be decoded", path, sequence.where)
+    images = []
+    for path in paths:
+        found = _decode(_read_file(path, camera, sequence.where), cv2.IMREAD_COLOR_RGB)
+        if found is None or found.shape != (camera.height, camera.width, 3):
+            raise image_error("cannot be decoded", path, sequence.where)
+        images.append(found)
+    path, raw = paths[0], np.max(images, axis=0)
     # The lit image is the brightest of its sequence, so that it shows the scale by itself.
     colours = whole_grey(convert_to_greys(raw, _find_scale([raw], camera, path, sequence.where)))
+    if (colours == colours[..., :1]).all():
+        return None
     if camera.channel_number is not None:
         light = colours[..., camera.channel_number]
         levels = np.median(colours[light > light.mean()], axis=0)
         if levels.min() < 0.25 * levels[camera.channel_number]:
             return None
     return colours
+
+
+def _list_complements(sequence: ImageSequence) -> list[Path]:
+    """Two patterns and their inverses, in one of which each pixel is lit: edges of two bits of a Gray
+    code do not coincide. Empty if no inverses were taken."""
+    patterns = [path for path in sequence.coded if path not in sequence.inverses]
+    return [*patterns[:2], *sequence.inverses[:2]] if sequence.inverses else []
 
 
 def _read_stack(sequence: ImageSequence, camera: CameraSpec, crop: Crop, workers: int) -> Greys:

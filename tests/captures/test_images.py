@@ -88,6 +88,7 @@ GREEN = np.dstack([NOISE // 6, NOISE, NOISE // 8])
         *((suffix, RGB, "grey", RGB) for suffix in (".png", ".tif", ".bmp")),
         *((suffix, NOISE, "grey", None) for suffix in (".png", ".tif", ".bmp", ".jpg")),
         (".png", RGB.astype(np.uint16) * 256 + 17, "grey", RGB),
+        (".png", np.dstack([NOISE] * 3), "grey", None),
         (".png", RGB, "green", RGB),
         (
             ".png",
@@ -109,6 +110,17 @@ def test_the_lit_image_is_read_in_colour_where_it_has_any(
     if found is not None and expected is not None:
         assert np.abs(found.astype(int) - expected).max() <= int(lit.dtype == np.uint16)
     assert read_colours(replace(sequence, lit=None), camera) is None
+
+
+def test_the_lit_image_in_colour_is_made_where_none_was_taken(tmp_path: Path) -> None:
+    """Each pixel as bright as in the brighter of a pattern and its inverse."""
+    sequence = replace(first_sequence(tmp_path), lit=None)
+    for path in sequence.coded:
+        grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        write(path, np.dstack([grey // 4, grey // 2, grey]))
+    found = read_colours(sequence, CAMERA)
+    assert found is not None
+    np.testing.assert_array_equal(found, np.broadcast_to([200, 100, 50], found.shape))
 
 
 @pytest.mark.parametrize(
