@@ -45,12 +45,14 @@ class Contradictions:
     compared, against: how often points of the column's pair were compared with the row's surface,
         and contradicted by it, (P, P).
     by_noise: share of contradictions that both points' sigmas predict for a single surface.
+    heights_mm: between which four of five contradictions are.
     """
 
     pairs: tuple[str, ...]
     compared: Counts
     against: Counts
     by_noise: float = 0.0
+    heights_mm: tuple[float, float] = (0.0, 0.0)
 
     @staticmethod
     def count(
@@ -60,14 +62,22 @@ class Contradictions:
         surfaces: Sequence[SmoothSurface],
         agreement_mm: float,
     ) -> Contradictions:
-        """Count what each pair's surface shows of all samples; consistency: one for each pair."""
+        """Count what each pair's surface shows of all samples; consistency: one for each pair.
+
+        Hair and dark cloth, darker than a third of most, are left out: strands and hems move.
+        """
+        grey = samples.colours.max(axis=1)
+        bright = grey >= np.median(grey) / 3.0
 
         def count_by_pair(index: Numbers) -> Counts:
-            pair = np.searchsorted(samples.starts, index, side="right") - 1
+            pair = np.searchsorted(samples.starts, index[bright[index]], side="right") - 1
             return np.bincount(pair, minlength=len(pairs))
 
         against = np.array([count_by_pair(one.against_index) for one in consistency])
         agreed = np.array([count_by_pair(one.index) for one in consistency])
+        index = np.concatenate([one.against_index for one in consistency])
+        heights = samples.points[index[bright[index]], 2]
+        low, high = np.percentile(heights, (10, 90)) if len(heights) else (0.0, 0.0)
         sigma = np.concatenate(
             [
                 np.hypot(samples.sigma_mm[index], surface.sigma_mm[at])
@@ -77,7 +87,8 @@ class Contradictions:
         )
         beyond = erfc(agreement_mm / (np.sqrt(2.0) * np.maximum(sigma, 1e-6)))
         by_noise = float(beyond.mean()) if len(beyond) else 0.0
-        return Contradictions(tuple(pairs), agreed + against, against, by_noise)
+        ends = float(low), float(high)
+        return Contradictions(tuple(pairs), agreed + against, against, by_noise, ends)
 
     @property
     def share(self) -> float:

@@ -15,7 +15,7 @@ from typing import ClassVar, TypeVar
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter
+from scipy.ndimage import label, maximum_filter
 
 from bodyscan.arrays import Array, Floats, Indices, Mask
 from bodyscan.compiled import compiled
@@ -258,9 +258,10 @@ def find_gaps(
 ) -> Mask:
     """Find the blocks of stride x stride pixels in a window that look through a gap of the body.
 
-    In such a block nothing was measured, its middle shows only filled faces, and there is measured
-    surface that is not dark to the left and to the right: between the legs, between arm and trunk. A
-    filled face in front of or behind measured surface is a part in shadow instead.
+    In such a block nothing was measured, its middle shows only filled faces, and the nearest measured
+    surfaces to the left and to the right are not dark, and turn towards it: between the legs, between
+    arm and trunk. A filled face in front of or behind measured surface is a part in shadow instead,
+    and so is one between surfaces that turn away from each other, as round a thigh.
     """
     rows, columns = (stride * np.arange(some.start, some.stop) + stride // 2 for some in blocks)
     vertices = _project_to_blocks(surface.vertices, image, rig_from_camera, stride, blocks)
@@ -269,14 +270,29 @@ def find_gaps(
     filled = np.zeros(hit.shape, bool)
     filled[hit] = surface.filled[first[hit]]
     body = hit & ~filled
-    body[hit] &= ~surface.dark[first[hit]]
+    bright, rightward = np.zeros(hit.shape, bool), np.zeros(hit.shape)
+    bright[body] = ~surface.dark[first[body]]
+    corners = surface.vertices[surface.faces[first[body]]].astype(np.float64)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    rightward[body] = normals @ rig_from_camera.rotation[:, 0]
+    # A coarse face at a rim has any direction: the mean over 15 mm.
+    rightward = cv2.blur(rightward, (5, 5)) / np.maximum(cv2.blur(body.astype(float), (5, 5)), 0.01)
     near = np.ones((2 * stride + 1, 2 * stride + 1), np.uint8)
     measured = np.pad(cv2.dilate((image.open_depth > 0).astype(np.uint8), near), stride)
     reach = int(200.0 / RAY_SPACING_MM)  # the widest gap
     open_ = filled & (measured[np.ix_(rows + stride, columns + stride)] == 0)
-    open_ &= _has_left_neighbour(body, reach) & _has_left_neighbour(body[:, ::-1], reach)[:, ::-1]
+    left, turn_left = _find_left_neighbour(body, bright, rightward, reach)
+    right, turn_right = (
+        part[:, ::-1]
+        for part in _find_left_neighbour(*(p[:, ::-1] for p in (body, bright, rightward)), reach)
+    )
+    open_ &= left & right & (turn_left - turn_right > -0.1)  # of flat ones 0, round a finger -0.2
     real = nearest_faces(vertices, surface.faces[~surface.filled], len(rows), len(columns))
-    return open_ & (real < 0)
+    # Between two fingers a patch of shadow shows, and not what is behind the body: less than 200 mm2.
+    number, count = label(open_ & (real < 0), np.ones((3, 3)))
+    large = np.bincount(number.ravel(), minlength=count + 1) * RAY_SPACING_MM**2 > 200.0
+    return np.asarray(large[number] & (number > 0))
 
 
 def _project_to_blocks(
@@ -295,11 +311,14 @@ def _project_to_blocks(
     return np.concatenate([pixels - first, points[:, 2:]], axis=1).astype(np.float32)
 
 
-def _has_left_neighbour(mask: Mask, reach: int) -> Mask:
-    """Whether there is a true pixel at most `reach` to the left in the same row."""
-    columns = np.arange(mask.shape[1])
-    latest = np.maximum.accumulate(np.where(mask, columns, -reach - 1), axis=1)
-    return columns - latest <= reach
+def _find_left_neighbour(body: Mask, bright: Mask, values: Array, reach: int) -> tuple[Mask, Array]:
+    """Whether the nearest pixel of the body to the left in the same row is bright and at most
+    `reach` away, and its value."""
+    columns = np.arange(body.shape[1])
+    latest = np.maximum.accumulate(np.where(body, columns, -reach - 1), axis=1)
+    at = latest.clip(0)
+    near = (columns - latest <= reach) & np.take_along_axis(bright, at, axis=1)
+    return near, np.take_along_axis(values, at, axis=1)
 
 
 @dataclass(frozen=True, eq=False)

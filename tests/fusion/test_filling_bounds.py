@@ -65,7 +65,7 @@ def plates(*parts: tuple[float, float, float, bool]) -> PartialSurface:
         corners = [(left, -1.0), (right, -1.0), (right, 21.0), (left, 21.0)]
         rays = [((u - 30.0) / 100.0, (v - 10.0) / 100.0, 1.0) for u, v in corners]
         vertices += [depth * np.array(ray) for ray in rays]
-        faces += [[4 * k, 4 * k + 1, 4 * k + 2], [4 * k, 4 * k + 2, 4 * k + 3]]
+        faces += [[4 * k, 4 * k + 2, 4 * k + 1], [4 * k, 4 * k + 3, 4 * k + 2]]
         filled += [fill, fill]
     nothing = np.zeros(len(faces), bool)
     return PartialSurface(np.array(vertices), np.array(faces), np.array(filled), nothing)
@@ -105,6 +105,26 @@ def test_beside_dark_cloth_a_lack_of_points_is_no_gap(side: int) -> None:
     guess = plates(*BETWEEN)
     dark = replace(guess, dark=np.arange(6) // 2 == side)
     assert open_columns(dark, (COLUMN < 21) | (COLUMN > 39)) == []
+    # Neither is it with a bright hand on the cloth's far side: five litres of pelvis were cut out.
+    hand, cloth = (0.5, 9.5, 1000.0, False), (9.5, 20.5, 1000.0, False)
+    dark = replace(plates(hand, cloth, *BETWEEN[1:]), dark=np.arange(8) // 2 == 1)
+    assert open_columns(dark, (COLUMN < 21) | (COLUMN > 39)) == []
+
+
+@pytest.mark.parametrize(("rise_mm", "opens"), [(-3.0, True), (3.0, False)])
+def test_a_shadow_on_a_thigh_is_no_gap(rise_mm: float, opens: bool) -> None:
+    """Round a thigh surfaces turn away from each other; a hand's shadow bored a tunnel through it."""
+    guess = plates(*BETWEEN)
+    vertices = guess.vertices.copy()
+    vertices[[1, 2, 8, 11], 2] -= 10.0 * rise_mm  # the rims of the gap, towards the camera
+    found = open_columns(replace(guess, vertices=vertices), (COLUMN < 21) | (COLUMN > 39))
+    assert bool(found) == opens
+
+
+def test_what_shows_between_two_fingers_is_no_gap() -> None:
+    bars = (0.5, 25.5, 1000.0, False), (25.5, 30.5, 1000.0, True), (30.5, 59.5, 1000.0, False)
+    measured, window = (COLUMN < 24) | (COLUMN > 32), np.s_[0:4, 0:60]
+    assert not find_gaps(plates(*bars), shown(measured), HERE, 1, window).any()
 
 
 def test_what_was_measured_on_one_side_only_leaves_no_gap() -> None:

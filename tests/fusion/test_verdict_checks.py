@@ -206,7 +206,12 @@ def test_the_outlier_is_the_pole_or_pair_that_contradicts_the_others(
 
 def test_contradictions_are_counted_by_pair() -> None:
     """Samples 0 to 9 are the first pair's, 10 to 19 the second's."""
-    samples: Any = SimpleNamespace(starts=np.array([0, 10, 20]), sigma_mm=np.full(20, 0.3))
+    samples: Any = SimpleNamespace(
+        starts=np.array([0, 10, 20]),
+        sigma_mm=np.full(20, 0.3),
+        points=np.outer(np.arange(20.0), [0.0, 0.0, 10.0]),
+        colours=np.full((20, 1), 90, np.uint8),
+    )
     surface: Any = SimpleNamespace(sigma_mm=np.full(50, 0.4))
 
     def compared(agreed: list[int], against: list[int]) -> Any:
@@ -217,6 +222,11 @@ def test_contradictions_are_counted_by_pair() -> None:
     found = Contradictions.count(["a", "b"], both, samples, [surface, surface], 1.5)
     assert found.compared.tolist() == [[0, 4], [5, 0]]
     assert found.against.tolist() == [[0, 1], [3, 0]]
+    assert found.heights_mm == pytest.approx((13.0, 86.0))
+    # Hair and dark cloth do not count.
+    samples.colours[[1, 12]] = 20
+    fewer = Contradictions.count(["a", "b"], both, samples, [surface, surface], 1.5)
+    assert (fewer.compared.tolist(), fewer.against.tolist()) == ([[0, 3], [4, 0]], [[0, 1], [2, 0]])
     # Both points' sigmas are 0.5 mm: noise exceeds three of them once in 370 times.
     assert found.by_noise == pytest.approx(0.0027, rel=1e-2)
     assert found.beyond_noise == pytest.approx(4.0 / 9.0 - 0.0027, abs=1e-4)

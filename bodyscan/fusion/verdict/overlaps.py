@@ -203,8 +203,9 @@ def check_contradictions(scan: ScanEvidence) -> Iterator[Finding]:
     yield Finding(
         "repeat" if found.beyond_noise > 0.02 else "usable",
         f"{f'{outlier} and the others' if outlier else 'the pairs'} disagree: at "
-        f"{found.share:.1%} of the pairs' common points one sees no surface where the other does. "
-        f"Possible causes: {scan.images.compression}"
+        f"{found.share:.1%} of the pairs' common points one sees no surface where the other does, "
+        f"mostly from {found.heights_mm[0]:.0f} to {found.heights_mm[1]:.0f} mm. "
+        f"Possible causes: {scan.images.compression}an arm or the head moved; "
         + (
             f"the person turned or stepped aside meanwhile; {outlier} was moved since the calibration, "
             "or is from another scan; "
