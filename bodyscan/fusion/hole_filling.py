@@ -283,11 +283,10 @@ def find_gaps(
     reach = int(200.0 / RAY_SPACING_MM)  # the widest gap
     open_ = filled & (measured[np.ix_(rows + stride, columns + stride)] == 0)
     left, turn_left = _find_left_neighbour(body, bright, rightward, reach)
-    right, turn_right = (
-        part[:, ::-1]
-        for part in _find_left_neighbour(*(p[:, ::-1] for p in (body, bright, rightward)), reach)
-    )
-    open_ &= left & right & (turn_left - turn_right > -0.1)  # of flat ones 0, round a finger -0.2
+    mirrored = body[:, ::-1], bright[:, ::-1], rightward[:, ::-1]
+    right, turn_right = _find_left_neighbour(*mirrored, reach)
+    # Of flat surfaces the difference is 0, round a finger -0.2.
+    open_ &= left & right[:, ::-1] & (turn_left - turn_right[:, ::-1] > -0.1)
     real = nearest_faces(vertices, surface.faces[~surface.filled], len(rows), len(columns))
     # Between two fingers a patch of shadow shows, and not what is behind the body: less than 200 mm2.
     number, count = label(open_ & (real < 0), np.ones((3, 3)))
