@@ -18,7 +18,7 @@ from bodyscan.arrays import Array
 from bodyscan.boards.view import ViewKey
 from bodyscan.calibration.board_views import BoardShape, LocatedView, PlanarView, apply_shape
 from bodyscan.calibration.boundary_points import BoardBoundaries, StripedView
-from bodyscan.calibration.camera import CORNERS, LensTrial, locate_board
+from bodyscan.calibration.camera import CORNERS, LensTrial, locate_board, locate_boards
 from bodyscan.calibration.pair import LocatedPair, PairCalibration
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform
@@ -89,13 +89,18 @@ class RigSolution:
     motions: Mapping[ViewKey, Array] = field(default_factory=dict)
 
     def residuals(self, name: str) -> Array:
-        """Projected less seen corners (N, 2) px of a pair's views."""
+        """Projected less seen corners (N, 2) px of a pair's views; of each view by itself where boards
+        moved between the pictures of one shot, which the sigmas of poses contain."""
         camera, camera_from_rig = self.cameras[name], self.rig_from_camera[name].inverse()
+        views = [view for view in self.views if view.pair == name]
+        if views and self.motions:
+            planar = [PlanarView(view.shot, view.points, view.pixels) for view in views]
+            starts = [view.camera_from_board for view in views]
+            return np.concatenate(locate_boards(camera, planar, starts)[1])
         parts = [
             camera.project((camera_from_rig @ self.rig_from_board[view.target]).apply(view.points))
             - view.pixels
-            for view in self.views
-            if view.pair == name
+            for view in views
         ]
         return np.concatenate(parts) if parts else np.empty((0, 2))
 
