@@ -19,6 +19,7 @@ from bodyscan.cli.options import (
     RigFile,
 )
 from bodyscan.errors import BadInput
+from bodyscan.files.atomic import hold_folder
 from bodyscan.files.messages import require_writable
 from bodyscan.settings import RigExportSettings
 
@@ -133,8 +134,9 @@ def calibrate_rig(
     from bodyscan.workflows.calibrate_rig import calibrate_folder
 
     out = _calibration_folder(rig_file, out, overwrite)
-    with output.stages() as progress:
-        _report_calibration(output, *calibrate_folder(rig_file, out, progress))
+    with hold_folder(out), output.stages() as progress:
+        found, saved = calibrate_folder(rig_file, out, progress)
+    _report_calibration(output, found, saved)
 
 
 def import_(

@@ -26,7 +26,7 @@ from bodyscan.cli.options import (
     ScanFolder,
 )
 from bodyscan.errors import BadInput, FailedWork
-from bodyscan.files.atomic import scratch_folder, sweep_scratch
+from bodyscan.files.atomic import hold_folder, scratch_folder, sweep_scratch
 from bodyscan.files.messages import require_writable
 from bodyscan.progress import step
 from bodyscan.settings import AlignmentSettings, ExportSettings, FusionSettings, ScanSettings
@@ -123,11 +123,11 @@ def scan(
 
     out = out or folder.with_name(f"{folder.name}-model")
     require_writable(out, folder, calibration, empty)
-    make_room(out, overwrite)
     fusion, alignment = FusionSettings(points=points), AlignmentSettings(matching=align)
     settings = ScanSettings(fusion=fusion, alignment=alignment)
     settings = apply_settings(settings, changes or (), BadInput)
-    with output.stages() as progress:
+    with hold_folder(out), output.stages() as progress:
+        make_room(out, overwrite)
         found, saved, pictures = scan_folder(
             folder, calibration, out, settings, progress, empty=empty, follow_links=follow_links
         )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import secrets
 import shutil
 import stat
@@ -145,6 +146,43 @@ def lock_file(path: Path, *, wait: bool) -> Iterator[None]:
         yield
     finally:
         os.close(handle)
+
+
+@contextmanager
+def hold_folder(folder: Path) -> Iterator[None]:
+    """Hold a folder of results, made if it is not there, for this process alone, and remove what killed
+    ones left half written in it.
+
+    Raises BadInput if another process holds it: the last to end would replace what the first wrote.
+    The folder itself is locked (flock: nothing is left behind, even after `kill -9`); where a file
+    system cannot, nothing is held or removed.
+    """
+    is_new = not folder.exists()
+    folder.mkdir(parents=True, exist_ok=True)
+    handle = None
+    try:
+        with suppress(ImportError, OSError):
+            import fcntl  # POSIX only
+
+            handle = os.open(folder, os.O_RDONLY)
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise BadInput(
+                    "another command is writing here",
+                    where=str(folder),
+                    remedy="wait until it has ended, or give another --out",
+                ) from None
+            for path in folder.iterdir():
+                if re.fullmatch(r"\..+\.[0-9a-f]{12}\.tmp(\.\w+)?", path.name):
+                    path.unlink()
+        yield
+    finally:
+        if handle is not None:
+            os.close(handle)
+        if is_new:
+            with suppress(OSError):  # not empty
+                folder.rmdir()
 
 
 @contextmanager

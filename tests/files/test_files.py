@@ -13,10 +13,20 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from small_workspace import run
 
-from bodyscan.files.atomic import atomic_replacement, json_text, write_bytes, write_json, write_npz
+from bodyscan.files.atomic import (
+    atomic_replacement,
+    hold_folder,
+    json_text,
+    write_bytes,
+    write_json,
+    write_npz,
+)
 from bodyscan.files.hashing import content_hash, file_hash, file_hashes, list_files
 from bodyscan.files.reading import read_npz
+
+RIGS = Path(__file__).parents[2] / "rigs"
 
 
 def test_a_failed_write_leaves_the_old_file_and_no_litter(tmp_path: Path) -> None:
@@ -40,6 +50,25 @@ def test_a_block_that_writes_nothing_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError), atomic_replacement(tmp_path / "x.bin"):
         pass
     assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    "command",
+    [("calibrate-rig", RIGS / "three-pole-12.yaml"), ("scan", RIGS, "--calibration", RIGS.parent)],
+)
+def test_a_folder_of_results_is_written_by_one_command_and_swept(
+    command: tuple[object, ...], tmp_path: Path
+) -> None:
+    folder = tmp_path / "result"
+    with hold_folder(folder):
+        refused = run(*command, "--out", folder)
+        assert "another command is writing here" in str(refused.exception)
+    assert not folder.exists()  # nothing was written
+    folder.mkdir()
+    for name in (".cloud.4c1516627044.tmp.ply", ".notes.tmp.ply", "cloud.ply"):
+        (folder / name).touch()
+    with hold_folder(folder):
+        assert sorted(os.listdir(folder)) == [".notes.tmp.ply", "cloud.ply"]
 
 
 def test_folders_are_created_and_the_umask_applies(tmp_path: Path) -> None:
