@@ -123,7 +123,10 @@ def parse_yaml(text: str, max_nodes: int = MAX_NODES, *, foreign: bool = False) 
         compose = yaml.compose_all if foreign else lambda *args: iter([yaml.compose(*args)])
         node = next(iter(compose(text, _PlainLoader)), None)
     except yaml.MarkedYAMLError as error:
-        raise _error(_place(error.problem_mark or error.context_mark), _describe(error)) from None
+        place = _place(error.problem_mark or error.context_mark)
+        near = text.splitlines()[max(place.line - 2, 0) : place.line]
+        odd = next(filter(None, map(_find_odd_letter, reversed(near))), "")
+        raise _error(place, f"is not YAML: {odd}" if odd else _describe(error)) from None
     except yaml.YAMLError as error:
         raise _error(Place(1, 1), f"is not YAML: {error}".splitlines()[0]) from None
     document = Document()
