@@ -62,6 +62,10 @@ def test_without_inverses_a_pattern_lies_between_dark_and_lit(side: int, level: 
                 exposed(lit, 20, patterns)
         else:
             exposed(lit, 20, patterns)
+    striped = np.where(np.arange(100) % 20 < 10, lit, 20)
+    exposed(lit, 20, [np.where(striped == level, level + side * 12, striped)])  # flicker
+    with pytest.raises(DecodingFailed, match="bit 0 is brighter"):
+        exposed(lit, 20, [striped + side * 12])
 
 
 @pytest.mark.parametrize("transposed", [False, True])
