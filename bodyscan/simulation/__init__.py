@@ -1,7 +1,7 @@
 """A rig, a body, lenses, light and noise: images with known truth.
 
 It shares no mathematics with what calibrates and reconstructs, so that an error made there shows.
-simulate makes a data set. settings, presets; layout, plan,
+simulate makes a data set, simulate_board one shot of a board. settings, presets; layout, plan,
 board, body, living, scene (what there is); render, rays, lens, projector, patterns, lamps, sensor
 (its images); files.
 """
@@ -10,6 +10,6 @@ from __future__ import annotations
 
 from bodyscan.simulation.presets import settings_for
 from bodyscan.simulation.settings import SimulationSettings
-from bodyscan.simulation.simulate import simulate
+from bodyscan.simulation.simulate import simulate, simulate_board
 
-__all__ = ["SimulationSettings", "settings_for", "simulate"]
+__all__ = ["SimulationSettings", "settings_for", "simulate", "simulate_board"]

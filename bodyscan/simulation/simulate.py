@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
@@ -10,6 +11,7 @@ from threading import Lock
 
 import numpy as np
 
+from bodyscan.errors import BadInput
 from bodyscan.files.atomic import write_json
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.progress import THREADS, Progress, map_threads, silent
@@ -109,7 +111,8 @@ def simulate(
         if pair.projector is not None:
             refuse_unknown_code(pair.projector, pair.name)
     truth = _decide(rig, subject, settings, seed, board_shots, take)
-    _render_all(rig, truth, Path(out), workers, progress)
+    tasks = {name: _list_tasks(truth, name) for name in truth.pairs}
+    _render_all(rig, truth, tasks, Path(out), workers, progress)
     write_rig(out / "rig.yaml", rig)
     if truth.plan:
         listed = [(shot.name, shot.stripes, shot.lit) for shot in truth.plan]
@@ -126,6 +129,33 @@ def simulate(
         body.save_truth(at_mean_breath, out / "truth" / "subject-mean-breath.ply")
         save_body(living, out / "truth" / "body.npz")
     write_json(out / "truth" / "truth.json", describe(truth))
+
+
+def simulate_board(
+    rig_file: Path, out: Path, shot: str, *, seed: int = 0, settings: SimulationSettings
+) -> None:
+    """Write all images that every pair takes of one shot of the board, as a rig does that does not know
+    who sees it: of the shot that fixes the rig frame, or where `simulate` holds the board in b01, b02
+    and so on.
+
+    Raises as `simulate` does, and BadInput for another name.
+    """
+    rig = load_rig(rig_file)
+    number = re.fullmatch(r"b(\d{2,3})", shot)
+    truth = _decide(rig, None, settings, seed, int(number[1]) if number else 1, 0)
+    if shot not in [one.name for one in truth.plan]:
+        raise BadInput("the simulator shows its board in shots b01, b02 and so on", where=shot)
+    names = tuple(truth.pairs)
+    truth = replace(truth, plan=tuple(replace(one, lit=names) for one in truth.plan))
+    tasks = {
+        name: [
+            replace(task, sequence=truth.pairs[name].has_stripes)
+            for task in _list_tasks(truth, name)
+            if task.shot == shot
+        ]
+        for name in names
+    }
+    _render_all(rig, truth, tasks, out, THREADS, silent)
 
 
 def random_stream(seed: int, *purpose: int) -> np.random.Generator:
@@ -195,9 +225,15 @@ def _list_tasks(truth: Truth, pair: str) -> list[Task]:
     return [*tasks, person]
 
 
-def _render_all(rig: Rig, truth: Truth, out: Path, workers: int, progress: Progress) -> None:
-    """Render every image of every pair; each thread has one pair at a time."""
-    tasks = {name: _list_tasks(truth, name) for name in truth.pairs}
+def _render_all(
+    rig: Rig,
+    truth: Truth,
+    tasks: Mapping[str, Sequence[Task]],
+    out: Path,
+    workers: int,
+    progress: Progress,
+) -> None:
+    """Render every image of every pair's tasks; each thread has one pair at a time."""
     room, settings = build_room(truth.pairs.values(), truth.settings.room), truth.settings
     lock, done, total = Lock(), 0, sum(map(len, tasks.values()))
     progress("simulate", 0, total)

@@ -1,7 +1,7 @@
 """A board carried round a rig: what each camera has covered, what ties pairs together, how well each
 pair is known, and where to hold the board next.
 
-Boards are found shot by shot, as the images come, and the advice that follows from what pictures cover
+Boards are found image by image, as they come, and the advice that follows from what pictures cover
 is there at once. The joint solve of all shots so far takes longer; it comes when it is ready.
 """
 
@@ -16,7 +16,7 @@ import numpy as np
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.boards.view import BoardView
-from bodyscan.captures.folder import Captures, open_captures
+from bodyscan.captures.folder import Captures, ImageSequence, open_captures
 from bodyscan.errors import BodyscanError
 from bodyscan.optional import optional
 from bodyscan.registration.advice import pair_sigma_mm, suggest_shots
@@ -35,59 +35,62 @@ BOARDS = 6
 class BoardTour:
     """The calibration captures that a rig file names, looked at again and again.
 
-    views: boards found so far. seen: shots in which they were looked for. lit: pairs and shots of which
-        only the lit image was taken: it places a board, but shows no stripes on it.
+    views: boards found so far. looked: pairs and shots in whose images they were looked for; seen: the
+        shots of these. lit: pairs and shots of which only the lit image was taken, which places a board
+        but shows no stripes on it.
     """
 
     rig_file: Path
     views: list[BoardView] = field(default_factory=list)
+    looked: set[tuple[str, str]] = field(default_factory=set)
     seen: set[str] = field(default_factory=set)
     lit: set[tuple[str, str]] = field(default_factory=set)
     missed: dict[str, list[str]] = field(default_factory=dict)
     solved: dict[str, Any] = field(default_factory=dict)
-    _pending: dict[str, int] = field(default_factory=dict)
+    _pending: set[tuple[str, str]] = field(default_factory=set)
 
     def __post_init__(self) -> None:
         self.rig = load_rig(self.rig_file)
 
     def look(self) -> list[str]:
-        """Find boards in the shots that have come since, and return their names.
+        """Find boards in the images that have come since, and return the names of their shots.
 
-        A shot is looked at when its lit images are there and no more came since the look before.
+        Pairs take turns, so a shot's images come one by one. One is looked at when it was there at the
+        look before, too: until then it may be half written.
         """
         try:
             captures = open_captures(self.rig, self.rig_file)
         except BodyscanError:
             return []  # nothing yet
-        fresh = []
-        for shot in captures.shots:
-            if shot in self.seen:
-                continue
-            there = sum(s.board_path.exists() for s in captures.shot_sequences(shot))
-            if there and there == self._pending.get(shot):
-                fresh.append(shot)
-            self._pending[shot] = there
-        for shot in fresh:
-            self._find(captures, shot)
-        return fresh
-
-    def _find(self, captures: Captures, shot: str) -> None:
-        sequences = tuple(s for s in captures.shot_sequences(shot) if s.board_path.exists())
-        found = find_all_boards(self.rig, replace(captures, shots=(shot,), sequences=sequences))
         projecting = {pair.name for pair in self.rig.pairs if pair.projector}
-        self.lit |= {
-            (s.pair, shot) for s in sequences if s.pair in projecting and not s.has_stripes
+        by_image = {(s.pair, s.shot): s for s in captures.sequences}
+        self.lit = {
+            image
+            for image, s in by_image.items()
+            if s.pair in projecting and s.board_path.exists() and not s.has_stripes
         }
+        there = {i for i, s in by_image.items() if i not in self.looked and s.board_path.exists()}
+        fresh, self._pending = there & self._pending, there - self._pending
+        if fresh:
+            self._find(captures, tuple(s for image, s in by_image.items() if image in fresh))
+        return sorted({shot for _, shot in fresh})
+
+    def _find(self, captures: Captures, fresh: tuple[ImageSequence, ...]) -> None:
+        shots = tuple(dict.fromkeys(s.shot for s in fresh))
+        self.looked |= {(s.pair, s.shot) for s in fresh}
+        self.seen |= set(shots)
+        found = find_all_boards(self.rig, replace(captures, shots=shots, sequences=fresh))
         self.views += found.value
-        seeing = {view.pair for view in found.value}
-        self.missed[shot] = sorted({s.pair for s in sequences} - seeing)
-        self.seen.add(shot)
+        for shot in shots:
+            seeing = {view.pair for view in self.views if view.shot == shot}
+            self.missed.pop(shot, None)  # so that the last shot is the last of them
+            self.missed[shot] = sorted({p for p, one in self.looked if one == shot} - seeing)
 
     def solve(self) -> None:
         """Solve for all cameras and poses by the boards so far; what fails is a line of advice."""
         notes: list[str] = []
         sigmas: dict[str, float] = {}
-        shots = len(self.seen)
+        images = len(self.looked)
         with optional("sigmas", notes.append):
             cameras = calibrate_cameras(self.rig, self.views, folder=self.rig_file.parent).value
             located = locate_views(self.rig, self.views, cameras).value
@@ -98,7 +101,7 @@ class BoardTour:
                 worst = max(sorted(sigmas), key=lambda name: sigmas[name])
                 notes += suggest_shots(self.rig, solution, worst)
         finite = {name: sigma for name, sigma in sigmas.items() if np.isfinite(sigma)}
-        self.solved = {"shots": shots, "sigmas_mm": finite, "advice": notes}
+        self.solved = {"images": images, "sigmas_mm": finite, "advice": notes}
 
     def describe(self) -> dict[str, Any]:
         """Everything that a page shows of it."""
@@ -125,7 +128,6 @@ class BoardTour:
             "shared": shared,
             "next": _choose_next_hold(cells, boards, groups),
             "advice": self.solved.get("advice", []),
-            "solved_shots": self.solved.get("shots", 0),
             "wanted": BOARDS,
         }
 

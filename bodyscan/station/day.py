@@ -17,7 +17,7 @@ from typing import Any
 
 from bodyscan.errors import BadInput
 from bodyscan.files.atomic import write_json
-from bodyscan.jobs.job import JOB, STATE, read_record
+from bodyscan.jobs.job import JOB, MEASURES, STATE, read_record
 from bodyscan.verdict import MARKS
 
 DECISIONS = ("keep", "repeat", "discard")
@@ -26,9 +26,13 @@ DECIDED = "station.json"
 
 Row = dict[str, Any]
 
+GIRTHS = {"chest_mm": "bust girth", "waist_mm": "waist girth", "hip_mm": "hip girth"}
+"""Cells of a row, and the measures that they hold."""
+
 COLUMNS = (
     *("job", "subject", "when", "state", "grade", "reasons", "decision", "note"),
-    *("sway_mm", "breath_mm", "coverage_percent", "stature_mm", "points", "seconds", "reason"),
+    *("sway_mm", "breath_mm", "coverage_percent", "stature_mm", *GIRTHS),
+    *("points", "seconds", "reason"),
 )
 
 
@@ -151,7 +155,22 @@ def read_row(folder: Path) -> Row:
     row["stature_mm"], row["points"] = facts.get("stature_mm"), counts.get("points")
     if "filled_share" in counts:
         row["coverage_percent"] = 100.0 * (1.0 - counts["filled_share"])
-    return row
+    return row | read_girths(folder / "measures" / MEASURES)
+
+
+def read_girths(path: Path) -> Row:
+    """The cells of GIRTHS from a table of measures: mm, or "low-high" where only that is known."""
+    try:
+        table = {one["name"]: one for one in csv.DictReader(io.StringIO(path.read_text("utf-8")))}
+        return {
+            cell: float(one["value"])
+            if one["value"]
+            else f"{float(one['low']):.0f}-{float(one['high']):.0f}"
+            for cell, name in GIRTHS.items()
+            if (one := table.get(name)) and (one["value"] or one["low"])
+        }
+    except (OSError, ValueError, KeyError):
+        return {}  # no measures, or a damaged table
 
 
 def table_csv(rows: Iterable[Row]) -> str:

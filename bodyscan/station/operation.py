@@ -95,10 +95,6 @@ class Operation:
         """Have a shot of the board taken; return its name. Raises BadInput if that cannot be now."""
         if self.rig_file is None or not self.rig.calibration:
             raise BadInput("the rig file names no calibration captures")
-        if self.rig.capture is not None and self.rig.capture.camera["kind"] == "simulated":
-            raise BadInput(
-                "the simulated camera shows people, not boards: `simulate` renders these"
-            )
         folder = capture_path(self.rig_file, self.rig.calibration[0])
         there = {path.name for path in folder.glob("*")}
         name = next(name for k in range(1, 10_000) if (name := f"b{k:02d}") not in there)
@@ -165,12 +161,19 @@ class Operation:
     def _look_at_boards(self) -> None:
         assert self.tour is not None
         while not self.stopped.wait(0.15):
-            if self.tour.look():
-                self.feed.publish({"kind": "boards", **self.tour.describe()})
+            try:
+                if self.tour.look():
+                    self.feed.publish({"kind": "boards", **self.tour.describe()})
+            except BodyscanError as error:
+                self._complain(str(error))  # such as a board of another size
 
     def _solve_boards(self) -> None:
+        """Solve whenever no image came for a moment: while they come, the advice is more urgent."""
         assert self.tour is not None
+        before = 0
         while not self.stopped.wait(0.5):
-            if len(self.tour.seen) > self.tour.solved.get("shots", 2):
+            images, solved = len(self.tour.looked), self.tour.solved.get("images", 0)
+            if images == before > solved and len(self.tour.seen) > 2:
                 self.tour.solve()
                 self.feed.publish({"kind": "boards", **self.tour.describe()})
+            before = images

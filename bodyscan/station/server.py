@@ -22,6 +22,7 @@ from starlette.routing import Route
 from bodyscan.captures.folder import open_scan
 from bodyscan.errors import BadInput, BodyscanError
 from bodyscan.files.reading import read_regular
+from bodyscan.jobs.job import MEASURES
 from bodyscan.station.day import Day, Row, table_csv
 from bodyscan.station.feed import Feed
 from bodyscan.station.guard import Guard, TooLarge
@@ -129,6 +130,10 @@ class Station:
         attached = {"content-disposition": "attachment; filename=day.csv"}
         return Response(table_csv(self.day.rows()), media_type="text/csv", headers=attached)
 
+    async def measures(self, request: Request) -> Response:
+        path = self.day.out / MEASURES
+        return FileResponse(path, filename=MEASURES) if path.is_file() else _absent()
+
     async def rig(self, request: Request) -> Response:
         folders = [self.day.out / row["job"] for row in self.day.rows() if row["state"] == "done"]
         return JSONResponse({
@@ -180,6 +185,7 @@ def make_app(operation: Operation, hosts: set[str], token: str | None = None) ->
             Route("/api/boards", station.boards),
             Route("/api/rig", station.rig),
             Route("/api/day.csv", station.csv),
+            Route("/api/measures.csv", station.measures),
             Route(scan, station.decide, methods=["POST"]),
             Route(f"{scan}/body", station.body),
             Route(f"{scan}/picture", station.picture),

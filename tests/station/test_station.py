@@ -5,19 +5,25 @@ from __future__ import annotations
 import asyncio
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from required import missing
+from small_workspace import small_rig
 
 from bodyscan.boards.view import BoardView
+from bodyscan.capture.devices import load_capture_rig, open_devices
+from bodyscan.capture.session import Shot, capture_shot
 from bodyscan.errors import BadInput
 from bodyscan.jobs.pipeline import Pipeline
 from bodyscan.jobs.watching import Watched
+from bodyscan.rig.rig import load_rig, write_rig
+from bodyscan.simulation.files import scale_rig
 from bodyscan.station.board_tour import BoardTour
-from bodyscan.station.day import Day, table_csv
+from bodyscan.station.day import GIRTHS, Day, table_csv
 from bodyscan.station.feed import BACKLOG, Feed
 from bodyscan.station.operation import Operation
 from bodyscan.station.serving import make_operation, names_of_host
@@ -147,10 +153,16 @@ def test_what_people_decide_stays_and_what_is_taken_again_begins_anew(
     with pytest.raises(BadInput, match="no such scan"):
         day.decide("anna", {"decision": "keep"})
     verdict = {"grade": "repeat", "reasons": ["moved 14 mm"]}
+    table = (
+        "name,value,low,high\nwaist girth,731.2,725,737\nhip girth,,940.4,962.3\nbust girth,,,\n"
+    )
+    (out / "anna" / "measures").mkdir(parents=True)
+    (out / "anna" / "measures" / "measures.csv").write_text(table)
     put_job(out, "anna", verdict=verdict, alignment={"motion_mm": {"p": 14.0}}, person=None)
     operation.listen(ENDED)
     row = day.row("anna")
     assert (row["mark"], row["sway_mm"], row["pairs"]) == ("bad", 14.0, {"p": [1, 9]})
+    assert [row[girth] for girth in GIRTHS] == [None, 731.2, "940-962"]
     with pytest.raises(BadInput):
         day.decide("anna", {"decision": "burn"})
     day.decide("anna", {"decision": "discard", "note": "=HYPERLINK(1)<b>"})
@@ -168,6 +180,31 @@ def test_of_two_who_press_start_at_once_one_is_told_to_wait(operation: Operation
     assert operation.request_person("anna") == "anna-01"
     with pytest.raises(BadInput, match="already"):
         operation.request_person("bea")
+
+
+def test_a_board_is_found_pair_by_pair_as_the_simulated_rig_takes_its_images(
+    tmp_path: Path,
+) -> None:
+    rig = scale_rig(load_rig(small_rig(tmp_path)), 0.3, "shots")
+    write_rig(tmp_path / "rig.yaml", rig)
+    with (tmp_path / "rig.yaml").open("a") as file:
+        file.write("capture: {camera: {kind: simulated, subject: nobody.ply, samples: 1}}\n")
+    shot = Shot(tmp_path / "taken", name="b01", kind="calibration")
+    with open_devices(load_capture_rig(tmp_path / "rig.yaml"), tmp_path) as devices:
+        assert capture_shot(devices, shot).lost == {}
+        with pytest.raises(BadInput, match="b01, b02 and so on"):
+            capture_shot(devices, replace(shot, name="table"))
+    tour = BoardTour(tmp_path / "rig.yaml")
+    shutil.copytree(shot.folder, tmp_path / "shots", ignore=shutil.ignore_patterns("*.png"))
+    names = [pair.name for pair in rig.pairs]
+    for number, name in enumerate(names, start=1):
+        shutil.copytree(
+            tmp_path / "taken/b01" / name, tmp_path / "shots/b01" / name, dirs_exist_ok=True
+        )
+        assert (tour.look(), tour.look(), tour.look()) == ([], ["b01"], [])
+        told = tour.describe()
+        assert [pair["boards"] for pair in told["pairs"]] == [1] * number + [0] * (4 - number)
+        assert (told["shots"], told["last"], told["missed"]) == (1, "b01", [])
 
 
 def test_the_board_is_held_where_stripes_are_lacking_until_it_was_everywhere() -> None:

@@ -1,4 +1,5 @@
-"""The simulator as a camera: each time a pair comes round again, the next person stands there.
+"""The simulator as a camera: each time a pair comes round again, the next person stands there. A shot
+of the board shows it where `simulate` holds it in the shot of that name.
 
 Times are those of the simulated scene, in which frames follow each other as `simulation.settings.Pace`
 has it, whatever order the rig file asks for.
@@ -45,7 +46,7 @@ class SimulatedKind(CameraKind):
 
 
 class _Scene:
-    """What all cameras of a rig look at: one person at a time.
+    """What all cameras of a rig look at: one person, or board, at a time.
 
     times: of each pair's frames, ms since the first pair began.
     """
@@ -53,33 +54,38 @@ class _Scene:
     def __init__(self, kind: SimulatedKind, place: Place, scratch: Path) -> None:
         self._kind, self._place, self._scratch = kind, place, scratch
         self._seen: set[str] = set()
-        self._number = 0
+        self._number, self._persons, self._shot = 0, 0, ""
         self.folder = scratch / "none"
         self.times: dict[str, dict[str, float]] = {}
 
-    def meet(self, pair: str) -> None:
-        """A pair begins: with the person who is there, or the next if it has seen that one."""
-        if pair in self._seen or not self.times:
-            self._render()
+    def meet(self, pair: str, shot: str) -> None:
+        """A pair begins a shot: with whom or what is there, or the next if it has seen that."""
+        if pair in self._seen or shot != self._shot:
+            self._render(shot)
         self._seen.add(pair)
 
-    def _render(self) -> None:
-        from bodyscan.simulation import settings_for, simulate
+    def _render(self, shot: str) -> None:
+        from bodyscan.simulation import settings_for, simulate, simulate_board
         from bodyscan.simulation.files import compute_person_times
-        from bodyscan.simulation.simulate import PERSON, PERSON_SHOT
+        from bodyscan.simulation.simulate import CALIBRATION, PERSON, PERSON_SHOT
 
         kind, rig = self._kind, self._place.rig
         settings = settings_for("mirror", preset=kind.preset, subject=kind.person)
         settings = replace(settings, optics=replace(settings.optics, samples=kind.samples))
-        out = self._scratch / f"person-{self._number}"
-        write_rig(self._scratch / "rig.yaml", rig)
-        simulate(
-            self._scratch / "rig.yaml", out, subject=self._place.base / kind.subject,
-            seed=kind.seed, take=self._number, settings=settings, board_shots=0,
-        )  # fmt: skip
-        self.times = compute_person_times(rig, PERSON_SHOT, settings.pace)
-        shutil.rmtree(self._scratch / f"person-{self._number - 1}", ignore_errors=True)
-        self.folder, self._seen, self._number = out / PERSON, set(), self._number + 1
+        out, rig_file = self._scratch / f"shot-{self._number}", self._scratch / "rig.yaml"
+        write_rig(rig_file, rig)
+        if shot == PERSON_SHOT:
+            simulate(
+                rig_file, out, subject=self._place.base / kind.subject, seed=kind.seed,
+                take=self._persons, settings=settings, board_shots=0,
+            )  # fmt: skip
+            self._persons += 1
+        else:
+            simulate_board(rig_file, out, shot, seed=kind.seed, settings=settings)
+        self.times = compute_person_times(rig, shot, settings.pace)
+        shutil.rmtree(self._scratch / f"shot-{self._number - 1}", ignore_errors=True)
+        self.folder = out / (PERSON if shot == PERSON_SHOT else CALIBRATION)
+        self._seen, self._shot, self._number = set(), shot, self._number + 1
 
 
 class SimulatedCamera(FolderCamera):
@@ -92,9 +98,9 @@ class SimulatedCamera(FolderCamera):
         self._scene, self._frame = scene, ""
 
     def begin(self, shot: str, frames: Sequence[str]) -> None:
-        self._scene.meet(self._place.pair.name)
+        self._scene.meet(self._place.pair.name, shot)
         self.folder = self._scene.folder
-        super().begin("s01", frames)
+        super().begin(shot, frames)
 
     def trigger(self, frame: str) -> None:
         self._frame = frame

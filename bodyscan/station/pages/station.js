@@ -49,6 +49,7 @@
     $("what-to-do").textContent = say(`${key}What`);
     const reasons = !row ? [] : row.state === "set aside" ? [row.reason] : row.reasons || [];
     $("reasons").replaceChildren(...reasons.filter(Boolean).map((text) => make("li", {}, text)));
+    $("in-english").hidden = words["#"] === "en" || !reasons.length;
     const working = row && row.state !== "done" && row.state !== "set aside" && row.part;
     $("stage").textContent = working ? `${row.part} ${row.total ? `${row.done}/${row.total}` : ""}` : "";
     $("whose").textContent = !row ? "" : row.body ? say("body", { job: row.subject || row.job }) : say("noBody");
@@ -114,7 +115,7 @@
     if (capture.total) $("taking").value = capture.done / capture.total;
     const lost = Object.entries(capture.lost || {}).map(([pair, reason]) => say("lostFrames", { pair, reason }));
     const text = capture.state === "idle" ? (capture.lost ? say("taken") : "") : say(capture.state, capture);
-    $("capture").textContent = [text, ...lost].filter(Boolean).join("\n");
+    for (const id of ["capture", "board-capture"]) $(id).textContent = [text, ...lost].filter(Boolean).join("\n");
   }
 
   async function decide(decision) {
@@ -157,23 +158,25 @@
     const counts = { done: 0, waiting: 0, failed: 0 };
     for (const row of rows) counts[row.state === "done" ? "done" : row.state === "set aside" ? "failed" : "waiting"] += 1;
     $("counts").textContent = rows.length ? say("counts", counts) : say("nothing");
+    $("measures").hidden = !counts.done;
     const found = rows.filter((row) => (!shown || standing(row) === shown || row.decision === shown) && [row.job, row.subject, row.note, ...(row.reasons || [])].join(" ").toLowerCase().includes(wanted));
     found.sort(ORDERS[$("sort").value] || ORDERS.newest);
-    const names = ["", "scan", "verdict", "sway", "breath", "covered", "stature", ""];
+    const names = ["", "scan", "verdict", "sway", "breath", "covered", "stature", "chest", "waist", "hip", ""];
     document.querySelector("#rows thead").replaceChildren(make("tr", {}, ...names.map((key) => make("th", { scope: "col" }, key && say(key)))));
     document.querySelector("#rows tbody").replaceChildren(...found.map(todayRow));
   }
 
   function todayRow(row) {
     const key = standing(row), why = row.state === "set aside" ? row.reason : (row.reasons || [])[0];
-    const figure = (name, value, digits) => make("td", { class: "number", "data-name": say(name) }, number(value, digits));
+    const figure = (name, value, digits) => make("td", { class: "number", "data-name": say(name) }, typeof value === "string" ? value.replace("-", "–") : number(value, digits));
     const picture = row.state === "done" ? make("img", { src: scanPath(row.job, "picture"), alt: "", loading: "lazy" }) : null;
     const decided = row.decision ? ` · ${say(row.decision)}` : "";
     return make("tr", { class: row.decision === "discard" ? "discard" : null },
       make("td", {}, picture),
       make("td", { class: "job" }, make("strong", {}, row.job), make("div", { class: "why" }, [row.subject !== row.job && row.subject, row.note].filter(Boolean).join(" · "))),
-      make("td", { class: "verdict" }, make("span", { class: `badge ${SIGNS[key] ? key : key === "aside" ? "bad" : ""}` }, `${SIGNS[key] || (key === "aside" ? "✗" : "…")} ${say(key)}`), decided, why ? make("div", { class: "why" }, why) : null),
+      make("td", { class: "verdict" }, make("span", { class: `badge ${SIGNS[key] ? key : key === "aside" ? "bad" : ""}` }, `${SIGNS[key] || (key === "aside" ? "✗" : "…")} ${say(key)}`), decided, why ? make("div", { class: "why", lang: "en" }, why) : null),
       figure("sway", row.sway_mm), figure("breath", row.breath_mm), figure("covered", row.coverage_percent), figure("stature", row.stature_mm, 0),
+      figure("chest", row.chest_mm, 0), figure("waist", row.waist_mm, 0), figure("hip", row.hip_mm, 0),
       make("td", {}, row.body === "mesh" ? make("a", { href: scanPath(row.job, "report"), target: "_blank", rel: "noopener" }, say("report")) : ""));
   }
 
