@@ -63,6 +63,7 @@ BENCHMARKS: dict[str, Callable[[], str]] = {
     "seconds": seconds.report,
     "costs": costs.report,
     "day": costs.day,
+    "batch": costs.batch,
     "png": png.report,
     "rig": rig.report,
     "procam": procam.report,
@@ -71,7 +72,7 @@ BENCHMARKS: dict[str, Callable[[], str]] = {
     "lens": lens.report,
     "mutants": mutants.report,
 }
-SLOW = ("mutants", "named-measures", "day", "sigmas-rigs", "sigmas-fresh")
+SLOW = ("mutants", "named-measures", "day", "batch", "sigmas-rigs", "sigmas-fresh")
 """Run only when named."""
 
 

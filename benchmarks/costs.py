@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import multiprocessing
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -26,6 +27,8 @@ BOARD_SHOTS, SEED = 6, 5
 DAY, DAY_PAIRS, DAY_MEGAPIXELS, DAY_FIGURE = 300, 4, 0.1, 0.5
 """Small scans of a figure half as large, so that a day takes minutes: what a process retains of
 scans does not depend on their size."""
+BATCH, WORKERS = 40, (1, 2)
+"""Small scans of a batch, and how many run at once, with one thread each."""
 SAMPLED = 25
 """Scans of a day over which seconds are averaged."""
 
@@ -63,6 +66,64 @@ A day of {DAY} scans ({DAY_PAIRS} pairs of {DAY_MEGAPIXELS:g} megapixels, the fi
 {first:.2f} s each, the last {SAMPLED} {last:.2f} s; it held {start_mib:.0f} MiB after these first,
 {end_mib:.0f} MiB at the end.
 """
+
+
+def batch(scans: int = BATCH) -> str:
+    """The section of docs/results.md on many scans at once."""
+    rows, mb = [], [0.0, 0.0]
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        one = make_pair(folder / "one", DAY_MEGAPIXELS, DAY_FIGURE)
+        rig = around(one, DAY_PAIRS, folder / "rig")
+        for k in range(scans):
+            shutil.copytree(rig / "captures" / "person", folder / "scans" / f"scan-{k:03d}")
+        mb[0] = _megabytes(rig / "captures") + _megabytes(rig / "calibration")
+        for workers in WORKERS:
+            wall, busy = _batch(rig, folder / "scans", folder / f"out-{workers}", workers)
+            mb[1] = _megabytes(folder / f"out-{workers}") / scans
+            rate, share = 3600.0 * scans / wall, 1.0 - busy / (workers * wall)
+            rows.append((workers, wall, busy / scans, rate, rate / workers, share))
+    single = rows[0][4]
+    table = "\n".join(
+        f"| {workers} | {wall:.0f} | {job:.1f} | {rate:.0f} | {each / single:.0%} | {share:.1%} |"
+        for workers, wall, job, rate, each, share in rows
+    )
+    return f"""## Many scans at once
+
+`bodyscan batch --until scan`: {scans} scans of {DAY_PAIRS} pairs of {DAY_MEGAPIXELS:g} megapixels,
+each in a process of its own with one thread. A scan reads {mb[0]:.1f} MB (images, calibration) and
+writes {mb[1]:.1f} MB. Overhead is the share of the workers' time in which no job ran.
+
+| workers | s | s of a job | scans an hour | efficiency | overhead |
+|---|---|---|---|---|---|
+{table}
+"""
+
+
+def _megabytes(folder: Path) -> float:
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) / 1e6
+
+
+def _batch(rig: Path, scans: Path, out: Path, workers: int) -> tuple[float, float]:
+    """Wall clock of a batch, and the seconds that its jobs took together."""
+    line = [sys.executable, "-m", "bodyscan", "batch", str(PROJECT / "pipelines" / "fuse.yaml")]
+    line += ["--scans", str(scans), "--out", str(out), "--calibration", str(rig / "calibration")]
+    line += [
+        "--workers",
+        str(workers),
+        "--set",
+        "resources.threads=1",
+        "--until",
+        "scan",
+        "--quiet",
+    ]
+    started = time.perf_counter()
+    subprocess.run(line, cwd=PROJECT, check=False, stdout=subprocess.DEVNULL)
+    wall = time.perf_counter() - started
+    states = [json.loads(path.read_text("utf-8")) for path in out.glob("*/state.json")]
+    if sum(state["state"] == "done" for state in states) < len(list(scans.iterdir())):
+        raise SystemExit(f"{' '.join(line)} failed")
+    return wall, sum(state["seconds"] for state in states)
 
 
 def _apart(make: Callable[..., Path], *arguments: object) -> Path:
