@@ -251,7 +251,7 @@ def _describe_loop(piece: Piece, mesh: BodyMesh, breath: BreathAt | None) -> Gir
     x, y = loop.centre
     values = loop.girth_mm, loop.tape_mm
     girths, tapes = (
-        (min(value, low) - 1.96 * sigma, max(value, high) + 1.96 * sigma)
+        (max(min(value, low) - 1.96 * sigma, 0.0), max(value, high) + 1.96 * sigma)
         for value, low, high in zip(values, lows, highs, strict=True)
     )
     shares = None if kinds is None else select_regions(kinds, loop.faces)

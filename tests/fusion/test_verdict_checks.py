@@ -309,7 +309,7 @@ def square(area: float) -> tuple[float, float]:
 
 
 TRUNK: Column = ((0.0, 0.0), square(90_000.0), 0.0, TALL_MM)
-SHAPES = ("more than one person", "touches the", "mm wide and")
+SHAPES = ("more than one person", "besides one person's", "touches the", "mm wide and")
 PERSON = standing_body(hanging(25.0))
 
 
@@ -327,8 +327,8 @@ def beside(thing: tuple[Array, Indices]) -> tuple[Array, Indices]:
         (standing_body(hanging(0.0)), "usable", "the left arm touches the trunk from"),
         (standing_body(HAND_ON_HIP), "usable", "hold the arms off"),
         (beside(PERSON), "repeat", "more than one person: at heights"),
-        (beside(cylinder(15.0, 0.0, 1000.0)), "usable", "causes: a stick"),
-        (beside(cylinder(130.0, 0.0, 450.0)), "usable", "a chair"),
+        (beside(cylinder(15.0, 0.0, 1000.0)), "usable", "a stick"),
+        (beside(cylinder(130.0, 0.0, 450.0)), "usable", "causes: a stool"),
         (ellipsoid((150.0, 850.0, 150.0), (0.0, 0.0, 150.0)), "usable", "1700 mm wide and 300 mm"),
     ],
 )

@@ -71,8 +71,8 @@ def check_limbs(scan: ScanEvidence) -> Iterator[Finding]:
     elif len(things) > 3:  # 50 mm of an adult
         yield Finding(
             "usable",
-            f"more than one person's trunk, legs and arms at heights from {min(things):.0f} to "
-            f"{max(things):.0f} mm. Possible causes: a stick, a rail, a chair or an animal; somebody's "
+            f"besides one person's trunk, legs and arms there is something from {min(things):.0f} to "
+            f"{max(things):.0f} mm. Possible causes: a stool, a stick, a rail or an animal; somebody's "
             "arm; a pair is misaligned. What touches the body is measured as body",
         )
 
