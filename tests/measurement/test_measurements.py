@@ -160,6 +160,8 @@ def test_every_girth_has_the_width_of_noise_and_breath() -> None:
     for mean_breath in (True, False):
         (girth,) = measure(breathing, [500.0], mean_breath=mean_breath).slices[0].girths
         assert girth.breath_sigma_mm == pytest.approx(2.0 * np.pi * 0.3, rel=0.02)
+    (girth,) = measure(replace(still, sigma_mm=1000.0 * sigma), [500.0]).slices[0].girths
+    assert (girth.girth_range_mm[0], girth.tape_range_mm[0]) == (0.0, 0.0), "no girth is negative"
 
 
 @pytest.mark.parametrize("degrees", [90.0, 180.0])
