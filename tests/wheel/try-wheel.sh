@@ -4,7 +4,7 @@
 # bodyscan-core is the same but for what it asks for: neither Open3D nor pycolmap (docs/dependencies.md).
 # Usage: try-wheel.sh PYTHON FOLDER-FOR-THE-WHEELS
 set -eu
-python=$1
+python=$(cd "$(dirname "$1")" && pwd)/$(basename "$1")
 mkdir -p "$2"
 wheels=$(cd "$2" && pwd)
 here=$(cd "$(dirname "$0")" && pwd)
