@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from bodyscan.arrays import Array
+from bodyscan.errors import BadInput
 from bodyscan.files.reading import read_json_object
 from bodyscan.fusion.storage import StoredScan
 from bodyscan.measurement.measurements import measure
@@ -67,12 +68,16 @@ def show_measures(scan: StoredScan, folder: Path) -> list[Block]:
 
 
 def _read_measures(folder: Path) -> Content | None:
-    """What was measured by name of the scan in `folder`, there or by the next stage of its job."""
-    for path in (folder / MEASUREMENTS, folder.parent / "measures" / MEASUREMENTS):
+    """What was measured by name of the scan in `folder`, there or by the next stage of its job. Raises
+    BadInput if that stage found no body: a fit that fails takes longest, and fails again."""
+    of_job = folder.parent / "measures" / MEASUREMENTS
+    for path in (folder / MEASUREMENTS, of_job):
         if path.is_file():
             content = read_json_object(path)
             if "measures" in content and "posture" in content:
                 return content
+            if path == of_job:
+                raise BadInput("no standing body fits the scan; measures.csv says why")
     return None
 
 

@@ -8,6 +8,7 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -27,6 +28,7 @@ from bodyscan.fusion.storage import Origin
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.jobs.forgetting import find_subject
 from bodyscan.mesh.body import HAIR, SKIN, BodyCloud
+from bodyscan.report.measures_section import show_measures
 from bodyscan.report.model import Layer, pack
 from bodyscan.report.page import Column, render
 from bodyscan.report.result_page import build_page
@@ -281,3 +283,11 @@ def test_landmarks_that_cannot_be_written_are_refused_before_the_scan_is_read(
     ):
         refused = run("measure", tmp_path, *options, "--landmarks", name)
         assert said in str(refused.exception)
+
+
+def test_a_body_that_the_jobs_measures_did_not_fit_is_not_fitted_again(tmp_path: Path) -> None:
+    (tmp_path / "measures").mkdir()
+    write_json(tmp_path / "measures" / "measurements.json", {"slices": []})
+    no_scan: Any = None
+    with pytest.raises(BadInput, match=r"measures\.csv says why"):
+        show_measures(no_scan, tmp_path / "scan")

@@ -87,23 +87,30 @@
     if (job === current && seen) showPairs(scans.get(job));
   }
 
-  // A figure is shown anew with a fresh canvas: so the picture of the person before is gone at once.
+  // A figure is shown anew with a fresh canvas: so the picture of the person before is gone at once. A
+  // person's cloud stays until the mesh is there.
   async function showBody(row) {
     const job = row ? row.job : "", kind = (row && row.body) || "";
     if (drawn.job === job && drawn.kind === kind) return;
+    const isSame = drawn.job === job && Boolean(kind);
     Object.assign(drawn, { job, kind });
     $("body").classList.toggle("empty", !kind);
+    if (!isSame) clearBody();
+    if (!kind) return;
+    const model = await ask(scanPath(job, "body")).catch(() => null);
+    if (!model || drawn.job !== job || drawn.kind !== kind) return;
+    if (isSame) clearBody();
+    if (!matchMedia("(prefers-reduced-motion: reduce)").matches) $("body").dataset.turning = "1";
+    window.showModel($("body"), model);
+  }
+
+  function clearBody() {
     const figure = $("body"), old = figure.querySelector("canvas"), label = old.getAttribute("aria-label");
     const lost = old.getContext("webgl");
     if (lost) lost.getExtension("WEBGL_lose_context")?.loseContext();
     old.replaceWith(make("canvas", { tabindex: "0", "aria-label": label }));
     for (const name of ["labels", "layers", "legend"]) figure.querySelector(`.${name}`).replaceChildren();
     figure.querySelector(".failed")?.remove();
-    if (!kind) return;
-    const model = await ask(scanPath(job, "body")).catch(() => null);
-    if (!model || drawn.job !== job || drawn.kind !== kind) return;
-    if (!matchMedia("(prefers-reduced-motion: reduce)").matches) figure.dataset.turning = "1";
-    window.showModel(figure, model);
   }
 
   function showCapture() {
@@ -125,7 +132,6 @@
     try {
       take(await ask(scanPath(job), { decision, note: $("note").value }));
       if (decision === "repeat") { $("subject").value = before.subject || ""; $("subject").focus(); }
-      if (decision === "discard" && current === job) { current = ""; showNow(); }
     } catch (error) { complain(error); }
   }
 
@@ -144,12 +150,12 @@
 
   // -- Today
 
-  const WORST = { bad: 0, usable: 1, good: 2 };
+  const WORST = { aside: 0, bad: 1, usable: 2, good: 3 };
   const ORDERS = {
     newest: () => 0,
     byName: (a, b) => a.job.localeCompare(b.job),
     bySway: (a, b) => (b.sway_mm ?? -1) - (a.sway_mm ?? -1),
-    byGrade: (a, b) => (WORST[a.mark] ?? 3) - (WORST[b.mark] ?? 3),
+    byGrade: (a, b) => (WORST[standing(a)] ?? 4) - (WORST[standing(b)] ?? 4),
   };
 
   function showToday() {
@@ -162,7 +168,7 @@
     const found = rows.filter((row) => (!shown || standing(row) === shown || row.decision === shown) && [row.job, row.subject, row.note, ...(row.reasons || [])].join(" ").toLowerCase().includes(wanted));
     found.sort(ORDERS[$("sort").value] || ORDERS.newest);
     const names = ["", "scan", "verdict", "sway", "breath", "covered", "stature", "chest", "waist", "hip", ""];
-    document.querySelector("#rows thead").replaceChildren(make("tr", {}, ...names.map((key) => make("th", { scope: "col" }, key && say(key)))));
+    document.querySelector("#rows thead").replaceChildren(make("tr", {}, ...names.map((key) => (key ? make("th", { scope: "col" }, say(key)) : make("td")))));
     document.querySelector("#rows tbody").replaceChildren(...found.map(todayRow));
   }
 
@@ -264,7 +270,9 @@
       current = row.job;
     }
     if (row.state === "running" && begun({ ...row, state: "arriving" })) current = row.job;
-    if (row.job === current) showNow();
+    const shown = row.job === current;
+    if (shown && row.decision === "discard" && before?.decision !== "discard") current = "";
+    if (shown) showNow();
     showToday();
     if (row.final && !before?.final) showRig();
   }
