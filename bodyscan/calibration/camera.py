@@ -27,7 +27,7 @@ from bodyscan.geometry.camera import MATRIX, Camera
 from bodyscan.geometry.least_squares import EXACT, Block, Noise, Solution, minimize
 from bodyscan.geometry.lenses.fisheye import Fisheye
 from bodyscan.geometry.lenses.lens import Lens
-from bodyscan.geometry.lenses.opencv import Radial, Rational
+from bodyscan.geometry.lenses.opencv import Brown, Radial, Rational
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 from bodyscan.geometry.uncertainty import RayUncertainty, node_pixels
 
@@ -320,8 +320,9 @@ def choose_lens(
 ) -> ChosenLens:
     """Choose the lens that predicts held-out boards best.
 
-    No margin is asked for: what a richer lens adds needlessly is in its covariance, what a simpler one
-    lacks is in none. A fisheye in place of a rational lens only has to be as good.
+    Brown's lens needs no margin: what it adds needlessly is in its covariance, what the chapter's lacks
+    is in none. A rational lens, which runs away beyond its boards, has to be clearly better; a fisheye
+    in its place only as good.
 
     kinds: simplest first, as in `FAMILY`.
     camera: a start, with the lens that fits most of the corners.
@@ -352,7 +353,7 @@ def choose_lens(
         held_out = _hold_out(tried, views, cluster)
         better_by = gain(ResidualPair(residuals, held_out, corner_cluster))
         trials.append((tried, held_out, better_by))
-        if better_by >= (-MIN_GAIN if simpler else 0.0):
+        if better_by >= (-MIN_GAIN if simpler else 0.0 if kind is Brown else MIN_GAIN):
             chosen, residuals = tried, held_out
     weights = shared_weights([one for _, one, _ in trials])
     figures = tuple(
