@@ -83,13 +83,15 @@ def capture_shot(devices: Devices, shot: Shot, progress: Progress = silent) -> C
     clock, rows = _Clock(), _other_rows(shot)
     lost: dict[Frame, str] = {}
     retaken = done = 0
-    _describe(devices, shot)
     with background() as writer:
         written: list[Future[None]] = []
         for turn in turns:
             progress("capture", done, total)
             taken, missing, again = take_turn(devices, turn, shot)
             lost, retaken = lost | missing, retaken + again
+            if turn is turns[0]:
+                # Not before: whoever watches the folder waits for images only so long.
+                _describe(devices, shot)
             # A pair has all its times or none: without some of its frames it is not decoded anyway.
             broken = {pair for pair, _ in missing}
             rows += clock.rows(shot.name, {k: p for k, p in taken.items() if k[0] not in broken})

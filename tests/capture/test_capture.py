@@ -228,6 +228,19 @@ def test_twelve_emulated_cameras_deliver_22_frames_each_in_order(
     assert (found.retaken, found.lost) == (1, {})
 
 
+def test_no_folder_waits_for_images_that_a_camera_still_owes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any) -> None:
+        raise FailedWork("the cable is out")
+
+    monkeypatch.setattr(MadeCamera, "trigger", fail)
+    rig = made(tmp_path, exposure_ms=2.0, projector={"delay_ms": 1.0})
+    with open_devices(rig, tmp_path) as devices, pytest.raises(FailedWork, match="cable"):
+        capture_shot(devices, Shot(tmp_path / "anna"))
+    assert not (tmp_path / "anna").exists()
+
+
 def test_a_video_and_a_folder_are_cameras_too(tmp_path: Path) -> None:
     video = cv2.VideoWriter(str(tmp_path / "a.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 30, (50, 40))
     for level in range(0, 240, 10):
