@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 from scipy.spatial.distance import cdist
@@ -13,6 +14,7 @@ from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.mesh.body import BodyCloud
 from bodyscan.motion.estimation import EstimatedMotion
+from bodyscan.progress import map_threads
 
 
 def add_pose_variance(
@@ -26,7 +28,27 @@ def add_pose_variance(
     centres = np.array([pose.translation for pose in rig_from_camera.values()])
     size = len(centres)
     joint = prior.select(tuple(rig_from_camera)).reshape(size, 6, size, 6)
-    points, normals = cloud.points, cloud.normals.astype(np.float64)
+
+    def variance(some: slice) -> Array:
+        points, normals = cloud.points[some], cloud.normals[some].astype(np.float64)
+        return _point_variance(points, normals, cloud.pairs_seen[some], centres, joint)
+
+    ends = np.linspace(0, len(cloud.points), 5).astype(
+        int
+    )  # as many whatever the threads: same bytes
+    parts = map_threads(variance, [slice(*both) for both in pairwise(ends.tolist())])
+    added = np.sqrt(cloud.sigma_mm**2 + np.concatenate(parts))
+    return replace(cloud, sigma_mm=added.astype(np.float32))
+
+
+def _point_variance(
+    points: Array, normals: Array, pairs_seen: Bytes, centres: Array, joint: Array
+) -> Array:
+    """Variance (N,) mm^2 along normals of points (N, 3), each the mean of `pairs_seen` pairs' (N,).
+
+    centres: (P, 3) of the cameras.
+    joint: (P, 6, P, 6), covariance of the pairs' twists.
+    """
     towards = normals @ centres.T - np.sum(points * normals, axis=1)[:, None]
     facing = towards > 0.2 * cdist(points, centres)
     lever = np.hstack([np.cross(points, normals), normals])
@@ -36,10 +58,11 @@ def add_pose_variance(
     order = np.lexsort(bits.T)
     starts = np.flatnonzero(np.diff(bits[order].astype(np.int16), axis=0).any(axis=1)) + 1
     for group in np.split(order, starts):
-        pairs = np.flatnonzero(facing[group[0]])
-        used = np.minimum(cloud.pairs_seen[group], len(pairs))
-        variance[group] = _mean_variance(lever[group], joint[pairs][:, :, pairs], used)
-    return replace(cloud, sigma_mm=np.sqrt(cloud.sigma_mm**2 + variance).astype(np.float32))
+        if len(group):
+            pairs = np.flatnonzero(facing[group[0]])
+            used = np.minimum(pairs_seen[group], len(pairs))
+            variance[group] = _mean_variance(lever[group], joint[pairs][:, :, pairs], used)
+    return variance
 
 
 def _mean_variance(lever: Array, joint: Array, used: Bytes) -> Array:
