@@ -88,21 +88,21 @@ def _find_decentred(chosen: Mapping[str, ChosenLens]) -> list[str]:
     """Cameras of one make that get Brown's lens in place of the chapter's, if together they are
     decentred beyond chance.
 
-    A camera's own boards must not clearly speak against it. A decentring too small for one camera to
-    prove is not zero: left out, it hides in the principal point, whose sigma does not account for
-    it. Held-out boards hardly see what hides so well; how many of its sigmas it is off zero does. The
-    other terms of a rational lens hide nowhere.
+    A camera's own boards must speak clearly neither for nor against it. A decentring too small for one
+    camera to prove is not zero: left out, it hides in the principal point, whose sigma does not account
+    for it. Held-out boards hardly see what hides so well; how many of its sigmas it is off zero does,
+    also where they happened to prefer Brown's. The other terms of a rational lens hide nowhere.
     """
     open_ = [
         name
         for name, lens in chosen.items()
-        if lens.fit.camera.lens.kind == Radial.kind
+        if lens.fit.camera.lens.kind in (Radial.kind, Brown.kind)
         and any(trial.kind == Brown.kind and trial.is_open for trial in lens.trials)
     ]
     decentring = np.array([_decentring(chosen[name]) for name in open_]).ravel()
     if not open_ or np.mean(decentring**2) < 1.0 + MIN_GAIN * np.sqrt(2.0 / len(decentring)):
         return []
-    return open_
+    return [name for name in open_ if chosen[name].fit.camera.lens.kind == Radial.kind]
 
 
 def _begin_with_brown(

@@ -52,11 +52,13 @@ def test_each_camera_gets_its_own_lens_and_no_view_is_lost(views: list[BoardView
         assert placed.camera_covariances[name].shape == (len(placed.cameras[name].parameters),) * 2
 
 
-def test_what_no_camera_proves_by_itself_all_may_together() -> None:
-    """Decentred by 2e-4 each, 0.06 px at the rim: left out it hides in the principal points."""
-    lens = {name: Brown(-0.1, 0.05, 2e-4 * (-1) ** k, 2e-4, 0.0) for k, name in enumerate(CAMERAS)}
+@pytest.mark.parametrize(("by", "seed"), [(2e-4, 3), (8e-5, 3)])
+def test_what_no_camera_proves_by_itself_all_may_together(by: float, seed: int) -> None:
+    """Decentred by 2e-4 each, 0.06 px at the rim: left out it hides in the principal points. Of the
+    second four two happen to prefer Brown's lens by themselves, and are evidence all the same."""
+    lens = {name: Brown(-0.1, 0.05, by * (-1) ** k, by, 0.0) for k, name in enumerate(CAMERAS)}
     cameras = {name: replace(camera, lens=lens[name]) for name, camera in CAMERAS.items()}
-    placed, _, _ = solved(ring_rig(PLACINGS), as_found(ring_views(PLACINGS, cameras, seed=3)[0]))
+    placed, _, _ = solved(ring_rig(PLACINGS), as_found(ring_views(PLACINGS, cameras, seed=seed)[0]))
     assert {camera.lens.kind for camera in placed.cameras.values()} == {"brown"}
     gains = {n: next(t.gain for t in tried if t.chosen) for n, tried in placed.lenses.items()}
     assert max(gain for gain in gains.values() if gain is not None) < 3.0
