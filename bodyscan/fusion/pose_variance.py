@@ -33,9 +33,8 @@ def add_pose_variance(
         points, normals = cloud.points[some], cloud.normals[some].astype(np.float64)
         return _point_variance(points, normals, cloud.pairs_seen[some], centres, joint)
 
-    ends = np.linspace(0, len(cloud.points), 5).astype(
-        int
-    )  # as many whatever the threads: same bytes
+    # As many parts whatever the threads: the same bytes.
+    ends = np.linspace(0, len(cloud.points), 5).astype(int)
     parts = map_threads(variance, [slice(*both) for both in pairwise(ends.tolist())])
     added = np.sqrt(cloud.sigma_mm**2 + np.concatenate(parts))
     return replace(cloud, sigma_mm=added.astype(np.float32))

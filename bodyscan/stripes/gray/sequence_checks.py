@@ -181,8 +181,8 @@ def replace_flashed(images: ScanLines) -> tuple[ScanLines, str]:
             stack[bit] = np.clip(grey, 0.0, 255.0).astype(stack.dtype)
             found.append(
                 f"the {flashed} of bit {bit} is {abs(added):.0%} of the contrast "
-                f"{'brighter' if added > 0.0 else 'darker'} than lit and dark image allow (a flash, a "
-                f"lamp, automatic exposure?) and is made from its {sound}"
+                f"{'brighter' if added > 0.0 else 'darker'} than lit and dark image allow, as with a "
+                f"flash or a lamp, and is made from its {sound}"
             )
     return replace(images, patterns=frames["pattern"], inverses=frames["inverse"]), "; ".join(found)
 
