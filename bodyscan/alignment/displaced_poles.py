@@ -71,35 +71,26 @@ class DisplacedPole:
 
 @dataclass(frozen=True)
 class DisplacementSearch:
-    """The result of a search for a displaced pole.
+    """The result of a search for a displaced pole."""
 
-    found: the pole or pair that is displaced in all scans, if any.
-    detectable_mm: smallest displacement that would have been detected of any pole or pair; infinite
-        if that of some cannot be told from sway.
-    sway_mm: standard deviation of the person's sway, per axis.
-    offset_mm: standard deviation of each pair's independent offset.
-    """
-
-    found: DisplacedPole | None
+    found: DisplacedPole | None  # the pole or pair that is displaced in all scans, if any
+    # Smallest displacement that would have been detected of any pole or pair; infinite if that of
+    # some cannot be told from sway.
     detectable_mm: float
-    sway_mm: float = 0.0
-    offset_mm: float = 0.0
+    sway_mm: float = 0.0  # standard deviation of the person's sway, per axis
+    offset_mm: float = 0.0  # standard deviation of each pair's independent offset
 
 
 @dataclass(frozen=True)
 class PairDrift:
-    """Mean motion of a pair or pole over several scans, which no person's sway explains.
-
-    shift: (3,) mm at the body's centre, rig axes.
-    sigma_mm: standard error of its length, from the variation between scans; None for fewer than
-        three scans.
-    limit_mm: a larger shift is not chance.
-    """
+    """Mean motion of a pair or pole over several scans, which no person's sway explains."""
 
     pair: str
-    shift: tuple[float, float, float]
+    shift: tuple[float, float, float]  # (3,) mm at the body's centre, rig axes
+    # Standard error of its length, from the variation between scans; None for fewer than three
+    # scans.
     sigma_mm: float | None
-    limit_mm: float
+    limit_mm: float  # a larger shift is not chance
 
     @property
     def shift_mm(self) -> float:
@@ -237,18 +228,13 @@ def _mean_motions(motions: Sequence[Mapping[str, Array]]) -> dict[str, Array]:
 
 @dataclass(frozen=True, eq=False)
 class _PoseMotions:
-    """Motions of N pairs, scan after scan, and the covariances that may explain them.
-
-    motions: of the body's centre and of a point at the lever arm, (N, 6) mm.
-    sway: correlations of the person's sway, (N, N).
-    sides: 1 for pairs of one pole in one scan, (N, N).
-    nuisance: prior variances of each scan's common motion, and of displaced poles, (N, N) mm^2.
-    """
+    """Motions of N pairs, scan after scan, and the covariances that may explain them."""
 
     names: tuple[str, ...]
-    motions: Array
-    sway: Array
-    sides: Array
+    motions: Array  # of the body's centre and of a point at the lever arm, (N, 6) mm
+    sway: Array  # correlations of the person's sway, (N, N)
+    sides: Array  # 1 for pairs of one pole in one scan, (N, N)
+    # Prior variances of each scan's common motion, and of displaced poles, (N, N) mm^2.
     nuisance: Array
 
     @staticmethod

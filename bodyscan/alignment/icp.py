@@ -39,20 +39,16 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True)
 class Overlap:
-    """An overlap of two pairs.
+    """An overlap of two pairs."""
 
-    source, target: names of the pairs.
-    points: approximate number of matched points.
-    rms_before_mm, rms_after_mm: their RMS distance before and after alignment.
-    expected_mm: RMS distance due to noise alone.
-    """
-
+    # source, target: names of the pairs.
     source: str
     target: str
-    points: int
+    points: int  # approximate number of matched points
+    # rms_before_mm, rms_after_mm: their RMS distance before and after alignment.
     rms_before_mm: float
     rms_after_mm: float
-    expected_mm: float = float("nan")
+    expected_mm: float = float("nan")  # RMS distance due to noise alone
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,21 +27,17 @@ NARROW_MARGIN_PX = 2  # blur reaches less far than this; only its bias remains
 
 @dataclass(frozen=True, eq=False)
 class SampledPoints:
-    """N points of one range image that are matched with other images, camera frame.
-
-    inner: pixels away from the margin of what was measured, (h, w). At silhouettes blur mixes in
-        the brighter parts that face the camera, which lifts a surface by some tenths of a millimetre.
-    points, normals: (N, 3).
-    sigma_mm: standard deviations along the normals, (N,).
-    in_margin: whether a point lies in that margin, (N,).
-    """
+    """N points of one range image that are matched with other images, camera frame."""
 
     image: RangeImage
+    # Pixels away from the margin of what was measured, (h, w). At silhouettes blur mixes in the
+    # brighter parts that face the camera, which lifts a surface by some tenths of a millimetre.
     inner: Mask
+    # points, normals: (N, 3).
     points: Array
     normals: Array
-    sigma_mm: Array
-    in_margin: Mask
+    sigma_mm: Array  # standard deviations along the normals, (N,)
+    in_margin: Mask  # whether a point lies in that margin, (N,)
 
     def select(self, chosen: Mask | slice) -> SampledPoints:
         """Copy the chosen points."""
@@ -56,20 +52,13 @@ class SampledPoints:
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """M points of a source image matched with a target's surface, rig frame.
+    """M points of a source image matched with a target's surface, rig frame."""
 
-    points: of the source, (M, 3) mm.
-    normals: mean normals of both surfaces, (M, 3).
-    distances: from the target's surface to the source point along the normal, (M,) mm.
-    sigma_mm: expected standard deviations of the distances, (M,).
-    source: indices of the source's points, (M,).
-    """
-
-    points: Array
-    normals: Array
-    distances: Array
-    sigma_mm: Array
-    source: Indices
+    points: Array  # of the source, (M, 3) mm
+    normals: Array  # mean normals of both surfaces, (M, 3)
+    distances: Array  # from the target's surface to the source point along the normal, (M,) mm
+    sigma_mm: Array  # expected standard deviations of the distances, (M,)
+    source: Indices  # indices of the source's points, (M,)
 
     def with_margin_bias(self) -> Matches:
         """Add the bias of blurred margins, 0.3 mm, to the sigmas."""

@@ -31,13 +31,10 @@ COARSE = slice(None, None, 4)
 
 @dataclass(frozen=True, eq=False)
 class OverlapPoints:
-    """Sampled points of one range image.
+    """Sampled points of one range image."""
 
-    inner: away from its margins.
-    whole: the same points nearly up to the margins, for images that share nothing more.
-    """
-
-    inner: SampledPoints
+    inner: SampledPoints  # away from its margins
+    # The same points nearly up to the margins, for images that share nothing more.
     whole: SampledPoints
 
     @staticmethod

@@ -34,27 +34,22 @@ MIN_OUTWARD_MM = 0.3
 
 @dataclass(frozen=True)
 class ScaleError:
-    """All poles are farther from the body than calibrated, or nearer.
+    """All poles are farther from the body than calibrated, or nearer."""
 
-    outward_mm: how much farther, negative for nearer; every radius of the body is too small by that.
-    sigma_mm: its standard deviation.
-    """
-
+    # How much farther, negative for nearer; every radius of the body is too small by that.
     outward_mm: float
-    sigma_mm: float
+    sigma_mm: float  # its standard deviation
 
 
 @dataclass(frozen=True)
 class CommonError:
     """Every pair is displaced alike in its own camera's frame: not poles moved, but all lenses or all
     projectors changed, or were calibrated with one error.
-
-    shift: (3,) mm, to the right, down and away, where cameras look at the body.
-    rotation_deg: about that place.
     """
 
+    # (3,) mm, to the right, down and away, where cameras look at the body.
     shift: tuple[float, float, float]
-    rotation_deg: float
+    rotation_deg: float  # about that place
 
     @property
     def shift_mm(self) -> float:
@@ -63,19 +58,13 @@ class CommonError:
 
 @dataclass(frozen=True)
 class PostureStep:
-    """The subject held another posture while one pole fired: drew the belly in, lifted an arm.
+    """The subject held another posture while one pole fired: drew the belly in, lifted an arm."""
 
-    pole: or poles, if it may have been another.
-    kinds: of motion, whose fields the step is a sum of.
-    moved_mm: largest amplitude.
-    size_mm: prior standard deviation of the amplitudes.
-    """
-
-    pole: str
+    pole: str  # or poles, if it may have been another
     pairs: frozenset[str]
-    kinds: tuple[str, ...]
-    moved_mm: float
-    size_mm: float
+    kinds: tuple[str, ...]  # of motion, whose fields the step is a sum of
+    moved_mm: float  # largest amplitude
+    size_mm: float  # prior standard deviation of the amplitudes
 
 
 Displacement = DisplacedPole | ScaleError | CommonError | PostureStep

@@ -30,20 +30,13 @@ Height = Callable[[Array], Array]
 
 @dataclass(frozen=True, eq=False)
 class BoundaryPoints:
-    """Stripe boundaries of one pair, intersected with its boards, camera frame.
+    """Stripe boundaries of one pair, intersected with its boards, camera frame."""
 
-    index: boundary i, where s = i, (N,).
-    board: number of the shot, (N,).
-    points: (N, 3) mm.
-    per_pixel: how a point moves on its board per pixel across the stripe, (N, 3) mm.
-    sigma_px: (N,) px.
-    """
-
-    index: Indices
-    board: Indices
-    points: Array
-    per_pixel: Array
-    sigma_px: Array
+    index: Indices  # boundary i, where s = i, (N,)
+    board: Indices  # number of the shot, (N,)
+    points: Array  # (N, 3) mm
+    per_pixel: Array  # how a point moves on its board per pixel across the stripe, (N, 3) mm
+    sigma_px: Array  # (N,) px
 
     @cached_property
     def board_errors(self) -> BoardErrors:
@@ -167,31 +160,22 @@ Box = tuple[Array, Array]
 
 @dataclass(frozen=True, eq=False)
 class BoardBoundaries:
-    """Stripe boundaries of one shot near a board.
+    """Stripe boundaries of one shot near a board."""
 
-    index: (N,).
-    pixels: (N, 2) px.
-    sigma_px: (N,) px.
-    crossing: those of the crossing stripes, if there are any.
-    """
-
-    index: Indices
-    pixels: Array
-    sigma_px: Array
-    crossing: BoardBoundaries | None = None
+    index: Indices  # (N,)
+    pixels: Array  # (N, 2) px
+    sigma_px: Array  # (N,) px
+    crossing: BoardBoundaries | None = None  # those of the crossing stripes, if there are any
 
 
 @dataclass(frozen=True, eq=False)
 class StripedView:
-    """A board that a pair observed, with its pose and the stripes decoded on it.
-
-    face: the face observed, if the board is known not to be flat.
-    """
+    """A board that a pair observed, with its pose and the stripes decoded on it."""
 
     view: LocatedView
     board: Board
     boundaries: BoardBoundaries
-    face: BoardFace | None = None
+    face: BoardFace | None = None  # the face observed, if the board is known not to be flat
 
     @property
     def camera_from_face(self) -> RigidTransform:

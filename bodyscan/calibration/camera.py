@@ -38,14 +38,11 @@ CORNERS = Noise("corners", group=2, cauchy=4.0)
 
 @dataclass(frozen=True)
 class LensTrial:
-    """How one kind of lens did on held-out boards.
-
-    rms_px: RMS error of their corners, px, robustly weighted.
-    gain: standard errors by which it beat the lens chosen so far; None for the first.
-    """
+    """How one kind of lens did on held-out boards."""
 
     kind: str
-    rms_px: float
+    rms_px: float  # RMS error of their corners, px, robustly weighted
+    # Standard errors by which it beat the lens chosen so far; None for the first.
     gain: float | None = None
     chosen: bool = False
 
@@ -57,17 +54,12 @@ class LensTrial:
 
 @dataclass(frozen=True, eq=False)
 class CameraCalibration:
-    """A calibrated camera.
-
-    covariance: of the camera's parameters, (P, P).
-    poses: `camera_from_board` of each view that it was fitted to.
-    rms_px: RMS distance of corners from their reprojection, robustly weighted.
-    """
+    """A calibrated camera."""
 
     camera: Camera
-    covariance: Array
-    poses: tuple[RigidTransform, ...]
-    rms_px: float
+    covariance: Array  # of the camera's parameters, (P, P)
+    poses: tuple[RigidTransform, ...]  # `camera_from_board` of each view that it was fitted to
+    rms_px: float  # RMS distance of corners from their reprojection, robustly weighted
 
 
 @dataclass(frozen=True, eq=False)
@@ -273,18 +265,13 @@ MIN_CLUSTERS = 4
 
 @dataclass(frozen=True, eq=False)
 class ChosenLens:
-    """The chosen lens.
+    """The chosen lens."""
 
-    fit: the camera fitted with it.
-    trials: how each lens did; () if there were too few clusters of poses, or one lens only.
-    tried: the fit of each trial.
-    rays: how well the boards determine each pixel's ray.
-    """
-
-    fit: CameraCalibration
+    fit: CameraCalibration  # the camera fitted with it
+    # How each lens did; () if there were too few clusters of poses, or one lens only.
     trials: tuple[LensTrial, ...]
-    tried: tuple[CameraCalibration, ...]
-    rays: RayUncertainty
+    tried: tuple[CameraCalibration, ...]  # the fit of each trial
+    rays: RayUncertainty  # how well the boards determine each pixel's ray
 
 
 def calibrate_widest(

@@ -28,24 +28,18 @@ WARP_POWERS = ((2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
 CORNERS = Noise("corners, px", group=2, cauchy=4.0, min_scale=1e-3)
 STRIPES = tuple(
     Noise(f"{which} stripes, in sigmas", cauchy=4.0, min_scale=1e-2)
-    for which in ("sheet_columns", "crossing")
+    for which in ("first", "crossing")
 )
 
 
 @dataclass(frozen=True, eq=False)
 class BoardStripes:
-    """Stripe boundaries of one direction on a board.
+    """Stripe boundaries of one direction on a board."""
 
-    pixels: of boundary points, (N, 2) px.
-    index: their boundaries, s = i, (N,).
-    sigma_px: (N,).
-    across: unit vector across the stripes in the image, (2,).
-    """
-
-    pixels: Array
-    index: Array
-    sigma_px: Array
-    across: Array
+    pixels: Array  # of boundary points, (N, 2) px
+    index: Array  # their boundaries, s = i, (N,)
+    sigma_px: Array  # (N,)
+    across: Array  # unit vector across the stripes in the image, (2,)
 
     @staticmethod
     def from_points(camera: Camera, points: BoundaryPoints) -> BoardStripes:
@@ -80,18 +74,14 @@ class StripedBoard:
 
 @dataclass(frozen=True, eq=False)
 class BoardWarp:
-    """Deviation of a board from its description, as unknowns with a Gaussian prior.
+    """Deviation of a board from its description, as unknowns with a Gaussian prior."""
 
-    points: corners as described, (N, 3) mm.
-    heights: coefficients of WARP_POWERS, each less its best plane, (7,) mm; x and y are -1 and 1 at
-        the outermost corners.
-    printed: displacement of corners within the sheet, (N, 2) mm.
-    flatness_mm, print_mm: prior standard deviations of heights and printed.
-    """
-
-    points: Array
+    points: Array  # corners as described, (N, 3) mm
+    # Coefficients of WARP_POWERS, each less its best plane, (7,) mm; x and y are -1 and 1 at the
+    # outermost corners.
     heights: Array
-    printed: Array
+    printed: Array  # displacement of corners within the sheet, (N, 2) mm
+    # flatness_mm, print_mm: prior standard deviations of heights and printed.
     flatness_mm: float
     print_mm: float
 
@@ -161,17 +151,12 @@ class BoardWarp:
 
 @dataclass(frozen=True, eq=False)
 class JointFit:
-    """The fit to corners and stripes together.
-
-    sheets: of each direction.
-    camera_covariance: (P, P).
-    corners_rms_px: robustly weighted.
-    """
+    """The fit to corners and stripes together."""
 
     camera: Camera
-    sheets: tuple[SmoothSheets, ...]
-    camera_covariance: Array
-    corners_rms_px: float
+    sheets: tuple[SmoothSheets, ...]  # of each direction
+    camera_covariance: Array  # (P, P)
+    corners_rms_px: float  # robustly weighted
     warps: dict[str, BoardWarp]
 
 

@@ -21,21 +21,14 @@ from bodyscan.stripes.stripe_code import StripeCode
 
 @dataclass(frozen=True, eq=False)
 class KnownPair:
-    """What another program knows of a pair.
-
-    camera_from_world: mm, None if the file does not say.
-    projector: the projector as a camera, None if nothing is known of it.
-    projector_from_camera: mm, None if nothing is known of the projector.
-    sigma_px: see `Known`.
-    source: the file and its format.
-    """
+    """What another program knows of a pair."""
 
     camera: Camera
-    camera_from_world: RigidTransform | None
-    projector: Camera | None
-    projector_from_camera: RigidTransform | None
-    sigma_px: float | None
-    source: str
+    camera_from_world: RigidTransform | None  # mm, None if the file does not say
+    projector: Camera | None  # the projector as a camera, None if nothing is known of it
+    projector_from_camera: RigidTransform | None  # mm, None if nothing is known of the projector
+    sigma_px: float | None  # see `Known`
+    source: str  # the file and its format
 
     def sheets(self, code: StripeCode) -> LightSheets:
         """Compute the sheets of the stripes that the projector shows."""

@@ -71,34 +71,25 @@ class Candidate:
 
 @dataclass(frozen=True)
 class HeldOutModel:
-    """How well one model measured held-out boards, as distances from the board, mm.
-
-    mean_mm: mean absolute distance, outliers capped, every board weighted the same.
-    rms_mm: RMS distance without outliers.
-    measured: share of the points that got a depth.
-    gain: standard errors by which it beat the model chosen among those before it, three being
-        required; None for the first.
-    """
+    """How well one model measured held-out boards, as distances from the board, mm."""
 
     model: str
-    mean_mm: float
+    mean_mm: float  # mean absolute distance, outliers capped, every board weighted the same
     median_mm: float
-    rms_mm: float
-    measured: float
+    rms_mm: float  # RMS distance without outliers
+    measured: float  # share of the points that got a depth
     chosen: bool = False
+    # Standard errors by which it beat the model chosen among those before it, three being required;
+    # None for the first.
     gain: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class HeldOutErrors:
-    """Distances of held-out points from their boards, as measured by sheets fitted without them.
+    """Distances of held-out points from their boards, as measured by sheets fitted without them."""
 
-    distances: (N,) mm, NaN where not measured.
-    unit_variance: (N,) mm^2 of the distances if boards were known to 1 mm.
-    """
-
-    distances: Array
-    unit_variance: Array
+    distances: Array  # (N,) mm, NaN where not measured
+    unit_variance: Array  # (N,) mm^2 of the distances if boards were known to 1 mm
 
     def board_error_mm(self, data: BoundaryPoints) -> float:
         """Estimate the error of the boards' poses, mm, that explains distances as large as these.

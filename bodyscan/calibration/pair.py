@@ -81,45 +81,36 @@ class PairQuality:
 
 @dataclass(frozen=True, eq=False)
 class PairCalibration:
-    """A calibrated pair, camera frame.
-
-    camera_covariance: covariance of the camera's parameters, (P, P).
-    sheets: None for a camera without a projector.
-    crossing: sheets of the crossing stripes, None if there are none or they are not known.
-    """
+    """A calibrated pair, camera frame."""
 
     name: str
     camera: Camera
-    camera_covariance: Array
-    sheets: LightSheets | None
+    camera_covariance: Array  # of the camera's parameters, (P, P)
+    sheets: LightSheets | None  # None for a camera without a projector
     quality: PairQuality
+    # Sheets of the crossing stripes, None if there are none or they are not known.
     crossing: LightSheets | None = None
     rays: RayUncertainty | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class LocatedPair:
-    """A pair whose camera and boards are known: the input for fitting its light sheets.
-
-    camera, camera_covariance: the camera after the joint solve of the rig's corners, and the
-        covariance (P, P) of its parameters.
-    rays: how well each pixel's ray is known.
-    views: every board view that the camera contributed, with `camera_from_board` from that solve.
-    shots: those with decoded stripes.
-    alone: whether no other pair constrains the boards.
-    """
+    """A pair whose camera and boards are known: the input for fitting its light sheets."""
 
     name: str
+    # camera, camera_covariance: the camera after the joint solve of the rig's corners, and the
+    # covariance (P, P) of its parameters.
     camera: Camera
     camera_covariance: Array
-    rays: RayUncertainty | None
+    rays: RayUncertainty | None  # how well each pixel's ray is known
     lenses: tuple[LensTrial, ...]
     rms_px: float
     projector: StripeCode | None
+    # Every board view that the camera contributed, with `camera_from_board` from that solve.
     views: tuple[LocatedView, ...]
-    shots: tuple[StripedView, ...]
+    shots: tuple[StripedView, ...]  # those with decoded stripes
     boards: tuple[Board, ...]
-    alone: bool
+    alone: bool  # whether no other pair constrains the boards
 
 
 def calibrate_pair(pair: LocatedPair) -> Outcome[PairCalibration]:

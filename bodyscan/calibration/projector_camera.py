@@ -127,31 +127,24 @@ POSE = 6  # unknowns of the projector's pose, before those of its camera model
 
 @dataclass(frozen=True, eq=False)
 class FittedProjector:
-    """A projector as a camera.
+    """A projector as a camera."""
 
-    camera: the projector, with one pixel for each stripe.
-    projector_from_camera: mm.
-    misfit_px: RMS distance of the pair's sheets from the projector's, weighted by their sigmas.
-    predicted_px: what their noise alone gives. Both are 0 where the projector is exact.
-    """
-
-    camera: Camera
-    projector_from_camera: RigidTransform
+    camera: Camera  # the projector, with one pixel for each stripe
+    projector_from_camera: RigidTransform  # mm
+    # RMS distance of the pair's sheets from the projector's, weighted by their sigmas.
     misfit_px: float = 0.0
+    # What their noise alone gives. Both are 0 where the projector is exact.
     predicted_px: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
 class _Samples:
-    """Points (N, 3) mm, camera frame, on the sheets at s (N,), with sigma (N,) in stripes.
-
-    axis: 0 for columns of the projector (vertical stripes), 1 for rows.
-    """
+    """Points (N, 3) mm, camera frame, on the sheets at s (N,), with sigma (N,) in stripes."""
 
     points: Array
     s: Array
     sigma: Array
-    axis: int
+    axis: int  # 0 for columns of the projector (vertical stripes), 1 for rows
 
 
 def fit_projector(

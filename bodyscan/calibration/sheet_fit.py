@@ -57,17 +57,12 @@ def fit_pinhole(points: Array, s: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class SheetFit(Generic[Sheets]):
-    """Fitted sheets with their covariance.
-
-    distances_mm: of the points from their sheets, (N,).
-    weights: robust weights of the points, (N,).
-    noise: robust sigma of the distances, in the points' own sigmas.
-    """
+    """Fitted sheets with their covariance."""
 
     sheets: Sheets
-    distances_mm: Array
-    weights: Array
-    noise: float
+    distances_mm: Array  # of the points from their sheets, (N,)
+    weights: Array  # robust weights of the points, (N,)
+    noise: float  # robust sigma of the distances, in the points' own sigmas
 
     @property
     def rms_mm(self) -> float:
@@ -170,15 +165,12 @@ def _sum_products(group: Indices, groups: int, left: Array, right: Array) -> Arr
 
 @dataclass(frozen=True, eq=False)
 class PlaneFit:
-    """Light planes and how well they fit.
-
-    distances_mm: distance of every boundary point from its plane, (N,), NaN without a plane.
-    rms_mm: robustly weighted RMS of the distances.
-    """
+    """Light planes and how well they fit."""
 
     planes: LightPlanes
+    # Distance of every boundary point from its plane, (N,), NaN without a plane.
     distances_mm: Array
-    rms_mm: float
+    rms_mm: float  # robustly weighted RMS of the distances
 
 
 def fit_light_planes(

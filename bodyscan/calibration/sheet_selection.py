@@ -32,19 +32,13 @@ from bodyscan.geometry.light_planes import Axis, LightPlanes, LightSheets, Smoot
 
 @dataclass(frozen=True, eq=False)
 class SheetsFit:
-    """The light sheets of a pair and how they were chosen.
-
-    model: its name in `held_out`.
-    held_out: figures of all models tried, simplest first.
-    rms_mm: distance of boundary points from their sheets, robustly weighted RMS.
-    board_counts: number of boards on which each boundary was found, (S + 1,).
-    """
+    """The light sheets of a pair and how they were chosen."""
 
     sheets: LightSheets
-    model: str
-    held_out: tuple[HeldOutModel, ...]
-    rms_mm: float
-    board_counts: Indices
+    model: str  # its name in `held_out`
+    held_out: tuple[HeldOutModel, ...]  # figures of all models tried, simplest first
+    rms_mm: float  # distance of boundary points from their sheets, robustly weighted RMS
+    board_counts: Indices  # number of boards on which each boundary was found, (S + 1,)
 
     @property
     def stripes_calibrated(self) -> int:

@@ -44,16 +44,13 @@ ERRORS = Console(stderr=True)
 
 @dataclass
 class Output:
-    """Collects files, findings and figures; shows them as they come, or as JSON.
-
-    exit_code: 1 where the work came to its end but its result must not be used as it is.
-    """
+    """Collects files, findings and figures; shows them as they come, or as JSON."""
 
     command: str
     json: bool = False
     quiet: bool = False
     verbose: bool = False
-    exit_code: int = 0
+    exit_code: int = 0  # 1 where the work came to its end but its result must not be used as it is
     _files: dict[str, list[str]] = field(default_factory=dict)
     _figures: dict[str, Any] = field(default_factory=dict)
     _lines: list[str] = field(default_factory=list)

@@ -29,18 +29,14 @@ MIN_PLATE_POINTS = 300
 
 @dataclass(frozen=True, eq=False)
 class SphereReading:
-    """One sphere, from points (all pairs merged, or one pair's).
-
-    form_mm: range of the radial distances from the fitted one, 3 per mille of the points left out.
-    shell_mm: width of the shell that holds 90 % of the points.
-    size_mm: its diameter less the calibrated one.
-    """
+    """One sphere, from points (all pairs merged, or one pair's)."""
 
     fitted: Sphere
     points: int
+    # Range of the radial distances from the fitted one, 3 per mille of the points left out.
     form_mm: float
-    shell_mm: float
-    size_mm: float
+    shell_mm: float  # width of the shell that holds 90 % of the points
+    size_mm: float  # its diameter less the calibrated one
 
 
 @dataclass(frozen=True, eq=False)

@@ -90,14 +90,10 @@ def measure_sphere(points: Array, radius: float) -> SphereAccuracy:
 
 @dataclass(frozen=True)
 class CentreDistances:
-    """Distances between sphere centres against the truth.
+    """Distances between sphere centres against the truth."""
 
-    rms_mm: RMS of their errors.
-    scale_ppm: measured over true, less 1, in ppm.
-    """
-
-    rms_mm: float
-    scale_ppm: float
+    rms_mm: float  # RMS of their errors
+    scale_ppm: float  # measured over true, less 1, in ppm
 
 
 def compare_centre_distances(measured: Array, true: Array) -> CentreDistances:

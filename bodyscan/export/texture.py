@@ -21,18 +21,12 @@ from bodyscan.progress import THREADS
 
 @dataclass(frozen=True, eq=False)
 class Texture:
-    """Colours of a mesh in an image. At seams of the atlas a vertex has several places in it.
+    """Colours of a mesh in an image. At seams of the atlas a vertex has several places in it."""
 
-    uv: (T, 2) float32, place in the image: 0 to 1, to the right and down.
-    vertex: (T,) index of the vertex at each place.
-    faces: (F, 3) indices into both, in the order of the mesh's faces.
-    image: (S, S, 3) uint8, red, green, blue.
-    """
-
-    uv: Floats
-    vertex: Indices
-    faces: Indices
-    image: Bytes
+    uv: Floats  # (T, 2) float32, place in the image: 0 to 1, to the right and down
+    vertex: Indices  # (T,) index of the vertex at each place
+    faces: Indices  # (F, 3) indices into both, in the order of the mesh's faces
+    image: Bytes  # (S, S, 3) uint8, red, green, blue
 
     @cached_property
     def png(self) -> bytes:

@@ -41,19 +41,14 @@ OUT_OF_STEPS: Ending = "out of steps"
 
 @dataclass(frozen=True)
 class Noise:
-    """The error model of one kind of residual; blocks with equal `Noise` share one spread.
-
-    group: how many neighbouring residuals (u and v of a corner) share one weight.
-    cauchy: scales beyond which residuals count less and less (Cauchy loss); None: all count alike.
-    min_scale: lower limit of the scale.
-    known: the spread, where it need not be estimated.
-    """
+    """The error model of one kind of residual; blocks with equal `Noise` share one spread."""
 
     kind: str
-    group: int = 1
+    group: int = 1  # how many neighbouring residuals (u and v of a corner) share one weight
+    # Scales beyond which residuals count less and less (Cauchy loss); None: all count alike.
     cauchy: float | None = None
-    min_scale: float = 1e-12
-    known: float | None = None
+    min_scale: float = 1e-12  # lower limit of the scale
+    known: float | None = None  # the spread, where it need not be estimated
 
     def estimate_scale(self, residuals: Array) -> float:
         return robust_scale(residuals, self.min_scale) if self.known is None else self.known
@@ -106,24 +101,16 @@ class Block:
 
 @dataclass(frozen=True, eq=False)
 class Solution(Generic[State]):
-    """The minimum and what is needed for its covariance.
+    """The minimum and what is needed for its covariance."""
 
-    state: the minimum.
-    blocks: evaluated there.
-    weights: robust weights (N,) in [0, 1] of each block.
-    scales: of each block, in its residuals' sigmas.
-    unknowns: P.
-    steps: how many were taken.
-    ending: `settled` (see above); `out of steps`; or `stuck`: no step lowers the cost although the
-        equations predict one (a wrong Jacobian, a kink).
-    """
-
-    state: State
-    blocks: tuple[Block, ...]
-    weights: tuple[Array, ...]
-    scales: tuple[float, ...]
-    unknowns: int
-    steps: int
+    state: State  # the minimum
+    blocks: tuple[Block, ...]  # evaluated there
+    weights: tuple[Array, ...]  # robust weights (N,) in [0, 1] of each block
+    scales: tuple[float, ...]  # of each block, in its residuals' sigmas
+    unknowns: int  # P
+    steps: int  # how many were taken
+    # `settled` (see above); `out of steps`; or `stuck`: no step lowers the cost although the
+    # equations predict one (a wrong Jacobian, a kink).
     ending: Ending
 
     @cached_property
@@ -210,18 +197,12 @@ def minimize(
 
 @dataclass(frozen=True, eq=False)
 class StackedEquations:
-    """Normal equations of N small problems.
+    """Normal equations of N small problems."""
 
-    normal: (N, P, P), J^T W J.
-    gradient: (N, P), J^T W r.
-    cost: (N,), r^T W r.
-    freedoms: (N,), sum of the weights less the number of unknowns, at least 1.
-    """
-
-    normal: Array
-    gradient: Array
-    cost: Array
-    freedoms: Array
+    normal: Array  # (N, P, P), J^T W J
+    gradient: Array  # (N, P), J^T W r
+    cost: Array  # (N,), r^T W r
+    freedoms: Array  # (N,), sum of the weights less the number of unknowns, at least 1
 
     def where(self, chosen: Mask, others: StackedEquations) -> StackedEquations:
         """Take the `chosen` (N,) problems from here and the rest from `others`."""
@@ -240,16 +221,11 @@ class StackedEquations:
 
 @dataclass(frozen=True, eq=False)
 class StackedSolution:
-    """The minima of N problems.
+    """The minima of N problems."""
 
-    state: (N, P).
-    equations: evaluated there.
-    converged: (N,), which problems settled.
-    """
-
-    state: Array
-    equations: StackedEquations
-    converged: Mask
+    state: Array  # (N, P)
+    equations: StackedEquations  # evaluated there
+    converged: Mask  # (N,), which problems settled
 
     def covariance(self) -> Array:
         """Covariance (N, P, P), with each problem's noise estimated from its remaining cost."""

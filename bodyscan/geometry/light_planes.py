@@ -20,16 +20,11 @@ Axis = Literal["horizontal", "vertical"]
 
 
 class RayDepths(NamedTuple):
-    """Depths along rays; NaN where a ray meets no sheet, or no depth can be trusted.
+    """Depths along rays; NaN where a ray meets no sheet, or no depth can be trusted."""
 
-    depth: z (...) mm.
-    per_stripe: dz/ds (...), mm per stripe.
-    variance_mm2: (...) of the depth, due to the uncertainty of the sheets alone.
-    """
-
-    depth: Array
-    per_stripe: Array
-    variance_mm2: Array
+    depth: Array  # z (...) mm
+    per_stripe: Array  # dz/ds (...), mm per stripe
+    variance_mm2: Array  # (...) of the depth, due to the uncertainty of the sheets alone
 
 
 class LightSheets(Protocol):
@@ -63,19 +58,15 @@ def towards_camera(planes: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class LightPlanes:
-    """One plane per boundary, each independent of its neighbours.
-
-    coefficients: (S + 1, 4), row i is (a, b, c, d) of the plane at s = i: ax + by + cz + d = 0,
-        camera frame, mm, (a, b, c) a unit vector, d >= 0. A row of NaN: the stripe is not calibrated.
-    covariance: (S + 1, 4, 4) of the coefficients.
-    direction: which way the stripes run in the image.
-    """
+    """One plane per boundary, each independent of its neighbours."""
 
     kind: ClassVar[str] = "planes"
 
+    # (S + 1, 4), row i is (a, b, c, d) of the plane at s = i: ax + by + cz + d = 0, camera frame,
+    # mm, (a, b, c) a unit vector, d >= 0. A row of NaN: the stripe is not calibrated.
     coefficients: Array
-    covariance: Array
-    direction: Axis
+    covariance: Array  # (S + 1, 4, 4) of the coefficients
+    direction: Axis  # which way the stripes run in the image
 
     @staticmethod
     def from_planes(planes: Array, direction: Axis) -> LightPlanes:
@@ -149,39 +140,29 @@ Sheets = TypeVar("Sheets", bound="SmoothSheets")
 
 @dataclass(frozen=True, eq=False)
 class Offset:
-    """How far points (..., 3) lie off their sheets, in the model's own unit.
+    """How far points (..., 3) lie off their sheets, in the model's own unit."""
 
-    value: (...).
-    by_point: (..., 3), derivatives by the point, camera frame.
-    reach: (...), the points' distance from the projector along its axis, mm.
-    by_parameter: (..., P), only when requested.
-    """
-
-    value: Array
-    by_point: Array
-    reach: Array
-    by_parameter: Array | None = None
+    value: Array  # (...)
+    by_point: Array  # (..., 3), derivatives by the point, camera frame
+    reach: Array  # (...), the points' distance from the projector along its axis, mm
+    by_parameter: Array | None = None  # (..., P), only when requested
 
 
 @dataclass(frozen=True, eq=False)
 class SmoothSheets(ABC):
-    """Light sheets that are smooth in s.
-
-    projector_from_camera: a frame roughly at the projector, z the direction it shines, x along the
-        stripes, y across them.
-    middle: (3,) mm, camera frame, the middle of the boards; the search for a depth starts there.
-    parameters: (Q,), see the model.
-    covariance: (P, P) of the freedoms that `retract` takes.
-    """
+    """Light sheets that are smooth in s."""
 
     kind: ClassVar[str]
 
+    # A frame roughly at the projector, z the direction it shines, x along the stripes, y across
+    # them.
     projector_from_camera: RigidTransform
+    # (3,) mm, camera frame, the middle of the boards; the search for a depth starts there.
     middle: Array
     stripes: int
     direction: Axis
-    parameters: Array
-    covariance: Array
+    parameters: Array  # (Q,), see the model
+    covariance: Array  # (P, P) of the freedoms that `retract` takes
 
     @abstractmethod
     def linearize_prior(self) -> tuple[Array, Array]:

@@ -26,15 +26,12 @@ from bodyscan.arrays import Array, Indices
 class LinearGaussianSystem:
     """Information matrix H and information vector b of P unknowns, or a stack of such systems.
 
-    information: (..., P, P), symmetric, in inverse squared units of the unknowns.
-    vector: (..., P).
-
     For residuals r(x) = r0 + J x with weights W (inverse variances), H = J^T W J and
     b = -J^T W r0. A stack (N, P, P) holds N systems of separate unknowns.
     """
 
-    information: Array
-    vector: Array
+    information: Array  # (..., P, P), symmetric, in inverse squared units of the unknowns
+    vector: Array  # (..., P)
 
     @staticmethod
     def from_observations(jacobian: Array, observed: Array, weights: Array) -> LinearGaussianSystem:

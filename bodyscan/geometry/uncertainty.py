@@ -71,14 +71,10 @@ ROWS, COLUMNS = 17, 21
 
 @dataclass(frozen=True, eq=False)
 class RayUncertainty:
-    """Standard deviations of a coordinate, px, at ROWS x COLUMNS nodes from first to last pixel.
+    """Standard deviations of a coordinate, px, at ROWS x COLUMNS nodes from first to last pixel."""
 
-    noise_px: due to the corners' noise.
-    lens_px: due to the choice of lens model.
-    """
-
-    noise_px: Array
-    lens_px: Array
+    noise_px: Array  # due to the corners' noise
+    lens_px: Array  # due to the choice of lens model
 
     @property
     def sigma_px(self) -> Array:

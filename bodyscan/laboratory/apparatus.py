@@ -69,17 +69,13 @@ class Stream(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class ChapterSetup:
-    """The simulated set-up, all in the camera's frame.
-
-    projector: a mirror whose surface lies off its axis.
-    seed: of all noise.
-    """
+    """The simulated set-up, all in the camera's frame."""
 
     settings: SimulationSettings
-    projector: MirrorProjector
+    projector: MirrorProjector  # a mirror whose surface lies off its axis
     board: MadeBoard
     view: View
-    seed: int
+    seed: int  # of all noise
 
 
 def ideal_settings(samples: int = 5) -> SimulationSettings:
@@ -240,22 +236,18 @@ class SceneCapture:
 
 @dataclass(frozen=True, eq=False)
 class ChapterCaptures:
-    """All captures.
-
-    boards: the three poses, or as many as were asked for.
-    stage, readings: a board on a slide stage, and its readings (mm).
-    owner: (H, W) number of the sphere that a pixel's centre sees and the projector lights, or -1.
-    on_plate: (H, W) pixels on the plate, clear of its rim.
-    """
+    """All captures."""
 
     setup: ChapterSetup
-    boards: tuple[StripedShot, ...]
+    boards: tuple[StripedShot, ...]  # the three poses, or as many as were asked for
+    # stage, readings: a board on a slide stage, and its readings (mm).
     stage: tuple[StripedShot, ...]
     readings: Array
     spheres: SceneCapture
     plate: SceneCapture
+    # (H, W) number of the sphere that a pixel's centre sees and the projector lights, or -1.
     owner: Indices
-    on_plate: Mask
+    on_plate: Mask  # (H, W) pixels on the plate, clear of its rim
 
 
 def take_captures(

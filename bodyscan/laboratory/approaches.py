@@ -204,22 +204,15 @@ def fit_approach(name: str, where: LocatedBoards, model: Model) -> Approach:
 
 @dataclass(frozen=True, eq=False)
 class Calibrations:
-    """Everything calibrated from the same images.
+    """Everything calibrated from the same images."""
 
-    reference: Zhang's camera.
-    planes: the chapter's fit of its free planes.
-    ours: our approach, with the camera of the joint solve.
-    model: of its light sheets, as held-out boards chose.
-    approaches: (i), (i) mended, (ii), (ii) with skew, (iii), ours.
-    by_stage, by_reference: every model of the projector, calibrated either way.
-    """
-
-    reference: CameraCalibration
-    planes: PlaneFit
-    ours: Approach
+    reference: CameraCalibration  # Zhang's camera
+    planes: PlaneFit  # the chapter's fit of its free planes
+    ours: Approach  # our approach, with the camera of the joint solve
     camera_covariance: Array
-    model: str
-    approaches: tuple[Approach, ...]
+    model: str  # of its light sheets, as held-out boards chose
+    approaches: tuple[Approach, ...]  # (i), (i) mended, (ii), (ii) with skew, (iii), ours
+    # by_stage, by_reference: every model of the projector, calibrated either way.
     by_stage: tuple[Approach, ...]
     by_reference: tuple[Approach, ...]
 

@@ -32,21 +32,16 @@ Stripes = NDArray[np.floating[Any]]
 
 @dataclass(frozen=True, eq=False)
 class ApproachAccuracy:
-    """Accuracy of one approach on the common images.
-
-    spheres: No. 1 to 5, from every measured pixel that a sphere covers and the projector lights.
-    covered: share of those pixels that were measured, for each sphere.
-    distances: between the spheres' centres (radius held), and their scale error.
-    plate: of the flat plate as decoded.
-    plate_systematic_mm: RMS flatness error of the same plate with every pixel's stripe coordinate
-        known exactly, so that only the calibration's error is left.
-    """
+    """Accuracy of one approach on the common images."""
 
     name: str
+    # No. 1 to 5, from every measured pixel that a sphere covers and the projector lights.
     spheres: tuple[SphereAccuracy, ...]
-    covered: tuple[float, ...]
-    distances: CentreDistances
-    plate: Flatness
+    covered: tuple[float, ...]  # share of those pixels that were measured, for each sphere
+    distances: CentreDistances  # between the spheres' centres (radius held), and their scale error
+    plate: Flatness  # of the flat plate as decoded
+    # RMS flatness error of the same plate with every pixel's stripe coordinate known exactly, so
+    # that only the calibration's error is left.
     plate_systematic_mm: float
 
     @property
@@ -152,17 +147,14 @@ def _drop_unknown(points: Array) -> Array:
 class PointSigma:
     """Errors along the rays over their sigma, after the rigid motion that fits best: a pair by itself
     has no frame but that of its boards.
-
-    spheres, plate: root mean square on these (1 if the sigmas are right).
-    beyond_three: share of all errors beyond three sigmas (0.0027 if Gaussian).
-    median_mm: of the sigmas themselves.
     """
 
     name: str
+    # spheres, plate: root mean square on these (1 if the sigmas are right).
     spheres: float
     plate: float
-    beyond_three: float
-    median_mm: float
+    beyond_three: float  # share of all errors beyond three sigmas (0.0027 if Gaussian)
+    median_mm: float  # of the sigmas themselves
 
 
 def compare_point_sigmas(approach: Approach, captures: ChapterCaptures) -> PointSigma:

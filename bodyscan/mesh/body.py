@@ -54,14 +54,10 @@ class BodyCloud:
 
 @dataclass(frozen=True, eq=False)
 class BreathAt:
-    """Displacements that bring vertices to mean breath.
+    """Displacements that bring vertices to mean breath."""
 
-    mm: (V,) float32, outwards along each vertex's normal.
-    sigma_mm: (V,) float32, their standard deviation.
-    """
-
-    mm: Floats
-    sigma_mm: Floats
+    mm: Floats  # (V,) float32, outwards along each vertex's normal
+    sigma_mm: Floats  # (V,) float32, their standard deviation
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,13 +146,10 @@ def compute_face_regions(regions: Bytes, faces: Indices) -> Bytes:
 
 @dataclass(frozen=True, eq=False)
 class FilledPatch:
-    """A connected patch of filled faces.
+    """A connected patch of filled faces."""
 
-    area_mm2: of the faces. centre: (3,) mm, rig frame.
-    """
-
-    area_mm2: float
-    centre: Array
+    area_mm2: float  # of the faces
+    centre: Array  # (3,) mm, rig frame
 
 
 def find_filled_patches(mesh: BodyMesh) -> list[FilledPatch]:

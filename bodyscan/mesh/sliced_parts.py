@@ -34,17 +34,13 @@ a hand, heights of the armpit and of a thigh surely below the crotch (Drillis an
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """One part of a body in one slice.
+    """One part of a body in one slice."""
 
-    part: trunk, head (above the neck), left leg, right leg, left arm, right arm, or other; several,
-        joined by " and ", where they touch and no neck divides them.
-    loop: its outline, closed straight where it was cut from others.
-    touches: the parts that it was cut from.
-    """
-
+    # Trunk, head (above the neck), left leg, right leg, left arm, right arm, or other; several,
+    # joined by " and ", where they touch and no neck divides them.
     part: str
-    loop: Loop
-    touches: tuple[str, ...]
+    loop: Loop  # its outline, closed straight where it was cut from others
+    touches: tuple[str, ...]  # the parts that it was cut from
 
 
 @dataclass(frozen=True)

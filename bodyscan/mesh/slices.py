@@ -15,15 +15,11 @@ from bodyscan.arrays import Array, Indices, Mask
 
 @dataclass(frozen=True, eq=False)
 class MeshSlicer:
-    """Cuts a closed mesh at any number of heights.
+    """Cuts a closed mesh at any number of heights."""
 
-    vertices: (V, 3) mm. faces: (F, 3), outward.
-    filled: (F,) which faces were filled.
-    """
-
-    vertices: Array
-    faces: Indices
-    filled: Mask | None = None
+    vertices: Array  # (V, 3) mm
+    faces: Indices  # (F, 3), outward
+    filled: Mask | None = None  # (F,) which faces were filled
 
     @cached_property
     def height_ranges(self) -> tuple[Indices, Array, Array]:
@@ -59,17 +55,13 @@ class MeshSlicer:
 
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """One closed curve of a slice, mm.
+    """One closed curve of a slice, mm."""
 
-    segments: (N, 2, 2) from (x, y) to (x, y), each from where the one before ends; seen from above,
-        the body is on the left.
-    measured: (N,) whether the segment crosses a measured face.
-    faces: (N,) of the mesh; -1 for segments that close a gap.
-    """
-
+    # (N, 2, 2) from (x, y) to (x, y), each from where the one before ends; seen from above, the
+    # body is on the left.
     segments: Array
-    measured: Mask
-    faces: Indices
+    measured: Mask  # (N,) whether the segment crosses a measured face
+    faces: Indices  # (N,) of the mesh; -1 for segments that close a gap
 
     @cached_property
     def lengths(self) -> Array:

@@ -30,17 +30,12 @@ class Bricks:
     """A sparse grid: B bricks of SIDE^3 nodes, kept only where they are needed.
 
     Values at the nodes are arrays (B, SIDE, SIDE, SIDE).
-
-    table: (a, b, c) int32, the number of each brick, -1 where there is none.
-    indices: (B, 3) int32, index of each brick in the table.
-    origin: (3,) mm, the grid's first node.
-    cell_mm: distance from node to node.
     """
 
-    table: Numbers
-    indices: Numbers
-    origin: Array
-    cell_mm: float
+    table: Numbers  # (a, b, c) int32, the number of each brick, -1 where there is none
+    indices: Numbers  # (B, 3) int32, index of each brick in the table
+    origin: Array  # (3,) mm, the grid's first node
+    cell_mm: float  # distance from node to node
 
     @staticmethod
     def from_mask(wanted: Mask, origin: Array, cell_mm: float) -> Bricks:

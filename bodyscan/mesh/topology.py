@@ -63,19 +63,13 @@ def find_fault(vertices: Array, faces: Indices) -> str | None:
 
 @dataclass(frozen=True)
 class Topology:
-    """Properties of a mesh as a surface.
+    """Properties of a mesh as a surface."""
 
-    closed: every edge lies in exactly two faces, which run along it in opposite directions.
-    manifold: closed, and the faces around every vertex form a single fan.
-    euler: V - E + F: 2 for a sphere, less 2 for each handle.
-    volume_mm3: signed; positive if the faces are oriented outwards.
-    """
-
-    closed: bool
-    manifold: bool
+    closed: bool  # every edge lies in exactly two faces, which run along it in opposite directions
+    manifold: bool  # closed, and the faces around every vertex form a single fan
     components: int
-    euler: int
-    volume_mm3: float
+    euler: int  # V - E + F: 2 for a sphere, less 2 for each handle
+    volume_mm3: float  # signed; positive if the faces are oriented outwards
 
 
 def compute_topology(vertices: Array, faces: Indices) -> Topology:

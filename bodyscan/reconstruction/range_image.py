@@ -16,16 +16,12 @@ imported calibration's lack all of its own) and cannot weight the directions."""
 
 @dataclass(frozen=True)
 class Agreement:
-    """How well the two directions agree.
+    """How well the two directions agree."""
 
-    offset_sigmas: robust sigma of the difference of both depths along the rays, in their own sigmas.
-    offset_stripes: the same in stripes of the less depth-sensitive direction.
-    stripes: number of stripes of that direction.
-    """
-
+    # Robust sigma of the difference of both depths along the rays, in their own sigmas.
     offset_sigmas: float
-    offset_stripes: float
-    stripes: int
+    offset_stripes: float  # the same in stripes of the less depth-sensitive direction
+    stripes: int  # number of stripes of that direction
 
     @property
     def unusual(self) -> bool:

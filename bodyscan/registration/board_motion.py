@@ -28,19 +28,15 @@ from bodyscan.registration.joint_solve import JointSolution, linearize_reproject
 
 @dataclass(frozen=True, eq=False)
 class _Motions:
-    """Estimates by each of V views of its board's motion from where the shot has it.
+    """Estimates by each of V views of its board's motion from where the shot has it."""
 
-    basis: (V, 6, 6) columns: turns about the board's middle that move its corners by 1 mm, and shifts
-        by 1 mm, board frame.
-    observed: (V, 6) mm in that basis. covariance: (V, 6, 6), of corners' noise.
-    path: (V, 6) mm from the shot before to the one after.
-    camera, target: (V,) their numbers.
-    """
-
+    # (V, 6, 6) columns: turns about the board's middle that move its corners by 1 mm, and shifts by
+    # 1 mm, board frame.
     basis: Array
-    observed: Array
-    covariance: Array
-    path: Array
+    observed: Array  # (V, 6) mm in that basis
+    covariance: Array  # (V, 6, 6), of corners' noise
+    path: Array  # (V, 6) mm from the shot before to the one after
+    # camera, target: (V,) their numbers.
     camera: Indices
     target: Indices
 

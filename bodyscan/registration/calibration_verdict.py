@@ -16,14 +16,11 @@ from bodyscan.verdict import Grade, Verdict
 
 @dataclass(frozen=True)
 class Limit:
-    """How large, or how small, a figure of a good pair may be.
-
-    reason: the sentence for a figure beyond it, with a field for the figure.
-    at_least: it bounds from below how much was seen; otherwise from above how large an error is.
-    """
+    """How large, or how small, a figure of a good pair may be."""
 
     value: float
-    reason: str
+    reason: str  # the sentence for a figure beyond it, with a field for the figure
+    # It bounds from below how much was seen; otherwise from above how large an error is.
     at_least: bool = False
 
 

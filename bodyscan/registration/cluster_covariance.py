@@ -38,21 +38,16 @@ class NormalEquations:
 
     The unknowns are motions of the pairs `names` (6 each), the parameters of each pair's camera,
     then the corners of boards whose shape was estimated (3 each, board frame, mm).
-
-    cameras: indices of each camera's parameters.
-    free: indices of the unknowns that the definition of the rig frame does not fix.
-    prior: the priors on cameras and corners, px2 per unit of either unknown.
-    parts: by target, indices (C,) of the unknowns that its views involve, and the system of these:
-        J^T W J, px2 per unit of either unknown, and -J^T W r.
-    variance_px2: variance of one coordinate of a corner, in a view of average noise.
     """
 
     names: tuple[str, ...]
-    cameras: dict[str, Indices]
-    free: Indices
-    prior: LinearGaussianSystem
+    cameras: dict[str, Indices]  # indices of each camera's parameters
+    free: Indices  # indices of the unknowns that the definition of the rig frame does not fix
+    prior: LinearGaussianSystem  # the priors on cameras and corners, px2 per unit of either unknown
+    # By target, indices (C,) of the unknowns that its views involve, and the system of these: J^T W
+    # J, px2 per unit of either unknown, and -J^T W r.
     parts: dict[Target, tuple[Indices, LinearGaussianSystem]]
-    variance_px2: float
+    variance_px2: float  # variance of one coordinate of a corner, in a view of average noise
 
     def sum_parts(self, targets: Sequence[Target]) -> LinearGaussianSystem:
         """The system of the free unknowns by these targets alone."""
@@ -170,15 +165,11 @@ def _information(shape: BoardShape) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class ClusterRobustCovariance:
-    """Covariance of the joint solve's unknowns.
+    """Covariance of the joint solve's unknowns."""
 
-    poses: of the pairs.
-    cameras: (P, P) of each camera's parameters.
-    variance_inflation: factor on the variances that independent corners predict, over all clusters.
-    """
-
-    poses: PoseCovariance
-    cameras: dict[str, Array]
+    poses: PoseCovariance  # of the pairs
+    cameras: dict[str, Array]  # (P, P) of each camera's parameters
+    # Factor on the variances that independent corners predict, over all clusters.
     variance_inflation: float
 
 

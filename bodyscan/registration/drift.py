@@ -50,17 +50,13 @@ def observe_pose(view: LocatedView, camera: Camera, sigma_px: float) -> Observed
 
 @dataclass(frozen=True, eq=False)
 class Move:
-    """A motion of pairs that moved together: one pair, or all of a pole.
-
-    motion: in the rig frame, `new rig_from_camera = motion @ old`.
-    covariance: (6, 6) of the motion's twist.
-    shift_mm, sigma_mm: shift of the cameras' centroid, and its sigma over all axes.
-    """
+    """A motion of pairs that moved together: one pair, or all of a pole."""
 
     name: str
     pairs: tuple[str, ...]
-    motion: RigidTransform
-    covariance: Array
+    motion: RigidTransform  # in the rig frame, `new rig_from_camera = motion @ old`
+    covariance: Array  # (6, 6) of the motion's twist
+    # shift_mm, sigma_mm: shift of the cameras' centroid, and its sigma over all axes.
     shift_mm: float
     sigma_mm: float
 
@@ -72,19 +68,14 @@ class Move:
 
 @dataclass(frozen=True, eq=False)
 class Drift:
-    """What moved.
+    """What moved."""
 
-    moves: in the order found, the clearest first.
-    rig_from_board: of the boards used.
-    misfit_before, misfit: RMS error of the views in sigmas, before and after all moves.
-    lonely: pairs that share no board with another.
-    """
-
-    moves: tuple[Move, ...]
-    rig_from_board: dict[Target, RigidTransform]
+    moves: tuple[Move, ...]  # in the order found, the clearest first
+    rig_from_board: dict[Target, RigidTransform]  # of the boards used
+    # misfit_before, misfit: RMS error of the views in sigmas, before and after all moves.
     misfit_before: float
     misfit: float
-    lonely: tuple[str, ...]
+    lonely: tuple[str, ...]  # pairs that share no board with another
 
 
 def find_drift(

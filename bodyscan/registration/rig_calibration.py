@@ -23,15 +23,11 @@ FLOOR_AXES = "origin on the floor at the rig's centre, x forward, y to the left,
 
 @dataclass(frozen=True, eq=False)
 class ObservedCorners:
-    """Board corners that one camera saw and the joint solve used.
+    """Board corners that one camera saw and the joint solve used."""
 
-    pixels: where they were seen, (N, 2) float32.
-    residuals_px: projected less seen, (N, 2) float32.
-    target: number of the corner's (shot, board) in sorted `rig_from_board`, (N,) int16.
-    """
-
-    pixels: Floats
-    residuals_px: Floats
+    pixels: Floats  # where they were seen, (N, 2) float32
+    residuals_px: Floats  # projected less seen, (N, 2) float32
+    # Number of the corner's (shot, board) in sorted `rig_from_board`, (N,) int16.
     target: NDArray[np.int16]
 
 
@@ -86,14 +82,10 @@ same share: 27 mm of 900 at 3 %."""
 
 @dataclass(frozen=True)
 class NominalSize:
-    """The rig's size relative to its nominal poses.
+    """The rig's size relative to its nominal poses."""
 
-    ratio: distances between cameras, divided by those between their nominal positions.
-    boards: those whose squares give the rig's lengths.
-    """
-
-    ratio: float
-    boards: tuple[Board, ...] = ()
+    ratio: float  # distances between cameras, divided by those between their nominal positions
+    boards: tuple[Board, ...] = ()  # those whose squares give the rig's lengths
 
     @property
     def mark(self) -> Mark:

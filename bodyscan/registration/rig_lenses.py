@@ -29,14 +29,11 @@ from bodyscan.rig.rig import Rig
 
 @dataclass(frozen=True, eq=False)
 class ChosenLenses:
-    """The solution with the chosen lenses.
-
-    trials: by camera whose lens was open, how each lens did.
-    rays: by camera, how well the corners determine each pixel's ray if they err independently.
-    """
+    """The solution with the chosen lenses."""
 
     solution: JointSolution
-    trials: dict[str, tuple[LensTrial, ...]]
+    trials: dict[str, tuple[LensTrial, ...]]  # by camera whose lens was open, how each lens did
+    # By camera, how well the corners determine each pixel's ray if they err independently.
     rays: dict[str, RayUncertainty]
 
 

@@ -154,16 +154,11 @@ def _measure_misfit(
 
 @dataclass(frozen=True, eq=False)
 class ConsistentSolve:
-    """The joint solve of consistent views.
+    """The joint solve of consistent views."""
 
-    solution: of all views but the wrong ones.
-    wrong: keys of those.
-    notes: one line for each cause of being wrong.
-    """
-
-    solution: JointSolution
-    wrong: frozenset[ViewKey]
-    notes: tuple[str, ...] = ()
+    solution: JointSolution  # of all views but the wrong ones
+    wrong: frozenset[ViewKey]  # keys of those
+    notes: tuple[str, ...] = ()  # one line for each cause of being wrong
 
     def select_consistent(self, views: Sequence[LocatedView]) -> list[LocatedView]:
         """The views that took part."""

@@ -26,22 +26,16 @@ Group = dict[str, RigidTransform]
 
 @dataclass(frozen=True, eq=False)
 class RelativePose:
-    """The relative pose of two groups of pairs by the boards that they share.
-
-    targets: the shared targets.
-    agreeing: those that agree with the pose.
-    rivals: votes of the best contradicting pose, which only boards with an ambiguous numbering, or
-        wrong views, can have.
-    corners: number of corners in the shared views.
-    ambiguous: whether any of the boards may be numbered in more than one way.
-    """
+    """The relative pose of two groups of pairs by the boards that they share."""
 
     first_from_second: RigidTransform
-    targets: tuple[Target, ...]
-    agreeing: tuple[Target, ...]
+    targets: tuple[Target, ...]  # the shared targets
+    agreeing: tuple[Target, ...]  # those that agree with the pose
+    # Votes of the best contradicting pose, which only boards with an ambiguous numbering, or wrong
+    # views, can have.
     rivals: int
-    corners: int
-    ambiguous: bool
+    corners: int  # number of corners in the shared views
+    ambiguous: bool  # whether any of the boards may be numbered in more than one way
 
     @property
     def votes(self) -> int:

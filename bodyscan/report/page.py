@@ -121,21 +121,15 @@ def make_sections(parts: Mapping[str, Callable[[], Sequence[Block]]]) -> list[Se
 
 @dataclass(frozen=True, eq=False)
 class Page:
-    """A whole report.
-
-    synthetic: whether what is reported was simulated.
-    facts: what it is, as (name, value).
-    axes: where the rig frame lies, in words.
-    subject: pseudonym of the person shown.
-    """
+    """A whole report."""
 
     title: str
     verdict: Verdict
-    synthetic: bool
-    facts: tuple[tuple[str, str], ...]
-    axes: str
+    synthetic: bool  # whether what is reported was simulated
+    facts: tuple[tuple[str, str], ...]  # what it is, as (name, value)
+    axes: str  # where the rig frame lies, in words
     sections: Sequence[Section] = ()
-    subject: str | None = None
+    subject: str | None = None  # pseudonym of the person shown
 
 
 def is_synthetic(folder: Path) -> bool:

@@ -128,13 +128,10 @@ def _label_margin(
 
 @dataclass(frozen=True, eq=False)
 class VisiblePoints:
-    """The point that each pixel of some views shows: the nearest of those that face the viewer.
-
-    numbers: an image (H, W) a view; -1 where there is none.
-    """
+    """The point that each pixel of some views shows: the nearest of those that face the viewer."""
 
     views: tuple[str, ...]
-    numbers: tuple[Indices, ...]
+    numbers: tuple[Indices, ...]  # an image (H, W) a view; -1 where there is none
 
     @staticmethod
     def from_points(

@@ -91,14 +91,11 @@ def _markers(board: Board, face: int, count: int) -> Mask:
 
 @dataclass(frozen=True, eq=False)
 class MadeBoard:
-    """A board with its errors.
+    """A board with its errors."""
 
-    surfaces: in the board frame.
-    corners: (faces * N, 3), the true positions of the printed inner corners, board frame, numbered
-        as in the rig file's board (front, then back).
-    """
-
-    surfaces: tuple[Surface, ...]
+    surfaces: tuple[Surface, ...]  # in the board frame
+    # (faces * N, 3), the true positions of the printed inner corners, board frame, numbered as in
+    # the rig file's board (front, then back).
     corners: Array
 
 

@@ -132,15 +132,11 @@ KEYS = {
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A living person and when each frame is taken.
-
-    times: by pair, then by frame, ms.
-    moment_ms: the middle of all times, which the truth's surface shows.
-    """
+    """A living person and when each frame is taken."""
 
     body: LivingBody
-    times: Mapping[str, Mapping[str, float]]
-    moment_ms: float
+    times: Mapping[str, Mapping[str, float]]  # by pair, then by frame, ms
+    moment_ms: float  # the middle of all times, which the truth's surface shows
 
     def middle_ms(self, pair: str) -> float:
         """Compute the middle of the time in which a pair takes its frames."""
@@ -154,12 +150,7 @@ class Motion:
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """Everything that is decided before an image is made.
-
-    person: the subject's surface in the rig frame, standing still.
-    sways: by pair, `swayed_from_still` of the person when that pair captures.
-    motion: what the person does meanwhile; None if they do not move.
-    """
+    """Everything that is decided before an image is made."""
 
     rig: str
     seed: int
@@ -168,9 +159,10 @@ class Truth:
     boards: Mapping[str, MadeBoard]
     plan: tuple[BoardShot, ...]
     subject: str | None
-    person: Surface | None
+    person: Surface | None  # the subject's surface in the rig frame, standing still
+    # By pair, `swayed_from_still` of the person when that pair captures.
     sways: Mapping[str, RigidTransform]
-    motion: Motion | None = None
+    motion: Motion | None = None  # what the person does meanwhile; None if they do not move
 
 
 def describe(truth: Truth) -> dict[str, Any]:

@@ -19,23 +19,16 @@ from bodyscan.simulation.settings import Skin
 
 @dataclass(frozen=True)
 class Lamps:
-    """Brightness of the light, and the distance of focus.
+    """Brightness of the light, and the distance of focus."""
 
-    laser_grey: grey level of a white surface that faces the projector at reach_mm.
-    ambient_grey: grey level that the room's own light gives a white surface.
-    focus_mm: distance at which the projector and the camera are focused.
-    window_grey: grey level that a large window gives a white surface that faces it.
-    window_direction: (3,) unit, direction to the window, camera frame.
-    skin: what skin does with light.
-    """
-
-    laser_grey: float
-    ambient_grey: float
+    laser_grey: float  # grey level of a white surface that faces the projector at reach_mm
+    ambient_grey: float  # grey level that the room's own light gives a white surface
     reach_mm: float
-    focus_mm: float
-    window_grey: float = 0.0
+    focus_mm: float  # distance at which the projector and the camera are focused
+    window_grey: float = 0.0  # grey level that a large window gives a white surface that faces it
+    # (3,) unit, direction to the window, camera frame.
     window_direction: tuple[float, float, float] = (0.0, 0.0, -1.0)
-    skin: Skin = field(default_factory=Skin)
+    skin: Skin = field(default_factory=Skin)  # what skin does with light
 
 
 def compute_room_light(hits: Hits, lamps: Lamps) -> Floats:
@@ -55,16 +48,11 @@ def compute_room_light(hits: Hits, lamps: Lamps) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class LaserLight:
-    """What each hit (N,) would receive from a lit stripe.
+    """What each hit (N,) would receive from a lit stripe."""
 
-    weight: grey level of the light that it scatters.
-    s: stripe coordinate of the projector's light, NaN where none arrives.
-    gloss: grey level of what its skin mirrors.
-    """
-
-    weight: Floats
-    s: Floats
-    gloss: Floats
+    weight: Floats  # grey level of the light that it scatters
+    s: Floats  # stripe coordinate of the projector's light, NaN where none arrives
+    gloss: Floats  # grey level of what its skin mirrors
 
 
 def compute_laser_light(scene: Scene, hits: Hits, projector: Projector, lamps: Lamps) -> LaserLight:

@@ -20,18 +20,14 @@ from bodyscan.simulation.settings import Optics, Projection, Room, SimulationSet
 
 @dataclass(frozen=True, eq=False)
 class TruePair:
-    """A pair: its name, its camera and that camera's pose, its projector in the camera's frame.
-
-    reach_mm: the working distance, from the nominal pose.
-    has_stripes: False for a camera alone, which a plain lamp lights.
-    """
+    """A pair: its name, its camera and that camera's pose, its projector in the camera's frame."""
 
     name: str
     camera: TrueCamera
     rig_from_camera: RigidTransform
     projector: Projector
-    reach_mm: float
-    has_stripes: bool
+    reach_mm: float  # the working distance, from the nominal pose
+    has_stripes: bool  # False for a camera alone, which a plain lamp lights
 
 
 def build_pairs(

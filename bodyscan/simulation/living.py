@@ -21,13 +21,10 @@ from bodyscan.simulation.settings import Person
 
 @dataclass(frozen=True, eq=False)
 class RandomSignal:
-    """A smooth random function of time with several components: sums of cosines.
+    """A smooth random function of time with several components: sums of cosines."""
 
-    hz: (K,).
-    sizes, phases: (K, n), of n components.
-    """
-
-    hz: Array
+    hz: Array  # (K,)
+    # sizes, phases: (K, n), of n components.
     sizes: Array
     phases: Array
 
@@ -54,16 +51,11 @@ def draw_signal(
 
 @dataclass(frozen=True, eq=False)
 class Joint:
-    """A part of a body that rotates.
+    """A part of a body that rotates."""
 
-    weights: (N,) 1 for vertices that fully rotate with it.
-    pivot: (3,) mm.
-    turn: rotation vector, radians.
-    """
-
-    weights: Array
-    pivot: Array
-    turn: RandomSignal
+    weights: Array  # (N,) 1 for vertices that fully rotate with it
+    pivot: Array  # (3,) mm
+    turn: RandomSignal  # rotation vector, radians
 
     def rotate(self, vertices: Array, ms: float) -> Array:
         """Rotate vertices (N, 3) by their weights."""
@@ -93,19 +85,13 @@ class Breath:
 
 @dataclass(frozen=True, eq=False)
 class LivingBody:
-    """A person who stands as people do.
+    """A person who stands as people do."""
 
-    rest: at mean breath, upright.
-    limbs: both arms, then the head, relative to the trunk.
-    breath_modes: (N, 3, 2) motion of each vertex with chest and belly, per mm of breath.
-    ankles: the whole body's sway.
-    """
-
-    rest: Surface
-    limbs: tuple[Joint, ...]
-    breath_modes: Array
+    rest: Surface  # at mean breath, upright
+    limbs: tuple[Joint, ...]  # both arms, then the head, relative to the trunk
+    breath_modes: Array  # (N, 3, 2) motion of each vertex with chest and belly, per mm of breath
     breath: Breath
-    ankles: Joint
+    ankles: Joint  # the whole body's sway
 
     def vertices(self, ms: float, *, breathing: bool = True) -> Array:
         """Compute vertices (N, 3) mm, rig frame, at a time since the scan began, or at mean breath."""

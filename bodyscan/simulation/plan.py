@@ -29,20 +29,13 @@ class BoardShot:
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """What one pair sees of boards in N poses.
+    """What one pair sees of boards in N poses."""
 
-    angle_deg: (N,) between the normal of the face it sees and the direction to the camera.
-    back: (N,) bool.
-    inside: (N,) share of the board in the image.
-    cells: (N, cells) bool, image cells it covers, near and far ones separate.
-    lean: (N,) direction in which the board is tilted, 0..7.
-    """
-
-    angle_deg: Array
-    back: Mask
-    inside: Array
-    cells: Mask
-    lean: Indices
+    angle_deg: Array  # (N,) between the normal of the face it sees and the direction to the camera
+    back: Mask  # (N,) bool
+    inside: Array  # (N,) share of the board in the image
+    cells: Mask  # (N, cells) bool, image cells it covers, near and far ones separate
+    lean: Indices  # (N,) direction in which the board is tilted, 0..7
 
 
 def count_default_shots(pairs: int) -> int:

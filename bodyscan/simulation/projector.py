@@ -26,9 +26,6 @@ class MirrorProjector:
     surface lies `offset_mm` from `centre` along that normal. Stripe coordinate s is swept at mirror
     angle first_angle + s / stripes * sweep_angle. Each stripe is a plane; with an offset, or a
     sheet tilted against the axis, the planes have no line in common.
-
-    fan: tangent of half the fan's opening.
-    smile_stripes: deviation of s at a fan's ends.
     """
 
     stripes: int
@@ -41,8 +38,8 @@ class MirrorProjector:
     aim: Array
     first_angle: float
     sweep_angle: float
-    fan: float = 1.0
-    smile_stripes: float = 0.0
+    fan: float = 1.0  # tangent of half the fan's opening
+    smile_stripes: float = 0.0  # deviation of s at a fan's ends
 
     def angle(self, points: Reals) -> Reals:
         """Compute the mirror angle at which the sheet passes through points (..., 3), radians.

@@ -22,18 +22,13 @@ from bodyscan.simulation.settings import Optics
 
 @dataclass(frozen=True, eq=False)
 class Band:
-    """Part of an image, R rows and C columns, and its rays, z = 1.
-
-    rays: (R, C, K, 3) through points inside pixels.
-    shift: (R, C, 2) by which these points are shifted from `lens.sample_offsets`.
-    corners: (R + 1, C + 1, 3) through the pixels' corners.
-    """
+    """Part of an image, R rows and C columns, and its rays, z = 1."""
 
     rows: slice
     columns: slice
-    rays: Floats
-    shift: Floats
-    corners: Floats
+    rays: Floats  # (R, C, K, 3) through points inside pixels
+    shift: Floats  # (R, C, 2) by which these points are shifted from `lens.sample_offsets`
+    corners: Floats  # (R + 1, C + 1, 3) through the pixels' corners
 
     @staticmethod
     def from_rows(camera: TrueCamera, samples: int, rng: np.random.Generator, rows: slice) -> Band:
@@ -92,26 +87,20 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class RayEnds:
-    """What the rays (R, C, K) of a band meet.
+    """What the rays (R, C, K) of a band meet."""
 
-    white, gloss: grey level of the projector's full light, as scattered by a white surface, and as
-        mirrored by skin.
-    s: stripe coordinate, NaN where none of that light arrives.
-    room: grey level of the room's light on a white surface.
-    albedo, skin: as in `Hits`.
-    depth: mm.
-    surface: its number.
-    across, down: slices on a print.
-    """
-
+    # white, gloss: grey level of the projector's full light, as scattered by a white surface, and
+    # as mirrored by skin.
     white: Floats
     gloss: Floats
-    s: Floats
-    room: Floats
+    s: Floats  # stripe coordinate, NaN where none of that light arrives
+    room: Floats  # grey level of the room's light on a white surface
+    # albedo, skin: as in `Hits`.
     albedo: Floats
     skin: Floats
-    depth: Floats
-    surface: Floats
+    depth: Floats  # mm
+    surface: Floats  # its number
+    # across, down: position on a print, as `Hits.print_xy`.
     across: Floats
     down: Floats
 

@@ -25,28 +25,19 @@ from bodyscan.stripes.stripe_code import StripeCode
 
 @dataclass(frozen=True, eq=False)
 class Moving:
-    """What moves while a sequence is taken.
+    """What moves while a sequence is taken."""
 
-    surfaces: how many move, the first of the scene's.
-    at: the scene when a frame of that name is taken.
-    reach_mm: largest displacement from the scene that is rendered once for all frames.
-    """
-
-    surfaces: int
-    at: Callable[[str], Scene]
-    reach_mm: float
+    surfaces: int  # how many move, the first of the scene's
+    at: Callable[[str], Scene]  # the scene when a frame of that name is taken
+    reach_mm: float  # largest displacement from the scene that is rendered once for all frames
 
 
 @dataclass(frozen=True, eq=False)
 class PixelTruth:
-    """What lies at each pixel's centre.
+    """What lies at each pixel's centre."""
 
-    depth: (height, width) mm along z, NaN where there is nothing.
-    s: stripe coordinate, NaN where no light of the projector arrives.
-    """
-
-    depth: Array
-    s: Array
+    depth: Array  # (height, width) mm along z, NaN where there is nothing
+    s: Array  # stripe coordinate, NaN where no light of the projector arrives
 
 
 def render_pair(
@@ -113,22 +104,16 @@ class _Source:
 
 @dataclass(frozen=True, eq=False)
 class _LightImages:
-    """What a camera sees before its lens blurs it: grey levels (H, W).
+    """What a camera sees before its lens blurs it: grey levels (H, W)."""
 
-    laser, ambient: by frame, of the projector's light and of the room's.
-    depth: (H, W) mm, minimum over each pixel's samples.
-    near: (H, W) where something that moves shows.
-    gloss: by frame, the part of the projector's light that skin mirrors; empty if nothing is
-        glossy.
-    skin: (H, W) the share that is skin.
-    """
-
+    # laser, ambient: by frame, of the projector's light and of the room's.
     laser: dict[str, Floats]
     ambient: dict[str, Floats]
-    depth: Floats
-    near: Mask
+    depth: Floats  # (H, W) mm, minimum over each pixel's samples
+    near: Mask  # (H, W) where something that moves shows
+    # By frame, the part of the projector's light that skin mirrors; empty if nothing is glossy.
     gloss: dict[str, Floats]
-    skin: Floats
+    skin: Floats  # (H, W) the share that is skin
 
 
 def _render_still(
@@ -178,20 +163,15 @@ def _rerender_moving(
 
 @dataclass(frozen=True, eq=False)
 class _LitRays:
-    """A band's rays, with the projector's light where they end.
+    """A band's rays, with the projector's light where they end."""
 
-    weight, gloss: (R, C, K) grey level under full light, scattered and mirrored.
-    index: (R, C, K) into a table of light.
-    ambient: (R, C) grey level due to the room's own light.
-    skin: (R, C) mean.
-    depth, surface: (R, C) minimum over the samples.
-    """
-
+    # weight, gloss: (R, C, K) grey level under full light, scattered and mirrored.
     weight: Floats
     gloss: Floats
-    index: NDArray[np.int32]
-    ambient: Floats
-    skin: Floats
+    index: NDArray[np.int32]  # (R, C, K) into a table of light
+    ambient: Floats  # (R, C) grey level due to the room's own light
+    skin: Floats  # (R, C) mean
+    # depth, surface: (R, C) minimum over the samples.
     depth: Floats
     surface: Floats
 

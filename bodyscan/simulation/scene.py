@@ -22,26 +22,19 @@ Print = Callable[[Floats], Floats]
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """A triangle mesh that scatters light evenly (Lambert), visible from either side.
+    """A triangle mesh that scatters light evenly (Lambert), visible from either side."""
 
-    vertices: (N, 3) mm.
-    triangles: (T, 3) int.
-    albedo: one, or (N,) one for each vertex.
-    printed, print_xy: a print, and each vertex's position on it, (N, 2); it overrides the albedo.
-    normals: (N, 3) unit, if the surface is to be shaded smoothly.
-    open_to_light: nothing can come between it and the projector, so shadows need not be tested.
-    encloses: everything is on one side of it, so it casts no shadow.
-    skin: (N,) how far each vertex is skin that lets light in, 0 to 1; None if nothing is.
-    """
-
-    vertices: Array
-    triangles: NDArray[np.integer]
-    albedo: float | Array = 0.5
+    vertices: Array  # (N, 3) mm
+    triangles: NDArray[np.integer]  # (T, 3) int
+    albedo: float | Array = 0.5  # one, or (N,) one for each vertex
+    # printed, print_xy: a print, and each vertex's position on it, (N, 2); it overrides the albedo.
     printed: Print | None = None
     print_xy: Array | None = None
-    normals: Array | None = None
+    normals: Array | None = None  # (N, 3) unit, if the surface is to be shaded smoothly
+    # Nothing can come between it and the projector, so shadows need not be tested.
     open_to_light: bool = False
-    encloses: bool = False
+    encloses: bool = False  # everything is on one side of it, so it casts no shadow
+    # (N,) how far each vertex is skin that lets light in, 0 to 1; None if nothing is.
     skin: Array | None = None
 
     def transform(self, a_from_b: RigidTransform) -> Surface:
@@ -52,25 +45,16 @@ class Surface:
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """Where rays met the scene.
+    """Where rays met the scene."""
 
-    depth: (N,), infinite where they met nothing.
-    normals: (N, 3), of any length, to either side.
-    surface: (N,) number of the surface, one past the last if none.
-    skin: (N,) as `Surface.skin`.
-    facets: (N, 3) normals of the triangles, of any length.
-    albedo: (N,) of what has no print; `Scene.print_on` writes that of prints.
-    print_xy: (N, 2) position on the surface's print, if it has one.
-    """
-
-    depth: Floats
+    depth: Floats  # (N,), infinite where they met nothing
     points: Floats
-    normals: Floats
-    albedo: Floats
-    surface: NDArray[np.uint32]
-    skin: Floats
-    facets: Floats
-    print_xy: Floats
+    normals: Floats  # (N, 3), of any length, to either side
+    albedo: Floats  # (N,) of what has no print; `Scene.print_on` writes that of prints
+    surface: NDArray[np.uint32]  # (N,) number of the surface, one past the last if none
+    skin: Floats  # (N,) as `Surface.skin`
+    facets: Floats  # (N, 3) normals of the triangles, of any length
+    print_xy: Floats  # (N, 2) position on the surface's print, if it has one
 
 
 class Scene:

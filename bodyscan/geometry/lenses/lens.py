@@ -24,12 +24,9 @@ TOLERANCE, NOT_FOUND = 1e-14, 1e-9
 
 @dataclass(frozen=True)
 class Lens(ABC):
-    """A frozen value whose fields are its coefficients, all 0 for a lens that bends nothing.
+    """A frozen value whose fields are its coefficients, all 0 for a lens that bends nothing."""
 
-    kind: its name in files.
-    """
-
-    kind: ClassVar[str]
+    kind: ClassVar[str]  # its name in files
 
     @property
     def names(self) -> tuple[str, ...]:
