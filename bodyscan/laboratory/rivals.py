@@ -1,11 +1,9 @@
 """Rival cameras, from points that are not in one plane, and rival projectors, fitted to stripe
 boundaries at known points.
 
-Tsai (1987): by radial alignment, whatever the focal length, the depth and the radial distortion, a
-point's image lies on the ray from the image centre in the direction of its offset from the axis.
-That gives rotation and lateral translation linearly, then focal length and depth; finally all are
-refined. One coefficient leads from real to ideal: ideal = real (1 + kappa r^2). Also a 3 x 4 matrix
-without a lens (Bolles et al. 1981).
+Tsai's camera (1987) has square-cornered pixels and one coefficient of its lens, from real to ideal:
+ideal = real (1 + kappa r^2). Refined, as he does in the end, it does not depend on the start, which is
+a 3 x 4 matrix without a lens (Bolles et al. 1981) here.
 
 By Eq. 7-9 a light plane is x - tan(tilt) y - tan(angle) z + l = 0, and by Eq. 14 it measures
 z = l / (tan(angle) - x/z + tan(tilt) y/z). The invariable baseline (Matsuki and Ueda 1989, Sansoni
@@ -40,19 +38,10 @@ def calibrate_tsai(
     whose radial lens is nearest to Tsai's, and camera_from_points.
 
     skewed: estimate a skew as well, which Tsai's own model lacks.
-
-    The centre is chosen where radial alignment is best (Lenz and Tsai 1988), then everything is
-    refined.
     """
-
-    def misalignment(centre: Array) -> Array:
-        return _solve_alignment(points, pixels - centre)[1]
-
-    centre = least_squares(misalignment, (np.array([width, height]) - 1.0) / 2.0).x
-    rotation, across, aspect = _align(points, pixels - centre)
-    focal, depth = _focal_and_depth(points, pixels - centre, rotation, across)
-    turn = RigidTransform(rotation, np.zeros(3)).rotation_vector
-    start = np.array([*turn, *across, depth, focal, aspect, *centre, 0.0, *[0.0] * skewed])
+    rough, pose = split_projection_matrix(projection_matrix(points, pixels), width, height)
+    start = [*pose.twist, rough.beta, rough.alpha / rough.beta, rough.u0, rough.v0, 0.0]
+    start += [0.0] * skewed
     solved = least_squares(_residuals, start, x_scale="jac", args=(points, pixels)).x
     focal, aspect, u0, v0, kappa, *skew = solved[6:].tolist()
     camera = Camera(
@@ -73,43 +62,6 @@ def _undo_kappa(camera: Camera, kappa: float) -> Array:
     # Weighted by the radius, as more of the image lies there.
     rows = np.stack([ideal**3, ideal**5], axis=1) * np.sqrt(real)[:, None]
     return np.linalg.lstsq(rows, (real - ideal) * np.sqrt(real), rcond=None)[0]
-
-
-def _solve_alignment(points: Array, image: Array) -> tuple[Array, Array]:
-    """Solve radial alignment for (8,) s r1, s tx, r2, ty, |r2| = 1; residuals (N,) px mm."""
-    u, v = image[:, :1], image[:, 1:]
-    whole = _append_ones(points)
-    rows = np.concatenate([v * whole, -u * whole], axis=1)
-    size = np.linalg.norm(rows, axis=0)
-    _, vectors = np.linalg.eigh((rows / size).T @ (rows / size))
-    solved = vectors[:, 0] / size
-    solved /= np.linalg.norm(solved[4:7])
-    return solved, rows @ solved
-
-
-def _align(points: Array, image: Array) -> tuple[Array, Array, float]:
-    """Compute rotation (3, 3), lateral translation (2,) and aspect from radial alignment."""
-    solved, _ = _solve_alignment(points, image)
-    aspect = float(np.linalg.norm(solved[:3]))
-    first, second = solved[:4] / aspect, solved[4:]
-    whole = _append_ones(points)
-    # The sign: points are imaged on their own side of the axis.
-    sign = np.sign(np.sum((whole @ np.stack([first, second]).T) * image))
-    first, second = sign * first, sign * second
-    rows = np.stack([first[:3], second[:3], np.cross(first[:3], second[:3])])
-    rotation = RigidTransform.from_matrix(np.column_stack([rows, np.zeros(3)])).rotation
-    return rotation, np.array([first[3], second[3]]), aspect
-
-
-def _focal_and_depth(
-    points: Array, image: Array, rotation: Array, across: Array
-) -> tuple[float, float]:
-    """Solve focal length (px) and depth (mm) without distortion by linear least squares."""
-    height = points @ rotation[1] + across[1]
-    forward = points @ rotation[2]
-    rows = np.stack([height, -image[:, 1]], axis=1)
-    focal, depth = np.linalg.lstsq(rows, forward * image[:, 1], rcond=None)[0]
-    return float(focal), float(depth)
 
 
 def _residuals(values: Array, points: Array, pixels: Array) -> Array:
