@@ -14,19 +14,14 @@ from bodyscan.boards.corners import refine_corners
 
 @dataclass(frozen=True, eq=False)
 class BoardMap:
-    """Map from printed points (mm) to image points (px): homography plus a polynomial for the lens.
+    """Map from printed points (mm) to image points (px): homography plus a polynomial for the lens."""
 
-    homography: (3, 3).
-    coefficients: (T, 2) px, of the monomials of printed points scaled to about [-1, 1].
-    middle, size: (2,) mm and mm, of that scaling.
-    degree: of the polynomial; 0 for none.
-    """
-
-    homography: Array
-    coefficients: Array
+    homography: Array  # (3, 3)
+    coefficients: Array  # (T, 2) px, of the monomials of printed points scaled to about [-1, 1]
+    # middle, size: (2,) mm and mm, of that scaling.
     middle: Array
     size: float
-    degree: int
+    degree: int  # of the polynomial; 0 for none
 
     def apply(self, printed: Array) -> Array:
         """Map printed points (..., 2) mm to image points (..., 2) px."""

@@ -48,18 +48,13 @@ def detect_markers(
 
 @dataclass(frozen=True, eq=False)
 class FacePosition:
-    """Where one face of a board appears in an image, by the markers that agree on it.
+    """Where one face of a board appears in an image, by the markers that agree on it."""
 
-    board: the board, in the layout that fits.
-    printed: (K, 4, 2) mm, corners of the markers that agree.
-    detected: how many of the face's markers were detected.
-    """
-
-    board: Board
+    board: Board  # the board, in the layout that fits
     face: int
     board_map: BoardMap
-    printed: Array
-    detected: int
+    printed: Array  # (K, 4, 2) mm, corners of the markers that agree
+    detected: int  # how many of the face's markers were detected
 
     @property
     def agreeing(self) -> int:

@@ -37,29 +37,22 @@ MIN_CONTRAST = 4.0
 
 @dataclass(frozen=True, eq=False)
 class DetectedCorners:
-    """Corners of one board face as found in an image.
+    """Corners of one board face as found in an image."""
 
-    ids: (N,) int64.
-    pixels: (N, 2) px.
-    """
-
-    ids: Indices
-    pixels: Array
+    ids: Indices  # (N,) int64
+    pixels: Array  # (N, 2) px
     appearance: Appearance = AS_PRINTED
 
 
 @dataclass(frozen=True, eq=False)
 class _Patches:
-    """P pixels around each of N corners.
+    """P pixels around each of N corners."""
 
-    pixels: (N, P, 2) px. grey: (N, P). weight: (N, P), 0 or 1.
-    rims: (N, 3): how far beyond either edge a marker begins, px, infinite without markers, and the
-        sign of the product of distances from both edges where squares are white.
-    """
-
-    pixels: Array
-    grey: Array
-    weight: Array
+    pixels: Array  # (N, P, 2) px
+    grey: Array  # (N, P)
+    weight: Array  # (N, P), 0 or 1
+    # (N, 3): how far beyond either edge a marker begins, px, infinite without markers, and the sign
+    # of the product of distances from both edges where squares are white.
     rims: Array
 
 
@@ -147,18 +140,12 @@ def _patches(
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """Fitted corners.
+    """Fitted corners."""
 
-    state: (N, 9): corner (2), the angles of both edges' normals (2), blur, b, a, g (2).
-    residual: (N,) RMS in grey levels.
-    variance: (N,) of a pixel.
-    covariance: (N, 9, 9).
-    """
-
-    state: Array
-    residual: Array
-    variance: Array
-    covariance: Array
+    state: Array  # (N, 9): corner (2), the angles of both edges' normals (2), blur, b, a, g (2)
+    residual: Array  # (N,) RMS in grey levels
+    variance: Array  # (N,) of a pixel
+    covariance: Array  # (N, 9, 9)
 
     @property
     def sigma(self) -> Array:

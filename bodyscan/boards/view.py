@@ -17,15 +17,11 @@ ViewKey = tuple[str, str, str]
 
 @dataclass(frozen=True)
 class Appearance:
-    """How a board with markers differs from its description.
+    """How a board with markers differs from its description."""
 
-    inverted: white where the print as described is black.
-    mirrored: seen in a mirror, or through the glass it is printed on.
-    other_layout: its markers follow OpenCV's other historic layout, not the one in the rig file.
-    """
-
-    inverted: bool = False
-    mirrored: bool = False
+    inverted: bool = False  # white where the print as described is black
+    mirrored: bool = False  # seen in a mirror, or through the glass it is printed on
+    # Its markers follow OpenCV's other historic layout, not the one in the rig file.
     other_layout: bool = False
 
     def undo(self, image: Bytes) -> Bytes:
@@ -45,21 +41,16 @@ AS_PRINTED = Appearance()
 
 @dataclass(frozen=True, eq=False)
 class BoardView:
-    """The corners of a board that one camera observed in one shot.
-
-    corner_ids: (N,) int, index into `board_layout.corner_points(board)` (front face first, then
-        back).
-    pixels: (N, 2) float64, real image coordinates, px.
-    turnable: the detector may have numbered this board from its other end.
-    appearance: how a board with markers was printed or seen, if not as described.
-    """
+    """The corners of a board that one camera observed in one shot."""
 
     pair: str
     shot: str
     board: str
+    # (N,) int, index into `board_layout.corner_points(board)` (front face first, then back).
     corner_ids: Indices
-    pixels: Array
-    turnable: bool = False
+    pixels: Array  # (N, 2) float64, real image coordinates, px
+    turnable: bool = False  # the detector may have numbered this board from its other end
+    # How a board with markers was printed or seen, if not as described.
     appearance: Appearance = AS_PRINTED
 
     @property

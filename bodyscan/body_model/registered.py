@@ -36,17 +36,13 @@ and above; four fitted facing aside, or with arms beside theirs, agreed to 0.82 
 
 @dataclass(frozen=True, eq=False)
 class RegisteredBody:
-    """A scan with the template laid over it.
+    """A scan with the template laid over it."""
 
-    mesh: the scan's, at mean breath, rig frame.
-    rig_from_body: the body frame: z = 0 on the floor, x where pelvis and chest face, y to the left.
-    fitted: the template there, body frame.
-    breath_sigma_mm: (N,), of the mesh's displacement to mean breath; 0 if that was not estimated.
-    """
-
-    mesh: BodyMesh
+    mesh: BodyMesh  # the scan's, at mean breath, rig frame
+    # The body frame: z = 0 on the floor, x where pelvis and chest face, y to the left.
     rig_from_body: RigidTransform
-    fitted: FittedBody
+    fitted: FittedBody  # the template there, body frame
+    # (N,), of the mesh's displacement to mean breath; 0 if that was not estimated.
     breath_sigma_mm: Array
 
     @cached_property

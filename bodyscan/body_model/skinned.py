@@ -16,39 +16,30 @@ from bodyscan.mesh.body import BodyMesh
 
 @dataclass(frozen=True, eq=False)
 class CarriedLandmark:
-    """A landmark and the joint that carries it.
-
-    position: (3,) mm, as the person stood. offset: (3,) mm, from the joint, in its frame.
-    """
+    """A landmark and the joint that carries it."""
 
     name: str
-    position: Array
+    position: Array  # (3,) mm, as the person stood
     sigma_mm: float
     found: str
     joint: int
-    offset: Array
+    offset: Array  # (3,) mm, from the joint, in its frame
 
 
 @dataclass(frozen=True, eq=False)
 class SkinnedBody:
-    """A registered body: `rest_vertices` skinned by `weights` are the vertices of `mesh`.
+    """A registered body: `rest_vertices` skinned by `weights` are the vertices of `mesh`."""
 
-    mesh: as the person stood, in the template's topology; what was not measured is filled.
-    rest_vertices: (V, 3), and rest_joints (J, 3) in the rest pose, mm.
-    weights: (V, J), at most four above 0.
-    rotations: (J, 3), rotation vectors relative to the parents; root: (3,) mm, of the first joint.
-    parts: (V,) index into part_names.
-    """
-
+    # As the person stood, in the template's topology; what was not measured is filled.
     mesh: BodyMesh
-    rest_vertices: Array
-    rest_joints: Array
-    weights: Array
+    rest_vertices: Array  # (V, 3) mm, in the rest pose
+    rest_joints: Array  # (J, 3) mm
+    weights: Array  # (V, J), at most four above 0
     joint_names: tuple[str, ...]
     parents: Indices
-    rotations: Array
-    root: Array
-    parts: Bytes
+    rotations: Array  # (J, 3), rotation vectors relative to the parents
+    root: Array  # (3,) mm, of the first joint
+    parts: Bytes  # (V,) index into part_names
     part_names: tuple[str, ...]
     landmarks: tuple[CarriedLandmark, ...]
 

@@ -23,34 +23,23 @@ from bodyscan.arrays import Array, Bytes, Indices, Mask
 
 @dataclass(frozen=True, eq=False)
 class BodyTemplate:
-    """A body with V vertices, F faces, K shapes and J joints, mm.
+    """A body with V vertices, F faces, K shapes and J joints, mm."""
 
-    vertices: (V, 3), the mean shape in the rest pose.
-    faces: (F, 3), outward.
-    shapes: (K, V, 3) float32, displacements of one standard deviation.
-    joints: (J, 3), the first is the root; joint_shapes: (K, J, 3) their displacements.
-    parents: (J,), -1 for the root; parents come before their children.
-    weights: (V, J), how much of each joint's motion a vertex follows; rows sum to 1.
-    parts: (V,) uint8, index into part_names.
-    landmarks: vertex of each landmark, by name.
-    landmark_sigma_mm: (L,), of each landmark's position along an axis: the 95 % quantile of the
-        error, over 1.96, on 20 simulated bodies half of which have surface that the shapes cannot make.
-    hidden: (V,) bool, inside the mouth and the nostrils, which no camera sees.
-    """
-
-    vertices: Array
-    faces: Indices
-    shapes: Array
-    joints: Array
-    joint_shapes: Array
-    parents: Indices
+    vertices: Array  # (V, 3), the mean shape in the rest pose
+    faces: Indices  # (F, 3), outward
+    shapes: Array  # (K, V, 3) float32, displacements of one standard deviation
+    joints: Array  # (J, 3), the first is the root
+    joint_shapes: Array  # (K, J, 3), their displacements
+    parents: Indices  # (J,), -1 for the root; parents come before their children
     joint_names: tuple[str, ...]
-    weights: Array
-    parts: Bytes
+    weights: Array  # (V, J), how much of each joint's motion a vertex follows; rows sum to 1
+    parts: Bytes  # (V,) uint8, index into part_names
     part_names: tuple[str, ...]
-    landmarks: Mapping[str, int]
+    landmarks: Mapping[str, int]  # vertex of each landmark, by name
+    # (L,), of each landmark's position along an axis: the 95 % quantile of the error, over 1.96, on
+    # 20 simulated bodies half of which have surface that the shapes cannot make.
     landmark_sigma_mm: Array
-    hidden: Mask
+    hidden: Mask  # (V,) bool, inside the mouth and the nostrils, which no camera sees
 
     @property
     def descendants(self) -> Array:
@@ -64,16 +53,12 @@ class BodyTemplate:
 
 @dataclass(frozen=True, eq=False)
 class BodyShapeAndPose:
-    """Parameters of a template's body.
+    """Parameters of a template's body."""
 
-    shape: (K,), in standard deviations.
-    rotations: (J, 3), rotation vectors of the joints relative to their parents, rest axes, rad.
-    root: (3,), position of the first joint, mm, body frame.
-    """
-
-    shape: Array
+    shape: Array  # (K,), in standard deviations
+    # (J, 3), rotation vectors of the joints relative to their parents, rest axes, rad.
     rotations: Array
-    root: Array
+    root: Array  # (3,), position of the first joint, mm, body frame
 
     def add_step(self, step: Array) -> BodyShapeAndPose:
         """Add a step (3 + 3 J + K,): of the root, right increments of the rotations, the shape."""
@@ -85,14 +70,11 @@ class BodyShapeAndPose:
 
 @dataclass(frozen=True, eq=False)
 class PosedBody:
-    """A template's body in a pose.
+    """A template's body in a pose."""
 
-    vertices: (V, 3), mm. rotations: (J, 3, 3) and joints: (J, 3) of the posed bones, body frame.
-    """
-
-    vertices: Array
-    rotations: Array
-    joints: Array
+    vertices: Array  # (V, 3), mm
+    rotations: Array  # (J, 3, 3) of the posed bones, body frame
+    joints: Array  # (J, 3) mm
 
 
 def drop_side(name: str) -> str:

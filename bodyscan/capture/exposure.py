@@ -20,18 +20,14 @@ MAX_SATURATED = 0.01
 
 @dataclass(frozen=True)
 class Exposure:
-    """What a camera saw under its projector's light.
-
-    lit: share of its image that the projector lights.
-    saturated, dark: shares of that part at white, and too dark to tell stripes from noise.
-    contrast: how many times as bright as most of it its brightest percent is.
-    """
+    """What a camera saw under its projector's light."""
 
     exposure_ms: float
-    lit: float = 0.0
+    lit: float = 0.0  # share of its image that the projector lights
+    # saturated, dark: shares of that part at white, and too dark to tell stripes from noise.
     saturated: float = 0.0
     dark: float = 0.0
-    contrast: float = 1.0
+    contrast: float = 1.0  # how many times as bright as most of it its brightest percent is
 
     def describe(self, pair: str) -> str:
         """One line for a person."""

@@ -50,12 +50,9 @@ Turn = tuple[Step, ...]
 
 @dataclass(frozen=True)
 class Shot:
-    """What is to be taken, and where it goes.
+    """What is to be taken, and where it goes."""
 
-    folder: of the captures.
-    """
-
-    folder: Path
+    folder: Path  # of the captures
     name: str = "s01"
     kind: Literal["scan", "calibration"] = "scan"
     subject: str | None = None

@@ -69,23 +69,17 @@ class PairCount:
 
 @dataclass(frozen=True)
 class CheckReport:
-    """What `check` found.
-
-    errors: what must be corrected, besides images.
-    warnings: what should be checked.
-    bad_images: missing or unusable, by pair, then shot.
-    images: how many were examined.
-    """
+    """What `check` found."""
 
     rig_path: Path
     rig: Rig
     folders: tuple[Path, ...]
     shots: tuple[str, ...]
-    images: int
+    images: int  # how many were examined
     pairs: tuple[PairCount, ...]
-    bad_images: tuple[BadImage, ...]
-    errors: tuple[str, ...]
-    warnings: tuple[str, ...]
+    bad_images: tuple[BadImage, ...]  # missing or unusable, by pair, then shot
+    errors: tuple[str, ...]  # what must be corrected, besides images
+    warnings: tuple[str, ...]  # what should be checked
 
     @property
     def ok(self) -> bool:

@@ -36,28 +36,22 @@ Kind = Literal["calibration", "scan"]
 
 @dataclass(frozen=True)
 class ImageSequence:
-    """The images that one pair took, or should have taken, in one shot.
-
-    lit, dark, board: None if there is no such image.
-    coded: the images of the stripe code, in the order of `FrameNames.code_names`; () if only the lit
-        or the board image was taken.
-    missing: the paths that do not exist.
-    exposure: its name, if the rig file names several; longer: the same images with the others.
-    inverses: those among `coded`.
-    crossing: images that show the crossing stripes, of all exposures.
-    """
+    """The images that one pair took, or should have taken, in one shot."""
 
     pair: str
     shot: str
+    # lit, dark, board: None if there is no such image.
     lit: Path | None
     dark: Path | None
+    # The images of the stripe code, in the order of `FrameNames.code_names`; () if only the lit or
+    # the board image was taken.
     coded: tuple[Path, ...]
-    missing: tuple[Path, ...]
+    missing: tuple[Path, ...]  # the paths that do not exist
     board: Path | None = None
-    exposure: str = ""
-    longer: tuple[ImageSequence, ...] = ()
-    inverses: tuple[Path, ...] = ()
-    crossing: tuple[Path, ...] = ()
+    exposure: str = ""  # its name, if the rig file names several
+    longer: tuple[ImageSequence, ...] = ()  # the same images with the others
+    inverses: tuple[Path, ...] = ()  # those among `coded`
+    crossing: tuple[Path, ...] = ()  # images that show the crossing stripes, of all exposures
 
     @property
     def where(self) -> str:

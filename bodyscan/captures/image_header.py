@@ -29,21 +29,16 @@ NO_INVERSES = (
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """Width and height in pixels, bits per sample; complete: whether a PNG or JPEG has its end.
-
-    colour: whether pixels have red, green and blue.
-    rounding_error: of JPEG, RMS in grey levels, for an image with sharp edges everywhere, such as
-        stripes.
-    fault: of TIFF, what this program does not read.
-    """
+    """What an image file says of its image."""
 
     width: int
     height: int
-    bits: int
-    complete: bool
-    colour: bool = False
+    bits: int  # per sample
+    complete: bool  # whether a PNG or JPEG has its end
+    colour: bool = False  # whether pixels have red, green and blue
+    # Of JPEG, RMS in grey levels, for an image with sharp edges everywhere, such as stripes.
     rounding_error: float = 0.0
-    fault: str = ""
+    fault: str = ""  # of TIFF, what this program does not read
 
 
 class NotAnImage(Exception):

@@ -40,15 +40,13 @@ Raw = NDArray[np.uint8] | NDArray[np.uint16]
 class StripeImages:
     """The images of one stripe sequence, grey levels 0 to 255.
 
-    lit, dark: (H, W), None if not taken.
-    coded: (F, H, W), the code's images in the order of `FrameNames.code_names`.
-
     All uint8, or float32 if files or exposures resolve more.
     """
 
+    # lit, dark: (H, W), None if not taken.
     lit: Greys | None
     dark: Greys | None
-    coded: Greys
+    coded: Greys  # (F, H, W), the code's images in the order of `FrameNames.code_names`
 
 
 def read_image(

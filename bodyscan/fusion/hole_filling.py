@@ -326,12 +326,10 @@ class Crown:
 
     A crown is convex: where cameras see its top too flat to measure it, these planes bound the
     head's height to a millimetre; planes around a hairline are steep and bound nothing.
-
-    highest: the highest point measured, (3,) mm.
-    normals, offsets: of the planes, (P, 3) and (P,) mm.
     """
 
-    highest: Array
+    highest: Array  # the highest point measured, (3,) mm
+    # normals, offsets: of the planes, (P, 3) and (P,) mm.
     normals: Array
     offsets: Array
 

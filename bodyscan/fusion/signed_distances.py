@@ -18,16 +18,11 @@ REACH_CELLS = 1.3
 
 @dataclass(frozen=True, eq=False)
 class Distances:
-    """Signed distances at all nodes of a grid, negative inside.
+    """Signed distances at all nodes of a grid, negative inside."""
 
-    values: (a, b, c) mm.
-    origin: the first node, (3,) mm.
-    cell_mm: from node to node.
-    """
-
-    values: Floats
-    origin: Array
-    cell_mm: float
+    values: Floats  # (a, b, c) mm
+    origin: Array  # the first node, (3,) mm
+    cell_mm: float  # from node to node
 
 
 def splat_planes(

@@ -79,16 +79,13 @@ DERIVED = (
 
 @dataclass(frozen=True)
 class Origin:
-    """Whose scan it is (a pseudonym), when it was taken, and the calibration it was made with.
-
-    axes: where the rig frame lies, in words.
-    """
+    """Whose scan it is (a pseudonym), when it was taken, and the calibration it was made with."""
 
     calibration_id: str
     subject: str | None
     when: datetime | None
     simulated: bool = False
-    axes: str = FLOOR_AXES
+    axes: str = FLOOR_AXES  # where the rig frame lies, in words
 
     @property
     def facts(self) -> dict[str, Any]:

@@ -18,18 +18,15 @@ from bodyscan.progress import THREADS, map_threads
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """N points taken from the surfaces, surface by surface, rig frame.
-
-    starts: where each surface's points begin, (surfaces + 1,).
-    weight, colours: as in SmoothSurface.
-    """
+    """N points taken from the surfaces, surface by surface, rig frame."""
 
     points: Floats
     normals: Floats
     sigma_mm: Floats
+    # weight, colours: as in SmoothSurface.
     weight: Floats
     colours: Bytes
-    starts: NDArray[np.intp]
+    starts: NDArray[np.intp]  # where each surface's points begin, (surfaces + 1,)
 
 
 def take_samples(surfaces: Sequence[SmoothSurface], points: int) -> Samples:

@@ -18,19 +18,14 @@ from bodyscan.geometry.transforms import RigidTransform
 
 @dataclass(frozen=True, eq=False)
 class FoundCamera:
-    """A camera, or a projector described as one, read from a file.
+    """A camera, or a projector described as one, read from a file."""
 
-    matrix: A of Eq. 1, (3, 3), px, whole numbers at pixel centres.
-    size: of its image, (width, height) px; None if the file does not say.
-    camera_from_world: its pose, lengths in the file's unit; None if the file does not say.
-    where: the file, and the line if it has lines.
-    """
-
-    matrix: Array
+    matrix: Array  # A of Eq. 1, (3, 3), px, whole numbers at pixel centres
     lens: Lens
-    size: tuple[int, int] | None
+    size: tuple[int, int] | None  # of its image, (width, height) px; None if the file does not say
+    # Its pose, lengths in the file's unit; None if the file does not say.
     camera_from_world: RigidTransform | None
-    where: str
+    where: str  # the file, and the line if it has lines
 
     def camera(self, width: int, height: int) -> Camera:
         """Make the camera with an image of that size, px.

@@ -38,21 +38,14 @@ False for boards and calibrations, which are of nobody."""
 
 @dataclass(frozen=True)
 class SubjectFiles:
-    """What belongs to a subject.
+    """What belongs to a subject."""
 
-    files: of the subject.
-    folders: of the subject alone.
-    tables: folders of batches, whose manifests are rewritten.
-    rows: their tables that have rows of the subject.
-    unreadable: files that should name a folder's owner, and do not.
-    unnamed: folders whose images or bodies name nobody, with how many there are in and below them.
-    """
-
-    files: tuple[Path, ...]
-    folders: tuple[Path, ...]
-    tables: tuple[Path, ...]
-    rows: tuple[Path, ...]
-    unreadable: tuple[Path, ...]
+    files: tuple[Path, ...]  # of the subject
+    folders: tuple[Path, ...]  # of the subject alone
+    tables: tuple[Path, ...]  # folders of batches, whose manifests are rewritten
+    rows: tuple[Path, ...]  # their tables that have rows of the subject
+    unreadable: tuple[Path, ...]  # files that should name a folder's owner, and do not
+    # Folders whose images or bodies name nobody, with how many there are in and below them.
     unnamed: dict[Path, int]
 
 

@@ -25,22 +25,16 @@ SUMMARY, MEASURES, BATCH_LOCK = "summary.csv", "measures.csv", "batch.lock"
 
 @dataclass(frozen=True)
 class Job:
-    """One scan to be fused, or one rig to be calibrated.
-
-    folder: where it is worked on.
-    source: the scan's folder, or the rig file's.
-    calibration: what calibrate-rig wrote; None for a rig.
-    until: the last stage wanted.
-    subject: the pseudonym in the scan's captures.yaml; without one, the name of the scan's folder, so
-        that `bodyscan forget` finds every scan. None for a rig.
-    """
+    """One scan to be fused, or one rig to be calibrated."""
 
     name: str
-    folder: Path
-    source: Path
-    calibration: Path | None
+    folder: Path  # where it is worked on
+    source: Path  # the scan's folder, or the rig file's
+    calibration: Path | None  # what calibrate-rig wrote; None for a rig
     pipeline: Pipeline
-    until: str
+    until: str  # the last stage wanted
+    # The pseudonym in the scan's captures.yaml; without one, the name of the scan's folder, so that
+    # `bodyscan forget` finds every scan. None for a rig.
     subject: str | None = None
 
 

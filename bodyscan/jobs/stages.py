@@ -23,18 +23,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Stage:
-    """One step of a job; its results are in the folder of its name.
-
-    version: raised whenever the same input would give other results than before.
-    sections: of the pipeline file, that it uses.
-    inputs: the files it reads, each under a name that says what it is for.
-    run: writes its results into an empty folder, and announces a verdict if it reaches one.
-    """
+    """One step of a job; its results are in the folder of its name."""
 
     name: str
-    version: int
-    sections: tuple[str, ...]
+    version: int  # raised whenever the same input would give other results than before
+    sections: tuple[str, ...]  # of the pipeline file, that it uses
+    # The files it reads, each under a name that says what it is for.
     inputs: Callable[[Job], dict[str, Path]]
+    # Writes its results into an empty folder, and announces a verdict if it reaches one.
     run: Callable[[Job, Path, Progress, Announce], None]
 
 

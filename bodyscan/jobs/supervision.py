@@ -68,14 +68,10 @@ def supervise_job(job: Job, process: Process, listen: Listen = ignore_events) ->
 
 @dataclass(frozen=True)
 class JobProcess:
-    """A new process for each attempt.
+    """A new process for each attempt."""
 
-    threads: of the libraries in it.
-    command: arguments to this Python.
-    """
-
-    threads: int
-    command: tuple[str, ...] = COMMAND
+    threads: int  # of the libraries in it
+    command: tuple[str, ...] = COMMAND  # arguments to this Python
 
     def attempt(self, job: Job, listen: Listen) -> tuple[str, tuple[str, ...]]:
         """Why the job failed, "" if it did not; and the stages that ran."""

@@ -64,15 +64,11 @@ file in one go, in hundredths of a second."""
 
 @dataclass(frozen=True)
 class Arrival:
-    """What has arrived of a scan.
+    """What has arrived of a scan."""
 
-    whole: pairs with all their images.
-    complete: nothing more is expected.
-    images: of each pair that takes part, how many images are there, and how many are to come in all.
-    """
-
-    whole: tuple[str, ...]
-    complete: bool
+    whole: tuple[str, ...]  # pairs with all their images
+    complete: bool  # nothing more is expected
+    # Of each pair that takes part, how many images are there, and how many are to come in all.
     images: Mapping[str, tuple[int, int]] = field(default_factory=dict)
 
 

@@ -1,7 +1,7 @@
 """Rival cameras, from points that are not in one plane, and rival projectors, fitted to stripe
 boundaries at known points.
 
-Tsai's camera (1987) has square-cornered pixels and one coefficient of its lens, from real to ideal:
+Tsai's camera (1987) has no skew, and one coefficient of its lens, from real to ideal:
 ideal = real (1 + kappa r^2). Refined, as he does in the end, it does not depend on the start, which is
 a 3 x 4 matrix without a lens (Bolles et al. 1981) here.
 

@@ -31,36 +31,29 @@ from bodyscan.mesh.topology import face_areas, signed_volume
 
 @dataclass(frozen=True)
 class Girth:
-    """One part of the body in a horizontal slice.
+    """One part of the body in a horizontal slice."""
 
-    part: trunk, head (above the neck), left leg, right leg, left arm, right arm, other; "trunk and left
-        arm" where the outline goes round both and nothing tells them apart.
-    girth_mm: along the surface, closed straight where the part touches others.
-    tape_mm: as a tape runs (convex hull).
-    width_mm, depth_mm: extent to the side and forward.
-    centre_mm: (x, y), body frame.
-    measured: share of girth_mm that was measured, not filled.
-    girth_range_mm, tape_range_mm: least and most, given noise and motion (95 %), what was not
-        measured, and what touches: see `bound_girths`.
-    breath_sigma_mm: sigma of girth_mm and tape_mm due to the breath's uncertainty, for the mean
-        breath or the scan's moment; None if that is not known.
-    regions: shares of girth_mm over skin, hair, dark cloth and unsure, by name; None if not known.
-    touches: parts that it touches, skin on skin.
-    """
-
+    # Trunk, head (above the neck), left leg, right leg, left arm, right arm, other; "trunk and left
+    # arm" where the outline goes round both and nothing tells them apart.
     part: str
-    girth_mm: float
-    tape_mm: float
+    girth_mm: float  # along the surface, closed straight where the part touches others
+    tape_mm: float  # as a tape runs (convex hull)
+    # width_mm, depth_mm: extent to the side and forward.
     width_mm: float
     depth_mm: float
     area_mm2: float
-    centre_mm: tuple[float, float]
-    measured: float
+    centre_mm: tuple[float, float]  # (x, y), body frame
+    measured: float  # share of girth_mm that was measured, not filled
+    # girth_range_mm, tape_range_mm: least and most, given noise and motion (95 %), what was not
+    # measured, and what touches: see `bound_girths`.
     girth_range_mm: Range
     tape_range_mm: Range
+    # Sigma of girth_mm and tape_mm due to the breath's uncertainty, for the mean breath or the
+    # scan's moment; None if that is not known.
     breath_sigma_mm: float | None = None
+    # Shares of girth_mm over skin, hair, dark cloth and unsure, by name; None if not known.
     regions: dict[str, float] | None = None
-    touches: tuple[str, ...] = ()
+    touches: tuple[str, ...] = ()  # parts that it touches, skin on skin
 
     @property
     def measured_skin(self) -> float:

@@ -44,25 +44,20 @@ MIN_MEASURED = 0.9
 
 @dataclass(frozen=True)
 class Measure:
-    """Value of a measure, mm, with its 95 % interval.
-
-    measured: share of what the tape touches that was measured; with less than MIN_MEASURED the measure
-        is the interval rather than the value.
-    kind: one of those above.
-    stance: what the standard wants otherwise than the person stood; "" if nothing.
-    path_mm: (N, 3), where it runs, rig frame.
-    """
+    """Value of a measure, mm, with its 95 % interval."""
 
     name: str
-    kind: str
+    kind: str  # one of those above
     mm: float
     interval_mm: tuple[float, float]
+    # Share of what the tape touches that was measured; with less than MIN_MEASURED the measure is
+    # the interval rather than the value.
     measured: float
     standard: str
     clause: str
     definition: str
-    stance: str
-    path_mm: Array = field(compare=False, repr=False)
+    stance: str  # what the standard wants otherwise than the person stood; "" if nothing
+    path_mm: Array = field(compare=False, repr=False)  # (N, 3), where it runs, rig frame
 
     @property
     def is_range(self) -> bool:

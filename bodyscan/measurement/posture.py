@@ -13,21 +13,14 @@ from bodyscan.body_model.fitting import FittedBody
 
 @dataclass(frozen=True)
 class Posture:
-    """Angles in degrees, left and right where there are two.
+    """Angles in degrees, left and right where there are two."""
 
-    heels_mm: between the backs of the heels, to the side.
-    sink_mm: how much lower the hips are than with the ankles straight beneath them.
-    feet_deg: that the toes point outwards.
-    arms_deg: between upper arms and the trunk's axis. elbows_deg: 0 for a straight arm.
-    head_deg: that the head nods forward, against the template's level one.
-    """
-
-    heels_mm: float
-    sink_mm: float
-    feet_deg: tuple[float, float]
-    arms_deg: tuple[float, float]
-    elbows_deg: tuple[float, float]
-    head_deg: float
+    heels_mm: float  # between the backs of the heels, to the side
+    sink_mm: float  # how much lower the hips are than with the ankles straight beneath them
+    feet_deg: tuple[float, float]  # that the toes point outwards
+    arms_deg: tuple[float, float]  # between upper arms and the trunk's axis
+    elbows_deg: tuple[float, float]  # 0 for a straight arm
+    head_deg: float  # that the head nods forward, against the template's level one
 
     def describe_departure(self, stance: Sequence[str]) -> str:
         """What a standard's stance wants otherwise than the person stood; "" if nothing.

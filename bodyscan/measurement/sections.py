@@ -23,21 +23,14 @@ UP = np.array([0.0, 0.0, 1.0])
 
 @dataclass(frozen=True, eq=False)
 class Section:
-    """A section of some parts by a plane.
+    """A section of some parts by a plane."""
 
-    points: (N, 2) mm, in the plane, the two ends of each segment.
-    observed: (N,), whether the scan measured them.
-    axes: (3, 3), the plane's two axes and its normal, body frame. level_mm: along the normal.
-    measured: share of its length that was measured.
-    sigma_mm: standard deviation of its tape girth.
-    """
-
-    points: Array
-    observed: Mask
-    axes: Array
-    level_mm: float
-    measured: float
-    sigma_mm: float
+    points: Array  # (N, 2) mm, in the plane, the two ends of each segment
+    observed: Mask  # (N,), whether the scan measured them
+    axes: Array  # (3, 3), the plane's two axes and its normal, body frame
+    level_mm: float  # along the normal
+    measured: float  # share of its length that was measured
+    sigma_mm: float  # standard deviation of its tape girth
 
     @cached_property
     def tape_mm(self) -> float:

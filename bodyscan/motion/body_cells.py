@@ -23,20 +23,13 @@ NEIGHBOUR_MM = 55.0  # centres of neighbouring cells are within this
 
 @dataclass(frozen=True, eq=False)
 class BodyCells:
-    """C cells of a body's surface, rig frame.
+    """C cells of a body's surface, rig frame."""
 
-    centres: (C, 3) mm.
-    normals: (C, 3).
-    graph: distances of neighbouring cells, (C, C) mm.
-    landmarks: a few cells, (L,).
-    landmark_distances: geodesic distances from each landmark to all cells, (L, C) mm.
-    """
-
-    centres: Array
-    normals: Array
-    graph: sparse.csr_array
-    landmarks: Indices
-    landmark_distances: Array
+    centres: Array  # (C, 3) mm
+    normals: Array  # (C, 3)
+    graph: sparse.csr_array  # distances of neighbouring cells, (C, C) mm
+    landmarks: Indices  # a few cells, (L,)
+    landmark_distances: Array  # geodesic distances from each landmark to all cells, (L, C) mm
 
     @staticmethod
     def from_points(points: Array, normals: Array) -> tuple[BodyCells, Indices]:

@@ -35,25 +35,20 @@ MODEL_ERROR_MM = 0.07
 
 @dataclass(frozen=True, eq=False)
 class BodyMotion:
-    """Gaussian estimate of the n amplitudes of all kinds of motion.
-
-    fields: of all kinds, (C, 12, M).
-    amplitudes: of the fields along their temporal modes, (n,).
-    information, vector: normal equations of the overlaps without prior; the matrix's lower triangle,
-        (n, n), and (n,).
-    factor: lower Cholesky factor (n, n) of the posterior information in units of `units` (n,).
-    breath: see `estimate_breath`; None at rest.
-    """
+    """Gaussian estimate of the n amplitudes of all kinds of motion."""
 
     kinds: tuple[MotionKind, ...]
-    fields: Array
-    amplitudes: Array
+    fields: Array  # of all kinds, (C, 12, M)
+    amplitudes: Array  # of the fields along their temporal modes, (n,)
+    # information, vector: normal equations of the overlaps without prior; the matrix's lower
+    # triangle, (n, n), and (n,).
     information: Array
     vector: Array
+    # Lower Cholesky factor (n, n) of the posterior information in units of `units` (n,).
     factor: Array
     units: Array
     breaths: Breaths
-    breath: BreathEstimate | None = None
+    breath: BreathEstimate | None = None  # see `estimate_breath`; None at rest
 
     @staticmethod
     def at_rest(

@@ -72,13 +72,11 @@ def _local_functions(centres: Array, shape: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class BreathEstimate:
-    """What the overlaps tell of M breath fields along J temporal modes.
+    """What the overlaps tell of M breath fields along J temporal modes."""
 
-    mode_covariance: of each field's amplitudes, (J, J).
-    at_middle, covariance: mean (M,) and covariance (M, M) of the fields in the middle of the scan.
-    """
-
-    mode_covariance: Array
+    mode_covariance: Array  # of each field's amplitudes, (J, J)
+    # at_middle, covariance: mean (M,) and covariance (M, M) of the fields in the middle of the
+    # scan.
     at_middle: Array
     covariance: Array
 

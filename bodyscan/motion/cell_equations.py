@@ -16,14 +16,11 @@ from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
 
 @dataclass(frozen=True, eq=False)
 class CellEquations:
-    """Normal equations of an overlap, cell by cell.
+    """Normal equations of an overlap, cell by cell."""
 
-    cells: those in which the pairs overlap, (c,).
-    system: of the first pair's displacement field (12,) in each of them, a stack (c,); see
-        `rigid_fields`. The second pair's acts oppositely.
-    """
-
-    cells: Indices
+    cells: Indices  # those in which the pairs overlap, (c,)
+    # Of the first pair's displacement field (12,) in each of them, a stack (c,); see
+    # `rigid_fields`. The second pair's acts oppositely.
     system: LinearGaussianSystem
 
     @staticmethod

@@ -43,14 +43,10 @@ ROUNDS = 3  # the last with all points
 
 @dataclass(frozen=True, eq=False)
 class BreathOffset:
-    """Displacement from the middle of the scan to mean breath.
+    """Displacement from the middle of the scan to mean breath."""
 
-    field: (C, 12), see `rigid_fields`.
-    sigma_mm: standard deviation (C,) along the normals, as it affects a girth there.
-    """
-
-    field: Array
-    sigma_mm: Array
+    field: Array  # (C, 12), see `rigid_fields`
+    sigma_mm: Array  # standard deviation (C,) along the normals, as it affects a girth there
 
     def along_normals(self, cells: BodyCells, points: Array, normals: Array) -> tuple[Array, Array]:
         """Displacement and sigma, (N,) mm each, along the normals of points (N, 3)."""

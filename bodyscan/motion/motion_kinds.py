@@ -22,23 +22,17 @@ PART_MM = 250.0
 
 @dataclass(frozen=True, eq=False)
 class MotionKind:
-    """One kind of motion: M displacement fields, each with amplitudes along J temporal modes.
-
-    fields: (C, 12, M) mm, see `rigid_fields`.
-    size: prior standard deviation of the amplitudes.
-    precision: prior information (M J, M J) of the amplitudes, instead of `size`.
-    twists: (6, M) about the rig's origin, if the body moves as a whole.
-    remainder: fields less twists, (C, 12, M), if the feet stay.
-    standing_size: in people who stand, mm; it holds as far as the overlaps determine nothing.
-    """
+    """One kind of motion: M displacement fields, each with amplitudes along J temporal modes."""
 
     name: str
-    fields: Array
+    fields: Array  # (C, 12, M) mm, see `rigid_fields`
     modes: TemporalModes
-    size: float = 1.0
+    size: float = 1.0  # prior standard deviation of the amplitudes
+    # Prior information (M J, M J) of the amplitudes, instead of `size`.
     precision: Array | None = None
-    twists: Array | None = None
-    remainder: Array | None = None
+    twists: Array | None = None  # (6, M) about the rig's origin, if the body moves as a whole
+    remainder: Array | None = None  # fields less twists, (C, 12, M), if the feet stay
+    # In people who stand, mm; it holds as far as the overlaps determine nothing.
     standing_size: float = 1.0
 
     @property

@@ -33,24 +33,18 @@ from bodyscan.settings import AlignmentSettings
 
 @dataclass(frozen=True, eq=False)
 class PersonAlignment:
-    """A person's aligned range images.
-
-    motion: of a person who moved.
-    displaced: poles, or pairs, that were displaced and moved back.
-    common_error: of all pairs, if one displacement of them all explains the scan.
-    time_factor: other than 1 if the pairs' moments, multiplied by it, explain the motion far better;
-        they were then left out.
-    posture: another one than at other times, while one pole fired.
-    search: for further displaced poles.
-    """
+    """A person's aligned range images."""
 
     alignment: Alignment
-    motion: EstimatedMotion | None
-    displaced: tuple[DisplacedPole, ...]
+    motion: EstimatedMotion | None  # of a person who moved
+    displaced: tuple[DisplacedPole, ...]  # poles, or pairs, that were displaced and moved back
+    # Of all pairs, if one displacement of them all explains the scan.
     common_error: ScaleError | CommonError | None
-    search: DisplacementSearch
+    search: DisplacementSearch  # for further displaced poles
+    # Other than 1 if the pairs' moments, multiplied by it, explain the motion far better; they were
+    # then left out.
     time_factor: float = 1.0
-    posture: PostureStep | None = None
+    posture: PostureStep | None = None  # another one than at other times, while one pole fired
 
 
 def align_person(

@@ -33,18 +33,14 @@ class PartMotion:
 
 @dataclass(frozen=True)
 class PersonMotion:
-    """How a person moved.
+    """How a person moved."""
 
-    parts: the parts that were measured, from the trunk outwards.
-    breathed_mm: see `measure_breath`.
-    moment_ms: the moment that the body represents, since the scan began; None (the mean of all)
-        without times.
-    fuller_mm, fuller_sigma_mm: see `measure_fullness`.
-    """
-
-    parts: tuple[PartMotion, ...]
-    breathed_mm: float | None
+    parts: tuple[PartMotion, ...]  # the parts that were measured, from the trunk outwards
+    breathed_mm: float | None  # see `measure_breath`
+    # The moment that the body represents, since the scan began; None (the mean of all) without
+    # times.
     moment_ms: float | None
+    # fuller_mm, fuller_sigma_mm: see `measure_fullness`.
     fuller_mm: float | None = None
     fuller_sigma_mm: float | None = None
 

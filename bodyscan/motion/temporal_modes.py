@@ -33,14 +33,10 @@ def breath_correlation(seconds: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class TemporalModes:
-    """Karhunen-Loeve basis of J modes of a stationary Gaussian process, of unit variance each.
+    """Karhunen-Loeve basis of J modes of a stationary Gaussian process, of unit variance each."""
 
-    values: at the pairs' moments, (P, J).
-    middle: at the middle of the scan, to which everything is carried, (J,).
-    """
-
-    values: Array
-    middle: Array
+    values: Array  # at the pairs' moments, (P, J)
+    middle: Array  # at the middle of the scan, to which everything is carried, (J,)
 
     @property
     def count(self) -> int:
@@ -77,16 +73,12 @@ class TemporalModes:
 
 @dataclass(frozen=True, eq=False)
 class Breaths:
-    """K breaths that a person may have drawn, as amplitudes of J temporal modes.
+    """K breaths that a person may have drawn, as amplitudes of J temporal modes."""
 
-    waves: (K, J, 2), of unit variance over time: the breath, and what comes earlier or later of it.
-    irregular: covariance (J, J) of what is not periodic.
-    priors: probabilities, (K,).
-    """
-
+    # (K, J, 2), of unit variance over time: the breath, and what comes earlier or later of it.
     waves: Array
-    irregular: Array
-    priors: Array
+    irregular: Array  # covariance (J, J) of what is not periodic
+    priors: Array  # probabilities, (K,)
 
     @staticmethod
     def from_modes(

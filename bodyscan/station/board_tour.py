@@ -33,17 +33,15 @@ BOARDS = 6
 
 @dataclass
 class BoardTour:
-    """The calibration captures that a rig file names, looked at again and again.
-
-    views: boards found so far. looked: pairs and shots in whose images they were looked for; seen: the
-        shots of these. lit: pairs and shots of which only the lit image was taken, which places a board
-        but shows no stripes on it.
-    """
+    """The calibration captures that a rig file names, looked at again and again."""
 
     rig_file: Path
-    views: list[BoardView] = field(default_factory=list)
+    views: list[BoardView] = field(default_factory=list)  # boards found so far
+    # Pairs and shots in whose images they were looked for.
     looked: set[tuple[str, str]] = field(default_factory=set)
-    seen: set[str] = field(default_factory=set)
+    seen: set[str] = field(default_factory=set)  # the shots of these
+    # Pairs and shots of which only the lit image was taken, which places a board but shows no
+    # stripes on it.
     lit: set[tuple[str, str]] = field(default_factory=set)
     missed: dict[str, list[str]] = field(default_factory=dict)
     solved: dict[str, Any] = field(default_factory=dict)

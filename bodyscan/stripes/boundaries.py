@@ -26,25 +26,18 @@ _ERFINV_SLOPE = np.sqrt(np.pi) / 2.0 * np.exp(_ERFINV**2)
 
 @dataclass(frozen=True, eq=False)
 class Boundaries:
-    """Boundaries, sorted by scan line and by position along it, (N,) each.
-
-    before: the pixel before the crossing.
-    position, line_position: px along the line, and across lines (off `line` at edges of
-        brightness).
-    sigma_px: standard deviation across the stripes.
-    index: boundary i lies between stripes i - 1 and i.
-    joined: (N - 1,) whether the next boundary ends the stripe that this one begins.
-    blur2: px^2, of lens and pixel, see `albedo_edges`.
-    """
+    """Boundaries, sorted by scan line and by position along it, (N,) each."""
 
     line: Indices
-    before: Indices
+    before: Indices  # the pixel before the crossing
+    # position, line_position: px along the line, and across lines (off `line` at edges of
+    # brightness).
     position: Array
     line_position: Array
-    sigma_px: Array
-    index: Indices
-    joined: Mask
-    blur2: float
+    sigma_px: Array  # standard deviation across the stripes
+    index: Indices  # boundary i lies between stripes i - 1 and i
+    joined: Mask  # (N - 1,) whether the next boundary ends the stripe that this one begins
+    blur2: float  # px^2, of lens and pixel, see `albedo_edges`
 
 
 def find_flipping_bits(boundary: Indices, bits: int) -> Indices:

@@ -19,19 +19,14 @@ WHOLE_SHARE = 128
 
 @dataclass(frozen=True, eq=False)
 class ScanLines:
-    """Images as scan lines: L lines, each of P pixels across the stripes.
+    """Images of one type as scan lines: L lines, each of P pixels across the stripes."""
 
-    lit, dark: (L, P).
-    patterns: (F, L, P), the images of the code.
-    inverses: (F, L, P), None if none are projected. All of one type, see `Greys`.
-    transposed: the lines are the camera image's columns (its stripes are horizontal).
-    """
-
+    # lit, dark: (L, P).
     lit: Greys
     dark: Greys
-    patterns: Greys
-    inverses: Greys | None
-    transposed: bool
+    patterns: Greys  # (F, L, P), the images of the code
+    inverses: Greys | None  # (F, L, P), None if none are projected
+    transposed: bool  # the lines are the camera image's columns (its stripes are horizontal)
 
     @staticmethod
     def from_images(

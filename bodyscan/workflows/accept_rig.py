@@ -44,17 +44,12 @@ FILE_NAME = "acceptance.json"
 
 @dataclass(frozen=True)
 class Acceptance:
-    """The result of an acceptance test.
+    """The result of an acceptance test."""
 
-    figures: the worst over all places, with their limits.
-    file: path of acceptance.json.
-    page: path of the report, None if it could not be made, as `notes` say.
-    """
-
-    figures: tuple[Figure, ...]
+    figures: tuple[Figure, ...]  # the worst over all places, with their limits
     verdict: Verdict
-    file: Path
-    page: Path | None
+    file: Path  # path of acceptance.json
+    page: Path | None  # path of the report, None if it could not be made, as `notes` say
     notes: tuple[str, ...]
 
 

@@ -145,16 +145,12 @@ def solve_boards(
 
 @dataclass(frozen=True, eq=False)
 class _Adjusted:
-    """The joint solve and what led to it.
+    """The joint solve and what led to it."""
 
-    rig: with board sizes corrected by reference lengths, and a frame held by a pair that is there.
-    rig_notes: on these.
-    located: each view's board pose by itself.
-    """
-
+    # With board sizes corrected by reference lengths, and a frame held by a pair that is there.
     rig: Rig
-    rig_notes: tuple[str, ...]
-    located: Outcome[list[LocatedView]]
+    rig_notes: tuple[str, ...]  # on these
+    located: Outcome[list[LocatedView]]  # each view's board pose by itself
     solution: Outcome[RigSolution]
 
 
@@ -223,17 +219,12 @@ def _fit_light(
 
 @dataclass(frozen=True, eq=False)
 class SolvedRig:
-    """A calibration and what the remarks on it are made from.
-
-    solution: the joint solve, including pairs that failed later.
-    views: all boards that were found.
-    images: number of images in which boards were looked for.
-    """
+    """A calibration and what the remarks on it are made from."""
 
     calibration: RigCalibration
-    solution: RigSolution
-    views: Sequence[BoardView]
-    images: int
+    solution: RigSolution  # the joint solve, including pairs that failed later
+    views: Sequence[BoardView]  # all boards that were found
+    images: int  # number of images in which boards were looked for
 
 
 def add_remarks(solved: SolvedRig, progress: Progress = silent) -> RigCalibration:

@@ -87,19 +87,13 @@ def number_shots(folders: Sequence[Captures]) -> list[Captures]:
 
 @dataclass(frozen=True)
 class StripeOffset:
-    """Distance of the surface that a pair's stripes measure from the board that its corners show.
-
-    offset_mm: median over all boards, positive away from the camera.
-    tilt_mm: half the difference between the board's two ends.
-    sigma_mm: the sigma that the calibration predicts.
-    imported: the file of another program that the pair's calibration is from, if any.
-    """
+    """Distance of the surface that a pair's stripes measure from the board that its corners show."""
 
     pair: str
-    offset_mm: float
-    tilt_mm: float
-    sigma_mm: float
-    imported: str
+    offset_mm: float  # median over all boards, positive away from the camera
+    tilt_mm: float  # half the difference between the board's two ends
+    sigma_mm: float  # the sigma that the calibration predicts
+    imported: str  # the file of another program that the pair's calibration is from, if any
 
     @staticmethod
     def from_distances(pair: PairCalibration, rows: Array) -> StripeOffset:

@@ -80,14 +80,10 @@ def decode_sequence(
 
 @dataclass(frozen=True, eq=False)
 class BoardStripes:
-    """What one sequence shows on boards.
+    """What one sequence shows on boards."""
 
-    boundaries: near each view.
-    faults: see `StripeMap.faults`.
-    """
-
-    boundaries: Mapping[ViewKey, BoardBoundaries]
-    faults: tuple[str, ...] = ()
+    boundaries: Mapping[ViewKey, BoardBoundaries]  # near each view
+    faults: tuple[str, ...] = ()  # see `StripeMap.faults`
 
 
 @dataclass(frozen=True, eq=False)

@@ -44,32 +44,23 @@ BodyAt = Callable[[float], Array]
 
 @dataclass(frozen=True, eq=False)
 class RigDeviation:
-    """Errors of each pair against the truth, in the rig frame as defined, without any alignment.
-
-    centres_mm: errors of the camera centres, (P, 3).
-    rotations_deg: (P,).
-    sigmas_mm: reported sigmas of the centres, (P, 3).
-    """
+    """Errors of each pair against the truth, in the rig frame as defined, without any alignment."""
 
     names: tuple[str, ...]
-    centres_mm: Array
-    rotations_deg: Array
-    sigmas_mm: Array
+    centres_mm: Array  # errors of the camera centres, (P, 3)
+    rotations_deg: Array  # (P,)
+    sigmas_mm: Array  # reported sigmas of the centres, (P, 3)
 
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """The simulator's truth.
+    """The simulator's truth."""
 
-    facts: content of truth.json.
-    vertices, faces: the subject's surface, mm, rig frame; for a moving subject, at mid-scan.
-    at_mean_breath: vertices of a moving subject at mean breath.
-    """
-
-    facts: dict[str, Any]
+    facts: dict[str, Any]  # content of truth.json
+    # vertices, faces: the subject's surface, mm, rig frame; for a moving subject, at mid-scan.
     vertices: Array | None
     faces: Indices | None
-    at_mean_breath: Array | None = None
+    at_mean_breath: Array | None = None  # vertices of a moving subject at mean breath
 
 
 def load_truth(folder: Path) -> Truth:

@@ -178,17 +178,13 @@ def scan_folder(
 
 @dataclass(frozen=True, eq=False)
 class _Subject:
-    """Range images that show something of the subject, carried to one moment if it moved.
-
-    rig_from_camera: the pairs' poses after alignment; as calibrated for those that saw nothing.
-    covariance: of these poses.
-    aligned: what alignment found; None if it took no part.
-    """
+    """Range images that show something of the subject, carried to one moment if it moved."""
 
     images: Sequence[RangeImage]
+    # The pairs' poses after alignment; as calibrated for those that saw nothing.
     rig_from_camera: dict[str, RigidTransform]
-    covariance: PoseCovariance
-    aligned: PersonAlignment | None = None
+    covariance: PoseCovariance  # of these poses
+    aligned: PersonAlignment | None = None  # what alignment found; None if it took no part
 
     @property
     def image_poses(self) -> dict[str, RigidTransform]:

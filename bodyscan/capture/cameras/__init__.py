@@ -29,35 +29,25 @@ class FrameLost(FailedWork):
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """One image as a camera delivered it.
+    """One image as a camera delivered it."""
 
-    image: (height, width) uint8 or uint16.
-    began_ms: when its exposure began, by `clock`.
-    received_ms: when it arrived, by this computer's monotonic clock.
-    exposure_ms: how long it was exposed; 0 if that is not known.
-    clock: its name; pictures of one clock can be compared.
-    """
-
-    image: Bytes
-    began_ms: float
-    received_ms: float
-    exposure_ms: float = 0.0
-    clock: str = HOST
+    image: Bytes  # (height, width) uint8 or uint16
+    began_ms: float  # when its exposure began, by `clock`
+    received_ms: float  # when it arrived, by this computer's monotonic clock
+    exposure_ms: float = 0.0  # how long it was exposed; 0 if that is not known
+    clock: str = HOST  # its name; pictures of one clock can be compared
 
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """Where a device is: its rig and pair, and the folder to which its paths are relative.
-
-    shared: what devices of a rig make once and use together, by name.
-    closing: what is to be closed after all devices.
-    """
+    """Where a device is: its rig and pair, and the folder to which its paths are relative."""
 
     rig: Rig
     pair: Pair
     base: Path
+    # What devices of a rig make once and use together, by name.
     shared: dict[str, Any] = field(default_factory=dict)
-    closing: ExitStack = field(default_factory=ExitStack)
+    closing: ExitStack = field(default_factory=ExitStack)  # what is to be closed after all devices
 
 
 class Camera(ABC):

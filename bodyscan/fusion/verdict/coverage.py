@@ -67,17 +67,13 @@ def measure_coverage(
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """One camera's view of N points of the mesh; masks (N,).
+    """One camera's view of N points of the mesh; masks (N,)."""
 
-    visible: inside its image and facing it by 60 degrees or less.
-    valid, measured: at whose pixel it measured something, and which it measured themselves.
-    white: white in its lit image.
-    """
-
-    visible: Mask
+    visible: Mask  # inside its image and facing it by 60 degrees or less
+    # valid, measured: at whose pixel it measured something, and which it measured themselves.
     valid: Mask
     measured: Mask
-    white: Mask
+    white: Mask  # white in its lit image
 
 
 def _look(

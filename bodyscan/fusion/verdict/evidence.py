@@ -30,18 +30,14 @@ BAND_MM = 50.0  # of the body's height, by which gaps are reported
 
 @dataclass(frozen=True)
 class Finding:
-    """A fault of a scan.
-
-    pairs: those that it is about, by name; none: the whole body.
-    explains: pairs whose own faults are a consequence of it.
-    spoils: whether it puts wrong points into the cloud, so that what the whole body looks like may be
-        a consequence as well.
-    """
+    """A fault of a scan."""
 
     grade: Grade
     words: str
-    pairs: frozenset[str] = frozenset()
-    explains: frozenset[str] = frozenset()
+    pairs: frozenset[str] = frozenset()  # those that it is about, by name; none: the whole body
+    explains: frozenset[str] = frozenset()  # pairs whose own faults are a consequence of it
+    # Whether it puts wrong points into the cloud, so that what the whole body looks like may be a
+    # consequence as well.
     spoils: bool = False
 
     def explains_finding(self, other: Finding) -> bool:
@@ -104,29 +100,20 @@ class SeamReport:
 
 @dataclass(frozen=True, eq=False)
 class ImageEvidence:
-    """What a verdict takes from the range images.
+    """What a verdict takes from the range images."""
 
-    failed: pairs that gave none, with the reason.
-    silent: poles of which no pair saw anybody, see `find_silent_poles`.
-    saturated: of overexposed pairs, the share of their pixels in the volume that are white.
-    absent: calibrated pairs that measured nothing of the subject.
-    compressed: pairs with images as JPEG leaves them, see `find_compressed`.
-    exchanged: pairs whose images are another's, and whose: see `find_exchanged`.
-    agreements: of pairs that project stripes of two directions.
-    seams: see `find_seams`.
-    contradictions: see `merge`.
-    floor_mm: height at which the floor was measured, see `find_floor`.
-    """
-
-    failed: Mapping[str, str] = field(default_factory=dict)
-    silent: tuple[str, ...] = ()
+    failed: Mapping[str, str] = field(default_factory=dict)  # pairs that gave none, with the reason
+    silent: tuple[str, ...] = ()  # poles of which no pair saw anybody, see `find_silent_poles`
+    # Of overexposed pairs, the share of their pixels in the volume that are white.
     saturated: Mapping[str, float] = field(default_factory=dict)
-    absent: frozenset[str] = frozenset()
+    absent: frozenset[str] = frozenset()  # calibrated pairs that measured nothing of the subject
+    # Of pairs that project stripes of two directions.
     agreements: Mapping[str, Agreement] = field(default_factory=dict)
-    seams: SeamReport | None = None
-    contradictions: Contradictions | None = None
-    floor_mm: float | None = None
-    compressed: tuple[str, ...] = ()
+    seams: SeamReport | None = None  # see `find_seams`
+    contradictions: Contradictions | None = None  # see `merge`
+    floor_mm: float | None = None  # height at which the floor was measured, see `find_floor`
+    compressed: tuple[str, ...] = ()  # pairs with images as JPEG leaves them, see `find_compressed`
+    # Pairs whose images are another's, and whose: see `find_exchanged`.
     exchanged: Mapping[str, str] = field(default_factory=dict)
 
     @property

@@ -27,19 +27,15 @@ def stripe_from_gray(gray: NDArray[np.uint16]) -> NDArray[np.int32]:
 
 @dataclass(frozen=True)
 class WordCode:
-    """Conversion between stripe numbers and code words.
-
-    single: whether the words of neighbouring stripes differ in one bit.
-    blur_sigma_px: added to the sigma of boundaries where the finest stripes are one wide and blur
-        into each other (measured on synthetic images).
-    first: the number of stripe 0.
-    """
+    """Conversion between stripe numbers and code words."""
 
     encode: Callable[[NDArray[Any]], NDArray[Any]]
     decode: Callable[[NDArray[np.uint16]], NDArray[np.int32]]
-    single: bool
+    single: bool  # whether the words of neighbouring stripes differ in one bit
+    # Added to the sigma of boundaries where the finest stripes are one wide and blur into each
+    # other (measured on synthetic images).
     blur_sigma_px: float
-    first: int = 0
+    first: int = 0  # the number of stripe 0
 
     def stripes(self, words: NDArray[np.uint16]) -> NDArray[np.int32]:
         """Stripes of code words; negative for words before the first."""

@@ -23,14 +23,11 @@ from bodyscan.stripes.stripe_code import Wave
 
 @dataclass(frozen=True, eq=False)
 class MeasuredWave:
-    """One wave at the pixels (L, P).
-
-    turn: s / period modulo 1.
-    amplitude, mean: grey levels, at least 1e-3.
-    """
+    """One wave at the pixels (L, P)."""
 
     wave: Wave
-    turn: Floats
+    turn: Floats  # s / period modulo 1
+    # amplitude, mean: grey levels, at least 1e-3.
     amplitude: Floats
     mean: Floats
 
