@@ -48,6 +48,8 @@ class BoundaryPoints:
         eigenvalues, axes = np.linalg.eigh(_by_board(products, board).reshape(-1, 3, 3))
         size = np.sqrt(np.maximum(eigenvalues[:, 1:] / count, 1e-18))
         scaled = np.einsum("ni,nij->nj", centred, axes[board][..., 1:]) / size[board]
+        # Points on a line show no tilt about it; what is across it is their noise.
+        scaled[(size[:, 0] < 0.02 * size[:, 1])[board], 0] = 0.0
         outward = np.einsum("ni,ni->n", axes[board][..., 0], self.points)
         return BoardErrors(
             np.column_stack([np.ones(len(scaled)), scaled]),

@@ -145,7 +145,7 @@ def calibrate_pair(pair: LocatedPair) -> Outcome[PairCalibration]:
         planes_rms_mm=fit.rms_mm,
         stripe_shots=len(shots),
         stripes_calibrated=fit.stripes_calibrated,
-        stripes_projected=code.stripes - 1,
+        stripes_projected=max(code.stripes - 1, 1),
         held_out=fit.held_out,
         boards_mm=(float(offsets.mean()), rms(offsets)) if offsets.size else None,
     )

@@ -29,11 +29,18 @@ def fit_pinhole(points: Array, s: Array) -> Array:
 
     Returns (2, 4): s = (row 0 . X) / (row 1 . X), X homogeneous in the camera frame, mm, scaled so
     that the first three numbers of row 1 are a unit vector, the projector's axis. A linear start is
-    followed by least squares on s with a Cauchy loss, on at most 20000 points.
+    followed by least squares on s with a Cauchy loss, on at most 20000 points. If all s are one, the
+    projector is taken to shine along the plane of the points, from as far away as the camera.
     """
     every = -(-len(points) // 20000)
     points, s = points[::every], s[::every]
     centre, size = points.mean(axis=0), points.std()
+    if np.ptp(s) == 0.0:
+        normal = np.linalg.svd(points - centre, full_matrices=False)[2][2]
+        sheet = np.append(normal, -normal @ centre)
+        axis = np.append(centre + sheet[3] * normal, 0.0)
+        axis /= np.linalg.norm(axis)
+        return np.array([sheet + s[0] * axis, axis])
     scaled = np.column_stack([(points - centre) / size, np.ones(len(points))])
     middle, half = float(np.mean(s)), float(np.std(s))
     t = (s - middle) / half

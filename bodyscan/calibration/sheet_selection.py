@@ -44,11 +44,12 @@ class SheetsFit:
     def stripes_calibrated(self) -> int:
         """Number of boundaries between two stripes that have a sheet.
 
-        For smooth models those on at least one board, for the chapter's planes on two.
+        For smooth models those on at least one board, for the chapter's planes on two. The middle of
+        a single line counts as one.
         """
-        if isinstance(self.sheets, LightPlanes):
-            return int(self.sheets.calibrated[1:-1].sum())
-        return int(np.count_nonzero(self.board_counts[1:-1]))
+        free = isinstance(self.sheets, LightPlanes)
+        found = self.sheets.calibrated if free else self.board_counts > 0
+        return int(np.count_nonzero(found[1:-1] if len(found) > 2 else found))
 
 
 def fit_light_sheets(bins: BoundaryPoints, stripes: int, direction: Axis) -> SheetsFit:
@@ -60,7 +61,7 @@ def fit_light_sheets(bins: BoundaryPoints, stripes: int, direction: Axis) -> She
     PairFailed with fewer than two boards, or with hardly any boundaries on them.
     """
     boards = len(np.unique(bins.board))
-    if boards < 2 or len(bins.index) < 50:
+    if boards < 2 or len(bins.index) < (50 if stripes > 1 else 12):
         raise PairFailed(
             f"{len(bins.index)} points of stripe boundaries on {boards} boards are too few for "
             "light sheets",
@@ -114,13 +115,13 @@ def smooth_models(
     few = subsample(data, 1000)
     pinhole = fit_pinhole(few.points, few.index.astype(float))
     plain = LensSheets.from_matrix(pinhole, data.points.mean(axis=0), stripes, direction)
-    lens = _lens_start(plain, few)
     models: list[tuple[str, SmoothSheets]] = [
-        ("lens k1 k2", lens),
-        ("lens k1 k2 p1 p2", lens.with_lens(4)),
         ("bowed sheets", BowedSheets.from_pinhole(plain, 1)),
         ("bowed sheets, 3 terms", BowedSheets.from_pinhole(plain, 3)),
     ]
+    if stripes > 1:  # one sheet shows no lens
+        lens = _lens_start(plain, few)
+        models = [("lens k1 k2", lens), ("lens k1 k2 p1 p2", lens.with_lens(4)), *models]
     return [(name, fit_sheets(model, data).sheets) for name, model in models]
 
 

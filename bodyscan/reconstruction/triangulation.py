@@ -16,7 +16,7 @@ from bodyscan.calibration.pair import PairCalibration
 from bodyscan.compiled import compiled
 from bodyscan.errors import BadInput
 from bodyscan.geometry.light_planes import LightSheets
-from bodyscan.geometry.light_sheets import stripes_per_pixel, triangulate_image
+from bodyscan.geometry.light_sheets import intersect_rays, stripes_per_pixel, triangulate_image
 from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
 from bodyscan.reconstruction.range_image import MAX_RATIO, Agreement, RangeImage
 from bodyscan.stripes.stripe_map import StripeMap
@@ -29,7 +29,10 @@ def reconstruct_range_image(pair: PairCalibration, stripes: StripeMap) -> RangeI
     the directions contradict each other as with a wrong calibration.
     """
     assert pair.sheets is not None  # its stripes would not have been decoded
-    one = _triangulate(pair, pair.sheets, stripes.s, stripes.sigma)
+    if stripes.stripes > 1:
+        one = _triangulate(pair, pair.sheets, stripes.s, stripes.sigma)
+    else:
+        one = _triangulate_line(pair, pair.sheets, stripes)
     (points, sigma_mm, common_mm), agreement = one, None
     correlation_px = stripes.correlation_px
     if pair.crossing is not None and stripes.crossing is not None:
@@ -177,6 +180,25 @@ def _triangulate(
         scale = np.float32(stripes_per_pixel(sheets, camera, s))
         ray_sigma = scale * pair.rays.image(camera.width, camera.height)
     return triangulate_image(sheets, camera, s, sigma, ray_sigma)
+
+
+def _triangulate_line(pair: PairCalibration, sheets: LightSheets, stripes: StripeMap) -> Depths:
+    """Triangulate the middle of a single line of light, to a fraction of a pixel: points are off the
+    rays of their pixels, along the surface."""
+    camera, pixels = pair.camera, stripes.boundary_pixels
+    half = np.array([0.0, 0.5] if sheets.direction == "horizontal" else [0.5, 0.0])
+    rays, s = camera.rays(pixels), np.zeros(len(pixels))
+    here = intersect_rays(sheets, rays, s)
+    ahead, behind = (intersect_rays(sheets, camera.rays(pixels + k), s) for k in (half, -half))
+    u, v = np.rint(pixels).astype(np.int64).T
+    shared = pair.rays.image(camera.width, camera.height)[v, u] if pair.rays else 0.0
+    per_pixel, longer = np.abs(ahead.depth - behind.depth), np.linalg.norm(rays, axis=1)
+    common = longer * np.sqrt(here.variance_mm2 + (per_pixel * shared) ** 2)
+    points = np.full((*stripes.s.shape, 3), np.nan, np.float32)
+    sigma_mm, common_mm = np.full((2, *stripes.s.shape), np.nan, np.float32)
+    points[v, u], common_mm[v, u] = rays * here.depth[:, None], common
+    sigma_mm[v, u] = np.hypot(longer * per_pixel * stripes.boundary_sigma_px, common)
+    return points, sigma_mm, common_mm
 
 
 def grid_normals(points: Floats, measured: Mask | None = None) -> Floats:

@@ -1,4 +1,4 @@
-"""Codes whose images number the stripes directly: a swept line of light, and the stripe-index image.
+"""Codes whose images number the stripes directly: a line of light, and the stripe-index image.
 
 A line of light is swept over the scene, one image per stripe. At a pixel with stripe coordinate s the
 light comes and goes over the images. The part of it that comes in images i and later is, whatever the
@@ -10,6 +10,9 @@ With z_i = (s - i) / sigma from the inverse of that, for the boundaries k and k 
 the brightest image k, s = k + z_k / (z_k - z_(k+1)). Sigma drops out; a parabola through the
 logarithms of three images would require a Gaussian line. If stripes are much wider than the blur,
 that determines little in their middle, and s comes from the boundaries on both sides.
+
+A laser's one line, which is not swept, is sought along each row that crosses it: its middle, where
+s = 0, is its light's centre of gravity.
 
 In a stripe-index image luminance n, 1 to 254, is the number of stripe n - 1 here (s lies between
 n - 1 and n); 0 and 255 mean none.
@@ -23,6 +26,8 @@ from scipy.special import ndtri
 
 from bodyscan.arrays import Floats, Greys, Mask
 from bodyscan.errors import DecodingFailed
+from bodyscan.geometry.robust import robust_scale
+from bodyscan.stripes.boundaries import MIN_SIGMA_PX, Boundaries
 from bodyscan.stripes.scan_lines import ScanLines
 from bodyscan.stripes.stripe_coordinates import interpolate_stripes
 from bodyscan.stripes.stripe_map import (
@@ -81,6 +86,59 @@ def decode_sweep(lit: Greys, frames: Greys, direction: str) -> StripeMap:
     images = ScanLines(whole, sweep.base.astype(np.uint8), lines.patterns, None, lines.transposed)
     variance = variance.astype(np.float32)
     return assemble_from_pixels(images, lit, s, sigma, variance, stripes, codes=sweep.peak)
+
+
+def decode_line(lit: Greys, frame: Greys, direction: str) -> StripeMap:
+    """Compute the stripe map of one line of light: its middle is boundary 0, with s = 0 at its pixel.
+
+    lit: (H, W), the scene without the line, or the image of the line if there is no other.
+    frame: (1, H, W), the image of the line.
+
+    Raises DecodingFailed if fewer than 20 rows show one line.
+    """
+    lines = ScanLines.from_images(lit, lit, frame, None, direction)
+    light = lines.patterns[0].astype(np.float32)
+    room = lines.lit * np.float32(not np.array_equal(lit, frame[0]))
+    seen = room >= MIN_CONTRAST
+    if seen.any():  # the room may have been darker while the line was on
+        light -= room * np.median(light[seen] / room[seen])
+    light -= np.median(light, axis=1, keepdims=True)
+    noise = robust_scale(light, UNIFORM_SIGMA)
+    peak, height = light.argmax(axis=1), light.max(axis=1)
+    bright = height >= max(MIN_CONTRAST, 2.0 * MIN_CONTRAST_TO_NOISE * noise)
+    half = np.count_nonzero(2.0 * light >= height[:, None], axis=1)
+    # A bell ends 1.5 times its width at half its height from its middle.
+    reach = int(np.ceil(1.5 * np.median(half[bright]))) if bright.any() else 0
+    line = np.flatnonzero(bright & (peak >= reach) & (peak + reach < light.shape[1]))
+    step = np.arange(-reach, reach + 1)
+    at = peak[line, None] + step
+    bell, surface = (np.take_along_axis(one[line], at, axis=1) for one in (light, room))
+    rest = light[line]
+    np.put_along_axis(rest, at, 0.0, axis=1)
+    # As in a sweep, a second peak may be a reflection. An edge of brightness shifts the middle.
+    alone = rest.max(axis=1) < np.maximum(0.3 * height[line], MIN_CONTRAST_TO_NOISE * noise)
+    even = surface.min(axis=1) >= 0.7 * surface.max(axis=1) - MIN_CONTRAST_TO_NOISE * noise
+    kept = alone & even
+    if np.count_nonzero(kept) < 20:
+        raise DecodingFailed(
+            f"one line of light is seen in {np.count_nonzero(kept)} of {len(peak)} "
+            f"{'columns' if lines.transposed else 'rows'}",
+            remedy="check that the laser is on, and `direction`; if the room is not dark, take `lit` "
+            "under the same light without the line",
+        )
+    line, bell = line[kept], bell[kept]
+    total = bell.sum(axis=1)
+    position = peak[line] + bell @ step / total
+    sigma = noise * np.sqrt(np.sum(step**2)) / total
+    # A laser's speckle makes its line rougher than noise does.
+    rough = robust_scale(np.diff(position, 2)[np.diff(line, 2) == 0]) / 6.0**0.5
+    sigma = np.hypot(sigma * max(1.0, rough / np.median(sigma)), MIN_SIGMA_PX)
+    pixel = np.rint(position).astype(np.int64)
+    s, spread = np.full((2, *light.shape), np.nan, np.float32)
+    s[line, pixel], spread[line, pixel] = 0.0, sigma
+    index = np.zeros_like(line)
+    rest_of = line.astype(np.float64), sigma, index, index[1:] > 0, 0.0
+    return assemble_map(lines, lit, s, spread, Boundaries(line, pixel, position, *rest_of), 1)
 
 
 class _Sweep:

@@ -168,6 +168,11 @@ class StripeCode(Model):
     def _pattern_images(self, width: int, height: int) -> Bytes:
         import numpy as np
 
+        if self.stripes < 2:
+            raise BadInput(
+                "a pair's one line of light is a laser's: there is nothing to project",
+                remedy="leave such pairs out, or sweep the line: one stripe for each of its places",
+            )
         horizontal = self.direction == "horizontal"
         side, across = ("height", height) if horizontal else ("width", width)
         if self.stripes > across:

@@ -1,9 +1,11 @@
-"""Light section: a line of light swept over the scene, one image per stripe."""
+"""Light section: a line of light swept over the scene, one image per stripe, or a laser's one line."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+
+from pydantic import Field
 
 from bodyscan.stripes.stripe_code import ImageKind, SequenceImages, StripeCode
 
@@ -22,6 +24,7 @@ class LightSection(StripeCode):
     uses_dark: ClassVar = False
 
     code: Literal["light-section"] = "light-section"
+    stripes: Annotated[int, Field(ge=1, le=65535)]
 
     @property
     def image_counts(self) -> Mapping[ImageKind, int]:
@@ -34,8 +37,10 @@ class LightSection(StripeCode):
         return np.asarray(np.floor(s) == np.arange(self.stripes)[:, None], float)
 
     def decode(self, images: SequenceImages, limits: StripeLimits | None) -> StripeMap:
-        from bodyscan.stripes.numbered_stripes import decode_sweep
+        from bodyscan.stripes.numbered_stripes import decode_line, decode_sweep
 
+        if self.stripes == 1:
+            return decode_line(images.lit, images.coded[STRIPE], self.direction)
         return decode_sweep(images.lit, images.coded[STRIPE], self.direction)
 
 
