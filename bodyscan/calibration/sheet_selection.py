@@ -47,8 +47,9 @@ class SheetsFit:
         For smooth models those on at least one board, for the chapter's planes on two. The middle of
         a single line counts as one.
         """
-        free = isinstance(self.sheets, LightPlanes)
-        found = self.sheets.calibrated if free else self.board_counts > 0
+        found = self.board_counts > 0
+        if isinstance(self.sheets, LightPlanes):
+            found = self.sheets.calibrated
         return int(np.count_nonzero(found[1:-1] if len(found) > 2 else found))
 
 
