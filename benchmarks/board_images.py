@@ -43,12 +43,7 @@ class SeenRig:
 
 
 def see_boards(
-    rig: Rig,
-    *,
-    seed: int,
-    shots: int | None = None,
-    workers: int = 2,
-    stored: Path | None = None,
+    rig: Rig, *, seed: int, shots: int | None = None, workers: int = 2, stored: Path | None = None
 ) -> SeenRig:
     """Draw a rig and a plan of board shots, render every view, find the corners.
 

@@ -100,25 +100,14 @@ def _board(board: Board, settings: SimulationSettings) -> Scene:
 
 
 def _row(
-    spec: StripeCode,
-    scene: Scene,
-    pair: TruePair,
-    truth: PixelTruth,
-    settings: SimulationSettings,
+    spec: StripeCode, scene: Scene, pair: TruePair, truth: PixelTruth, settings: SimulationSettings
 ) -> str:
     rng, frames = np.random.default_rng(SEED), FrameNames()
     view = View.from_camera(pair.camera, settings.optics, rng)
     light = settings.lighting
     lamps = Lamps(light.laser_grey, light.ambient_grey, 0.85 * pair.reach_mm, pair.reach_mm)
     images = render_pair(
-        scene,
-        view,
-        pair.projector,
-        lamps,
-        settings.projection,
-        rng,
-        frames=frames,
-        code=spec,
+        scene, view, pair.projector, lamps, settings.projection, rng, frames=frames, code=spec
     )
     length = exposure(images["lit"], light.board_grey, light)
     seen = {name: expose(image * length, settings.noise, rng) for name, image in images.items()}

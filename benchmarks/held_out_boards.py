@@ -133,8 +133,7 @@ def _shots(rig: Rig, captures: Captures, pair: str) -> tuple[CameraCalibration, 
         shots.append(_Shot(view, pose, points, stripes))
     if len(shots) < 3:
         raise PairFailed(
-            f"{len(shots)} boards with stripes, holding one out needs three",
-            where=f"pair {pair}",
+            f"{len(shots)} boards with stripes, holding one out needs three", where=f"pair {pair}"
         )
     return camera, shots
 

@@ -134,10 +134,7 @@ def _score(
     centres = [np.sum((found.translation - true.translation) ** 2) for found, true in pairs]
     turns = [(found.inverse() @ true).angle ** 2 for found, true in pairs]
     return Scored(
-        float(np.sqrt(np.mean(centres))),
-        float(np.degrees(np.sqrt(np.mean(turns)))),
-        seconds,
-        cpu,
+        float(np.sqrt(np.mean(centres))), float(np.degrees(np.sqrt(np.mean(turns)))), seconds, cpu
     )
 
 

@@ -137,10 +137,7 @@ def _camera(ours: Camera, matrix: Array, lens: Array) -> Camera:
 
 
 def _corners(
-    board: Board,
-    views: Sequence[LocatedView],
-    cameras: Mapping[str, Camera],
-    names: Sequence[str],
+    board: Board, views: Sequence[LocatedView], cameras: Mapping[str, Camera], names: Sequence[str]
 ) -> dict[str, Any]:
     """Input of rig_rivals.py."""
     points = corner_points(board)

@@ -130,8 +130,7 @@ def _work(workspace: Path, what: str) -> Callable[[], Any]:
 
     paths = [[str(path) for path in sequence.paths] for sequence in captures.sequences]
     return lambda: map_threads(
-        lambda own: [cv2.imread(path, cv2.IMREAD_GRAYSCALE) for path in own] and None,
-        paths,
+        lambda own: [cv2.imread(path, cv2.IMREAD_GRAYSCALE) for path in own] and None, paths
     )
 
 

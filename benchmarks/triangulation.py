@@ -60,10 +60,7 @@ def _equations(
 
 
 def _nearest_to_rays(
-    cameras: Sequence[Camera],
-    camera_from_rig: Sequence[RigidTransform],
-    pixels: Array,
-    seen: Mask,
+    cameras: Sequence[Camera], camera_from_rig: Sequence[RigidTransform], pixels: Array, seen: Mask
 ) -> Array:
     normal, right = np.zeros((pixels.shape[1], 3, 3)), np.zeros((pixels.shape[1], 3))
     for camera, transform, seen_at, here in zip(

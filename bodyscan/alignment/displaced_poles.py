@@ -15,12 +15,7 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.special import fdtri
 
-from bodyscan.alignment.sway_prior import (
-    LEVER_MM,
-    SwayPrior,
-    centre_shifts,
-    stance_correlation,
-)
+from bodyscan.alignment.sway_prior import LEVER_MM, SwayPrior, centre_shifts, stance_correlation
 from bodyscan.arrays import Array
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance

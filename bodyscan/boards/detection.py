@@ -10,12 +10,7 @@ import numpy as np
 from bodyscan.arrays import Bytes
 from bodyscan.boards.aprilgrid import find_aprilgrid
 from bodyscan.boards.board_layout import corners_per_face
-from bodyscan.boards.charuco import (
-    Markers,
-    detect_markers,
-    locate_charuco,
-    locate_face,
-)
+from bodyscan.boards.charuco import Markers, detect_markers, locate_charuco, locate_face
 from bodyscan.boards.checkerboard import find_checkerboard
 from bodyscan.boards.corners import DetectedCorners
 from bodyscan.boards.view import AS_PRINTED, Appearance, BoardView

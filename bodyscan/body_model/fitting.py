@@ -269,11 +269,7 @@ def _joint_precision(template: BodyTemplate) -> Array:
 
 
 def differentiate(
-    template: BodyTemplate,
-    body: BodyShapeAndPose,
-    posed: PosedBody,
-    used: Indices,
-    normals: Array,
+    template: BodyTemplate, body: BodyShapeAndPose, posed: PosedBody, used: Indices, normals: Array
 ) -> Array:
     """Derivatives (M, 3 + 3 J + K) of displacements along normals by root, turns and shapes.
 

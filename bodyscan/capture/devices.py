@@ -16,13 +16,7 @@ from bodyscan.capture.cameras import CAMERAS, Camera, Place
 from bodyscan.capture.projectors import PROJECTORS, Projector
 from bodyscan.captures.pattern_files import name_patterns
 from bodyscan.errors import BadInput, RigFileError
-from bodyscan.files.model import (
-    Model,
-    Problem,
-    did_you_mean,
-    format_alternatives,
-    problem_error,
-)
+from bodyscan.files.model import Model, Problem, did_you_mean, format_alternatives, problem_error
 from bodyscan.files.model_file import load_model
 from bodyscan.files.registry import Registry
 from bodyscan.rig.devices import CapturePlan

@@ -116,10 +116,7 @@ def _find_free_nodes(
     nearest = np.rint((vertices - bricks.origin) / bricks.cell_mm).astype(int)
     filled, near_dark = ~fixed[tuple(nearest.T)], dark[tuple(nearest.T)]
     surface = PartialSurface(
-        vertices.astype(np.float32),
-        faces,
-        filled[faces].any(axis=1),
-        near_dark[faces].any(axis=1),
+        vertices.astype(np.float32), faces, filled[faces].any(axis=1), near_dark[faces].any(axis=1)
     )
     index = np.argwhere((guess < 0.0) & ~fixed)
     nodes = (bricks.origin + bricks.cell_mm * index).astype(np.float32)
@@ -218,10 +215,7 @@ class PartialSurface:
 
 
 def find_free_points(
-    points: Floats,
-    surface: PartialSurface,
-    image: RangeImage,
-    rig_from_camera: RigidTransform,
+    points: Floats, surface: PartialSurface, image: RangeImage, rig_from_camera: RigidTransform
 ) -> Mask:
     """Find the points (N, 3), rig frame, that one camera saw through by at least 10 mm: something
     was measured behind them, or they lie in a gap (see `find_gaps`)."""

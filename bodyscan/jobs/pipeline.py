@@ -22,10 +22,7 @@ from bodyscan.settings import (
     UseLimits,
 )
 
-SECTIONS = {
-    "fuse": ("alignment", "fusion", "mesh", "use", "export"),
-    "calibrate": ("rig_export",),
-}
+SECTIONS = {"fuse": ("alignment", "fusion", "mesh", "use", "export"), "calibrate": ("rig_export",)}
 
 
 class Pipeline(Model):

@@ -32,16 +32,7 @@ from bodyscan.errors import BadInput, CaptureError, FailedWork
 from bodyscan.files.atomic import write_bytes
 from bodyscan.files.hashing import list_files
 from bodyscan.jobs.batch import finish, hold_output, write_or_refuse
-from bodyscan.jobs.job import (
-    RESULTS,
-    STAGE,
-    STATE,
-    Job,
-    job_name,
-    job_of,
-    read_record,
-    results_in,
-)
+from bodyscan.jobs.job import RESULTS, STAGE, STATE, Job, job_name, job_of, read_record, results_in
 from bodyscan.jobs.pipeline import Pipeline
 from bodyscan.jobs.stages import KINDS, rig_of
 from bodyscan.jobs.supervision import (

@@ -61,11 +61,7 @@ class Reproduction:
 
 
 def reproduce(
-    out: Path,
-    *,
-    seed: int = 0,
-    real_light: bool = False,
-    progress: Progress = silent,
+    out: Path, *, seed: int = 0, real_light: bool = False, progress: Progress = silent
 ) -> tuple[str, tuple[str, ...]]:
     """Simulate, calibrate every approach, measure; returns the text, and the names of the files in
     `out`: that text, and the figures.

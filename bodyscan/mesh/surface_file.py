@@ -9,12 +9,7 @@ import numpy as np
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.errors import BadInput
-from bodyscan.mesh.topology import (
-    check_manifold,
-    drop_unused_vertices,
-    find_fault,
-    signed_volume,
-)
+from bodyscan.mesh.topology import check_manifold, drop_unused_vertices, find_fault, signed_volume
 from bodyscan.outcome import Outcome
 
 UNITS_MM = {"millimetres": 1.0, "centimetres": 10.0, "inches": 25.4, "feet": 304.8, "metres": 1e3}

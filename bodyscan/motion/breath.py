@@ -11,12 +11,7 @@ from scipy.special import log_ndtr
 
 from bodyscan.arrays import Array
 from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
-from bodyscan.motion.body_cells import (
-    BodyCells,
-    modulate_fields,
-    pick_one_per_cube,
-    rigid_fields,
-)
+from bodyscan.motion.body_cells import BodyCells, modulate_fields, pick_one_per_cube, rigid_fields
 from bodyscan.motion.body_parts import PARTS, leftward, name_parts
 from bodyscan.motion.temporal_modes import Breaths
 

@@ -51,11 +51,7 @@ class MotionKind:
 
 
 def build_kinds(
-    cells: BodyCells,
-    seconds: Sequence[float | None],
-    middle_s: float,
-    boards: Array,
-    sway: Array,
+    cells: BodyCells, seconds: Sequence[float | None], middle_s: float, boards: Array, sway: Array
 ) -> tuple[MotionKind, ...]:
     """All kinds of motion, beginning with the pairs' pose errors.
 

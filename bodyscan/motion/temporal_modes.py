@@ -44,9 +44,7 @@ class TemporalModes:
 
     @staticmethod
     def from_correlation(
-        correlation: Callable[[Array], Array],
-        seconds: Sequence[float | None],
-        middle_s: float,
+        correlation: Callable[[Array], Array], seconds: Sequence[float | None], middle_s: float
     ) -> TemporalModes:
         """Modes of a correlation over time; seconds: each pair's moment, None if not known.
 

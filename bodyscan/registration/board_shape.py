@@ -17,11 +17,7 @@ from bodyscan.calibration.camera import CORNERS
 from bodyscan.calibration.model_selection import MIN_GAIN, ResidualPair, gain
 from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
 from bodyscan.outcome import Outcome
-from bodyscan.registration.joint_solve import (
-    JointSolution,
-    linearize_reprojection,
-    refine_solution,
-)
+from bodyscan.registration.joint_solve import JointSolution, linearize_reprojection, refine_solution
 from bodyscan.registration.view_consistency import ConsistentSolve, fit_board
 from bodyscan.registration.view_graph import by_target
 
@@ -98,10 +94,7 @@ def _gain_per_unknown(
 
 
 def _hold_out(
-    views: Sequence[LocatedView],
-    solution: JointSolution,
-    shapes: dict[str, BoardShape],
-    root: str,
+    views: Sequence[LocatedView], solution: JointSolution, shapes: dict[str, BoardShape], root: str
 ) -> ResidualPair:
     """Residuals of held-out boards, flat and in the shape found from the rest, both posed by the
     rest's cameras."""

@@ -126,9 +126,7 @@ class _Solved:
 
 
 def solve_rig(
-    rig: Rig,
-    views: Sequence[LocatedView],
-    cameras: Mapping[str, Camera],
+    rig: Rig, views: Sequence[LocatedView], cameras: Mapping[str, Camera]
 ) -> Outcome[RigSolution]:
     """Join all pairs by their shared board views.
 
@@ -299,10 +297,7 @@ def _with_pose(solution: RigSolution, view: LocatedView) -> LocatedView:
 
 
 def solved_pair(
-    rig: Rig,
-    solution: RigSolution,
-    name: str,
-    boundaries: Mapping[ViewKey, BoardBoundaries],
+    rig: Rig, solution: RigSolution, name: str, boundaries: Mapping[ViewKey, BoardBoundaries]
 ) -> LocatedPair:
     """A pair with the camera, and the poses and shapes of its boards, of the joint solve.
 

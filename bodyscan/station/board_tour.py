@@ -168,13 +168,7 @@ def _choose_next_hold(
     if boards[barest_pair] >= BOARDS and share[barest] >= 0.8:
         return {"say": "enough"}
     row, column = divmod(int(np.argmin(_inner_first(cells[target]))), COLUMNS)
-    return {
-        "say": "hold",
-        "pair": target,
-        "row": row,
-        "column": column,
-        "boards": boards[target],
-    }
+    return {"say": "hold", "pair": target, "row": row, "column": column, "boards": boards[target]}
 
 
 def _count_cells(pair: Pair, views: Sequence[BoardView]) -> Indices:

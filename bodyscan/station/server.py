@@ -192,11 +192,7 @@ def make_app(operation: Operation, hosts: set[str], token: str | None = None) ->
             Route(f"{scan}/report", station.report),
             Route(f"{scan}/pairs/{{pair}}", station.pair),
         ],
-        exception_handlers={
-            BodyscanError: _explain,
-            KeyError: _unknown,
-            TooLarge: _too_large,
-        },
+        exception_handlers={BodyscanError: _explain, KeyError: _unknown, TooLarge: _too_large},
         lifespan=run,
     )
     return Guard(app, hosts, token)

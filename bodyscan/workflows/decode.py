@@ -40,11 +40,7 @@ NUMBER = re.compile(r"(?<!bit )\b\d[\d.]*%?(, \d[\d.]*%?)*")
 
 
 def decode_sequence(
-    sequence: ImageSequence,
-    pair: Pair,
-    *,
-    limits: StripeLimits | None = None,
-    crop: Crop = WHOLE,
+    sequence: ImageSequence, pair: Pair, *, limits: StripeLimits | None = None, crop: Crop = WHOLE
 ) -> StripeMap:
     """Read and decode what `pair` took in one shot.
 

@@ -14,11 +14,7 @@ import numpy as np
 from bodyscan.arrays import Array
 from bodyscan.boards.board_layout import corner_grid, corner_points
 from bodyscan.boards.detection import find_boards
-from bodyscan.boards.detection_failure import (
-    describe_unfound,
-    detect_any,
-    estimate_first_marker,
-)
+from bodyscan.boards.detection_failure import describe_unfound, detect_any, estimate_first_marker
 from bodyscan.boards.view import BoardView, ViewKey, number_corners
 from bodyscan.calibration.board_views import (
     LocatedView,

@@ -16,12 +16,7 @@ from bodyscan.alignment.displaced_poles import (
     group_by_pole,
     motions_between,
 )
-from bodyscan.alignment.sway_prior import (
-    BODY_CENTRE,
-    LEVER_MM,
-    centre_shifts,
-    stance_correlation,
-)
+from bodyscan.alignment.sway_prior import BODY_CENTRE, LEVER_MM, centre_shifts, stance_correlation
 from bodyscan.arrays import Array
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 from bodyscan.geometry.uncertainty import PoseCovariance

@@ -12,17 +12,8 @@ from ball import ball_points, range_image_of
 from ring import looking_at
 
 from bodyscan.alignment import overlaps
-from bodyscan.alignment.matching import (
-    Matches,
-    SampledPoints,
-    match_projected,
-    sample_points,
-)
-from bodyscan.alignment.overlaps import (
-    OverlapPoints,
-    map_overlaps,
-    match_overlap,
-)
+from bodyscan.alignment.matching import Matches, SampledPoints, match_projected, sample_points
+from bodyscan.alignment.overlaps import OverlapPoints, map_overlaps, match_overlap
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.transforms import RigidTransform
@@ -64,9 +55,7 @@ def test_a_patch_is_about_evenly_spread(two: list[tuple[SampledPoints, RigidTran
         assert 0.0 < part.in_margin.mean() < 0.3
 
 
-def test_matches_lie_on_the_surface(
-    two: list[tuple[SampledPoints, RigidTransform]],
-) -> None:
+def test_matches_lie_on_the_surface(two: list[tuple[SampledPoints, RigidTransform]]) -> None:
     (a, rig_from_a), (b, rig_from_b) = two
     found = match_projected(a, b, rig_from_a, rig_from_b, 6.0)
     assert len(found.distances) > 500

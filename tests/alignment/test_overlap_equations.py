@@ -8,11 +8,7 @@ from scipy import stats
 
 from bodyscan.alignment.displaced_poles import PairDrift, estimate_drift
 from bodyscan.alignment.matching import Matches
-from bodyscan.alignment.overlaps import (
-    linearize,
-    motion_covariance,
-    solve_motions,
-)
+from bodyscan.alignment.overlaps import linearize, motion_covariance, solve_motions
 from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
 
 

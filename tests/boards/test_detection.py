@@ -172,10 +172,7 @@ def test_a_plain_board_with_two_faces_is_turnable() -> None:
 
 @pytest.mark.parametrize(
     ("columns", "rows", "message"),
-    [
-        (9, 3, "9 columns and 3 rows cannot be found"),
-        (3, 9, "cannot be found"),
-    ],
+    [(9, 3, "9 columns and 3 rows cannot be found"), (3, 9, "cannot be found")],
 )
 def test_plain_boards_that_cannot_be_found_are_refused(
     columns: int, rows: int, message: str

@@ -12,11 +12,7 @@ from meshed import mesh
 from ray_cast_scan import looking, nominal_camera
 
 from bodyscan.arrays import Array
-from bodyscan.fusion.hole_filling import (
-    CELL_MM,
-    fill_distances,
-    fill_harmonically,
-)
+from bodyscan.fusion.hole_filling import CELL_MM, fill_distances, fill_harmonically
 from bodyscan.fusion.signed_distances import (
     Distances,
     find_crossed_bricks,

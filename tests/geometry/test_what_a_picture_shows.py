@@ -10,10 +10,7 @@ from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.camera_tables import is_in_image
 from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.light_planes import LightPlanes
-from bodyscan.geometry.light_sheets import (
-    intersect_rays,
-    stripes_per_pixel,
-)
+from bodyscan.geometry.light_sheets import intersect_rays, stripes_per_pixel
 from bodyscan.geometry.uncertainty import (
     COLUMNS,
     ROWS,

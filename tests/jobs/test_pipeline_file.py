@@ -9,11 +9,7 @@ import yaml
 
 from bodyscan.errors import BadInput
 from bodyscan.jobs.batch import allocate
-from bodyscan.jobs.pipeline import (
-    SECTIONS,
-    Pipeline,
-    load_pipeline,
-)
+from bodyscan.jobs.pipeline import SECTIONS, Pipeline, load_pipeline
 from bodyscan.settings import AlignmentSettings, Resources, ScanSettings
 
 PIPELINES = sorted((Path(__file__).parents[2] / "pipelines").glob("*.yaml"))

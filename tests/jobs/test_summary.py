@@ -16,12 +16,7 @@ from cheap_batch import jobs_of
 from bodyscan.arrays import Array
 from bodyscan.jobs.display import print_json_lines, show_on_screen
 from bodyscan.jobs.job import Job
-from bodyscan.jobs.summary import (
-    find_drift,
-    scans_to_repeat,
-    write_day_measures,
-    write_summary,
-)
+from bodyscan.jobs.summary import find_drift, scans_to_repeat, write_day_measures, write_summary
 from bodyscan.jobs.supervision import JobResult
 from bodyscan.measurement.named import read_definitions
 from bodyscan.report.measurement_table import named_csv

@@ -12,10 +12,7 @@ from bodyscan.calibration.board_views import LocatedView
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import position_sigma
-from bodyscan.registration.advice import (
-    advise,
-    find_articulation_shots,
-)
+from bodyscan.registration.advice import advise, find_articulation_shots
 from bodyscan.registration.rig_solve import RigSolution, solve_rig
 from bodyscan.rig.rig import Rig
 

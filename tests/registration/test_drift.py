@@ -53,10 +53,7 @@ def test_a_rig_that_stood_still_is_not_suspected(calibrated: RigSolution, seed: 
     ("turn_deg", "shift_mm"), [([0, 0, 0], [0.3, -0.4, 0]), ([0.012, 0, 0.016], [0, 0, 0])]
 )
 def test_half_a_millimetre_or_a_fiftieth_of_a_degree_is_noticed(
-    calibrated: RigSolution,
-    pair: str,
-    turn_deg: list[float],
-    shift_mm: list[float],
+    calibrated: RigSolution, pair: str, turn_deg: list[float], shift_mm: list[float]
 ) -> None:
     motion = about(PLACINGS[pair].translation, turn_deg, shift_mm)
     (move,) = drift_after(calibrated, {pair: motion}, shots=6).moves

@@ -15,11 +15,7 @@ from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.lenses.opencv import Brown, Radial
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.cluster_covariance import normal_equations
-from bodyscan.registration.joint_solve import (
-    JointSolution,
-    refine_solution,
-    solve_poses,
-)
+from bodyscan.registration.joint_solve import JointSolution, refine_solution, solve_poses
 from bodyscan.registration.rig_solve import LOSSES_PX
 
 PLACINGS, CAMERAS = ring_of_cameras(poles=2, heights=(700, 1100))

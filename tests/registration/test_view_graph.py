@@ -10,11 +10,7 @@ import pytest
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.errors import RigDisconnected
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.registration.view_graph import (
-    initial_poses,
-    locate_boards_jointly,
-    view_graph,
-)
+from bodyscan.registration.view_graph import initial_poses, locate_boards_jointly, view_graph
 
 PLACED = {
     "a": RigidTransform.identity(),

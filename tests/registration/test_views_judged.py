@@ -16,10 +16,7 @@ from bodyscan.outcome import Outcome
 from bodyscan.registration import view_consistency
 from bodyscan.registration.joint_solve import JointSolution
 from bodyscan.registration.rig_solve import RigSolution, collect_corners
-from bodyscan.registration.view_consistency import (
-    ConsistentSolve,
-    solve_consistently,
-)
+from bodyscan.registration.view_consistency import ConsistentSolve, solve_consistently
 
 BEFORE = RigidTransform.from_rotation_vector([0.0, 0.1, 0.0], [10.0, 0.0, 900.0])
 

@@ -145,9 +145,7 @@ def test_a_page_that_was_away_is_told_what_it_missed_or_to_begin_anew() -> None:
         assert "event: anew" in asyncio.run(read(feed, lost, 1))[0]
 
 
-def test_what_people_decide_stays_and_what_is_taken_again_begins_anew(
-    operation: Operation,
-) -> None:
+def test_what_people_decide_stays_and_what_is_taken_again_begins_anew(operation: Operation) -> None:
     out, day = operation.watched.out, operation.day
     operation.listen({"event": "images", "job": "anna", "scan": "anna", "pairs": {"p": [1, 9]}})
     with pytest.raises(BadInput, match="no such scan"):

@@ -49,9 +49,7 @@ def arrays(made: o3d.geometry.TriangleMesh) -> tuple[np.ndarray, np.ndarray]:
 
 
 def ellipsoid(
-    axes: ArrayLike,
-    centre: ArrayLike = (0.0, 0.0, 0.0),
-    resolution: int = 200,
+    axes: ArrayLike, centre: ArrayLike = (0.0, 0.0, 0.0), resolution: int = 200
 ) -> tuple[np.ndarray, np.ndarray]:
     vertices, faces = arrays(o3d.geometry.TriangleMesh.create_sphere(1.0, resolution=resolution))
     return vertices * np.asarray(axes) + np.asarray(centre), faces

@@ -13,12 +13,7 @@ from bodyscan.errors import FailedWork
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.registration.drift import Move
-from bodyscan.workflows.check_rig import (
-    BoardCheck,
-    ScanCheck,
-    apply_moves,
-    number_shots,
-)
+from bodyscan.workflows.check_rig import BoardCheck, ScanCheck, apply_moves, number_shots
 
 
 @dataclass(frozen=True)

@@ -35,11 +35,7 @@ def test_all_pairs_are_calibrated(workspace: Workspace, calibration: RigCalibrat
     outputs = workspace.outputs
     for name in (*calibration.pairs, "calibration.json"):
         assert name in outputs["calibrate-rig"]
-    for command, made in (
-        ("scan", "scan.json"),
-        ("export", "body.glb"),
-        ("evaluate", "truth"),
-    ):
+    for command, made in (("scan", "scan.json"), ("export", "body.glb"), ("evaluate", "truth")):
         assert made in outputs[command]
 
 

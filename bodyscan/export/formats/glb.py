@@ -200,9 +200,7 @@ def _linear(colours: Bytes) -> NDArray[np.uint16]:
 def _add_materials(buffer: _Buffer, texture: Texture | None) -> dict[str, Any]:
     """The material of all primitives, and the image that it shows if there is one."""
     surface: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": 0.9}
-    content: dict[str, Any] = {
-        "materials": [{"name": "body", "pbrMetallicRoughness": surface}],
-    }
+    content: dict[str, Any] = {"materials": [{"name": "body", "pbrMetallicRoughness": surface}]}
     if texture is None:
         return content
     surface["baseColorTexture"] = {"index": 0}

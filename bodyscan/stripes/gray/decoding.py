@@ -73,11 +73,7 @@ def decode_bits(
 
 
 def lay_out(
-    lit: Greys,
-    dark: Greys | None,
-    patterns: Greys,
-    inverses: Greys | None,
-    direction: str,
+    lit: Greys, dark: Greys | None, patterns: Greys, inverses: Greys | None, direction: str
 ) -> ScanLines:
     """Lay out patterns (bits, H, W), and inverses if any, as scan lines.
 
