@@ -35,15 +35,18 @@ def seen(name: str, rig_from_camera: RigidTransform) -> RangeImage:
     return range_image_of(CAMERA, points, normals, sigma_mm=SIGMA_MM, pair=name, grey=150)
 
 
+Two = list[tuple[SampledPoints, RigidTransform]]
+
+
 @pytest.fixture(scope="module")
-def two() -> list[tuple[SampledPoints, RigidTransform]]:
+def two() -> Two:
     places = [
         looking_at([1300.0 * np.cos(a), 1300.0 * np.sin(a), 950.0], CENTRE) for a in (0.2, 0.9)
     ]
     return [(sample_points(seen(f"p{k}", t), 5.0)[0], t) for k, t in enumerate(places)]
 
 
-def test_a_patch_is_about_evenly_spread(two: list[tuple[SampledPoints, RigidTransform]]) -> None:
+def test_a_patch_is_about_evenly_spread(two: Two) -> None:
     for part, _ in two:
         # 1050 mm away a pixel is 2.6 mm: every second one is the nearest to 5 mm.
         gaps = np.linalg.norm(np.diff(part.points, axis=0), axis=1)
@@ -55,7 +58,7 @@ def test_a_patch_is_about_evenly_spread(two: list[tuple[SampledPoints, RigidTran
         assert 0.0 < part.in_margin.mean() < 0.3
 
 
-def test_matches_lie_on_the_surface(two: list[tuple[SampledPoints, RigidTransform]]) -> None:
+def test_matches_lie_on_the_surface(two: Two) -> None:
     (a, rig_from_a), (b, rig_from_b) = two
     found = match_projected(a, b, rig_from_a, rig_from_b, 6.0)
     assert len(found.distances) > 500
@@ -68,9 +71,7 @@ def test_matches_lie_on_the_surface(two: list[tuple[SampledPoints, RigidTransfor
     assert np.all((found.sigma_mm > 0.3 * SIGMA_MM) & (found.sigma_mm < 1.5 * SIGMA_MM))
 
 
-def test_projected_points_are_those_that_the_camera_saw(
-    two: list[tuple[SampledPoints, RigidTransform]],
-) -> None:
+def test_projected_points_are_those_that_the_camera_saw(two: Two) -> None:
     """Each matched point lands, lens and all, on a pixel away from rims and the hole."""
     (a, rig_from_a), (b, rig_from_b) = two
     found = match_projected(a, b, rig_from_a, rig_from_b, 6.0)
@@ -95,7 +96,7 @@ def test_projected_points_are_those_that_the_camera_saw(
     "part", [np.s_[130:256, 0:320], np.s_[0:140, 0:320], np.s_[0:256, 130:185]]
 )
 def test_what_lies_outside_of_the_part_that_was_kept_has_no_match(
-    two: list[tuple[SampledPoints, RigidTransform]], part: tuple[slice, slice]
+    two: Two, part: tuple[slice, slice]
 ) -> None:
     (a, rig_from_a), (b, rig_from_b) = two
     image, (rows, columns) = b.image, part
@@ -118,9 +119,7 @@ def test_what_lies_outside_of_the_part_that_was_kept_has_no_match(
     np.testing.assert_array_equal(cut.source, whole.source[inside])
 
 
-def test_a_shift_is_measured_along_the_normals(
-    two: list[tuple[SampledPoints, RigidTransform]],
-) -> None:
+def test_a_shift_is_measured_along_the_normals(two: Two) -> None:
     (a, rig_from_a), (b, rig_from_b) = two
     shift = np.array([0.4, -0.3, 0.5])
     away = RigidTransform(rig_from_a.rotation, rig_from_a.translation + shift)
@@ -130,7 +129,7 @@ def test_a_shift_is_measured_along_the_normals(
     np.testing.assert_allclose(found.distances, found.normals @ shift, atol=5e-3)
 
 
-def test_nothing_farther_than_the_reach(two: list[tuple[SampledPoints, RigidTransform]]) -> None:
+def test_nothing_farther_than_the_reach(two: Two) -> None:
     (a, rig_from_a), (b, rig_from_b) = two
     inward = 8.0 * rig_from_a.rotation[:, 2]
     away = RigidTransform(rig_from_a.rotation, rig_from_a.translation + inward)
@@ -140,9 +139,7 @@ def test_nothing_farther_than_the_reach(two: list[tuple[SampledPoints, RigidTran
     assert len(near.distances) < len(far.distances)
 
 
-def test_cameras_on_opposite_sides_share_nothing(
-    two: list[tuple[SampledPoints, RigidTransform]],
-) -> None:
+def test_cameras_on_opposite_sides_share_nothing(two: Two) -> None:
     (a, rig_from_a), _ = two
     opposite = looking_at(2.0 * CENTRE - rig_from_a.translation, CENTRE)
     other = sample_points(seen("p2", opposite), 5.0)[0]
@@ -175,6 +172,8 @@ def test_rims_are_asked_where_the_inner_parts_share_too_little(
 ) -> None:
     """What rims say is believed less: 0.3 mm more."""
     both: Any = OverlapPoints("inner", "whole")  # type: ignore[arg-type]
+    here: Any = 1
+    there: Any = 2
     counts = {"inner": inner, "whole": whole}
 
     def match(source: str, target: str, here: int, there: int, reach_mm: float) -> Matches:
@@ -182,8 +181,6 @@ def test_rims_are_asked_where_the_inner_parts_share_too_little(
         return matches(counts[source])
 
     monkeypatch.setattr(overlaps, "match_projected", match)
-    here: Any = 1
-    there: Any = 2
     told = match_overlap(both, both, here, there, 5.0, 10)
     assert (None if told is None else len(told.distances)) == found
     if told is not None:

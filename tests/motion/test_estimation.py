@@ -24,9 +24,11 @@ from bodyscan.simulation.settings import Person
 SCALE = 0.25  # pixels of 4 mm
 
 
-def together(
-    scan: LivingScan, *, timed: bool = True
-) -> tuple[Alignment, Alignment, EstimatedMotion | None]:
+Found = tuple[Alignment, Alignment, EstimatedMotion | None]
+"""The rigid alignment, that of the body's motion, and the motion."""
+
+
+def together(scan: LivingScan, *, timed: bool = True) -> Found:
     images, settings = images_of(scan, timed=timed), AlignmentSettings()
     aligned = align(images, scan.rig_from_camera, boards(scan), settings)
     return aligned, *estimate_motion(images, scan.rig_from_camera, aligned, boards(scan), settings)[
@@ -51,15 +53,23 @@ def rms(values: Array) -> float:
 
 
 @pytest.fixture(scope="module")
-def found(standing: LivingScan) -> tuple[Alignment, Alignment, EstimatedMotion | None]:
+def found(standing: LivingScan) -> Found:
     return together(standing)
 
 
-def test_one_body_comes_of_many_moments(
-    standing: LivingScan, found: tuple[Alignment, Alignment, EstimatedMotion | None]
-) -> None:
+@pytest.fixture(scope="module")
+def followed(found: Found) -> EstimatedMotion:
+    assert found[2] is not None
+    return found[2]
+
+
+@pytest.fixture(scope="module")
+def person(followed: EstimatedMotion) -> PersonMotion:
+    return PersonMotion.from_motion(followed)
+
+
+def test_one_body_comes_of_many_moments(standing: LivingScan, found: Found) -> None:
     aligned, alignment, followed = found
-    assert followed is not None
     truth = standing.at(standing.middle_s)
     rigid = errors_mm(truth, surface(standing, aligned, None))
     carried = errors_mm(truth, surface(standing, alignment, followed))
@@ -67,24 +77,12 @@ def test_one_body_comes_of_many_moments(
     assert rms(carried) < 0.25 * rms(rigid)
     assert np.median(np.abs(carried)) < 0.1
     assert alignment.rms_after_mm < 0.6 * aligned.rms_after_mm
-
-
-def test_sigmas_say_what_is_left(
-    standing: LivingScan, found: tuple[Alignment, Alignment, EstimatedMotion | None]
-) -> None:
-    _, alignment, followed = found
-    assert followed is not None
-    errors = errors_mm(standing.at(standing.middle_s), surface(standing, alignment, followed))
     # Of five people, on three and four poles, 0.9.
-    assert 0.6 < rms(errors) / rms(followed.sigma_mm) < 1.4
-
-
-def test_the_operator_hears_what_each_part_did(
-    standing: LivingScan, found: tuple[Alignment, Alignment, EstimatedMotion | None]
-) -> None:
-    _, _, followed = found
     assert followed is not None
-    person = PersonMotion.from_motion(followed)
+    assert 0.6 < rms(carried) / rms(followed.sigma_mm) < 1.4
+
+
+def test_the_operator_hears_what_each_part_did(standing: LivingScan, person: PersonMotion) -> None:
     assert [part.name for part in person.parts] == list(PARTS)
     assert person.moment_ms == pytest.approx(1e3 * standing.middle_s)
     moved = {part.name: part.moved_mm for part in person.parts}
@@ -96,12 +94,8 @@ def test_the_operator_hears_what_each_part_did(
     assert "left arm: moved by" in person.lines[2]
 
 
-def test_without_a_trunk_there_is_no_breath(
-    found: tuple[Alignment, Alignment, EstimatedMotion | None],
-) -> None:
+def test_without_a_trunk_there_is_no_breath(followed: EstimatedMotion) -> None:
     """Legs alone were seen: they are named, and that is all."""
-    _, _, followed = found
-    assert followed is not None
     cells = followed.cells
     high = cells.centres * [1.0, 1.0, 0.0] + [0.0, 0.0, 100.0]
     high[0, 2] = 1000.0
@@ -113,18 +107,15 @@ def test_without_a_trunk_there_is_no_breath(
 
 
 def test_the_way_to_mean_breath_is_told(
-    standing: LivingScan, found: tuple[Alignment, Alignment, EstimatedMotion | None]
+    standing: LivingScan, followed: EstimatedMotion, person: PersonMotion
 ) -> None:
     """Half of it and more, and the sigma says what is left."""
-    _, _, followed = found
-    assert followed is not None
     assert followed.breath is not None
     cells, now = followed.cells, standing.at(standing.middle_s).vertices
     mean = standing.at(standing.middle_s, breathing=False).vertices
     near = cKDTree(now).query(cells.centres)[1]
     front = breath_along_normals(cells) > 0.5
     true = float(np.mean(np.sum((now - mean)[near] * cells.normals, axis=1)[front]))
-    person = PersonMotion.from_motion(followed)
     assert person.fuller_mm is not None and person.fuller_sigma_mm is not None  # noqa: PT018
     assert abs(true) > 0.25  # or the seed says nothing
     assert abs(person.fuller_mm - true) < 0.7 * abs(true)
