@@ -26,8 +26,12 @@ CAMERA = Camera(380.0, 380.0, 0.0, 160.0, 128.0, Radial(), 320, 256)
 NOISE_MM = 0.2
 
 
+Scanned = tuple[list[RangeImage], dict[str, RigidTransform]]
+"""Range images, and where their cameras stand."""
+
+
 @pytest.fixture(scope="module")
-def scanned() -> tuple[list[RangeImage], dict[str, RigidTransform]]:
+def scanned() -> Scanned:
     """Four cameras at 90 degrees around a lumpy body (two ellipsoids), and their true placings."""
     points, faces = ellipsoid((110.0, 170.0, 300.0), resolution=120)
     points[:, 0] += 25.0 * np.sin(points[:, 2] / 60.0)
@@ -72,7 +76,7 @@ def disagreement_mm(placings: dict[str, RigidTransform], truth: dict[str, RigidT
 
 @pytest.mark.parametrize("matching", ["projected", "open3d"])
 def test_pairs_come_together(
-    scanned: tuple[list[RangeImage], dict[str, RigidTransform]],
+    scanned: Scanned,
     matching: Literal["projected", "open3d"],
 ) -> None:
     images, truth = scanned
@@ -85,18 +89,14 @@ def test_pairs_come_together(
     assert found.rms_after_mm < found.rms_before_mm
 
 
-def test_a_firm_prior_is_not_moved(
-    scanned: tuple[list[RangeImage], dict[str, RigidTransform]],
-) -> None:
+def test_a_firm_prior_is_not_moved(scanned: Scanned) -> None:
     images, truth = scanned
     settings = AlignmentSettings(sway_mm=0.0, sway_deg=0.0)
     found = align(images, truth, known_to(truth, 0.01, 0.001), settings)
     assert max(found.motion_mm.values()) < 0.1
 
 
-def test_a_pair_that_asks_for_too_much_stays(
-    scanned: tuple[list[RangeImage], dict[str, RigidTransform]],
-) -> None:
+def test_a_pair_that_asks_for_too_much_stays(scanned: Scanned) -> None:
     images, truth = scanned
     start = dict(truth)
     start["p2"] = RigidTransform(
@@ -108,9 +108,7 @@ def test_a_pair_that_asks_for_too_much_stays(
     assert np.allclose(found.rig_from_camera["p2"].matrix, start["p2"].matrix)
 
 
-def test_a_pair_without_overlap_stays(
-    scanned: tuple[list[RangeImage], dict[str, RigidTransform]],
-) -> None:
+def test_a_pair_without_overlap_stays(scanned: Scanned) -> None:
     images, truth = scanned
     alone = [image for image in images if image.pair in ("p0", "p2")]
     two = {name: truth[name] for name in ("p0", "p2")}
@@ -121,9 +119,7 @@ def test_a_pair_without_overlap_stays(
 
 
 @pytest.mark.parametrize("sway_mm", [0.0, 1.0, 3.0])
-def test_sway_is_found_whatever_its_size(
-    scanned: tuple[list[RangeImage], dict[str, RigidTransform]], sway_mm: float
-) -> None:
+def test_sway_is_found_whatever_its_size(scanned: Scanned, sway_mm: float) -> None:
     """The settings know of 1 mm; a person who stands still or sways by far more is as well aligned."""
     images, truth = scanned
     rng = np.random.default_rng(7)
@@ -142,9 +138,7 @@ def test_sway_is_found_whatever_its_size(
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")
-def test_a_rig_is_refined_on_a_still_object(
-    scanned: tuple[list[RangeImage], dict[str, RigidTransform]],
-) -> None:
+def test_a_rig_is_refined_on_a_still_object(scanned: Scanned) -> None:
     images, truth = scanned
     start = pushed(truth, 0.8, seed=2) | {"unseen": truth["p0"]}
     prior = known_to(start, 0.8, 0.02)
@@ -160,7 +154,7 @@ def test_a_rig_is_refined_on_a_still_object(
 @pytest.mark.slow
 @pytest.mark.parametrize("matching", ["projected", "open3d"])
 def test_threads_change_nothing(
-    scanned: tuple[list[RangeImage], dict[str, RigidTransform]],
+    scanned: Scanned,
     matching: Literal["projected", "open3d"],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -122,12 +122,14 @@ def test_another_pair_than_those_that_are_free() -> None:
     assert found.name == "pair p3-2"
 
 
+def of_few(whole: PoseEvidence, *names: str) -> Displacement | None:
+    """What is found if there are these pairs alone."""
+    places = np.concatenate([6 * NAMES.index(name) + np.arange(6) for name in names])
+    return detect_displacement(PoseEvidence(names, whole.system.select(places)), PLACED, POLES)
+
+
 def test_of_three_pairs_any_may_have_moved() -> None:
-    few = [NAMES.index(name) for name in ("p1-1", "p2-1", "p3-1")]
-    places = np.concatenate([np.arange(6 * k, 6 * k + 6) for k in few])
-    whole = evidence(of_pair("p1-1", [5.0, 0.0, 0.0]))
-    cut = PoseEvidence(tuple(NAMES[k] for k in few), whole.system.select(places))
-    found = detect_displacement(cut, PLACED, POLES)
+    found = of_few(evidence(of_pair("p1-1", [5.0, 0.0, 0.0])), "p1-1", "p2-1", "p3-1")
     assert not isinstance(found, DisplacedPole) or found.all_moved
 
 
@@ -154,12 +156,8 @@ def test_of_poles_that_are_free_nothing_is_asked() -> None:
 
 
 def test_of_three_pairs_two_that_stand_on_one_pole_and_moved_are_named() -> None:
-    few = [NAMES.index(name) for name in ("p1-1", "p1-3", "p2-1")]
-    places = np.concatenate([np.arange(6 * k, 6 * k + 6) for k in few])
     # Which of two sides moved, or both, only noise would decide.
-    whole = evidence(of_pole("p1", [5.0, 0.0, 0.0]), noise=0.0)
-    cut = PoseEvidence(tuple(NAMES[k] for k in few), whole.system.select(places))
-    found = detect_displacement(cut, PLACED, POLES)
+    found = of_few(evidence(of_pole("p1", [5.0, 0.0, 0.0]), noise=0.0), "p1-1", "p1-3", "p2-1")
     assert isinstance(found, DisplacedPole)
     assert (found.name, found.all_moved) == ("pole p1", False)
     assert found.pairs == {"p1-1", "p1-3"}

@@ -154,9 +154,6 @@ def plate(bend_mm: float = 0.0, noise_mm: float = 0.0, seed: int = 0) -> np.ndar
 
 def test_a_flat_plate_is_flat() -> None:
     assert measure_flatness(plate()).rms_mm < 1e-10
-    normal, offset = fit_plane(plate())
-    assert normal == pytest.approx(PLACE.rotation[:, 2], abs=1e-12)
-    assert offset == pytest.approx(PLACE.rotation[:, 2] @ PLACE.translation, abs=1e-9)
 
 
 def test_noise_hardly_counts_as_systematic() -> None:

@@ -1,16 +1,22 @@
 """The rival projectors: exact where light is as they take it to be, and how far off for a mirror."""
 
-from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from mirror_points import STRIPES, mirror_points, systematic_mm
+from lit_boards import Projector, Scene
 
 from bodyscan.arrays import Array
+from bodyscan.calibration.boundary_points import BoundaryPoints, boundary_points, concatenate
+from bodyscan.geometry.camera import camera_from_fields
 from bodyscan.geometry.light_planes import LightPlanes, baseline_angle_tilt
+from bodyscan.laboratory import apparatus
 from bodyscan.laboratory.approaches import PROJECTORS
 from bodyscan.laboratory.rivals import fit_baseline, fit_remapped_pinhole
+from bodyscan.simulation.files import describe_camera
 
+MIRROR = apparatus.chapter_setup(apparatus.ideal_settings(1)).projector
+STRIPES = MIRROR.stripes
 ANGLES = np.radians(np.linspace(2.0, 38.0, STRIPES + 1))
 BASELINES = np.linspace(165.0, 150.0, STRIPES + 1)
 
@@ -25,18 +31,43 @@ def baseline_planes(baseline: Array | float, tilt_deg: float = 0.0) -> LightPlan
     return LightPlanes(planes, np.zeros((len(planes), 4, 4)), "vertical")
 
 
-def stripe_of(planes: LightPlanes) -> Callable[[Array], Array]:
-    """s of points: the linear interpolation of where each plane lies along x."""
+@dataclass(frozen=True, eq=False)
+class Sheets:
+    """Light of which the stripe coordinate is linear in x between two planes."""
 
-    def stripe(points: Array) -> Array:
-        a, b, c, d = planes.coefficients.T
+    planes: LightPlanes
+    stripes: int = STRIPES
+
+    def stripe(self, points: Array) -> Array:
+        a, b, c, d = self.planes.coefficients.T
         across = points @ np.stack([a, b, c]) + d
         below = np.argmax(across[:, :-1] * across[:, 1:] <= 0, axis=1)
         rows = np.arange(len(points))
         first, second = across[rows, below], across[rows, below + 1]
         return below + first / (first - second)
 
-    return stripe
+
+def seen_of(light: Projector, noise_px: float = 0.0) -> BoundaryPoints:
+    """On the chapter's three boards, as a perfect calibration of the camera has them."""
+    camera, board = camera_from_fields(describe_camera(apparatus.CAMERA)), apparatus.BOARD
+    scene = Scene(camera, light, "vertical", board.square_mm, board.columns, board.rows)
+    rng = np.random.default_rng(0)
+    parts = []
+    for number, place in enumerate(apparatus.board_poses()):
+        index, pixels = scene.crossings(place, every_px=16)
+        pixels[:, 0] += noise_px * rng.standard_normal(len(pixels))
+        sigma = np.full(len(index), max(noise_px, 0.01))
+        seen = camera, place, index, pixels, sigma
+        parts.append(boundary_points(*seen, board=number, direction="vertical"))
+    return concatenate(parts)
+
+
+def systematic_mm(planes: LightPlanes) -> float:
+    """RMS depth error over a wall at 400 mm, every stripe coordinate known exactly."""
+    x, y = np.meshgrid(np.linspace(-60.0, 60.0, 40), np.linspace(-50.0, 40.0, 30))
+    points = np.stack([x, y, np.full_like(x, 400.0)], axis=-1).reshape(-1, 3)
+    depth = planes.intersect(points / points[:, 2:], MIRROR.stripe(points)).depth
+    return float(np.sqrt(np.nanmean((depth - 400.0) ** 2)))
 
 
 def worst_offset(found: LightPlanes, true: LightPlanes) -> float:
@@ -50,7 +81,7 @@ def worst_offset(found: LightPlanes, true: LightPlanes) -> float:
 @pytest.mark.parametrize("tilt_deg", [0.0, 1.5])
 def test_an_invariable_baseline_is_found(tilt_deg: float) -> None:
     true = baseline_planes(160.0, tilt_deg)
-    points = mirror_points(stripe=stripe_of(true), every_px=32)
+    points = seen_of(Sheets(true))
     found = fit_baseline(points, STRIPES, "vertical", variable=False)
     # Points come from an iteration that ends at 1e-7 of a stripe.
     assert worst_offset(found, true) < 1e-4
@@ -61,7 +92,7 @@ def test_an_invariable_baseline_is_found(tilt_deg: float) -> None:
 
 def test_a_variable_baseline_is_found_and_an_invariable_one_misses_it() -> None:
     true = baseline_planes(BASELINES, 1.5)
-    points = mirror_points(stripe=stripe_of(true), every_px=32)
+    points = seen_of(Sheets(true))
     assert worst_offset(fit_baseline(points, STRIPES, "vertical", variable=True), true) < 1e-4
     # 15 mm of change in the baseline, half of it within the boards: the best single baseline is
     # off by some 3 of 160 mm at their ends, which angles make up for at one depth only.
@@ -70,7 +101,7 @@ def test_a_variable_baseline_is_found_and_an_invariable_one_misses_it() -> None:
 
 def test_tilted_light_needs_a_tilted_model() -> None:
     true = baseline_planes(160.0, 1.5)
-    points = mirror_points(stripe=stripe_of(true), every_px=32)
+    points = seen_of(Sheets(true))
     straight = fit_baseline(points, STRIPES, "vertical", variable=False, fit_tilt=False)
     # tan 1.5 degrees over 20 mm (0.05 of 400) is 0.5 mm across, over tan of some 20 degrees.
     assert worst_offset(straight, true) > 0.5
@@ -78,7 +109,7 @@ def test_tilted_light_needs_a_tilted_model() -> None:
 
 def test_outliers_lose_their_weight() -> None:
     true = baseline_planes(160.0)
-    points = mirror_points(stripe=stripe_of(true), every_px=16, noise_px=0.02)
+    points = seen_of(Sheets(true), 0.02)
     points.points[::50] += [3.0, 0.0, 0.0]
     found = fit_baseline(points, STRIPES, "vertical", variable=False)
     # Unweighted they would move every angle by 3 / 50 = 0.06 mm across, 0.15 mm in depth.
@@ -86,7 +117,7 @@ def test_outliers_lose_their_weight() -> None:
 
 
 def test_horizontal_stripes_are_the_same_turned() -> None:
-    points = mirror_points(every_px=16)
+    points = seen_of(MIRROR)
     turned = type(points)(
         points.index,
         points.board,
@@ -105,7 +136,7 @@ def test_horizontal_stripes_are_the_same_turned() -> None:
 def test_equal_angles_through_one_line_need_a_new_index() -> None:
     # Stripes at equal angles from one centre: no slide has them evenly, a re-mapped one does.
     true = baseline_planes(160.0)
-    points = mirror_points(stripe=stripe_of(true), every_px=32)
+    points = seen_of(Sheets(true))
     s = points.index.astype(float)
     found = fit_remapped_pinhole(points.points, s, STRIPES, "vertical")
     # tan over 36 degrees: its part of the sixth power in the index is left, below 0.01 mm.
@@ -115,7 +146,7 @@ def test_equal_angles_through_one_line_need_a_new_index() -> None:
 
 
 def test_a_rotating_mirror_fits_planes_best() -> None:
-    points = mirror_points(every_px=16)
+    points = seen_of(MIRROR)
     error = {
         name: systematic_mm(model(points, STRIPES, "vertical"))
         for name, model in PROJECTORS.items()

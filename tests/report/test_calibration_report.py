@@ -15,7 +15,6 @@ from bodyscan.calibration.pair import PairCalibration, PairQuality
 from bodyscan.errors import BadInput
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.camera_tables import is_in_image
-from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.registration.calibration_verdict import grade_calibration
@@ -230,16 +229,3 @@ def test_no_map_is_drawn_of_what_is_not_known() -> None:
     one = {"p1-1": placings["p1-1"]}
     with pytest.raises(BadInput, match="no pose uncertainty to map"):
         sigma_chart(calibrated(one, cameras, shifts(one, 0.0)))
-
-
-def test_points_that_the_lens_folds_back_are_not_seen() -> None:
-    """With Radial(-0.4, 0) a point at 70 degrees projects into the image, which ends at 23 degrees."""
-    camera = Camera(1500.0, 1500.0, 0.0, 640.0, 512.0, Radial(-0.4, 0.0), 1280, 1024)
-    angles = np.linspace(0.0, 1.4, 200)
-    points = 1000.0 * np.stack([np.sin(angles), 0 * angles, np.cos(angles)], axis=1)
-    pixels = camera.project(points)
-    folded = (pixels[:, 0] > 0) & (pixels[:, 0] < 1279) & (angles > 0.8)
-    assert folded.any()
-    assert not is_in_image(camera, points)[folded].any()
-    assert is_in_image(camera, points)[angles < 0.38].all()
-    assert not is_in_image(camera, -points).any()
