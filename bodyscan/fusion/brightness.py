@@ -19,6 +19,7 @@ from bodyscan.arrays import Array, Bytes, Floats
 from bodyscan.fusion.consistency import Consistency
 from bodyscan.fusion.smoothing import SmoothSurface
 from bodyscan.fusion.voxel_thinning import Samples
+from bodyscan.progress import map_threads
 
 MIN_GREY = 8
 """Level below which a pixel carries no information about the light."""
@@ -41,15 +42,15 @@ def equalize_colours(
     in common with them.
     """
     centres = [surface.rig_from_camera.translation for surface in surfaces]
-    of_surfaces = [
-        log_irradiance(surface.points, surface.normals, centre)
-        for surface, centre in zip(surfaces, centres, strict=True)
-    ]
+    of_surfaces = map_threads(
+        lambda one: log_irradiance(one.points, one.normals, one.rig_from_camera.translation),
+        surfaces,
+    )
     parts = [slice(start, end) for start, end in pairwise(samples.starts)]
-    log_irradiances = [
-        log_irradiance(samples.points[part], samples.normals[part], centre)
-        for part, centre in zip(parts, centres, strict=True)
-    ]
+    log_irradiances = map_threads(
+        lambda both: log_irradiance(samples.points[both[0]], samples.normals[both[0]], both[1]),
+        zip(parts, centres, strict=True),
+    )
     of_samples = np.concatenate(log_irradiances)
     overlaps = [
         find_overlaps(samples, surfaces, consistency, of_samples, of_surfaces, channel)
