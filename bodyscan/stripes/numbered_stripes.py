@@ -20,6 +20,8 @@ n - 1 and n); 0 and 255 mean none.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
@@ -64,7 +66,7 @@ def decode_sweep(lit: Greys, frames: Greys, direction: str) -> StripeMap:
     lit: (H, W). Raises DecodingFailed if the images are inconsistent.
     """
     stripes = len(frames)
-    lines = ScanLines.from_images(lit, lit, frames, None, direction)
+    lines, flashed = _blank_flashed(ScanLines.from_images(lit, lit, frames, None, direction))
     sweep = _Sweep.from_frames(lines.patterns)
     base_noise2 = sweep.base_noise2(lines.patterns)
     rise = sweep.noise_rise(lines.lit, base_noise2)
@@ -72,6 +74,8 @@ def decode_sweep(lit: Greys, frames: Greys, direction: str) -> StripeMap:
     bright = sweep.height >= np.maximum(MIN_CONTRAST, MIN_CONTRAST_TO_NOISE * noise)
     check_illumination(bright, np.where(bright, sweep.height + sweep.base, 0))
     usable = bright & (sweep.height + sweep.base < SATURATED)
+    for number in flashed:
+        usable &= np.abs(sweep.peak - number) > REACH
     check_order(sweep.peak, usable, lines.transposed, stripes)
     # A second peak of 0.3 of the first may be light by way of another surface, or a second surface.
     usable &= sweep.second < np.maximum(0.3 * sweep.height, MIN_CONTRAST_TO_NOISE * noise)
@@ -85,7 +89,28 @@ def decode_sweep(lit: Greys, frames: Greys, direction: str) -> StripeMap:
     whole = np.clip(sweep.total + sweep.base, 0, 255).astype(np.uint8)
     images = ScanLines(whole, sweep.base.astype(np.uint8), lines.patterns, None, lines.transposed)
     variance = variance.astype(np.float32)
-    return assemble_from_pixels(images, lit, s, sigma, variance, stripes, codes=sweep.peak)
+    found = assemble_from_pixels(images, lit, s, sigma, variance, stripes, codes=sweep.peak)
+    named = f"other light reached the image of stripe {', '.join(map(str, flashed))}, as of a flash or a "
+    return replace(found, flash=named + "lamp: it is not used" if flashed else "")
+
+
+def _blank_flashed(lines: ScanLines) -> tuple[ScanLines, list[int]]:
+    """Replace images that other light reached by what is seen without the line; also return which.
+
+    Away from its line such an image is brighter than others. Where the line itself fills half of what
+    is lit, which stands on few stripes, the images before and after are as bright.
+    """
+    every = max(1, len(lines.patterns) // SAMPLES)
+    reached = lines.lit >= np.median(lines.lit)
+    level = np.array([np.median(frame[reached]) for frame in lines.patterns], float)
+    level = np.pad(level - np.median(level), 1)
+    beside = np.maximum(level[2:], level[:-2])
+    flashed = np.flatnonzero((level[1:-1] > MIN_CONTRAST) & (beside < 0.5 * level[1:-1]))
+    if not flashed.size:
+        return lines, []
+    patterns = lines.patterns.copy()
+    patterns[flashed] = np.median(patterns[::every], axis=0).astype(patterns.dtype)
+    return replace(lines, patterns=patterns), flashed.tolist()
 
 
 def decode_line(lit: Greys, frame: Greys, direction: str) -> StripeMap:

@@ -17,12 +17,18 @@ S = np.linspace(2.5, 37.0, SHAPE[1]) + 0.8 * np.sin(np.arange(SHAPE[0]) / 9.0)[:
 
 
 def swept(
-    blur: float, noise: float = 0.0, *, ramp: float = 0.0, bright: float = 160.0
+    blur: float,
+    noise: float = 0.0,
+    *,
+    ramp: float = 0.0,
+    bright: float = 160.0,
+    flash: float = 0.0,
 ) -> StripeMap:
     """A stripe at a time, its edges blurred by so many stripes."""
     edges = np.arange(STRIPES + 1)[:, None, None]
     past = 0.5 * (1.0 + erf((S - edges) / (np.sqrt(2.0) * blur)))
     light = bright * (past[:-1] - past[1:])
+    light[20] += flash
     rng = np.random.default_rng(0)
     sigma = np.sqrt(noise**2 + ramp * light)
     frames = np.clip(20.0 + light + sigma * rng.normal(size=light.shape), 0.0, 255.0)
@@ -122,3 +128,11 @@ def test_bad_pixels_are_ignored() -> None:
     numbers, good = shown_in_order(), np.ones((30, 48), bool)
     numbers[:, 21], good[:, 21] = 11, False
     check(numbers, good)
+
+
+def test_an_image_of_a_sweep_that_a_flash_reached_is_named_and_not_used() -> None:
+    found = swept(0.6, 1.5, flash=60.0)
+    assert "the image of stripe 20, as of a flash" in found.flash
+    known = np.isfinite(off(found))
+    assert known.mean() > 0.75
+    assert np.abs(off(found)[known]).max() < 0.3

@@ -16,6 +16,7 @@ from bodyscan.stripes.phase.decoding import (
     check_several_waves,
     check_wave_images,
 )
+from bodyscan.stripes.phase.waves import measure_wave, remove_added_light
 from bodyscan.stripes.scan_lines import ScanLines
 from bodyscan.stripes.stripe_code import Wave
 
@@ -52,6 +53,19 @@ def test_all_images_together_are_half_as_bright_at_each_pixel(offset: float, sig
     check_images(shares() + 0.8 * offset * sign)
     with pytest.raises(DecodingFailed, match=r"mean is not the middle .* \(off by 16"):
         check_images(shares() + offset * sign)
+
+
+@pytest.mark.parametrize(("flicker", "flash"), [(1.2, 0.0), (1.0, 0.3)])
+def test_light_that_reached_one_image_is_removed_and_flicker_is_not(
+    flicker: float, flash: float
+) -> None:
+    share, light = flicker ** (np.arange(4) == 1)[:, None, None] * shares(), np.full(S.shape, 200.0)
+    share[2] += flash
+    images, wave = (200.0 * share).astype(np.float32), Wave(PERIOD, STEPS)
+    arguments = images, measure_wave(images, wave), 0 * light, light.astype(np.float32), EVERY, 3
+    found, told = remove_added_light(*arguments)
+    assert told.startswith("other light reached phase image 5 (30%") == (flash > 0.0)
+    np.testing.assert_allclose(found[2], 200.0 * shares()[2], atol=2.0)
 
 
 def test_phases_lie_in_their_half_periods_and_do_not_jump_between_them() -> None:

@@ -22,6 +22,7 @@ from bodyscan.compiled import compiled
 from bodyscan.errors import DecodingFailed
 from bodyscan.stripes.gray.bit_words import GRAY
 from bodyscan.stripes.gray.decoding import read_words
+from bodyscan.stripes.gray.sequence_checks import replace_flashed
 from bodyscan.stripes.grey_noise import measure_noise
 from bodyscan.stripes.phase.projector_response import (
     MIN_PERIODS,
@@ -35,6 +36,7 @@ from bodyscan.stripes.phase.waves import (
     estimate_white_and_black,
     measure_wave,
     measure_wave_noise,
+    remove_added_light,
     split_waves,
 )
 from bodyscan.stripes.scan_lines import ScanLines, transpose
@@ -76,13 +78,16 @@ def decode_wave(
     whose phase is nearest to its middle is the right one. Raises DecodingFailed for inconsistent
     images.
     """
+    images, flash = replace_flashed(images)
     variance = measure_noise(images)
     halves = GRAY.stripes(read_words(GRAY, images, half_periods, variance))
     fine_bit = GRAY.bit_two_wide(len(images.patterns))
     usable, _ = find_usable_pixels(images, halves, variance, half_periods, fine_bit)
     phases = transpose(phases) if images.transposed else phases
     check_wave_images(images, phases, usable)
-    measured = measure_wave(phases, wave)
+    measured, light = measure_wave(phases, wave), (images.dark, images.contrast)
+    phases, added = remove_added_light(phases, measured, *light, usable, 0)
+    measured = measure_wave(phases, wave) if added else measured
     noise = np.sqrt(variance[np.clip(measured.mean, 0, 255).astype(np.uint8)])
     floor = min_contrast(phases.dtype) / 2.0
     usable &= measured.amplitude >= np.maximum(floor, MIN_CONTRAST_TO_NOISE * noise)
@@ -95,7 +100,8 @@ def decode_wave(
     s[~usable] = np.nan
     s, sigma = smooth_phase(s, np.where(usable, sigma * period, np.float32(np.nan)))
     result = assemble_from_pixels(images, lit, s, sigma, variance, stripes)
-    return replace(result, correlation_px=(CORRELATION_PX, CORRELATION_PX))
+    flash = "; ".join(filter(None, (flash, added)))
+    return replace(result, correlation_px=(CORRELATION_PX, CORRELATION_PX), flash=flash)
 
 
 def check_wave_images(images: ScanLines, waves: Greys, usable: Mask) -> None:
@@ -185,11 +191,12 @@ def decode_waves(
     """
     transposed = direction == "horizontal"
     lines = transpose(images) if transposed else images
-    both = sorted(
-        zip(waves, split_waves(lines, waves), strict=True), key=lambda each: each[0].period
+    firsts = np.cumsum([0, *(wave.steps for wave in waves[:-1])])
+    each = sorted(
+        zip(waves, split_waves(lines, waves), firsts, strict=True), key=lambda one: one[0].period
     )
-    stacks = [stack for _, stack in both]
-    measured = [measure_wave(stack, wave) for wave, stack in both]
+    stacks = [stack for _, stack, _ in each]
+    measured = [measure_wave(stack, wave) for wave, stack, _ in each]
     brightest = lines.max(axis=0)
     contrast = np.min([2.0 * wave.amplitude for wave in measured], axis=0)
     bright = contrast >= min_contrast(lines.dtype)
@@ -198,6 +205,14 @@ def decode_waves(
     bright = bright & (contrast >= np.float32(2.0 * MIN_CONTRAST_TO_NOISE) * noise)
     check_illumination(bright, brightest)
     good = bright & (brightest < SATURATED)
+    flash = []
+    for k, (wave, stack, first) in enumerate(each):
+        if len(each) > 1 and wave.period * MIN_PERIODS <= stripes:
+            white, black = estimate_white_and_black(measured[:k] + measured[k + 1 :])
+            light = black, white - black
+            stacks[k], added = remove_added_light(stack, measured[k], *light, good, first)
+            measured[k] = measure_wave(stacks[k], wave) if added else measured[k]
+            flash += [added] if added else []
     check_several_waves(measured, stacks, good, stripes)
     usable = good & ~find_half_covered_pixels(contrast, bright)
     corrected = _correct_waves(measured, usable, stripes)
@@ -211,7 +226,8 @@ def decode_waves(
     white, black = (convert_like(grey, lines) for grey in estimate_white_and_black(measured))
     light = ScanLines(white, black, lines[:0], None, transposed)
     result = assemble_from_pixels(light, lit, s, sigma, variance, stripes)
-    return replace(result, correlation_px=(CORRELATION_PX, CORRELATION_PX))
+    correlation_px = CORRELATION_PX, CORRELATION_PX
+    return replace(result, correlation_px=correlation_px, flash="; ".join(flash))
 
 
 def _correct_waves(waves: list[MeasuredWave], usable: Mask, stripes: int) -> list[MeasuredWave]:

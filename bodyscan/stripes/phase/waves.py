@@ -79,6 +79,49 @@ def split_waves(images: Greys, waves: tuple[Wave, ...]) -> list[Greys]:
     return [images[first:end] for first, end in pairwise(ends)]
 
 
+MIN_ADDED = 0.05
+"""Share of the contrast. In four steps it moves the phase by up to a hundredth of a period."""
+
+
+def remove_added_light(
+    images: Greys,
+    wave: MeasuredWave,
+    black: Greys | Floats,
+    contrast: Floats,
+    usable: Mask,
+    first: int,
+) -> tuple[Greys, str]:
+    """Remove light that reached one image of a wave and not the others, such as a flash; also say which
+    image, "" if none.
+
+    images: (steps, L, P) of the wave. black, contrast: (L, P), without the projector's light, and what
+        all of it adds. usable: (L, P). first: number of the first image.
+
+    Over whole periods what is bright and what is dark is so in all images alike. A flicker of the
+    projector changes the bright alone; what is added to both is removed as a share of the contrast.
+    """
+    some = np.flatnonzero(usable)
+    some = some[:: max(1, len(some) // 50_000)]
+    eighth = np.bincount((wave.turn.ravel()[some] * 8.0).astype(int) % 8, minlength=8)
+    if eighth.min() <= len(some) / 32:  # the subject shows a part of a period
+        return images, ""
+    levels = images.reshape(len(images), -1)[:, some] - black.ravel()[some].astype(np.float32)
+    ends = np.quantile(levels / contrast.ravel()[some], (0.1, 0.9), axis=1)
+    dark, bright = ends - np.median(ends, axis=1, keepdims=True)
+    added = np.where(dark * bright > 0.0, np.minimum(np.abs(dark), np.abs(bright)), 0.0)
+    found = np.flatnonzero(added > MIN_ADDED)
+    if not found.size:
+        return images, ""
+    corrected = images.astype(np.float32)
+    for step in found:
+        corrected[step] -= contrast * np.float32(np.sign(dark[step]) * added[step])
+    of = ", ".join(f"{first + step} ({added[step]:.0%} of the contrast)" for step in found)
+    return (
+        corrected,
+        f"other light reached phase image {of}, as of a flash or a lamp: it is removed",
+    )
+
+
 def measure_wave_noise(
     waves: Sequence[MeasuredWave], images: Sequence[Greys], usable: Mask
 ) -> Floats:
