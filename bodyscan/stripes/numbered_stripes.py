@@ -90,8 +90,11 @@ def decode_sweep(lit: Greys, frames: Greys, direction: str) -> StripeMap:
     images = ScanLines(whole, sweep.base.astype(np.uint8), lines.patterns, None, lines.transposed)
     variance = variance.astype(np.float32)
     found = assemble_from_pixels(images, lit, s, sigma, variance, stripes, codes=sweep.peak)
-    named = f"other light reached the image of stripe {', '.join(map(str, flashed))}, as of a flash or "
-    return replace(found, flash=named + "a lamp: it is not used" if flashed else "")
+    named = ", ".join(map(str, flashed))
+    flash = (
+        f"other light reached the image of stripe {named}, as of a flash or a lamp: it is not used"
+    )
+    return replace(found, flash=flash if flashed else "")
 
 
 def _blank_flashed(lines: ScanLines) -> tuple[ScanLines, list[int]]:

@@ -85,8 +85,8 @@ def decode_wave(
     usable, _ = find_usable_pixels(images, halves, variance, half_periods, fine_bit)
     phases = transpose(phases) if images.transposed else phases
     check_wave_images(images, phases, usable)
-    measured, light = measure_wave(phases, wave), (images.dark, images.contrast)
-    phases, added = remove_added_light(phases, measured, *light, usable, 0)
+    measured = measure_wave(phases, wave)
+    phases, added = remove_added_light(phases, measured, images.dark, images.contrast, usable, 0)
     measured = measure_wave(phases, wave) if added else measured
     noise = np.sqrt(variance[np.clip(measured.mean, 0, 255).astype(np.uint8)])
     floor = min_contrast(phases.dtype) / 2.0
@@ -209,8 +209,9 @@ def decode_waves(
     for k, (wave, stack, first) in enumerate(each):
         if len(each) > 1 and wave.period * MIN_PERIODS <= stripes:
             white, black = estimate_white_and_black(measured[:k] + measured[k + 1 :])
-            light = black, white - black
-            stacks[k], added = remove_added_light(stack, measured[k], *light, good, first)
+            stacks[k], added = remove_added_light(
+                stack, measured[k], black, white - black, good, int(first)
+            )
             measured[k] = measure_wave(stacks[k], wave) if added else measured[k]
             flash += [added] if added else []
     check_several_waves(measured, stacks, good, stripes)
