@@ -224,8 +224,8 @@ def decode_waves(
     usable = order.certain & ~find_code_jumps(halves, order.certain)
     s = np.where(usable, order.s, np.float32(np.nan))
     s, sigma = smooth_phase(s, np.where(usable, order.sigma, np.float32(np.nan)))
-    ends = (convert_like(grey, lines) for grey in estimate_white_and_black(measured))
-    light = ScanLines(*ends, lines[:0], None, transposed)
+    lit_all, unlit = (convert_like(grey, lines) for grey in estimate_white_and_black(measured))
+    light = ScanLines(lit_all, unlit, lines[:0], None, transposed)
     result = assemble_from_pixels(light, lit, s, sigma, variance, stripes)
     correlation_px = CORRELATION_PX, CORRELATION_PX
     return replace(result, correlation_px=correlation_px, flash="; ".join(flash))
