@@ -107,8 +107,8 @@ def _blank_flashed(lines: ScanLines) -> tuple[ScanLines, list[int]]:
     reached = lines.lit >= np.median(lines.lit)
     level = np.array([np.median(frame[reached]) for frame in lines.patterns], float)
     level = np.pad(level - np.median(level), 1)
-    beside = np.maximum(level[2:], level[:-2])
-    flashed = np.flatnonzero((level[1:-1] > MIN_CONTRAST) & (beside < 0.5 * level[1:-1]))
+    neighbour = np.maximum(level[2:], level[:-2])
+    flashed = np.flatnonzero((level[1:-1] > MIN_CONTRAST) & (neighbour < 0.5 * level[1:-1]))
     if not flashed.size:
         return lines, []
     patterns = lines.patterns.copy()
