@@ -45,19 +45,15 @@ def test_no_color_is_obeyed(tmp_path: Path) -> None:
     assert "\x1b[31m" not in on_a_terminal(*command, NO_COLOR="1")
 
 
-def made_table() -> Table:
-    table = Table("pair", "position mm (x, y, z)", "sigma mm", title="rig")
-    table.add_row("p1-1", "650.0 1126.0 950.0", "0.102 0.104 0.099")
-    return table
-
-
 @pytest.mark.parametrize(("width", "whole"), [(100, True), (40, False)])
 def test_a_table_wider_than_the_screen_is_a_list(
     width: int, whole: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     screen = Console(width=width, record=True)
     monkeypatch.setattr(console, "CONSOLE", screen)
-    Output("x").show(made_table())
+    table = Table("pair", "position mm (x, y, z)", "sigma mm", title="rig")
+    table.add_row("p1-1", "650.0 1126.0 950.0", "0.102 0.104 0.099")
+    Output("x").show(table)
     lines = screen.export_text().splitlines()
     assert all(len(line) <= width for line in lines)
     if whole:

@@ -1,4 +1,4 @@
-"""Detect views of one board at one moment that cannot all be true, and solve the rig without them.
+"""Detect views of one board in one shot that contradict each other, and solve the rig without them.
 
 Judged with the cameras as solved: every view by itself fits some pose of the board to within the
 corners' noise; all views together must fit one. A view that was rejected takes no part, but each
@@ -64,7 +64,7 @@ def find_inconsistent_views(
 def _examine_board(
     group: list[LocatedView], solution: JointSolution, start: RigidTransform, limit_px: float
 ) -> Outcome[list[LocatedView]]:
-    """Find which of one board's views at one moment are wrong, given that not all can be true."""
+    """Find which of one board's views in one shot are wrong, given that they contradict each other."""
     shot, board = group[0].target
     bad, notes = [], []
     for view in group:

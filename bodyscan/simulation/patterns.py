@@ -103,7 +103,7 @@ def refuse_unknown_code(code: StripeCode, pair: str) -> None:
     """Raise BadInput for a code that has no formulas here."""
     if type(code) not in (Gray, Binary, LightSection, PhaseShift, StripeIndex):
         raise BadInput(
-            f"its code {code.code} is none that the simulator knows how to project",
+            f"the simulator cannot project its stripe code, {code.code}",
             where=f"pair {pair}",
             remedy="the simulator has formulas of its own for each code, so that no mistake is made "
             "twice: add those of this code to bodyscan/simulation/patterns.py",

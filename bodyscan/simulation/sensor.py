@@ -63,7 +63,7 @@ class FixedPattern:
 def fixed_pattern(
     camera: TrueCamera, noise: Noise, rng: np.random.Generator
 ) -> FixedPattern | None:
-    """Draw a sensor's fixed pattern; None if its pixels are all alike."""
+    """Draw a sensor's fixed pattern; None if all its pixels respond equally."""
     if noise.pixel_gain <= 0 and noise.pixel_grey <= 0:
         return None
     gain, grey = rng.standard_normal((2, camera.height, camera.width), dtype=np.float32)

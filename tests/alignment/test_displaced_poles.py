@@ -31,10 +31,8 @@ def in_one(scan: Scan, displaced: Collection[str] = ()) -> DisplacedPole | None:
     return find_displaced_pole([scan], POLES, displaced).found
 
 
-def found(
-    seed: int, sway_mm: float, step: Array, every_ms: float = SEQUENCE_MS
-) -> DisplacedPole | None:
-    return in_one(scanned(np.random.default_rng(seed), sway_mm, step, every_ms))
+def found(seed: int, sway_mm: float, step: Array) -> DisplacedPole | None:
+    return in_one(scanned(np.random.default_rng(seed), sway_mm, step))
 
 
 def scanned(

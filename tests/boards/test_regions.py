@@ -64,10 +64,6 @@ def test_a_large_board_out_of_focus_shows_its_lattice() -> None:
     assert shows_lattice(grey(flat, blur_px=30.0, noise=1.0), SIZE)
 
 
-def flat_board(left: int, top: int, columns: int, rows: int, square: int) -> tuple[slice, slice]:
-    return slice(top, top + rows * square), slice(left, left + columns * square)
-
-
 def sides(region: tuple[slice, slice]) -> list[int]:
     rows, columns = region
     return [columns.start, rows.start, columns.stop, rows.stop]
@@ -80,7 +76,7 @@ def test_regions_hold_boards_with_a_margin_the_larger_first() -> None:
     for left, top, columns, rows in ((220, 120, 14, 9), (500, 350, 8, 6)):
         even = np.add.outer(np.arange(rows), np.arange(columns)) % 2
         part = np.kron(even, np.ones((10, 10))) * 150 + 40
-        image[flat_board(left, top, columns, rows, 10)] = part
+        image[top : top + 10 * rows, left : left + 10 * columns] = part
     found = board_regions(image, 13 * 8)
     # 104 corners are asked for; seven tenths of that would be more than the second board has.
     assert len(found) == 1

@@ -19,13 +19,11 @@ from bodyscan.geometry.transforms import RigidTransform
 SIZE = (1280, 800)
 
 
-def made(width: int, height: int) -> tuple[int, int]:
-    return width, height
-
-
 def projector(size: tuple[int, int] | None, *ways: Any) -> Any:
     matrix = np.array([[1500.0, 0.0, 630.2], [0.0, 1500.0, 410.4], [0.0, 0.0, 1.0]])
-    found: Any = SimpleNamespace(size=size, where="theirs.json", matrix=matrix, projector=made)
+    found: Any = SimpleNamespace(
+        size=size, where="theirs.json", matrix=matrix, projector=lambda *size: size
+    )
     code: Any = SimpleNamespace(directions=ways)
     return _projector(found, code)
 

@@ -39,10 +39,6 @@ class Leaning(Lens):
     def prior_sigmas(self) -> Array:
         return np.array([0.05])
 
-    @property
-    def difference_steps(self) -> Array:
-        return np.array([1e-5])
-
     def distort(self, ideal: Array) -> Array:
         return ideal + self.t * self.by_coefficients(ideal)[..., 0]
 

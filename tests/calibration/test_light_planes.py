@@ -79,10 +79,10 @@ def test_outliers_move_no_plane() -> None:
     assert np.sqrt(np.mean(off**2)) < 0.002
 
 
-def pulls(noise_px: float, board_mm: float, believed_mm: float, seeds: int = 12) -> float:
+def pulls(noise_px: float, board_mm: float, believed_mm: float) -> float:
     """RMS of how far fitted planes are off amid the boards, over what their covariance says."""
     planes, found = true_planes(), []
-    for seed in range(seeds):
+    for seed in range(12):
         rng = np.random.default_rng([7, seed])
         parts = []
         for k, pose in enumerate(POSES):

@@ -28,12 +28,6 @@ def taken(folder: Path, timing: str, rig: str = RIG, times: str | None = None) -
     return open_scan(load_rig(write(folder / "rig.yaml", rig)), captures)
 
 
-def firsts(captures: Captures) -> dict[str, float]:
-    """When each pair took its first frame."""
-    found = {one.pair: captures.frame_ms("b1", one.pair) for one in captures.sequences}
-    return {pair: min(times.values()) for pair, times in found.items() if times}
-
-
 def test_without_timing_nothing_is_known(tmp_path: Path) -> None:
     captures = open_captures(load_rig(write_small_captures(tmp_path)), tmp_path / "rig.yaml")
     assert captures.frame_ms("b1", "p1") is None
@@ -70,7 +64,9 @@ def test_an_order_of_its_own(tmp_path: Path) -> None:
     ],
 )
 def test_when_pairs_begin(tmp_path: Path, start: str, rig: str, expected: dict[str, float]) -> None:
-    assert firsts(taken(tmp_path, f"  frame_ms: 10\n  start: {start}\n", rig)) == expected
+    captures = taken(tmp_path, f"  frame_ms: 10\n  start: {start}\n", rig)
+    found = {one.pair: captures.frame_ms("b1", one.pair) for one in captures.sequences}
+    assert {pair: min(times.values()) for pair, times in found.items() if times} == expected
 
 
 def rows(change: dict[str, str] | None = None) -> str:

@@ -139,7 +139,7 @@ def test_opencv_s_projector_pose_is_that_of_stereo_calibrate(tmp_path: Path) -> 
     np.testing.assert_allclose(lens, RADIAL, rtol=0, atol=1e-8)
 
 
-def test_a_camera_alone_and_a_name_that_is_taken(tmp_path: Path) -> None:
+def test_a_camera_alone_and_a_name_that_is_taken() -> None:
     wanted = calibrate(RADIAL)
     pairs = {
         "a": wanted.pairs["a"],

@@ -39,9 +39,9 @@ def paint(positions: Array) -> Array:
     return 140.0 + 80.0 * np.sin(positions / [40.0, 50.0, 60.0])
 
 
-def sprinkle(mesh: BodyMesh, count: int = 20_000) -> tuple[Array, Bytes]:
+def sprinkle(mesh: BodyMesh) -> tuple[Array, Bytes]:
     """Points on a ball and their colours."""
-    ways = np.random.default_rng(0).normal(size=(count, 3))
+    ways = np.random.default_rng(0).normal(size=(20_000, 3))
     points = mesh.vertices.mean(axis=0) + 120.0 * ways / np.linalg.norm(ways, axis=1)[:, None]
     return points, np.rint(paint(points)).astype(np.uint8)
 

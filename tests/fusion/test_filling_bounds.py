@@ -166,7 +166,7 @@ MISSING_MM, ASIDE_MM = 28.0, 25.0
 """Radius of what pairs at the height of a man's head see too flat, and how far from the top it lies."""
 
 
-def head(seen: Callable[[Array], Mask], noise_mm: float = 0.1, tilt: float = 0.02) -> BodyCloud:
+def head(seen: Callable[[Array], Mask]) -> BodyCloud:
     """A ball, as a cloud of points 2 mm apart, where it was seen."""
     rng = np.random.default_rng(0)
     ways = rng.normal(size=(20_000, 3))
@@ -175,8 +175,8 @@ def head(seen: Callable[[Array], Mask], noise_mm: float = 0.1, tilt: float = 0.0
     kept = seen(points)
     points, ways = points[kept], ways[kept]
     count = len(points)
-    points = points + noise_mm * rng.normal(size=(count, 1)) * ways
-    normals = ways + tilt * rng.normal(size=(count, 3))
+    points = points + 0.1 * rng.normal(size=(count, 1)) * ways
+    normals = ways + 0.02 * rng.normal(size=(count, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     return cloud_of(points, normals)
 

@@ -186,16 +186,12 @@ def distances(values: Array) -> Distances:
     return Distances(values.astype(np.float32), ORIGIN, CELL_MM)
 
 
-def fine(shape: tuple[int, int, int]) -> Bricks:
-    return Bricks.from_mask(np.ones(shape, bool), ORIGIN, FINE_MM)
-
-
 def test_between_nodes_it_is_linear_and_beyond_the_grid_as_at_its_rim() -> None:
     def field(places: Array) -> Array:
         x, y, z = np.moveaxis((places - ORIGIN) / CELL_MM, -1, 0)
         return np.asarray(3.0 * x - 2.0 * y + 1.0 * z + 4.0)
 
-    bricks = fine((6, 5, 7))
+    bricks = Bricks.from_mask(np.ones((6, 5, 7), bool), ORIGIN, FINE_MM)
     found = interpolate_distances(distances(field(nodes(SHAPE, CELL_MM))), bricks)
     index = SIDE * bricks.indices[:, None, None, None] + np.moveaxis(np.indices((SIDE,) * 3), 0, -1)
     last = ORIGIN + CELL_MM * (np.array(SHAPE) - 1.0)

@@ -25,10 +25,6 @@ TERMS = np.stack([np.ones_like(DU), DU, DV, DU**2, DU * DV, DV**2], axis=-1).res
 SHARPEST = PIXEL_MM**2 * CENTRE**2 / SIGMA / (2.0 * 6.0)
 
 
-def blank(height: int, width: int) -> QuadraticFit:
-    return QuadraticFit(*np.zeros((4, height, width), np.float32))
-
-
 def fitted(offset: Array, valid: Mask | None = None) -> tuple[Array, float, bool]:
     """Value and slopes at the middle of a window, the value's sigma, and whether it is accepted.
 
@@ -36,7 +32,8 @@ def fitted(offset: Array, valid: Mask | None = None) -> tuple[Array, float, bool
     """
     there = np.ones_like(offset, bool) if valid is None else valid
     image = np.where(there, CENTRE + SIGMA * offset, 0.0).astype(np.float32)
-    fit, accepted = blank(SIDE, SIDE), np.zeros((SIDE, SIDE), bool)
+    fit = QuadraticFit(*np.zeros((4, SIDE, SIDE), np.float32))
+    accepted = np.zeros((SIDE, SIDE), bool)
     noise = np.full((SIDE, SIDE), SIGMA, np.float32)
     middle = np.array([SIDE * REACH + REACH])
     fit_trimmed_windows(image, noise, middle, REACH, PIXEL_MM, fit, accepted)

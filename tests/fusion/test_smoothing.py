@@ -24,17 +24,17 @@ RAYS = CAMERA.pixel_rays()
 POSE = RigidTransform.from_rotation_vector([0.3, -2.0, 0.4], [700.0, -200.0, 900.0])
 
 
-def image_of(depth: np.ndarray, noise_mm: float = 0.0, seed: int = 0) -> RangeImage:
+def image_of(depth: np.ndarray, noise_mm: float = 0.0) -> RangeImage:
     """Of depths (h, w), NaN where nothing is; noise along the ray, which sigma_mm tells."""
     length = np.linalg.norm(RAYS, axis=-1)
-    noise = noise_mm * np.random.default_rng(seed).normal(size=depth.shape)
+    noise = noise_mm * np.random.default_rng(0).normal(size=depth.shape)
     points = RAYS * (depth + noise / length)[..., None]
     return range_image_of(CAMERA, points, sigma_mm=max(noise_mm, 0.05), grey=128)
 
 
-def plane_depth(normal: np.ndarray, distance: float = DISTANCE) -> np.ndarray:
-    """Of the plane through (0, 0, distance)."""
-    return distance * normal[2] / (RAYS @ normal)
+def plane_depth(normal: np.ndarray) -> np.ndarray:
+    """Of the plane through (0, 0, DISTANCE)."""
+    return DISTANCE * normal[2] / (RAYS @ normal)
 
 
 def sphere_depth(radius: float) -> np.ndarray:

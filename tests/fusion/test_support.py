@@ -14,9 +14,9 @@ REACH_MM = 4.0
 UP = np.array([0.0, 0.0, 1.0])
 
 
-def sheet(spacing: float = 1.3, size: int = 20) -> np.ndarray:
-    """Points of the plane z = 0 with x from -size mm to 0, a rim."""
-    x, y = np.meshgrid(np.arange(-size, 0.1, spacing), np.arange(-size, size, spacing))
+def sheet(spacing: float = 1.3) -> np.ndarray:
+    """Points of the plane z = 0 with x from -20 mm to 0, a rim."""
+    x, y = np.meshgrid(np.arange(-20, 0.1, spacing), np.arange(-20, 20, spacing))
     return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=-1)
 
 

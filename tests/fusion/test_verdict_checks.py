@@ -304,11 +304,7 @@ def scattered(columns: Sequence[Column], counts: Sequence[int]) -> BodyCloud:
     return facing_x(np.concatenate(parts))
 
 
-def square(area: float) -> tuple[float, float]:
-    return float(np.sqrt(area)), float(np.sqrt(area))
-
-
-TRUNK: Column = ((0.0, 0.0), square(90_000.0), 0.0, TALL_MM)
+TRUNK: Column = ((0.0, 0.0), (300.0, 300.0), 0.0, TALL_MM)
 SHAPES = ("more than one person", "besides one person's", "touches the", "mm wide and")
 PERSON = standing_body(hanging(25.0))
 

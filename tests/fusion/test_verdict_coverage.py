@@ -32,15 +32,14 @@ def grid(columns: int, rows: int) -> tuple[Array, Indices]:
     return 10.0 * places.reshape(-1, 3), faces
 
 
-def seen(pair: str, *, shift_mm: float = 0.0, left_of: int = 121, camera: Camera = CAMERA) -> Any:
-    """What a camera at the origin measured of the plane, or of one so far behind: the columns left of
-    some."""
+def seen(pair: str, *, left_of: int = 121, camera: Camera = CAMERA) -> Any:
+    """What a camera at the origin measured of the plane: the columns left of some."""
     rays = camera.pixel_rays()
     valid = np.ones((81, 121), bool)
     valid[:, left_of:] = False
     return SimpleNamespace(
         pair=pair, camera=camera, corner=np.zeros(2, np.int64), valid=valid,
-        points=(AWAY_MM + shift_mm) * rays, sigma_mm=np.ones((81, 121)),
+        points=AWAY_MM * rays, sigma_mm=np.ones((81, 121)),
         lit=np.full((81, 121), 100, np.uint8),
     )  # fmt: skip
 

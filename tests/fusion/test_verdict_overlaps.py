@@ -141,8 +141,8 @@ def test_what_shares_no_surface_is_not_tied(woman: list[RangeImage]) -> None:
     assert not aligned.motion_mm
 
 
-def seam(one: str, other: str, apart_mm: float, patches: int = 10, sigma_mm: float = 0.1) -> Seam:
-    return Seam((one, other), np.full(patches, apart_mm), np.full(patches, sigma_mm))
+def seam(one: str, other: str, apart_mm: float, patches: int = 10) -> Seam:
+    return Seam((one, other), np.full(patches, apart_mm), np.full(patches, 0.1))
 
 
 SINGLE = {f"pair {name}": frozenset([name]) for name in ("a1", "a2", "b1", "b2", "c1", "c2")}

@@ -16,9 +16,9 @@ from bodyscan.fusion.voxel_thinning import find_voxel_size, select_per_voxel, ta
 from bodyscan.geometry.transforms import RigidTransform
 
 
-def sphere(count: int, radius: float = 300.0, seed: int = 0) -> np.ndarray:
+def sphere(count: int, seed: int = 0) -> np.ndarray:
     points = np.random.default_rng(seed).normal(size=(count, 3))
-    return (radius * points / np.linalg.norm(points, axis=1, keepdims=True)).astype(np.float32)
+    return (300.0 * points / np.linalg.norm(points, axis=1, keepdims=True)).astype(np.float32)
 
 
 def cells(points: np.ndarray, voxel_mm: float) -> np.ndarray:

@@ -244,9 +244,9 @@ class Many:
         )
 
 
-def many(count: int = 5) -> Many:
+def many() -> Many:
     rng = np.random.default_rng(6)
-    measured = np.stack([noisy(seed, 0.003 * (1 + seed)) for seed in range(count)])
+    measured = np.stack([noisy(seed, 0.003 * (1 + seed)) for seed in range(5)])
     return Many(measured, (rng.random(measured.shape) < 0.8).astype(float))
 
 

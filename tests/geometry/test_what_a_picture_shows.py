@@ -36,8 +36,8 @@ def test_a_crop_is_the_smallest_box_and_grows_no_farther_than_the_first_row() ->
     assert find_crop(np.zeros((4, 4), bool)) is None
 
 
-def at(camera: Camera, *pixels: tuple[float, float], depth: float = 800.0) -> np.ndarray:
-    return depth * camera.rays(np.array(pixels))
+def at(camera: Camera, *pixels: tuple[float, float]) -> np.ndarray:
+    return 800.0 * camera.rays(np.array(pixels))
 
 
 def test_what_is_seen_lies_ahead_between_the_first_pixel_and_the_last() -> None:
@@ -123,10 +123,10 @@ def sheets() -> LightPlanes:
     return LightPlanes(planes, np.full((81, 4, 4), 1e-12), "vertical")
 
 
-def flat_wall(depth: float = 800.0) -> tuple[np.ndarray, np.ndarray]:
+def flat_wall() -> tuple[np.ndarray, np.ndarray]:
     """s of every pixel, and its point."""
-    points = depth * CAMERA.pixel_rays()
-    s = 40.0 + (points[..., 0] - BASELINE) / depth / APART
+    points = 800.0 * CAMERA.pixel_rays()
+    s = 40.0 + (points[..., 0] - BASELINE) / 800.0 / APART
     s[(s < 1.0) | (s > 79.0)] = np.nan
     return s.astype(np.float32), points.astype(np.float32)
 

@@ -15,7 +15,7 @@ FREE = {"trunk", "left arm", "right arm"}
 
 
 def parts_of(
-    arms: list[Rod], heights: tuple[float, ...] = (), *, scale: float = 1.0, **given: float
+    arms: list[Rod], heights: tuple[float, ...], *, scale: float = 1.0, **given: float
 ) -> BodyParts:
     body = standing_body(arms, scale=scale, **given)
     return find_parts(MeshSlicer(*body), [scale * height for height in heights])

@@ -209,21 +209,15 @@ def test_a_girth_is_uncertain_by_what_all_around_it_shares() -> None:
     np.testing.assert_allclose(girth_sigmas(alone, height), 50.0**-0.5)
 
 
-def certain(motion: BodyMotion) -> BodyMotion:
-    """With amplitudes that are known."""
-    pose, *others = motion.kinds
-    known = (replace(kind, precision=1e8 * np.eye(kind.count)) for kind in others)
-    return replace(motion, kinds=(pose, *known))
-
-
 def test_a_place_that_two_saw_alike_is_as_uncertain_as_one_and_one_that_errs_by_itself_less(
     cells: BodyCells,
 ) -> None:
     """Pairs' own errors average out over those who saw a place."""
     boards = np.diag(np.tile([1e-12] * 3 + [0.1**2] * 3, 4))
-    motion = certain(
-        BodyMotion.at_rest(cells, [0.0, 0.0, 0.0, 0.0], 0.0, boards, np.full(6, 1e-3))
-    )._solve()
+    rest = BodyMotion.at_rest(cells, [0.0, 0.0, 0.0, 0.0], 0.0, boards, np.full(6, 1e-3))
+    pose, *others = rest.kinds
+    known = (replace(kind, precision=1e8 * np.eye(kind.count)) for kind in others)
+    motion = replace(rest, kinds=(pose, *known))._solve()
     seen = np.zeros((4, len(cells.centres)), bool)
     left = cells.centres[:, 1] > 0.0
     seen[0, left], seen[1, ~left] = True, True

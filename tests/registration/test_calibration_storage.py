@@ -45,11 +45,6 @@ def pose(content: dict[str, Any], change: Callable[[Any], Any]) -> None:
     pair["rig_from_camera"] = change(np.array(pair["rig_from_camera"])).tolist()
 
 
-def exchange(content: dict[str, Any], part: str) -> None:
-    a, b = (content["pairs"][name] for name in ("p1-2", "p2-3"))
-    a[part], b[part] = b[part], a[part]
-
-
 CAMERA = ("pairs", "p1-2", "camera")
 MISTAKES: dict[str, Callable[[dict[str, Any]], Any]] = {
     "a focal length that is NaN": lambda c: set_(c, *CAMERA, "alpha", to=float("nan")),
@@ -206,7 +201,8 @@ def test_no_value_is_changed_unseen(stored_now: Path, data: st.DataObject) -> No
 @pytest.mark.parametrize("part", ["camera", "rig_from_camera", "quality"])
 def test_parts_exchanged_between_pairs_are_noticed(part: str, mine: Path) -> None:
     content = read(mine)
-    exchange(content, part)
+    a, b = (content["pairs"][name] for name in ("p1-2", "p2-3"))
+    a[part], b[part] = b[part], a[part]
     write(mine, content)
     with pytest.raises(CalibrationFileError, match="was changed after it was stored"):
         load_calibration(mine)

@@ -6,13 +6,21 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from ring import CHARUCO, ring_of_cameras, ring_rig, ring_views
+from ring import (
+    CHARUCO,
+    centre_errors,
+    in_sigmas,
+    ring_of_cameras,
+    ring_rig,
+    ring_views,
+    rms_mm,
+    seen_anew,
+)
 
 from bodyscan.calibration.board_views import LocatedView, PlanarView
 from bodyscan.calibration.camera import locate_board
 from bodyscan.errors import RigDisconnected
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.geometry.uncertainty import position_sigma
 from bodyscan.outcome import Outcome
 from bodyscan.registration.rig_solve import RigSolution, solve_rig
 
@@ -27,11 +35,7 @@ def place(views: list[LocatedView]) -> Outcome[RigSolution]:
 
 
 def rms(placed: Outcome[RigSolution]) -> float:
-    errors = [
-        placed.value.rig_from_camera[name].translation - PLACINGS[name].translation
-        for name in placed.value.rig_from_camera
-    ]
-    return float(np.sqrt(np.mean(np.sum(np.square(errors), axis=1))))
+    return rms_mm(placed.value, PLACINGS)
 
 
 @pytest.fixture(scope="module")
@@ -40,16 +44,12 @@ def seen() -> Seen:
     return views, truth, rms(place(views))
 
 
-def seen_anew(
+def seen_there(
     view: LocatedView, rig_from_board: RigidTransform, rng: np.random.Generator, size: float = 1.0
 ) -> LocatedView:
     """The view as it would have been with the board there, its squares so many times as large."""
-    camera = CAMERAS[view.pair]
-    camera_from_board = PLACINGS[view.pair].inverse() @ rig_from_board
-    pixels = camera.project(camera_from_board.apply(size * view.points))
-    pixels += rng.normal(0.0, 0.03, pixels.shape)
-    pose, _ = locate_board(camera, PlanarView(view.shot, view.points, pixels))
-    return replace(view, pixels=pixels, camera_from_board=pose)
+    there = PLACINGS[view.pair].inverse() @ rig_from_board
+    return seen_anew(view, CAMERAS[view.pair], there, rng, size * view.points)
 
 
 def busiest(views: list[LocatedView]) -> tuple[str, list[str]]:
@@ -82,7 +82,7 @@ def test_a_board_that_slipped_between_exposures(seen: Seen, slip_mm: float) -> N
     rng = np.random.default_rng(2)
     slip = RigidTransform.from_rotation_vector([0.0, 0.0, 0.002], [0.0, slip_mm, -slip_mm])
     moved = slip @ truth[shot, CHARUCO.name]
-    changed = [seen_anew(v, moved, rng) if v.shot == shot and v.pair in late else v for v in views]
+    changed = [seen_there(v, moved, rng) if v.shot == shot and v.pair in late else v for v in views]
     placed = place(changed)
     (note,) = placed.notes
     assert f"shot {shot}" in note
@@ -97,7 +97,7 @@ def test_a_different_board_in_one_shot(seen: Seen, size: float) -> None:
     shot, pairs = busiest(views)
     rng = np.random.default_rng(3)
     changed = [
-        seen_anew(v, truth[shot, CHARUCO.name], rng, size) if v.shot == shot else v for v in views
+        seen_there(v, truth[shot, CHARUCO.name], rng, size) if v.shot == shot else v for v in views
     ]
     placed = place(changed)
     (note,) = placed.notes
@@ -111,7 +111,7 @@ def test_a_camera_whose_pictures_show_other_shots_is_left_out(seen: Seen) -> Non
     rng = np.random.default_rng(4)
     others = [v for v in views if v.pair != "p1-3"]
     own = [
-        seen_anew(v, drifted(truth[v.target], 400.0, rng), rng) for v in views if v not in others
+        seen_there(v, drifted(truth[v.target], 400.0, rng), rng) for v in views if v not in others
     ]
     placed = place(others + own)
     assert list(placed.failures) == ["p1-3"]
@@ -127,7 +127,7 @@ def test_pictures_of_not_quite_the_same_moment_give_poses_with_sigmas_to_match(
     views, truth, clean = seen
     rng = np.random.default_rng(5)
     changed = [
-        seen_anew(v, drifted(truth[v.target], 10.0, rng), rng) if v.pair in late else v
+        seen_there(v, drifted(truth[v.target], 10.0, rng), rng) if v.pair in late else v
         for v in views
     ]
     placed = place(changed)
@@ -137,14 +137,9 @@ def test_pictures_of_not_quite_the_same_moment_give_poses_with_sigmas_to_match(
     found = placed.value
     assert len(found.views) == len(views)
     assert max(found.rms_px.values()) < 0.1  # corners' noise: what moved is in the sigmas of poses
-    errors, pulls = {}, []
-    for name, pose in found.rig_from_camera.items():
-        errors[name] = pose.translation - PLACINGS[name].translation
-        sigma = position_sigma(found.covariance, name, pose.translation)
-        if np.all(sigma > 1e-6):  # all but the one that fixes the frame
-            pulls.append(errors[name] / sigma)
-    assert 0.7 < np.sqrt(np.mean(np.square(pulls))) < 1.4
-    others = [np.sum(error**2) for name, error in errors.items() if name not in late]
+    assert 0.7 < np.sqrt(np.mean(np.square(in_sigmas(found, PLACINGS)))) < 1.4
+    errors = centre_errors(found, PLACINGS).items()
+    others = [np.sum(error**2) for name, (error, _) in errors if name not in late]
     assert not others or np.sqrt(np.mean(others)) < 1.2 * clean
 
 
@@ -169,7 +164,7 @@ def test_clocks_that_differ_cost_little_where_the_board_s_path_is_seen(seen: See
     poses = [board(0.4 * k) for k in range(40)]
     carried = ring_views(PLACINGS, CAMERAS, poses=poses)[0]
     placed = place(
-        [seen_anew(v, board(0.4 * int(v.shot[1:]) + late[v.pair]), rng) for v in carried]
+        [seen_there(v, board(0.4 * int(v.shot[1:]) + late[v.pair]), rng) for v in carried]
     )
     assert not placed.failures
     assert rms(placed) < 3.0 * clean
@@ -178,7 +173,7 @@ def test_clocks_that_differ_cost_little_where_the_board_s_path_is_seen(seen: See
 def test_pictures_none_of_which_were_taken_together_are_refused(seen: Seen) -> None:
     views, truth, _ = seen
     rng = np.random.default_rng(5)
-    changed = [seen_anew(v, drifted(truth[v.target], 400.0, rng), rng) for v in views]
+    changed = [seen_there(v, drifted(truth[v.target], 400.0, rng), rng) for v in views]
     with pytest.raises(RigDisconnected, match="taken together") as caught:
         place(changed)
     assert all(name in str(caught.value) for name in CAMERAS)
@@ -202,12 +197,11 @@ def test_one_of_two_boards_with_other_squares_than_the_rig_file_says(seen: Seen)
     rng = np.random.default_rng(6)
     second = {f"s{number:02d}" for number in range(0, SHOTS, 4)}
     changed = [
-        replace(seen_anew(v, truth[v.target], rng, 1.03), board="other") if v.shot in second else v
+        replace(seen_there(v, truth[v.target], rng, 1.03), board="other") if v.shot in second else v
         for v in views
     ]
     other = CHARUCO.model_copy(update={"name": "other", "first_marker": 200})
-    rig = ring_rig(PLACINGS).model_copy(update={"boards": (CHARUCO, other)})
-    placed = solve_rig(rig, changed, CAMERAS)
+    placed = solve_rig(ring_rig(PLACINGS, CHARUCO, other), changed, CAMERAS)
     shots = {view.shot for view in views} & second
     assert all(any(f"shot {s}: the pose of board other" in n for n in placed.notes) for s in shots)
     without = place([v for v in views if v.shot not in second])

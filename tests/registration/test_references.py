@@ -40,14 +40,11 @@ LEFT, RIGHT = plate("left", 200), plate("right", 220)
 
 
 def small_rig(*references: Reference) -> Rig:
-    rig = ring_rig(PLACINGS)
-    return rig.model_copy(
-        update={"boards": (CHARUCO, LEFT, RIGHT), "references": tuple(references)}
-    )
+    return ring_rig(PLACINGS, CHARUCO, LEFT, RIGHT, references=references)
 
 
-def bar(length_mm: float = BAR_MM, name: str = "bar") -> Reference:
-    return Reference(name=name, boards=("left", "right"), length_mm=length_mm, sigma_mm=0.01)
+def bar(length_mm: float = BAR_MM) -> Reference:
+    return Reference(name="bar", boards=("left", "right"), length_mm=length_mm, sigma_mm=0.01)
 
 
 def placed(scale: float) -> RigSolution:

@@ -34,13 +34,13 @@ SEEN = (("a", "s1"), ("b", "s1"), ("a", "s2"), ("b", "s3"), ("a", "s3"))
 POINTS = np.array([[40.0 * (k % 5), 40.0 * (k // 5), 0.0] for k in range(20)])
 
 
-def views(noise_px: float = 0.0) -> list[LocatedView]:
+def views() -> list[LocatedView]:
     rng = np.random.default_rng(4)
     found = []
     for pair, shot in SEEN:
         camera_from_board = PLACED[pair].inverse() @ BOARDS[shot, "board"]
         pixels = CAMERAS[pair].project(camera_from_board.apply(POINTS))
-        pixels = pixels + noise_px * rng.standard_normal(pixels.shape)
+        pixels = pixels + 1e-3 * rng.standard_normal(pixels.shape)
         found.append(LocatedView(pair, shot, "board", POINTS, pixels, camera_from_board))
     return found
 
@@ -80,7 +80,7 @@ def jacobian(seen: list[LocatedView]) -> Array:
 def test_they_are_those_of_all_errors_by_all_unknowns(target: Target | None) -> None:
     """With noise so even that every corner counts alike; boards, but one that holds the frame, are
     eliminated."""
-    seen = views(1e-3)
+    seen = views()
     found = equations(seen, target)
     assert found.names == ("a", "b")
     assert list(found.parts) == list(BOARDS)
@@ -107,7 +107,7 @@ def test_they_are_those_of_all_errors_by_all_unknowns(target: Target | None) -> 
 
 
 def test_a_corner_that_is_far_off_counts_for_next_to_nothing() -> None:
-    seen = views(1e-3)
+    seen = views()
     before = equations(seen)
     pixels = seen[0].pixels.copy()
     pixels[7] += 0.2  # two hundred times the noise
@@ -120,7 +120,7 @@ def test_a_corner_that_is_far_off_counts_for_next_to_nothing() -> None:
 
 
 def test_what_is_known_of_cameras_beforehand_is_added_to_their_own_unknowns() -> None:
-    seen = views(1e-3)
+    seen = views()
     found = equations(seen)
     own = np.concatenate(list(found.cameras.values()))
     sigmas = np.concatenate([CAMERAS[name].prior_sigmas for name in "ab"])
@@ -132,7 +132,7 @@ def test_what_is_known_of_cameras_beforehand_is_added_to_their_own_unknowns() ->
 def test_cameras_that_are_known_take_no_degrees_of_freedom() -> None:
     priors = {n: CameraPrior(c.parameters, np.full(7, 1e-9)) for n, c in CAMERAS.items()}
     exact = {name: replace(camera, prior=priors[name]) for name, camera in CAMERAS.items()}
-    seen = views(1e-3)
+    seen = views()
     found = normal_equations(seen, exact, PLACED, BOARDS, fixed_pair="a", fixed_target=None)
     # Of 200 residuals with weights of 0.9, three boards and a pair take 24, unknown cameras 14.
     ratio = found.variance_px2 / equations(seen).variance_px2

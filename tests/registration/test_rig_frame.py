@@ -194,10 +194,10 @@ def test_a_board_that_tells_its_ends_is_left_as_it_was_read() -> None:
     assert np.array_equal(found.matrix, np.eye(4))
 
 
-def tie(agreeing: int, rivals: int, shared: int, corners: int = 40) -> RelativePose:
+def tie(agreeing: int, rivals: int, shared: int) -> RelativePose:
     targets = tuple((f"s{k}", "b") for k in range(shared))
     pose = RigidTransform.identity()
-    return RelativePose(pose, targets, targets[:agreeing], rivals, corners, True)
+    return RelativePose(pose, targets, targets[:agreeing], rivals, 40, True)
 
 
 @pytest.mark.parametrize(

@@ -25,8 +25,8 @@ def ball() -> BodyMesh:
     return mesh_of(vertices, faces, filled, colours=90)
 
 
-def dots(count: int = 200_000) -> BodyCloud:
-    normals = np.random.default_rng(0).normal(size=(count, 3))
+def dots() -> BodyCloud:
+    normals = np.random.default_rng(0).normal(size=(200_000, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     return BodyCloud(
         RADIUS * normals + CENTRE,

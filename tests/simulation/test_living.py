@@ -28,8 +28,8 @@ SUBJECT = PROJECT / "data" / "subjects" / "man_average.ply"
 STANDING = Person(subdivisions=0, **SUBJECTS["standing"])
 
 
-def load_moving_body(person: Person, seed: int = 0) -> LivingBody:
-    rng = np.random.default_rng(seed)
+def load_moving_body(person: Person) -> LivingBody:
+    rng = np.random.default_rng(0)
     return animate(load_subject(SUBJECT, person, rng), person, rng)
 
 
@@ -185,9 +185,9 @@ WOMAN = Path(__file__).parents[2] / "data" / "subjects" / "woman_average.ply"
 SPREADS = Skin(spread_mm=1.0, stays=0.07)
 
 
-def bright_point(size: int = 201) -> Floats:
-    light = np.zeros((size, size), np.float32)
-    light[size // 2, size // 2] = 1.0
+def bright_point() -> Floats:
+    light = np.zeros((201, 201), np.float32)
+    light[100, 100] = 1.0
     return light
 
 

@@ -27,12 +27,12 @@ from bodyscan.simulation.settings import BoardMaking, Noise, Optics, Projection
 BITS = 5
 
 
-def ball(centre: list[float], radius: float, albedo: float = 0.8, resolution: int = 60) -> Surface:
+def ball(centre: list[float], radius: float, resolution: int = 60) -> Surface:
     mesh = o3d.geometry.TriangleMesh.create_sphere(radius, resolution)
     mesh.compute_vertex_normals()
     vertices = np.asarray(mesh.vertices) + centre
     return Surface(
-        vertices, np.asarray(mesh.triangles), albedo, normals=np.asarray(mesh.vertex_normals)
+        vertices, np.asarray(mesh.triangles), 0.8, normals=np.asarray(mesh.vertex_normals)
     )
 
 

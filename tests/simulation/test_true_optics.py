@@ -106,21 +106,6 @@ def test_smile_bows_the_ends_only() -> None:
     assert bowed.stripe(SEEN) - straight.stripe(SEEN) == pytest.approx(0.5 * across**2)
 
 
-def flatness(projector: PinholeProjector) -> float:
-    """Largest distance (mm) of a stripe's light from its best plane, at 0.8 to 1.6 m."""
-    x = np.linspace(-250, 250, 41)
-    y = np.linspace(-330, 330, 3001)
-    lines = []
-    for z in (800.0, 1200.0, 1600.0):
-        grid = np.stack(np.meshgrid(x, y, [z], indexing="ij"), axis=-1)[:, :, 0]
-        s = projector.stripe(grid)
-        height = [np.interp(150.0, row_s, row[:, 1]) for row_s, row in zip(s, grid, strict=True)]
-        lines.append(np.stack([x, height, np.full_like(x, z)], axis=1))
-    points = np.concatenate(lines)
-    points = points - points.mean(axis=0)
-    return float(np.abs(points @ np.linalg.svd(points)[2][2]).max())
-
-
 SKEWED = TrueCamera(1061.71, 1064.09, -0.56, 350.08, 286.5, -0.14, -0.09, 640, 480)
 DECENTRED = replace(SKEWED, p1=4e-4, p2=-3e-4, k3=0.01)
 

@@ -109,7 +109,6 @@ CHARUCO = Board(
     name="b", kind="charuco", columns=6, rows=4, square_mm=60, marker_mm=45, margin_mm=10,
     faces=2, thickness_mm=5, first_marker=7, dictionary="DICT_4X4_1000",
 )  # fmt: skip
-PLAIN = Board(name="p", columns=5, rows=4, square_mm=20, margin_mm=5)
 MAKING = BoardMaking()
 
 

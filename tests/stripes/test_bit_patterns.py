@@ -13,13 +13,11 @@ SHAPE = (40, 64)
 
 
 def lines(
-    contrast: int, *, off: int = 0, dark: int | None = 20, coarse: int = 0, inverses: bool = True
+    contrast: int, *, off: int = 0, dark: int | None = 20, inverses: bool = True
 ) -> ScanLines:
-    """Lit and dark, and four bits with inverses that are `off` grey levels brighter; but for so many
-    of the coarse ones, which are as they should be."""
+    """Lit and dark, and four bits with inverses that are `off` grey levels brighter."""
     bits = (np.arange(64) >> np.arange(5, 1, -1)[:, None]) & 1
-    more = np.where(np.arange(4) < coarse, 0, off)[:, None]
-    on, below = 20 + contrast + more, 20 + more
+    on, below = 20 + contrast + off, 20 + off
     pattern = np.where(bits == 1, on, below).astype(np.uint8)[:, None].repeat(SHAPE[0], axis=1)
     inverse = np.where(bits == 0, on, below).astype(np.uint8)[:, None].repeat(SHAPE[0], axis=1)
     lit = np.full(SHAPE, 20 + contrast, np.uint8)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from stripe_rendering import code_light, render
 
-from bodyscan.arrays import Array, Bytes, Indices
+from bodyscan.arrays import Bytes, Indices
 from bodyscan.errors import DecodingFailed
 from bodyscan.geometry.light_planes import Axis
 from bodyscan.stripes.codes import parse_stripe_code
@@ -116,10 +116,6 @@ def test_a_wrong_period_is_noticed(phase: Read) -> None:
         phase(spec=spec)
 
 
-def index_image(s: Array) -> Indices:
-    return np.where((s >= 0) & (s < STRIPES), np.clip(s, 0, 254).astype(int) + 1, 0)
-
-
 def read_index(image: Indices, stripes: int = STRIPES, direction: Axis = "horizontal") -> StripeMap:
     spec = StripeIndex(stripes=stripes, direction=direction)
     lit = np.full(image.shape, 200, np.uint8)
@@ -128,7 +124,8 @@ def read_index(image: Indices, stripes: int = STRIPES, direction: Axis = "horizo
 
 def test_a_stripe_index_image_is_read_or_refused() -> None:
     v, u = np.mgrid[:130, :130]
-    image = index_image(1.2 + (v + 0.1 * u) / 2.3)
+    s = 1.2 + (v + 0.1 * u) / 2.3
+    image = np.where(s < STRIPES, s.astype(int) + 1, 0)
     image[:5], image[5:9] = 0, 255  # both are no stripe
     seen = read_index(image)
     assert np.isnan(seen.s[:9]).all()

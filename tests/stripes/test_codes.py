@@ -24,12 +24,8 @@ def described(code: str, stripes: int = 64, **keys: Any) -> StripeCode:
     return parse_stripe_code({"code": code, "stripes": stripes, "direction": "vertical", **keys})
 
 
-def counts(code: StripeCode) -> dict[str, int]:
-    return {kind.name: count for kind, count in code.image_counts.items()}
-
-
-def waves(stripes: int = 64, **keys: Any) -> PhaseShift:
-    code = described("phase-shift", stripes, **keys)
+def waves(**keys: Any) -> PhaseShift:
+    code = described("phase-shift", 64, **keys)
     assert isinstance(code, PhaseShift)
     return code
 
@@ -57,7 +53,7 @@ def test_number_of_images_by_kind(
     code: str, keys: dict[str, Any], expected: dict[str, int]
 ) -> None:
     found = described(code, **keys)
-    assert counts(found) == expected
+    assert {kind.name: count for kind, count in found.image_counts.items()} == expected
     assert sorted(found.show_order) == list(range(sum(expected.values()))), "each is shown once"
     black = not keys.get("inverses", True)
     assert found.needs_dark is black

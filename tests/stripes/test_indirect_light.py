@@ -18,12 +18,8 @@ THERE = slice(12, 31)
 DIRECT = 180.0
 
 
-def slanted(u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    return 2.0 + u / PX * 0.7 + 0.02 * v
-
-
 def is_shadowed(u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    return np.where((u > 100) & (u < 160), np.nan, slanted(u, v))
+    return np.where((u > 100) & (u < 160), np.nan, 2.0 + u / PX * 0.7 + 0.02 * v)
 
 
 def with_indirect(sequence: Sequence, grey: float) -> Sequence:

@@ -101,7 +101,7 @@ def test_its_file_in_the_folder_is_all_it_needs(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("registered")
 def test_the_simulator_refuses_a_code_that_it_has_no_formulas_for(tmp_path: Path) -> None:
     rig = write(tmp_path / "rig.yaml", ITS_RIG)
-    with pytest.raises(BadInput, match="shifted-binary is none that the simulator knows") as caught:
+    with pytest.raises(BadInput, match="cannot project its stripe code, shifted-binary") as caught:
         simulate(rig, tmp_path / "made")
     assert caught.value.where == "pair p1"
     assert not (tmp_path / "made").exists()

@@ -25,20 +25,19 @@ S = np.linspace(5.0, 235.0, SHAPE[1]) + RNG.uniform(-3.0, 3.0, SHAPE)
 def order_of(
     periods: tuple[float, ...],
     sigma: float = 0.005,
-    claimed: float | None = None,
     *,
     apart: tuple[float, ...] | None = None,
     usable: np.ndarray | None = None,
     s: np.ndarray = S,
 ) -> PhaseOrder:
-    """Of waves whose turns err by `sigma` and claim to; apart: turns that each is off besides."""
+    """Of waves whose turns err by `sigma` and say so; apart: turns that each is off besides."""
     rng = np.random.default_rng(1)
     waves, sigmas = [], []
     for period, off in zip(periods, apart or (0.0,) * len(periods), strict=True):
         turn = (s / period + off + sigma * rng.normal(size=s.shape)) % 1.0
         grey = np.full(s.shape, 50.0, np.float32)
         waves.append(MeasuredWave(Wave(period, 4), turn.astype(np.float32), grey, grey))
-        sigmas.append(np.full(s.shape, claimed or sigma, np.float32))
+        sigmas.append(np.full(s.shape, sigma, np.float32))
     every = np.ones(s.shape, bool) if usable is None else usable
     return find_phase_order(waves, sigmas, every, STRIPES)
 

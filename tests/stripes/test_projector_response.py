@@ -21,7 +21,7 @@ S = np.linspace(3.0, 117.0, WIDTH) + np.linspace(0.0, 2.0, LINES)[:, None]
 
 
 def seen(
-    wave: Wave, error: PhaseError | None = None, noise: float = 0.0, s: np.ndarray = S
+    wave: Wave, error: PhaseError | None, noise: float = 0.0, s: np.ndarray = S
 ) -> MeasuredWave:
     """Of a flat surface; error: of the turn as it is read."""
     true = s / wave.period

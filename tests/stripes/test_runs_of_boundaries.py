@@ -293,17 +293,15 @@ def test_correlation_length_of_noise_along_lines(width: float) -> None:
     assert correlation_along_lines(run(even[:1], index[:1])) == 0.0
 
 
-def boundaries(
-    count: int, *, claimed: float, apart_px: float = 2.0, line: int | None = None
-) -> Boundaries:
+def boundaries(count: int, *, claimed: float, line: int | None = None) -> Boundaries:
     """Runs of so many boundaries (all, where line is None) that lie 0.05 px off a parabola."""
     number = np.arange(count)
     along = number % (line or count)
     noise = 0.05 * np.random.default_rng(0).standard_normal(count)
     return Boundaries(
         line=number // (line or count),
-        before=np.floor(apart_px * along).astype(np.int64),
-        position=30.0 + apart_px * along + 1e-6 * along**2 + noise,
+        before=np.floor(2.0 * along).astype(np.int64),
+        position=30.0 + 2.0 * along + 1e-6 * along**2 + noise,
         line_position=np.zeros(count),
         sigma_px=np.full(count, claimed),
         index=along + 1,

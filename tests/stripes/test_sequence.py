@@ -11,7 +11,6 @@ from stripe_rendering import Sequence, decode_gray, render_sequence
 
 from bodyscan.arrays import Bytes, Floats
 from bodyscan.errors import DecodingFailed
-from bodyscan.geometry.light_planes import Axis
 from bodyscan.stripes.codes import parse_stripe_code
 from bodyscan.stripes.codes.gray import Gray
 from bodyscan.stripes.decoding import decode_stripes
@@ -29,11 +28,8 @@ def good() -> Sequence:
     )
 
 
-def read(sequence: Sequence, direction: Axis = "horizontal") -> StripeMap:
-    return decode_gray(
-        sequence.lit, sequence.dark, sequence.patterns, sequence.inverses,
-        stripes=STRIPES, direction=direction,
-    )  # fmt: skip
+def read(sequence: Sequence) -> StripeMap:
+    return sequence.decode(STRIPES)
 
 
 def reordered(sequence: Sequence, order: list[int]) -> Sequence:

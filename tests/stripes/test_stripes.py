@@ -18,17 +18,8 @@ from stripe_rendering import (
 
 from bodyscan.arrays import Array, Bytes
 from bodyscan.boards.detection import find_boards
-from bodyscan.geometry.light_planes import Axis
 from bodyscan.geometry.robust import robust_scale
 from bodyscan.rig.board import Board
-from bodyscan.stripes.stripe_map import StripeMap
-
-
-def read(sequence: Sequence, stripes: int, direction: Axis = "horizontal") -> StripeMap:
-    return decode_gray(
-        sequence.lit, sequence.dark, sequence.patterns, sequence.inverses,
-        stripes=stripes, direction=direction,
-    )  # fmt: skip
 
 
 def contrast(sequence: Sequence) -> Bytes:
@@ -77,7 +68,7 @@ def test_pixels_half_off_the_surface_have_no_value() -> None:
         return np.where(np.abs(u - 130.3) < 60, 3 + (v + 0.7 * u) / 2.2, np.nan)
 
     sequence = render_sequence(s_at, stripes=200)
-    seen = read(sequence, 200)
+    seen = sequence.decode(200)
     on, has = np.isfinite(sequence.s), np.isfinite(seen.s)
     # 200 lines, each with two rims that cut a pixel: at most the better half of one is kept.
     assert (has & ~on).sum() < 20
@@ -91,7 +82,7 @@ def test_pixels_half_off_the_surface_have_no_value() -> None:
 def test_black_and_white_edges_along_the_scan_lines_do_not_move_slanted_stripes() -> None:
     s_at = wavy(2.2, slant=0.6)
     sequence = render_sequence(s_at, stripes=170, albedo=checkered(24, turned_deg=8))
-    seen = read(sequence, 170)
+    seen = sequence.decode(170)
     # Measured 0.084 px and 0.027 stripes; 0.107 and 0.039 if only edges across lines counted.
     assert np.sqrt(np.mean(boundary_errors(seen, s_at) ** 2)) < 0.095
     both = np.isfinite(sequence.s) & np.isfinite(seen.s)
@@ -105,7 +96,7 @@ def test_saturated_and_unlit_pixels_have_no_value() -> None:
     def s_at(u: Array, v: Array) -> Array:
         return np.where(u > 200, np.nan, wavy(3.0)(u, v))
 
-    seen = read(render_sequence(s_at, stripes=90, albedo=bright_spot), 90)
+    seen = render_sequence(s_at, stripes=90, albedo=bright_spot).decode(90)
     v, u = np.mgrid[: seen.s.shape[0], : seen.s.shape[1]]
     spot = (u - 60) ** 2 + (v - 60) ** 2
     assert np.isnan(seen.s[spot < 18**2]).all()
@@ -154,7 +145,7 @@ def test_stripes_that_end_and_begin_again_are_not_joined() -> None:
         return np.where(v < 108, 3 + v / 7.5, np.where(v < 113, np.nan, behind))
 
     sequence = render_sequence(s_at, stripes=40)
-    seen = read(sequence, 40)
+    seen = sequence.decode(40)
     both = np.isfinite(seen.s) & np.isfinite(sequence.s)
     # 0.2 stripes when the two were joined.
     assert np.abs(seen.s - sequence.s)[both].max() < 0.08

@@ -65,12 +65,10 @@ def off_surface(s: np.ndarray, board: np.ndarray, reach_px: float) -> np.ndarray
     return np.where(known > 0, rest - around, np.nan)
 
 
-def systematic(off: np.ndarray, size: int = 15) -> float:
-    """What is left of `off` in means of `size` x `size` pixels, RMS."""
+def systematic(off: np.ndarray) -> float:
+    """What is left of `off` in means of 15 x 15 pixels, RMS."""
     known = np.isfinite(off).astype(float)
-    mean = cv2.blur(np.nan_to_num(off), (size, size)) / np.maximum(
-        cv2.blur(known, (size, size)), 0.1
-    )
+    mean = cv2.blur(np.nan_to_num(off), (15, 15)) / np.maximum(cv2.blur(known, (15, 15)), 0.1)
     return float(np.sqrt(np.mean(np.square(mean[known > 0]))))
 
 

@@ -78,12 +78,12 @@ def test_phases_lie_in_their_half_periods_and_do_not_jump_between_them() -> None
         check_phase(np.float32(1.0) - turn, COARSE, EVERY)
 
 
-def check_waves(bright: float = 1.0, copied: float | None = None, period: float = 20.0) -> None:
-    """Check waves of 8 and of `period` stripes; of the second the mean is so bright, and its
+def check_waves(bright: float = 1.0, copied: float | None = None) -> None:
+    """Check waves of 8 and of 20 stripes; of the second the mean is so bright, and its
     second image the first plus so many grey levels."""
     waves: list[Any] = []
     images: list[Floats] = []
-    for length, times in ((8.0, 1.0), (period, bright)):
+    for length, times in ((8.0, 1.0), (20.0, bright)):
         turns = S / length - np.arange(STEPS)[:, None, None] / STEPS
         stack: Floats = (times * (120.0 + 100.0 * np.cos(2.0 * np.pi * turns))).astype(np.float32)
         mean, amplitude = np.full(S.shape, 120.0 * times), np.full(S.shape, 100.0)

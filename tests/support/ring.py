@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -10,11 +11,14 @@ from bodyscan.arrays import Array
 from bodyscan.boards.board_layout import corner_points
 from bodyscan.boards.view import BoardView
 from bodyscan.calibration.board_views import LocatedView, PlanarView, board_symmetries
-from bodyscan.calibration.camera import estimate_pose, locate_boards
+from bodyscan.calibration.camera import estimate_pose, locate_board, locate_boards
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.uncertainty import position_sigma
+from bodyscan.registration.rig_solve import RigSolution
 from bodyscan.rig.board import Board
+from bodyscan.rig.pair import NominalPose
 from bodyscan.rig.rig import Rig
 
 CHARUCO = Board(
@@ -52,20 +56,65 @@ def ring_of_cameras(
     return placings, cameras
 
 
-def ring_rig(placings: dict[str, RigidTransform], fixed: str = "p1-1") -> Rig:
-    position = placings[fixed].translation
-    target = position + 1000.0 * placings[fixed].rotation[:, 2]
-    pairs: list[dict[str, object]] = [
-        {"name": name, "camera": {"width": 1280, "height": 1024}} for name in sorted(placings)
+def nominal(placing: RigidTransform) -> NominalPose:
+    """A place as a rig file has it."""
+    position = placing.translation
+    look_at = position + 1000.0 * placing.rotation[:, 2]
+    return NominalPose(position_mm=tuple(position), look_at_mm=tuple(look_at))
+
+
+def ring_rig(
+    placings: dict[str, RigidTransform], *boards: Board, fixed: str = "p1-1", **other: object
+) -> Rig:
+    """Of CHARUCO if no board is named; other: further keys of the rig file."""
+    pairs = [
+        {
+            "name": name,
+            "camera": {"width": 1280, "height": 1024},
+            "nominal": nominal(placings[name]) if name == fixed else None,
+        }
+        for name in sorted(placings)
     ]
-    for pair in pairs:
-        if pair["name"] == fixed:
-            pair["nominal"] = {
-                "position_mm": tuple(position), "look_at_mm": tuple(target)
-            }  # fmt: skip
-    return Rig.model_validate(
-        {"name": "ring", "boards": (CHARUCO,), "pairs": pairs, "rig_frame": {"pair": fixed}}
-    )
+    rig = {"name": "ring", "boards": boards or (CHARUCO,), "pairs": pairs}
+    return Rig.model_validate(rig | {"rig_frame": {"pair": fixed}} | other)
+
+
+def centre_errors(
+    placed: RigSolution, placings: dict[str, RigidTransform]
+) -> dict[str, tuple[Array, Array]]:
+    """By how much pairs were put beside where they stand, and the sigmas of that, mm."""
+    return {
+        name: (
+            pose.translation - placings[name].translation,
+            position_sigma(placed.covariance, name, pose.translation),
+        )
+        for name, pose in placed.rig_from_camera.items()
+    }
+
+
+def rms_mm(placed: RigSolution, placings: dict[str, RigidTransform]) -> float:
+    errors = [error for error, _ in centre_errors(placed, placings).values()]
+    return float(np.sqrt(np.mean(np.sum(np.square(errors), axis=1))))
+
+
+def in_sigmas(placed: RigSolution, placings: dict[str, RigidTransform]) -> list[Array]:
+    """Errors over their sigmas, of all but the pair that fixes the frame, which has none."""
+    errors = centre_errors(placed, placings).values()
+    return [error / sigma for error, sigma in errors if np.all(sigma > 1e-6)]
+
+
+def seen_anew(
+    view: LocatedView,
+    camera: Camera,
+    camera_from_board: RigidTransform,
+    rng: np.random.Generator,
+    points: Array,
+) -> LocatedView:
+    """The view as it would have been with the board there, its corners at these points."""
+    pixels = camera.project(camera_from_board.apply(points))
+    pixels += rng.normal(0.0, 0.03, pixels.shape)
+    pose, _ = locate_board(camera, PlanarView(view.shot, view.points, pixels))
+    return replace(view, pixels=pixels, camera_from_board=pose)
 
 
 def board_poses(count: int, rng: np.random.Generator) -> Iterator[RigidTransform]:
@@ -87,7 +136,6 @@ def ring_views(
     noise_px: float = 0.03,
     seed: int = 0,
     board: Board = CHARUCO,
-    least_facing: float = 0.4,
     poses: Sequence[RigidTransform] = (),
 ) -> tuple[list[LocatedView], dict[tuple[str, str], RigidTransform]]:
     """What each camera sees of each shot, located with the true camera; poses: of the shots' boards."""
@@ -103,7 +151,7 @@ def ring_views(
             camera_from_board = placings[name].inverse() @ rig_from_board
             middle = camera_from_board.apply(points.mean(axis=0))
             facing = camera_from_board.rotation[:, 2] @ middle / np.linalg.norm(middle)
-            if abs(facing) < least_facing or (facing < 0 and board.faces == 1):
+            if abs(facing) < 0.4 or (facing < 0 and board.faces == 1):
                 continue
             face = points[:per_face] if facing > 0 else points[-per_face:]
             pixels = camera.project(camera_from_board.apply(face))

@@ -18,13 +18,13 @@ def ball(resolution: int = 20, radius_mm: float = 120.0) -> BodyMesh:
     return mesh_of(vertices, faces, colours=rng.integers(0, 256, vertices.shape), sigma_mm=sigma_mm)
 
 
-def points(count: int = 500) -> BodyCloud:
+def points() -> BodyCloud:
     rng = np.random.default_rng(2)
-    normals = rng.normal(size=(count, 3))
+    normals = rng.normal(size=(500, 3))
     return BodyCloud(
-        rng.uniform(-900.0, 1900.0, (count, 3)),
+        rng.uniform(-900.0, 1900.0, (500, 3)),
         (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32),
-        rng.uniform(0.01, 1.0, count).astype(np.float32),
-        rng.integers(0, 256, (count, 3)).astype(np.uint8),
-        rng.integers(1, 13, count).astype(np.uint8),
+        rng.uniform(0.01, 1.0, 500).astype(np.float32),
+        rng.integers(0, 256, (500, 3)).astype(np.uint8),
+        rng.integers(1, 13, 500).astype(np.uint8),
     )

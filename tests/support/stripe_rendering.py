@@ -28,15 +28,19 @@ class Sequence:
     inverses: np.ndarray
     s: np.ndarray
 
+    def decode(self, stripes: int) -> StripeMap:
+        frames = self.lit, self.dark, self.patterns, self.inverses
+        return decode_gray(*frames, stripes=stripes, direction="horizontal")
+
 
 Field = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
-def wavy(stripe_px: float, *, slant: float = 0.1, first: float = 3.3) -> Field:
+def wavy(stripe_px: float, *, slant: float = 0.1) -> Field:
     """A smooth, uneven field of s with stripes about `stripe_px` wide."""
 
     def s_at(u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        return first + (v + slant * u + 2.5 * np.sin(u / 23) + 1.5 * np.sin(v / 31)) / stripe_px
+        return 3.3 + (v + slant * u + 2.5 * np.sin(u / 23) + 1.5 * np.sin(v / 31)) / stripe_px
 
     return s_at
 
