@@ -158,11 +158,6 @@ def test_groups_are_what_ties_join_by_way_of_any() -> None:
         assert found == sorted(found, key=lambda group: min(map(names.index, group)))
 
 
-def matches(count: int) -> Matches:
-    ones = np.ones(count)
-    return Matches(np.zeros((count, 3)), np.zeros((count, 3)), ones, 0.4 * ones, np.arange(count))
-
-
 @pytest.mark.parametrize(
     ("inner", "whole", "found"),
     [(10, 50, 10), (9, 50, 50), (9, 10, 10), (9, 9, None), (0, 0, None)],
@@ -178,7 +173,9 @@ def test_rims_are_asked_where_the_inner_parts_share_too_little(
 
     def match(source: str, target: str, here: int, there: int, reach_mm: float) -> Matches:
         assert (source, here, there, reach_mm) == (target, 1, 2, 5.0)
-        return matches(counts[source])
+        count = counts[source]
+        nowhere, ones = np.zeros((count, 3)), np.ones(count)
+        return Matches(nowhere, nowhere, ones, 0.4 * ones, np.arange(count))
 
     monkeypatch.setattr(overlaps, "match_projected", match)
     told = match_overlap(both, both, here, there, 5.0, 10)

@@ -116,7 +116,10 @@ def test_a_browser_shows_the_image_inside_a_glb(texture: Texture, tmp_path: Path
 
 @pytest.mark.parametrize("frame", ["rig", "body"])
 def test_a_scan_with_a_texture(frame: str, tmp_path: Path) -> None:
-    cloud = BodyCloud(*sprinkle_cloud(ball()))
+    points, colours = sprinkle(ball())
+    flat = np.zeros(len(points), np.float32)
+    normals = np.zeros_like(points, np.float32)
+    cloud = BodyCloud(points, normals, flat, colours, flat.astype(np.uint8))
     scan = StoredScan(cloud, ball(), {"subject": "S-0042", "calibration_id": "3f2a"})
     chosen = ["stl", "obj", "glb"]
     written = export_scan(scan, tmp_path, chosen, ["textured"], texture_px=SIZE, frame=frame)
@@ -134,12 +137,6 @@ def test_a_scan_with_a_texture(frame: str, tmp_path: Path) -> None:
     assert np.abs(found - paint(places)).max() < TOLERANCE
     with pytest.raises(BadInput, match="stl holds no texture"):
         export_scan(scan, tmp_path, ["stl"], ["textured"])
-
-
-def sprinkle_cloud(mesh: BodyMesh) -> tuple[Any, ...]:
-    points, colours = sprinkle(mesh)
-    flat = np.zeros(len(points), np.float32)
-    return points, np.zeros_like(points, np.float32), flat, colours, flat.astype(np.uint8)
 
 
 def test_without_the_library_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -151,18 +151,13 @@ def test_a_rim_keeps_its_pixels_and_what_juts_out_of_it_goes() -> None:
 NAN = np.float32(np.nan)
 
 
-def depth_of(patch: int) -> np.ndarray:
+@pytest.mark.parametrize(("patch", "kept"), [(49, 0), (51, 51)])
+def test_patches_of_fewer_pixels_are_speckles(patch: int, kept: int) -> None:
     """A patch of so many pixels, a gap and a wall of 300."""
     depth = np.full((20, 30), NAN)
     depth[:, 15:] = 1000.0
-    rows, columns = np.divmod(np.arange(patch), 10)
-    depth[rows, columns] = 1000.0
-    return depth
-
-
-@pytest.mark.parametrize(("patch", "kept"), [(49, 0), (51, 51)])
-def test_patches_of_fewer_pixels_are_speckles(patch: int, kept: int) -> None:
-    found = drop_speckles(depth_of(patch), 4.0, 50.0)
+    depth[np.divmod(np.arange(patch), 10)] = 1000.0
+    found = drop_speckles(depth, 4.0, 50.0)
     assert found[:, :10].sum() == kept
     assert found[:, 15:].all()
     assert not found[:, 10:15].any(), "nothing was measured there"

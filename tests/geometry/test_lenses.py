@@ -154,10 +154,6 @@ def test_a_lens_of_opencvs_is_read_as_it_was_written(lens: Lens) -> None:
     assert np.allclose(found.distort(ideal), lens.distort(ideal), rtol=0.0, atol=1e-15)
 
 
-def fields() -> dict[str, Any]:
-    return camera_to_fields(Camera(600.0, 601.0, 0.0, 320.0, 240.0, LENSES["radial"](), 640, 480))
-
-
 @pytest.mark.parametrize("lens", [Brown(p1=0.01, p2=-0.02), Rational(p1=0.01, p2=-0.02)])
 def test_points_in_whole_numbers_are_distorted_as_others_are(lens: Lens) -> None:
     whole = np.array([[0, 0], [1, 0], [0, -1]])
@@ -175,8 +171,10 @@ def test_points_in_whole_numbers_are_distorted_as_others_are(lens: Lens) -> None
     ],
 )
 def test_fields_of_no_camera_are_refused(changed: dict[str, Any], message: str) -> None:
+    camera = Camera(600.0, 601.0, 0.0, 320.0, 240.0, LENSES["radial"](), 640, 480)
+    fields = camera_to_fields(camera) | changed
     with pytest.raises(ValueError, match=message):
-        camera_from_fields({k: v for k, v in (fields() | changed).items() if v is not None})
+        camera_from_fields({k: v for k, v in fields.items() if v is not None})
 
 
 def test_a_coefficient_that_lenses_share_is_as_likely_large_in_each() -> None:

@@ -131,14 +131,6 @@ def test_a_pair_is_the_frame_at_its_nominal_pose_or_as_it_is() -> None:
         find_rig_from_root(described, {"p": SOMEWHERE}, {})
 
 
-def looking_in(**places: tuple[float, float, float]) -> dict[str, RigidTransform]:
-    """Cameras in the rig frame."""
-    return {
-        name: nominal_pose(NominalPose(position_mm=place, look_at_mm=(0, 0, 800)))
-        for name, place in places.items()
-    }
-
-
 TWO_FACES = {**PLAIN, "faces": 2, "thickness_mm": 5.0}
 PLACES: dict[str, tuple[float, float, float]] = {"p": (1400, 200, 900), "q": (-900, 1000, 1500)}
 
@@ -157,7 +149,10 @@ def test_of_all_readings_of_a_plain_board_the_one_that_puts_cameras_where_they_s
     turn = board_symmetries(described.boards[0])[read]
     axes = np.diag([1.0, -1.0, -1.0])  # the default: columns along x, face up
     lies = RigidTransform(axes, np.zeros(3))
-    cameras = {name: SOMEWHERE @ placing for name, placing in looking_in(**PLACES).items()}
+    cameras = {
+        name: SOMEWHERE @ nominal_pose(NominalPose(position_mm=place, look_at_mm=(0, 0, 800)))
+        for name, place in PLACES.items()
+    }
     # What was seen is the board as it lies, read in one of its ways.
     seen = {("s1", "b"): SOMEWHERE @ lies @ turn}
     found = find_frame_board_rotation(described, cameras, seen)

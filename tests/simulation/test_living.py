@@ -122,16 +122,6 @@ def test_a_wrong_change_is_named(change: str, message: str) -> None:
         settings_for("mirror", changes=[change])
 
 
-def test_every_number_can_be_changed() -> None:
-    changes = ["person.breath_mm=5", "pace.start=poles", "projection.mirror_offset_mm=[1, 2]"]
-    settings = settings_for("pinhole", subject="restless", changes=changes)
-    assert settings.person.breath_mm == 5.0
-    assert settings.person.sway_mm_s == 14.0
-    assert settings.pace.start == "poles"
-    assert settings.projection.mirror_offset_mm == (1.0, 2.0)
-    assert settings.projection.kind == "pinhole"
-
-
 @pytest.mark.slow
 def test_what_moves_is_seen_where_it_is_when_each_frame_is_taken() -> None:
     """A white square before a dark wall: frame by frame its image is that of a still one there."""

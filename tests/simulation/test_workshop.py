@@ -25,9 +25,12 @@ def test_a_workshop_is_not_ideal_and_every_number_stays_free() -> None:
     for part in ("optics", "projection", "lighting", "noise", "board"):
         assert getattr(ideal, part) != getattr(workshop, part)
     assert workshop.person == ideal.person
-    changed = settings_for("pinhole", preset="workshop", changes=["board.warp_mm=[0, 0]"])
+    changes = ["person.breath_mm=5", "pace.start=poles", "board.warp_mm=[0, 0]"]
+    changed = settings_for("pinhole", preset="workshop", subject="restless", changes=changes)
+    assert (changed.person.breath_mm, changed.person.sway_mm_s) == (5.0, 14.0)
+    assert changed.pace.start == "poles"
     assert changed.board.warp_mm == (0.0, 0.0)
-    assert changed.projection.gamma == 2.2
+    assert (changed.projection.kind, changed.projection.gamma) == ("pinhole", 2.2)
     with pytest.raises(BadInput, match="no preset 'garage' to simulate"):
         settings_for("mirror", preset="garage")
 
