@@ -142,6 +142,10 @@ def format_report(report: CheckReport) -> list[str]:
     rig = report.rig
     counts = f"{_format_count(len(rig.pairs), 'pair')}, {_format_count(len(rig.boards), 'board')}"
     lines = [f"{report.rig_path}: rig {rig.name}: {counts}", *map(str, report.folders)]
+    for board in rig.boards:
+        squares = f"{board.columns} x {board.rows} squares of {board.square_mm:g} mm"
+        size = "{:g} x {:g} mm".format(*board.size_mm)
+        lines.append(f"board {board.name}: {squares}, {size} in all: every length rests on it")
     shots = _format_count(len(report.shots), "calibration shot")
     lines.append(f"{shots}, {_format_count(report.images, 'image')}")
     width = max(len(pair.name) for pair in rig.pairs)
