@@ -198,15 +198,24 @@ def measure(
         Path | None,
         typer.Option(help="With --named: also write the landmarks to this .csv, .json or .lnd."),
     ] = None,
+    since: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="EARLIER", help="With --named: also say what changed since this earlier scan."
+        ),
+    ] = None,
     anyway: Anyway = False,
 ) -> None:
     """Measure a scan's mesh: stature, girths of horizontal slices, volume, area."""
     from bodyscan.files.atomic import write_json
     from bodyscan.fusion.storage import load_scan, refuse_own_file, refuse_repeat
+    from bodyscan.measurement.changes import Changes, find_changes
     from bodyscan.measurement.measurements import heights_from
     from bodyscan.measurement.measurements import measure as measure_mesh
+    from bodyscan.measurement.named import measure_by_name
     from bodyscan.report.measurement_table import (
         MEASUREMENTS,
+        changes_table,
         measurements_document,
         require_formats,
         tables,
@@ -215,15 +224,20 @@ def measure(
     )
 
     path = out or result / MEASUREMENTS
-    require_formats(path, landmarks, named=named)
+    require_formats(path, landmarks, since, named=named)
     for file in filter(None, (path, landmarks)):
         refuse_own_file(file, result)
     stored, levels = load_scan(result), None if heights is None else heights_from(heights)
     if not anyway:
         refuse_repeat(result, stored.facts)
-    measured = measure_mesh(stored.mesh, levels, named=named)
-    content = measurements_document(measured, stored.facts)
-    write_measurements(path, measured, stored.facts)
+    earlier = None if since is None else _load_earlier(since, stored, anyway=anyway)
+    measured, changes = measure_mesh(stored.mesh, levels, named=named), None
+    if earlier is not None and measured.named is not None:
+        same = stored.facts.get("calibration_id") == earlier.facts.get("calibration_id")
+        found = find_changes(measure_by_name(earlier.mesh), measured.named)
+        changes = Changes(earlier.facts.get("when"), same, found)
+    content = measurements_document(measured, stored.facts, changes)
+    write_measurements(path, measured, stored.facts, changes)
     written = [path]
     if landmarks is not None and measured.named is not None:
         write_landmarks(landmarks, measured.named, stored.facts)
@@ -232,6 +246,8 @@ def measure(
         # As beside an export, so that `bodyscan forget` knows whose it is.
         write_json(one.with_name(f"{one.name}.json"), {"subject": content["subject"]})
     output.show(*tables(measured))
+    if changes is not None:
+        output.show(changes_table(changes))
     _show_grade(output, stored)
     output.figures(**content)
     output.add_files("measurements", *written)
@@ -294,6 +310,20 @@ def export(
     for path in written:
         output.add_files("export", path)
     output.say(f"PLY, OBJ and STL are in mm, {up} up; GLB is in metres, y up")
+
+
+def _load_earlier(folder: Path, later: StoredScan, *, anyway: bool) -> StoredScan:
+    """Load an earlier scan of the same person. Raises BadInput if it is of another."""
+    from bodyscan.fusion.storage import load_scan, refuse_repeat
+
+    earlier = load_scan(folder)
+    if not anyway:
+        refuse_repeat(folder, earlier.facts)
+    one, other = (scan.facts.get("subject") for scan in (earlier, later))
+    if one != other and not anyway:
+        what = f"it is of {one or 'nobody named'}, the later scan of {other or 'nobody named'}"
+        raise BadInput(what, where=str(folder), remedy="Give two scans of one person, or --anyway.")
+    return earlier
 
 
 def _show_grade(output: Output, scan: StoredScan) -> None:

@@ -30,6 +30,7 @@ import yaml
 from scipy.spatial import ConvexHull
 
 from bodyscan.arrays import Array
+from bodyscan.body_model.fitting import BASIS_MM
 from bodyscan.body_model.registered import RegisteredBody, register_body
 from bodyscan.measurement.landmarks import Landmark, find_landmarks
 from bodyscan.measurement.posture import Posture, find_posture
@@ -50,8 +51,8 @@ class Measure:
     kind: str  # one of those above
     mm: float
     interval_mm: tuple[float, float]
-    # Share of what the tape touches that was measured; with less than MIN_MEASURED the measure is
-    # the interval rather than the value.
+    # Share of what the tape touches, or of both ends of a breadth or depth, that was measured; with
+    # less than MIN_MEASURED the measure is the interval rather than the value.
     measured: float
     standard: str
     clause: str
@@ -242,9 +243,12 @@ def _extent(body: _Body, definition: Mapping[str, Any], shift_mm: float) -> _Tak
     cut = _cut(body, definition, UP, [level + shift_mm])[0]
     axis = 0 if definition["kind"] == "depth" else 1
     values = cut.points[:, axis]
-    path = cut.positions[[int(values.argmin()), int(values.argmax())]]
+    ends = [int(values.argmin()), int(values.argmax())]
+    path = cut.positions[ends]
     path[:, 1 - axis] = path[:, 1 - axis].mean()
-    return _Taken(float(np.ptp(values)), cut.measured, cut.sigma_mm / np.pi, path)
+    measured = float(cut.observed[ends].mean())
+    sigma_mm = np.hypot(cut.sigma_mm / np.pi, 2.0 * BASIS_MM * (1.0 - measured))
+    return _Taken(float(np.ptp(values)), measured, float(sigma_mm), path)
 
 
 def _cut(

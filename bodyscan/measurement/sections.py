@@ -85,7 +85,7 @@ class BodySections:
         )
 
     def cut(self, normal: Array, level_mm: float, parts: str | Sequence[str]) -> Section | None:
-        """Section of the largest loop that has these parts, by the plane square to a normal (3,);
+        """Section of the loop that has most of these parts, by the plane square to a normal (3,);
         None if none has."""
         axes, scan, template = self._find_slicers(normal)
         names = [parts] if isinstance(parts, str) else parts
@@ -138,13 +138,16 @@ class BodySections:
 def _select(
     loops: Sequence[Loop], face_parts: Bytes, wanted: Sequence[int]
 ) -> tuple[Loop, Mask] | None:
-    """The largest loop with more than a rim of the wanted parts, and which segments are theirs."""
-    for loop in loops:
-        mine = np.isin(face_parts[loop.faces], wanted)
-        length = loop.lengths[mine].sum()
-        # A limb by itself has some faces named after its neighbours.
-        if length > 0.8 * loop.girth_mm:
-            mine[:] = True
-        if length > 50.0:
-            return loop, mine
-    return None
+    """The loop with most of the wanted parts, and which segments are theirs; None if that is a rim.
+
+    The other thigh has some of the trunk above it, so the first loop that has any may be wrong.
+    """
+    shares = [np.isin(face_parts[loop.faces], wanted) for loop in loops]
+    lengths = [loop.lengths[mine].sum() for loop, mine in zip(loops, shares, strict=True)]
+    best = int(np.argmax(lengths)) if lengths else 0
+    if not lengths or lengths[best] <= 50.0:
+        return None
+    # A limb by itself has some faces named after its neighbours.
+    if lengths[best] > 0.8 * loops[best].girth_mm:
+        shares[best][:] = True
+    return loops[best], shares[best]

@@ -16,6 +16,7 @@ from bodyscan.errors import BadInput
 from bodyscan.files.atomic import json_text, write_json, write_text
 from bodyscan.files.messages import require_suffix
 from bodyscan.fusion.storage import StoredScan
+from bodyscan.measurement.changes import Changes
 from bodyscan.measurement.measurements import Measurements, measure
 from bodyscan.measurement.named import MIN_MEASURED, Measure, NamedMeasures, read_definitions
 from bodyscan.measurement.outline import Range
@@ -106,6 +107,23 @@ def _named_table(named: NamedMeasures) -> Table:
     return table
 
 
+def changes_table(changes: Changes) -> Table:
+    """Changes since an earlier scan with their 95 % intervals, those that are certain marked."""
+    scale = "" if changes.same_calibration else " (of other calibrations: their scales may differ)"
+    table = Table(title=f"changes since {changes.when or 'the earlier scan'}, mm{scale}")
+    for heading in ("measure", "change", "95 %", "changed"):
+        table.add_column(heading, justify="right" if heading in ("change", "95 %") else "left")
+    for one in changes.measures:
+        low, high = one.interval_mm
+        changed = one.reason or ("certainly" if one.is_certain else "")
+        style = "bold" if one.is_certain else ""
+        cells = f"{one.mm:+.1f}", f"{low:+.0f} to {high:+.0f}"
+        table.add_row(one.name, *cells, changed, style=style)
+    return table
+
+
+CHANGE_COLUMNS = ("since", "change", "change_low", "change_high", "changed")
+"""Of a table of measures by name, after the others, if an earlier scan was given."""
 MEASURE_COLUMNS = (
     *("subject", "when", "verdict", "name", "value", "low", "high", "unit", "measured"),
     *("standard", "clause", "stance", "definition", "reason"),
@@ -113,12 +131,18 @@ MEASURE_COLUMNS = (
 """Of a table of measures by name: one row for each person and measure."""
 
 
-def named_csv(named: NamedMeasures | str, facts: Mapping[str, Any]) -> str:
+def named_csv(
+    named: NamedMeasures | str,
+    facts: Mapping[str, Any],
+    changes: Changes | None = None,
+) -> str:
     """Named measures as CSV: a row for each, lengths in mm; no value where it is a range, neither value
     nor interval where it could not be taken, for a reason.
 
-    named: or the reason why there are none. facts: of the scan, as in its scan.json.
+    named: or the reason why there are none. facts: of the scan, as in its scan.json. changes: since an
+        earlier scan, if one was given.
     """
+    by_name = {change.name: change for change in changes.measures} if changes else {}
     verdict = (facts.get("verdict") or {}).get("grade")
     scan = {"subject": facts.get("subject"), "when": facts.get("when"), "verdict": verdict}
     rows = []
@@ -132,8 +156,12 @@ def named_csv(named: NamedMeasures | str, facts: Mapping[str, Any]) -> str:
                 value = None if measure.is_range else round(measure.mm, 1)
                 row |= {"value": value, "low": low, "high": high, "stance": measure.stance}
                 row["measured"] = round(measure.measured, 3)
+        if change := by_name.get(definition["name"]):
+            ends = (round(value, 1) for value in (change.mm, *change.interval_mm))
+            row |= dict(zip(CHANGE_COLUMNS[1:], (*ends, change.is_certain), strict=True))
+            row["since"] = changes and changes.when
         rows.append(row)
-    return _write_csv(MEASURE_COLUMNS, rows)
+    return _write_csv(MEASURE_COLUMNS + (CHANGE_COLUMNS if changes else ()), rows)
 
 
 def landmarks_csv(named: NamedMeasures, facts: Mapping[str, Any]) -> str:
@@ -169,9 +197,13 @@ def landmarks_json(named: NamedMeasures, facts: Mapping[str, Any]) -> str:
 LANDMARK_FORMATS = {".csv": landmarks_csv, ".json": landmarks_json, ".lnd": landmarks_lnd}
 
 
-def require_formats(path: Path, landmarks: Path | None, *, named: bool) -> None:
+def require_formats(
+    path: Path, landmarks: Path | None, since: Path | None = None, *, named: bool
+) -> None:
     """Raise BadInput if measurements or landmarks are not written to such files, or none are found."""
     require_suffix(path, (".json", ".csv"), "measurements")
+    if since is not None and not named:
+        raise BadInput("--since needs --named, whose measures it compares", remedy="give both")
     if landmarks is not None:
         require_suffix(landmarks, LANDMARK_FORMATS, "landmarks")
         if not named:
@@ -183,12 +215,17 @@ def write_landmarks(path: Path, named: NamedMeasures, facts: Mapping[str, Any]) 
     write_text(path, LANDMARK_FORMATS[path.suffix.lower()](named, facts))
 
 
-def write_measurements(path: Path, measured: Measurements, facts: Mapping[str, Any]) -> None:
-    """Write measurements as JSON, or as CSV if the path's suffix says so."""
+def write_measurements(
+    path: Path,
+    measured: Measurements,
+    facts: Mapping[str, Any],
+    changes: Changes | None = None,
+) -> None:
+    """Write measurements as JSON, or as CSV if the path's suffix says so, with changes if any."""
     if path.suffix.lower() == ".csv":
-        write_text(path, measurements_csv(measured, facts))
+        write_text(path, measurements_csv(measured, facts, changes))
     else:
-        write_json(path, measurements_document(measured, facts))
+        write_json(path, measurements_document(measured, facts, changes))
 
 
 def write_measures(stored: StoredScan, folder: Path) -> str:
@@ -216,8 +253,13 @@ def _write_csv(columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str
     return text.getvalue()
 
 
-def measurements_document(measured: Measurements, facts: Mapping[str, Any]) -> dict[str, Any]:
-    """Content of `measurements.json`; facts: of the scan, as in its scan.json."""
+def measurements_document(
+    measured: Measurements,
+    facts: Mapping[str, Any],
+    changes: Changes | None = None,
+) -> dict[str, Any]:
+    """Content of `measurements.json`; facts: of the scan, as in its scan.json; changes, as in
+    `named_csv`."""
     named = measured.named
     by_name = named and {
         "landmarks": [asdict(landmark) for landmark in named.landmarks.values()],
@@ -240,18 +282,29 @@ def measurements_document(measured: Measurements, facts: Mapping[str, Any]) -> d
         "rig_from_body": measured.rig_from_body.matrix,
         "slices": [asdict(level) for level in measured.slices],
         **(by_name or {}),
+        **(_describe_changes(changes) if changes else {}),
     }
+
+
+def _describe_changes(changes: Changes) -> dict[str, Any]:
+    earlier = {"when": changes.when, "same_calibration": changes.same_calibration}
+    described = [asdict(one) | {"is_certain": one.is_certain} for one in changes.measures]
+    return {"since": earlier, "changes": described}
 
 
 def _describe(measure: Measure) -> dict[str, Any]:
     return asdict(measure) | {"path_mm": np.round(measure.path_mm, 1)}
 
 
-def measurements_csv(measured: Measurements, facts: Mapping[str, Any]) -> str:
+def measurements_csv(
+    measured: Measurements,
+    facts: Mapping[str, Any],
+    changes: Changes | None = None,
+) -> str:
     """Measurements as CSV: `Measurements.to_records`, each with the scan's subject, date and grade; or
     those by name, if they were asked for."""
     if measured.named is not None:
-        return named_csv(measured.named, facts)
+        return named_csv(measured.named, facts, changes)
     scan = {"subject": facts.get("subject"), "when": facts.get("when")}
     scan["grade"] = (facts.get("verdict") or {}).get("grade")
     records = [scan | record for record in measured.to_records()]

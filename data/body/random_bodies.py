@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import anny
 import numpy as np
@@ -21,9 +22,13 @@ from scipy.spatial.transform import Rotation
 from bodyscan.body_model.registered import RegisteredBody
 from bodyscan.body_model.template import load_template
 from bodyscan.mesh.body import BodyMesh
+from bodyscan.rig.rig import load_rig
 
 Array = NDArray[np.float64]
 TEMPLATE = load_template()
+RIG = Path(__file__).parents[2] / "rigs" / "three-pole-12.yaml"
+FIELD = (0.42, 0.34)
+"""Tangents of half the fields of view, across and upwards, as the simulator's devices have."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,8 +135,8 @@ def make_bodies(seeds: Sequence[int]) -> Iterator[RandomBody]:
 
 
 def scan_body(body: RandomBody) -> BodyMesh:
-    """The mesh of a scan: other vertices, 0.3 mm of noise over 20 mm, filled where three poles of four
-    cameras see nothing."""
+    """The mesh of a scan: other vertices, 0.3 mm of noise over 20 mm, filled where three-pole-12 sees
+    nothing."""
     rng = np.random.default_rng(body.seed + 10_000)
     mesh = o3d.geometry.TriangleMesh(
         o3d.utility.Vector3dVector(body.vertices), o3d.utility.Vector3iVector(body.faces)
@@ -161,19 +166,24 @@ def _find_seen(vertices: Array, faces: NDArray[np.int64], normals: Array) -> NDA
     corners = o3d.core.Tensor(faces.astype(np.uint32))
     scene.add_triangles(o3d.core.Tensor(vertices.astype(np.float32)), corners)
     seen = np.zeros(len(vertices), bool)
-    for azimuth in np.radians([0.0, 120.0, 240.0]):
-        for height in (350.0, 800.0, 1250.0, 1700.0):
-            both = np.ones(len(vertices), bool)
-            for off in (-0.1, 0.1):
-                place = 1500.0 * np.array([np.cos(azimuth + off), np.sin(azimuth + off), 0.0])
-                to = place + [0.0, 0.0, height] - vertices
-                distance = np.linalg.norm(to, axis=1)
-                both &= np.einsum("vi,vi->v", to, normals) > 0.26 * distance
-                start = np.flatnonzero(both)
-                rays = np.hstack([vertices + 1.0 * normals, to / distance[:, None]])[start]
-                hit = scene.cast_rays(o3d.core.Tensor(rays.astype(np.float32)))["t_hit"].numpy()
-                both[start] = np.isinf(hit)
-            seen |= both
+    for pair in load_rig(RIG).pairs:
+        both = np.ones(len(vertices), bool)
+        for device in (pair.nominal, pair.projector_nominal):
+            to = np.array(device.position_mm) - vertices
+            distance = np.linalg.norm(to, axis=1)
+            forward = np.subtract(device.look_at_mm, device.position_mm)
+            forward /= np.linalg.norm(forward)
+            across = np.cross(forward, [0.0, 0.0, 1.0])
+            across /= np.linalg.norm(across)
+            depth = -to @ forward
+            both &= np.abs(to @ across) < FIELD[0] * depth
+            both &= np.abs(to @ np.cross(across, forward)) < FIELD[1] * depth
+            both &= np.einsum("vi,vi->v", to, normals) > 0.26 * distance
+            start = np.flatnonzero(both)
+            rays = np.hstack([vertices + 1.0 * normals, to / distance[:, None]])[start]
+            hit = scene.cast_rays(o3d.core.Tensor(rays.astype(np.float32)))["t_hit"].numpy()
+            both[start] = np.isinf(hit)
+        seen |= both
     return seen
 
 

@@ -13,7 +13,9 @@ from bodyscan.body_model.registered import RegisteredBody
 from bodyscan.errors import BadInput
 from bodyscan.export.scan import transform_mesh
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.measurement.changes import find_changes
 from bodyscan.measurement.named import measure_by_name, read_definitions, take_measures
+from bodyscan.measurement.sections import UP, BodySections
 from bodyscan.mesh.body import BodyMesh
 
 
@@ -77,6 +79,28 @@ def test_a_web_between_arm_and_trunk_is_no_part_of_a_girth() -> None:
     assert found["bust girth"].measured < 0.95
 
 
+def test_a_thigh_is_not_the_trunk_above_the_other_one() -> None:
+    body = register_exactly(*make_body(4))
+    crotch = body.fitted.vertices[TEMPLATE.landmarks["crotch"]][2]
+    for below in (10.0, 25.0):
+        left, right = (
+            BodySections(body).cut(UP, crotch - below, [f"{side} thigh", "trunk"])
+            for side in ("left", "right")
+        )
+        assert left is not None
+        assert right is not None
+        assert left.tape_mm == pytest.approx(right.tape_mm, rel=0.1)
+
+
+def test_a_depth_is_measured_where_its_ends_are() -> None:
+    body = register_exactly(*make_body(3))
+    above = body.fitted.vertices[:, 2] - body.fitted.vertices[TEMPLATE.landmarks["left waist"]][2]
+    flanks = (np.abs(body.mesh.normals[:, 1]) > 0.8) & (np.abs(above) < 100.0)
+    found = take_measures(hide(body, flanks)).measures
+    assert found["waist depth"].measured == 1.0
+    assert found["waist breadth"].measured == 0.0
+
+
 def test_a_girth_of_which_a_tenth_was_not_seen_is_a_range() -> None:
     body = register_exactly(*make_body(3))
     above = body.fitted.vertices[:, 2] - body.fitted.vertices[TEMPLATE.landmarks["left waist"]][2]
@@ -92,3 +116,20 @@ def test_a_measure_that_wants_other_arms_is_marked() -> None:
         named = take_measures(register_exactly(*make_body(3, arms_deg=arms_deg)))
         assert ("arms down" in named.measures["bust girth"].stance) == departs
         assert "arms down" not in named.measures["left calf girth"].stance
+
+
+def test_changes_that_are_certain_exceed_both_scans_errors() -> None:
+    body = register_exactly(*make_body(3))
+    earlier, above = take_measures(body), body.vertices[:, 2]
+    waist = body.fitted.vertices[TEMPLATE.landmarks["left waist"]][2]
+    belly = np.exp(-(((above - waist) / 60.0) ** 2)) * (
+        body.parts == TEMPLATE.part_names.index("trunk")
+    )
+    grown = body.mesh.vertices + 12.0 * belly[:, None] * body.mesh.normals
+    later = take_measures(replace(body, mesh=replace(body.mesh, vertices=grown)))
+    changes = {one.name: one for one in find_changes(earlier, later)}
+    assert changes["waist girth"].mm == pytest.approx(75.0, abs=8.0)
+    assert changes["waist girth"].is_certain
+    low, high = changes["left calf girth"].interval_mm
+    assert low < 0.0 < high
+    assert not changes["left calf girth"].is_certain
