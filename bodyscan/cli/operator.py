@@ -37,6 +37,8 @@ if TYPE_CHECKING:
     from bodyscan.jobs.object_storage import Store
     from bodyscan.jobs.pipeline import Pipeline
     from bodyscan.jobs.supervision import Listen
+    from bodyscan.measurement.changes import Changes
+    from bodyscan.measurement.measurements import Measurements
 
 PANEL = "Operator: scan people"
 DEFAULTS = ScanSettings()
@@ -209,10 +211,8 @@ def measure(
     """Measure a scan's mesh: stature, girths of horizontal slices, volume, area."""
     from bodyscan.files.atomic import write_json
     from bodyscan.fusion.storage import load_scan, refuse_own_file, refuse_repeat
-    from bodyscan.measurement.changes import Changes, find_changes
     from bodyscan.measurement.measurements import heights_from
     from bodyscan.measurement.measurements import measure as measure_mesh
-    from bodyscan.measurement.named import measure_by_name
     from bodyscan.report.measurement_table import (
         MEASUREMENTS,
         changes_table,
@@ -231,11 +231,8 @@ def measure(
     if not anyway:
         refuse_repeat(result, stored.facts)
     earlier = None if since is None else _load_earlier(since, stored, anyway=anyway)
-    measured, changes = measure_mesh(stored.mesh, levels, named=named), None
-    if earlier is not None and measured.named is not None:
-        same = stored.facts.get("calibration_id") == earlier.facts.get("calibration_id")
-        found = find_changes(measure_by_name(earlier.mesh), measured.named)
-        changes = Changes(earlier.facts.get("when"), same, found)
+    measured = measure_mesh(stored.mesh, levels, named=named)
+    changes = None if earlier is None else _compare(earlier, stored, measured)
     content = measurements_document(measured, stored.facts, changes)
     write_measurements(path, measured, stored.facts, changes)
     written = [path]
@@ -324,6 +321,18 @@ def _load_earlier(folder: Path, later: StoredScan, *, anyway: bool) -> StoredSca
         what = f"it is of {one or 'nobody named'}, the later scan of {other or 'nobody named'}"
         raise BadInput(what, where=str(folder), remedy="Give two scans of one person, or --anyway.")
     return earlier
+
+
+def _compare(earlier: StoredScan, later: StoredScan, measured: Measurements) -> Changes | None:
+    """Changes of the named measures since an earlier scan, if they were taken."""
+    from bodyscan.measurement.changes import Changes, find_changes
+    from bodyscan.measurement.named import measure_by_name
+
+    if measured.named is None:
+        return None
+    one, other = (scan.facts.get("calibration_id") for scan in (earlier, later))
+    found = find_changes(measure_by_name(earlier.mesh), measured.named)
+    return Changes(earlier.facts.get("when"), one == other, found)
 
 
 def _show_grade(output: Output, scan: StoredScan) -> None:

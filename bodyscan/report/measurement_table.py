@@ -122,8 +122,6 @@ def changes_table(changes: Changes) -> Table:
     return table
 
 
-CHANGE_COLUMNS = ("since", "change", "change_low", "change_high", "changed")
-"""Of a table of measures by name, after the others, if an earlier scan was given."""
 MEASURE_COLUMNS = (
     *("subject", "when", "verdict", "name", "value", "low", "high", "unit", "measured"),
     *("standard", "clause", "stance", "definition", "reason"),
@@ -142,6 +140,7 @@ def named_csv(
     named: or the reason why there are none. facts: of the scan, as in its scan.json. changes: since an
         earlier scan, if one was given.
     """
+    of_change = ("since", "change", "change_low", "change_high", "changed")
     by_name = {change.name: change for change in changes.measures} if changes else {}
     verdict = (facts.get("verdict") or {}).get("grade")
     scan = {"subject": facts.get("subject"), "when": facts.get("when"), "verdict": verdict}
@@ -158,10 +157,10 @@ def named_csv(
                 row["measured"] = round(measure.measured, 3)
         if change := by_name.get(definition["name"]):
             ends = (round(value, 1) for value in (change.mm, *change.interval_mm))
-            row |= dict(zip(CHANGE_COLUMNS[1:], (*ends, change.is_certain), strict=True))
-            row["since"] = changes and changes.when
+            cells = (changes and changes.when, *ends, change.is_certain)
+            row |= dict(zip(of_change, cells, strict=True))
         rows.append(row)
-    return _write_csv(MEASURE_COLUMNS + (CHANGE_COLUMNS if changes else ()), rows)
+    return _write_csv(MEASURE_COLUMNS + (of_change if changes else ()), rows)
 
 
 def landmarks_csv(named: NamedMeasures, facts: Mapping[str, Any]) -> str:
