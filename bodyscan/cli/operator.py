@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from bodyscan.jobs.object_storage import Store
     from bodyscan.jobs.pipeline import Pipeline
     from bodyscan.jobs.supervision import Listen
-    from bodyscan.measurement.changes import Changes
+    from bodyscan.measurement.changes import MeasureChanges
     from bodyscan.measurement.measurements import Measurements
 
 PANEL = "Operator: scan people"
@@ -323,16 +323,18 @@ def _load_earlier(folder: Path, later: StoredScan, *, anyway: bool) -> StoredSca
     return earlier
 
 
-def _compare(earlier: StoredScan, later: StoredScan, measured: Measurements) -> Changes | None:
+def _compare(
+    earlier: StoredScan, later: StoredScan, measured: Measurements
+) -> MeasureChanges | None:
     """Changes of the named measures since an earlier scan, if they were taken."""
-    from bodyscan.measurement.changes import Changes, find_changes
+    from bodyscan.measurement.changes import MeasureChanges, find_changes
     from bodyscan.measurement.named import measure_by_name
 
     if measured.named is None:
         return None
     one, other = (scan.facts.get("calibration_id") for scan in (earlier, later))
     found = find_changes(measure_by_name(earlier.mesh), measured.named)
-    return Changes(earlier.facts.get("when"), one == other, found)
+    return MeasureChanges(earlier.facts.get("when"), one == other, found)
 
 
 def _show_grade(output: Output, scan: StoredScan) -> None:

@@ -27,7 +27,7 @@ class Change:
 
 
 @dataclass(frozen=True)
-class Changes:
+class MeasureChanges:
     """Changes since an earlier scan."""
 
     when: str | None  # of the earlier scan

@@ -16,7 +16,7 @@ from bodyscan.errors import BadInput
 from bodyscan.files.atomic import json_text, write_json, write_text
 from bodyscan.files.messages import require_suffix
 from bodyscan.fusion.storage import StoredScan
-from bodyscan.measurement.changes import Changes
+from bodyscan.measurement.changes import MeasureChanges
 from bodyscan.measurement.measurements import Measurements, measure
 from bodyscan.measurement.named import MIN_MEASURED, Measure, NamedMeasures, read_definitions
 from bodyscan.measurement.outline import Range
@@ -107,7 +107,7 @@ def _named_table(named: NamedMeasures) -> Table:
     return table
 
 
-def changes_table(changes: Changes) -> Table:
+def changes_table(changes: MeasureChanges) -> Table:
     """Changes since an earlier scan with their 95 % intervals, those that are certain marked."""
     scale = "" if changes.same_calibration else " (of other calibrations: their scales may differ)"
     table = Table(title=f"changes since {changes.when or 'the earlier scan'}, mm{scale}")
@@ -132,7 +132,7 @@ MEASURE_COLUMNS = (
 def named_csv(
     named: NamedMeasures | str,
     facts: Mapping[str, Any],
-    changes: Changes | None = None,
+    changes: MeasureChanges | None = None,
 ) -> str:
     """Named measures as CSV: a row for each, lengths in mm; no value where it is a range, neither value
     nor interval where it could not be taken, for a reason.
@@ -218,7 +218,7 @@ def write_measurements(
     path: Path,
     measured: Measurements,
     facts: Mapping[str, Any],
-    changes: Changes | None = None,
+    changes: MeasureChanges | None = None,
 ) -> None:
     """Write measurements as JSON, or as CSV if the path's suffix says so, with changes if any."""
     if path.suffix.lower() == ".csv":
@@ -255,7 +255,7 @@ def _write_csv(columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str
 def measurements_document(
     measured: Measurements,
     facts: Mapping[str, Any],
-    changes: Changes | None = None,
+    changes: MeasureChanges | None = None,
 ) -> dict[str, Any]:
     """Content of `measurements.json`; facts: of the scan, as in its scan.json; changes, as in
     `named_csv`."""
@@ -285,7 +285,7 @@ def measurements_document(
     }
 
 
-def _describe_changes(changes: Changes) -> dict[str, Any]:
+def _describe_changes(changes: MeasureChanges) -> dict[str, Any]:
     earlier = {"when": changes.when, "same_calibration": changes.same_calibration}
     described = [asdict(one) | {"is_certain": one.is_certain} for one in changes.measures]
     return {"since": earlier, "changes": described}
@@ -298,7 +298,7 @@ def _describe(measure: Measure) -> dict[str, Any]:
 def measurements_csv(
     measured: Measurements,
     facts: Mapping[str, Any],
-    changes: Changes | None = None,
+    changes: MeasureChanges | None = None,
 ) -> str:
     """Measurements as CSV: `Measurements.to_records`, each with the scan's subject, date and grade; or
     those by name, if they were asked for."""
