@@ -192,9 +192,7 @@ def measure(
     ] = None,
     named: Annotated[
         bool,
-        typer.Option(
-            "--named", help="Also lay a body over the scan: landmarks, and measures by name."
-        ),
+        typer.Option("--named", help="Lay a body over the scan: landmarks, measures by name."),
     ] = False,
     landmarks: Annotated[
         Path | None,
@@ -202,20 +200,17 @@ def measure(
     ] = None,
     since: Annotated[
         Path | None,
-        typer.Option(
-            metavar="EARLIER", help="With --named: also say what changed since this earlier scan."
-        ),
+        typer.Option(metavar="EARLIER", help="With --named: what changed since this scan."),
     ] = None,
     anyway: Anyway = False,
 ) -> None:
     """Measure a scan's mesh: stature, girths of horizontal slices, volume, area."""
     from bodyscan.files.atomic import write_json
-    from bodyscan.fusion.storage import load_scan, refuse_own_file, refuse_repeat
+    from bodyscan.fusion.storage import refuse_own_file
     from bodyscan.measurement.measurements import heights_from
     from bodyscan.measurement.measurements import measure as measure_mesh
     from bodyscan.report.measurement_table import (
         MEASUREMENTS,
-        changes_table,
         measurements_document,
         require_formats,
         tables,
@@ -227,10 +222,8 @@ def measure(
     require_formats(path, landmarks, since, named=named)
     for file in filter(None, (path, landmarks)):
         refuse_own_file(file, result)
-    stored, levels = load_scan(result), None if heights is None else heights_from(heights)
-    if not anyway:
-        refuse_repeat(result, stored.facts)
-    earlier = None if since is None else _load_earlier(since, stored, anyway=anyway)
+    levels = None if heights is None else heights_from(heights)
+    stored, earlier = _load_scans(result, since, anyway=anyway)
     measured = measure_mesh(stored.mesh, levels, named=named)
     changes = None if earlier is None else _compare(earlier, stored, measured)
     content = measurements_document(measured, stored.facts, changes)
@@ -242,9 +235,7 @@ def measure(
     for one in (file for file in written if file.suffix != ".json"):
         # As beside an export, so that `bodyscan forget` knows whose it is.
         write_json(one.with_name(f"{one.name}.json"), {"subject": content["subject"]})
-    output.show(*tables(measured))
-    if changes is not None:
-        output.show(changes_table(changes))
+    output.show(*tables(measured, changes))
     _show_grade(output, stored)
     output.figures(**content)
     output.add_files("measurements", *written)
@@ -309,18 +300,24 @@ def export(
     output.say(f"PLY, OBJ and STL are in mm, {up} up; GLB is in metres, y up")
 
 
-def _load_earlier(folder: Path, later: StoredScan, *, anyway: bool) -> StoredScan:
-    """Load an earlier scan of the same person. Raises BadInput if it is of another."""
+def _load_scans(
+    folder: Path, since: Path | None, *, anyway: bool
+) -> tuple[StoredScan, StoredScan | None]:
+    """Load a scan, and an earlier one of the same person if its folder is given. Raises BadInput if it
+    is of another, FailedWork if a scan is to be repeated."""
     from bodyscan.fusion.storage import load_scan, refuse_repeat
 
-    earlier = load_scan(folder)
-    if not anyway:
-        refuse_repeat(folder, earlier.facts)
-    one, other = (scan.facts.get("subject") for scan in (earlier, later))
-    if one != other and not anyway:
-        what = f"it is of {one or 'nobody named'}, the later scan of {other or 'nobody named'}"
-        raise BadInput(what, where=str(folder), remedy="Give two scans of one person, or --anyway.")
-    return earlier
+    later, earlier = load_scan(folder), None if since is None else load_scan(since)
+    for path, scan in ((folder, later), (since, earlier)):
+        if path is not None and scan is not None and not anyway:
+            refuse_repeat(path, scan.facts)
+    if earlier is not None and not anyway:
+        one, other = (scan.facts.get("subject") or "nobody named" for scan in (earlier, later))
+        if one != other:
+            what = f"it is of {one}, the later scan of {other}"
+            remedy = "Give two scans of one person, or --anyway."
+            raise BadInput(what, where=str(since), remedy=remedy)
+    return later, earlier
 
 
 def _compare(

@@ -31,7 +31,7 @@ COPIED = (
 """Fields of `Measurements` that `measurements.json` has as they are."""
 
 
-def tables(measured: Measurements) -> Iterator[Table]:
+def tables(measured: Measurements, changes: MeasureChanges | None = None) -> Iterator[Table]:
     """The whole body, then one row for each part of each slice, from the top down."""
     body = Table("", "", title="body", show_header=False)
     body.columns[1].justify = "right"
@@ -72,6 +72,8 @@ def tables(measured: Measurements) -> Iterator[Table]:
     yield slices
     if measured.named is not None:
         yield _named_table(measured.named)
+    if changes is not None:
+        yield _changes_table(changes)
 
 
 def _name_covered(regions: Mapping[str, float] | None) -> str:
@@ -107,7 +109,7 @@ def _named_table(named: NamedMeasures) -> Table:
     return table
 
 
-def changes_table(changes: MeasureChanges) -> Table:
+def _changes_table(changes: MeasureChanges) -> Table:
     """Changes since an earlier scan with their 95 % intervals, those that are certain marked."""
     scale = "" if changes.same_calibration else " (of other calibrations: their scales may differ)"
     table = Table(title=f"changes since {changes.when or 'the earlier scan'}, mm{scale}")
