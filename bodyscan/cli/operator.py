@@ -182,9 +182,7 @@ def measure(
     result: Result,
     heights: Annotated[
         str | None,
-        typer.Option(
-            help="Heights of slices above the floor in mm, such as 800,1050. Default: every 100."
-        ),
+        typer.Option(help="Heights of slices in mm, such as 800,1050. Default: every 100."),
     ] = None,
     out: Annotated[
         Path | None,
