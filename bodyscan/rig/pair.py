@@ -156,3 +156,5 @@ class Pair(Model):
             yield ("projector_nominal",), "needs a projector: this pair is a camera alone"
         if self.known and self.known.projector and not self.projector:
             yield ("known", "projector"), "needs a projector: this pair is a camera alone"
+        if self.known and self.known.projector and self.projector and self.projector.stripes == 1:
+            yield ("known", "projector"), "is no laser: leave it out, boards calibrate its line"

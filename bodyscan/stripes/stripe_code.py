@@ -126,6 +126,8 @@ class StripeCode(Model):
             yield ("crossing", "crossing"), "is not a key known here: stripes run two ways"
         if not (self.is_projected and self.crossing.is_projected):
             yield ("crossing",), "is for projectors that show images"
+        if 1 in (self.stripes, self.crossing.stripes):
+            yield ("crossing",), "is for projectors: a laser's single line is a pair by itself"
 
     @property
     def needs_lit(self) -> bool:

@@ -112,6 +112,8 @@ CHARUCO = "square_mm: 30, kind: charuco"
         (", stripes: 12", "", "8:16: pairs[0].projector.stripes: is missing"),
         ("{code: gray, stripes: 12, direction: horizontal}", "gray", "projector: must be a mapping"),
         ("code: gray", "code: light-section, inverses: true", "inverses: is for code: gray"),
+        ("code: gray, stripes: 12", "code: light-section, stripes: 1, crossing: {stripes: 4}",
+         "pairs[0].projector.crossing: is for projectors: a laser's single line"),
         ("code: gray", "code: phase-shift, steps: 2", "steps: must be 3 or more or a list (got 2)"),
         ("code: gray", "code: phase-shift, period: 20", "period: must be 12 (stripes) or less (got"),
         ("code: gray, stripes: 12", "code: stripe-index, stripes: 255", "must be 254 or less for s"),
