@@ -60,7 +60,8 @@ def describe_step(code: StripeCode, lit: Greys | None, dark: Greys | None, coded
     another as files do, each pattern before its inverse, or in the best order to show them.
     """
     files = np.arange(sum(code.image_counts.values()))
-    if lit is None or dark is None or len(coded) < len(files):
+    dark = dark if code.uses_dark else np.zeros_like(coded[0])
+    if lit is None or dark is None or not 2 < len(files) <= len(coded):
         return ""
     levels = np.stack([lit, dark, *coded[: len(files)]])[:, ::4, ::4].astype(np.float32)
     contrast = np.ptp(levels, axis=0)
@@ -68,6 +69,10 @@ def describe_step(code: StripeCode, lit: Greys | None, dark: Greys | None, coded
         return ""
     shares = (levels - levels.min(axis=0))[:, contrast > 20.0] / contrast[contrast > 20.0]
     is_lit, is_dark = (np.mean(x, axis=1) > 0.9 for x in (shares > 0.8, shares < 0.2))
+    if not code.uses_dark:  # of a sweep no other image is lit all over
+        late = int(np.argmax(np.delete(is_lit, 1)))
+        late -= (len(files) + 1) * (late > len(files) / 2)
+        return _format_step(late) if late else ""
     by_bit = files.reshape(2, -1).T.ravel() if len(files) % 2 == 0 else files
     orders = [[0, 1, *(2 + np.array(order))] for order in (files, by_bit, code.show_order)]
     early = not is_lit[1]  # begun one early, the lit image is lost; else dark and lit are exchanged
@@ -88,10 +93,13 @@ def describe_step(code: StripeCode, lit: Greys | None, dark: Greys | None, coded
             sound = late < 1 or (not ends[o[-1]] and (not inverted or agree(o, late)))
             begun = is_lit[o[late]] or (late == -1 and early)
             if sound and begun and is_dark[o[late + 1]]:
-                side = f"{abs(late)} {'before' if late > 0 else 'after'}"
-                step = f"the frames are out of step by {abs(late)}: each file holds that {side} its own"
-                return step if late else ""
+                return _format_step(late) if late else ""
     return ""
+
+
+def _format_step(late: int) -> str:
+    side = f"{abs(late)} {'before' if late > 0 else 'after'}"
+    return f"the frames are out of step by {abs(late)}: each file holds that {side} its own"
 
 
 def _decode_direction(

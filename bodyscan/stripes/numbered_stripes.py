@@ -101,11 +101,17 @@ def _blank_flashed(lines: ScanLines) -> tuple[ScanLines, list[int]]:
     """Replace images that other light reached by what is seen without the line; also return which.
 
     Away from its line such an image is brighter than others. Where the line itself fills half of what
-    is lit, which stands on few stripes, the images before and after are as bright.
+    is lit, which stands on few stripes, the images before and after are as bright. Raises DecodingFailed
+    for one that is brighter than lit.
     """
     every = max(1, len(lines.patterns) // SAMPLES)
     reached = lines.lit >= np.median(lines.lit)
     level = np.array([np.median(frame[reached]) for frame in lines.patterns], float)
+    if level.max() > np.median(lines.lit[reached]) + MIN_CONTRAST:
+        raise DecodingFailed(
+            f"the image of stripe {level.argmax()} is brighter than lit all over",
+            remedy="check whether the two are exchanged, or other light reached it",
+        )
     level = np.pad(level - np.median(level), 1)
     neighbour = np.maximum(level[2:], level[:-2])
     flashed = np.flatnonzero((level[1:-1] > MIN_CONTRAST) & (neighbour < 0.5 * level[1:-1]))

@@ -92,6 +92,16 @@ def test_exchanged_images_of_a_sweep_are_named(section: Read, one: int, other: i
         section(exchanged(one, other))
 
 
+@pytest.mark.parametrize("late", [2, -1])
+def test_a_sweep_out_of_step_says_by_how_many(section: Read, late: int) -> None:
+    def change(images: Images) -> None:
+        shown = np.roll(np.stack([images["lit"], *images["coded"]]), late, axis=0)
+        images["lit"], images["coded"] = shown[0], shown[1:]
+
+    with pytest.raises(DecodingFailed, match=f"out of step by {abs(late)}: each file holds"):
+        section(change)
+
+
 def test_images_of_a_sweep_that_are_missing_or_double_are_named(section: Read) -> None:
     with pytest.raises(DecodingFailed, match="stripe 25 shows no line"):
         section(replaced(25, "dark"))
