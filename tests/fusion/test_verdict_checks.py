@@ -245,6 +245,15 @@ def coverage(filled: Mask, **pair: float) -> Coverage:
     return Coverage(BANDS, np.ones(len(BANDS)), filled, *shares, none)
 
 
+def test_causes_that_only_together_explain_a_gap_come_before_it(scan: MadeScan) -> None:
+    failed = {"p1": "too dark", "p2": "too bright", "p3": "is missing"}
+    gap = replace(coverage(FACE < 60), missed=FACE < 60)
+    verdict = verdict_given(scan.cloud, coverage=gap, failed=failed, absent=frozenset(failed))
+    left_out = tuple(f"left out: {name}: {reason}" for name, reason in failed.items())
+    assert (verdict.grade, verdict.reasons[:3]) == ("repeat", left_out)
+    assert verdict.consequences[0].startswith("at ")
+
+
 @pytest.mark.parametrize(
     ("given", "grade", "words"),
     [

@@ -42,10 +42,11 @@ def grade_scan(scan: ScanEvidence) -> Verdict:
         subject = check.__name__.removeprefix("check_").replace("_", " ")
         with optional(f"verdict on {subject}", failures.append):
             for found in check(scan):
-                cause = next((c for c in causes if c.explains_finding(found)), found)
-                if cause is found:
-                    causes.append(found)
-                followers.setdefault(cause, []).append(found)
+                alone = [cause for cause in causes if cause.explains_finding(found)][:1]
+                together = alone or _explain_together(causes, found)
+                for cause in together or [found]:
+                    followers.setdefault(cause, []).append(found)
+                causes += [] if together else [found]
     causes += [Finding("usable", line) for line in failures]
 
     def grade(cause: Finding) -> int:
@@ -62,3 +63,11 @@ def grade_scan(scan: ScanEvidence) -> Verdict:
     worst = WORST_FIRST[grade(causes[0])] if causes else "good"
     reasons = tuple(cause.words for cause in causes)
     return Verdict(worst, reasons, tuple(dict.fromkeys(consequences)))
+
+
+def _explain_together(causes: list[Finding], found: Finding) -> list[Finding]:
+    """List the causes that explain a finding together, as pairs that were each left out explain a
+    gap; empty if they do not."""
+    parts = [cause for cause in causes if cause.explains & found.pairs]
+    joint = Finding(found.grade, "", explains=frozenset().union(*(c.explains for c in parts)))
+    return parts if joint.explains_finding(found) else []
