@@ -40,10 +40,9 @@ def open_regular(path: Path) -> BinaryIO:
 def read_regular(path: Path, max_bytes: int | None = None) -> bytes:
     """Read a whole file. Raises as `open_regular`, and OSError if it is longer than `max_bytes`."""
     with open_regular(path) as stream:
-        data = stream.read(-1 if max_bytes is None else max_bytes + 1)
-    if max_bytes is not None and len(data) > max_bytes:
-        raise OSError(errno.EOVERFLOW, f"is longer than {max_bytes:,} bytes", str(path))
-    return data
+        if max_bytes is not None and os.fstat(stream.fileno()).st_size > max_bytes:
+            raise OSError(errno.EOVERFLOW, f"is longer than {max_bytes:,} bytes", str(path))
+        return stream.read()
 
 
 def read_json_object(path: Path) -> dict[str, Any]:

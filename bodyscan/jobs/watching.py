@@ -371,7 +371,7 @@ class ResidentProcess:
         self._process = start_process(self._arguments, self._threads)
         first = next(read_messages(self._process), {})
         if "unusable" in first:
-            raise BadInput(first["unusable"])
+            raise (BadInput if first["exit_code"] == 2 else FailedWork)(first["unusable"])
         if "ready" not in first:
             raise FailedWork(
                 f"the process that fuses scans does not start: exit status {self._process.wait()}",

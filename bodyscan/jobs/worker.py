@@ -64,28 +64,32 @@ def stay() -> int:
     A request is a JSON object on a line of standard input. With `pairs` it asks to decode those of
     a scan that is still arriving, without to do the job in `folder` as a process of its own would,
     with the same stages, locks and manifests; with `preview` it shows the cloud too. Returns 2 if
-    the calibration cannot be used.
+    the calibration cannot be used, 1 if there is no memory for it.
     """
-    from bodyscan.fusion.storage import no_use
-    from bodyscan.mesh.body import BodyCloud, BodyMesh
-    from bodyscan.report.model import pack_cloud
-    from bodyscan.workflows.range_images import Preparation
-
     emit = _become_worker()
     requests = _read_requests()
     try:
+        from bodyscan.fusion.storage import no_use
+        from bodyscan.mesh.body import BodyCloud, BodyMesh
+        from bodyscan.report.model import pack_cloud
+        from bodyscan.workflows.range_images import Preparation
+
+        reserve_blas_memory(THREADS)
         preparation = Preparation(Path(sys.argv[2]))
-    except BodyscanError as error:
-        emit(unusable=str(error))
-        return error.exit_code
+        # Now, not while someone waits for the first verdict.
+        import_module("bodyscan.workflows.scan_person")
+    except Exception as error:
+        known = error if isinstance(error, BodyscanError) else translate_failure(error)
+        if known is None:
+            raise
+        emit(unusable=str(known), exit_code=known.exit_code)
+        return known.exit_code
     scan, *others = KINDS["fuse"]
 
     def show(body: BodyCloud | BodyMesh) -> None:
         if isinstance(body, BodyCloud):
             emit(cloud=pack_cloud(body))
 
-    # Now, not while someone waits for the first verdict.
-    import_module("bodyscan.workflows.scan_person")
     emit(ready=True)
     while True:
         request = requests.get()

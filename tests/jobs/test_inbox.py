@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -208,14 +209,27 @@ def test_a_process_that_died_is_started_again_for_the_next_job(tmp_path: Path) -
         process.start()
 
 
+ON_LINUX = pytest.mark.skipif(sys.platform != "linux", reason="only Linux limits memory so")
+LIMITED = """
+from resource import RLIMIT_AS, setrlimit
+from bodyscan.jobs.worker import stay
+setrlimit(RLIMIT_AS, (600_000_000, -1))
+raise SystemExit(stay())
+"""
+
+
 @pytest.mark.parametrize(
-    ("program", "error"),
-    [('print(\'{"unusable": "no file"}\')', BadInput), ("raise SystemExit(3)", FailedWork)],
+    ("program", "error", "reason"),
+    [
+        ('print(\'{"unusable": "no file", "exit_code": 2}\')', BadInput, "no file"),
+        ("raise SystemExit(3)", FailedWork, "exit status 3"),
+        pytest.param(LIMITED, FailedWork, "there is not enough memory", marks=ON_LINUX),
+    ],
 )
 def test_a_process_that_cannot_start_ends_the_watch(
-    tmp_path: Path, program: str, error: type[Exception]
+    tmp_path: Path, program: str, error: type[Exception], reason: str
 ) -> None:
     process, _ = resident(tmp_path, program)
-    with pytest.raises(error):
+    with pytest.raises(error, match=reason):
         process.start()
     process.stop()
