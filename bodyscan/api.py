@@ -257,13 +257,13 @@ def save_scan(
         by hash.
     subject: pseudonym by which `bodyscan forget` finds everything made of a person.
     """
-    from bodyscan.fusion.storage import Origin
-    from bodyscan.fusion.storage import save_scan as save
+    from bodyscan.fusion.storage import Origin, save_body, save_facts
     from bodyscan.registration.storage import calibration_id, load_calibration
 
-    stored = Path(calibration)
+    stored, written = Path(calibration), Path(folder)
     axes = load_calibration(stored).axes
-    save(scan, Path(folder), Origin(calibration_id(stored), subject, when, axes=axes))
+    origin = Origin(calibration_id(stored), subject, when, axes=axes)
+    save_facts(scan, written, origin, save_body(scan, written))
     return load_scan(folder)
 
 

@@ -147,8 +147,8 @@ def clear(folder: Path) -> None:
                 path.unlink()
 
 
-def save_scan(scan: Scan, folder: Path, origin: Origin) -> Path:
-    """Write the body model and its description into `folder`; return the path of scan.json."""
+def save_body(scan: Scan, folder: Path) -> dict[str, str]:
+    """Write the cloud and the mesh into `folder`; return their SHA-256 by name."""
     (folder / FILE_NAME).unlink(missing_ok=True)
 
     def write(name: str) -> str:
@@ -156,12 +156,19 @@ def save_scan(scan: Scan, folder: Path, origin: Origin) -> Path:
         return file_hash(folder / name)
 
     names = (CLOUD_NAME, MESH_NAME)
-    digests = map_threads(write, names)
+    return dict(zip(names, map_threads(write, names), strict=True))
+
+
+def save_facts(scan: Scan, folder: Path, origin: Origin, digests: Mapping[str, str]) -> Path:
+    """Write scan.json, which makes the files in `folder` a result; return its path.
+
+    digests: as `save_body` returns them.
+    """
     write_json(
         folder / FILE_NAME,
         origin.facts
         | {
-            "sha256": dict(zip(names, digests, strict=True)),
+            "sha256": digests,
             "counts": {
                 "points": len(scan.cloud.points),
                 "vertices": len(scan.mesh.vertices),

@@ -25,7 +25,16 @@ from bodyscan.fusion.merging import MergedCloud, merge
 from bodyscan.fusion.meshing import attach_attributes, closed_surface
 from bodyscan.fusion.pose_variance import add_motion_variance, add_pose_variance
 from bodyscan.fusion.regions import label_regions
-from bodyscan.fusion.storage import Made, Origin, Scan, clear, no_use, save_failure, save_scan
+from bodyscan.fusion.storage import (
+    Made,
+    Origin,
+    Scan,
+    clear,
+    no_use,
+    save_body,
+    save_facts,
+    save_failure,
+)
 from bodyscan.fusion.verdict import grade_scan
 from bodyscan.fusion.verdict.coverage import measure_coverage
 from bodyscan.fusion.verdict.evidence import ImageEvidence, RigEvidence, ScanEvidence
@@ -137,8 +146,8 @@ def scan_folder(
     empty: captures of the rig with nobody in it.
     follow_links: follow links even if the calibration's rig file does not allow it.
     preparation: what was loaded and decoded before.
-    announce: called with the verdict on the points alone, and with the final one once the result is
-        saved.
+    announce: called with the verdict on the points alone, and with the final one once the cloud and
+        the mesh are saved.
     made: called with the cloud and the mesh while pictures of them are drawn.
 
     Raises ScanFailed after recording it in scan.json.
@@ -170,9 +179,11 @@ def scan_folder(
             raise
         with step(progress, "writing"):
             clear(out)
-            saved = save_scan(scan, out, origin)
+            digests = save_body(scan, out)
             announce(scan.verdict, final=True)
             pictures = write_pictures((each.result() for each in drawn), out)
+            # Last, so that what is killed before its end is no result, and is made again.
+            saved = save_facts(scan, out, origin, digests)
     return scan, saved, pictures
 
 

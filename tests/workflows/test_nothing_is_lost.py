@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from typing import NoReturn
+from unittest.mock import Mock
 
 import pytest
 from made_scan import make_scan
@@ -13,12 +14,13 @@ from verdict_given import verdict_given
 
 from bodyscan.files.hashing import file_hash
 from bodyscan.fusion import verdict
-from bodyscan.fusion.storage import load_scan
+from bodyscan.fusion.storage import Scan, load_scan, make_room
 from bodyscan.registration.storage import load_calibration
 from bodyscan.report import calibration_charts, calibration_page, pictures
 from bodyscan.report.page import render
 from bodyscan.report.result_page import write_report
-from bodyscan.workflows import calibrate_rig
+from bodyscan.verdict import Verdict
+from bodyscan.workflows import calibrate_rig, scan_person
 
 
 def broken(*_: object, **__: object) -> NoReturn:
@@ -66,6 +68,23 @@ def test_a_calibration_that_is_killed_at_its_end_is_made_by_the_same_command(
     result = run("calibrate-rig", tmp_path / "rig.yaml")
     assert result.exit_code == 0, result.output
     assert load_calibration(tmp_path / "calibration").advice
+
+
+def test_a_scan_that_is_killed_before_its_pictures_is_made_by_the_same_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made, out = make_scan(tmp_path), tmp_path / "out"
+    scan = Scan(made.cloud, made.mesh, None, {}, {}, Verdict("good"), (), {})
+    stands_for = {"scan_person": scan, "calibration_id": "0", "load_calibration": Mock(axes="")}
+    stands_for["open_scan"] = Mock(subject="anna", when=None, simulated=False)
+    for name, value in stands_for.items():
+        monkeypatch.setattr(scan_person, name, Mock(return_value=value))
+    with monkeypatch.context() as kill, pytest.raises(KeyboardInterrupt):
+        kill.setattr(scan_person, "write_pictures", killed)
+        scan_person.scan_folder(tmp_path, tmp_path, out, Mock())
+    make_room(out, overwrite=False)
+    scan_person.scan_folder(tmp_path, tmp_path, out, Mock())
+    assert load_scan(out).facts["subject"] == "anna"
 
 
 def test_a_remark_that_fails_costs_itself_alone(ring: SeenBoards, calibrated: Path) -> None:
