@@ -37,8 +37,6 @@ def main() -> None:
     # Stages run threads of their own; BLAS threads inside them get in each other's way (measured:
     # 15 s instead of 1 s for twelve cameras on two cores).
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    # Our own errors say what OpenCV warns of, with the line of the rig file.
-    os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # a terminal may lack a sign of ours, or of a path
             stream.reconfigure(errors="backslashreplace")

@@ -8,7 +8,6 @@ object per line, and ends as soon as its parent is gone.
 
 from __future__ import annotations
 
-import errno
 import json
 import logging
 import os
@@ -115,8 +114,6 @@ def _attempt(folder: Path, kinds: Kinds, emit: Emit) -> tuple[str, int]:
     except Exception as error:
         with suppress(OSError):  # the log is on that same disk
             traceback.print_exc()
-        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
-            return "the disk is full: make room, then start again", 1
         known = translate_failure(error)
         return str(known or f"{type(error).__name__}: {error}"), 1
     return "", 0

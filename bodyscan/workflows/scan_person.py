@@ -19,22 +19,14 @@ from bodyscan.alignment.icp import align
 from bodyscan.alignment.sway_prior import SwayPrior, select_tighter
 from bodyscan.captures.folder import Captures, ImageSequence, open_scan
 from bodyscan.errors import BodyscanError, CaptureError, ScanFailed
+from bodyscan.fusion import storage
 from bodyscan.fusion.cleaning import clean, require_subject
 from bodyscan.fusion.consistency import Contradictions
 from bodyscan.fusion.merging import MergedCloud, merge
 from bodyscan.fusion.meshing import attach_attributes, closed_surface
 from bodyscan.fusion.pose_variance import add_motion_variance, add_pose_variance
 from bodyscan.fusion.regions import label_regions
-from bodyscan.fusion.storage import (
-    Made,
-    Origin,
-    Scan,
-    clear,
-    no_use,
-    save_body,
-    save_facts,
-    save_failure,
-)
+from bodyscan.fusion.storage import Made, Origin, Scan, no_use
 from bodyscan.fusion.verdict import grade_scan
 from bodyscan.fusion.verdict.coverage import measure_coverage
 from bodyscan.fusion.verdict.evidence import ImageEvidence, RigEvidence, ScanEvidence
@@ -174,16 +166,16 @@ def scan_folder(
                 empty=nobody, reconstructed=reconstructed, announce=announce, made=draw,
             )  # fmt: skip
         except ScanFailed as error:
-            clear(out)
-            save_failure(error, out, origin)
+            storage.clear(out)
+            storage.save_failure(error, out, origin)
             raise
         with step(progress, "writing"):
-            clear(out)
-            digests = save_body(scan, out)
+            storage.clear(out)
+            digests = storage.save_body(scan, out)
             announce(scan.verdict, final=True)
             pictures = write_pictures((each.result() for each in drawn), out)
             # Last, so that what is killed before its end is no result, and is made again.
-            saved = save_facts(scan, out, origin, digests)
+            saved = storage.save_facts(scan, out, origin, digests)
     return scan, saved, pictures
 
 

@@ -43,10 +43,10 @@ def grade_scan(scan: ScanEvidence) -> Verdict:
         with optional(f"verdict on {subject}", failures.append):
             for found in check(scan):
                 alone = [cause for cause in causes if cause.explains_finding(found)][:1]
-                together = alone or _explain_together(causes, found)
-                for cause in together or [found]:
+                jointly = alone or _explain_jointly(causes, found)
+                for cause in jointly or [found]:
                     followers.setdefault(cause, []).append(found)
-                causes += [] if together else [found]
+                causes += [] if jointly else [found]
     causes += [Finding("usable", line) for line in failures]
 
     def grade(cause: Finding) -> int:
@@ -65,8 +65,8 @@ def grade_scan(scan: ScanEvidence) -> Verdict:
     return Verdict(worst, reasons, tuple(dict.fromkeys(consequences)))
 
 
-def _explain_together(causes: list[Finding], found: Finding) -> list[Finding]:
-    """List the causes that explain a finding together, as pairs that were each left out explain a
+def _explain_jointly(causes: list[Finding], found: Finding) -> list[Finding]:
+    """List the causes that all explain a finding in part, as pairs that were each left out explain a
     gap; empty if they do not."""
     parts = [cause for cause in causes if cause.explains & found.pairs]
     joint = Finding(found.grade, "", explains=frozenset().union(*(c.explains for c in parts)))
