@@ -66,12 +66,14 @@ class BodyMotion:
         breaths = Breaths.from_modes(kinds[-1].modes, seconds, middle_s)
         return BodyMotion(kinds, fields, vector, matrix, vector, matrix, np.ones(count), breaths)
 
-    def with_times(self, seconds: Sequence[float | None], middle_s: float) -> BodyMotion:
-        """At rest at other times, without the motion of parts.
+    def with_times(
+        self, seconds: Sequence[float | None], middle_s: float, *, parts: bool = False
+    ) -> BodyMotion:
+        """At rest at other times, with or without the motion of parts.
 
         seconds: each pair's moment.
         """
-        kinds = retime_kinds(self.kinds, seconds, middle_s)
+        kinds = retime_kinds(self.kinds, seconds, middle_s, parts=parts)
         vector = np.zeros(sum(kind.count for kind in kinds))
         fields = np.concatenate([kind.fields for kind in kinds], axis=2)
         breaths = Breaths.from_modes(kinds[-1].modes, seconds, middle_s)

@@ -270,14 +270,26 @@ class _Solution:
         if len(times) < len(seconds):
             return TimeFit()
         factors = 1.0, 0.1, 10.0
-        persons = [self.motion.with_times([f * s for s in times], f * middle_s) for f in factors]
+
+        def retime(factor: float, *, parts: bool = False) -> BodyMotion:
+            moments = [factor * second for second in times]
+            return self.motion.with_times(moments, factor * middle_s, parts=parts)
+
+        persons = [retime(factor) for factor in factors]
         fields = self.motion.find_fields([kind.name for kind in persons[0].kinds])
         projected = {both: system.select(fields) for both, system in self.projected.items()}
         solved = map_threads(lambda person: person.solve_projected(projected), persons)
         stated, *others = (person.log_evidence for person in solved)
         fits = [TimeFit(f, e - stated) for f, e in zip(factors[1:], others, strict=True)]
         best = max(fits, key=lambda one: one.log_ratio)
-        return best if best.log_ratio > MIN_LOG_RATIO else TimeFit()
+        if best.log_ratio <= MIN_LOG_RATIO:
+            return TimeFit()
+        # Hips that shift are no lean or limb: whoever moves so would seem to need other times.
+        stated, other = (
+            retime(factor, parts=True).solve_projected(self.projected).log_evidence
+            for factor in (1.0, best.factor)
+        )
+        return best if other > stated + MIN_LOG_RATIO else TimeFit()
 
 
 def _begin(

@@ -85,9 +85,9 @@ def build_kinds(
 
 
 def retime_kinds(
-    kinds: Sequence[MotionKind], seconds: Sequence[float | None], middle_s: float
+    kinds: Sequence[MotionKind], seconds: Sequence[float | None], middle_s: float, *, parts: bool
 ) -> tuple[MotionKind, ...]:
-    """All kinds but `parts` with the modes of other moments, the breath of unit variance.
+    """All kinds, `parts` only if asked, with the modes of other moments, the breath of unit variance.
 
     No size in people who stand is assumed: who stands very still does so at any times.
     """
@@ -100,7 +100,7 @@ def retime_kinds(
         elif kind.name == "breath":
             identity = np.eye(kind.fields.shape[2] * breathing.count)
             retimed.append(replace(kind, modes=breathing, precision=identity))
-        elif kind.name != "parts":
+        elif parts or kind.name != "parts":
             retimed.append(replace(kind, modes=stance, standing_size=0.0))
     return tuple(retimed)
 
