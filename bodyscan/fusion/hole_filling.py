@@ -199,6 +199,8 @@ def _relax(
 
 RAY_SPACING_MM = 3.0
 """Between rays that look through gaps, at the subject."""
+APART_MM = 30.0
+"""Half a wrist: what is so far before a surface hides it, and does not run into it."""
 CROWN_RADIUS_MM = 100.0
 """Half the length of a head: what lies farther from its highest point is not part of it."""
 
@@ -253,9 +255,10 @@ def find_gaps(
     """Find the blocks of stride x stride pixels in a window that look through a gap of the body.
 
     In such a block nothing was measured, its middle shows only filled faces, and the nearest measured
-    surfaces to the left and to the right are not dark, and turn towards it: between the legs, between
-    arm and trunk. A filled face in front of or behind measured surface is a part in shadow instead,
-    and so is one between surfaces that turn away from each other, as round a thigh.
+    surfaces to the left and to the right are not dark, turn towards it and run into what fills it:
+    between the legs, between arm and trunk. A filled face in front of or behind measured surface is a
+    part in shadow instead, and so is one between surfaces that turn away from each other, as round a
+    thigh, or that begins behind one of them: a hand, and its shadow on a thigh.
     """
     rows, columns = (stride * np.arange(some.start, some.stop) + stride // 2 for some in blocks)
     vertices = _project_to_blocks(surface.vertices, image, rig_from_camera, stride, blocks)
@@ -264,6 +267,7 @@ def find_gaps(
     filled = np.zeros(hit.shape, bool)
     filled[hit] = surface.filled[first[hit]]
     body = hit & ~filled
+    depth = np.where(hit, vertices[surface.faces[first], 2].mean(axis=-1), np.nan)
     bright, rightward = np.zeros(hit.shape, bool), np.zeros(hit.shape)
     bright[body] = ~surface.dark[first[body]]
     corners = surface.vertices[surface.faces[first[body]]].astype(np.float64)
@@ -276,8 +280,8 @@ def find_gaps(
     measured = np.pad(cv2.dilate((image.open_depth > 0).astype(np.uint8), near), stride)
     reach = int(200.0 / RAY_SPACING_MM)  # the widest gap
     open_ = filled & (measured[np.ix_(rows + stride, columns + stride)] == 0)
-    left, turn_left = _find_left_neighbour(body, bright, rightward, reach)
-    mirrored = body[:, ::-1], bright[:, ::-1], rightward[:, ::-1]
+    left, turn_left = _find_left_neighbour(body, bright, rightward, depth, reach)
+    mirrored = body[:, ::-1], bright[:, ::-1], rightward[:, ::-1], depth[:, ::-1]
     right, turn_right = _find_left_neighbour(*mirrored, reach)
     # Of flat surfaces the difference is 0, round a finger -0.2.
     open_ &= left & right[:, ::-1] & (turn_left - turn_right[:, ::-1] > -0.1)
@@ -304,13 +308,17 @@ def _project_to_blocks(
     return np.concatenate([pixels - first, points[:, 2:]], axis=1).astype(np.float32)
 
 
-def _find_left_neighbour(body: Mask, bright: Mask, values: Array, reach: int) -> tuple[Mask, Array]:
-    """Whether the nearest pixel of the body to the left in the same row is bright and at most
-    `reach` away, and its value."""
+def _find_left_neighbour(
+    body: Mask, bright: Mask, values: Array, depth: Array, reach: int
+) -> tuple[Mask, Array]:
+    """Whether the nearest pixel of the body to the left in the same row is bright, at most `reach` away
+    and not far before its right neighbour, and its value."""
+    joined = bright.copy()
+    joined[:, :-1] &= ~(np.diff(depth, axis=1) > APART_MM)
     columns = np.arange(body.shape[1])
     latest = np.maximum.accumulate(np.where(body, columns, -reach - 1), axis=1)
     at = latest.clip(0)
-    near = (columns - latest <= reach) & np.take_along_axis(bright, at, axis=1)
+    near = (columns - latest <= reach) & np.take_along_axis(joined, at, axis=1)
     return near, np.take_along_axis(values, at, axis=1)
 
 
