@@ -25,15 +25,37 @@ def name_parts(cells: BodyCells) -> Indices:
     part = np.where(height > NECK, PARTS.index("head"), PARTS.index("trunk"))
     part[height < CROTCH] = PARTS.index("right leg")
     part[(height < CROTCH) & (sideways > 0.0)] = PARTS.index("left leg")
-    navel = int(np.argmin(np.abs(height - 0.6) + np.abs(sideways)))
-    from_navel = cells.distances(np.array([navel]))[0] / stature
+    navel = find_navel(cells)
+    from_navel = cells.distances(np.array([navel]))[0] / stature  # through the body
+    straight = np.linalg.norm(cells.centres - cells.centres[navel], axis=1) / stature
     hands = (height > 0.29) & (height < NECK)  # above the knees
-    for name, outward in (("left arm", sideways), ("right arm", -sideways)):
-        tip = int(np.argmax(np.where(hands, outward, -np.inf)))
-        if from_navel[tip] > 0.35:  # through the body; a fingertip is farther from the navel
-            from_tip = cells.distances(np.array([tip]))[0] / stature
-            part[from_tip < 0.38] = PARTS.index(name)  # up to the shoulder
+    for name, side in (("left arm", sideways > 0.0), ("right arm", sideways < 0.0)):
+        # From the navel a fingertip is far, by way of the shoulder; an elbow may stick out farther.
+        tip = int(np.argmax(np.where(hands & side, 2.0 * from_navel - straight, -np.inf)))
+        from_tip = cells.distances(np.array([tip]))[0]
+        reach = measure_arm(from_tip, 0.38 * stature)  # up to the shoulder
+        if from_navel[tip] > 0.3 and reach > 0.15 * stature:  # not the end of a thigh or a flank
+            part[from_tip < reach] = PARTS.index(name)
     return part
+
+
+def find_navel(cells: BodyCells) -> int:
+    """The cell at a navel's height next to the middle of the body."""
+    stature = float(cells.centres[:, 2].max())
+    offsets = cells.centres[:, :2] - np.median(cells.centres[:, :2], axis=0)
+    aside = np.abs(offsets @ leftward(cells)) / stature
+    return int(np.argmin(np.abs(cells.centres[:, 2] / stature - 0.6) + aside))
+
+
+def measure_arm(from_tip: Array, longest_mm: float) -> float:
+    """Distance, mm, from a fingertip at which cells are no longer those of an arm: a ring of 40 mm has
+    over 2.5 times as many as the usual one before it. from_tip: of all cells, mm."""
+    inside = from_tip < longest_mm + 40.0
+    rings = np.bincount((from_tip[inside] / 40.0).astype(np.int64))
+    for k in range(2, len(rings)):
+        if rings[k] > 2.5 * np.median(rings[:k]):
+            return min(40.0 * k, longest_mm)
+    return longest_mm
 
 
 def ankles(cells: BodyCells) -> Array:
@@ -71,10 +93,11 @@ def limb_weights(cells: BodyCells) -> dict[str, Array]:
     kernel = np.exp(-0.5 * (cells.landmark_distances / 60.0) ** 2)
     total = np.maximum(kernel.sum(axis=0), 1e-12)
     members = {limb: part == PARTS.index(limb.replace("forearm", "arm")) for limb in LIMBS}
+    from_navel = cells.distances(np.array([find_navel(cells)]))[0]
     for limb in ("left forearm", "right forearm"):
         inside = cells.landmarks[members[limb]]
         if len(inside):
-            tip = inside[np.argmin(cells.centres[inside, 2])]
+            tip = inside[np.argmax(from_navel[inside])]
             from_tip = cells.distances(np.array([tip]))[0, cells.landmarks]
             members[limb] &= from_tip < FOREARM * cells.centres[:, 2].max()
     return {limb: np.minimum((marks @ kernel) / total, 1.0) for limb, marks in members.items()}

@@ -10,7 +10,15 @@ from scipy import sparse
 
 from bodyscan.arrays import Array
 from bodyscan.motion.body_cells import BodyCells
-from bodyscan.motion.body_parts import LIMBS, PARTS, leftward, limb_fields, limb_weights, name_parts
+from bodyscan.motion.body_parts import (
+    LIMBS,
+    PARTS,
+    leftward,
+    limb_fields,
+    limb_weights,
+    measure_arm,
+    name_parts,
+)
 from bodyscan.motion.breath import breath_along_normals, breath_fields
 from bodyscan.motion.estimation import BreathOffset, EstimatedMotion
 from bodyscan.motion.person_motion import (
@@ -88,14 +96,32 @@ def test_parts_are_told_by_height_and_by_how_far_they_are_through_the_body() -> 
 
 def test_an_arm_too_short_to_be_one_is_trunk() -> None:
     cells = person()
-    for reach, name in ((300.0, "left arm"), (210.0, "trunk")):
-        # From the navel 360 mm up and so far out; to a fingertip it is 593 mm at least.
+    for reach, name in ((300.0, "left arm"), (120.0, "trunk")):
+        # From the navel 360 mm up and so far out; to a fingertip it is 508 mm at least.
         kept = (cells.centres[:, 1] <= reach) & (cells.centres[:, 1] > -50.0)
         graph = cells.graph[kept][:, kept]
         short = BodyCells(
             cells.centres[kept], cells.normals[kept], graph, np.arange(3), cells.landmark_distances
         )
         assert named(short, reach, 1365.0) == name
+
+
+def test_an_elbow_that_sticks_out_is_no_fingertip() -> None:
+    """Of eight strangers five had an arm that was taken for trunk, or half a chest for an arm."""
+    cells = person()
+    bent = cells.centres.copy()
+    beyond = np.maximum(bent[:, 1] - 480.0, 0.0)
+    bent -= np.outer(beyond, [0.0, 1.5, 0.85])
+    arm = replace(cells, centres=bent)
+    ends = (330.0, 1110.0), (480.0, 1365.0), (0.0, 1365.0)
+    assert [named(arm, *end) for end in ends] == ["left arm", "left arm", "trunk"]
+
+
+@pytest.mark.parametrize("chest_mm", [300.0, 500.0])
+def test_an_arm_ends_where_it_meets_the_trunk(chest_mm: float) -> None:
+    """Stout upper arms touch it far below the shoulder."""
+    from_tip = np.concatenate([np.arange(0.0, chest_mm, 5.0), np.arange(chest_mm, 900.0, 0.5)])
+    assert measure_arm(from_tip, 640.0) == pytest.approx(chest_mm, abs=40.0)
 
 
 @pytest.mark.parametrize("degrees", [0.0, 50.0, 180.0, -120.0])
