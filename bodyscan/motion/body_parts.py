@@ -29,13 +29,14 @@ def name_parts(cells: BodyCells) -> Indices:
     from_navel = cells.distances(np.array([navel]))[0] / stature  # through the body
     straight = np.linalg.norm(cells.centres - cells.centres[navel], axis=1) / stature
     hands = (height > 0.29) & (height < NECK)  # above the knees
-    for name, side in (("left arm", sideways > 0.0), ("right arm", sideways < 0.0)):
+    for name, outward in (("left arm", sideways), ("right arm", -sideways)):
         # From the navel a fingertip is far, by way of the shoulder; an elbow may stick out farther.
-        tip = int(np.argmax(np.where(hands & side, 2.0 * from_navel - straight, -np.inf)))
-        from_tip = cells.distances(np.array([tip]))[0]
-        reach = measure_arm(from_tip, 0.38 * stature)  # up to the shoulder
-        if from_navel[tip] > 0.3 and reach > 0.15 * stature:  # not the end of a thigh or a flank
-            part[from_tip < reach] = PARTS.index(name)
+        score = 2.0 * from_navel - straight + outward
+        tip = int(np.argmax(np.where(hands & (outward > 0.0), score, -np.inf)))
+        # Straight is the way to a thigh or a flank.
+        if from_navel[tip] > 0.35 or from_navel[tip] > straight[tip] + 0.05:
+            from_tip = cells.distances(np.array([tip]))[0] / stature
+            part[from_tip < 0.38] = PARTS.index(name)  # up to the shoulder
     return part
 
 
@@ -45,17 +46,6 @@ def find_navel(cells: BodyCells) -> int:
     offsets = cells.centres[:, :2] - np.median(cells.centres[:, :2], axis=0)
     aside = np.abs(offsets @ leftward(cells)) / stature
     return int(np.argmin(np.abs(cells.centres[:, 2] / stature - 0.6) + aside))
-
-
-def measure_arm(from_tip: Array, longest_mm: float) -> float:
-    """Distance, mm, from a fingertip at which cells are no longer those of an arm: a ring of 40 mm has
-    over 2.5 times as many as the usual one before it. from_tip: of all cells, mm."""
-    inside = from_tip < longest_mm + 40.0
-    rings = np.bincount((from_tip[inside] / 40.0).astype(np.int64))
-    for k in range(2, len(rings)):
-        if rings[k] > 2.5 * np.median(rings[:k]):
-            return min(40.0 * k, longest_mm)
-    return longest_mm
 
 
 def ankles(cells: BodyCells) -> Array:
