@@ -199,8 +199,6 @@ def _relax(
 
 RAY_SPACING_MM = 3.0
 """Between rays that look through gaps, at the subject."""
-APART_MM = 30.0
-"""Half a wrist: what is so far before a surface hides it, and does not run into it."""
 CROWN_RADIUS_MM = 100.0
 """Half the length of a head: what lies farther from its highest point is not part of it."""
 
@@ -314,7 +312,8 @@ def _find_left_neighbour(
     """Whether the nearest pixel of the body to the left in the same row is bright, at most `reach` away
     and not far before its right neighbour, and its value."""
     joined = bright.copy()
-    joined[:, :-1] &= ~(np.diff(depth, axis=1) > APART_MM)
+    # What is half a wrist before a surface hides it, and does not run into it.
+    joined[:, :-1] &= ~(np.diff(depth, axis=1) > 30.0)
     columns = np.arange(body.shape[1])
     latest = np.maximum.accumulate(np.where(body, columns, -reach - 1), axis=1)
     at = latest.clip(0)
