@@ -13,6 +13,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from bodyscan.arrays import Array
+from bodyscan.errors import BadInput
 from bodyscan.files.atomic import atomic_replacement
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.simulation.scene import Surface
@@ -119,7 +120,10 @@ def moves(person: Person) -> bool:
 
 
 def animate(still: Surface, person: Person, rng: np.random.Generator) -> LivingBody:
-    """Give a still surface joints, breath and sway; lengths are shares of the stature (ANSUR II)."""
+    """Give a still surface joints, breath and sway; lengths are shares of the stature (ANSUR II).
+
+    Raises BadInput for one without arms or a head.
+    """
     vertices = still.vertices
     height = float(vertices[:, 2].max())
     z = vertices[:, 2] / height
@@ -127,6 +131,11 @@ def animate(still: Surface, person: Person, rng: np.random.Generator) -> LivingB
     head = _smoothstep(z, 0.835, 0.885) * (1.0 - arms[0]) * (1.0 - arms[1])
     limbs = [(weights, np.radians(person.arms_deg)) for weights in arms]
     limbs += [(head, np.radians(person.head_deg))]
+    if not all(np.any((weights > 0.3) & (weights < 0.7)) for weights, _ in limbs):
+        raise BadInput(
+            "the subject has no arms and head that could move",
+            remedy="give a standing person, or --subject-preset mannequin",
+        )
     joints = tuple(
         # Its joint is where a limb ends.
         Joint(

@@ -41,7 +41,9 @@ def test_complete_captures_are_good(rig_path: Path) -> None:
         ("cam", 0, 3),
     ]
     assert format_report(report)[-1] == "good"
-    assert any(line.endswith("mm in all: every length rests on it") for line in format_report(report))
+    assert any(
+        line.endswith("mm in all: every length rests on it") for line in format_report(report)
+    )
     assert sum("3 board poses will do" in warning for warning in report.warnings) == 3
 
 
