@@ -101,8 +101,8 @@ def _blank_flashed(lines: ScanLines) -> tuple[ScanLines, list[int]]:
     """Replace images that other light reached by what is seen without the line; also return which.
 
     Away from its line such an image is brighter than others. Where the line itself fills half of what
-    is lit, which stands on few stripes, the images before and after are as bright. Raises DecodingFailed
-    for one that is brighter than lit.
+    is lit, which stands on few stripes, the images before and after are as bright. Raises
+    DecodingFailed for one that is brighter than lit.
     """
     every = max(1, len(lines.patterns) // SAMPLES)
     reached = lines.lit >= np.median(lines.lit)

@@ -79,9 +79,10 @@ def test_a_scan_that_is_killed_before_its_pictures_is_made_by_the_same_command(
     stands_for["open_scan"] = Mock(subject="anna", when=None, simulated=False)
     for name, value in stands_for.items():
         monkeypatch.setattr(scan_person, name, Mock(return_value=value))
-    with monkeypatch.context() as kill, pytest.raises(KeyboardInterrupt):
+    with monkeypatch.context() as kill:
         kill.setattr(scan_person, "write_pictures", killed)
-        scan_person.scan_folder(tmp_path, tmp_path, out, Mock())
+        with pytest.raises(KeyboardInterrupt):
+            scan_person.scan_folder(tmp_path, tmp_path, out, Mock())
     make_room(out, overwrite=False)
     scan_person.scan_folder(tmp_path, tmp_path, out, Mock())
     assert load_scan(out).facts["subject"] == "anna"
