@@ -92,7 +92,7 @@ class BodyCells:
         size = (len(self.centres),) * 2
         return [
             sparse.csr_array((row, (i, j)), shape=size)
-            - sparse.diags_array(np.bincount(i, row, size[0]), format="csr")
+            - sparse.diags_array(np.bincount(i, row, size[0]), format="csr", dtype=np.float64)
             for row in weights
         ]
 
