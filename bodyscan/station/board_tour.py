@@ -20,6 +20,7 @@ from bodyscan.captures.folder import Captures, ImageSequence, open_captures
 from bodyscan.errors import BodyscanError
 from bodyscan.optional import optional
 from bodyscan.registration.advice import pair_sigma_mm, suggest_shots
+from bodyscan.registration.rig_frame import frame_target
 from bodyscan.registration.rig_solve import solve_rig
 from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig import find_connected_groups, load_rig
@@ -124,10 +125,17 @@ class BoardTour:
             ],
             "groups": groups,
             "shared": shared,
-            "next": _choose_next_hold(cells, boards, groups),
+            "next": self._find_frame_shot() or _choose_next_hold(cells, boards, groups),
             "advice": self.solved.get("advice", []),
             "wanted": BOARDS,
         }
+
+    def _find_frame_shot(self) -> dict[str, Any] | None:
+        """Advice to take the shot that fixes the rig frame, as long as no pair saw its board there."""
+        target = frame_target(self.rig)
+        if target is None or target in {(view.shot, view.board) for view in self.views}:
+            return None
+        return {"say": "frame", "shot": target[0], "board": target[1]}
 
     def _calibrating(self, pair: str) -> list[BoardView]:
         """Boards that calibrate a pair: those on which it took its stripes, if it has any."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any
@@ -92,12 +93,17 @@ class Operation:
         return name
 
     def request_board(self) -> str:
-        """Have a shot of the board taken; return its name. Raises BadInput if that cannot be now."""
+        """Have a shot of the board taken, the one that fixes the rig frame first; return its name.
+
+        Raises BadInput if that cannot be now.
+        """
         if self.rig_file is None or not self.rig.calibration:
             raise BadInput("the rig file names no calibration captures")
         folder = capture_path(self.rig_file, self.rig.calibration[0])
         there = {path.name for path in folder.glob("*")}
-        name = next(name for k in range(1, 10_000) if (name := f"b{k:02d}") not in there)
+        first = filter(None, [self.rig.rig_frame.shot])
+        names = chain(first, (f"b{number:02d}" for number in range(1, 10_000)))
+        name = next(name for name in names if name not in there)
         self._request(Shot(folder, name=name, kind="calibration"))
         return name
 
