@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 from collections import defaultdict
 from collections.abc import Iterable
+from contextlib import suppress
 from datetime import UTC, datetime
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -44,16 +46,23 @@ def find_series(folders: Iterable[Path]) -> dict[str, list[dict[str, Any]]]:
     """
     shifts: dict[str, list[Array]] = defaultdict(list)
     series: dict[str, list[dict[str, Any]]] = defaultdict(list)
+    scans: list[tuple[str, dict[str, Array]]] = []
     for folder in folders:
-        try:
-            motions = pair_motions(read_job(folder))
-        except (BodyscanError, KeyError, ValueError):
-            continue  # without a result, or with a damaged one
+        with suppress(OSError, BodyscanError, KeyError, ValueError):  # no result, or a damaged one
+            motions = _read_motions(folder, (folder / "scan" / "scan.json").stat().st_mtime_ns)
+            scans.append((folder.name, motions))
+    for job, motions in scans:
         for pair, shift in sorted(motions.items()):
             shifts[pair].append(shift)
             if len(shifts[pair]) < MIN_SCANS:
                 continue
             found = estimate_drift(pair, np.array(shifts[pair][-WINDOW:]))
-            point = {"job": folder.name, "mm": found.shift_mm, "sigma_mm": found.sigma_mm}
+            point = {"job": job, "mm": found.shift_mm, "sigma_mm": found.sigma_mm}
             series[pair].append(point | {"limit_mm": found.limit_mm, "moved": found.moved})
     return dict(series)
+
+
+@lru_cache(maxsize=2000)
+def _read_motions(folder: Path, written_ns: int) -> dict[str, Array]:
+    """`pair_motions` of the job whose scan was written then: read once, not at each look at the day."""
+    return pair_motions(read_job(folder))

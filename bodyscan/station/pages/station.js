@@ -6,6 +6,7 @@
   const SIGNS = { good: "✓", usable: "!", bad: "✗" };
   const ROWS = 3, COLUMNS = 4; // of a picture's cells, as station/board_tour.py has them
   const scans = new Map(), looks = new Map(), drawn = { job: "", kind: "" };
+  let drawnRows = new WeakMap(); // of Today: all made anew at each event would load all pictures again
   let words = {}, capture = { state: "idle" }, hasRig = false, canCapture = false, current = "", stream = null, boards = null;
 
   const $ = (id) => document.getElementById(id);
@@ -169,7 +170,7 @@
     found.sort(ORDERS[$("sort").value] || ORDERS.newest);
     const names = ["", "scan", "verdict", "sway", "breath", "covered", "stature", "chest", "waist", "hip", ""];
     document.querySelector("#rows thead").replaceChildren(make("tr", {}, ...names.map((key) => (key ? make("th", { scope: "col" }, say(key)) : make("td")))));
-    document.querySelector("#rows tbody").replaceChildren(...found.map(todayRow));
+    document.querySelector("#rows tbody").replaceChildren(...found.map((row) => drawnRows.get(row) || drawnRows.set(row, todayRow(row)).get(row)));
   }
 
   function todayRow(row) {
@@ -331,6 +332,7 @@
 
   async function speak(language) {
     words = await (await fetch(`languages/${language}.json`)).json();
+    drawnRows = new WeakMap();
     words["#"] = language;
     document.documentElement.lang = language;
     for (const element of document.querySelectorAll("[data-say]")) element.textContent = say(element.dataset.say);
