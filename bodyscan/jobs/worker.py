@@ -100,6 +100,8 @@ def stay() -> int:
         run = partial(run_scan, preparation=preparation, made=made)
         with _log_of(folder):
             reason, _ = _attempt(folder, {"fuse": (replace(scan, run=run), *others)}, emit)
+        with suppress(BodyscanError):
+            preparation.drop(read_job(folder).source)
         emit(ended=request["folder"], failed=reason)
 
 

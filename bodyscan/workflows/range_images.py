@@ -166,6 +166,10 @@ class Preparation:
             if one is not None and _stamps(captures, sequence) == one[1]
         }
 
+    def drop(self, folder: Path) -> None:
+        """Drop what was made of a scan and not taken, as when its earlier result was up to date."""
+        self._made.pop(folder, None)
+
 
 def _stamps(captures: Captures, sequence: ImageSequence) -> tuple[tuple[int, int], ...]:
     """Stamps of the images and of captures.yaml, which says when they were taken; (0, 0) for a

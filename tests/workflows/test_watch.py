@@ -112,6 +112,9 @@ def test_pairs_that_come_one_by_one_are_decoded_side_by_side(
     preparation = Preparation(day / "calibration")
     person = example / "pole" / "captures" / "person"
     captures = open_scan(preparation.calibration.rig, person)
+    preparation.prepare(person, [captures.sequences[0].pair])
+    preparation.drop(person)
+    assert preparation.take(captures) == {}, "memory of a job that had nothing to do"
     both, met = threading.Barrier(2, timeout=60.0), list[str]()
 
     def decode(_: object, __: object, sequence: ImageSequence, **___: object) -> None:
