@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import ipaddress
 import socket
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from bodyscan.capture.devices import load_capture_rig
-from bodyscan.errors import BadInput
+from bodyscan.errors import BadInput, FailedWork
 from bodyscan.jobs.stages import rig_of
 from bodyscan.jobs.watching import Watched
 from bodyscan.station.day import Day
@@ -57,7 +58,7 @@ def serve(
             "whoever listens on this network can read the page and its token: give --certificate and "
             "--key (docs/station.md)"
         )
-    uvicorn.run(
+    config = uvicorn.Config(
         app,
         host=address.host,
         port=address.port,
@@ -69,6 +70,15 @@ def serve(
         proxy_headers=False,
         h11_max_incomplete_event_size=16_384,
     )
+    # In a thread of its own: a signal that stops the command shows no traceback of what was open.
+    server = uvicorn.Server(config)
+    serving = threading.Thread(target=server.run, daemon=True)
+    serving.start()
+    serving.join()
+    if not server.started:
+        raise FailedWork(
+            "cannot be served", where=address.link, remedy="give another --port or --host"
+        )
 
 
 def make_operation(watched: Watched, rig_file: Path | None) -> Operation:
