@@ -112,9 +112,6 @@ def test_pairs_that_come_one_by_one_are_decoded_side_by_side(
     preparation = Preparation(day / "calibration")
     person = example / "pole" / "captures" / "person"
     captures = open_scan(preparation.calibration.rig, person)
-    preparation.prepare(person, [captures.sequences[0].pair])
-    preparation.drop(person)
-    assert preparation.take(captures) == {}, "memory of a job that had nothing to do"
     both, met = threading.Barrier(2, timeout=60.0), list[str]()
 
     def decode(_: object, __: object, sequence: ImageSequence, **___: object) -> None:
@@ -128,6 +125,15 @@ def test_pairs_that_come_one_by_one_are_decoded_side_by_side(
         preparation.prepare(person, [pair])
     assert preparation.take(captures) == {}
     assert sorted(met) == pairs
+
+
+def test_what_a_job_had_no_use_for_is_dropped(example: Path, day: Path) -> None:
+    preparation = Preparation(day / "calibration")
+    person = example / "pole" / "captures" / "person"
+    captures = open_scan(preparation.calibration.rig, person)
+    preparation.prepare(person, [captures.sequences[0].pair])
+    preparation.drop(person)
+    assert preparation.take(captures) == {}
 
 
 def test_a_calibration_that_cannot_be_used_is_said_at_once(tmp_path: Path) -> None:
