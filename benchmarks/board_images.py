@@ -24,7 +24,7 @@ from bodyscan.simulation.board import make_print
 from bodyscan.simulation.layout import TruePair, build_pairs
 from bodyscan.simulation.lens import sample_directions
 from bodyscan.simulation.plan import BoardShot, count_default_shots, plan_boards
-from bodyscan.simulation.sensor import expose, exposure
+from bodyscan.simulation.sensor import choose_exposure, expose
 from bodyscan.simulation.settings import SimulationSettings
 
 BACKGROUND = 0.25
@@ -56,7 +56,7 @@ def see_boards(
     if stored is not None and stored.exists():
         return SeenRig(rig, pairs, tuple(plan), load_views(stored))
     board = rig.boards[0]
-    textures = [_texture(board, face) for face in range(board.faces)]
+    textures = [_make_texture(board, face) for face in range(board.faces)]
 
     def see(number: int) -> list[BoardView]:
         pair = list(pairs.values())[number]
@@ -123,7 +123,7 @@ def _views_of(
             noise = np.random.default_rng([seed, 7, number, shot_number])
             camera_from_board = pair.rig_from_camera.inverse() @ shot.rig_from_board
             lit = _render(pair, board, textures, camera_from_board, planes)
-            length = exposure(lit, SETTINGS.lighting.board_grey, SETTINGS.lighting)
+            length = choose_exposure(lit, SETTINGS.lighting.board_grey, SETTINGS.lighting)
             image = expose(lit * length, SETTINGS.noise, noise)
             yield from find_boards(image, [board], pair=pair.name, shot=shot.name)
 
@@ -180,7 +180,7 @@ def _shading(pair: TruePair, camera_from_board: RigidTransform, rays: Floats) ->
     return np.asarray(at * np.abs(across) / square**1.5, np.float32)
 
 
-def _texture(board: Board, face: int) -> Floats:
+def _make_texture(board: Board, face: int) -> Floats:
     """The print's albedo at `TEXELS_PER_MM`, including its margin."""
     size = 2.0 * board.margin_mm + board.square_mm * np.array([board.columns, board.rows])
     x, y = (

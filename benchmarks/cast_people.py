@@ -24,7 +24,7 @@ from bodyscan.simulation.files import compute_person_times, describe_camera, sca
 from bodyscan.simulation.lamps import Lamps, compute_laser_light
 from bodyscan.simulation.layout import TruePair
 from bodyscan.simulation.living import LivingBody, animate
-from bodyscan.simulation.presets import settings_for
+from bodyscan.simulation.presets import compose_settings
 from bodyscan.simulation.projector import MirrorProjector
 from bodyscan.simulation.scene import Hits, Scene
 from bodyscan.simulation.settings import Pace
@@ -86,7 +86,7 @@ def cast_person(
     rng = np.random.default_rng([seed, 1])
     full = load_rig(PROJECT / "rigs" / f"{rig_name}.yaml")
     rig = scale_rig(full, SCALE, CALIBRATION)
-    settings = settings_for("mirror", preset="workshop", subject=preset)
+    settings = compose_settings("mirror", preset="workshop", subject=preset)
     person = replace(settings.person, size=size * settings.person.size, subdivisions=1)
     pairs = draw_true_pairs(rig, settings, seed)
     still = load_subject(PROJECT / "data" / "subjects" / f"{subject}.ply", person, rng)

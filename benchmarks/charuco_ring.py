@@ -21,7 +21,7 @@ from benchmarks.free_triangulation import (
 )
 from benchmarks.rivals import RIVALS, run_rival, with_lens, without_skew
 from bodyscan.boards.view import BoardView
-from bodyscan.calibration.board_views import max_displacement_mm
+from bodyscan.calibration.board_views import compute_max_displacement_mm
 from bodyscan.geometry.lenses.opencv import Brown
 from bodyscan.registration.rig_solve import RigSolution, solve_rig
 from bodyscan.rig.rig import Rig
@@ -121,7 +121,7 @@ def same_places(placed: RigSolution) -> list[tuple[str, ...]]:
         first = next(
             t
             for t in targets
-            if max_displacement_mm(board[target], board[t], BOARD_REACH_MM) < SAME_PLACE_MM
+            if compute_max_displacement_mm(board[target], board[t], BOARD_REACH_MM) < SAME_PLACE_MM
         )
         groups.setdefault(first[0], []).append(target[0])
     return [tuple(group) for group in groups.values()]

@@ -17,8 +17,8 @@ from bodyscan.simulation.layout import TruePair, build_pairs
 from bodyscan.simulation.patterns import simulate_instrument
 from bodyscan.simulation.rays import View
 from bodyscan.simulation.render import PixelTruth, compute_pixel_truth, render_pair
-from bodyscan.simulation.scene import Scene, grid_surface
-from bodyscan.simulation.sensor import expose, exposure
+from bodyscan.simulation.scene import Scene, build_grid_surface
+from bodyscan.simulation.sensor import choose_exposure, expose
 from bodyscan.simulation.settings import SimulationSettings
 from bodyscan.stripes.codes import parse_stripe_code
 from bodyscan.stripes.decoding import decode_stripes
@@ -87,10 +87,10 @@ def hollow() -> Scene:
     """A groove 110 mm deep, 400 mm away, and a 14 mm bar in front of its middle; camera frame."""
     down, crease = np.array([0.0, 140.0, 0.0]), np.array([-10.0, -70.0, 400.0])
     sides = [110.0 * np.array([np.sin(turn), 0.0, -np.cos(turn)]) for turn in np.radians([-35, 35])]
-    bar = grid_surface(
+    bar = build_grid_surface(
         np.array([-6.0, -70.0, 320.0]), np.array([14.0, 0.0, 0.0]), down, albedo=SKIN
     )
-    return Scene([bar, *(grid_surface(crease, side, down, albedo=SKIN) for side in sides)])
+    return Scene([bar, *(build_grid_surface(crease, side, down, albedo=SKIN) for side in sides)])
 
 
 def _board(board: Board, settings: SimulationSettings) -> Scene:
@@ -109,7 +109,7 @@ def _row(
     images = render_pair(
         scene, view, pair.projector, lamps, settings.projection, rng, frames=frames, code=spec
     )
-    length = exposure(images["lit"], light.board_grey, light)
+    length = choose_exposure(images["lit"], light.board_grey, light)
     seen = {name: expose(image * length, settings.noise, rng) for name, image in images.items()}
     if not spec.is_projected:
         seen = simulate_instrument(seen, spec, frames)

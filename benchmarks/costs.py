@@ -140,7 +140,7 @@ def make_pair(folder: Path, megapixels: float, figure: float = 1.0) -> Path:
     """
     from bodyscan.rig.gauge import RigFrame
     from bodyscan.rig.rig import load_rig, write_rig
-    from bodyscan.simulation import settings_for, simulate
+    from bodyscan.simulation import compose_settings, simulate
     from bodyscan.workflows.calibrate_rig import calibrate_folder
 
     rig = load_rig(PROJECT / "rigs" / "three-pole-12.yaml")
@@ -156,7 +156,7 @@ def make_pair(folder: Path, megapixels: float, figure: float = 1.0) -> Path:
         subject=folder / "figure.ply",
         scale=scale,
         seed=SEED,
-        settings=settings_for("mirror"),
+        settings=compose_settings("mirror"),
         board_shots=BOARD_SHOTS,
     )
     calibrate_folder(folder / "rig.yaml", folder / "calibration")

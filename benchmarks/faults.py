@@ -23,7 +23,7 @@ from benchmarks.full_size import PROJECT, run_commands
 from benchmarks.true_calibration import calibration_from_truth
 from bodyscan.captures.folder import open_scan
 from bodyscan.errors import BodyscanError
-from bodyscan.evaluation.body import girth_errors, true_girths
+from bodyscan.evaluation.body import compute_girth_errors, measure_true_girths
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.outcome import Outcome
 from bodyscan.progress import THREADS
@@ -127,7 +127,7 @@ def _sound(rig: str, subject: str, kind: str) -> Sound:
     )
     truth = o3d.io.read_triangle_mesh(str(workspace / "truth" / "subject.ply"))
     vertices, faces = np.asarray(truth.vertices), np.asarray(truth.triangles).astype(np.int64)
-    girths = true_girths(vertices, faces)
+    girths = measure_true_girths(vertices, faces)
     return Sound(calibration, images, others, person, vertices, faces, girths)
 
 
@@ -230,7 +230,7 @@ def _judge(rig: str, subject: str, fault: Fault, sound: Sound) -> Found:
     except Exception as error:  # costs its cell, not the hours of the others
         return Found(rig, subject, fault.name, CRASHED, None, False, repr(error))
     try:
-        errors = girth_errors(scan.mesh, sound.girths)
+        errors = compute_girth_errors(scan.mesh, sound.girths)
         worst = errors.worst_mm if np.isfinite(errors.worst_mm) else None
     except BodyscanError:  # a body cut short gives no girth
         worst = None

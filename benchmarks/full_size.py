@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.people import of_arms
-from bodyscan.evaluation.surface import fit_to_surface, signed_distances
+from bodyscan.evaluation.surface import compute_signed_distances, fit_to_surface
 from bodyscan.fusion.storage import load_scan
 from bodyscan.geometry.robust import rms
 from bodyscan.simulation.living import load_moving_body
@@ -76,7 +76,7 @@ def _by_parts(workspace: Path) -> str:
     assert body
     surface = body.vertices(stored.facts["person"]["moment_ms"]), np.asarray(body.rest.triangles)
     points = fit_to_surface(stored.cloud.points, *surface).apply(stored.cloud.points)
-    errors, arms = signed_distances(points, *surface), of_arms(points, surface[0], body)
+    errors, arms = compute_signed_distances(points, *surface), of_arms(points, surface[0], body)
     return (
         f"| of the cloud | arms RMS {rms(errors[arms]):.3f}, trunk, legs and head "
         f"{rms(errors[~arms]):.3f} mm |"

@@ -238,7 +238,7 @@ def _ours(workspace: Path, folder: Path) -> Step:
 
 
 def _mesh(workspace: Path, folder: Path) -> Step:
-    from bodyscan.fusion.meshing import attach_attributes, closed_surface
+    from bodyscan.fusion.meshing import attach_attributes, make_closed_surface
 
     images, _, _, placing, cloud = _kept(folder / "ours")
 
@@ -250,7 +250,7 @@ def _mesh(workspace: Path, folder: Path) -> Step:
         }
 
     def make() -> Any:
-        shape = closed_surface(cloud, SETTINGS.mesh, images, placing)
+        shape = make_closed_surface(cloud, SETTINGS.mesh, images, placing)
         return attach_attributes(*shape, cloud, SETTINGS.mesh.reach_mm)
 
     return make, finish
@@ -262,7 +262,7 @@ def versions(full: Any) -> Figures:
     Distances, mm, are those of random points on the light mesh and of all vertices of the full one.
     """
     from benchmarks.self_intersections import self_intersections
-    from bodyscan.evaluation.surface import sample_surface, signed_distances
+    from bodyscan.evaluation.surface import compute_signed_distances, sample_surface
     from bodyscan.mesh.repair import decimate
 
     lean = decimate(full)
@@ -270,8 +270,8 @@ def versions(full: Any) -> Figures:
     distances = np.abs(
         np.concatenate(
             [
-                signed_distances(spots, full.vertices, full.faces),
-                signed_distances(full.vertices, lean.vertices, lean.faces),
+                compute_signed_distances(spots, full.vertices, full.faces),
+                compute_signed_distances(full.vertices, lean.vertices, lean.faces),
             ]
         )
     )
@@ -476,13 +476,15 @@ def _near(workspace: Path, points: Any, vertices: Any, faces: Any) -> Figures:
 def _deviation(workspace: Path, points: Any) -> Figures:
     from dataclasses import asdict
 
-    from bodyscan.evaluation.surface import deviation, signed_distances
+    from bodyscan.evaluation.surface import compute_signed_distances, summarize_deviation
     from bodyscan.workflows.evaluate import load_truth
 
     truth = load_truth(workspace / "truth")
     assert truth.vertices is not None
     assert truth.faces is not None
-    return asdict(deviation(signed_distances(points, truth.vertices, truth.faces)))
+    return asdict(
+        summarize_deviation(compute_signed_distances(points, truth.vertices, truth.faces))
+    )
 
 
 def _keep(path: Path, things: Any) -> None:

@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 
 from bodyscan.captures.captures_file import load_captures_file
-from bodyscan.captures.grey_png import png_damage
+from bodyscan.captures.grey_png import find_png_damage
 from bodyscan.captures.image_header import NotAnImage, read_header
 from bodyscan.errors import BodyscanError
 from bodyscan.evaluation.acceptance import load_acceptance
@@ -182,7 +182,7 @@ def _images(folder: Path) -> Iterator[Kind]:
     for ending in ("png", "jpg", "bmp", "tiff"):
         cv2.imwrite(str(folder / f"image.{ending}"), grey)
         yield Kind(f"{ending} image", f"image.{ending}", read_header)
-    yield Kind("png chunks", "image.png", lambda path: png_damage(path.read_bytes()))
+    yield Kind("png chunks", "image.png", lambda path: find_png_damage(path.read_bytes()))
 
 
 def _imports(folder: Path) -> Iterator[Kind]:

@@ -10,9 +10,9 @@ import numpy as np
 
 from benchmarks.pinhole_opencv import fit_pinhole_opencv
 from bodyscan.arrays import Array
-from bodyscan.boards.board_layout import corner_points
+from bodyscan.boards.board_layout import compute_corner_points
 from bodyscan.boards.view import BoardView
-from bodyscan.calibration.board_views import LocatedView, planar_view
+from bodyscan.calibration.board_views import LocatedView, make_planar_view
 from bodyscan.calibration.boundary_points import (
     BoardBoundaries,
     BoundaryPoints,
@@ -118,8 +118,8 @@ def _shots(rig: Rig, captures: Captures, pair: str) -> tuple[CameraCalibration, 
             continue
         stripes = decode_sequence(sequence, spec)
         board = rig.board(view.board)
-        pose = locate_board(camera.camera, planar_view(view, board))[0]
-        corners = corner_points(board)[view.corner_ids]
+        pose = locate_board(camera.camera, make_planar_view(view, board))[0]
+        corners = compute_corner_points(board)[view.corner_ids]
         located = LocatedView(pair, view.shot, view.board, corners, view.pixels, pose)
         boundaries = BoardBoundaries(
             stripes.boundary_index,
@@ -146,7 +146,7 @@ def _corners_with_stripe(rig: Rig, shot: _Shot) -> tuple[Array, Array, Array]:
         shot.stripes.s, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=np.nan
     ).ravel()
     known = np.isfinite(s)
-    corners = corner_points(rig.board(shot.view.board))[shot.view.corner_ids]
+    corners = compute_corner_points(rig.board(shot.view.board))[shot.view.corner_ids]
     return corners[known], shot.view.pixels[known], s[known].astype(float)
 
 

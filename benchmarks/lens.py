@@ -13,7 +13,7 @@ import numpy as np
 import open3d as o3d
 
 from bodyscan.arrays import Array, Indices, Mask
-from bodyscan.boards.board_layout import corner_points
+from bodyscan.boards.board_layout import compute_corner_points
 from bodyscan.calibration.pair import PairCalibration
 from bodyscan.captures.folder import open_captures, open_scan
 from bodyscan.geometry.transforms import RigidTransform
@@ -207,7 +207,7 @@ def boards_reached(
     for shot in shots[pair]:
         board = facts["shots"][shot]
         pose = camera_from_rig @ RigidTransform.from_matrix(board["rig_from_board"])
-        points = pose.apply(corner_points(rig.board(board["board"])))
+        points = pose.apply(compute_corner_points(rig.board(board["board"])))
         u, v = camera.image(points).T
         seen = (u > 0) & (u < camera.width - 1) & (v > 0) & (v < camera.height - 1)
         on = projector.stripe(points[seen])

@@ -12,8 +12,8 @@ from scipy.spatial import cKDTree
 
 from benchmarks.cast_people import SCALE, STANCE_DEG, STANCE_MM, cast_person
 from bodyscan.arrays import Array, Mask
-from bodyscan.evaluation.body import WHOLE, true_girths
-from bodyscan.evaluation.surface import fit_to_surface, normalize_errors, signed_distances
+from bodyscan.evaluation.body import WHOLE, measure_true_girths
+from bodyscan.evaluation.surface import compute_signed_distances, fit_to_surface, normalize_errors
 from bodyscan.geometry.robust import rms
 from bodyscan.measurement.measurements import Measurements, measure
 from bodyscan.outcome import Outcome
@@ -103,8 +103,8 @@ def scan_person(job: Job) -> Found:
     scan = fuse(cast.calibration, Outcome(cast.images), ScanSettings())
     vertices, faces = cast.vertices(), cast.faces
     points = fit_to_surface(scan.cloud.points, vertices, faces).apply(scan.cloud.points)
-    errors = signed_distances(points, vertices, faces)
-    true = true_girths(cast.vertices(breathing=False), faces)
+    errors = compute_signed_distances(points, vertices, faces)
+    true = measure_true_girths(cast.vertices(breathing=False), faces)
     ours = measure(scan.mesh, [one.height_mm for one in true.slices])
     over = errors / scan.cloud.sigma_mm
     arms = of_arms(points, vertices, cast.body)

@@ -16,7 +16,7 @@ import numpy as np
 
 from benchmarks import full_size
 from bodyscan.captures.folder import open_scan
-from bodyscan.captures.grey_png import decode_grey_png, png_damage
+from bodyscan.captures.grey_png import decode_grey_png, find_png_damage
 from bodyscan.registration.storage import load_calibration
 
 RUNS, THREADS = 7, 2
@@ -70,7 +70,7 @@ def _times(reader: Reader, files: list[bytes]) -> tuple[float, float, float]:
 
 
 def _ours(width: int, height: int) -> Reader:
-    return lambda file: png_damage(file) or decode_grey_png(file, width, height)
+    return lambda file: find_png_damage(file) or decode_grey_png(file, width, height)
 
 
 def _opencv(width: int, height: int) -> Reader:

@@ -15,7 +15,7 @@ from bodyscan.arrays import Array, Mask
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.transforms import RigidTransform, fit_rigid_transform
-from bodyscan.geometry.uncertainty import position_sigma
+from bodyscan.geometry.uncertainty import compute_position_sigma
 from bodyscan.registration.rig_solve import RigSolution, solve_rig
 from bodyscan.rig.board import Board
 from bodyscan.rig.rig import Rig, load_rig
@@ -206,7 +206,7 @@ def _normalized(seen: SeenRig, placed: RigSolution) -> Array:
     return np.concatenate(
         [
             (found.translation - seen.pairs[name].rig_from_camera.translation)
-            / position_sigma(placed.covariance, name, found.translation)
+            / compute_position_sigma(placed.covariance, name, found.translation)
             for name, found in placed.rig_from_camera.items()
         ]
     )

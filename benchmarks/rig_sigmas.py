@@ -12,8 +12,8 @@ import numpy as np
 from benchmarks.full_size import PROJECT, run_commands
 from benchmarks.sigmas import each_seed
 from bodyscan.arrays import Array
-from bodyscan.boards.board_layout import corner_points
-from bodyscan.evaluation.surface import signed_distances
+from bodyscan.boards.board_layout import compute_corner_points
+from bodyscan.evaluation.surface import compute_signed_distances
 from bodyscan.fusion.storage import load_scan
 from bodyscan.geometry.camera import camera_from_fields
 from bodyscan.geometry.robust import rms
@@ -104,7 +104,7 @@ def _rig(preset: str, seed: int) -> RigErrors:
     assert truth.vertices is not None
     assert truth.faces is not None
     cloud = load_scan(workspace / "scan").cloud
-    distances = signed_distances(cloud.points, truth.vertices, truth.faces)
+    distances = compute_signed_distances(cloud.points, truth.vertices, truth.faces)
     shutil.rmtree(workspace / "scan")
     names = sorted(found.pairs)
     apart = _turned_print(found, truth)
@@ -130,7 +130,7 @@ def _turned_print(found: RigCalibration, truth: Truth) -> RigidTransform:
         return RigidTransform.identity()
     printed = np.array(truth.facts["boards"][board.name]["corners_mm"])
     rig_from_board = RigidTransform.from_matrix(truth.facts["shots"][shot]["rig_from_board"])
-    moved = fit_rigid_transform(corner_points(board), printed)
+    moved = fit_rigid_transform(compute_corner_points(board), printed)
     return rig_from_board @ moved @ rig_from_board.inverse()
 
 

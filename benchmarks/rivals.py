@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from bodyscan.arrays import Array
-from bodyscan.boards.board_layout import corner_points
+from bodyscan.boards.board_layout import compute_corner_points
 from bodyscan.calibration.board_views import LocatedView, PlanarView
 from bodyscan.calibration.camera import calibrate_camera
 from bodyscan.geometry.camera import Camera
@@ -140,7 +140,7 @@ def _corners(
     board: Board, views: Sequence[LocatedView], cameras: Mapping[str, Camera], names: Sequence[str]
 ) -> dict[str, Any]:
     """Input of rig_rivals.py."""
-    points = corner_points(board)
+    points = compute_corner_points(board)
     number = {tuple(point): k for k, point in enumerate(np.round(points, 4).tolist())}
     shots = sorted({view.shot for view in views})
     pixels = np.full((len(names), len(shots), len(points), 2), np.nan)

@@ -6,7 +6,7 @@ import numpy as np
 import open3d as o3d
 
 from bodyscan.arrays import Array, Indices
-from bodyscan.mesh.topology import directed_edges
+from bodyscan.mesh.topology import list_directed_edges
 
 
 def self_intersections(vertices: Array, faces: Indices) -> Indices:
@@ -16,7 +16,7 @@ def self_intersections(vertices: Array, faces: Indices) -> Indices:
     ray at all faces but those it touches; comparing triangles in pairs would be quadratic. In
     float32: exact to a ten-thousandth of a millimetre on a body.
     """
-    edges = np.unique(np.sort(directed_edges(faces), axis=1), axis=0)
+    edges = np.unique(np.sort(list_directed_edges(faces), axis=1), axis=0)
     # The scene computes in float32, so coordinates are centred first.
     places = (vertices - vertices.mean(axis=0)).astype(np.float32)
     scene = o3d.t.geometry.RaycastingScene()

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.distance import pdist
 
 from bodyscan.arrays import Array
-from bodyscan.boards.board_layout import corner_points
+from bodyscan.boards.board_layout import compute_corner_points
 from bodyscan.evaluation.primitives import compare_centre_distances
 from bodyscan.geometry.camera import camera_from_fields
 from bodyscan.geometry.robust import rms
@@ -83,14 +83,14 @@ class UnitErrors:
 
 
 def _unit(boards: int, real_light: bool, seed: int) -> UnitErrors:
-    settings = apparatus.real_settings() if real_light else apparatus.ideal_settings()
-    setup = apparatus.chapter_setup(settings, seed)
+    settings = apparatus.make_real_settings() if real_light else apparatus.make_ideal_settings()
+    setup = apparatus.build_chapter_setup(settings, seed)
     captures = take_captures(setup, boards=boards, stage_stops=0)
     ours, covariance, *_ = calibrate_ours(captures, *calibrate_by_reference_plane(captures.boards))
     true = camera_from_fields(describe_camera(apparatus.CAMERA)).parameters
     off = (ours.camera.parameters - true) / np.sqrt(np.diag(covariance))
     print_ppm = compare_centre_distances(
-        setup.board.corners, corner_points(apparatus.BOARD)
+        setup.board.corners, compute_corner_points(apparatus.BOARD)
     ).scale_ppm
     accuracy, best = (measure_artefacts(one, captures) for one in (ours, make_true_approach(setup)))
     return UnitErrors(compare_point_sigmas(ours, captures), off, accuracy, best, print_ppm)

@@ -20,14 +20,14 @@ from benchmarks.full_size import PROJECT, run_commands
 from benchmarks.true_calibration import calibration_from_truth
 from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.captures.folder import open_scan
-from bodyscan.evaluation.body import sway_residual
-from bodyscan.evaluation.surface import signed_distances
+from bodyscan.evaluation.body import compute_sway_residual
+from bodyscan.evaluation.surface import compute_signed_distances
 from bodyscan.fusion.storage import Scan
 from bodyscan.geometry.camera import camera_from_fields
-from bodyscan.geometry.robust import rms, robust_scale
+from bodyscan.geometry.robust import estimate_robust_scale, rms
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import DARK_CLOTH, HAIR, REGION_NAMES, SKIN, compute_region_shares
-from bodyscan.mesh.topology import vertex_normals
+from bodyscan.mesh.topology import compute_vertex_normals
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.settings import ScanSettings
 from bodyscan.simulation.body import mask_hair, mask_shorts
@@ -125,7 +125,7 @@ def _scan(calibration: RigCalibration, person: Path) -> Scan:
 
 def _light_row(name: str, case: Case) -> str:
     scan, off = case.scan, _errors(case)
-    sigmas = robust_scale(off / scan.cloud.sigma_mm)
+    sigmas = estimate_robust_scale(off / scan.cloud.sigma_mm)
     size = f"{off.mean():.3f}, {rms(off):.3f}, {np.percentile(np.abs(off), 95):.3f}"
     return f"| {name} | {size} | {sigmas:.2f} | {scan.verdict.grade} |"
 
@@ -146,7 +146,7 @@ def _region_rows(name: str, case: Case) -> list[str]:
         recall = np.mean(regions[of_points == kind] == kind)
         covered = np.mean(near[seen & (true == kind)])
         own = of_points == kind
-        sigmas = robust_scale(off[own] / case.scan.cloud.sigma_mm[own])
+        sigmas = estimate_robust_scale(off[own] / case.scan.cloud.sigma_mm[own])
         figures = f"{precision:.4f} | {recall:.4f} | {100.0 * covered:.1f} %"
         figures += f" | {rms(off[own]):.3f} | {sigmas:.2f}"
         rows.append(f"| {name} | {REGION_NAMES[kind]} | {figures} |")
@@ -167,13 +167,13 @@ def _surface(truth: Truth) -> tuple[Array, Indices]:
 
 def _errors(case: Case) -> Array:
     """How far the cloud's points lie off the truth, (N,) mm."""
-    return signed_distances(_laid(case), *_surface(case.truth))
+    return compute_signed_distances(_laid(case), *_surface(case.truth))
 
 
 def _laid(case: Case) -> Array:
     """The cloud's points moved to where the truth stands."""
     vertices, _ = _surface(case.truth)
-    rig_from_still, _ = sway_residual(
+    rig_from_still, _ = compute_sway_residual(
         case.scan.rig_from_camera, case.truth.facts["pairs"], vertices
     )
     return rig_from_still.inverse().apply(case.scan.cloud.points)
@@ -181,7 +181,7 @@ def _laid(case: Case) -> Array:
 
 def _seen_by_two(vertices: Array, faces: Indices, pairs: Mapping[str, Any]) -> Mask:
     """Vertices (V,) that the camera and projector of at least two pairs face."""
-    normals = vertex_normals(vertices, faces).astype(float)
+    normals = compute_vertex_normals(vertices, faces).astype(float)
     scene, count = o3d.t.geometry.RaycastingScene(), np.zeros(len(vertices), int)
     scene.add_triangles(vertices.astype(np.float32), faces.astype(np.uint32))
     start = vertices + LIFT_MM * normals

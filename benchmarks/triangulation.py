@@ -31,7 +31,7 @@ def triangulate(
     start = _nearest_to_rays(cameras, camera_from_rig, pixels, seen)
     points[enough] = minimize_each(
         start,
-        lambda points: _equations(cameras, camera_from_rig, pixels, seen, points),
+        lambda points: _form_equations(cameras, camera_from_rig, pixels, seen, points),
         steps=STEPS,
         damping=0.0,
         min_sigma=LEAST_PX,
@@ -39,7 +39,7 @@ def triangulate(
     return points
 
 
-def _equations(
+def _form_equations(
     cameras: Sequence[Camera],
     camera_from_rig: Sequence[RigidTransform],
     pixels: Array,

@@ -20,7 +20,7 @@ Greys = NDArray[np.uint8] | NDArray[np.float32]
 """Grey levels, 0 to 255: float32 where a camera or merged exposures resolve finer steps."""
 
 
-def whole_grey(image: Greys) -> Bytes:
+def round_to_grey(image: Greys) -> Bytes:
     """The image, rounded to whole grey levels."""
     return cast(Bytes, image) if image.dtype == np.uint8 else np.rint(image).astype(np.uint8)
 

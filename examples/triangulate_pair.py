@@ -12,7 +12,7 @@ from tempfile import mkdtemp
 import numpy as np
 
 import bodyscan
-from bodyscan.boards.board_layout import corner_points
+from bodyscan.boards.board_layout import compute_corner_points
 from bodyscan.captures.folder import open_captures
 from bodyscan.reconstruction.triangulation import reconstruct_range_image
 from bodyscan.rig.frame_names import CaptureFolder
@@ -49,7 +49,7 @@ points = image.points[image.valid].astype(float)
 board = rig.boards[0]
 rig_from_board = calibration.rig_from_board[sequence.shot, board.name]
 board_from_camera = rig_from_board.inverse() @ calibration.rig_from_camera[name]
-on_board, corners = board_from_camera.apply(points), corner_points(board)
+on_board, corners = board_from_camera.apply(points), compute_corner_points(board)
 inside = np.all(
     (on_board > corners.min(0) - [0, 0, 5]) & (on_board < corners.max(0) + [0, 0, 5]), 1
 )

@@ -15,7 +15,12 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.special import fdtri
 
-from bodyscan.alignment.sway_prior import LEVER_MM, SwayPrior, centre_shifts, stance_correlation
+from bodyscan.alignment.sway_prior import (
+    LEVER_MM,
+    SwayPrior,
+    compute_centre_shifts,
+    correlate_stance,
+)
 from bodyscan.arrays import Array
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance
@@ -59,7 +64,7 @@ class DisplacedPole:
             np.mean([twist for n, twist in motions.items() if (n in pairs) == inside], axis=0)
             for inside in (True, False)
         )
-        shift = float(np.linalg.norm(centre_shifts((mean - reference)[None])[0]))
+        shift = float(np.linalg.norm(compute_centre_shifts((mean - reference)[None])[0]))
         rotation = float(np.degrees(np.linalg.norm((mean - reference)[:3])))
         return DisplacedPole(name, pairs, shift, rotation)
 
@@ -129,7 +134,7 @@ def free_pairs(boards: PoseCovariance, pairs: Collection[str]) -> PoseCovariance
     return boards.add_motions(pairs, SwayPrior(30.0, 5.0, 1.0, 1.0).pair_covariance(), common=True)
 
 
-def motions_between(
+def compute_motions_between(
     before: Mapping[str, RigidTransform], after: Mapping[str, RigidTransform]
 ) -> dict[str, Array]:
     """Twist (6,) by which each pair's pose changed, rig frame."""
@@ -187,11 +192,13 @@ def find_displaced_pole(
         motions = [
             {n: m[n] for n in m if n in measured.names and n not in displaced} for m, _ in scans
         ]
-        candidates.append((gain, DisplacedPole.from_motions(name, pairs, _mean_motions(motions))))
+        candidates.append(
+            (gain, DisplacedPole.from_motions(name, pairs, _average_motions(motions)))
+        )
     if not candidates:
         return DisplacementSearch(None, np.inf)
     if not ambiguous:
-        same_pole = _same_pole(measured.names, poles)
+        same_pole = _mark_same_pole(measured.names, poles)
         each = _maximize_likelihood(measured, SWAYS_MM, same_pole, STEPS_MM)[0] - null
         candidates = _with_all_moved(candidates, each)
     gain, best = max(candidates, key=lambda one: one[0])
@@ -213,7 +220,7 @@ def _with_all_moved(
     return [(gain, replace(farthest, all_moved=True))]
 
 
-def _mean_motions(motions: Sequence[Mapping[str, Array]]) -> dict[str, Array]:
+def _average_motions(motions: Sequence[Mapping[str, Array]]) -> dict[str, Array]:
     """Mean twist of each pair over the scans that have it."""
     names = dict.fromkeys(name for scan in motions for name in scan)
     return {
@@ -242,9 +249,9 @@ class _PoseMotions:
         for twist_of, moments_ms in scans:
             used = [name for name in twist_of if not timed or moments_ms[name] is not None]
             twists = np.array([twist_of[name] for name in used]).reshape(-1, 6)
-            motions.append(np.hstack([centre_shifts(twists), LEVER_MM * twists[:, :3]]))
-            sways.append(_stance_correlations([moments_ms[name] for name in used]))
-            sides.append(_same_pole(used, poles))
+            motions.append(np.hstack([compute_centre_shifts(twists), LEVER_MM * twists[:, :3]]))
+            sways.append(_correlate_stances([moments_ms[name] for name in used]))
+            sides.append(_mark_same_pole(used, poles))
             names += used
         is_displaced = np.array([name in displaced for name in names], float)
         nuisance = block_diag(*(np.ones_like(sway) for sway in sways))
@@ -258,14 +265,14 @@ class _PoseMotions:
         )
 
 
-def _stance_correlations(moments_ms: Sequence[float | None]) -> Array:
+def _correlate_stances(moments_ms: Sequence[float | None]) -> Array:
     """Correlations of the posture between moments; an unknown one correlates with no other."""
     seconds = np.array([np.nan if at is None else 1e-3 * at for at in moments_ms], float)
     lag = seconds[:, None] - seconds
-    return np.where(np.isnan(lag), np.eye(len(seconds)), stance_correlation(np.nan_to_num(lag)))
+    return np.where(np.isnan(lag), np.eye(len(seconds)), correlate_stance(np.nan_to_num(lag)))
 
 
-def _same_pole(names: Sequence[str], poles: Mapping[str, str]) -> Array:
+def _mark_same_pole(names: Sequence[str], poles: Mapping[str, str]) -> Array:
     """(N, N): 1 for two pairs of one pole."""
     side = [poles.get(name, name) for name in names]
     return np.equal.outer(side, side).astype(float)

@@ -18,13 +18,13 @@ from bodyscan.alignment.matching import Matches
 from bodyscan.alignment.overlaps import (
     COARSE,
     OverlapPoints,
+    compute_motion_covariance,
     linearize,
     map_overlaps,
     match_overlap,
-    motion_covariance,
     solve_motions,
 )
-from bodyscan.alignment.sway_prior import SwayPrior, centre_shifts, reject_large_motions
+from bodyscan.alignment.sway_prior import SwayPrior, compute_centre_shifts, reject_large_motions
 from bodyscan.arrays import Array
 from bodyscan.geometry.robust import rms
 from bodyscan.geometry.transforms import RigidTransform
@@ -115,7 +115,7 @@ def align(
         _map_matches(_measure_distances, coarse, poses, settings.min_reach_mm, settings)
         for poses in (start, moved)
     )
-    shift = np.linalg.norm(centre_shifts(motion), axis=1).tolist()
+    shift = np.linalg.norm(compute_centre_shifts(motion), axis=1).tolist()
     connected = _find_largest_group(after)
     unknown = 0, np.nan, np.nan
     return Alignment(
@@ -154,7 +154,7 @@ def _register(
         covariance = sway.covariance(names, prior, scale)
         motion = solve_motions(overlaps, motion, covariance)
         reach, scale = max(reach / 2.0, settings.min_reach_mm), sway.scale(motion)
-    return motion, motion_covariance(overlaps, covariance)
+    return motion, compute_motion_covariance(overlaps, covariance)
 
 
 def _map_matches(

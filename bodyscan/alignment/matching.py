@@ -14,7 +14,7 @@ import numpy as np
 
 from bodyscan.arrays import Array, Floats, Indices, Mask
 from bodyscan.compiled import compiled
-from bodyscan.geometry.camera_tables import Table, look_up, projection_table
+from bodyscan.geometry.camera_tables import Table, look_up, make_projection_table
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
 
@@ -110,7 +110,7 @@ def match_projected(
     distances, sigma_mm, number = np.empty(size), np.empty(size), np.empty(size, np.int64)
     found = _match_projected(
         np.ascontiguousarray(target_from_source.matrix[:3]),
-        projection_table(image.camera),
+        make_projection_table(image.camera),
         (source.points, source.normals, source.sigma_mm, source.in_margin),
         (image.points, image.normals, image.sigma_mm, target.inner),
         image.corner,

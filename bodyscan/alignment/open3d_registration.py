@@ -106,13 +106,13 @@ def _register_two(
         if reach <= settings.min_reach_mm:
             break
         reach = max(reach / 2.0, settings.min_reach_mm)
-    matches = _matches(source, target, found)
+    matches = _select_matches(source, target, found)
     if len(matches.distances) < settings.min_matches:
         return None
     return _Edge(motion, linearize(matches, settings.correlated).information)
 
 
-def _matches(
+def _select_matches(
     source: _RigCloud, target: _RigCloud, found: o3d.pipelines.registration.RegistrationResult
 ) -> Matches:
     """The last matches of ICP whose normals agree."""

@@ -18,7 +18,7 @@ from bodyscan.alignment.matching import (
 )
 from bodyscan.arrays import Array, Mask
 from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
-from bodyscan.geometry.robust import robust_scale
+from bodyscan.geometry.robust import estimate_robust_scale
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.progress import map_threads
 from bodyscan.reconstruction.range_image import RangeImage
@@ -95,17 +95,17 @@ def linearize(matches: Matches, correlated: float) -> LinearGaussianSystem:
     correlated: number of neighbouring matches that count as one.
     """
     jacobian = np.hstack([np.cross(matches.points, matches.normals), matches.normals])
-    weights = cauchy_weights(matches) / correlated
+    weights = weigh_by_cauchy(matches) / correlated
     return LinearGaussianSystem.from_observations(jacobian, -matches.distances, weights)
 
 
-def cauchy_weights(matches: Matches) -> Array:
+def weigh_by_cauchy(matches: Matches) -> Array:
     """Weights (M,): 1 / (1 + (d / 2 sigma)^2) / sigma^2.
 
     sigma^2 is the sum of a match's expected variance and the robust variance of all distances, at
     least 0.01 mm: surfaces of two calibrations never agree better.
     """
-    scale_mm = robust_scale(matches.distances, 0.01)
+    scale_mm = estimate_robust_scale(matches.distances, 0.01)
     variance = matches.sigma_mm**2 + scale_mm * scale_mm
     return 1.0 / (variance + 0.25 * matches.distances**2)
 
@@ -118,19 +118,19 @@ def solve_motions(
     overlaps: by source and target, linearized at `motion` (P, 6).
     covariance: of the prior, whose mean is zero, (6P, 6P).
     """
-    system = _joint_system(overlaps, motion, covariance)
+    system = _assemble_system(overlaps, motion, covariance)
     return system.solve().reshape(-1, 6)
 
 
-def motion_covariance(
+def compute_motion_covariance(
     overlaps: Mapping[tuple[int, int], LinearGaussianSystem], covariance: Array
 ) -> Array:
     """Posterior covariance (6P, 6P) of the twists that `solve_motions` finds."""
     motion = np.zeros((len(covariance) // 6, 6))
-    return _joint_system(overlaps, motion, covariance).covariance()
+    return _assemble_system(overlaps, motion, covariance).covariance()
 
 
-def _joint_system(
+def _assemble_system(
     overlaps: Mapping[tuple[int, int], LinearGaussianSystem], motion: Array, covariance: Array
 ) -> LinearGaussianSystem:
     """The prior and all overlaps, as one system of all twists."""

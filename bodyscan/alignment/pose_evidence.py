@@ -135,23 +135,25 @@ def detect_displacement(
         # Among few pairs, any single one could be displaced.
         identifiable = len(pairs) > 1 or len(evidence.names) >= MIN_PAIRS
         if identifiable and pairs.isdisjoint(displaced):
-            fit = evidence.fit(_rigid_basis(np.isin(evidence.names, list(pairs))))
-            candidates.append((fit.log_ratio, _displaced_pole(name, pairs, fit.steps)))
+            fit = evidence.fit(_build_rigid_basis(np.isin(evidence.names, list(pairs))))
+            candidates.append((fit.log_ratio, _describe_displaced_pole(name, pairs, fit.steps)))
             if len(pairs) > 1:
                 candidates += _fit_postures(evidence, name, pairs)
     if not displaced:
-        bases = {side: _rigid_basis(np.equal(sides, side)) for side in dict.fromkeys(sides)}
+        bases = {side: _build_rigid_basis(np.equal(sides, side)) for side in dict.fromkeys(sides)}
         each = evidence.fit(np.hstack(list(bases.values())))
         relative = each.steps.reshape(-1, 6) - each.steps.reshape(-1, 6).mean(axis=0)
         farthest = int(np.argmax(np.linalg.norm(relative, axis=1)))
         side = list(bases)[farthest]
         pairs = frozenset(np.array(evidence.names)[np.equal(sides, side)].tolist())
-        pole = _displaced_pole(f"pole {side}", pairs, relative[farthest])
+        pole = _describe_displaced_pole(f"pole {side}", pairs, relative[farthest])
         candidates.append((each.log_ratio, replace(pole, all_moved=True)))
-        scale = evidence.fit(_outward_basis(evidence.names, sides, rig_from_camera).reshape(-1, 1))
+        scale = evidence.fit(
+            _build_outward_basis(evidence.names, sides, rig_from_camera).reshape(-1, 1)
+        )
         sigma_mm = float(np.sqrt(scale.covariance[0, 0]))
         candidates.append((scale.log_ratio, ScaleError(float(scale.steps[0]), sigma_mm)))
-        common = evidence.fit(common_basis(evidence.names, rig_from_camera))
+        common = evidence.fit(build_common_basis(evidence.names, rig_from_camera))
         shift, lever = common.steps.reshape(2, 3)
         turn_deg = float(np.degrees(np.linalg.norm(lever) / LEVER_MM))
         candidates.append((common.log_ratio, CommonError(tuple(shift.tolist()), turn_deg)))
@@ -190,13 +192,13 @@ def _is_harmful(found: Displacement) -> bool:
     return float(np.hypot(found.shift_mm, lever)) > limit_mm
 
 
-def _displaced_pole(name: str, pairs: frozenset[str], steps: Array) -> DisplacedPole:
-    """steps: (6,) mm, along `_rigid_basis`."""
+def _describe_displaced_pole(name: str, pairs: frozenset[str], steps: Array) -> DisplacedPole:
+    """steps: (6,) mm, along `_build_rigid_basis`."""
     shift, lever = np.linalg.norm(steps.reshape(2, 3), axis=1)
     return DisplacedPole(name, pairs, float(shift), float(np.degrees(lever / LEVER_MM)))
 
 
-def _rigid_basis(members: Mask) -> Array:
+def _build_rigid_basis(members: Mask) -> Array:
     """Twists (6P, 6) of the pairs (P,) that move as one.
 
     Translations of the body's centre by 1 mm, then rotations about it that move a point at the lever
@@ -209,7 +211,7 @@ def _rigid_basis(members: Mask) -> Array:
     return np.asarray(np.kron(members.astype(float)[:, None], twists))
 
 
-def _outward_basis(
+def _build_outward_basis(
     names: Collection[str], sides: Sequence[str], rig_from_camera: Mapping[str, RigidTransform]
 ) -> Array:
     """(P, 6): each pair translated by 1 mm, level and away from the body, equally for one pole."""
@@ -223,7 +225,9 @@ def _outward_basis(
     return twists
 
 
-def common_basis(names: Collection[str], rig_from_camera: Mapping[str, RigidTransform]) -> Array:
+def build_common_basis(
+    names: Collection[str], rig_from_camera: Mapping[str, RigidTransform]
+) -> Array:
     """Twists (6P, 6) of pairs that all move alike in their own camera's frames.
 
     Translations by 1 mm along the camera's axes, then rotations about the point on its axis that is as

@@ -15,7 +15,7 @@ from bodyscan.arrays import Array
 from bodyscan.geometry.linear_gaussian import solve_scaled
 from bodyscan.geometry.robust import rms
 from bodyscan.geometry.transforms import RigidTransform, adjoint
-from bodyscan.geometry.uncertainty import PoseCovariance, position_sigma
+from bodyscan.geometry.uncertainty import PoseCovariance, compute_position_sigma
 from bodyscan.settings import BODY_CENTRE_MM, AlignmentSettings
 
 BODY_CENTRE = np.array(BODY_CENTRE_MM)
@@ -24,7 +24,7 @@ LEVER_MM = 400.0
 point as far as a unit of translation."""
 
 
-def stance_correlation(seconds: Array) -> Array:
+def correlate_stance(seconds: Array) -> Array:
     """Correlation of a standing person's posture with itself after so many seconds.
 
     Matern's of order 3/2 with a length of 0.8 s: people sway at 0.1 to 1 Hz, and muscles change the
@@ -57,7 +57,7 @@ class SwayPrior:
         """
         if not self.shift_mm:
             return 1.0
-        ratio = rms(centre_shifts(motion)) / self.shift_mm
+        ratio = rms(compute_centre_shifts(motion)) / self.shift_mm
         return float(np.clip(1.5 * ratio, self.min_scale, self.max_scale))
 
     def covariance(self, names: Sequence[str], boards: PoseCovariance, scale: float = 1.0) -> Array:
@@ -76,15 +76,15 @@ class SwayPrior:
         return boards.add_motions(names, self.pair_covariance(), common=False)
 
 
-def centre_shifts(motion: Array) -> Array:
+def compute_centre_shifts(motion: Array) -> Array:
     """Displacements (P, 3) mm of the body's centre by twists (P, 6)."""
     return motion[:, 3:] + np.cross(motion[:, :3], BODY_CENTRE)
 
 
-def centre_sigmas(boards: PoseCovariance) -> dict[str, float]:
+def compute_centre_sigmas(boards: PoseCovariance) -> dict[str, float]:
     """Standard deviation, mm, of the body's centre due to each pair's pose error."""
     return {
-        name: float(np.linalg.norm(position_sigma(boards, name, BODY_CENTRE)))
+        name: float(np.linalg.norm(compute_position_sigma(boards, name, BODY_CENTRE)))
         for name in boards.names
     }
 
@@ -116,6 +116,6 @@ def select_tighter(
     """
     if not names:
         return one
-    sizes = (centre_sigmas(poses) for poses in (one, other))
+    sizes = (compute_centre_sigmas(poses) for poses in (one, other))
     first, second = (rms(np.array([sigmas[name] for name in names])) for sigmas in sizes)
     return other if second < first else one

@@ -38,17 +38,17 @@ class GridPosition:
 def find_aprilgrid(image: Bytes, board: Board, *, thorough: bool = True) -> DetectedCorners | None:
     """Find the grid's visible corners, of the whole grid or a part; thorough: at several scales."""
     best: GridPosition | None = None
-    for position in _candidate_positions(image, board, thorough):
+    for position in _propose_positions(image, board, thorough):
         if best is None or position.agreeing > best.agreeing:
             best = position
         if best.agreeing >= 0.5 * board.marker_count:
             break
     if best is None:
         return None
-    printed = board_layout.printed_corners(board)
+    printed = board_layout.compute_printed_corners(board)
     # Other edges near a corner are those of rim, gap and small squares.
     marker_mm = board.marker_mm or 0.0
-    bits = board_layout.marker_dictionary(board).markerSize + 2 * best.border_bits
+    bits = board_layout.find_marker_dictionary(board).markerSize + 2 * best.border_bits
     clear_mm = 0.85 * min(best.border_bits * marker_mm / bits, board.square_mm - marker_mm)
     # Tags are black: at their upper left and lower right corners the other two squares are white.
     row, column = np.divmod(np.arange(len(printed)), 2 * board.columns)
@@ -58,7 +58,7 @@ def find_aprilgrid(image: Bytes, board: Board, *, thorough: bool = True) -> Dete
     return DetectedCorners(ids, pixels[good])
 
 
-def _candidate_positions(image: Bytes, board: Board, thorough: bool) -> Iterator[GridPosition]:
+def _propose_positions(image: Bytes, board: Board, thorough: bool) -> Iterator[GridPosition]:
     # Scale of the image, and the width in px by which white is grown there.
     tries = ((1.0, 1), (2.0, 3), (1.0, 3), (0.5, 1), (2.0, 1))
     for scale, grown in tries if thorough else tries[:1]:
@@ -82,7 +82,7 @@ def locate_grid(board: Board, tags: Markers, border_bits: int = 2) -> GridPositi
 
     All tags may be rotated by quarter turns, and count from the lowest row (Kalibr) or the highest.
     """
-    ids, printed = board_layout.marker_corners(board)
+    ids, printed = board_layout.compute_marker_corners(board)
     rows = printed.reshape(board.rows, board.columns, 4, 2)
     found = []
     _, detected, of_grid = np.intersect1d(tags.ids, ids, return_indices=True)

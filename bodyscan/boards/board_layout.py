@@ -17,39 +17,39 @@ from bodyscan.arrays import Array, Indices
 from bodyscan.rig.board import Board
 
 
-def corner_grid(board: Board) -> tuple[int, int]:
+def compute_corner_grid(board: Board) -> tuple[int, int]:
     """Columns and rows of corners on one face: between squares, or of an aprilgrid's tags."""
     if board.kind == "aprilgrid":
         return 2 * board.columns, 2 * board.rows
     return board.columns - 1, board.rows - 1
 
 
-def corners_per_face(board: Board) -> int:
+def count_corners_per_face(board: Board) -> int:
     """Number of corners of one face."""
-    columns, rows = corner_grid(board)
+    columns, rows = compute_corner_grid(board)
     return columns * rows
 
 
-def corner_points(board: Board) -> Array:
+def compute_corner_points(board: Board) -> Array:
     """Compute the corners in the board frame, (N, 3) mm, or (2N, 3) for a board with two faces.
 
     Corner id r * (columns - 1) + c is the crossing of column line c + 1 and row line r + 1; the
     back's corners, numbered likewise on its own print, follow the front's. An aprilgrid has the
     corners of all tags, row by row: id r * 2 * columns + c.
     """
-    grid = np.meshgrid(*(_lines(board, count) for count in (board.columns, board.rows)))
+    grid = np.meshgrid(*(_space_corners(board, count) for count in (board.columns, board.rows)))
     x, y = grid[0].ravel(), board.stretch * grid[1].ravel()
     front = np.stack([x, y, np.zeros_like(x)], axis=-1)
     back = np.stack([board.size_mm[0] - x, y, np.full_like(x, board.thickness_mm)], axis=-1)
     return np.concatenate([front, back]) if board.faces == 2 else front
 
 
-def printed_corners(board: Board) -> Array:
+def compute_printed_corners(board: Board) -> Array:
     """Corners (N, 2) mm on the print of one face before it was stretched, x along the columns."""
-    return corner_points(board.model_copy(update={"faces": 1, "stretch": 1.0}))[:, :2]
+    return compute_corner_points(board.model_copy(update={"faces": 1, "stretch": 1.0}))[:, :2]
 
 
-def _lines(board: Board, count: int) -> Array:
+def _space_corners(board: Board, count: int) -> Array:
     """Positions of corners along one side of `count` squares or tags, mm."""
     if board.kind != "aprilgrid":
         return board.square_mm * np.arange(1.0, count)
@@ -58,12 +58,12 @@ def _lines(board: Board, count: int) -> Array:
     return np.stack([starts + gap, starts + board.square_mm - gap], axis=-1).ravel()
 
 
-def marker_dictionary(board: Board) -> cv2.aruco.Dictionary:
+def find_marker_dictionary(board: Board) -> cv2.aruco.Dictionary:
     """Look up OpenCV's dictionary by its name, which a valid board has."""
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
 
 
-def marker_corners(board: Board, face: int = 0) -> tuple[Indices, Array]:
+def compute_marker_corners(board: Board, face: int = 0) -> tuple[Indices, Array]:
     """Marker ids (M,) and their four corners on the face's print, (M, 4, 2) mm.
 
     Corners run clockwise as printed, from the marker's own top left, as OpenCV's detector gives
@@ -73,7 +73,7 @@ def marker_corners(board: Board, face: int = 0) -> tuple[Indices, Array]:
     count = board.marker_count // board.faces
     ids = board.first_marker + face * count + np.arange(count)
     if board.kind == "aprilgrid":
-        x, y = _lines(board, board.columns), _lines(board, board.rows)
+        x, y = _space_corners(board, board.columns), _space_corners(board, board.rows)
         columns, rows = np.meshgrid(np.arange(board.columns), np.arange(board.rows)[::-1])
         column, row = columns.ravel(), rows.ravel()
         left, right, top, bottom = x[2 * column], x[2 * column + 1], y[2 * row], y[2 * row + 1]
@@ -83,7 +83,7 @@ def marker_corners(board: Board, face: int = 0) -> tuple[Indices, Array]:
         (board.columns, board.rows),
         board.square_mm,
         board.marker_mm or 0.0,
-        marker_dictionary(board),
+        find_marker_dictionary(board),
         ids,
     )
     charuco.setLegacyPattern(board.legacy_layout)

@@ -26,7 +26,7 @@ class BoardMap:
     def apply(self, printed: Array) -> Array:
         """Map printed points (..., 2) mm to image points (..., 2) px."""
         scaled = (printed - self.middle) / self.size
-        return _project(self.homography, printed) + _monomials(scaled, self.degree) @ (
+        return _project(self.homography, printed) + _evaluate_monomials(scaled, self.degree) @ (
             self.coefficients
         )
 
@@ -56,7 +56,7 @@ def fit_board_map(printed: Array, pixels: Array, *, curved: bool = False) -> Boa
         homography = np.full((3, 3), np.nan)
     homography[2, 2] = homography[2, 2] or 1.0
     degree = 5 if curved else 3 if len(printed) >= 40 else 2 if len(printed) >= 20 else 0
-    design = _monomials((printed - middle) / size, degree)
+    design = _evaluate_monomials((printed - middle) / size, degree)
     residual = pixels - _project(homography, printed)
     ridge = (1e-6 if curved else 1e-3) * len(printed) * np.eye(design.shape[1])
     solved = np.linalg.solve(design.T @ design + ridge, design.T @ residual)
@@ -94,7 +94,7 @@ def _project(homography: Array, points: Array) -> Array:
     return image[..., :2] / image[..., 2:]
 
 
-def _monomials(points: Array, degree: int) -> Array:
+def _evaluate_monomials(points: Array, degree: int) -> Array:
     """1, x, y, ... up to x^i y^j with i + j <= degree; for degree 0 a column of zeros."""
     x, y = points[..., 0], points[..., 1]
     if degree == 0:

@@ -35,7 +35,7 @@ def detect_markers(
     parameters = cv2.aruco.DetectorParameters()
     parameters.minMarkerPerimeterRate = 0.01
     parameters.markerBorderBits = border_bits
-    dictionary = board_layout.marker_dictionary(board)
+    dictionary = board_layout.find_marker_dictionary(board)
     codes = np.ascontiguousarray(dictionary.bytesList[:first])
     dictionary = cv2.aruco.Dictionary(codes, dictionary.markerSize, dictionary.maxCorrectionBits)
     detector = cv2.aruco.ArucoDetector(dictionary, parameters)
@@ -89,12 +89,12 @@ def locate_charuco(
     pixels, good = refine_predicted(
         image,
         position.board_map,
-        board_layout.printed_corners(board)[nearby],
+        board_layout.compute_printed_corners(board)[nearby],
         board.square_mm,
         (row + column + marked) % 2 == 0,
         marker_gap=gap,
     )
-    ids = nearby[good] + position.face * board_layout.corners_per_face(board)
+    ids = nearby[good] + position.face * board_layout.count_corners_per_face(board)
     appearance = Appearance(other_layout=position.board.legacy_layout != board.legacy_layout)
     return DetectedCorners(ids, pixels[good], appearance)
 
@@ -109,7 +109,7 @@ def locate_face(board: Board, markers: Markers) -> FacePosition | None:
 
 
 def _fit_face(board: Board, face: int, markers: Markers) -> FacePosition | None:
-    face_ids, printed = board_layout.marker_corners(board, face)
+    face_ids, printed = board_layout.compute_marker_corners(board, face)
     _, detected, of_face = np.intersect1d(markers.ids, face_ids, return_indices=True)
     if len(detected) < 2:
         return None

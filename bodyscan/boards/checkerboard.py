@@ -37,7 +37,7 @@ def find_checkerboard(image: Bytes, board: Board, *, quick: bool = False) -> Det
             where=f"board {board.name}",
             remedy="use a board with more squares, or a charuco board",
         )
-    for candidate in _candidates(image, board, quick):
+    for candidate in _propose_corners(image, board, quick):
         found = _refine(image, board, candidate)
         if found is None or len(found.ids) < len(candidate):
             curved = _refine(image, board, candidate, curved=True)
@@ -55,7 +55,7 @@ def _refine(
     Detectors err by a pixel or two at times: corners not found there are looked for where the
     others predict them; on a board that is `curved` (`fit_board_map`) all are needed for that.
     """
-    printed = board_layout.printed_corners(board)
+    printed = board_layout.compute_printed_corners(board)
     row, column = np.divmod(np.arange(len(printed)), board.columns - 1)
     pixels, first_is_black = _number_as_printed(image, board, candidate, printed)
     bright_diagonal = ((row + column) % 2 == 0) != first_is_black
@@ -85,10 +85,10 @@ def _is_part_of_larger(
     image: Bytes, board: Board, board_map: BoardMap, first_is_black: bool
 ) -> bool:
     """Whether squares and corners continue beyond a side, at half the contrast or more."""
-    inside = _greys(image, board, board_map, _inner_squares(board))
+    inside = _sample_greys(image, board, board_map, _list_inner_squares(board))
     contrast = abs(inside[0].mean() - inside[1].mean())
-    for lines, squares in _beyond(board):
-        even, odd = _greys(image, board, board_map, squares)
+    for lines, squares in _extend_beyond(board):
+        even, odd = _sample_greys(image, board, board_map, squares)
         dark, light = (even, odd) if first_is_black else (odd, even)
         if light.min() - dark.max() < 0.5 * contrast:
             continue
@@ -101,7 +101,7 @@ def _is_part_of_larger(
     return False
 
 
-def _beyond(board: Board) -> Iterator[tuple[Indices, Indices]]:
+def _extend_beyond(board: Board) -> Iterator[tuple[Indices, Indices]]:
     """Yield for each side the corners (N, 2) and squares (M, 2) of a larger board beyond it."""
     size = np.array([board.columns, board.rows])
     for along, across in ((0, 1), (1, 0)):
@@ -113,7 +113,7 @@ def _beyond(board: Board) -> Iterator[tuple[Indices, Indices]]:
             yield corners, squares
 
 
-def _candidates(image: Bytes, board: Board, quick: bool) -> Iterator[Array]:
+def _propose_corners(image: Bytes, board: Board, quick: bool) -> Iterator[Array]:
     """Yield corner sets (N, 2) px from the detectors, in order of speed and success.
 
     The plain threshold of the whole image finds most boards in hundredths of a second. If it finds
@@ -137,7 +137,7 @@ def _candidates(image: Bytes, board: Board, quick: bool) -> Iterator[Array]:
         yield from _detect(image, size, flags=adaptive)
     if quick:
         return
-    regions = board_regions(image, size[0] * size[1])
+    regions = find_board_regions(image, size[0] * size[1])
     for region in regions if not large else ():
         if 2 * image[region].size < image.size:
             yield from _detect(image, size, region, scale=2.0)
@@ -184,20 +184,22 @@ def _number_as_printed(
         grid = grid[:, ::-1]
     pixels = grid.reshape(-1, 2)
     # By all squares between inner corners: uneven light does not matter.
-    even, odd = _greys(image, board, fit_board_map(printed, pixels), _inner_squares(board))
+    even, odd = _sample_greys(
+        image, board, fit_board_map(printed, pixels), _list_inner_squares(board)
+    )
     first_is_black = bool(even.mean() < odd.mean())
     if (board.columns + board.rows) % 2 and not first_is_black:
         pixels, first_is_black = pixels[::-1], True
     return np.ascontiguousarray(pixels), first_is_black
 
 
-def _inner_squares(board: Board) -> Indices:
+def _list_inner_squares(board: Board) -> Indices:
     """Column and row (N, 2) of the squares between inner corners."""
     column, row = np.meshgrid(np.arange(1, board.columns - 1), np.arange(1, board.rows - 1))
     return np.stack([column.ravel(), row.ravel()], axis=-1)
 
 
-def _greys(
+def _sample_greys(
     image: Bytes, board: Board, board_map: BoardMap, squares: Indices
 ) -> tuple[Array, Array]:
     """Sample grey levels in the middles of squares (N, 2), given by column and row: of those with
@@ -208,13 +210,13 @@ def _greys(
     return grey[even], grey[~even]
 
 
-def board_regions(image: Bytes, corners: int) -> list[Crop]:
+def find_board_regions(image: Bytes, corners: int) -> list[Crop]:
     """Find regions of the image (H, W) with enough saddles for a board of that many corners.
 
     OpenCV's quick detector finds fine, slanted or dim boards more readily in an image of the board
     alone. Saddles are clustered at two distances; the two largest clusters of each count.
     """
-    points, _ = _strongest_saddles(image, 4 * corners + 100)
+    points, _ = _find_strongest_saddles(image, 4 * corners + 100)
     height, width = image.shape
     marks = np.zeros((height, width), np.uint8)
     marks[points[:, 1], points[:, 0]] = 1
@@ -251,7 +253,7 @@ def shows_lattice(image: Bytes, size: tuple[int, int]) -> bool:
         reduced = image
         if scale != 1.0:
             reduced = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-        saddles = _strongest_saddles(reduced, 4 * size[0] * size[1] + 100)
+        saddles = _find_strongest_saddles(reduced, 4 * size[0] * size[1] + 100)
         if _count_lattice_points(*saddles) >= 0.3 * interior:
             return True
     return False
@@ -282,7 +284,7 @@ def _count_lattice_points(points: NDArray[np.intp], angles: Array) -> int:
     return int(both.any(axis=(1, 2)).sum())
 
 
-def _strongest_saddles(image: Bytes, count: int) -> tuple[NDArray[np.intp], Array]:
+def _find_strongest_saddles(image: Bytes, count: int) -> tuple[NDArray[np.intp], Array]:
     """Find the `count` strongest saddles (N, 2) px, and the direction (N,) rad in which each rises.
 
     Strength is the Hessian's negative determinant relative to the local contrast.

@@ -75,12 +75,12 @@ def refine_corners(
         return start, np.zeros(0, bool)
 
     def patches(radius_px: float) -> _Patches:
-        return _patches(image, start, along, bright_diagonal, marker_gap, radius_px)
+        return _collect_patches(image, start, along, bright_diagonal, marker_gap, radius_px)
 
     narrow = patches(9.0)
     fit = _fit(narrow, start, along)
     if np.median(fit.sigma) > 0.04:  # in such noise a wider window is worth its time
-        fit = _fit(patches(16.0), start, along, _common_light(fit))
+        fit = _fit(patches(16.0), start, along, _estimate_common_light(fit))
     # b is the brightness of squares where one edge distance is negative: not those on the diagonal.
     pixels = fit.state[:, :2]
     contrast = np.where(bright_diagonal, -fit.state[:, 5], fit.state[:, 5])
@@ -88,22 +88,22 @@ def refine_corners(
     good &= np.linalg.norm(pixels - start, axis=1) < 1.5
     good &= contrast > MIN_CONTRAST
     share = fit.residual / np.maximum(contrast, MIN_CONTRAST)
-    good &= share < _upper_limit(share[good], 0.25, 0.7)
-    good &= fit.sigma < _upper_limit(fit.sigma[good], 0.06, 0.35)
+    good &= share < _compute_upper_limit(share[good], 0.25, 0.7)
+    good &= fit.sigma < _compute_upper_limit(fit.sigma[good], 0.06, 0.35)
     # At the image's rim a corner visible on one side only is fitted well, but at the wrong position.
     size = np.array(image.shape[::-1])
     good &= np.all((pixels >= 5.0) & (pixels <= size - 6.0), axis=1)
     return pixels, good
 
 
-def _upper_limit(values: Array, clear: float, noisy: float) -> float:
+def _compute_upper_limit(values: Array, clear: float, noisy: float) -> float:
     """Largest value of a good corner: twice the median (N,), within the limits of a clear image and
     of any image."""
     median = float(np.median(values)) if len(values) else 0.0
     return float(np.clip(2.0 * median, clear, noisy))
 
 
-def _patches(
+def _collect_patches(
     image: Bytes,
     start: Array,
     along: Array,
@@ -154,7 +154,7 @@ class _Fit:
         return np.asarray(np.sqrt(np.maximum(corner.max(axis=1), 0.0)))
 
 
-def _common_light(fit: _Fit) -> tuple[Array, Array]:
+def _estimate_common_light(fit: _Fit) -> tuple[Array, Array]:
     """Estimate a Gaussian prior of g from all corners of a board: mean (2,), and information (N, 2)
     in squared grey levels.
 
@@ -172,13 +172,13 @@ def _common_light(fit: _Fit) -> tuple[Array, Array]:
 def _fit(
     patches: _Patches, start: Array, along: Array, light: tuple[Array, Array] | None = None
 ) -> _Fit:
-    """Fit the image model to every corner's patch. light: see `_common_light`."""
+    """Fit the image model to every corner's patch. light: see `_estimate_common_light`."""
     angles = np.arctan2(along[:, 1], along[:, 0]) + np.pi / 2.0
     state = np.column_stack([start, angles, np.full(len(start), 0.9), np.zeros((len(start), 4))])
-    state[:, 5:] = _linear(patches, state)
+    state[:, 5:] = _solve_linear(patches, state)
 
     def equations(state: Array) -> StackedEquations:
-        corners = _equations(patches, state)
+        corners = _form_equations(patches, state)
         if light is None:
             return corners
         mean, information = light
@@ -204,19 +204,19 @@ def _fit(
     )
 
 
-def _linear(patches: _Patches, state: Array) -> Array:
+def _solve_linear(patches: _Patches, state: Array) -> Array:
     """Solve for b, a and g (N, 4) with the edges fixed.
 
     Around a state without contrast and with even light the image is linear in them.
     """
     even = np.column_stack([state[:, :5], np.tile([0.0, MIN_CONTRAST, 0.0, 0.0], (len(state), 1))])
-    at = _equations(patches, even)
+    at = _form_equations(patches, even)
     # A slight damping leaves unchanged what a window without pixels does not determine.
     step = solve_scaled(at.normal[:, 5:, 5:], at.gradient[:, 5:], np.full(len(state), 1e-9))
     return even[:, 5:] - step
 
 
-def _equations(patches: _Patches, state: Array) -> StackedEquations:
+def _form_equations(patches: _Patches, state: Array) -> StackedEquations:
     """Normal equations of every corner's fit at a state (N, 9)."""
     return StackedEquations(
         *sum_equations(patches.pixels, patches.grey, patches.weight, patches.rims, state)
@@ -224,7 +224,7 @@ def _equations(patches: _Patches, state: Array) -> StackedEquations:
 
 
 @compiled
-def edge_and_slope(distance: float, blur: float) -> tuple[float, float]:
+def evaluate_edge(distance: float, blur: float) -> tuple[float, float]:
     """Evaluate E(d) of a blurred edge, and its derivative."""
     scaled = distance / (math.sqrt(2.0) * blur)
     return math.erf(scaled), math.sqrt(2.0 / math.pi) / blur * math.exp(-scaled * scaled)
@@ -252,15 +252,15 @@ def sum_equations(
                 continue
             x, y = pixels[n, p, 0] - state[n, 0], pixels[n, p, 1] - state[n, 1]
             across1, across2 = x * cos1 + y * sin1, x * cos2 + y * sin2
-            edge1, steep1 = edge_and_slope(across1, blur)
-            edge2, steep2 = edge_and_slope(across2, blur)
+            edge1, steep1 = evaluate_edge(across1, blur)
+            edge2, steep2 = evaluate_edge(across2, blur)
             product, by1, by2 = edge1 * edge2, steep1 * edge2, edge1 * steep2
             by_blur = by1 * across1 + by2 * across2
             into1, into2 = abs(across1) - rims[n, 0], abs(across2) - rims[n, 1]
             # Four blurs before a marker's rim it takes less than 1e-4 of the contrast.
             if across1 * across2 * rims[n, 2] > 0.0 and min(into1, into2) > -4.0 * blur:
-                rim1, steep1 = edge_and_slope(into1, blur)
-                rim2, steep2 = edge_and_slope(into2, blur)
+                rim1, steep1 = evaluate_edge(into1, blur)
+                rim2, steep2 = evaluate_edge(into2, blur)
                 kept = 1.0 - 0.5 * (1.0 + rim1) * (1.0 + rim2)
                 lost1, lost2 = (1.0 + rim2) * steep1, (1.0 + rim1) * steep2
                 by_blur = kept * by_blur - 0.5 * product * (lost1 * into1 + lost2 * into2)

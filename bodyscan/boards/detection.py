@@ -9,7 +9,7 @@ import numpy as np
 
 from bodyscan.arrays import Bytes
 from bodyscan.boards.aprilgrid import find_aprilgrid
-from bodyscan.boards.board_layout import corners_per_face
+from bodyscan.boards.board_layout import count_corners_per_face
 from bodyscan.boards.charuco import Markers, detect_markers, locate_charuco, locate_face
 from bodyscan.boards.checkerboard import find_checkerboard
 from bodyscan.boards.corners import DetectedCorners
@@ -76,7 +76,7 @@ def _find_marked(
 
 def _determines_plane(found: DetectedCorners, board: Board) -> bool:
     """Whether there are six corners (four on a board that has no more), not all on one line."""
-    if len(found.ids) < min(6, corners_per_face(board)):
+    if len(found.ids) < min(6, count_corners_per_face(board)):
         return False
     extents = np.linalg.svd(found.pixels - found.pixels.mean(axis=0), compute_uv=False)
     return bool(extents[1] > 2.0)

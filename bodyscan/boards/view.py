@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodyscan.arrays import Array, Bytes, Indices
-from bodyscan.boards.board_layout import corner_grid, corner_points
+from bodyscan.boards.board_layout import compute_corner_grid, compute_corner_points
 from bodyscan.errors import CaptureError
 from bodyscan.rig.board import Board
 
@@ -46,7 +46,7 @@ class BoardView:
     pair: str
     shot: str
     board: str
-    # (N,) int, index into `board_layout.corner_points(board)` (front face first, then back).
+    # (N,) int, index into `board_layout.compute_corner_points(board)` (front face first, then back).
     corner_ids: Indices
     pixels: Array  # (N, 2) float64, real image coordinates, px
     turnable: bool = False  # the detector may have numbered this board from its other end
@@ -72,8 +72,8 @@ def number_corners(
     Raises CaptureError if the number of corners differs from the board's, or one is outside the
     image.
     """
-    columns = corner_grid(board)[0]
-    count = len(corner_points(board))
+    columns = compute_corner_grid(board)[0]
+    count = len(compute_corner_points(board))
     known = np.isfinite(pixels).all(axis=1)
     if not known.any():
         return None

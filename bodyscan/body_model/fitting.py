@@ -28,7 +28,7 @@ from bodyscan.body_model.template import (
 )
 from bodyscan.geometry.robust import rms
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.mesh.topology import directed_edges, vertex_normals
+from bodyscan.mesh.topology import compute_vertex_normals, list_directed_edges
 
 NORMAL_MM = 80.0
 """Distance that counts as much as normals at right angles: the opposite sides of an arm, 80 mm apart,
@@ -170,7 +170,7 @@ def _start(template: BodyTemplate, surface: Surface, arms_deg: float) -> BodySha
 
 
 def _compute_normals(template: BodyTemplate, vertices: Array) -> Array:
-    return vertex_normals(vertices, template.faces).astype(np.float64)
+    return compute_vertex_normals(vertices, template.faces).astype(np.float64)
 
 
 def _match(
@@ -244,7 +244,11 @@ def _step(
 ) -> tuple[BodyShapeAndPose, float]:
     """One Gauss-Newton step, and the cost before it. sigma_mm: of a matched distance."""
     precision = np.concatenate(
-        [np.full(3, 1e-6), np.repeat(_joint_precision(template), 3), np.ones(len(template.shapes))]
+        [
+            np.full(3, 1e-6),
+            np.repeat(_compute_joint_precision(template), 3),
+            np.ones(len(template.shapes)),
+        ]
     )
     here = np.concatenate([np.zeros(3), body.rotations.ravel(), body.shape])
     information, gradient = np.diag(precision), precision * here
@@ -264,7 +268,7 @@ def _step(
     return replace(moved, shape=np.clip(moved.shape, -4.0, 4.0)), cost
 
 
-def _joint_precision(template: BodyTemplate) -> Array:
+def _compute_joint_precision(template: BodyTemplate) -> Array:
     return np.array([np.radians(JOINT_DEG[drop_side(one)]) ** -2.0 for one in template.joint_names])
 
 
@@ -303,7 +307,7 @@ def _fit_residual(template: BodyTemplate, surface: Surface, tree: KDTree, vertic
 
     What slides along the surface stays where the prior on shape and pose has put it.
     """
-    laplacian = _laplacian(template.faces, len(vertices))
+    laplacian = _build_laplacian(template.faces, len(vertices))
     smooth = (laplacian.T @ laplacian).tocsc()
     rest = vertices
     for stiffness, scale in ((10.0, 20.0), (1.0, 12.0), (0.1, 8.0), (0.1, 8.0)):
@@ -322,9 +326,9 @@ def _fit_residual(template: BodyTemplate, surface: Surface, tree: KDTree, vertic
     return vertices
 
 
-def _laplacian(faces: Indices, count: int) -> sparse.csr_matrix:
+def _build_laplacian(faces: Indices, count: int) -> sparse.csr_matrix:
     """The uniform graph Laplacian (V, V) of a closed mesh, each edge of which runs both ways."""
-    edges = directed_edges(faces)
+    edges = list_directed_edges(faces)
     links = sparse.csr_matrix((np.ones(len(edges)), edges.T), shape=(count, count))
     degree = np.asarray(links.sum(axis=1)).ravel()
     return sparse.csr_matrix(sparse.identity(count) - sparse.diags(1.0 / degree) @ links)

@@ -25,7 +25,7 @@ from bodyscan.errors import BadInput
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyMesh
 from bodyscan.mesh.sliced_parts import find_body_frame
-from bodyscan.mesh.topology import vertex_normals
+from bodyscan.mesh.topology import compute_vertex_normals
 
 SAMPLES = 80_000
 """Points of the mesh that the template is fitted to: one in 5 mm."""
@@ -54,7 +54,7 @@ class RegisteredBody:
     def parts(self) -> Bytes:
         """Part (N,) of each vertex of the scan's mesh: that of the closest vertex of the template."""
         template, normals = self.fitted.template, self.mesh.normals.astype(np.float64)
-        facing = vertex_normals(self.fitted.vertices, template.faces).astype(np.float64)
+        facing = compute_vertex_normals(self.fitted.vertices, template.faces).astype(np.float64)
         tree = KDTree(join_positions_normals(self.fitted.vertices, facing))
         rotated = self.rig_from_body.inverse().rotate(normals)
         _, nearest = tree.query(join_positions_normals(self.vertices, rotated))
@@ -75,7 +75,7 @@ class RegisteredBody:
         filled = np.asarray(~self.measured[faces].all(axis=1))
         mesh = self.mesh.part(vertices, faces, used, filled)
         mesh.sigma_mm[~self.measured] = np.nan
-        mesh.normals[:] = vertex_normals(vertices, faces)
+        mesh.normals[:] = compute_vertex_normals(vertices, faces)
         return mesh
 
 

@@ -9,9 +9,13 @@ import cv2
 import numpy as np
 
 from bodyscan.arrays import Array, Indices
-from bodyscan.boards.board_layout import corner_grid, corner_points, corners_per_face
+from bodyscan.boards.board_layout import (
+    compute_corner_grid,
+    compute_corner_points,
+    count_corners_per_face,
+)
 from bodyscan.boards.view import BoardView, ViewKey
-from bodyscan.geometry.robust import rms, rms_length
+from bodyscan.geometry.robust import compute_rms_length, rms
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 from bodyscan.rig.board import Board
 
@@ -117,7 +121,7 @@ class BoardShape:
 
     @property
     def rms_mm(self) -> float:
-        return rms_length(self.offsets)
+        return compute_rms_length(self.offsets)
 
     @property
     def out_of_plane_mm(self) -> float:
@@ -187,37 +191,37 @@ def apply_shape(view: LocatedView, shapes: Mapping[str, BoardShape]) -> LocatedV
     return replace(view, points=shapes[view.board].apply(view.points))
 
 
-def planar_view(view: BoardView, board: Board) -> PlanarView:
+def make_planar_view(view: BoardView, board: Board) -> PlanarView:
     """Look up where the corners of a view lie in the board frame."""
-    return PlanarView(view.shot, corner_points(board)[view.corner_ids], view.pixels)
+    return PlanarView(view.shot, compute_corner_points(board)[view.corner_ids], view.pixels)
 
 
 def has_enough_corners(view: BoardView, board: Board) -> bool:
     """Whether a view has eight corners or more, not all along one line of the board."""
-    grid = view.corner_ids % corners_per_face(board)
-    width = corner_grid(board)[0]
+    grid = view.corner_ids % count_corners_per_face(board)
+    width = compute_corner_grid(board)[0]
     columns, rows = grid % width, grid // width
     return len(grid) >= 8 and len(set(columns)) >= 3 and len(set(rows)) >= 3
 
 
-def corner_keys(points: Array) -> list[tuple[float, ...]]:
+def make_corner_keys(points: Array) -> list[tuple[float, ...]]:
     """Keys by which corners (M, 3) mm are identified: rounded to a nanometre, without a -0."""
     return [tuple(point) for point in (np.round(points, 6) + 0.0).tolist()]
 
 
 def match_corners(points: Array, known: Array) -> Indices:
     """Indices (M,) of corners (M, 3) mm in `known` (N, 3) mm, -1 where it has none."""
-    index = {key: k for k, key in enumerate(corner_keys(known))}
-    return np.array([index.get(key, -1) for key in corner_keys(points)], np.int64)
+    index = {key: k for k, key in enumerate(make_corner_keys(known))}
+    return np.array([index.get(key, -1) for key in make_corner_keys(points)], np.int64)
 
 
-def max_displacement_mm(a: RigidTransform, b: RigidTransform, radius_mm: float) -> float:
+def compute_max_displacement_mm(a: RigidTransform, b: RigidTransform, radius_mm: float) -> float:
     """Difference of two transforms: translation plus rotation acting at `radius_mm`."""
     difference = a.inverse() @ b
     return float(np.linalg.norm(difference.translation) + difference.angle * radius_mm)
 
 
-def board_symmetries(board: Board) -> tuple[RigidTransform, ...]:
+def find_board_symmetries(board: Board) -> tuple[RigidTransform, ...]:
     """Every `board_from_observed` under which a plain board looks the same to the detector.
 
     A plain board may be numbered from its other end, unless the colour of its first square shows

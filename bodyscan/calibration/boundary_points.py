@@ -15,7 +15,7 @@ from bodyscan.calibration.board_views import BoardFace, LocatedView
 from bodyscan.compiled import compiled
 from bodyscan.errors import PairFailed
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.camera_tables import Table, look_up, ray_table
+from bodyscan.geometry.camera_tables import Table, look_up, make_ray_table
 from bodyscan.geometry.light_planes import Axis
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.rig.board import Board
@@ -58,7 +58,7 @@ class BoundaryPoints:
         )
 
 
-def rays_on_board(
+def intersect_with_board(
     rays: Array, camera_from_board: RigidTransform, height: Height | None = None
 ) -> Array:
     """Intersect rays (..., 3), camera frame, with a board's plane z = 0, or with its surface if
@@ -97,7 +97,8 @@ def boundary_points(
     half = np.zeros_like(rays)
     half[:, :2] = 0.5 * camera.rays_by_pixels(rays)[..., across]
     points, after, before = (
-        rays_on_board(rays + step, camera_from_board, height) for step in (0.0 * half, half, -half)
+        intersect_with_board(rays + step, camera_from_board, height)
+        for step in (0.0 * half, half, -half)
     )
     return BoundaryPoints(index, np.full(len(index), board), points, after - before, sigma_px)
 
@@ -186,7 +187,7 @@ class StripedView:
         return self.view.camera_from_board @ RigidTransform.from_translation([0.0, 0.0, z_mm])
 
 
-def boundaries_near(stripes: StripeMap, box: Box, crop: Crop = WHOLE) -> BoardBoundaries:
+def select_boundaries_near(stripes: StripeMap, box: Box, crop: Crop = WHOLE) -> BoardBoundaries:
     """Select the boundaries within a box around a view.
 
     crop: rows and columns of the image that the stripe map covers.
@@ -199,7 +200,9 @@ def boundaries_near(stripes: StripeMap, box: Box, crop: Crop = WHOLE) -> BoardBo
         stripes.boundary_index[near],
         pixels[near],
         stripes.boundary_sigma_px[near].astype(np.float64),
-        boundaries_near(stripes.crossing, box, crop) if stripes.crossing is not None else None,
+        select_boundaries_near(stripes.crossing, box, crop)
+        if stripes.crossing is not None
+        else None,
     )
 
 
@@ -332,7 +335,7 @@ def on_print(
     area = np.array(board.size_mm) - rim
     inside = np.zeros(len(boundaries.index), np.bool_)
     pixels = np.ascontiguousarray(boundaries.pixels)
-    _mark_inside(ray_table(camera), np.linalg.inv(plane), np.append(area, rim), pixels, inside)
+    _mark_inside(make_ray_table(camera), np.linalg.inv(plane), np.append(area, rim), pixels, inside)
     means = bin_boundaries(boundaries, inside, code.direction, bin_px)
     if boundaries.crossing is None or code.crossing is None:
         return means

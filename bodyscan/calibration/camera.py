@@ -18,8 +18,8 @@ from bodyscan.calibration.model_selection import (
     MAX_FOLDS,
     MIN_GAIN,
     ResidualPair,
+    compute_shared_weights,
     gain,
-    shared_weights,
 )
 from bodyscan.calibration.zhang import matrix_from_homographies
 from bodyscan.errors import DegeneratePoses
@@ -29,7 +29,7 @@ from bodyscan.geometry.lenses.fisheye import Fisheye
 from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.lenses.opencv import Brown, Radial, Rational
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
-from bodyscan.geometry.uncertainty import RayUncertainty, node_pixels
+from bodyscan.geometry.uncertainty import RayUncertainty, list_node_pixels
 
 MIN_POSES = 3
 CHAPTER_LENS = Radial()
@@ -144,7 +144,7 @@ def fit_camera(
         solution.state.camera,
         solution.variance * solution.covariance[:size, :size],
         solution.state.poses,
-        weighted_rms(corners.residuals.reshape(-1, 2), solution.weights[0][::2]),
+        compute_weighted_rms(corners.residuals.reshape(-1, 2), solution.weights[0][::2]),
     )
 
 
@@ -160,7 +160,10 @@ def minimize_camera(
     size = len(camera.parameters)
     return minimize(
         _State(camera, tuple(poses)),
-        lambda state: [_corner_block(state, views), camera_prior(state.camera, np.arange(size))],
+        lambda state: [
+            _make_corner_block(state, views),
+            evaluate_camera_prior(state.camera, np.arange(size)),
+        ],
         _State.retract,
         unknowns=size + 6 * len(views),
         tolerance=tolerance,
@@ -168,12 +171,12 @@ def minimize_camera(
     )
 
 
-def weighted_rms(residuals: Array, weights: Array) -> float:
+def compute_weighted_rms(residuals: Array, weights: Array) -> float:
     """Compute the weighted RMS length of residuals (N, 2)."""
     return float(np.sqrt(np.sum(weights * np.sum(residuals**2, axis=1)) / np.sum(weights)))
 
 
-def camera_prior(camera: Camera, columns: Indices) -> Block:
+def evaluate_camera_prior(camera: Camera, columns: Indices) -> Block:
     """Residuals of the prior of a camera: the one it has, otherwise that its lens distorts little.
 
     The latter keeps coefficients that the boards do not determine, or only their sum, from growing
@@ -221,7 +224,7 @@ def locate_boards(
     """
     solution = minimize(
         _State(camera, tuple(starts)),
-        lambda state: [_corner_block(state, views, camera_free=False)],
+        lambda state: [_make_corner_block(state, views, camera_free=False)],
         _State.retract_poses,
         unknowns=6 * len(views),
         steps=30,
@@ -232,7 +235,9 @@ def locate_boards(
     return solution.state.poses, tuple(np.split(residuals, ends))
 
 
-def _corner_block(state: _State, views: Sequence[PlanarView], *, camera_free: bool = True) -> Block:
+def _make_corner_block(
+    state: _State, views: Sequence[PlanarView], *, camera_free: bool = True
+) -> Block:
     """Reprojection errors, px, one run for each view.
 
     Derivatives are by the camera's parameters, which come first if free, and by the board's pose.
@@ -319,7 +324,7 @@ def choose_lens(
     cluster = cluster_poses(views)
     if len(kinds) == 1 or len(set(cluster.tolist())) < MIN_CLUSTERS:
         richest = chosen if len(kinds) == 1 else _fit(kinds[1], camera, poses, views)
-        return ChosenLens(chosen, (), (), ray_uncertainty(chosen.camera, richest, views))
+        return ChosenLens(chosen, (), (), estimate_ray_uncertainty(chosen.camera, richest, views))
     residuals = _hold_out(chosen, views, cluster)
     trials: list[tuple[CameraCalibration, Array, float | None]] = [(chosen, residuals, None)]
     corner_cluster = _repeat_by_corner(cluster, views)
@@ -342,15 +347,17 @@ def choose_lens(
         trials.append((tried, held_out, better_by))
         if better_by >= (-MIN_GAIN if simpler else 0.0 if kind is Brown else MIN_GAIN):
             chosen, residuals = tried, held_out
-    weights = shared_weights([one for _, one, _ in trials])
+    weights = compute_shared_weights([one for _, one, _ in trials])
     figures = tuple(
-        LensTrial(fit.camera.lens.kind, weighted_rms(one, weights), better_by, fit is chosen)
+        LensTrial(
+            fit.camera.lens.kind, compute_weighted_rms(one, weights), better_by, fit is chosen
+        )
         for fit, one, better_by in trials
     )
     tried_fits = tuple(fit for fit, _, _ in trials)
     after = tried_fits.index(chosen) + 1
     open_ = (f for f, t in zip(tried_fits[after:], figures[after:], strict=True) if t.is_open)
-    rays = ray_uncertainty(chosen.camera, next(open_, chosen), views)
+    rays = estimate_ray_uncertainty(chosen.camera, next(open_, chosen), views)
     return ChosenLens(chosen, figures, tried_fits, rays)
 
 
@@ -372,7 +379,7 @@ def _compare_fits(
 ) -> ResidualPair:
     """Residuals of the same views in two fits to them."""
     first_px, second_px = (
-        _corner_block(_State(fit.camera, fit.poses), views).residuals.reshape(-1, 2)
+        _make_corner_block(_State(fit.camera, fit.poses), views).residuals.reshape(-1, 2)
         for fit in (first, second)
     )
     return ResidualPair(first_px, second_px, _repeat_by_corner(cluster, views))
@@ -381,18 +388,18 @@ def _compare_fits(
 def _folds(fit: CameraCalibration, views: Sequence[PlanarView]) -> bool:
     """Whether a lens folds over before the outermost corner, or over most of the picture: what it does
     there is no camera's."""
-    valid = np.isfinite(_corner_rays(fit.camera, views)).all()
+    valid = np.isfinite(_compute_corner_rays(fit.camera, views)).all()
     return not valid or fit.camera.folds
 
 
 def _is_wide(camera: Camera, views: Sequence[PlanarView]) -> bool:
     """Whether some corner is more than 60 degrees off the axis, where r^6 is 27: there lenses that go
     by the tangent run away, and elsewhere decentring, which a fisheye lacks, must not hide."""
-    radius = np.linalg.norm(_corner_rays(camera, views)[:, :2], axis=1)
+    radius = np.linalg.norm(_compute_corner_rays(camera, views)[:, :2], axis=1)
     return bool(np.any(radius > 1.73))
 
 
-def _corner_rays(camera: Camera, views: Sequence[PlanarView]) -> Array:
+def _compute_corner_rays(camera: Camera, views: Sequence[PlanarView]) -> Array:
     """Rays (N, 3) of all corners, z = 1; NaN where the lens folds."""
     return camera.rays(np.concatenate([view.pixels for view in views]))
 
@@ -452,7 +459,7 @@ def _hold_out(fit: CameraCalibration, views: Sequence[PlanarView], cluster: Indi
     return np.concatenate(residuals)
 
 
-def ray_uncertainty(
+def estimate_ray_uncertainty(
     chosen: Camera, richest: CameraCalibration, views: Sequence[PlanarView]
 ) -> RayUncertainty:
     """Estimate the uncertainty of the rays of the camera `chosen`, also where boards did not reach.
@@ -470,21 +477,24 @@ def ray_uncertainty(
         [pose.apply(view.points) for pose, view in zip(richest.poses, views, strict=True)]
     )
     corners = corners[:: -(-len(corners) // 3000)]
-    rays = chosen.rays(node_pixels(camera.width, camera.height))
+    rays = chosen.rays(list_node_pixels(camera.width, camera.height))
     valid: Mask = np.asarray(np.isfinite(rays).all(axis=-1))
     points = rays[valid] * np.median(corners[:, 2])
-    by_nodes, by_corners = _changes(chosen, camera, points), _changes(chosen, camera, corners)
+    by_nodes, by_corners = (
+        _compute_changes(chosen, camera, points),
+        _compute_changes(chosen, camera, corners),
+    )
     change, motion = (part.reshape(-1, part.shape[2]) for part in by_corners)
     remaining = by_nodes[0] - by_nodes[1] @ np.linalg.lstsq(motion, change, rcond=None)[0]
     by_parameter, difference = remaining[..., :-1], remaining[..., -1]
     noise = np.einsum("npi,ij,npj->n", by_parameter, richest.covariance, by_parameter) / 2.0
     lens = np.sum(difference**2, axis=1) / 2.0
     return RayUncertainty(
-        *(_on_all_nodes(np.sqrt(np.maximum(part, 0.0)), valid) for part in (noise, lens))
+        *(_spread_over_nodes(np.sqrt(np.maximum(part, 0.0)), valid) for part in (noise, lens))
     )
 
 
-def _changes(chosen: Camera, camera: Camera, points: Array) -> tuple[Array, Array]:
+def _compute_changes(chosen: Camera, camera: Camera, points: Array) -> tuple[Array, Array]:
     """Changes of pixels at points (N, 3), camera frame.
 
     (N, 2, P + 1): by the parameters of `camera`, and its difference from `chosen`.
@@ -498,7 +508,7 @@ def _changes(chosen: Camera, camera: Camera, points: Array) -> tuple[Array, Arra
     )
 
 
-def _on_all_nodes(values: Array, valid: Mask) -> Array:
+def _spread_over_nodes(values: Array, valid: Mask) -> Array:
     """Spread values over all nodes; those without rays, where the lens folds, get the largest."""
     filled = np.full(valid.shape, values.max(initial=0.0))
     filled[valid] = values

@@ -16,9 +16,13 @@ from typing import Any
 import numpy as np
 
 from bodyscan.arrays import Array, Indices
-from bodyscan.calibration.board_views import BoardFace, PlanarView, corner_keys, match_corners
-from bodyscan.calibration.boundary_points import BoundaryPoints, lift_along_rays, rays_on_board
-from bodyscan.calibration.camera import camera_prior
+from bodyscan.calibration.board_views import BoardFace, PlanarView, make_corner_keys, match_corners
+from bodyscan.calibration.boundary_points import (
+    BoundaryPoints,
+    intersect_with_board,
+    lift_along_rays,
+)
+from bodyscan.calibration.camera import evaluate_camera_prior
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.least_squares import EXACT, Block, Noise, minimize
 from bodyscan.geometry.light_planes import SmoothSheets
@@ -88,7 +92,7 @@ class BoardWarp:
     @staticmethod
     def flat(points: Array, flatness_mm: float, print_mm: float) -> BoardWarp:
         """Describe a board without deviation; points (M, 3) are the corners of any views given."""
-        known = np.unique(corner_keys(points), axis=0)
+        known = np.unique(make_corner_keys(points), axis=0)
         heights, printed = np.zeros(len(WARP_POWERS)), np.zeros((len(known), 2))
         return BoardWarp(known, heights, printed, flatness_mm, print_mm)
 
@@ -185,7 +189,7 @@ def refine_jointly(
     start = _State(camera, tuple(camera_from_board), tuple(sheets), warps)
     solution = minimize(
         start,
-        lambda state: _blocks(state, boards),
+        lambda state: _make_blocks(state, boards),
         lambda state, step: state.retract(step),
         unknowns=sum(start.sizes),
         steps=20,
@@ -194,7 +198,9 @@ def refine_jointly(
     )
     state, covariance = solution.state, solution.covariance_by_freedoms
     camera_columns = state.columns[0]
-    corners = np.concatenate([_corner_residuals(state, k, one) for k, one in enumerate(boards)])
+    corners = np.concatenate(
+        [_compute_corner_residuals(state, k, one) for k, one in enumerate(boards)]
+    )
     return JointFit(
         state.camera,
         tuple(
@@ -242,15 +248,15 @@ class _State:
         )
 
 
-def _blocks(state: _State, boards: Sequence[StripedBoard]) -> Iterator[Block]:
+def _make_blocks(state: _State, boards: Sequence[StripedBoard]) -> Iterator[Block]:
     """Residuals of each board's corners and stripes, then the priors of camera, sheets, warps."""
     camera, poses, sheets, warps = state.columns
     with np.errstate(all="ignore"):
         for k, board in enumerate(boards):
             pose, warp = poses[k], warps[board.board]
             yield Block(
-                _corner_residuals(state, k, board),
-                partial(_corner_jacobian, state, k, board),
+                _compute_corner_residuals(state, k, board),
+                partial(_compute_corner_jacobian, state, k, board),
                 np.concatenate([camera, pose, warp]),
                 CORNERS,
             )
@@ -261,19 +267,19 @@ def _blocks(state: _State, boards: Sequence[StripedBoard]) -> Iterator[Block]:
                 pixels = np.stack([stripes.pixels, stripes.pixels + 0.5 * stripes.across])
                 rays = state.camera.rays(pixels)
                 yield Block(
-                    _stripe_residuals(state, k, board, direction, rays),
-                    partial(_stripe_jacobian, state, k, board, direction, rays),
+                    _compute_stripe_residuals(state, k, board, direction, rays),
+                    partial(_compute_stripe_jacobian, state, k, board, direction, rays),
                     np.concatenate([camera, pose, sheet_columns, heights]),
                     STRIPES[direction],
                 )
-    yield camera_prior(state.camera, camera)
+    yield evaluate_camera_prior(state.camera, camera)
     for one, sheet_columns in zip(state.sheets, sheets, strict=True):
-        yield _prior_block(one.linearize_prior(), sheet_columns)
+        yield _make_prior_block(one.linearize_prior(), sheet_columns)
     for name, shape in state.warps.items():
-        yield _prior_block(shape.prior, warps[name])
+        yield _make_prior_block(shape.prior, warps[name])
 
 
-def _prior_block(prior: tuple[Array, Array], columns: Indices) -> Block:
+def _make_prior_block(prior: tuple[Array, Array], columns: Indices) -> Block:
     residuals, jacobian = prior
     return Block(residuals, lambda: jacobian, columns, EXACT)
 
@@ -283,11 +289,11 @@ def _place_corners(state: _State, k: int, board: StripedBoard) -> Array:
     return state.poses[k].apply(state.warps[board.board].apply(board.view.points))
 
 
-def _corner_residuals(state: _State, k: int, board: StripedBoard) -> Array:
+def _compute_corner_residuals(state: _State, k: int, board: StripedBoard) -> Array:
     return (state.camera.project(_place_corners(state, k, board)) - board.view.pixels).ravel()
 
 
-def _corner_jacobian(state: _State, k: int, board: StripedBoard) -> Array:
+def _compute_corner_jacobian(state: _State, k: int, board: StripedBoard) -> Array:
     """Derivatives (2N, ...) by camera, this board's pose, and its warp."""
     points, warp = _place_corners(state, k, board), state.warps[board.board]
     by_parameter, by_point = state.camera.jacobians(points)
@@ -301,41 +307,43 @@ def _corner_jacobian(state: _State, k: int, board: StripedBoard) -> Array:
     return jacobian.reshape(-1, jacobian.shape[2])
 
 
-def _rays_by_camera(camera: Camera, rays: Array) -> Array:
+def _differentiate_rays(camera: Camera, rays: Array) -> Array:
     """Derivatives of the rays (..., 3) of fixed pixels by the camera's parameters, (..., 2, P)."""
     by_parameter, _ = camera.jacobians(rays.reshape(-1, 3))
     by_parameter = by_parameter.reshape(*rays.shape[:-1], 2, -1)
     return -(camera.rays_by_pixels(rays) @ by_parameter)
 
 
-def _height(state: _State, board: StripedBoard, xy: Array) -> Array:
+def _evaluate_height(state: _State, board: StripedBoard, xy: Array) -> Array:
     """Height of a board's surface above the plane of its face at (..., 2) mm."""
     height = state.warps[board.board].height(xy)
     return height + board.face.height(xy) if board.face else height
 
 
-def _stripe_residuals(
+def _compute_stripe_residuals(
     state: _State, k: int, board: StripedBoard, direction: int, rays: Array
 ) -> Array:
     """Offsets of the k-th board's boundaries of one direction from their sheets, in sigmas, (N,)."""
     sheets, stripes = state.sheets[direction], board.stripes[direction]
     camera_from_face = state.poses[k] @ board.board_from_face
-    points = rays_on_board(rays, camera_from_face, partial(_height, state, board))
+    points = intersect_with_board(rays, camera_from_face, partial(_evaluate_height, state, board))
     return _whiten_offsets(sheets, sheets.evaluate(stripes.index), stripes, points)
 
 
 def _whiten_offsets(sheets: SmoothSheets, at: Any, stripes: BoardStripes, points: Array) -> Array:
     offset = sheets.offset(points[0], at)
-    return np.asarray(offset.value / _offset_sigma(stripes, points, offset.by_point), np.float64)
+    return np.asarray(
+        offset.value / _compute_offset_sigma(stripes, points, offset.by_point), np.float64
+    )
 
 
-def _offset_sigma(stripes: BoardStripes, points: Array, by_point: Array) -> Array:
+def _compute_offset_sigma(stripes: BoardStripes, points: Array, by_point: Array) -> Array:
     """Standard deviation of the offsets for that of the pixels, (N,), in the offsets' unit."""
     per_pixel = np.abs(np.sum(by_point * (points[1] - points[0]), axis=1)) / 0.5
     return np.maximum(per_pixel, 1e-12) * stripes.sigma_px
 
 
-def _stripe_jacobian(
+def _compute_stripe_jacobian(
     state: _State, k: int, board: StripedBoard, direction: int, rays: Array
 ) -> Array:
     """Derivatives (N, ...) by camera, board pose, sheets and board heights.
@@ -344,19 +352,19 @@ def _stripe_jacobian(
     noise would push the focal lengths up.
     """
     sheets, stripes = state.sheets[direction], board.stripes[direction]
-    pose, by_camera = state.poses[k], _rays_by_camera(state.camera, rays)
+    pose, by_camera = state.poses[k], _differentiate_rays(state.camera, rays)
     camera_from_face = pose @ board.board_from_face
-    points = rays_on_board(rays, camera_from_face, partial(_height, state, board))
+    points = intersect_with_board(rays, camera_from_face, partial(_evaluate_height, state, board))
     at = sheets.evaluate(stripes.index)
     offset = sheets.offset(points[0], at, parameters=True)
     assert offset.by_parameter is not None
-    sigma = _offset_sigma(stripes, points, offset.by_point)
+    sigma = _compute_offset_sigma(stripes, points, offset.by_point)
     # The height of a board changes by a thousandth of a step along it: it is held constant here.
-    height = _height(state, board, camera_from_face.inverse().apply(points)[..., :2])
+    height = _evaluate_height(state, board, camera_from_face.inverse().apply(points)[..., :2])
 
     def residuals(rays: Array, pose: RigidTransform) -> Array:
         camera_from_face = pose @ board.board_from_face
-        points = rays_on_board(rays, camera_from_face) + lift_along_rays(
+        points = intersect_with_board(rays, camera_from_face) + lift_along_rays(
             rays, camera_from_face, height
         )
         return _whiten_offsets(sheets, at, stripes, points)
@@ -405,7 +413,7 @@ def _compute_depth_covariance(
         offset = sheets.offset(points, sheets.evaluate(index), parameters=True)
         assert offset.by_parameter is not None
         along_ray = np.sum(offset.by_point * rays, axis=1)[:, None]
-        by_rays = depth[..., None] * _rays_by_camera(state.camera, rays)
+        by_rays = depth[..., None] * _differentiate_rays(state.camera, rays)
         by_camera = -np.einsum("nk,nkp->np", offset.by_point[:, :2], by_rays) / along_ray
         by_sheets = -offset.by_parameter / along_ray
     # How points move, (N, 3, P), by the unknowns of the camera and of the sheets.

@@ -54,7 +54,7 @@ def read_known_camera(pair: Pair, folder: Path) -> Camera:
     assert pair.known is not None
     found = _find(pair.known, pair.known.camera, pair.name, folder)
     camera = found.camera(pair.camera.width, pair.camera.height)
-    sigmas = parameter_sigmas(camera, pair.known.sigma_px or 1e-6)
+    sigmas = compute_parameter_sigmas(camera, pair.known.sigma_px or 1e-6)
     return replace(camera, prior=CameraPrior(camera.parameters, sigmas))
 
 
@@ -68,12 +68,12 @@ def read_known_pair(pair: Pair, folder: Path) -> KnownPair:
     assert known is not None
     found = _find(known, known.camera, pair.name, folder)
     camera = found.camera(pair.camera.width, pair.camera.height)
-    camera_from_world = _pose(known, known.camera, found, pair.name)
+    camera_from_world = _convert_pose(known, known.camera, found, pair.name)
     projector, projector_from_camera = None, None
     if known.projector is not None and pair.projector is not None:
         light = _find(known, known.projector, pair.name, folder)
-        projector = _projector(light, pair.projector)
-        from_world = _pose(known, known.projector, light, pair.name)
+        projector = _convert_projector(light, pair.projector)
+        from_world = _convert_pose(known, known.projector, light, pair.name)
         if known.projector.nodes and camera_from_world is not None:
             from_world = from_world or RigidTransform.identity()  # the projector is the world
         if from_world is None:
@@ -103,7 +103,7 @@ def _require_baseline(projector_from_camera: RigidTransform, where: str, known: 
         )
 
 
-def parameter_sigmas(camera: Camera, sigma_px: float) -> Array:
+def compute_parameter_sigmas(camera: Camera, sigma_px: float) -> Array:
     """Compute standard deviations (P,) of a camera's parameters for pixels with sigma_px.
 
     Each parameter by itself moves the most affected image point by just sigma_px.
@@ -128,7 +128,7 @@ def _find(known: Known, device: KnownCamera, name: str, folder: Path) -> FoundCa
     return find_camera(cameras, device.name or name, str(path))
 
 
-def _pose(
+def _convert_pose(
     known: Known, device: KnownCamera, found: FoundCamera, name: str
 ) -> RigidTransform | None:
     """Convert `camera_from_world` to mm; None if the file has no pose."""
@@ -146,7 +146,7 @@ def _pose(
     return scaled.inverse() if device.inverse else scaled
 
 
-def _projector(found: FoundCamera, code: StripeCode) -> Camera:
+def _convert_projector(found: FoundCamera, code: StripeCode) -> Camera:
     """Convert the projector to a camera; if the file gives no image size, a stripe is a pixel.
 
     Stripes must divide the image evenly, or they belong to another projector. The start of waves

@@ -16,7 +16,12 @@ import numpy as np
 from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.calibration.boundary_points import BoundaryPoints, select
 from bodyscan.geometry.light_planes import LightSheets
-from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN, cauchy_weights, rms, robust_scale
+from bodyscan.geometry.robust import (
+    SIGMAS_PER_MEDIAN,
+    compute_cauchy_weights,
+    estimate_robust_scale,
+    rms,
+)
 
 MIN_GAIN = 3.0
 """Standard errors by which a richer model must be better: by chance once in 700 times."""
@@ -37,19 +42,19 @@ class ResidualPair:
     cluster: Indices
 
 
-def shared_weights(tried: Sequence[Array]) -> Array:
+def compute_shared_weights(tried: Sequence[Array]) -> Array:
     """Robust weights (N,) of points with residuals (N, D) in each model: low where none fits."""
     size = tried[0].shape[1]
     smallest = np.min([np.sum(residuals**2, axis=1) for residuals in tried], axis=0)
-    sigma = min(robust_scale(residuals.ravel()) for residuals in tried)
+    sigma = min(estimate_robust_scale(residuals.ravel()) for residuals in tried)
     scaled = np.repeat(np.sqrt(smallest / size), size) / sigma
-    return np.asarray(cauchy_weights(scaled, size, 4.0)[::size], np.float64)
+    return np.asarray(compute_cauchy_weights(scaled, size, 4.0)[::size], np.float64)
 
 
 def gain(pair: ResidualPair) -> float:
     """Compute by how many standard errors the richer model lowers held-out squared residuals."""
-    sigma = min(robust_scale(residuals.ravel()) for residuals in (pair.simple, pair.rich))
-    weights = shared_weights([pair.simple, pair.rich]) / sigma**2
+    sigma = min(estimate_robust_scale(residuals.ravel()) for residuals in (pair.simple, pair.rich))
+    weights = compute_shared_weights([pair.simple, pair.rich]) / sigma**2
     gained = float(np.sum(weights * np.sum(pair.simple**2 - pair.rich**2, axis=1)))
     noise = weights * np.sum(2.0 * pair.rich * (pair.simple - pair.rich), axis=1)
     deviation = float(np.sqrt(np.sum(np.bincount(pair.cluster, noise) ** 2)))
@@ -106,7 +111,7 @@ class HeldOutErrors:
         neighbours = (np.diff(data.index) == 0) & (np.diff(data.board) == 0)
         steps = np.diff(self.distances)[neighbours]
         steps = steps[np.isfinite(steps)]
-        noise = 0.5 * robust_scale(steps) ** 2 if steps.size else 0.0
+        noise = 0.5 * estimate_robust_scale(steps) ** 2 if steps.size else 0.0
         # Boards are never assumed to account for less than a hundredth.
         left = max(total - noise, 0.01 * total)
         return float(np.sqrt(left / self.unit_variance[known].mean()))
@@ -150,9 +155,9 @@ def select_model(
     of a held-out board is fitted with either model, so that only the light differs. Models that give
     no depth where a stripe was seen too seldom are compared only where they give one.
     """
-    medians = [_median(np.abs(errors.distances)) for errors in tried]
+    medians = [_compute_median(np.abs(errors.distances)) for errors in tried]
     cap = 30.0 * min(medians)
-    cluster, effects, board = _board_ninths(data), data.board_errors.effects, data.board
+    cluster, effects, board = _number_board_ninths(data), data.board_errors.effects, data.board
     counted = [
         np.isfinite(errors.distances) | candidate.complete
         for candidate, errors in zip(candidates, tried, strict=True)
@@ -164,7 +169,7 @@ def select_model(
         if not np.isfinite(medians[i]):
             continue
         rich, simple = (
-            _without_motion(_clip(tried[k].distances[known], cap), effects[known], board[known])
+            _subtract_motion(_clip(tried[k].distances[known], cap), effects[known], board[known])
             for k in (i, chosen)
         )
         better_by = gain(ResidualPair(simple[:, None], rich[:, None], cluster[known]))
@@ -173,9 +178,9 @@ def select_model(
     figures = tuple(
         HeldOutModel(
             candidate.name,
-            _mean_of_boards(np.abs(_clip(errors.distances, cap)), board, counted[i]),
+            _average_boards(np.abs(_clip(errors.distances, cap)), board, counted[i]),
             medians[i],
-            _rms(np.abs(errors.distances)),
+            _compute_rms(np.abs(errors.distances)),
             float(np.isfinite(errors.distances).mean()),
             i == chosen,
             gains[i],
@@ -186,7 +191,7 @@ def select_model(
     return chosen, figures
 
 
-def _board_ninths(data: BoundaryPoints) -> Indices:
+def _number_board_ninths(data: BoundaryPoints) -> Indices:
     """Number (N,) of the ninth of its board in which each point lies."""
     # Thirds along an axis, in standard deviations of the points there.
     across, down = (np.digitize(xy, (-0.6, 0.6)) for xy in data.board_errors.effects[:, 1:].T)
@@ -194,7 +199,7 @@ def _board_ninths(data: BoundaryPoints) -> Indices:
     return np.asarray(9 * board + 3 * across + down, np.int64)
 
 
-def _without_motion(distances: Array, effects: Array, board: Indices) -> Array:
+def _subtract_motion(distances: Array, effects: Array, board: Indices) -> Array:
     """Subtract from distances (N,) the shift and tilts that fit each board best, by trimmed least
     squares; effects: see `BoardErrors`."""
     remaining = distances.copy()
@@ -214,17 +219,17 @@ def _clip(distances: Array, cap: float) -> Array:
     return np.asarray(np.clip(np.nan_to_num(distances, nan=cap), -cap, cap), np.float64)
 
 
-def _mean_of_boards(values: Array, board: Indices, known: Mask) -> float:
+def _average_boards(values: Array, board: Indices, known: Mask) -> float:
     """Mean over boards of the mean of each, so that every board counts the same."""
     count, total = np.bincount(board[known]), np.bincount(board[known], values[known])
     return float(np.mean(total[count > 0] / count[count > 0])) if known.any() else np.inf
 
 
-def _median(distances: Array) -> float:
+def _compute_median(distances: Array) -> float:
     return float(np.nanmedian(distances)) if np.isfinite(distances).any() else np.inf
 
 
-def _rms(distances: Array) -> float:
-    limit = OUTLIER * _median(distances)
+def _compute_rms(distances: Array) -> float:
+    limit = OUTLIER * _compute_median(distances)
     kept = distances[distances <= limit]
     return rms(kept) if kept.size else np.inf

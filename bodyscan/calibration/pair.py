@@ -139,7 +139,7 @@ def calibrate_pair(pair: LocatedPair) -> Outcome[PairCalibration]:
         shots = (*shots[:number], *shots[number + 1 :])
         points = locate_boundaries_on_boards(pair.name, pair.camera, code, shots)
     fit = fit_light_sheets(points, code.stripes, code.direction)
-    offsets = board_offsets(points, fit.sheets)
+    offsets = compute_board_offsets(points, fit.sheets)
     quality = replace(
         calibration.quality,
         planes_rms_mm=fit.rms_mm,
@@ -264,12 +264,12 @@ def find_odd_board(data: BoundaryPoints, stripes: int, direction: Axis) -> tuple
     boards = np.unique(few.board)
     if len(boards) < 3:
         return None
-    ratio, rms_mm = _disagreement(few, stripes, direction)
+    ratio, rms_mm = _measure_disagreement(few, stripes, direction)
     if ratio < 1.0:
         return None
     if len(boards) > 3:
         without = (select(few, few.board != board) for board in boards)
-        ratios = [_disagreement(rest, stripes, direction)[0] for rest in without]
+        ratios = [_measure_disagreement(rest, stripes, direction)[0] for rest in without]
         if min(ratios) < min(1.0, ratio / 3.0):
             return int(boards[np.argmin(ratios)]), rms_mm
     raise PairFailed(
@@ -281,7 +281,9 @@ def find_odd_board(data: BoundaryPoints, stripes: int, direction: Axis) -> tuple
     )
 
 
-def _disagreement(data: BoundaryPoints, stripes: int, direction: Axis) -> tuple[float, float]:
+def _measure_disagreement(
+    data: BoundaryPoints, stripes: int, direction: Axis
+) -> tuple[float, float]:
     """Compute by how much boards disagree with sheets fitted to all, relative to what is allowed, and
     as the RMS offset of the boards from their corners, mm.
 
@@ -293,12 +295,12 @@ def _disagreement(data: BoundaryPoints, stripes: int, direction: Axis) -> tuple[
     fit = fit_sheets(BowedSheets.from_pinhole(plain, 1), data, max_steps=12)
     pixels = fit.distances_mm / np.linalg.norm(data.per_pixel, axis=1)
     rms_px = rms(np.array([np.median(pixels[data.board == k]) for k in np.unique(data.board)]))
-    rms_mm = rms(board_offsets(data, fit.sheets))
+    rms_mm = rms(compute_board_offsets(data, fit.sheets))
     allowed_mm = MAX_DISAGREEMENT * float(np.median(data.points[:, 2]))
     return min(rms_px / MAX_DISAGREEMENT_PX, rms_mm / allowed_mm), rms_mm
 
 
-def board_offsets(data: BoundaryPoints, sheets: LightSheets) -> Array:
+def compute_board_offsets(data: BoundaryPoints, sheets: LightSheets) -> Array:
     """Compute the offset (B,) mm of each board as the stripes measure it from its pose by corners.
 
     Median along the board's normal, positive away from the camera.

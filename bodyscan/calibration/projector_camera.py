@@ -45,7 +45,7 @@ def sheets_from_projector(
     this row becomes y, a projector with OpenCV's lens again has such a lens: its tangential part is
     r^2 q + 2 (q . x) x with q = (p2, p1), and q rotates as x does.
     """
-    row, centre, size = _across_stripes(projector, direction)
+    row, centre, size = _select_across_stripes(projector, direction)
     focal = float(np.linalg.norm(row))
     across = row / focal
     along = np.array([across[1], -across[0]])
@@ -108,7 +108,7 @@ def intersect_central_rays(
     return np.asarray(ray * (depth if meets else 5.0 * baseline), float)
 
 
-def _across_stripes(projector: Camera, direction: Axis) -> tuple[Array, float, int]:
+def _select_across_stripes(projector: Camera, direction: Axis) -> tuple[Array, float, int]:
     """The row of A that gives the coordinate across the stripes, its centre, and the image size
     there."""
     if direction == "vertical":
@@ -233,7 +233,9 @@ def _refine(
     def errors(step: Array) -> Array:
         """In sigmas: of the sheets across the stripes, then of the lens from its prior."""
         light, pose = perturb(step)
-        return np.concatenate([*(_errors(light, pose, s) for s in both), step[-terms:] / priors])
+        return np.concatenate(
+            [*(_compute_errors(light, pose, s) for s in both), step[-terms:] / priors]
+        )
 
     from scipy.optimize import least_squares  # imported here because scans do not need it
 
@@ -249,7 +251,7 @@ def _refine(
     return FittedProjector(*perturb(solved.x), predicted * misfit, predicted)
 
 
-def _errors(light: Camera, from_camera: RigidTransform, samples: _Samples) -> Array:
+def _compute_errors(light: Camera, from_camera: RigidTransform, samples: _Samples) -> Array:
     """Reprojection errors across the stripes (N,) in sigmas; far off behind the projector."""
     points = from_camera.apply(samples.points)
     with np.errstate(all="ignore"):

@@ -14,7 +14,7 @@ from bodyscan.compiled import compiled
 from bodyscan.geometry.least_squares import EXACT, Block, Noise, minimize
 from bodyscan.geometry.light_planes import Axis, LightPlanes, SmoothSheets
 from bodyscan.geometry.linear_gaussian import invert_scaled
-from bodyscan.geometry.robust import cauchy_weights, robust_scale
+from bodyscan.geometry.robust import compute_cauchy_weights, estimate_robust_scale
 
 Sheets = TypeVar("Sheets", bound=SmoothSheets)
 
@@ -53,7 +53,7 @@ def fit_pinhole(points: Array, s: Array) -> Array:
 
     from scipy.optimize import least_squares  # imported here because scans do not need it
 
-    scale = 3.0 * robust_scale(residuals(start), 1e-9)
+    scale = 3.0 * estimate_robust_scale(residuals(start), 1e-9)
     solved = least_squares(residuals, start, loss="cauchy", f_scale=scale).x.reshape(2, 4)
     solved[0] = solved[0] * half + middle * solved[1]
     solved[:, :3] /= size
@@ -87,7 +87,7 @@ def fit_sheets(
     """
     solution = minimize(
         start,
-        lambda sheets: _blocks(sheets, data),
+        lambda sheets: _make_blocks(sheets, data),
         lambda sheets, step: sheets.retract(step),
         unknowns=len(start.covariance),
         steps=max_steps,
@@ -100,7 +100,7 @@ def fit_sheets(
     if board_error_mm > 0.0:
         weights = solution.weights[0] / (points.sigma * solution.scales[0]) ** 2
         one = np.zeros_like(data.index)
-        (by_boards,) = _board_covariance(
+        (by_boards,) = _compute_board_covariance(
             covariance[None], points.jacobian, by_point, weights, data, one, board_error_mm
         )
         covariance = covariance + by_boards
@@ -112,7 +112,7 @@ def fit_sheets(
     )
 
 
-def _blocks(sheets: SmoothSheets, data: BoundaryPoints) -> tuple[Block, Block]:
+def _make_blocks(sheets: SmoothSheets, data: BoundaryPoints) -> tuple[Block, Block]:
     """Residuals: offsets of the points with the sigma that their pixel error gives, and the prior."""
     with np.errstate(all="ignore"):
         at = sheets.evaluate(data.index.astype(float))
@@ -132,7 +132,7 @@ def _blocks(sheets: SmoothSheets, data: BoundaryPoints) -> tuple[Block, Block]:
     )
 
 
-def _board_covariance(
+def _compute_board_covariance(
     covariance: Array,
     jacobian: Array,
     by_point: Array,
@@ -201,13 +201,13 @@ def fit_light_planes(
     sigma_mm = np.linalg.norm(data.per_pixel, axis=1) * data.sigma_px
     robust = np.ones(len(data.index))
     for _ in range(4):
-        planes, opening, scatter = _weighted_planes(data, robust / sigma_mm**2, count)
+        planes, opening, scatter = _fit_weighted_planes(data, robust / sigma_mm**2, count)
         distances = np.sum(data.points * planes[data.index, :3], axis=1) + planes[data.index, 3]
         leverage = np.abs(np.sum(data.per_pixel * planes[data.index, :3], axis=1))
         sigma_mm = np.maximum(leverage, 1e-6) * data.sigma_px
         normalized = distances / sigma_mm
-        scale = robust_scale(normalized[np.isfinite(normalized)], 1e-9)
-        robust = np.nan_to_num(cauchy_weights(normalized, 1, 3.0 * scale))
+        scale = estimate_robust_scale(normalized[np.isfinite(normalized)], 1e-9)
+        robust = np.nan_to_num(compute_cauchy_weights(normalized, 1, 3.0 * scale))
     bad = ~enough | (opening < 1e-4)  # on a line, for all their noise
     planes = np.where(bad[:, None], np.nan, planes)
     distances = np.where(bad[data.index], np.nan, distances)
@@ -215,7 +215,7 @@ def fit_light_planes(
     total = float(np.sum(robust[used]))
     rms = float(np.sqrt(np.sum((robust * distances**2)[used]) / total)) if total else np.nan
     weights = robust / (sigma_mm * scale) ** 2
-    covariance = _covariance(planes, scatter / scale**2, data, weights, board_error_mm)
+    covariance = _compute_covariance(planes, scatter / scale**2, data, weights, board_error_mm)
     return PlaneFit(LightPlanes(planes, covariance, direction), distances, rms)
 
 
@@ -226,7 +226,7 @@ def count_boards(data: BoundaryPoints, stripes: int, min_points: int = 1) -> Ind
     return np.count_nonzero(points.reshape(stripes + 1, boards) >= min_points, axis=1)
 
 
-def _weighted_planes(
+def _fit_weighted_planes(
     data: BoundaryPoints, weights: Array, count: int
 ) -> tuple[Array, Array, Array]:
     """Fit planes (count, 4); also return the ratio of the two variances of the points within each
@@ -245,7 +245,7 @@ def _weighted_planes(
     return planes, opening, moments
 
 
-def _covariance(
+def _compute_covariance(
     planes: Array, moments: Array, data: BoundaryPoints, weights: Array, board_error_mm: float
 ) -> Array:
     """Covariance (S + 1, 4, 4): the inverse of the weighted normal equations in the planes' three
@@ -261,7 +261,7 @@ def _covariance(
     if board_error_mm > 0.0:
         homogeneous = np.column_stack([data.points, np.ones(len(data.points))])
         normals = planes[data.index, :3]
-        covariance += _board_covariance(
+        covariance += _compute_board_covariance(
             covariance, homogeneous, normals, weights, data, data.index, board_error_mm
         )
     return covariance

@@ -121,12 +121,12 @@ def smooth_models(
         ("bowed sheets, 3 terms", BowedSheets.from_pinhole(plain, 3)),
     ]
     if stripes > 1:  # one sheet shows no lens
-        lens = _lens_start(plain, few)
+        lens = _find_lens_start(plain, few)
         models = [("lens k1 k2", lens), ("lens k1 k2 p1 p2", lens.with_lens(4)), *models]
     return [(name, fit_sheets(model, data).sheets) for name, model in models]
 
 
-def _lens_start(plain: LensSheets, data: BoundaryPoints) -> LensSheets:
+def _find_lens_start(plain: LensSheets, data: BoundaryPoints) -> LensSheets:
     """Fit a lens from several starts of its axis, in heights of the image.
 
     Planes hardly determine the axis, and many projectors shine upwards, with their axis at the

@@ -23,16 +23,16 @@ def matrix_from_homographies(homographies: Sequence[Array], width: int, height: 
     )
     scaled = [size @ h for h in homographies]
     scaled = [h / np.linalg.norm(h[:, :2]) * np.sqrt(2) for h in scaled]
-    matrix = _full_matrix(scaled)
+    matrix = _solve_full_matrix(scaled)
     if matrix is None:
         matrix = _solve_central_matrix(scaled)
     return np.linalg.inv(size) @ matrix
 
 
-def _full_matrix(homographies: Sequence[Array]) -> Array | None:
+def _solve_full_matrix(homographies: Sequence[Array]) -> Array | None:
     """Solve for A with skew and principal point; None if the solution is no camera."""
-    rows = [_constraint(h, 0, 1) for h in homographies]
-    rows += [_constraint(h, 0, 0) - _constraint(h, 1, 1) for h in homographies]
+    rows = [_form_constraint(h, 0, 1) for h in homographies]
+    rows += [_form_constraint(h, 0, 0) - _form_constraint(h, 1, 1) for h in homographies]
     _, _, vt = np.linalg.svd(np.stack(rows))
     b11, b12, b22, b13, b23, b33 = vt[-1] * np.sign(vt[-1][0])
     conic = np.array([[b11, b12, b13], [b12, b22, b23], [b13, b23, b33]])
@@ -49,7 +49,10 @@ def _solve_central_matrix(homographies: Sequence[Array]) -> Array:
     """Solve for A with a focal length only."""
     rows, right = [], []
     for h in homographies:
-        for row in (_constraint(h, 0, 1), _constraint(h, 0, 0) - _constraint(h, 1, 1)):
+        for row in (
+            _form_constraint(h, 0, 1),
+            _form_constraint(h, 0, 0) - _form_constraint(h, 1, 1),
+        ):
             rows.append([row[0] + row[2]])
             right.append(-row[5])
     inverse_square = np.linalg.lstsq(np.array(rows), np.array(right), rcond=None)[0][0]
@@ -57,7 +60,7 @@ def _solve_central_matrix(homographies: Sequence[Array]) -> Array:
     return np.diag([focal, focal, 1.0])
 
 
-def _constraint(h: Array, i: int, j: int) -> Array:
+def _form_constraint(h: Array, i: int, j: int) -> Array:
     """Coefficients v_ij of h_i^T B h_j in (B11, B12, B22, B13, B23, B33) (Zhang 2000, Eq. 7)."""
     a, b = h[:, i], h[:, j]
     twice = np.outer(a, b) + np.outer(b, a)

@@ -16,7 +16,13 @@ from bodyscan.capture.cameras import CAMERAS, Camera, Place
 from bodyscan.capture.projectors import PROJECTORS, Projector
 from bodyscan.captures.pattern_files import name_patterns
 from bodyscan.errors import BadInput, RigFileError
-from bodyscan.files.model import Model, Problem, did_you_mean, format_alternatives, problem_error
+from bodyscan.files.model import (
+    Model,
+    Problem,
+    did_you_mean,
+    format_alternatives,
+    make_problem_error,
+)
 from bodyscan.files.model_file import load_model
 from bodyscan.files.registry import Registry
 from bodyscan.rig.devices import CapturePlan
@@ -144,6 +150,6 @@ def _parse(registry: Registry[type[Kind]], keys: Mapping[str, Any]) -> Kind:
     if name not in registry.names():
         hint = did_you_mean(name, registry.names())
         wrong = f"must be {format_alternatives(registry.names())}{hint} (got {name!r})"
-        error = problem_error((("kind",), wrong))
+        error = make_problem_error((("kind",), wrong))
         raise ValidationError.from_exception_data("device", [error])
     return registry.find(name).model_validate_json(json.dumps(keys), strict=True)

@@ -71,7 +71,7 @@ def find_exposures(devices: Devices) -> Iterator[tuple[str, Exposure]]:
             continue
         found = _settle(camera, projector, lit, dark)
         if not found.lit:
-            raise _unseen_light(devices, pair)
+            raise _make_unseen_light_error(devices, pair)
         yield pair, found
 
 
@@ -122,7 +122,7 @@ def _shake_hands(devices: Devices, pair: str, lit: str, dark: str) -> float:
     projector.rest()
     white = seen[-1][1]
     if white - black < 1.0:
-        raise _unseen_light(devices, pair)
+        raise _make_unseen_light_error(devices, pair)
     on_ms = next(at for at, level in seen if level > 0.9 * white + 0.1 * black)
     # Light may have come at any moment since the picture before.
     between_ms = float(np.median(np.diff([at for at, _ in seen]))) if len(seen) > 1 else 0.0
@@ -134,7 +134,7 @@ def _look(camera: Camera, frame: str) -> Picture:
     return camera.take(5.0)
 
 
-def _unseen_light(devices: Devices, pair: str) -> FailedWork:
+def _make_unseen_light_error(devices: Devices, pair: str) -> FailedWork:
     return FailedWork(
         f"the camera of pair {pair} does not see its projector's light",
         where=f"rig {devices.rig.name}",

@@ -77,7 +77,7 @@ def capture_shot(devices: Devices, shot: Shot, progress: Progress = silent) -> C
     """
     turns = plan_turns(devices.rig, devices.plan.order)
     total = sum(len(step) for turn in turns for step in turn)
-    clock, rows = _Clock(), _other_rows(shot)
+    clock, rows = _Clock(), _read_other_rows(shot)
     lost: dict[Frame, str] = {}
     retaken = done = 0
     with background() as writer:
@@ -262,7 +262,7 @@ def _write_turn(
         put_image(inbox, devices.rig, scan, pair, frame, picture.image, shot=shot.name)
 
 
-def _other_rows(shot: Shot) -> list[str]:
+def _read_other_rows(shot: Shot) -> list[str]:
     """Rows of other shots in the folder's file of times."""
     with suppress(OSError):
         lines = (shot.folder / TIMES).read_text("utf-8").splitlines()[1:]

@@ -25,7 +25,7 @@ from bodyscan.files.model_file import combine_problems, load_model
 from bodyscan.files.reading import read_regular
 from bodyscan.files.yaml_file import Place, YamlProblem, dump_yaml
 from bodyscan.rig.rig import Rig
-from bodyscan.rig.templates import path_fault
+from bodyscan.rig.templates import find_path_fault
 
 FILE_NAME = "captures.yaml"
 _TIMES_REMEDY = "Correct the file of times; docs/formats.md explains its columns."
@@ -70,7 +70,7 @@ class Timing(Model):
         steady = {"frame_ms": self.frame_ms, "order": self.order, "start": self.start}
         for key in [key for key, value in steady.items() if value is not None and self.times]:
             yield (key,), "is said twice: `times` has the time of each frame"
-        fault = path_fault(self.times) if self.times is not None else None
+        fault = find_path_fault(self.times) if self.times is not None else None
         if fault:
             yield ("times",), fault
         for index, name in find_duplicates(self.order or ()):

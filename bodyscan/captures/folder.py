@@ -26,7 +26,7 @@ from bodyscan.files.model import MAX_SHOT_LENGTH, SHOT
 from bodyscan.rig.frame_names import CaptureFolder
 from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig import Rig
-from bodyscan.rig.templates import fill, has_field, shot_pattern
+from bodyscan.rig.templates import compile_shot_pattern, fill, has_field
 
 IMAGE_SUFFIXES = {".png", ".bmp", ".tif", ".tiff", ".jpg", ".jpeg", ".pgm", ".ppm"}
 """Suffixes of image files, whatever program wrote them."""
@@ -154,7 +154,7 @@ def open_captures(rig: Rig, rig_path: Path) -> Captures:
 
 def open_folder(rig: Rig, rig_path: Path, entry: CaptureFolder) -> Captures:
     """Open one folder of the rig file's `calibration` list. Raises as `open_scan`."""
-    folder, template = capture_path(rig_path, entry), entry.files or rig.files
+    folder, template = resolve_capture_path(rig_path, entry), entry.files or rig.files
     if entry.corners is None:
         return _open(rig, folder, "calibration", template, entry.shots)
 
@@ -165,7 +165,7 @@ def open_folder(rig: Rig, rig_path: Path, entry: CaptureFolder) -> Captures:
     return replace(captures, corners={folder / name: pixels for name, pixels in named.items()})
 
 
-def capture_path(rig_path: Path, entry: CaptureFolder) -> Path:
+def resolve_capture_path(rig_path: Path, entry: CaptureFolder) -> Path:
     """Return the path of a folder, with .. resolved if that leads to the same folder."""
     path = Path(rig_path).parent / entry.folder
     short = os.path.normpath(path)  # differs if a symbolic link comes before ..
@@ -264,7 +264,7 @@ def _open(
         sequence for shot in shots for sequence in _collect_sequences(rig, listing, template, shot)
     )
     if not sequences:
-        raise _no_image_error(rig, folder, template, first)
+        raise _make_no_image_error(rig, folder, template, first)
     captures = Captures(rig, (folder,), names, sequences, base=folder)
     if file is None:
         return captures
@@ -279,7 +279,7 @@ def _open(
     )
 
 
-def _no_image_error(rig: Rig, folder: Path, template: str, first: str) -> CaptureError:
+def _make_no_image_error(rig: Rig, folder: Path, template: str, first: str) -> CaptureError:
     """Make the error for a folder without images; first: the template of the first exposure."""
     frame = next(iter(rig.frames.sequence_names(rig.pairs[0].projector)), "")
     example = fill(first, shot="SHOT", pair=rig.pairs[0].name, frame=frame)
@@ -329,8 +329,12 @@ def _discover_shots(rig: Rig, listing: Listing, template: str) -> tuple[str, ...
         if pair.projector:
             frames |= set(rig.frames.code_names(pair.projector)[:1])
         for frame in filter(None, frames):
-            found |= _find_shots(listing, shot_pattern(template, pair.name, frame), "", None)
-    return tuple(sorted((name for name in found if len(name) <= MAX_SHOT_LENGTH), key=_natural_key))
+            found |= _find_shots(
+                listing, compile_shot_pattern(template, pair.name, frame), "", None
+            )
+    return tuple(
+        sorted((name for name in found if len(name) <= MAX_SHOT_LENGTH), key=_make_natural_key)
+    )
 
 
 def _find_shots(
@@ -352,7 +356,7 @@ def _find_shots(
     return found
 
 
-def _natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
+def _make_natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
     """Return a sort key that puts b2 before b10."""
     pieces = re.findall(r"\d+|\D+", name)
     return tuple((0, int(p), p) if p.isdecimal() else (1, 0, p) for p in pieces)

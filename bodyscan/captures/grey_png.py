@@ -20,19 +20,19 @@ from bodyscan.compiled import compiled
 SUB, UP, AVERAGE, PAETH = 1, 2, 3, 4  # filters of rows; 0 is none
 
 
-def png_damage(data: bytes) -> str | None:
+def find_png_damage(data: bytes) -> str | None:
     """Check a whole PNG file: return what is wrong (ends early, wrong checksum), or None.
 
     libpng decodes such a file as far as it can and leaves the rest of the image as it is.
     """
     last = b""
-    for last, content, checksum in _png_chunks(data):
+    for last, content, checksum in _iterate_png_chunks(data):
         if _update_crc(content, isal_zlib.crc32(last)) != checksum:
             return "is damaged (a checksum is wrong)"
     return None if last == b"IEND" else "is cut short"
 
 
-def _png_chunks(data: bytes) -> Iterator[tuple[bytes, memoryview, int]]:
+def _iterate_png_chunks(data: bytes) -> Iterator[tuple[bytes, memoryview, int]]:
     """Yield kind, content and checksum of every complete chunk of a PNG file."""
     position, kind = 8, b""
     while kind != b"IEND" and position + 12 <= len(data):
@@ -66,7 +66,7 @@ def decode_grey_png(data: bytes, width: int, height: int, rows: int | None = Non
     """
     if data[16:29] != struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0):
         return None
-    packed = b"".join(content for kind, content, _ in _png_chunks(data) if kind == b"IDAT")
+    packed = b"".join(content for kind, content, _ in _iterate_png_chunks(data) if kind == b"IDAT")
     # Inflate no more than is wanted, whatever the file holds.
     wanted = height if rows is None else min(rows, height)
     try:

@@ -166,7 +166,7 @@ def describe_missing(path: Path) -> str:
     return "is missing"
 
 
-def image_error(what: str, path: Path, where: str, *, remedy: str = "") -> ImageError:
+def make_image_error(what: str, path: Path, where: str, *, remedy: str = "") -> ImageError:
     """Make an ImageError that names file, pair and shot, and what to do."""
     remedy = remedy or (
         "Possible causes: it was not taken, or is damaged (copy it again, take the shot again, or "
@@ -177,7 +177,7 @@ def image_error(what: str, path: Path, where: str, *, remedy: str = "") -> Image
     return ImageError(what, where=f"{path} ({where})" if where else str(path), remedy=remedy)
 
 
-def missing_error(missing: Sequence[Path], inverses: Sequence[Path], where: str) -> ImageError:
+def make_missing_error(missing: Sequence[Path], inverses: Sequence[Path], where: str) -> ImageError:
     """Make an ImageError for missing images, which names the first of them.
 
     inverses: those of the sequence, missing or not.
@@ -186,4 +186,4 @@ def missing_error(missing: Sequence[Path], inverses: Sequence[Path], where: str)
     remedy = NO_INVERSES if set(missing) == set(inverses) else ""
     if len(missing) > 1:
         what += f", and {len(missing) - 1} more of this shot cannot be found"
-    return image_error(what, missing[0], where, remedy=remedy)
+    return make_image_error(what, missing[0], where, remedy=remedy)

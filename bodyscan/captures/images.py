@@ -15,13 +15,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.arrays import WHOLE, Array, Bytes, Crop, Floats, Greys, whole_grey
+from bodyscan.arrays import WHOLE, Array, Bytes, Crop, Floats, Greys, round_to_grey
 from bodyscan.captures.folder import ImageSequence
-from bodyscan.captures.grey_png import decode_grey_png, png_damage
+from bodyscan.captures.grey_png import decode_grey_png, find_png_damage
 from bodyscan.captures.image_header import (
     find_header_fault,
-    image_error,
-    missing_error,
+    make_image_error,
+    make_missing_error,
     read_header,
     store_upright,
 )
@@ -30,7 +30,7 @@ from bodyscan.files.reading import read_regular
 from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
 from bodyscan.progress import THREADS, map_threads
 from bodyscan.rig.pair import CameraSpec, Pair
-from bodyscan.stripes.decoding import images_by_kind
+from bodyscan.stripes.decoding import split_by_kind
 from bodyscan.stripes.usable_pixels import SATURATED
 
 Raw = NDArray[np.uint8] | NDArray[np.uint16]
@@ -60,7 +60,7 @@ def read_image(
     """
     where = ", ".join(f"{kind} {name}" for kind, name in (("pair", pair), ("shot", shot)) if name)
     raw = _read_raw(path, camera, where)
-    image = whole_grey(convert_to_greys(raw, _find_scale([raw], camera, path, where)))
+    image = round_to_grey(convert_to_greys(raw, _find_scale([raw], camera, path, where)))
     if lit:
         _refuse_blank(image, path, where)
     return image
@@ -78,7 +78,7 @@ def read_board_image(sequence: ImageSequence, pair: Pair) -> Bytes:
         return read_image(path, pair.camera, pair=pair.name, shot=shot, lit=True)
     code = pair.projector.model_copy(update={"crossing": None})
     images = read_sequence(sequence.without_crossing, pair.camera)
-    made = whole_grey(code.lit_from(images_by_kind(code, images.coded)[0]))
+    made = round_to_grey(code.lit_from(split_by_kind(code, images.coded)[0]))
     _refuse_blank(made, sequence.board_path, sequence.where)
     return made
 
@@ -104,7 +104,7 @@ def read_sequence(
     singles = iter(whole)
     lit, dark = (next(singles) if path else None for path in (sequence.lit, sequence.dark))
     if lit is not None and sequence.lit is not None:
-        _refuse_blank(whole_grey(lit), sequence.lit, sequence.where)
+        _refuse_blank(round_to_grey(lit), sequence.lit, sequence.where)
     coded = whole[len(whole) - len(sequence.coded) :]
     return StripeImages(lit, dark, coded)
 
@@ -127,11 +127,11 @@ def read_colours(sequence: ImageSequence, camera: CameraSpec) -> Bytes | None:
     for path in paths:
         found = _decode(_read_file(path, camera, sequence.where), cv2.IMREAD_COLOR_RGB)
         if found is None or found.shape != (camera.height, camera.width, 3):
-            raise image_error("cannot be decoded", path, sequence.where)
+            raise make_image_error("cannot be decoded", path, sequence.where)
         images.append(found)
     path, raw = paths[0], np.max(images, axis=0)
     # The lit image is the brightest of its sequence, so that it shows the scale by itself.
-    colours = whole_grey(convert_to_greys(raw, _find_scale([raw], camera, path, sequence.where)))
+    colours = round_to_grey(convert_to_greys(raw, _find_scale([raw], camera, path, sequence.where)))
     if (colours == colours[..., :1]).all():
         return None
     if camera.channel_number is not None:
@@ -155,7 +155,7 @@ def _read_stack(sequence: ImageSequence, camera: CameraSpec, crop: Crop, workers
     paths = (*taken, *sequence.coded)
     missing = [path for path in paths if path in sequence.missing]
     if missing:
-        raise missing_error(missing, sequence.inverses, sequence.where)
+        raise make_missing_error(missing, sequence.inverses, sequence.where)
     read = partial(_read_raw, camera=camera, where=sequence.where, rows=crop[0].stop)
     first = read(paths[0])
     # In 16-bit files white is found from all numbers, so these are cropped afterwards.
@@ -168,7 +168,7 @@ def _read_stack(sequence: ImageSequence, camera: CameraSpec, crop: Crop, workers
         if image.dtype != first.dtype:
             bits, others = 8 * image.itemsize, 8 * first.itemsize
             what = f"has {bits} bits a sample, but {paths[0].name} has {others}"
-            raise image_error(what, paths[k], sequence.where)
+            raise make_image_error(what, paths[k], sequence.where)
         stack[k] = image[early]
 
     map_threads(read_into, range(1, len(paths)), workers=workers)
@@ -181,7 +181,7 @@ def _find_scale(images: list[Raw], camera: CameraSpec, path: Path, where: str) -
     try:
         return find_full_scale(images, camera.bits)
     except ImageError as error:
-        raise image_error(error.what, path, where, remedy=error.remedy) from None
+        raise make_image_error(error.what, path, where, remedy=error.remedy) from None
 
 
 def _read_raw(path: Path, camera: CameraSpec, where: str, rows: int | None = None) -> Raw:
@@ -203,12 +203,12 @@ def _read_raw(path: Path, camera: CameraSpec, where: str, rows: int | None = Non
         return image
     found = _decode(data, cv2.IMREAD_GRAYSCALE if channel is None else cv2.IMREAD_ANYCOLOR)
     if found is None or found.shape[:2] != (height, width):
-        raise image_error("cannot be decoded", path, where)
+        raise make_image_error("cannot be decoded", path, where)
     if channel is not None and found.ndim == 3:
         found = found[:, :, 2 - channel]  # OpenCV's order is blue, green, red
     elif channel is not None:
         what = f"is grey, but the rig file says `channel: {camera.channel}`"
-        raise image_error(what, path, where, remedy="Leave `channel` out for this camera.")
+        raise make_image_error(what, path, where, remedy="Leave `channel` out for this camera.")
     return cast(Raw, np.ascontiguousarray(found))
 
 
@@ -216,9 +216,9 @@ def _read_file(path: Path, camera: CameraSpec, where: str) -> bytes:
     """Read a file whose header, and if it is a PNG whose checksums, are sound."""
     fault = find_header_fault(path, camera.width, camera.height)
     data = b"" if fault else read_regular(path)
-    fault = fault or (png_damage(data) if data.startswith(b"\x89PNG") else None)
+    fault = fault or (find_png_damage(data) if data.startswith(b"\x89PNG") else None)
     if fault:
-        raise image_error(fault, path, where)
+        raise make_image_error(fault, path, where)
     return data
 
 
@@ -245,12 +245,12 @@ def _refuse_blank(image: Bytes, path: Path, where: str) -> None:
     if brightest <= 8:  # the sensor's offset and noise
         what = f"shows nothing: its brightest pixel is {brightest} of 255"
         remedy = "Check the exposure, the lens cap, and that the projector was on; then retake."
-        raise image_error(what, path, where, remedy=remedy)
+        raise make_image_error(what, path, where, remedy=remedy)
     darkest = int(image.min())
     if darkest >= SATURATED:
         what = f"shows nothing but white: its darkest pixel is {darkest} of 255"
         remedy = "Shorten the exposure, close the iris or dim the projector; then retake."
-        raise image_error(what, path, where, remedy=remedy)
+        raise make_image_error(what, path, where, remedy=remedy)
 
 
 def find_full_scale(images: Sequence[Raw], bits: int | None) -> float:

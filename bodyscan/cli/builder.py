@@ -133,7 +133,7 @@ def calibrate_rig(
     """Calibrate every pair of a rig and join them in one frame."""
     from bodyscan.workflows.calibrate_rig import calibrate_folder
 
-    out = _calibration_folder(rig_file, out, overwrite)
+    out = _prepare_calibration_folder(rig_file, out, overwrite)
     with hold_folder(out), output.stages() as progress:
         found, saved = calibrate_folder(rig_file, out, progress)
     _report_calibration(output, found, saved)
@@ -155,19 +155,19 @@ def import_(
     """Import calibrations from other programs: the files that the rig file names as `known`."""
     from bodyscan.workflows.import_rig import import_folder
 
-    out = _calibration_folder(rig_file, out, overwrite)
+    out = _prepare_calibration_folder(rig_file, out, overwrite)
     _report_calibration(output, *import_folder(rig_file, out, sigma_px))
 
 
-def _calibration_folder(rig_file: Path, out: Path | None, overwrite: bool) -> Path:
-    from bodyscan.captures.folder import capture_path
+def _prepare_calibration_folder(rig_file: Path, out: Path | None, overwrite: bool) -> Path:
+    from bodyscan.captures.folder import resolve_capture_path
     from bodyscan.rig.rig import load_rig
 
     # A default beside the rig file may lie among its captures: their shots are told by name.
     folder = out or rig_file.parent / "calibration"
     _require_writable(folder, overwrite)
     named = load_rig(rig_file).calibration if out else ()
-    require_writable(folder, *(capture_path(rig_file, entry) for entry in named))
+    require_writable(folder, *(resolve_capture_path(rig_file, entry) for entry in named))
     return folder
 
 

@@ -140,7 +140,7 @@ class Output:
             "command": self.command,
             "exit_code": error.exit_code if error else self.exit_code,
             "made": self._files,
-            "figures": _finite(self._figures),
+            "figures": _replace_nonfinite(self._figures),
             "lines": self._lines,
             "notes": self._notes,
             "failures": self._failures,
@@ -171,9 +171,9 @@ class Output:
         self._give_back()
         known = error if isinstance(error, BodyscanError) else None
         if self.json and not self._events and (known or error is None):
-            from bodyscan.files.atomic import json_text
+            from bodyscan.files.atomic import format_json
 
-            sys.stdout.write(json_text(self.as_document(known)))
+            sys.stdout.write(format_json(self.as_document(known)))
 
     def _give_back(self) -> None:
         if self._standard_output is not None:
@@ -237,12 +237,12 @@ def _fitting(table: RenderableType) -> RenderableType:
     return Text("\n".join(lines))
 
 
-def _finite(value: Any) -> Any:
+def _replace_nonfinite(value: Any) -> Any:
     """Replace NaN and infinity by None: JSON has neither."""
     if isinstance(value, Mapping):
-        return {key: _finite(one) for key, one in value.items()}
+        return {key: _replace_nonfinite(one) for key, one in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(one) for one in value]
+        return [_replace_nonfinite(one) for one in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 

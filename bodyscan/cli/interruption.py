@@ -49,7 +49,7 @@ def run_interruptibly(work: Callable[[], int]) -> int:
         _work(work, parent)
     try:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
-        return _code(os.waitpid(child, 0)[1])
+        return _compute_exit_code(os.waitpid(child, 0)[1])
     except _StopRequest as request:
         with suppress(ChildProcessError, ProcessLookupError):  # it has ended meanwhile
             _stop(child)
@@ -77,7 +77,7 @@ def _work(work: Callable[[], int], parent: int) -> NoReturn:
     os._exit(code)
 
 
-def _code(status: int) -> int:
+def _compute_exit_code(status: int) -> int:
     code = os.waitstatus_to_exitcode(status)
     if code < 0:
         name = signal.Signals(-code).name

@@ -77,10 +77,10 @@ def simulate(
             remedy="give another --out, or --overwrite to replace them",
         )
     from bodyscan.mesh.surface_file import read_surface
-    from bodyscan.simulation import settings_for
+    from bodyscan.simulation import compose_settings
     from bodyscan.simulation import simulate as run
 
-    settings = settings_for(
+    settings = compose_settings(
         projector, preset=preset, subject=subject_preset, look=look,
         changes=changes or (),
     )  # fmt: skip
@@ -146,7 +146,7 @@ def accept(
     """Measure spheres and a plate of known size at several places, and judge the figures."""
     from bodyscan.evaluation.acceptance import limit_from, load_acceptance
     from bodyscan.registration.storage import load_calibration
-    from bodyscan.report.acceptance_page import NO_STANDARD, screen_table
+    from bodyscan.report.acceptance_page import NO_STANDARD, make_screen_table
     from bodyscan.report.page import is_synthetic
     from bodyscan.workflows.accept_rig import judge_readings, read_captures, refuse_existing_test
 
@@ -164,7 +164,7 @@ def accept(
     synthetic = any(map(is_synthetic, captured))
     found = judge_readings(readings, file, rig, calibration, folder, synthetic=synthetic)
     with output.optional("table"):
-        output.show(screen_table(found.figures, synthetic))
+        output.show(make_screen_table(found.figures, synthetic))
     output.figures(**{one.name: one.value_mm for one in found.figures})
     output.notes([NO_STANDARD, *found.notes])
     output.notes(readings.problems, "problem")

@@ -205,11 +205,11 @@ def measure(
     """Measure a scan's mesh: stature, girths of horizontal slices, volume, area."""
     from bodyscan.files.atomic import write_json
     from bodyscan.fusion.storage import refuse_own_file
-    from bodyscan.measurement.measurements import heights_from
     from bodyscan.measurement.measurements import measure as measure_mesh
+    from bodyscan.measurement.measurements import parse_heights
     from bodyscan.report.measurement_table import (
         MEASUREMENTS,
-        measurements_document,
+        make_measurements_document,
         require_formats,
         tables,
         write_landmarks,
@@ -220,11 +220,11 @@ def measure(
     require_formats(path, landmarks, since, named=named)
     for file in filter(None, (path, landmarks)):
         refuse_own_file(file, result)
-    levels = None if heights is None else heights_from(heights)
+    levels = None if heights is None else parse_heights(heights)
     stored, earlier = _load_scans(result, since, anyway=anyway)
     measured = measure_mesh(stored.mesh, levels, named=named)
     changes = None if earlier is None else _compare(earlier, stored, measured)
-    content = measurements_document(measured, stored.facts, changes)
+    content = make_measurements_document(measured, stored.facts, changes)
     write_measurements(path, measured, stored.facts, changes)
     written = [path]
     if landmarks is not None and measured.named is not None:
@@ -374,12 +374,12 @@ def batch(
     from bodyscan.jobs.job import find_jobs
     from bodyscan.jobs.object_storage import Store, find_stored_jobs, is_url
     from bodyscan.jobs.pipeline import load_pipeline
-    from bodyscan.jobs.stages import KINDS, stages_until
+    from bodyscan.jobs.stages import KINDS, select_stages_until
 
     settings = load_pipeline(pipeline, changes or ())
     every = KINDS[settings.kind]
     last = until or every[-1].name
-    stages_until(every, last)  # refuses an unknown stage before any folder is made
+    select_stages_until(every, last)  # refuses an unknown stage before any folder is made
     if not is_url(scans) and not is_url(out):
         given = Path(calibration) if calibration else None
         jobs = find_jobs(settings, Path(scans), Path(out), given, last)
@@ -416,7 +416,7 @@ def _run(
     output.stream_events()
     resources = jobs[0].pipeline.resources
     shares = batches.allocate(
-        resources, len(jobs), workers, batches.cores(), batches.free_memory_mb()
+        resources, len(jobs), workers, batches.cores(), batches.measure_free_memory_mb()
     )
     work = partial(object_storage.work_on_stored, store=store) if store else supervise_job
     with _listening(output) as listen:
@@ -550,13 +550,13 @@ def verify(
     ],
 ) -> None:
     """Compare images, calibration and results with the manifest, and find any byte that changed."""
-    from bodyscan.jobs.job import printable
+    from bodyscan.jobs.job import escape_control
     from bodyscan.jobs.verification import verify as look
 
     verified = look(folder)
     output.figures(files=verified.files)
-    output.say(*(printable(fault) for fault in verified.faults), wrong=True)
-    output.notes((printable(str(path)) for path in verified.added), "added since, not checked")
+    output.say(*(escape_control(fault) for fault in verified.faults), wrong=True)
+    output.notes((escape_control(str(path)) for path in verified.added), "added since, not checked")
     if verified.faults:
         raise FailedWork(
             f"{len(verified.faults)} of {verified.files} files have changed",
@@ -580,7 +580,7 @@ def forget(
 ) -> None:
     """Remove every file of a subject: images, jobs, results, exports, rows of summaries."""
     from bodyscan.jobs import forgetting
-    from bodyscan.jobs.job import printable
+    from bodyscan.jobs.job import escape_control
 
     found = forgetting.find_subject(subject, workspace)
     forgetting.require_found(found, subject, workspace)
@@ -592,11 +592,11 @@ def forget(
     listed = [str(path) for path in found.files]
     if not output.verbose:
         listed = list(forgetting.list_by_folder(found))
-    output.say(*(f"{verb} {printable(line)}" for line in listed))
-    output.notes((printable(str(path)) for path in found.unreadable), "owner unknown")
+    output.say(*(f"{verb} {escape_control(line)}" for line in listed))
+    output.notes((escape_control(str(path)) for path in found.unreadable), "owner unknown")
     output.notes(
         (
-            printable(f"{path}: {count} images or bodies; look whether they show {subject}")
+            escape_control(f"{path}: {count} images or bodies; look whether they show {subject}")
             for path, count in found.unnamed.items()
         ),
         "names nobody",

@@ -9,7 +9,7 @@ import numpy as np
 from rich.table import Table
 
 from bodyscan.fusion.storage import Scan
-from bodyscan.geometry.uncertainty import position_sigma
+from bodyscan.geometry.uncertainty import compute_position_sigma
 from bodyscan.mesh.body import compute_cover_shares
 from bodyscan.registration.rig_calibration import RigCalibration
 
@@ -25,7 +25,7 @@ def calibration_table(calibration: RigCalibration) -> Table:
     for name, pair in calibration.pairs.items():
         quality = pair.quality
         position = calibration.rig_from_camera[name].translation
-        sigma = position_sigma(calibration.covariance, name, position)
+        sigma = compute_position_sigma(calibration.covariance, name, position)
         known = " ".join(f"{value:.3f}" for value in sigma) if sigma.any() else "defines the frame"
         stripes = f"{quality.stripes_calibrated} of {quality.stripes_projected}"
         table.add_row(

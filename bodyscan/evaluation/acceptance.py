@@ -168,21 +168,21 @@ def figures(readings: Readings, file: AcceptanceFile) -> list[Figure]:
     plates = [row for row in readings.plates if row.view == ALL]
     alone = [row for row in readings.plates if row.view != ALL]
     found = (
-        ("probing_form_mm", _worst(merged, "form_mm"),
+        ("probing_form_mm", _find_worst(merged, "form_mm"),
          "range of the points' distances from the best sphere, all pairs merged, 3 in 1000 points "
          "left out"),
-        ("probing_size_mm", _worst(merged, "size_mm"),
+        ("probing_size_mm", _find_worst(merged, "size_mm"),
          "diameter of the best sphere less the calibrated diameter"),
-        ("sphere_spacing_mm", _worst(readings.spacings, "error_mm"),
+        ("sphere_spacing_mm", _find_worst(readings.spacings, "error_mm"),
          "distance of two spheres' centres less the calibrated distance"),
-        ("flatness_mm", _worst(plates, "flatness_mm"),
+        ("flatness_mm", _find_worst(plates, "flatness_mm"),
          "range of the points' distances from the best plane, all pairs merged, 3 in 1000 points "
          "left out"),
         ("repeatability_mm", _find_widest_range(readings.spacings),
          "range of one distance between spheres over repeated shots at one place"),
-        ("single_probing_form_mm", _worst(single, "form_mm"),
+        ("single_probing_form_mm", _find_worst(single, "form_mm"),
          "probing form of one pair by itself, not merged"),
-        ("single_flatness_mm", _worst(alone, "flatness_mm"),
+        ("single_flatness_mm", _find_worst(alone, "flatness_mm"),
          "flatness by one pair by itself, not merged"),
     )  # fmt: skip
     return [
@@ -208,7 +208,7 @@ def grade_acceptance(found: Sequence[Figure], readings: Readings) -> Verdict:
     return Verdict("accepted")
 
 
-def acceptance_document(
+def make_acceptance_document(
     readings: Readings, found: Sequence[Figure], file: AcceptanceFile, **origin: Any
 ) -> dict[str, Any]:
     """The content of acceptance.json."""
@@ -234,7 +234,7 @@ def acceptance_document(
     }
 
 
-def _worst(rows: Sequence[Any], name: str) -> tuple[float | None, str]:
+def _find_worst(rows: Sequence[Any], name: str) -> tuple[float | None, str]:
     if not rows:
         return None, "not measured"
     row = max(rows, key=lambda one: abs(getattr(one, name)))

@@ -97,7 +97,7 @@ def require_spheres(readings: Sequence[SphereReading], radius_mm: float, centres
                 f"shell of {one.shell_mm:.1f} mm, and a sphere within {widest:.1f}",
                 remedy=remedy,
             )
-    errors = spacing_errors(readings, centres_mm)
+    errors = compute_spacing_errors(readings, centres_mm)
     worst = float(errors[np.argmax(np.abs(errors))]) if len(errors) else 0.0
     if abs(worst) > radius_mm:
         raise FailedWork(
@@ -107,7 +107,7 @@ def require_spheres(readings: Sequence[SphereReading], radius_mm: float, centres
         )
 
 
-def spacing_errors(readings: Sequence[SphereReading], centres_mm: Array) -> Array:
+def compute_spacing_errors(readings: Sequence[SphereReading], centres_mm: Array) -> Array:
     """(K,) mm: distances of the spheres' centres less the calibrated ones, for every two."""
     return pdist(np.stack([one.fitted.centre for one in readings])) - pdist(centres_mm)
 
@@ -119,7 +119,7 @@ def read_plate(points: Array, normals: Array) -> PlateReading:
     """
     if len(points) < MIN_PLATE_POINTS:
         raise FailedWork(f"{len(points)} points are too few for a plate")
-    normal, offset = _largest_plane(points, np.random.default_rng(0))
+    normal, offset = _find_largest_plane(points, np.random.default_rng(0))
     for _ in range(3):
         near = np.abs(points @ normal - offset) < PLATE_REACH_MM
         near &= np.abs(normals @ normal) > MIN_COSINE
@@ -128,7 +128,7 @@ def read_plate(points: Array, normals: Array) -> PlateReading:
         normal, offset = fit_plane(points[near])
     on_plate = points[near]
     flat = on_plate @ null_space(normal[None])
-    joined = _largest_piece(flat)
+    joined = _find_largest_piece(flat)
     hull = ConvexHull(flat[joined])
     inward = -(flat[joined] @ hull.equations[:, :2].T + hull.equations[:, 2])
     kept = on_plate[joined][inward.min(axis=1) > 12.0]  # mm from the rim
@@ -155,7 +155,7 @@ def _drop_farthest(residual: Array) -> Array:
     return residual[np.argsort(size, kind="stable")[:kept]]
 
 
-def _largest_plane(points: Array, rng: np.random.Generator) -> tuple[Array, float]:
+def _find_largest_plane(points: Array, rng: np.random.Generator) -> tuple[Array, float]:
     """Find the plane through three points that most points lie near (RANSAC)."""
     some = points[rng.choice(len(points), min(3000, len(points)), replace=False)]
     a, b, c = np.moveaxis(some[rng.integers(0, len(some), (600, 3))], 1, 0)
@@ -171,7 +171,7 @@ def _largest_plane(points: Array, rng: np.random.Generator) -> tuple[Array, floa
     return normals[best], float(offsets[best])
 
 
-def _largest_piece(flat: Array) -> Mask:
+def _find_largest_piece(flat: Array) -> Mask:
     """Which flat points (N, 2) belong to the largest piece of touching cells of 10 mm, (N,)."""
     cells = np.floor((flat - flat.min(axis=0)) / 10.0).astype(np.int64)
     occupied = np.zeros(cells.max(axis=0) + 1, bool)

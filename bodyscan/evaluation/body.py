@@ -10,7 +10,7 @@ import numpy as np
 import open3d as o3d
 
 from bodyscan.arrays import Array, Indices, Mask
-from bodyscan.evaluation.surface import covered_spots, sample_surface
+from bodyscan.evaluation.surface import find_covered_spots, sample_surface
 from bodyscan.geometry.camera import camera_from_fields
 from bodyscan.geometry.camera_tables import is_in_image
 from bodyscan.geometry.robust import rms
@@ -23,7 +23,7 @@ TORSO = (0.46, 0.86)  # of the stature: crotch to shoulders
 WHOLE = 0.97  # of a girth measured, and not hair: what is filled is a declared guess
 
 
-def sway_residual(
+def compute_sway_residual(
     found: Mapping[str, RigidTransform], true_pairs: Mapping[str, Any], vertices: Array
 ) -> tuple[RigidTransform, float]:
     """What is left of calibration error and sway: `rig_from_still`, where the model has the true
@@ -57,7 +57,7 @@ class GirthErrors:
     stature_mm: float
 
 
-def true_girths(vertices: Array, faces: Indices) -> Measurements:
+def measure_true_girths(vertices: Array, faces: Indices) -> Measurements:
     """Girths of the true trunk, every `STEP_MM`."""
     stature = float(vertices[:, 2].max())
     levels = np.arange(TORSO[0] * stature, TORSO[1] * stature, STEP_MM).tolist()
@@ -67,10 +67,12 @@ def true_girths(vertices: Array, faces: Indices) -> Measurements:
     return measure(BodyMesh(vertices, faces, normals, colours, sigma_mm, filled), levels)
 
 
-def girth_errors(mesh: BodyMesh, true: Measurements, *, mean_breath: bool = False) -> GirthErrors:
+def compute_girth_errors(
+    mesh: BodyMesh, true: Measurements, *, mean_breath: bool = False
+) -> GirthErrors:
     """Errors of a mesh in the frame of the truth, at mean breath or at the mesh's moment.
 
-    true: see `true_girths`.
+    true: see `measure_true_girths`.
     """
     ours = measure(mesh, [one.height_mm for one in true.slices], mean_breath=mean_breath)
     both = zip(ours.slices, true.slices, strict=True)
@@ -106,7 +108,7 @@ def measure_visible_coverage(
             eye = still_from_camera.apply(centre)
             index = index[_in_sight(scene, spots[index], normals[index], eye)]
         visible[index] = True
-    covered = covered_spots(points, spots[visible], normals[visible])
+    covered = find_covered_spots(points, spots[visible], normals[visible])
     return float(visible.mean()), float(covered.mean())
 
 

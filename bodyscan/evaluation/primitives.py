@@ -16,7 +16,7 @@ from scipy.spatial.distance import pdist
 from bodyscan.arrays import Array
 from bodyscan.errors import FailedWork
 from bodyscan.geometry.least_squares import Block, Noise, minimize
-from bodyscan.geometry.robust import rms, robust_scale
+from bodyscan.geometry.robust import estimate_robust_scale, rms
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +42,7 @@ class SphereAccuracy:
     e_fitted: float
 
 
-def mean_square_distance(points: Array, sphere: Sphere) -> float:
+def compute_mean_square_distance(points: Array, sphere: Sphere) -> float:
     """Eq. 19, E in mm^2, over all points (N, 3): none is left out."""
     return float(np.mean(sphere.distances(points) ** 2))
 
@@ -84,7 +84,7 @@ def fit_sphere(points: Array, radius: float | None = None) -> Sphere:
 def measure_sphere(points: Array, radius: float) -> SphereAccuracy:
     """Measure a sphere of known radius from all points (N, 3) on it."""
     spheres = fit_sphere(points, radius), fit_sphere(points)
-    errors = [mean_square_distance(points, sphere) for sphere in spheres]
+    errors = [compute_mean_square_distance(points, sphere) for sphere in spheres]
     return SphereAccuracy(len(points), *spheres, *errors)
 
 
@@ -113,12 +113,12 @@ class Flatness:
 
 def fit_plane(points: Array) -> tuple[Array, float]:
     """Fit a plane to points (N, 3) by total least squares; return unit normal (3,) and offset."""
-    middle, axes = _principal_axes(points)
+    middle, axes = _compute_principal_axes(points)
     normal = axes[:, 0] * (np.sign(axes[:, 0] @ middle) or 1.0)
     return normal, float(normal @ middle)
 
 
-def _principal_axes(points: Array) -> tuple[Array, Array]:
+def _compute_principal_axes(points: Array) -> tuple[Array, Array]:
     """Mean (3,) of points (N, 3), and unit vectors (3, 3), columns, of growing spread about it."""
     middle = points.mean(axis=0)
     centred = points - middle
@@ -139,7 +139,7 @@ def measure_flatness(points: Array) -> Flatness:
 
 def fit_polynomial(points: Array, values: Array, degree: int = 6) -> Array:
     """Fit a polynomial over a plane to values (N,) at points (N, 3); return it there, (N,)."""
-    middle, axes = _principal_axes(points)
+    middle, axes = _compute_principal_axes(points)
     position = (points - middle) @ axes[:, 1:]
     position /= np.abs(position).max(axis=0)
     rows = legendre.legvander2d(position[:, 0], position[:, 1], [degree, degree])
@@ -192,9 +192,9 @@ def _find_sphere(points: Array, votes: Array, radius: float) -> Sphere | None:
         return None
     sphere = fit_sphere(inliers, radius)
     normal, offset = fit_plane(inliers)
-    flat = robust_scale(inliers @ normal - offset)
+    flat = estimate_robust_scale(inliers @ normal - offset)
     # Ground between the spheres gathers votes too, but a plane fits it better.
-    return sphere if robust_scale(sphere.distances(inliers)) < 0.5 * flat else None
+    return sphere if estimate_robust_scale(sphere.distances(inliers)) < 0.5 * flat else None
 
 
 def _sort_in_reading_order(spheres: list[Sphere]) -> list[Sphere]:

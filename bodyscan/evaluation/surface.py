@@ -16,7 +16,7 @@ from bodyscan.geometry.robust import rms
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyMesh
 from bodyscan.mesh.surface_file import read_surface, refuse_size
-from bodyscan.mesh.topology import face_normals, find_twins
+from bodyscan.mesh.topology import compute_face_normals, find_twins
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Deviation:
     worst_mm: float
 
 
-def signed_distances(points: Array, vertices: Array, faces: Indices) -> Array:
+def compute_signed_distances(points: Array, vertices: Array, faces: Indices) -> Array:
     """Distances (N,) mm of points (N, 3) from a closed triangle mesh, positive outside it.
 
     The sign is that of the angle-weighted pseudo-normal at the nearest spot (Baerentzen, Aanaes 2005).
@@ -43,15 +43,17 @@ def signed_distances(points: Array, vertices: Array, faces: Indices) -> Array:
     distance = np.linalg.norm(offset, axis=-1)
     face = nearest["primitive_ids"].numpy().astype(np.int64)
     u, v = nearest["primitive_uvs"].numpy().astype(np.float64).T
-    normals = _pseudo_normals(vertices, faces, face, np.stack([1.0 - u - v, u, v], axis=-1))
+    normals = _compute_pseudo_normals(vertices, faces, face, np.stack([1.0 - u - v, u, v], axis=-1))
     return np.where(np.einsum("nc,nc->n", offset, normals) >= 0, distance, -distance)
 
 
-def _pseudo_normals(vertices: Array, faces: Indices, face: Indices, barycentric: Array) -> Array:
+def _compute_pseudo_normals(
+    vertices: Array, faces: Indices, face: Indices, barycentric: Array
+) -> Array:
     """(N, 3): normals, of any length, at spots on faces: the face's, or its edge's or corner's."""
     corners = vertices[faces]
     sides = np.roll(corners, -1, axis=1) - corners  # side k runs from corner k to the next
-    cross = face_normals(vertices, faces)
+    cross = compute_face_normals(vertices, faces)
     unit = cross / np.maximum(np.linalg.norm(cross, axis=-1, keepdims=True), 1e-300)
     normals = unit[face]
     low = barycentric < 1e-5  # in float32
@@ -70,7 +72,7 @@ def _pseudo_normals(vertices: Array, faces: Indices, face: Indices, barycentric:
     return normals
 
 
-def deviation(signed_mm: Array) -> Deviation:
+def summarize_deviation(signed_mm: Array) -> Deviation:
     """Bias, median, RMS, 95th percentile and worst of signed distances (N,)."""
     size, bias, rms_mm = np.abs(signed_mm), float(np.mean(signed_mm)), rms(signed_mm)
     median, p95, worst = float(np.median(size)), float(np.percentile(size, 95)), float(size.max())
@@ -84,7 +86,7 @@ def normalize_errors(signed_mm: Array, sigma_mm: NDArray[np.floating[Any]]) -> t
     return float(np.median(over) / 0.6745), float(np.mean(over > 3.0))
 
 
-def covered_spots(
+def find_covered_spots(
     points: Array, spots: Array, normals: Array, within_mm: float = 1.0, spacing_mm: float = 2.0
 ) -> Mask:
     """Which spots (N, 3) of a surface with normals (N, 3) are covered by points (M, 3), (N,).
@@ -107,7 +109,7 @@ def sample_surface(
     """Random points (N, 3) on a mesh, uniform in area, and the normals (N, 3) of their faces."""
     rng = np.random.default_rng(seed)
     a, b, c = (vertices[faces[:, k]] for k in range(3))
-    cross = face_normals(vertices, faces)
+    cross = compute_face_normals(vertices, faces)
     area = np.linalg.norm(cross, axis=-1)
     chosen = rng.choice(len(faces), count, p=area / area.sum())
     root, t = np.sqrt(rng.random((count, 1))), rng.random((count, 1))
@@ -151,9 +153,9 @@ def compare_surfaces(mesh: BodyMesh, other: Path | BodyMesh) -> list[Comparison]
     points = mesh.vertices[measured]
     fit = fit_to_surface(points, vertices, faces)
     return [
-        Comparison(name, is_scan, measured, signed, deviation(signed), fitted, pose)
+        Comparison(name, is_scan, measured, signed, summarize_deviation(signed), fitted, pose)
         for pose, fitted in ((RigidTransform.identity(), False), (fit, True))
-        for signed in (signed_distances(pose.apply(points), vertices, faces),)
+        for signed in (compute_signed_distances(pose.apply(points), vertices, faces),)
     ]
 
 

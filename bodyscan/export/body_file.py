@@ -14,11 +14,11 @@ from bodyscan.body_model.skinned import SkinnedBody
 from bodyscan.export.formats import BODY_FORMATS, BodyFormat
 from bodyscan.export.texture import Texture
 from bodyscan.files.atomic import write_json
-from bodyscan.files.registry import unknown_format_error
+from bodyscan.files.registry import make_unknown_format_error
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import REGION_NAMES, BodyCloud, BodyMesh
 from bodyscan.mesh.repair import collapse_slivers
-from bodyscan.mesh.topology import face_areas
+from bodyscan.mesh.topology import compute_face_areas
 from bodyscan.version import __version__
 
 
@@ -60,7 +60,7 @@ def write_body(
     able = [known for known in BODY_FORMATS.names() if kind in BODY_FORMATS.find(known).holds]
     if name not in able:
         what = name or "a file without suffix"
-        raise unknown_format_error(f"a {kind}", what, able, where=str(path))
+        raise make_unknown_format_error(f"a {kind}", what, able, where=str(path))
     format_ = BODY_FORMATS.find(name)
     up = (origin.up,) if format_.free_axes else ()
     found: dict[str, Any] = {}
@@ -107,8 +107,8 @@ def describe_body(
     if "regions" in format_.holds and body.regions is not None:
         info["regions"] = list(REGION_NAMES)
     if isinstance(body, BodyCloud):
-        return info | {"points": len(body.points), "sigma_mm": _median(body.sigma_mm)}
-    areas = face_areas(body.vertices, body.faces)
+        return info | {"points": len(body.points), "sigma_mm": _compute_median(body.sigma_mm)}
+    areas = compute_face_areas(body.vertices, body.faces)
     return info | {
         "vertices": len(body.vertices),
         "faces": len(body.faces),
@@ -116,7 +116,7 @@ def describe_body(
         "area_mm2": float(areas.sum()),
         "filled_area_mm2": float(areas[body.filled].sum()),
         "coverage": float(areas[~body.filled].sum() / areas.sum()) if len(areas) else 0.0,
-        "sigma_mm": _median(body.sigma_mm),
+        "sigma_mm": _compute_median(body.sigma_mm),
     }
 
 
@@ -130,7 +130,7 @@ def _rig_from_file(format_: BodyFormat, rig_from_body: RigidTransform) -> Array:
     return rig_from_body.matrix @ body_from_file
 
 
-def _median(sigma_mm: np.ndarray[Any, Any]) -> float | None:
+def _compute_median(sigma_mm: np.ndarray[Any, Any]) -> float | None:
     """Compute the median of what was measured; None if nothing was."""
     known = sigma_mm[np.isfinite(sigma_mm)]
     return float(np.median(known)) if known.size else None

@@ -15,13 +15,13 @@ import numpy as np
 from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.errors import FailedWork
 from bodyscan.mesh.body import BodyMesh, select_regions
-from bodyscan.mesh.slices import MeshSlicer, hull_perimeter
+from bodyscan.mesh.slices import MeshSlicer, compute_hull_perimeter
 from bodyscan.mesh.topology import (
     RIM,
+    compute_vertex_normals,
     drop_unused_vertices,
     find_twins,
     label_components,
-    vertex_normals,
 )
 
 REACH_MM = 160.0  # from the head's axis; arms and shoulders farther out do not count
@@ -54,11 +54,11 @@ def find_neck(vertices: Array, faces: Indices) -> Neck:
     near = np.linalg.norm(vertices[:, :2] - axis, axis=1) < 2.0 * REACH_MM
     near &= vertices[:, 2] > heights[0] - (to_shoulders + REACH_MM)
     slicer = MeshSlicer(vertices, faces[near[faces].all(axis=1)])
-    girths = np.array([_girth(slicer, height, axis) for height in heights])
+    girths = np.array([_measure_girth(slicer, height, axis) for height in heights])
     narrowest = int(np.argmin(girths)) if girths.size else 0
     neck = float(girths[narrowest])
-    head = max(girths[narrowest:].max(), _girth(slicer, top - 0.06 * stature, axis))
-    shoulders = _girth(slicer, heights[narrowest] - to_shoulders, axis)
+    head = max(girths[narrowest:].max(), _measure_girth(slicer, top - 0.06 * stature, axis))
+    shoulders = _measure_girth(slicer, heights[narrowest] - to_shoulders, axis)
     inside = 0 < narrowest < len(girths) - 1 and 180.0 < neck < 700.0
     # Wrists of arms held overhead are narrow too, but have no head above and no shoulders below.
     if not (inside and head > 400.0 and head > 1.1 * neck and shoulders > 1.5 * neck):
@@ -66,12 +66,12 @@ def find_neck(vertices: Array, faces: Indices) -> Neck:
     return Neck(float(heights[narrowest]), axis)
 
 
-def _girth(slicer: MeshSlicer, height: float, axis: Array) -> float:
+def _measure_girth(slicer: MeshSlicer, height: float, axis: Array) -> float:
     """Compute a slice's hull perimeter, mm, near `axis` (x, y); infinite for too few points."""
     loops = slicer.slice(height)
     points = np.concatenate([np.empty((0, 2)), *(loop.segments[:, 0] for loop in loops)])
     points = points[np.linalg.norm(points - axis, axis=1) < REACH_MM]
-    return hull_perimeter(points) if len(points) > 3 else float("inf")
+    return compute_hull_perimeter(points) if len(points) > 3 else float("inf")
 
 
 def _find_crown(vertices: Array) -> tuple[Array, float]:
@@ -92,8 +92,8 @@ def deface(mesh: BodyMesh, neck: Neck) -> BodyMesh:
     open one (only what was measured) ends at the neck. Raises FailedWork if there is nothing above
     the neck, or its rim is not a simple line.
     """
-    head = _head_faces(mesh, neck)
-    closed = not len(_free_edges(mesh.faces))
+    head = _find_head_faces(mesh, neck)
+    closed = not len(_find_free_edges(mesh.faces))
     if closed:
         head = _simplify_rim(mesh.faces, head)
     crown_mm = float(mesh.vertices[mesh.faces[head]][..., 2].max())
@@ -103,9 +103,9 @@ def deface(mesh: BodyMesh, neck: Neck) -> BodyMesh:
     index = np.full(len(mesh.vertices), -1, np.int64)
     index[used] = np.arange(len(used))
     # Free edges of the head run opposite to those of what was kept.
-    rims = _trace_loops(index[_free_edges(mesh.faces[head])[:, ::-1]]) if closed else []
+    rims = _trace_loops(index[_find_free_edges(mesh.faces[head])[:, ::-1]]) if closed else []
     for number, rim in enumerate(sorted(rims, key=len, reverse=True)):
-        cap = vertices[rim].mean(axis=0)[None] if number else _dome(vertices[rim], crown_mm)
+        cap = vertices[rim].mean(axis=0)[None] if number else _build_dome(vertices[rim], crown_mm)
         faces = np.concatenate([faces, _stitch(rim, len(vertices), len(cap))])
         vertices = np.concatenate([vertices, cap])
     added = len(vertices) - len(used)
@@ -113,7 +113,7 @@ def deface(mesh: BodyMesh, neck: Neck) -> BodyMesh:
     return BodyMesh(
         vertices,
         faces,
-        np.concatenate([mesh.normals[used], vertex_normals(vertices, faces)[len(used) :]]),
+        np.concatenate([mesh.normals[used], compute_vertex_normals(vertices, faces)[len(used) :]]),
         np.concatenate([mesh.colours[used], np.full((added, 3), 150, np.uint8)]),
         np.concatenate([mesh.sigma_mm[used], np.full(added, np.nan, np.float32)]),
         np.concatenate([filled, np.ones(len(faces) - len(filled), bool)]),
@@ -121,7 +121,7 @@ def deface(mesh: BodyMesh, neck: Neck) -> BodyMesh:
     )
 
 
-def _head_faces(mesh: BodyMesh, neck: Neck) -> Mask:
+def _find_head_faces(mesh: BodyMesh, neck: Neck) -> Mask:
     """Find faces (F,) that reach above the neck, in components that come near the head's axis.
 
     Hands held up beside the head are other components, and stay.
@@ -142,14 +142,14 @@ def _head_faces(mesh: BodyMesh, neck: Neck) -> Mask:
 def _simplify_rim(faces: Indices, head: Mask) -> Mask:
     """Take faces out of the head where its rim touches itself, until it is a simple line."""
     for _ in range(50):
-        points, times = np.unique(_free_edges(faces[head])[:, 0], return_counts=True)
+        points, times = np.unique(_find_free_edges(faces[head])[:, 0], return_counts=True)
         if not (times > 1).any():
             return head
         head = head & ~np.isin(faces, points[times > 1]).any(axis=1)
     raise FailedWork("the mesh cannot be cut at the neck", remedy="look at the mesh there")
 
 
-def _free_edges(faces: Indices) -> Indices:
+def _find_free_edges(faces: Indices) -> Indices:
     """Find directed edges (E, 2) without a twin."""
     face, corner = np.nonzero(find_twins(faces, int(faces.max(initial=-1)) + 1) == RIM)
     return np.stack([faces[face, corner], faces[face, (corner + 1) % 3]], axis=-1)
@@ -169,7 +169,7 @@ def _trace_loops(edges: Indices) -> list[Indices]:
     return loops
 
 
-def _dome(rim: Array, crown_mm: float) -> Array:
+def _build_dome(rim: Array, crown_mm: float) -> Array:
     """Build 40 rings from a rim (N, 3) to an ellipsoid, and the top: (40 N + 1, 3)."""
     # Shares of the height from neck to crown: half the head's length and breadth, where it is
     # widest, and where the neck's shape ends.

@@ -83,7 +83,7 @@ def export_scan(
             stem, body = "body-registered", _register(scan.mesh, pose)
             rest = load_template().vertices
             if "textured" in versions:
-                texture = _texture(scan, body.mesh, neck, pose, texture_px, rest)
+                texture = _make_texture(scan, body.mesh, neck, pose, texture_px, rest)
         else:
             stem, convert = VERSIONS[version]
             body = convert(scan.mesh)
@@ -91,7 +91,7 @@ def export_scan(
             body = body if pose is None else transform_mesh(body, pose.inverse())
             if version == "textured":
                 body = collapse_slivers(body)
-                texture = _texture(scan, body, neck, pose, texture_px, body.vertices)
+                texture = _make_texture(scan, body, neck, pose, texture_px, body.vertices)
         for name in able if version == "textured" else names:
             written.append(folder / f"{stem}.{name}")
             write_body(written[-1], body, origin, texture if name in able else None)
@@ -106,7 +106,7 @@ def _require_known(*choices: tuple[str, Sequence[str]]) -> None:
             raise BadInput(what, remedy=f"Choose from {', '.join(known)}.")
 
 
-def _texture(
+def _make_texture(
     scan: StoredScan,
     mesh: BodyMesh,
     neck: Neck | None,

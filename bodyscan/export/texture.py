@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from bodyscan.arrays import Array, Bytes, Floats, Indices
 from bodyscan.compiled import compiled
 from bodyscan.errors import BadInput
-from bodyscan.mesh.depth_buffer import nearest_faces
+from bodyscan.mesh.depth_buffer import find_nearest_faces
 from bodyscan.progress import THREADS
 
 
@@ -74,7 +74,7 @@ def bake(
     pixels: (T, 2) column and row, and positions: (T, 3) mm, of the faces' (F, 3) corners.
     """
     flat = np.column_stack([pixels, np.zeros(len(pixels))]).astype(np.float32)
-    face = nearest_faces(flat, faces, size, size)
+    face = find_nearest_faces(flat, faces, size, size)
     origin, slope = _fit_faces(pixels[faces], positions[faces])
     tree, image = cKDTree(points), np.zeros((size, size, 3), np.uint8)
     band = max(1, 1_000_000 // size)

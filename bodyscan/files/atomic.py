@@ -56,18 +56,18 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write `json_text(content)` to `path`, all or nothing."""
-    write_text(path, json_text(content))
+    """Write `format_json(content)` to `path`, all or nothing."""
+    write_text(path, format_json(content))
 
 
-def json_text(content: Any) -> str:
+def format_json(content: Any) -> str:
     """Format as JSON that is exact when read back (float64 to the last bit) and easy to diff.
 
     Keys are sorted, indents are two spaces, a list of numbers takes one line (so a matrix takes one
     line per row). numpy arrays and scalars are written as lists and numbers. Raises ValueError for
     NaN and infinity, which JSON does not have, and TypeError for what JSON cannot hold.
     """
-    return _json(content, "") + "\n"
+    return _format_value(content, "") + "\n"
 
 
 def write_npz(path: Path, /, **arrays: Any) -> None:
@@ -96,21 +96,21 @@ def flush(path: Path, flags: int = os.O_RDONLY) -> None:
         os.close(handle)
 
 
-def _json(value: Any, indent: str) -> str:
+def _format_value(value: Any, indent: str) -> str:
     value = value.tolist() if hasattr(value, "tolist") else value
     deeper = indent + "  "
     if isinstance(value, Mapping) and value:
         if not all(isinstance(key, str) for key in value):
             raise TypeError(f"JSON keys must be text, got {list(value)[:5]}")
-        items = [f"{json.dumps(key)}: {_json(value[key], deeper)}" for key in sorted(value)]
+        items = [f"{json.dumps(key)}: {_format_value(value[key], deeper)}" for key in sorted(value)]
         brackets = "{}"
     elif isinstance(value, list | tuple) and any(
         isinstance(item, Mapping | list | tuple) or getattr(item, "ndim", 0) > 0 for item in value
     ):
-        items = [_json(item, deeper) for item in value]
+        items = [_format_value(item, deeper) for item in value]
         brackets = "[]"
     elif isinstance(value, list | tuple):
-        return "[" + ", ".join(_json(item, deeper) for item in value) + "]"
+        return "[" + ", ".join(_format_value(item, deeper) for item in value) + "]"
     else:
         return json.dumps({} if isinstance(value, Mapping) else value, allow_nan=False)
     inside = f",\n{deeper}".join(items)

@@ -50,7 +50,7 @@ def read_corners(path: Path) -> dict[str, Corners]:
         if not order:
             what = "comes before the line that names the columns"
             raise CaptureError(what, where=where, remedy=_REMEDY)
-        name, corner = _corner(words, order, where)
+        name, corner = _parse_corner(words, order, where)
         corners = found.setdefault(name, [])
         if corner is not None:
             corners.append(corner)
@@ -76,7 +76,7 @@ def write_corners(path: Path, corners: Iterable[tuple[str, Corners]]) -> None:
     write_text(path, "\n".join(lines) + "\n")
 
 
-def _corner(
+def _parse_corner(
     words: list[str], order: list[int], where: str
 ) -> tuple[str, tuple[float, float] | None]:
     """Parse an image's name and its next corner; None for an image without a board."""

@@ -13,7 +13,7 @@ from bodyscan.files.reading import open_regular
 from bodyscan.progress import map_threads
 
 
-def file_hash(path: Path) -> str:
+def hash_file(path: Path) -> str:
     """Compute the SHA-256 of a file, in hexadecimal.
 
     Raises BadInput if it is not a regular file (reading a pipe might never end), OSError if it
@@ -26,10 +26,10 @@ def file_hash(path: Path) -> str:
     return digest.hexdigest()
 
 
-def file_hashes(files: Mapping[str, Path]) -> dict[str, str]:
+def hash_files(files: Mapping[str, Path]) -> dict[str, str]:
     """Compute the SHA-256 of each file by name, sorted by name."""
     names = sorted(files)
-    hashes = map_threads(lambda name: file_hash(files[name]), names)
+    hashes = map_threads(lambda name: hash_file(files[name]), names)
     return dict(zip(names, hashes, strict=True))
 
 
@@ -46,7 +46,7 @@ def list_relative_files(folder: Path) -> dict[str, Path]:
     return {path.relative_to(folder).as_posix(): path for path in list_files(folder)}
 
 
-def content_hash(content: Any) -> str:
+def hash_content(content: Any) -> str:
     """Compute the SHA-256 of plain data, by its JSON with sorted keys."""
     text = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode("ascii")).hexdigest()

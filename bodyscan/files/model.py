@@ -50,26 +50,26 @@ class Model(BaseModel):
 
     @model_validator(mode="after")
     def _refuse_problems(self) -> Self:
-        details = [problem_error(problem) for problem in self.problems()]
+        details = [make_problem_error(problem) for problem in self.problems()]
         if details:
             raise ValidationError.from_exception_data(type(self).__name__, details)
         return self
 
 
-def problem_error(problem: Problem) -> InitErrorDetails:
+def make_problem_error(problem: Problem) -> InitErrorDetails:
     """A problem in the form that pydantic takes."""
     where, text = problem
     kind = PydanticCustomError("problem", "{text}", {"text": text})
     return InitErrorDetails(type=kind, loc=where, input=None)
 
 
-def unknown_key_error(key: str, known: Iterable[str]) -> InitErrorDetails:
+def make_unknown_key_error(key: str, known: Iterable[str]) -> InitErrorDetails:
     """pydantic's error for an unknown key, with the known ones."""
     kind = PydanticCustomError("extra_forbidden", "is not a key known here", {"known": list(known)})
     return InitErrorDetails(type=kind, loc=(key,), input=None)
 
 
-def choice_error(key: str, value: str, choices: Iterable[str]) -> InitErrorDetails:
+def make_choice_error(key: str, value: str, choices: Iterable[str]) -> InitErrorDetails:
     """pydantic's error for a value that is none of the choices."""
     choices = list(choices)
     wanted = format_alternatives(choices) + did_you_mean(value, choices)

@@ -12,7 +12,14 @@ from pydantic_core import ErrorDetails
 
 from bodyscan.errors import BadInput
 from bodyscan.files.model import Model, Problem, did_you_mean
-from bodyscan.files.yaml_file import Document, Where, YamlError, YamlProblem, dotted_path, read_yaml
+from bodyscan.files.yaml_file import (
+    Document,
+    Where,
+    YamlError,
+    YamlProblem,
+    format_dotted_path,
+    read_yaml,
+)
 
 M = TypeVar("M", bound=Model)
 
@@ -97,7 +104,7 @@ def apply_changes(model: M, changes: Mapping[Where, Any], error: type[BadInput])
         for part in where[:-1]:
             deeper = inside.setdefault(part, {})
             if not isinstance(deeper, dict):
-                raise error(f"--set {dotted_path(where)}: {part} is a value, not a mapping")
+                raise error(f"--set {format_dotted_path(where)}: {part} is a value, not a mapping")
             inside = deeper
         inside[where[-1]] = value
     try:
@@ -147,7 +154,7 @@ def combine_problems(
 
 def _locate(problem: Problem, document: Document) -> YamlProblem:
     where, text = problem
-    return YamlProblem(document.place(where), dotted_path(where), text)
+    return YamlProblem(document.place(where), format_dotted_path(where), text)
 
 
 def _translate(
@@ -162,11 +169,13 @@ def _translate(
         if e["type"] == "missing":
             missing.append(where)
         elif e["type"] == "extra_forbidden":
-            known = e.get("ctx", {}).get("known") or _keys_at(model, where[:-1])
+            known = e.get("ctx", {}).get("known") or _list_keys_at(model, where[:-1])
             hint = did_you_mean(str(where[-1]), known)
             guessed |= {(*where[:-1], key) for key in known if f"'{key}'" in hint}
             place = document.place(where, of_key=True)
-            other.append(YamlProblem(place, dotted_path(where), f"is not a key known here{hint}"))
+            other.append(
+                YamlProblem(place, format_dotted_path(where), f"is not a key known here{hint}")
+            )
         elif e["type"] in _MUST_BE:
             context = e.get("ctx", {}).items()
             limits = {k: f"{v:g}" if isinstance(v, float) else v for k, v in context}
@@ -174,7 +183,8 @@ def _translate(
         else:
             other.append(_locate((where, e["msg"]), document))
     for where, wanted in wrong.items():
-        text = f"must be {' or '.join(dict.fromkeys(wanted))} ({_got(where, wanted, document)})"
+        found = _describe_found(where, wanted, document)
+        text = f"must be {' or '.join(dict.fromkeys(wanted))} ({found})"
         other.append(_locate((where, text), document))
     other += [_locate((w, "is missing"), document) for w in missing if w not in guessed]
     return other
@@ -217,7 +227,7 @@ def _find_path(loc: Where, document: Document) -> Where:
     return where
 
 
-def _keys_at(model: type[BaseModel], where: Where) -> list[str]:
+def _list_keys_at(model: type[BaseModel], where: Where) -> list[str]:
     here: type[BaseModel] | None = model
     for part in where:
         if isinstance(part, str) and here is not None:
@@ -233,7 +243,7 @@ def _find_model(annotation: Any) -> type[BaseModel] | None:
     return next((model for model in found if model), None)
 
 
-def _got(where: Where, wanted: list[str], document: Document) -> str:
+def _describe_found(where: Where, wanted: list[str], document: Document) -> str:
     value = document.at(where)
     if isinstance(value, dict):
         return "got a mapping"

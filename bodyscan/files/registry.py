@@ -43,7 +43,7 @@ class Registry(Generic[Format]):
         # Last: every installed package is asked.
         for added in entry_points(group=self.package, name=name):
             return cast(Format, added.load())
-        raise unknown_format_error(self.what, name, self.names(), refusal=self.refusal)
+        raise make_unknown_format_error(self.what, name, self.names(), refusal=self.refusal)
 
     def _modules(self) -> list[str]:
         return [one.name for one in pkgutil.iter_modules(import_module(self.package).__path__)]
@@ -55,7 +55,7 @@ class Registry(Generic[Format]):
         self.registered[name] = format_
 
 
-def unknown_format_error(
+def make_unknown_format_error(
     what: str,
     name: str,
     known: Iterable[str],

@@ -103,7 +103,7 @@ def read_yaml(path: Path) -> Document:
     except UnicodeDecodeError as error:
         before = content[: error.start].split(b"\n")
         place = Place(len(before), len(before[-1]) + 1)
-        raise _error(place, "is not UTF-8 text: save it as UTF-8") from None
+        raise _make_error(place, "is not UTF-8 text: save it as UTF-8") from None
     return parse_yaml(text)
 
 
@@ -123,19 +123,19 @@ def parse_yaml(text: str, max_nodes: int = MAX_NODES, *, foreign: bool = False) 
         compose = yaml.compose_all if foreign else lambda *args: iter([yaml.compose(*args)])
         node = next(iter(compose(text, _PlainLoader)), None)
     except yaml.MarkedYAMLError as error:
-        place = _place(error.problem_mark or error.context_mark)
+        place = _convert_mark(error.problem_mark or error.context_mark)
         near = text.splitlines()[max(place.line - 2, 0) : place.line]
         odd = next(filter(None, map(_find_odd_letter, reversed(near))), "")
-        raise _error(place, f"is not YAML: {odd}" if odd else _describe(error)) from None
+        raise _make_error(place, f"is not YAML: {odd}" if odd else _describe(error)) from None
     except yaml.YAMLError as error:
-        raise _error(Place(1, 1), f"is not YAML: {error}".splitlines()[0]) from None
+        raise _make_error(Place(1, 1), f"is not YAML: {error}".splitlines()[0]) from None
     document = Document()
     if node is not None:
         document.data = _Builder(document, max_nodes, foreign).build(node, (), 0)
     return document
 
 
-def dotted_path(where: Where) -> str:
+def format_dotted_path(where: Where) -> str:
     """`('pairs', 2, 'camera')` as `pairs[2].camera`."""
     text = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in where)
     return text.removeprefix(".")
@@ -169,12 +169,12 @@ class _Builder:
 
     def build(self, node: yaml.Node, where: Where, depth: int) -> Any:
         self.nodes += 1
-        place = _place(node.start_mark)
+        place = _convert_mark(node.start_mark)
         if self.nodes > self.max_nodes:
             text = f"has more than {self.max_nodes:,} values once aliases are followed"
-            raise _error(place, text)
+            raise _make_error(place, text)
         if depth > MAX_DEPTH:
-            raise _error(place, f"is nested more than {MAX_DEPTH} deep")
+            raise _make_error(place, f"is nested more than {MAX_DEPTH} deep")
         self.document.values[where] = place
         kinds = {"str": yaml.ScalarNode, "seq": yaml.SequenceNode, "map": yaml.MappingNode}
         if not self.foreign and not isinstance(
@@ -197,7 +197,7 @@ class _Builder:
     def _mapping(self, node: yaml.MappingNode, where: Where, depth: int) -> dict[str, Any]:
         keys: set[str] = set()
         for key, _ in node.value:
-            place = _place(key.start_mark)
+            place = _convert_mark(key.start_mark)
             if not isinstance(key, yaml.ScalarNode):
                 self._problem(place, where, "has a key that is not text")
                 continue
@@ -209,7 +209,7 @@ class _Builder:
             keys.add(key.value)
         result = {}
         for name, (key, value) in self._entries(node, where, depth).items():
-            self.document.keys[*where, name] = _place(key.start_mark)
+            self.document.keys[*where, name] = _convert_mark(key.start_mark)
             result[name] = self.build(value, (*where, name), depth + 1)
         return result
 
@@ -218,7 +218,7 @@ class _Builder:
     ) -> dict[str, tuple[yaml.Node, yaml.Node]]:
         """Keys and values of a mapping, after those of mappings that it merges."""
         if depth > MAX_DEPTH or self.nodes > self.max_nodes:
-            raise _error(_place(node.start_mark), "merges (<<) too much")
+            raise _make_error(_convert_mark(node.start_mark), "merges (<<) too much")
         direct: dict[str, tuple[yaml.Node, yaml.Node]] = {
             k.value: (k, v) for k, v in node.value if isinstance(k, yaml.ScalarNode)
         }
@@ -231,11 +231,11 @@ class _Builder:
                 self.nodes += 1 + len(base.value)
                 entries = self._entries(base, where, depth + 1) | entries
             else:
-                self._problem(_place(base.start_mark), where, "can merge (<<) only mappings")
+                self._problem(_convert_mark(base.start_mark), where, "can merge (<<) only mappings")
         return entries | direct
 
     def _problem(self, place: Place, where: Where, text: str) -> None:
-        self.document.problems.append(YamlProblem(place, dotted_path(where), text))
+        self.document.problems.append(YamlProblem(place, format_dotted_path(where), text))
 
 
 def parse_scalar(text: str) -> Any:
@@ -272,12 +272,14 @@ def _refuse_deep(text: str, *, only_first: bool) -> None:
         depth += isinstance(event, yaml.CollectionStartEvent)
         depth -= isinstance(event, yaml.CollectionEndEvent)
         if depth > MAX_DEPTH:
-            raise _error(_place(event.start_mark), f"is nested more than {MAX_DEPTH} deep")
+            raise _make_error(
+                _convert_mark(event.start_mark), f"is nested more than {MAX_DEPTH} deep"
+            )
         if only_first and isinstance(event, yaml.DocumentEndEvent):
             return
 
 
-def _place(mark: Any) -> Place:
+def _convert_mark(mark: Any) -> Place:
     return Place(mark.line + 1, mark.column + 1) if mark else Place(1, 1)
 
 
@@ -290,5 +292,5 @@ def _describe(error: yaml.MarkedYAMLError) -> str:
     return f"is not YAML: {text}{advice}"
 
 
-def _error(place: Place, text: str) -> YamlError:
+def _make_error(place: Place, text: str) -> YamlError:
     return YamlError(YamlProblem(place, "", text))

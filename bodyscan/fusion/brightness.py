@@ -43,12 +43,16 @@ def equalize_colours(
     """
     centres = [surface.rig_from_camera.translation for surface in surfaces]
     of_surfaces = map_threads(
-        lambda one: log_irradiance(one.points, one.normals, one.rig_from_camera.translation),
+        lambda one: compute_log_irradiance(
+            one.points, one.normals, one.rig_from_camera.translation
+        ),
         surfaces,
     )
     parts = [slice(start, end) for start, end in pairwise(samples.starts)]
     log_irradiances = map_threads(
-        lambda both: log_irradiance(samples.points[both[0]], samples.normals[both[0]], both[1]),
+        lambda both: compute_log_irradiance(
+            samples.points[both[0]], samples.normals[both[0]], both[1]
+        ),
         zip(parts, centres, strict=True),
     )
     of_samples = np.concatenate(log_irradiances)
@@ -166,7 +170,7 @@ def solve_gains(ratios: Sequence[tuple[int, int, float, int]], count: int) -> Fl
     return np.exp(logarithms - logarithms.mean()).astype(np.float32)
 
 
-def log_irradiance(points: Floats, normals: Floats, centre: Array) -> Floats:
+def compute_log_irradiance(points: Floats, normals: Floats, centre: Array) -> Floats:
     """Logarithm (N,) of a surface's irradiance from a lamp at a camera's centre, up to a
     constant: cosine of incidence over squared distance. Below a cosine of 0.1 the room's light
     prevails."""

@@ -17,7 +17,7 @@ from bodyscan.arrays import Array, Floats
 from bodyscan.compiled import compiled
 from bodyscan.fusion.smoothing import Numbers, SmoothSurface
 from bodyscan.fusion.voxel_thinning import Samples
-from bodyscan.geometry.camera_tables import Table, look_up, projection_table
+from bodyscan.geometry.camera_tables import Table, look_up, make_projection_table
 
 Counts = NDArray[np.int64]
 
@@ -137,7 +137,7 @@ def compare_with_surface(
         (int(samples.starts[number]), int(samples.starts[number + 1])),
         (surface.points, surface.normals, surface.number),
         surface.corner,
-        projection_table(surface.camera),
+        make_projection_table(surface.camera),
         (camera_from_rig.rotation, camera_from_rig.translation),
         surface.warped,
         (agreement_mm, double_mm),

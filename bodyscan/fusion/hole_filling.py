@@ -23,7 +23,7 @@ from bodyscan.fusion.regions import DARK
 from bodyscan.fusion.signed_distances import REACH_CELLS, Distances, splat_planes
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud
-from bodyscan.mesh.depth_buffer import nearest_faces
+from bodyscan.mesh.depth_buffer import find_nearest_faces
 from bodyscan.mesh.surface_nets import SIDE, Bricks, extract_surface, join_bricks, split_into_bricks
 from bodyscan.progress import map_threads
 from bodyscan.reconstruction.range_image import RangeImage
@@ -44,7 +44,7 @@ def fill_distances(
     """Signed distances of a closed surface through the cloud, on a grid with room around it, no
     cell smaller than `finest_mm`; range_images: as measured, background included."""
     cell_mm = max(CELL_MM, finest_mm)
-    bricks = _grid_around(cloud.points, cell_mm)
+    bricks = _make_grid_around(cloud.points, cell_mm)
     some = cloud.subsample(max(1, len(cloud.points) // 250_000))  # nine within a node's reach
     # From a rim the surface continues straight for a cell before it bends.
     reach_cells = max(10.0 / cell_mm, REACH_CELLS)
@@ -91,7 +91,7 @@ def _mirror(values: Floats | Mask, below: int, where: Mask) -> None:
         values[under] = np.where(where[under], above, values[under])
 
 
-def _grid_around(points: Array, cell_mm: float) -> Bricks:
+def _make_grid_around(points: Array, cell_mm: float) -> Bricks:
     """All bricks around the points; the floor, z = 0, lies between two layers of nodes."""
     # As far as a harmonic surface bulges, and more than a point's reach and the neighbouring cells.
     room = max(60.0, 5 * cell_mm)
@@ -260,7 +260,7 @@ def find_gaps(
     """
     rows, columns = (stride * np.arange(some.start, some.stop) + stride // 2 for some in blocks)
     vertices = _project_to_blocks(surface.vertices, image, rig_from_camera, stride, blocks)
-    first = nearest_faces(vertices, surface.faces, len(rows), len(columns))
+    first = find_nearest_faces(vertices, surface.faces, len(rows), len(columns))
     hit = first >= 0
     filled = np.zeros(hit.shape, bool)
     filled[hit] = surface.filled[first[hit]]
@@ -283,7 +283,7 @@ def find_gaps(
     right, turn_right = _find_left_neighbour(*mirrored, reach)
     # Of flat surfaces the difference is 0, round a finger -0.2.
     open_ &= left & right[:, ::-1] & (turn_left - turn_right[:, ::-1] > -0.1)
-    real = nearest_faces(vertices, surface.faces[~surface.filled], len(rows), len(columns))
+    real = find_nearest_faces(vertices, surface.faces[~surface.filled], len(rows), len(columns))
     # Between two fingers a patch of shadow shows, and not what is behind the body: less than 200 mm2.
     number, count = label(open_ & (real < 0), np.ones((3, 3)))
     large = np.bincount(number.ravel(), minlength=count + 1) * RAY_SPACING_MM**2 > 200.0

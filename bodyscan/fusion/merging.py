@@ -153,13 +153,13 @@ def estimate_sigma_inflation(
         index, shift_mm = one.index[::8], one.shift_mm[::8]
         variance = samples.sigma_mm[index] ** 2 + surface.sigma_mm[one.at[::8]] ** 2
         if poses is not None:
-            variance += _pose_variance(samples, index, surfaces, surface.pair, poses)
+            variance += _compute_pose_variance(samples, index, surfaces, surface.pair, poses)
         ratios.append(np.abs(shift_mm) / np.sqrt(variance))
     every = np.concatenate(ratios)
     return max(1.0, SIGMAS_PER_MEDIAN * float(np.median(every))) if every.size else 1.0
 
 
-def _pose_variance(
+def _compute_pose_variance(
     samples: Samples,
     index: Numbers,
     surfaces: Sequence[SmoothSurface],

@@ -20,12 +20,12 @@ from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud, BodyMesh, select_regions
 from bodyscan.mesh.repair import extract_largest_piece
 from bodyscan.mesh.surface_nets import SIDE, Bricks, extract_surface
-from bodyscan.mesh.topology import check_manifold, compute_topology, vertex_normals
+from bodyscan.mesh.topology import check_manifold, compute_topology, compute_vertex_normals
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.settings import MeshSettings
 
 
-def closed_surface(
+def make_closed_surface(
     cloud: BodyCloud,
     settings: MeshSettings,
     range_images: Sequence[RangeImage] = (),
@@ -80,14 +80,14 @@ def attach_attributes(
 ) -> BodyMesh:
     """Fit the mesh to the points, along its normals, and attach normals, the points' attributes
     and what was filled: vertices farther than `reach_mm` from every point were not measured."""
-    normals = vertex_normals(vertices, faces)
+    normals = compute_vertex_normals(vertices, faces)
     around = measure_support(vertices, normals, cloud, reach_mm)
     vertices = fit_to_points(vertices, faces, normals, around)
     sigma_mm = np.where(around.measured, around.sigma_mm, np.float32(np.nan))
     return BodyMesh(
         vertices,
         faces,
-        vertex_normals(vertices, faces),
+        compute_vertex_normals(vertices, faces),
         cloud.colours[around.nearest],
         sigma_mm,
         np.any(np.isnan(sigma_mm)[faces], axis=1),

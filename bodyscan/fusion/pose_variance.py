@@ -60,11 +60,11 @@ def _point_variance(
         if len(group):
             pairs = np.flatnonzero(facing[group[0]])
             used = np.minimum(pairs_seen[group], len(pairs))
-            variance[group] = _mean_variance(lever[group], joint[pairs][:, :, pairs], used)
+            variance[group] = _compute_mean_variance(lever[group], joint[pairs][:, :, pairs], used)
     return variance
 
 
-def _mean_variance(lever: Array, joint: Array, used: Bytes) -> Array:
+def _compute_mean_variance(lever: Array, joint: Array, used: Bytes) -> Array:
     """Variance (N,) of the mean of some pairs' offsets along normals, `used` (N,) for each point.
 
     lever: (N, 6), derivative of an offset by a pair's twist.

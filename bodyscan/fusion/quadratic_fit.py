@@ -40,11 +40,11 @@ def fit_quadratics(
     inverse, noise: inverse depths (h, w), 0 where nothing was measured, and their standard
         deviation, which is scaled up if the residuals are larger.
     reach: windows have 2 reach + 1 pixels a side, of `pixel_mm` on the surface.
-    correlation_px: see `noise_gain`.
+    correlation_px: see `compute_noise_gain`.
     """
     valid = inverse > 0
     fit, fitted = fit_full_windows(inverse, noise, reach)
-    scale = _noise_scale(inverse, noise, fit, fitted)
+    scale = _estimate_noise_scale(inverse, noise, fit, fitted)
     noise = noise * scale
     np.multiply(fit.sigma, scale, out=fit.sigma)
 
@@ -60,17 +60,17 @@ def fit_quadratics(
     smooth.ravel()[cut] = True  # already fitted by trimmed least squares
     jumps = np.flatnonzero(valid & ~smooth)
     fit_trimmed_windows(inverse, noise, jumps, reach, pixel_mm, fit, fitted)
-    np.multiply(fit.sigma, np.float32(noise_gain(reach, correlation_px)), out=fit.sigma)
+    np.multiply(fit.sigma, np.float32(compute_noise_gain(reach, correlation_px)), out=fit.sigma)
     return fit, fitted
 
 
-def noise_gain(reach: int, correlation_px: tuple[float, float]) -> float:
+def compute_noise_gain(reach: int, correlation_px: tuple[float, float]) -> float:
     """Sigma of a full window's fit to correlated noise, over that to white noise.
 
     correlation_px: distance along rows and along columns over which the correlation of two pixels'
         noise falls linearly from 1 to 0; 0 for white noise.
     """
-    basis = window_basis(reach)
+    basis = make_window_basis(reach)
     weights = (np.linalg.inv(basis.T @ basis)[0] @ basis.T).reshape(2 * reach + 1, -1)
     distance = np.abs(np.subtract.outer(np.arange(2 * reach + 1), np.arange(2 * reach + 1)))
     along_u, along_v = (np.maximum(0.0, 1.0 - distance / max(px, 1.0)) for px in correlation_px)
@@ -91,7 +91,7 @@ def fit_full_windows(inverse: Floats, noise: Floats, reach: int) -> tuple[Quadra
 def convolve_quadratics(inverse: Floats, noise: Floats, reach: int) -> QuadraticFit:
     """Least-squares quadratics of full windows, as separable convolutions."""
     offsets = np.arange(-reach, reach + 1, dtype=float)
-    basis = window_basis(reach)
+    basis = make_window_basis(reach)
     normal = np.linalg.inv(basis.T @ basis)
     one, slope, square = np.ones_like(offsets), offsets, offsets**2
 
@@ -127,7 +127,7 @@ def close_holes(inverse: Floats, valid: Mask) -> tuple[Floats, Mask]:
     return closed, whole
 
 
-def window_basis(reach: int) -> Array:
+def make_window_basis(reach: int) -> Array:
     """(samples, 6): 1, du, dv, du^2, du dv, dv^2 over a square window, row by row."""
     dv, du = np.mgrid[-reach : reach + 1, -reach : reach + 1].reshape(2, -1).astype(float)
     return np.stack([np.ones_like(du), du, dv, du * du, du * dv, dv * dv], axis=-1)
@@ -152,7 +152,7 @@ def fit_trimmed_windows(
     border = (reach, reach, reach, reach)
     padded = cv2.copyMakeBorder(inverse, *border, cv2.BORDER_CONSTANT, value=0.0)
     fits = (fit.value, fit.slope_u, fit.slope_v, fit.sigma)
-    _fit_trimmed(window_basis(reach), padded, noise, pixels, reach, pixel_mm, fits, fitted)
+    _fit_trimmed(make_window_basis(reach), padded, noise, pixels, reach, pixel_mm, fits, fitted)
 
 
 @compiled
@@ -213,7 +213,7 @@ def _solve_window(
 ) -> int:
     """Solve for a window's six coefficients; return the number of inliers.
 
-    basis: (samples, 6), see `window_basis`.
+    basis: (samples, 6), see `make_window_basis`.
     ridge: information of the prior on each of the last three.
     normal: overwritten; its first element becomes the first coefficient's inverse variance.
     """
@@ -245,7 +245,9 @@ def _solve_window(
     return count
 
 
-def _noise_scale(inverse: Floats, noise: Floats, fit: QuadraticFit, full: Mask) -> np.float32:
+def _estimate_noise_scale(
+    inverse: Floats, noise: Floats, fit: QuadraticFit, full: Mask
+) -> np.float32:
     """Factor for `noise`, at least 1, from the residuals of full windows in every 8th row."""
     there = full[::8]
     if not there.any():

@@ -16,8 +16,12 @@ from scipy import ndimage
 
 from bodyscan.arrays import Array, Bytes, Crop, Floats, Indices, Mask, find_crop
 from bodyscan.fusion.brightness import MIN_GREY
-from bodyscan.fusion.quadratic_fit import fit_full_windows, window_basis
-from bodyscan.fusion.smoothing import compute_inverse_depths, estimate_pixel_size, window_reach
+from bodyscan.fusion.quadratic_fit import fit_full_windows, make_window_basis
+from bodyscan.fusion.smoothing import (
+    compute_inverse_depths,
+    compute_window_reach,
+    estimate_pixel_size,
+)
 from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN, group_medians
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import DARK_CLOTH, HAIR, SKIN, UNSURE, BodyCloud
@@ -210,13 +214,13 @@ def measure_roughness(
     """Compare the pixels in a box with quadratics in windows of about `window_mm`."""
     image = image.crop(box)
     inverse, noise = compute_inverse_depths(image)
-    reach = window_reach(estimate_pixel_size(inverse, image.camera), window_mm)
+    reach = compute_window_reach(estimate_pixel_size(inverse, image.camera), window_mm)
     fit, full = fit_full_windows(inverse, noise, reach)
     residual = (inverse - fit.value)[full]
     points = image.points[full]
     # Along the ray a point moves by its length over z times dz, and dz is z squared times d(1/z).
     length = np.linalg.norm(points, axis=1) * points[:, 2]
-    basis = window_basis(reach)
+    basis = make_window_basis(reach)
     absorbed = np.linalg.inv(basis.T @ basis)[0, 0]  # share of a pixel's variance in its fit
     left = np.float32(np.sqrt(1.0 - absorbed))
     points_rig = rig_from_camera.apply(points.astype(np.float64))

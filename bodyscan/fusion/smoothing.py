@@ -16,7 +16,7 @@ from bodyscan.arrays import Array, Bytes, Floats, Mask, find_crop
 from bodyscan.compiled import compiled
 from bodyscan.fusion.quadratic_fit import QuadraticFit, fit_quadratics
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.camera_tables import Table, look_up_derivatives, projection_table
+from bodyscan.geometry.camera_tables import Table, look_up_derivatives, make_projection_table
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
 
@@ -65,7 +65,7 @@ def smooth(
     image = image.crop(box)
     inverse, noise = compute_inverse_depths(image)
     pixel_mm = estimate_pixel_size(inverse, image.camera)
-    reach = window_reach(pixel_mm, window_mm)
+    reach = compute_window_reach(pixel_mm, window_mm)
     fit, fitted = fit_quadratics(inverse, noise, reach, pixel_mm, image.correlation_px)
     return _build_surface(image, rig_from_camera, fit, fitted, reach, channels)
 
@@ -76,7 +76,7 @@ def estimate_pixel_size(inverse: Floats, camera: Camera) -> float:
     return float(np.median(1.0 / rows[rows > 0])) / camera.alpha
 
 
-def window_reach(pixel_mm: float, window_mm: float) -> int:
+def compute_window_reach(pixel_mm: float, window_mm: float) -> int:
     """Pixels to either side of a window's middle."""
     return int(np.clip(round(0.5 * window_mm / pixel_mm), 2, 6))
 
@@ -97,14 +97,14 @@ def _build_surface(
         (image.points, _compute_common_sigmas(image)),
         (fit.value, fit.slope_u, fit.slope_v, fit.sigma),
         fitted,
-        projection_table(image.camera),
+        make_projection_table(image.camera),
         (rig_from_camera.rotation, rig_from_camera.translation),
         (depth, number),
         (points, normals, sigma),
     )
     there = number >= 0
     # A jump of 8 pixel widths between neighbours is steeper than any useful surface.
-    distance = distance_to_rim(depth, 8.0 / image.camera.alpha)[there]
+    distance = compute_distance_to_rim(depth, 8.0 / image.camera.alpha)[there]
     rim, sigma = np.minimum(distance / np.float32(2 * reach), np.float32(1.0)), sigma[:count]
     return SmoothSurface(
         image.pair,
@@ -117,19 +117,19 @@ def _build_surface(
         sigma,
         rim,
         rim / (sigma * sigma),
-        _colours(image, there, channels),
+        _select_colours(image, there, channels),
         image.warped,
     )
 
 
-def _colours(image: RangeImage, there: Mask, channels: int) -> Bytes:
+def _select_colours(image: RangeImage, there: Mask, channels: int) -> Bytes:
     """Colours (n, channels) of the pixels `there` (h, w)."""
     if image.rgb is not None and channels == 3:
         return image.rgb[there]
     return np.repeat(image.colours[there][:, None], channels, axis=1)
 
 
-def distance_to_rim(depth: Floats, jump: float) -> Floats:
+def compute_distance_to_rim(depth: Floats, jump: float) -> Floats:
     """Distance in pixels, from 1, to the nearest rim.
 
     A rim is a pixel without depth (0), or one in front of another by `jump` of its depth.
@@ -184,7 +184,9 @@ def _compute_points(
                 continue
             inverse, there = value[row, column], measured_points[row, column]
             x, y, z = there[0] / there[2], there[1] / there[2], 1.0 / inverse
-            a, b, c = _normal(x, y, inverse, slope_u[row, column], slope_v[row, column], projection)
+            a, b, c = _compute_normal(
+                x, y, inverse, slope_u[row, column], slope_v[row, column], projection
+            )
             length = np.sqrt(x * x + y * y + 1.0)
             cosine = -(a * x + b * y + c) / length
             if cosine <= 0.17:  # seen at more than 80 degrees
@@ -202,7 +204,7 @@ def _compute_points(
 
 
 @compiled
-def _normal(
+def _compute_normal(
     x: float, y: float, inverse: float, by_u: float, by_v: float, projection: Table
 ) -> tuple[float, float, float]:
     """Unit normal towards the camera, camera frame, from the slopes of 1/z per pixel.

@@ -19,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from bodyscan.alignment.icp import Alignment
 from bodyscan.errors import FailedWork, ResultError, ScanFailed
 from bodyscan.files.atomic import write_json
-from bodyscan.files.hashing import file_hash
+from bodyscan.files.hashing import hash_file
 from bodyscan.files.model import describe_first_error
 from bodyscan.files.reading import read_json_object
 from bodyscan.geometry.transforms import RigidTransform
@@ -42,7 +42,7 @@ Made = Callable[[BodyCloud | BodyMesh], None]
 """Called with a scan's cloud, and then with its mesh, as soon as each exists; from any thread."""
 
 
-def no_use(body: BodyCloud | BodyMesh) -> None:
+def ignore_made(body: BodyCloud | BodyMesh) -> None:
     """A `Made` that does nothing."""
 
 
@@ -113,7 +113,7 @@ class StoredScan:
     @property
     def verdict(self) -> Verdict | None:
         """The verdict; None for scans from before there were any."""
-        return stored_verdict(self.facts)
+        return read_stored_verdict(self.facts)
 
 
 def make_room(folder: Path, overwrite: bool) -> None:
@@ -153,7 +153,7 @@ def save_body(scan: Scan, folder: Path) -> dict[str, str]:
 
     def write(name: str) -> str:
         write_ply(folder / name, scan.cloud if name == CLOUD_NAME else scan.mesh)
-        return file_hash(folder / name)
+        return hash_file(folder / name)
 
     names = (CLOUD_NAME, MESH_NAME)
     return dict(zip(names, map_threads(write, names), strict=True))
@@ -182,7 +182,7 @@ def save_facts(scan: Scan, folder: Path, origin: Origin, digests: Mapping[str, s
             "verdict": asdict(scan.verdict),
             "measured": scan.measured,
             "failed": scan.failed,
-            "alignment": _alignment(scan),
+            "alignment": _describe_alignment(scan),
             "person": asdict(scan.person) if scan.person else None,
         },
     )
@@ -276,7 +276,7 @@ def read_facts(folder: Path) -> dict[str, Any]:
     return facts
 
 
-def stored_verdict(facts: dict[str, Any]) -> Verdict | None:
+def read_stored_verdict(facts: dict[str, Any]) -> Verdict | None:
     """The stored verdict; None for scans from before there were verdicts."""
     verdict = facts.get("verdict")
     if not verdict:
@@ -299,7 +299,7 @@ def load_scan(folder: Path) -> StoredScan:
     for name, digest in facts["sha256"].items():
         file = folder / name
         try:
-            same = file_hash(file) == digest
+            same = hash_file(file) == digest
         except OSError as error:
             missing = isinstance(error, FileNotFoundError)
             reason = "there is no such file" if missing else str(error)
@@ -322,7 +322,7 @@ def refuse_repeat(folder: Path, facts: Mapping[str, Any]) -> None:
         )
 
 
-def _alignment(scan: Scan) -> dict[str, Any] | None:
+def _describe_alignment(scan: Scan) -> dict[str, Any] | None:
     if scan.alignment is None:
         return None
     alignment = scan.alignment

@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 from bodyscan.arrays import Array, Floats, Indices, Mask
 from bodyscan.compiled import compiled
 from bodyscan.mesh.body import BodyCloud
-from bodyscan.mesh.topology import face_normals
+from bodyscan.mesh.topology import compute_face_normals
 from bodyscan.progress import THREADS
 
 MAX_SHIFT = 0.25
@@ -76,7 +76,7 @@ def fit_to_points(vertices: Array, faces: Indices, normals: Floats, around: Supp
     for share in (0.5, 0.5, 0.0):
         some = faces[concerned]
         moved = vertices + move[:, None] * normals
-        before, after = face_normals(vertices, some), face_normals(moved, some)
+        before, after = compute_face_normals(vertices, some), compute_face_normals(moved, some)
         cosine = np.einsum("fc,fc->f", before, after)
         lengths = np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)
         folded = np.unique(some[cosine < min_cosine * lengths])

@@ -72,7 +72,7 @@ def find_voxel_size(points: Floats, wanted: int) -> float:
     layers = 4 if len(points) > 300_000 else 1
     equal = np.zeros(len(points), np.bool_)
     for _ in range(4):
-        ratio = layers * len(_best_per_voxel(points, equal, low, size, layers, 0)) / wanted
+        ratio = layers * len(_find_best_per_voxel(points, equal, low, size, layers, 0)) / wanted
         size *= float(np.clip(np.sqrt(ratio), 0.25, 4.0))
         if abs(ratio - 1.0) < 0.05:
             break
@@ -84,14 +84,14 @@ def select_per_voxel(points: Floats, second_rate: Mask, voxel_mm: float) -> NDAr
     only where there is no other; return their indices, ascending."""
     low = points.min(axis=0)
     parts = map_threads(
-        lambda layer: _best_per_voxel(points, second_rate, low, voxel_mm, THREADS, layer),
+        lambda layer: _find_best_per_voxel(points, second_rate, low, voxel_mm, THREADS, layer),
         range(THREADS),
     )
     return np.sort(np.concatenate(parts))
 
 
 @compiled
-def _best_per_voxel(
+def _find_best_per_voxel(
     points: Floats, second_rate: Mask, low: Floats, voxel_mm: float, layers: int, layer: int
 ) -> NDArray[np.intp]:
     """Index of the best point of each voxel, in every `layers`-th layer of blocks from `layer` on.

@@ -144,7 +144,7 @@ class Camera:
 SIZE = ("width", "height")
 
 
-def camera_to_fields(camera: Camera) -> dict[str, Any]:
+def describe_camera(camera: Camera) -> dict[str, Any]:
     """alpha, beta, gamma, u0, v0, the kind of lens, its coefficients by name, width and height."""
     matrix = {name: getattr(camera, name) for name in (*MATRIX, *SIZE)}
     lens = {name: getattr(camera.lens, name) for name in camera.lens.names}
@@ -153,7 +153,7 @@ def camera_to_fields(camera: Camera) -> dict[str, Any]:
 
 
 def camera_from_fields(content: Mapping[str, Any]) -> Camera:
-    """The camera whose fields `camera_to_fields` returned.
+    """The camera whose fields `describe_camera` returned.
 
     Raises ValueError for an unknown lens, a missing or surplus name, or a value that is not finite.
     """

@@ -113,7 +113,7 @@ CAMERAS = 64  # cached: enough for a few rigs
 
 
 @lru_cache(CAMERAS)
-def projection_table(camera: Camera) -> Table:
+def make_projection_table(camera: Camera) -> Table:
     """From ideal normalised (x, y) to the pixel (u, v); OUTSIDE where no ray of the image goes.
 
     Far outside its image a lens may fold back: such points have no pixel here, although
@@ -129,21 +129,21 @@ def projection_table(camera: Camera) -> Table:
         return np.where(one_to_one, found, np.nan)
 
     low, high = np.nanmin(ideal, axis=0), np.nanmax(ideal, axis=0)
-    return _within_tolerance(camera, pixels, low, high, 1.0, OUTSIDE)
+    return _fit_within_tolerance(camera, pixels, low, high, 1.0, OUTSIDE)
 
 
 @lru_cache(CAMERAS)
-def ray_table(camera: Camera) -> Table:
+def make_ray_table(camera: Camera) -> Table:
     """From a pixel (u, v) of the image to the (x, y) of its ray (x, y, 1); NaN where the lens folds."""
     last = np.array([camera.width, camera.height]) - 0.5
 
     def ideal(pixels: Array) -> Array:
         return camera.rays(pixels)[..., :2]
 
-    return _within_tolerance(camera, ideal, np.full(2, -0.5), last, camera.alpha, np.nan)
+    return _fit_within_tolerance(camera, ideal, np.full(2, -0.5), last, camera.alpha, np.nan)
 
 
-def _within_tolerance(
+def _fit_within_tolerance(
     camera: Camera,
     function: Callable[[Array], Array],
     low: Array,
@@ -164,7 +164,7 @@ def _within_tolerance(
 def look_up_rays(table: Table, wanted: Mask, first_row: int = 0) -> Array:
     """Rays (N, 3) through the N pixels that are `wanted` (rows, width), row by row.
 
-    table: the camera's `ray_table`.
+    table: the camera's `make_ray_table`.
     first_row: the image row of the first row of `wanted`.
     """
     rays, n = np.ones((np.count_nonzero(wanted), 3)), 0

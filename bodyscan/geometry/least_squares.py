@@ -24,7 +24,11 @@ import numpy as np
 from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.compiled import compiled
 from bodyscan.geometry.linear_gaussian import invert_scaled, multiply_transposed, solve_scaled
-from bodyscan.geometry.robust import cauchy_cost, cauchy_weights, robust_scale
+from bodyscan.geometry.robust import (
+    compute_cauchy_cost,
+    compute_cauchy_weights,
+    estimate_robust_scale,
+)
 
 Columns = Indices | slice
 State = TypeVar("State")
@@ -51,19 +55,21 @@ class Noise:
     known: float | None = None  # the spread, where it need not be estimated
 
     def estimate_scale(self, residuals: Array) -> float:
-        return robust_scale(residuals, self.min_scale) if self.known is None else self.known
+        return (
+            estimate_robust_scale(residuals, self.min_scale) if self.known is None else self.known
+        )
 
     def cost(self, residuals: Array) -> float:
         """Cost of residuals (N,) given in units of their spread."""
         if self.cauchy is None:
             return float(residuals @ residuals)
-        return cauchy_cost(residuals, self.group, self.cauchy)
+        return compute_cauchy_cost(residuals, self.group, self.cauchy)
 
     def weights(self, residuals: Array) -> Array:
         """Weights (N,) in [0, 1] of residuals (N,) given in units of their spread."""
         if self.cauchy is None:
             return np.ones(len(residuals))
-        return cauchy_weights(residuals, self.group, self.cauchy)
+        return compute_cauchy_weights(residuals, self.group, self.cauchy)
 
     def mean_square(self, residuals: Array) -> float:
         """Mean square of robustly weighted residuals (N,), in their unit squared."""
@@ -117,7 +123,7 @@ class Solution(Generic[State]):
     def covariance(self) -> Array:
         """Covariance (P, P) of the unknowns, with the residuals' spread as their noise."""
         parts = zip(self.blocks, self.weights, self.scales, strict=True)
-        return invert_scaled(_equations(parts, self.unknowns)[0])
+        return invert_scaled(_form_equations(parts, self.unknowns)[0])
 
     @cached_property
     def covariance_by_freedoms(self) -> Array:
@@ -127,15 +133,15 @@ class Solution(Generic[State]):
         boards of 48 corners whose print is unknown.
         """
         scales = list(self.scales)
-        for noise, numbers in _kinds(self.blocks).items():
+        for noise, numbers in _group_by_noise(self.blocks).items():
             if noise.known is None:
                 parts = [(self.blocks[k], self.weights[k], self.scales[k]) for k in numbers]
-                spent = float(np.sum(_equations(parts, self.unknowns)[0] * self.covariance))
+                spent = float(np.sum(_form_equations(parts, self.unknowns)[0] * self.covariance))
                 total = sum(float(np.sum(weights)) for _, weights, _ in parts)
                 for k in numbers:
                     scales[k] *= np.sqrt(total / max(total - spent, 1.0))
         parts = list(zip(self.blocks, self.weights, scales, strict=True))
-        return invert_scaled(_equations(parts, self.unknowns)[0])
+        return invert_scaled(_form_equations(parts, self.unknowns)[0])
 
     @property
     def variance(self) -> float:
@@ -169,9 +175,9 @@ def minimize(
     taken, ending = 0, OUT_OF_STEPS
     weights, scales = _weigh(blocks)
     while taken < steps:
-        cost = _cost(blocks, blocks, scales)
+        cost = _compute_cost(blocks, blocks, scales)
         parts = zip(blocks, weights, scales, strict=True)
-        normal, gradient = _equations(parts, unknowns)
+        normal, gradient = _form_equations(parts, unknowns)
         promised = 0.0
         # After ten increases of the damping nothing moves any more.
         for attempt in range(10):
@@ -179,7 +185,7 @@ def minimize(
             promised = promised if attempt else -float(step @ gradient)
             candidate = retract(state, step)
             tried = tuple(blocks_at(candidate))
-            gained = cost - _cost(tried, blocks, scales)
+            gained = cost - _compute_cost(tried, blocks, scales)
             if gained > 0.0 or promised < tolerance:
                 break
             damping = max(FACTOR * damping, EFFECTIVE_DAMPING)
@@ -273,7 +279,7 @@ def _weigh(blocks: Sequence[Block]) -> tuple[tuple[Array, ...], tuple[float, ...
     """Robust weights and spread of each block; all residuals of a kind share one spread."""
     weights: list[Array] = [np.empty(0)] * len(blocks)
     scales = [0.0] * len(blocks)
-    for noise, numbers in _kinds(blocks).items():
+    for noise, numbers in _group_by_noise(blocks).items():
         scaled = _normalize_residuals(blocks, blocks, numbers)
         size = noise.estimate_scale(scaled)
         cuts = np.cumsum([len(blocks[k].residuals) for k in numbers])[:-1]
@@ -283,16 +289,18 @@ def _weigh(blocks: Sequence[Block]) -> tuple[tuple[Array, ...], tuple[float, ...
     return tuple(weights), tuple(scales)
 
 
-def _cost(blocks: Sequence[Block], there: Sequence[Block], scales: Sequence[float]) -> float:
+def _compute_cost(
+    blocks: Sequence[Block], there: Sequence[Block], scales: Sequence[float]
+) -> float:
     """Total cost of blocks, with sigmas and scales as they were `there`."""
     total = 0.0
     with np.errstate(all="ignore"):
-        for noise, numbers in _kinds(blocks).items():
+        for noise, numbers in _group_by_noise(blocks).items():
             total += noise.cost(_normalize_residuals(blocks, there, numbers) / scales[numbers[0]])
     return total
 
 
-def _kinds(blocks: Sequence[Block]) -> dict[Noise, list[int]]:
+def _group_by_noise(blocks: Sequence[Block]) -> dict[Noise, list[int]]:
     kinds: dict[Noise, list[int]] = {}
     for number, block in enumerate(blocks):
         kinds.setdefault(block.noise, []).append(number)
@@ -305,7 +313,9 @@ def _normalize_residuals(
     return np.concatenate([blocks[k].residuals / there[k].sigma for k in numbers])
 
 
-def _equations(parts: Iterable[tuple[Block, Array, float]], unknowns: int) -> tuple[Array, Array]:
+def _form_equations(
+    parts: Iterable[tuple[Block, Array, float]], unknowns: int
+) -> tuple[Array, Array]:
     """Normal matrix (P, P) and gradient (P,) of half the cost of blocks with weights and scales."""
     normal, gradient = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
     for block, weight, size in parts:

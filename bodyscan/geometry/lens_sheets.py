@@ -22,7 +22,7 @@ import numpy as np
 from bodyscan.arrays import Array
 from bodyscan.compiled import compiled
 from bodyscan.geometry.light_planes import Axis, Offset, SmoothSheets
-from bodyscan.geometry.transforms import RigidTransform, cross_matrix
+from bodyscan.geometry.transforms import RigidTransform, make_cross_matrix
 
 FRAME, SCALE = 6, 2
 CENTRE = FRAME + 1
@@ -49,7 +49,7 @@ class LensSheets(SmoothSheets):
     def from_matrix(matrix: Array, middle: Array, stripes: int, direction: Axis) -> LensSheets:
         """A projector without a lens: s = (row 0 . X) / (row 1 . X), matrix (2, 4), X homogeneous,
         camera frame. It leaves the centre's place along the stripes open: opposite `middle`."""
-        frame, scale = _frame_and_scale(matrix[0], matrix[1], 0.0)
+        frame, scale = _compute_frame_and_scale(matrix[0], matrix[1], 0.0)
         opposite = frame.translation - [frame.apply(middle)[0], 0.0, 0.0]
         frame, size = RigidTransform(frame.rotation, opposite), FRAME + SCALE
         unknown = np.full((size, size), np.nan)
@@ -89,12 +89,12 @@ class LensSheets(SmoothSheets):
         """Apply a step in the 2 x 4 matrix of the projector without its lens: there the valley in
         which frame, f and c compensate for one another is straight."""
         rows = self.projector_from_camera.matrix[:3]
-        turn = cross_matrix(step[:3]) @ rows
+        turn = make_cross_matrix(step[:3]) @ rows
         turn[:, 3] += step[3:FRAME]
         (focal, centre), (more_focal, more_centre) = self.parameters[:SCALE], step[FRAME:][:SCALE]
         above = (focal + more_focal) * rows[1] + (centre + more_centre) * rows[2]
         above += focal * turn[1] + centre * turn[2]
-        frame, scale = _frame_and_scale(above, rows[2] + turn[2], rows[0, 3] + turn[0, 3])
+        frame, scale = _compute_frame_and_scale(above, rows[2] + turn[2], rows[0, 3] + turn[0, 3])
         lens = self.parameters[SCALE:] + step[FRAME + SCALE :]
         return replace(self, projector_from_camera=frame, parameters=np.append(scale, lens))
 
@@ -124,7 +124,7 @@ class LensSheets(SmoothSheets):
         measure_rays(*camera, rays, s, found)
 
 
-def _frame_and_scale(above: Array, below: Array, x: float) -> tuple[RigidTransform, Array]:
+def _compute_frame_and_scale(above: Array, below: Array, x: float) -> tuple[RigidTransform, Array]:
     """projector_from_camera and (f, c) of s = (above . X) / (below . X); x: of its translation."""
     above, below = above / np.linalg.norm(below[:3]), below / np.linalg.norm(below[:3])
     axis, centre = below[:3], float(above[:3] @ below[:3])

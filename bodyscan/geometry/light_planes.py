@@ -51,7 +51,7 @@ class LightSheets(Protocol):
         ...
 
 
-def towards_camera(planes: Array) -> Array:
+def orient_towards_camera(planes: Array) -> Array:
     """Planes (..., 4) with the sign that makes d >= 0."""
     return planes * np.where(planes[..., 3:] < 0.0, -1.0, 1.0)
 
@@ -72,7 +72,9 @@ class LightPlanes:
     def from_planes(planes: Array, direction: Axis) -> LightPlanes:
         """Normalize planes (S + 1, 4) of any length and sign; their covariance is unknown."""
         unit = planes / np.linalg.norm(planes[:, :3], axis=1, keepdims=True)
-        return LightPlanes(towards_camera(unit), np.full((len(planes), 4, 4), np.nan), direction)
+        return LightPlanes(
+            orient_towards_camera(unit), np.full((len(planes), 4, 4), np.nan), direction
+        )
 
     @property
     def stripes(self) -> int:
@@ -124,7 +126,7 @@ class LightPlanes:
         return below, np.where(np.isfinite(s), s - below, np.nan)
 
 
-def baseline_angle_tilt(planes: Array, direction: Axis) -> tuple[Array, Array, Array]:
+def compute_baseline_angle_tilt(planes: Array, direction: Axis) -> tuple[Array, Array, Array]:
     """Eq. 7-9: baseline (mm), projection angle and tilt angle (radians) of planes (N, 4).
 
     The equations divide by a, which is 0 for horizontal stripes; for those x and y are exchanged.
@@ -213,4 +215,4 @@ class SmoothSheets(ABC):
         normals = self.offset(points, sheet).by_point
         normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
         planes = np.concatenate([normals, -np.sum(normals * points, -1, keepdims=True)], axis=-1)
-        return towards_camera(planes)
+        return orient_towards_camera(planes)

@@ -10,7 +10,7 @@ import numpy as np
 from bodyscan.arrays import Array, Floats
 from bodyscan.geometry.bowed_sheets import BOW_DEGREE, PLANE_DEGREE, BowedSheets
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.camera_tables import look_up_rays, ray_table
+from bodyscan.geometry.camera_tables import look_up_rays, make_ray_table
 from bodyscan.geometry.lens_sheets import LensSheets
 from bodyscan.geometry.light_planes import Axis, LightPlanes, LightSheets, RayDepths, SmoothSheets
 from bodyscan.geometry.transforms import RigidTransform
@@ -68,11 +68,11 @@ def intersect_rays(sheets: LightSheets, rays: Array, s: Array) -> RayDepths:
     """Intersect rays (..., 3) with z = 1, camera frame, with the sheets at real s (...); NaN where
     no depth can be trusted."""
     found = sheets.intersect(rays, s)
-    unsure = found.variance_mm2 > (_max_relative_sigma(sheets) * found.depth) ** 2
+    unsure = found.variance_mm2 > (_find_max_relative_sigma(sheets) * found.depth) ** 2
     return RayDepths(*(np.where(unsure, np.nan, part) for part in found))
 
 
-def stripes_per_pixel(sheets: LightSheets, camera: Camera, s: Floats) -> float:
+def measure_stripes_per_pixel(sheets: LightSheets, camera: Camera, s: Floats) -> float:
     """Change of s, at constant depth, from one pixel to the next across the stripes: median over a
     sample of the pixels that have an s (height, width); 0 if none has."""
     rows, columns = np.nonzero(np.isfinite(s))
@@ -100,7 +100,7 @@ def triangulate_image(
     Returns points (height, width, 3), camera frame, mm, and their standard deviations along the
     viewing rays (height, width): sigma_mm, and common_mm, the part that neighbours share.
     """
-    pixels, limit = ray_table(camera), _max_relative_sigma(sheets)
+    pixels, limit = make_ray_table(camera), _find_max_relative_sigma(sheets)
     points = np.full((*s.shape, 3), np.nan, np.float32)
     sigma_mm, common_mm = np.full((2, *s.shape), np.nan, np.float32)
     for first in range(0, len(s), BAND):
@@ -121,7 +121,7 @@ def triangulate_image(
     return points, sigma_mm, common_mm
 
 
-def _max_relative_sigma(sheets: LightSheets) -> float:
+def _find_max_relative_sigma(sheets: LightSheets) -> float:
     """MAX_RELATIVE_SIGMA, or GUESSED times the sigma amid the boards; infinite for a projector
     calibrated elsewhere, which does not extrapolate from boards."""
     if isinstance(sheets, LensSheets) and sheets.only_centre_uncertain:

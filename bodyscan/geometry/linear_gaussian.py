@@ -149,7 +149,7 @@ def solve_scaled(matrix: Array, right: Array, damping: Array | float = 0.0) -> A
 
     A singular system gives the shortest scaled solution.
     """
-    size = _root_diagonal(matrix)
+    size = _take_root_of_diagonal(matrix)
     scaled = matrix / (size[..., :, None] * size[..., None, :])
     diagonal = np.einsum("...ii->...i", scaled)
     diagonal += np.asarray(damping)[..., None]
@@ -157,7 +157,7 @@ def solve_scaled(matrix: Array, right: Array, damping: Array | float = 0.0) -> A
     try:
         solution = np.linalg.solve(scaled, columns)
     except np.linalg.LinAlgError:
-        solution = _pseudo_inverse(scaled) @ columns
+        solution = _invert_pseudo(scaled) @ columns
     return np.asarray(solution[..., 0] / size, np.float64)
 
 
@@ -166,7 +166,7 @@ def invert_scaled(matrix: Array) -> Array:
 
     Directions of a scaled matrix with less than 1e-14 of the largest eigenvalue get no variance.
     """
-    size = _root_diagonal(matrix)
+    size = _take_root_of_diagonal(matrix)
     outer = size[..., :, None] * size[..., None, :]
     scaled = matrix / outer
     try:
@@ -175,11 +175,11 @@ def invert_scaled(matrix: Array) -> Array:
     except np.linalg.LinAlgError:
         regular = False
     # Eigenvalues take ten times as long and are needed only where the rank is in doubt.
-    inverse = np.linalg.inv(scaled) if regular else _pseudo_inverse(scaled)
+    inverse = np.linalg.inv(scaled) if regular else _invert_pseudo(scaled)
     return np.asarray(0.5 * (inverse + np.swapaxes(inverse, -1, -2)) / outer, np.float64)
 
 
-def _pseudo_inverse(scaled: Array) -> Array:
+def _invert_pseudo(scaled: Array) -> Array:
     finite = np.isfinite(scaled).all(axis=(-2, -1))
     inverse = np.full(scaled.shape, np.nan)
     inverse[finite] = np.linalg.pinv(scaled[finite], 1e-14, hermitian=True)
@@ -198,6 +198,6 @@ def multiply_transposed(left: Array, right: Array) -> Array:
     return np.sum(head.transpose(0, 2, 1) @ tail, axis=0) + left[cut:].T @ right[cut:]
 
 
-def _root_diagonal(matrix: Array) -> Array:
+def _take_root_of_diagonal(matrix: Array) -> Array:
     """Square roots (..., P) of the diagonal; tiny but positive for an unknown without influence."""
     return np.sqrt(np.maximum(np.einsum("...ii->...i", matrix), 1e-300))

@@ -15,12 +15,12 @@ def rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def rms_length(vectors: Array) -> float:
+def compute_rms_length(vectors: Array) -> float:
     """Root mean square length of vectors (N, D)."""
     return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))
 
 
-def robust_scale(residuals: Array, min_scale: float = 1e-12) -> float:
+def estimate_robust_scale(residuals: Array, min_scale: float = 1e-12) -> float:
     """Robust standard deviation from the median absolute value; at least `min_scale`."""
     return max(SIGMAS_PER_MEDIAN * float(np.median(np.abs(residuals))), min_scale)
 
@@ -46,13 +46,13 @@ def group_medians(values: Floats | Array, group: Indices, count: int) -> Array:
     return medians
 
 
-def cauchy_weights(residuals: Array, group: int, scale: float) -> Array:
+def compute_cauchy_weights(residuals: Array, group: int, scale: float) -> Array:
     """Weights (N,) of the Cauchy loss; `group` neighbouring residuals (u, v) share one weight."""
     weights = 1.0 / (1.0 + _square(residuals, group) / scale**2)
     return np.repeat(weights, group) if group > 1 else weights
 
 
-def cauchy_cost(residuals: Array, group: int, scale: float) -> float:
+def compute_cauchy_cost(residuals: Array, group: int, scale: float) -> float:
     """Sum of the Cauchy loss over the groups; for small residuals, the sum of their squares."""
     return float(np.sum(np.log1p(_square(residuals, group) / scale**2)) * scale**2)
 

@@ -94,7 +94,7 @@ class RigidTransform:
         return RigidTransform.from_rotation_vector(twist[:3], twist[3:]) @ self
 
 
-def cross_matrix(vectors: Array) -> Array:
+def make_cross_matrix(vectors: Array) -> Array:
     """Cross-product matrices (..., 3, 3) of vectors (..., 3): cross_matrix(a) @ b = a x b."""
     zero = np.zeros(vectors.shape[:-1])
     x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
@@ -107,14 +107,14 @@ def adjoint(a_from_b: RigidTransform) -> Array:
     rotation = a_from_b.rotation
     matrix = np.zeros((6, 6))
     matrix[:3, :3] = matrix[3:, 3:] = rotation
-    matrix[3:, :3] = cross_matrix(a_from_b.translation) @ rotation
+    matrix[3:, :3] = make_cross_matrix(a_from_b.translation) @ rotation
     return matrix
 
 
 def twist_jacobian(points: Array) -> Array:
     """d(point)/d(twist) (..., 3, 6) when a small motion acts on points (..., 3) in their own frame."""
     unit = np.broadcast_to(np.eye(3), (*points.shape, 3))
-    return np.concatenate([-cross_matrix(points), unit], axis=-1)
+    return np.concatenate([-make_cross_matrix(points), unit], axis=-1)
 
 
 def fit_rigid_transform(source: Array, target: Array) -> RigidTransform:

@@ -57,7 +57,7 @@ def point_covariance(motion_covariance: Array, point: Array) -> Array:
     return jacobian @ motion_covariance @ jacobian.T
 
 
-def position_sigma(covariance: PoseCovariance, name: str, position: Array) -> Array:
+def compute_position_sigma(covariance: PoseCovariance, name: str, position: Array) -> Array:
     """Standard deviations (3,) mm, along the rig's axes, of a point attached to the pair.
 
     position: (3,) mm, rig frame, such as the centre of the pair's camera.
@@ -92,7 +92,7 @@ class RayUncertainty:
         return cv2.remap(self.sigma_px.astype(np.float32), *np.meshgrid(u, v), cv2.INTER_LINEAR)
 
 
-def node_pixels(width: int, height: int) -> Array:
+def list_node_pixels(width: int, height: int) -> Array:
     """Pixels (ROWS, COLUMNS, 2) of the nodes."""
     u, v = np.linspace(0.0, width - 1.0, COLUMNS), np.linspace(0.0, height - 1.0, ROWS)
     return np.stack(np.meshgrid(u, v), axis=-1)

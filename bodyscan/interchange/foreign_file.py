@@ -198,7 +198,7 @@ def read_document(file: ForeignFile) -> Any:
     text = file.text.lstrip()
     try:
         if text.startswith("<"):
-            return _plain_xml(ElementTree.fromstring(text))
+            return _convert_xml(ElementTree.fromstring(text))
         if text.startswith("{"):
             with suppress(ValueError):
                 return json.loads(text)
@@ -218,12 +218,12 @@ def read_document(file: ForeignFile) -> Any:
     raise CalibrationFileError(what, where=where, remedy=remedy)
 
 
-def _plain_xml(element: ElementTree.Element) -> Any:
+def _convert_xml(element: ElementTree.Element) -> Any:
     parts = list(element)
     if parts and all(part.tag == "_" for part in parts):
-        return [_plain_xml(part) for part in parts]
+        return [_convert_xml(part) for part in parts]
     if parts:
-        return {part.tag: _plain_xml(part) for part in parts}
+        return {part.tag: _convert_xml(part) for part in parts}
     text = (element.text or "").strip()
     values = [parse_scalar(word) for word in text.split()]
     if not all(isinstance(value, int | float) for value in values):

@@ -48,7 +48,7 @@ def projector_name(pair: str) -> str:
     return f"{pair}-projector"
 
 
-def opencv_lens(camera: Camera) -> tuple[bool, Array]:
+def describe_opencv_lens(camera: Camera) -> tuple[bool, Array]:
     """Return whether the lens is OpenCV's fisheye, and its coefficients: four, or else five or more."""
     is_fisheye = camera.lens.kind == "fisheye"
     return is_fisheye, camera.lens.coefficients if is_fisheye else camera.lens.opencv()

@@ -213,7 +213,7 @@ def finish(jobs: Sequence[Job], outcomes: Sequence[JobResult], out: Path) -> dic
     """
     from bodyscan.jobs.summary import (
         find_drift,
-        scans_to_repeat,
+        list_scans_to_repeat,
         write_day_measures,
         write_out_manifest,
         write_summary,
@@ -238,7 +238,7 @@ def finish(jobs: Sequence[Job], outcomes: Sequence[JobResult], out: Path) -> dic
         "done": len(jobs) - len(aside),
         "ran": sum(bool(outcome.stages) for outcome in outcomes),
         "set_aside": aside,
-        "repeat": scans_to_repeat(done),
+        "repeat": list_scans_to_repeat(done),
         "drifted": {one.pair: round(one.shift_mm, 2) for one in find_drift(done)},
         "table": str(table),
         "measures": measures and str(measures),
@@ -279,7 +279,7 @@ def cores() -> int:
     return os.cpu_count() or 1
 
 
-def free_memory_mb() -> float:
+def measure_free_memory_mb() -> float:
     """Memory that is free on the machine, or left to this container, in MB (1e6 bytes)."""
     free = [float("inf")]
     with suppress(OSError, ValueError):

@@ -38,7 +38,7 @@ class Job:
     subject: str | None = None
 
 
-def job_name(folder_name: str) -> str:
+def make_job_name(folder_name: str) -> str:
     """Derive a job's name from that of its scan's folder: unchanged, or its plain letters and a hash.
 
     A name with quotes, line breaks or other alphabets thus is safe in every file system and table.
@@ -109,7 +109,7 @@ def read_record(path: Path) -> dict[str, Any]:
     return content if isinstance(content, dict) else {}
 
 
-def results_in(folder: Path) -> dict[str, Path]:
+def list_results_in(folder: Path) -> dict[str, Path]:
     """The files that a stage wrote, as far as they exist, by relative path; not what people added."""
     named = read_record(folder / STAGE).get("outputs")
     if not isinstance(named, dict):
@@ -121,7 +121,7 @@ def _resolve(folder: Path, relative: str) -> Path:
     return Path(os.path.normpath(folder.absolute() / relative))
 
 
-def printable(text: str) -> str:
+def escape_control(text: str) -> str:
     """Escape control characters, which would disturb a terminal or a table."""
     return "".join(
         letter if letter.isprintable() or letter == "\n" else ascii(letter)[1:-1] for letter in text
@@ -146,24 +146,26 @@ def find_jobs(
     if not scans.is_dir():
         raise BadInput("there is no such folder", where=str(scans), remedy="check --scans")
     if pipeline.kind == "fuse":
-        sources, what = _scans(scans, out), "scan folder"
-        calibration = calibration or nearest_calibration(scans)
+        sources, what = _find_scans(scans, out), "scan folder"
+        calibration = calibration or find_nearest_calibration(scans)
     else:
-        sources, what, calibration = _rigs(scans, out), f"folder with a {RIG_FILE}", None
+        sources, what, calibration = _find_rigs(scans, out), f"folder with a {RIG_FILE}", None
     if not sources:
         raise BadInput(f"holds no {what}", where=str(scans), remedy="check --scans")
-    return [job_of(path, pipeline, out, calibration, until) for path in sources]
+    return [make_job(path, pipeline, out, calibration, until) for path in sources]
 
 
-def job_of(path: Path, pipeline: Pipeline, out: Path, calibration: Path | None, until: str) -> Job:
+def make_job(
+    path: Path, pipeline: Pipeline, out: Path, calibration: Path | None, until: str
+) -> Job:
     """Make the job of one scan's (or rig's) folder."""
-    name, subject = job_name(path.name), _captures_content(path).get("subject")
+    name, subject = make_job_name(path.name), _read_captures_content(path).get("subject")
     if not isinstance(subject, str):
         subject = path.name if pipeline.kind == "fuse" else None
     return Job(name, out.absolute() / name, path, calibration, pipeline, until, subject)
 
 
-def _scans(scans: Path, out: Path) -> list[Path]:
+def _find_scans(scans: Path, out: Path) -> list[Path]:
     """Every folder except hidden ones, results, and captures that say they are not a scan.
 
     A folder that cannot be read as a scan is a job too: its failure must be reported.
@@ -172,19 +174,19 @@ def _scans(scans: Path, out: Path) -> list[Path]:
         return [scans.absolute()]
     return [
         path
-        for path in _folders(scans, out)
+        for path in _find_folders(scans, out)
         if not any((path / name).exists() for name in RESULTS)
-        and _captures_content(path).get("kind") != "calibration"
+        and _read_captures_content(path).get("kind") != "calibration"
     ]
 
 
-def _rigs(folder: Path, out: Path) -> list[Path]:
+def _find_rigs(folder: Path, out: Path) -> list[Path]:
     if (folder / RIG_FILE).exists():
         return [folder.absolute()]
-    return [path for path in _folders(folder, out) if (path / RIG_FILE).exists()]
+    return [path for path in _find_folders(folder, out) if (path / RIG_FILE).exists()]
 
 
-def _folders(folder: Path, out: Path) -> list[Path]:
+def _find_folders(folder: Path, out: Path) -> list[Path]:
     results = os.path.realpath(out)
     return [
         path
@@ -193,7 +195,7 @@ def _folders(folder: Path, out: Path) -> list[Path]:
     ]
 
 
-def _captures_content(folder: Path) -> dict[str, Any]:
+def _read_captures_content(folder: Path) -> dict[str, Any]:
     """The folder's captures.yaml, unchecked; empty if it cannot be read."""
     try:
         data = read_yaml(folder / CAPTURES).data
@@ -202,7 +204,7 @@ def _captures_content(folder: Path) -> dict[str, Any]:
     return data if isinstance(data, dict) else {}
 
 
-def nearest_calibration(scans: Path) -> Path:
+def find_nearest_calibration(scans: Path) -> Path:
     """The `calibration` folder in the folder of the scans, beside it or above it. Raises
     BadInput."""
     absolute = scans.absolute()

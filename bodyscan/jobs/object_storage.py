@@ -62,7 +62,7 @@ def find_stored_jobs(store: Store, pipeline: Pipeline, until: str, work: Path) -
         files = _open(store.scans)
         for entry in files.ls("", detail=True) if files.exists("") else ():
             if entry["type"] == "directory":
-                _inside(work / "scans", entry["name"]).mkdir()
+                _resolve_inside(work / "scans", entry["name"]).mkdir()
                 for small in (f"{entry['name']}/{name}" for name in (CAPTURES, "rig.yaml")):
                     _fetch_one(files, small, work / "scans" / small)
     _require_some(store.scans, work / "scans")
@@ -114,7 +114,7 @@ def work_on_stored(
             if store.calibration:
                 _fetch(store.calibration, work / "calibration")
             _fetch(store.job(job.name), local.folder)
-            was = _stages(local.folder)
+            was = _read_stages(local.folder)
             write_job(local)
             outcome = supervise_job(local, process, listen)
             _put_back(local.folder, _open(store.job(job.name)), was, outcome.stages)
@@ -148,7 +148,7 @@ def put_summary(out: Path, store: Store) -> str:
     return store.job(SUMMARY)
 
 
-def _stages(folder: Path) -> dict[str, bytes]:
+def _read_stages(folder: Path) -> dict[str, bytes]:
     return {path.parent.name: path.read_bytes() for path in folder.glob(f"*/{STAGE}")}
 
 
@@ -161,7 +161,7 @@ def _put_back(folder: Path, there: Any, was: dict[str, bytes], ran: tuple[str, .
 
     for kept in folder.glob(f"{KEPT}*"):
         put(list_files(kept), "")  # before what it is taken from goes
-    now = _stages(folder)
+    now = _read_stages(folder)
     for stage in sorted(was.keys() | now.keys()):
         if stage in ran or now.get(stage) != was.get(stage):
             if there.exists(stage):
@@ -195,7 +195,7 @@ def _fetch(url: str, folder: Path) -> None:
     files = _open(url)
     folder.mkdir(parents=True, exist_ok=True)
     for name in sorted(files.find("")):
-        _fetch_one(files, name, _inside(folder, name))
+        _fetch_one(files, name, _resolve_inside(folder, name))
 
 
 def _fetch_one(files: Any, name: str, path: Path) -> None:
@@ -210,7 +210,7 @@ def _put(files: Any, name: str, path: Path) -> None:
     files.put_file(str(path), name)
 
 
-def _inside(folder: Path, name: str) -> Path:
+def _resolve_inside(folder: Path, name: str) -> Path:
     """The path of an object; names may be any text, but none may lead out of the folder."""
     parts = PurePosixPath(name).parts
     if not parts or name.startswith("/") or ".." in parts:

@@ -49,8 +49,8 @@ class Pipeline(Model):
         every = {name for names in SECTIONS.values() for name in names}
         for name in sorted((every - set(allowed)) & self.model_fields_set):
             yield (name,), f"is for another kind of pipeline than {self.kind}"
-        yield from _unknown_formats("export", self.export.formats, BODY_FORMATS.names())
-        yield from _unknown_formats("rig_export", self.rig_export.formats, RIG_FORMATS.names())
+        yield from _find_unknown_formats("export", self.export.formats, BODY_FORMATS.names())
+        yield from _find_unknown_formats("rig_export", self.rig_export.formats, RIG_FORMATS.names())
 
     @property
     def scan(self) -> ScanSettings:
@@ -64,7 +64,7 @@ class Pipeline(Model):
         return dict(getattr(self, name).model_dump(mode="json"))
 
 
-def _unknown_formats(
+def _find_unknown_formats(
     section: str, formats: Sequence[str], known: Sequence[str]
 ) -> Iterator[Problem]:
     for index, name in enumerate(formats):

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from bodyscan.files.hashing import file_hashes
-from bodyscan.jobs.job import STAGE, STATE, Job, read_record, results_in
+from bodyscan.files.hashing import hash_files
+from bodyscan.jobs.job import STAGE, STATE, Job, list_results_in, read_record
 from bodyscan.jobs.stages import Stage
 
 
@@ -27,13 +27,13 @@ class Origin:
         return heading | asdict(self) | {"outputs": dict(outputs)}
 
 
-def origin_of(job: Job, stage: Stage) -> Origin:
+def describe_origin(job: Job, stage: Stage) -> Origin:
     """Origin of a stage if it ran now. Raises BodyscanError or OSError for unreadable inputs."""
     settings = {name: job.pipeline.section(name) for name in stage.sections}
-    return Origin(stage.name, stage.version, settings, file_hashes(stage.inputs(job)))
+    return Origin(stage.name, stage.version, settings, hash_files(stage.inputs(job)))
 
 
-def reason_to_run(job: Job, now: Origin) -> str:
+def find_reason_to_run(job: Job, now: Origin) -> str:
     """Why a stage has to run; "" if its results were made from exactly this, and are complete."""
     folder = job.folder / now.stage
     try:
@@ -47,16 +47,16 @@ def reason_to_run(job: Job, now: Origin) -> str:
         return "what its last result was made from cannot be read"
     if version != now.stage_version:
         return f"version {now.stage_version} of the stage, it was {version}"
-    if changes := _changes(settings, now.settings):
+    if changes := _list_changes(settings, now.settings):
         return f"settings changed: {changes}"
-    if changes := _difference(inputs, now.inputs):
+    if changes := _list_difference(inputs, now.inputs):
         return f"inputs changed: {changes}"
-    if changes := _difference(outputs, file_hashes(results_in(folder))):
+    if changes := _list_difference(outputs, hash_files(list_results_in(folder))):
         return f"its result was changed: {changes}"
     return ""
 
 
-def _difference(was: Mapping[str, str], now: Mapping[str, str]) -> str:
+def _list_difference(was: Mapping[str, str], now: Mapping[str, str]) -> str:
     """List which files changed, came or went, the first three by name."""
     changes = [
         *(f"{name} has other content" for name in was if name in now and was[name] != now[name]),
@@ -67,7 +67,7 @@ def _difference(was: Mapping[str, str], now: Mapping[str, str]) -> str:
     return ", ".join([*changes[:3], *more])
 
 
-def _changes(was: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+def _list_changes(was: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     """List the settings that differ, by section and key, with both values."""
     before, after = (
         {f"{name}.{key}": value for name, each in sections.items() for key, value in each.items()}

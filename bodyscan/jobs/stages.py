@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from bodyscan.captures.folder import Captures, open_captures, open_scan
 from bodyscan.errors import BadInput, CalibrationFileError, CaptureError
-from bodyscan.jobs.job import CALIBRATION, RIG_FILE, Job, results_in
+from bodyscan.jobs.job import CALIBRATION, RIG_FILE, Job, list_results_in
 from bodyscan.progress import Progress, step
 from bodyscan.rig.rig import Rig, load_rig
 from bodyscan.verdict import Announce
@@ -37,7 +37,7 @@ class Stage:
 Kinds = Mapping[str, tuple[Stage, ...]]
 
 
-def stages_until(stages: tuple[Stage, ...], until: str) -> tuple[Stage, ...]:
+def select_stages_until(stages: tuple[Stage, ...], until: str) -> tuple[Stage, ...]:
     """The stages up to the one called `until`. Raises BadInput if there is none of that name."""
     names = [stage.name for stage in stages]
     if until not in names:
@@ -55,8 +55,8 @@ def scan_inputs(job: Job) -> dict[str, Path]:
             where=str(job.source),
             remedy="copy what it points to into the scans' folder",
         )
-    calibration = calibration_of(job)
-    files = _images(open_scan(rig_of(calibration), job.source), job.source)
+    calibration = find_calibration_of(job)
+    files = _list_images(open_scan(read_rig_of(calibration), job.source), job.source)
     return files | {
         f"calibration/{name}": calibration / name for name in (CALIBRATION, "calibration.npz")
     }
@@ -77,7 +77,7 @@ def run_scan(
     """
     from bodyscan.workflows.scan_person import scan_folder
 
-    folders, settings = (job.source, calibration_of(job), out), job.pipeline.scan
+    folders, settings = (job.source, find_calibration_of(job), out), job.pipeline.scan
     *_, pictures = scan_folder(
         *folders, settings, progress, preparation=preparation, announce=announce, made=made
     )
@@ -118,11 +118,11 @@ def run_report(job: Job, out: Path, progress: Progress, announce: Announce) -> N
         write_report(folder, out / "report.html")
 
 
-def rig_inputs(job: Job) -> dict[str, Path]:
+def list_rig_inputs(job: Job) -> dict[str, Path]:
     """The rig file and the images of its calibration captures."""
     rig_file = job.source / RIG_FILE
     rig = load_rig(rig_file)
-    return {"rig.yaml": rig_file, **_images(open_captures(rig, rig_file), job.source)}
+    return {"rig.yaml": rig_file, **_list_images(open_captures(rig, rig_file), job.source)}
 
 
 def run_calibrate(job: Job, out: Path, progress: Progress, announce: Announce) -> None:
@@ -142,14 +142,14 @@ def run_rig_export(job: Job, out: Path, progress: Progress, announce: Announce) 
         export_rig(load_calibration(job.folder / "calibration"), out, formats)
 
 
-def results_of(*stages: str) -> Callable[[Job], dict[str, Path]]:
+def list_results_of(*stages: str) -> Callable[[Job], dict[str, Path]]:
     """Inputs that are the results of earlier stages."""
 
     def inputs(job: Job) -> dict[str, Path]:
         return {
             f"{stage}/{name}": path
             for stage in stages
-            for name, path in results_in(job.folder / stage).items()
+            for name, path in list_results_in(job.folder / stage).items()
         }
 
     return inputs
@@ -158,26 +158,26 @@ def results_of(*stages: str) -> Callable[[Job], dict[str, Path]]:
 KINDS: Kinds = {
     "fuse": (
         Stage("scan", 7, ("alignment", "fusion", "mesh"), scan_inputs, run_scan),
-        Stage("measures", 1, (), results_of("scan"), run_measures),
-        Stage("export", 4, ("export",), results_of("scan"), run_export),
-        Stage("report", 2, (), results_of("scan", "measures"), run_report),
+        Stage("measures", 1, (), list_results_of("scan"), run_measures),
+        Stage("export", 4, ("export",), list_results_of("scan"), run_export),
+        Stage("report", 2, (), list_results_of("scan", "measures"), run_report),
     ),
     "calibrate": (
-        Stage("calibration", 3, (), rig_inputs, run_calibrate),
-        Stage("rig", 2, ("rig_export",), results_of("calibration"), run_rig_export),
-        Stage("report", 1, (), results_of("calibration"), run_report),
+        Stage("calibration", 3, (), list_rig_inputs, run_calibrate),
+        Stage("rig", 2, ("rig_export",), list_results_of("calibration"), run_rig_export),
+        Stage("report", 1, (), list_results_of("calibration"), run_report),
     ),
 }
 
 
-def calibration_of(job: Job) -> Path:
+def find_calibration_of(job: Job) -> Path:
     """The folder that `calibrate-rig` wrote. Raises BadInput if the job names none."""
     if job.calibration is None:
         raise BadInput("the job names no calibration", where=str(job.folder))
     return job.calibration if job.calibration.is_dir() else job.calibration.parent
 
 
-def rig_of(calibration: Path) -> Rig:
+def read_rig_of(calibration: Path) -> Rig:
     """The rig file's content as stored in a calibration; its arrays are not loaded."""
     path = calibration / CALIBRATION
     try:
@@ -190,7 +190,7 @@ def rig_of(calibration: Path) -> Rig:
         ) from error
 
 
-def _images(captures: Captures, base: Path) -> dict[str, Path]:
+def _list_images(captures: Captures, base: Path) -> dict[str, Path]:
     """Every existing image, and the files that describe them, by path relative to `base`."""
     paths = [p for s in captures.sequences for p in s.paths if p not in set(s.missing)]
     paths += captures.described_in

@@ -14,7 +14,7 @@ import numpy as np
 from bodyscan.alignment.displaced_poles import PairDrift, estimate_drift
 from bodyscan.arrays import Array
 from bodyscan.files.atomic import write_json, write_text
-from bodyscan.files.hashing import file_hash
+from bodyscan.files.hashing import hash_file
 from bodyscan.jobs.job import MANIFEST, MEASURES, SUMMARY, Job, read_record
 from bodyscan.jobs.supervision import JobResult
 from bodyscan.settings import BODY_CENTRE_MM
@@ -78,13 +78,13 @@ def write_day_measures(jobs: Sequence[Job], out: Path) -> Path | None:
 def write_out_manifest(out: Path) -> None:
     """Write the manifests of all jobs under one hash each, so that a vanished job is missed."""
     found = sorted(path for path in out.glob(f"*/{MANIFEST}") if not path.parent.is_symlink())
-    jobs = {path.parent.name: file_hash(path) for path in found}
+    jobs = {path.parent.name: hash_file(path) for path in found}
     write_json(out / MANIFEST, {"schema": "bodyscan-batch", "version": 1, "jobs": jobs})
 
 
-def scans_to_repeat(jobs: Sequence[Job]) -> list[str]:
+def list_scans_to_repeat(jobs: Sequence[Job]) -> list[str]:
     """List the jobs whose scan was fused but has the verdict `repeat`, by name."""
-    verdicts = {job.name: _facts(job).get("verdict") for job in jobs}
+    verdicts = {job.name: _read_facts(job).get("verdict") for job in jobs}
     return [name for name, verdict in verdicts.items() if verdict and verdict["grade"] == "repeat"]
 
 
@@ -108,11 +108,13 @@ def _make_row(job: Job, outcome: JobResult) -> dict[str, Any]:
     if outcome.state != "done":
         return row
     if job.pipeline.kind == "calibrate":
-        return row | _rig_figures(read_record(job.folder / "calibration" / "calibration.json"))
-    return row | _scan_figures(_facts(job))
+        return row | _collect_rig_figures(
+            read_record(job.folder / "calibration" / "calibration.json")
+        )
+    return row | _collect_scan_figures(_read_facts(job))
 
 
-def _scan_figures(facts: Mapping[str, Any]) -> dict[str, Any]:
+def _collect_scan_figures(facts: Mapping[str, Any]) -> dict[str, Any]:
     if not facts:
         return {}
     counts, alignment = facts["counts"], facts["alignment"]
@@ -139,7 +141,7 @@ def _scan_figures(facts: Mapping[str, Any]) -> dict[str, Any]:
     return figures
 
 
-def _rig_figures(content: Mapping[str, Any]) -> dict[str, Any]:
+def _collect_rig_figures(content: Mapping[str, Any]) -> dict[str, Any]:
     if not content:
         return {}
     qualities = [pair["quality"] for pair in content["pairs"].values()]
@@ -153,14 +155,14 @@ def _rig_figures(content: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _facts(job: Job) -> dict[str, Any]:
+def _read_facts(job: Job) -> dict[str, Any]:
     """Facts about the job's scan; empty if it has none."""
     return read_record(job.folder / "scan" / "scan.json")
 
 
 def pair_motions(job: Job) -> dict[str, Array]:
     """Motion (3,) mm of every pair at the body's centre, from its calibrated to its aligned pose."""
-    alignment = _facts(job).get("alignment")
+    alignment = _read_facts(job).get("alignment")
     if not alignment or job.calibration is None:
         return {}
     calibrated = read_record(job.calibration / "calibration.json").get("pairs", {})

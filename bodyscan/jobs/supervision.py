@@ -16,7 +16,7 @@ from subprocess import PIPE, Popen
 from typing import Any, Protocol
 
 from bodyscan.files.atomic import write_json
-from bodyscan.jobs.job import LOG, STATE, Job, printable
+from bodyscan.jobs.job import LOG, STATE, Job, escape_control
 
 Listen = Callable[[dict[str, Any]], None]
 
@@ -133,7 +133,7 @@ def listen_to(process: Popen[str], job: Job, listen: Listen) -> tuple[str, tuple
             if "stage" in message:
                 listen({"event": "stage", "job": job.name, **message})
             if "ended" in message:
-                return printable(message["failed"]), tuple(ran)
+                return escape_control(message["failed"]), tuple(ran)
         status = process.wait()
         in_time = stuck.is_alive()
     finally:
@@ -164,7 +164,7 @@ def _describe_death(status: int, log: Path) -> str:
         lines = stream.read().decode("utf-8", "replace").split("\n")
         last = next((line for line in reversed(lines) if line.strip()), "")
         if last and not last.startswith("-- "):
-            how += f"; the last line of its log: {printable(last)}"
+            how += f"; the last line of its log: {escape_control(last)}"
     return how
 
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bodyscan.errors import BadInput, BodyscanError
-from bodyscan.files.hashing import content_hash, file_hash, list_files
-from bodyscan.jobs.job import MANIFEST, STAGE, read_job, read_record, results_in
+from bodyscan.files.hashing import hash_content, hash_file, list_files
+from bodyscan.jobs.job import MANIFEST, STAGE, list_results_in, read_job, read_record
 from bodyscan.jobs.stages import KINDS, Kinds
 
 
@@ -66,7 +66,7 @@ def _verify_job(folder: Path, kinds: Kinds) -> Iterator[tuple[Path, str]]:
     except (KeyError, TypeError, ValueError):
         yield path, "is not a manifest"
         return
-    yield path, "" if content_hash(content) == stored else "was changed"
+    yield path, "" if hash_content(content) == stored else "was changed"
     for name, digest in outputs.items():
         yield _compare_hash(folder / name, digest)
     try:
@@ -84,14 +84,14 @@ def _verify_job(folder: Path, kinds: Kinds) -> Iterator[tuple[Path, str]]:
 def _find_added(folder: Path) -> Iterator[Path]:
     """Files that people put among a batch's results, or a job's."""
     for record in sorted((*folder.glob(f"*/{STAGE}"), *folder.glob(f"*/*/{STAGE}"))):
-        known = {record, *results_in(record.parent).values()}
+        known = {record, *list_results_in(record.parent).values()}
         yield from (path for path in list_files(record.parent) if path not in known)
 
 
 def _compare_hash(path: Path, digest: str) -> tuple[Path, str]:
     """The file, and how it differs from its hash; "" if it does not."""
     try:
-        return path, "" if file_hash(path) == digest else "was changed"
+        return path, "" if hash_file(path) == digest else "was changed"
     except FileNotFoundError:
         return path, "is gone"
     except (OSError, BodyscanError) as error:

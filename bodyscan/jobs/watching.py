@@ -32,9 +32,18 @@ from bodyscan.errors import BadInput, CaptureError, FailedWork
 from bodyscan.files.atomic import write_bytes
 from bodyscan.files.hashing import list_files
 from bodyscan.jobs.batch import finish, hold_output, write_or_refuse
-from bodyscan.jobs.job import RESULTS, STAGE, STATE, Job, job_name, job_of, read_record, results_in
+from bodyscan.jobs.job import (
+    RESULTS,
+    STAGE,
+    STATE,
+    Job,
+    list_results_in,
+    make_job,
+    make_job_name,
+    read_record,
+)
 from bodyscan.jobs.pipeline import Pipeline
-from bodyscan.jobs.stages import KINDS, rig_of
+from bodyscan.jobs.stages import KINDS, read_rig_of
 from bodyscan.jobs.supervision import (
     COMMAND,
     JobResult,
@@ -207,7 +216,7 @@ def watch(
     """
     if not watched.inbox.is_dir():
         raise BadInput("there is no such folder", where=str(watched.inbox), remedy="make it first")
-    rig = rig_of(watched.calibration)
+    rig = read_rig_of(watched.calibration)
     with hold_output(watched.out):
         process = ResidentProcess(watched)
         pool = ThreadPoolExecutor(1)
@@ -221,7 +230,7 @@ def watch(
             while True:
                 for folder in watching.folders():
                     if folder not in watching.scans:
-                        since_ns = retaken_since(folder, watching.state_file(folder))
+                        since_ns = find_retake_time(folder, watching.state_file(folder))
                         watching.scans[folder] = IncomingScan(folder, rig, since_ns)
                     watching.look_at(watching.scans[folder])
                 for outcome in watching.take_ended():
@@ -254,7 +263,7 @@ class _Watching:
 
     def state_file(self, path: Path) -> Path:
         """Path of the file that records how a scan's job ended."""
-        return self.watched.out / job_name(path.name) / STATE
+        return self.watched.out / make_job_name(path.name) / STATE
 
     def folders(self) -> list[Path]:
         """Folders of scans that are not done: what an earlier watch or batch did stays done.
@@ -266,7 +275,7 @@ class _Watching:
         done = [path for path in self.ended if path not in self.scans]
         self._turn += 1
         retaken = done[self._turn % len(done)] if done else None
-        if retaken and not retaken_since(retaken, self.state_file(retaken)):
+        if retaken and not find_retake_time(retaken, self.state_file(retaken)):
             retaken = None
         for path in sorted(watched.inbox.absolute().iterdir()):
             is_folder = path.is_dir() and path != watched.out.absolute()
@@ -291,7 +300,7 @@ class _Watching:
         arrival = scan.look(time.monotonic(), self.watched.quiet_s)
         if self.watched.preview and arrival != self.shown.get(path):
             self.shown[path] = arrival
-            job, images = job_name(path.name), dict(arrival.images)
+            job, images = make_job_name(path.name), dict(arrival.images)
             self.listen({"event": "images", "job": job, "scan": path.name, "pairs": images})
         new = set(arrival.whole) - self.prepared.setdefault(path, set())
         if new:
@@ -320,10 +329,10 @@ class _Watching:
     def _job(self, path: Path) -> Job:
         watched = self.watched
         last = KINDS["fuse"][-1].name
-        return job_of(path, watched.pipeline, watched.out, watched.calibration.absolute(), last)
+        return make_job(path, watched.pipeline, watched.out, watched.calibration.absolute(), last)
 
 
-def retaken_since(source: Path, state: Path) -> int:
+def find_retake_time(source: Path, state: Path) -> int:
     """When (ns) a scan's job ended, if a file of its folder is newer; 0 otherwise."""
     with suppress(OSError):
         since = state.stat().st_mtime_ns
@@ -336,13 +345,13 @@ def find_earlier(source: Path, state: Path) -> JobResult | None:
     """How a scan's job ended before this watch began; None if its images, or a file of its results,
     have changed or gone since."""
     content = read_record(state)
-    if content.get("state") not in ("done", "set aside") or retaken_since(source, state):
+    if content.get("state") not in ("done", "set aside") or find_retake_time(source, state):
         return None
     folder, since = state.parent, state.stat().st_mtime_ns
     if content["state"] == "done":
         for stage in KINDS["fuse"]:
             named = read_record(folder / stage.name / STAGE).get("outputs")
-            there = results_in(folder / stage.name)
+            there = list_results_in(folder / stage.name)
             if not isinstance(named, dict) or there.keys() != named.keys():
                 return None
             if any(os.stat(path).st_ctime_ns > since for path in there.values()):

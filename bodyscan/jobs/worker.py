@@ -26,18 +26,18 @@ from queue import SimpleQueue
 from typing import Any
 
 from bodyscan.errors import BodyscanError, CaptureError
-from bodyscan.files.atomic import flush, json_text, lock_file, restrict_to_owner, write_json
+from bodyscan.files.atomic import flush, format_json, lock_file, restrict_to_owner, write_json
 from bodyscan.files.hashing import (
-    content_hash,
-    file_hash,
-    file_hashes,
+    hash_content,
+    hash_file,
+    hash_files,
     list_files,
     list_relative_files,
 )
 from bodyscan.files.messages import translate_failure
-from bodyscan.jobs.job import KEPT, LOCK, LOG, MANIFEST, STAGE, Job, read_job, results_in
-from bodyscan.jobs.plan import Origin, origin_of, reason_to_run
-from bodyscan.jobs.stages import KINDS, Kinds, Stage, run_scan, stages_until
+from bodyscan.jobs.job import KEPT, LOCK, LOG, MANIFEST, STAGE, Job, list_results_in, read_job
+from bodyscan.jobs.plan import Origin, describe_origin, find_reason_to_run
+from bodyscan.jobs.stages import KINDS, Kinds, Stage, run_scan, select_stages_until
 from bodyscan.jobs.supervision import open_log
 from bodyscan.memory import keep_freed_memory, reserve_blas_memory
 from bodyscan.progress import THREADS
@@ -68,7 +68,7 @@ def stay() -> int:
     emit = _become_worker()
     requests = _read_requests()
     try:
-        from bodyscan.fusion.storage import no_use
+        from bodyscan.fusion.storage import ignore_made
         from bodyscan.mesh.body import BodyCloud, BodyMesh
         from bodyscan.report.model import pack_cloud
         from bodyscan.workflows.range_images import Preparation
@@ -96,9 +96,9 @@ def stay() -> int:
         if "pairs" in request:
             preparation.prepare(folder, request["pairs"])
             continue
-        made = show if request.get("preview") else no_use
+        made = show if request.get("preview") else ignore_made
         run = partial(run_scan, preparation=preparation, made=made)
-        with _log_of(folder):
+        with _redirect_to_log(folder):
             reason, _ = _attempt(folder, {"fuse": (replace(scan, run=run), *others)}, emit)
         with suppress(BodyscanError):
             preparation.drop(read_job(folder).source)
@@ -148,17 +148,17 @@ def _work(folder: Path, kinds: Kinds, emit: Emit) -> None:
         _tidy(folder, emit)
         job = read_job(folder)
         every = kinds[job.pipeline.kind]
-        stages = stages_until(every, job.until)
+        stages = select_stages_until(every, job.until)
         for stage in stages:
-            now = origin_of(job, stage)
-            if why := reason_to_run(job, now):
+            now = describe_origin(job, stage)
+            if why := find_reason_to_run(job, now):
                 emit(stage=stage.name, why=why)
                 _perform(job, stage, now, emit)
         for stage in every[len(stages) :]:
             # Remove results that were made from other results than are there now.
             results = job.folder / stage.name
             with suppress(BodyscanError, OSError):
-                if results.exists() and reason_to_run(job, origin_of(job, stage)):
+                if results.exists() and find_reason_to_run(job, describe_origin(job, stage)):
                     _remove_results(_move_aside(results), emit)
         _write_manifest(job, every)
 
@@ -177,10 +177,10 @@ def _perform(job: Job, stage: Stage, before: Origin, emit: Emit) -> None:
 
     try:
         stage.run(job, made, progress, announce)
-        if file_hashes(stage.inputs(job)) != before.inputs:
+        if hash_files(stage.inputs(job)) != before.inputs:
             remedy = "start the batch again when the folder is complete"
             raise CaptureError("changed while it was read", where=str(job.source), remedy=remedy)
-        write_json(made / STAGE, before.record(file_hashes(list_relative_files(made))))
+        write_json(made / STAGE, before.record(hash_files(list_relative_files(made))))
         for path in (*list_files(made), made):  # to the disk, before a name says that it is there
             flush(path)
     except BaseException:
@@ -209,7 +209,7 @@ def _remove_results(old: Path, emit: Emit) -> None:
     stage = token.rpartition("-")[0]
     if old.is_dir() and not old.is_symlink():
         # Without a record (an upload that was cut short) the new result tells what stages write.
-        ours = results_in(old) or results_in(old.with_name(stage))
+        ours = list_results_in(old) or list_results_in(old.with_name(stage))
         for name, path in list_relative_files(old).items():
             if name in ours:
                 path.unlink()
@@ -236,13 +236,13 @@ def _write_manifest(job: Job, stages: Sequence[Stage]) -> None:
             record = json.loads(path.read_text("utf-8"))
             inputs |= record["inputs"]
             outputs |= {f"{stage.name}/{name}": h for name, h in record["outputs"].items()}
-            outputs[f"{stage.name}/{STAGE}"] = file_hash(path)
+            outputs[f"{stage.name}/{STAGE}"] = hash_file(path)
     inputs = {name: value for name, value in inputs.items() if name not in outputs}
     content: dict[str, Any] = {"schema": "bodyscan-manifest", "version": 1}
     content |= {"inputs": inputs, "outputs": outputs}
-    content["own_sha256"] = content_hash(content)
+    content["own_sha256"] = hash_content(content)
     path = job.folder / MANIFEST
-    if not path.exists() or path.read_text("utf-8") != json_text(content):
+    if not path.exists() or path.read_text("utf-8") != format_json(content):
         write_json(path, content)
 
 
@@ -273,7 +273,7 @@ def _read_requests() -> SimpleQueue[dict[str, Any]]:
 
 
 @contextmanager
-def _log_of(folder: Path) -> Iterator[None]:
+def _redirect_to_log(folder: Path) -> Iterator[None]:
     """Send what is printed meanwhile to the job's log."""
     before = os.dup(2)
     try:

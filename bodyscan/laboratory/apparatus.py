@@ -20,7 +20,7 @@ from bodyscan.arrays import Array, Bytes, Indices, Mask
 from bodyscan.boards.detection import find_boards
 from bodyscan.boards.view import BoardView
 from bodyscan.errors import BoardNotFound
-from bodyscan.geometry.light_planes import towards_camera
+from bodyscan.geometry.light_planes import orient_towards_camera
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.progress import Progress, silent
 from bodyscan.rig.board import Board
@@ -32,7 +32,7 @@ from bodyscan.simulation.lens import TrueCamera
 from bodyscan.simulation.projector import MirrorProjector
 from bodyscan.simulation.rays import View
 from bodyscan.simulation.render import PixelTruth, compute_pixel_truth, render_pair
-from bodyscan.simulation.scene import Scene, Surface, grid_surface
+from bodyscan.simulation.scene import Scene, Surface, build_grid_surface
 from bodyscan.simulation.sensor import expose
 from bodyscan.simulation.settings import BoardMaking, Noise, Optics, Projection, SimulationSettings
 from bodyscan.stripes.codes.gray import Gray
@@ -78,7 +78,7 @@ class ChapterSetup:
     seed: int  # of all noise
 
 
-def ideal_settings(samples: int = 5) -> SimulationSettings:
+def make_ideal_settings(samples: int = 5) -> SimulationSettings:
     """Make settings of a flat, exact board and the simulator's own noise.
 
     samples: rays per pixel along each axis. With 3 their positions alone move a boundary by 0.015
@@ -87,7 +87,7 @@ def ideal_settings(samples: int = 5) -> SimulationSettings:
     return SimulationSettings(optics=Optics(samples=samples))
 
 
-def real_settings(samples: int = 5) -> SimulationSettings:
+def make_real_settings(samples: int = 5) -> SimulationSettings:
     """Make settings of realistic light and a realistic board."""
     return SimulationSettings(
         optics=Optics(samples=samples, defocus_px=2.0),
@@ -99,7 +99,7 @@ def real_settings(samples: int = 5) -> SimulationSettings:
     )
 
 
-def chapter_setup(settings: SimulationSettings, seed: int = 0) -> ChapterSetup:
+def build_chapter_setup(settings: SimulationSettings, seed: int = 0) -> ChapterSetup:
     """Build the set-up; its projector is the same whatever the seed."""
     # Behind the camera's lens, so that baselines decrease with the stripe's number (Fig. 6).
     x, y, z = -150.0, 0.0, -25.0
@@ -121,12 +121,12 @@ def chapter_setup(settings: SimulationSettings, seed: int = 0) -> ChapterSetup:
     )
 
 
-def true_planes(setup: ChapterSetup) -> Array:
+def compute_true_planes(setup: ChapterSetup) -> Array:
     """Compute planes (S + 1, 4) of the boundaries before any smile; (a, b, c) unit, d >= 0."""
-    return towards_camera(setup.projector.plane(np.arange(setup.projector.stripes + 1.0)))
+    return orient_towards_camera(setup.projector.plane(np.arange(setup.projector.stripes + 1.0)))
 
 
-def board_poses(count: int = 3) -> list[RigidTransform]:
+def list_board_poses(count: int = 3) -> list[RigidTransform]:
     """List camera_from_board of the three poses, or of `count` poses."""
     # The board's middle, mm, and its rotation; the first three, and more if they are not enough.
     poses = (
@@ -141,7 +141,7 @@ def board_poses(count: int = 3) -> list[RigidTransform]:
         ((-11.0, -17.0, 410.0), (0.0, 0.05, 0.8)),
         ((0.0, -25.0, 395.0), (-0.25, -0.2, -0.6)),
     )
-    return [pose_about(middle, turn) for middle, turn in poses[:count]]
+    return [compute_pose_about(middle, turn) for middle, turn in poses[:count]]
 
 
 def stage_readings(count: int = 7) -> Array:
@@ -152,13 +152,13 @@ def stage_readings(count: int = 7) -> Array:
 def stage_poses(readings: Array, seed: int) -> list[RigidTransform]:
     """List camera_from_board at each stop, along the board's normal, with the stage's errors."""
     rng = np.random.default_rng([seed, Stream.STAGE])
-    stage = pose_about((-11.0, -17.0, 400.0), (0.12, -0.16, 0.02))
+    stage = compute_pose_about((-11.0, -17.0, 400.0), (0.12, -0.16, 0.02))
     stops = readings + 0.01 * rng.standard_normal(len(readings))
     slides = [RigidTransform.from_translation([0.0, 0.0, stop]) for stop in stops]
     return [stage @ slide for slide in slides]
 
 
-def pose_about(
+def compute_pose_about(
     position: Sequence[float], turn: Sequence[float], middle: Array | None = None
 ) -> RigidTransform:
     """Compute camera_from_board that puts the board's middle at a position, rotated about it."""
@@ -174,16 +174,16 @@ def build_spheres() -> list[Surface]:
     arms = np.asarray(mesh.vertices)
     ball = Surface(arms, np.asarray(mesh.triangles), 0.8, normals=arms / RADIUS_MM)
     spheres = [replace(ball, vertices=arms + centre) for centre in CENTRES]
-    return [*spheres, _ground(), _wall()]
+    return [*spheres, _build_ground(), _build_wall()]
 
 
-def plate_scene() -> list[Surface]:
+def build_plate_scene() -> list[Surface]:
     """Build a flat white plate, smaller than the board: no calibration reaches farther."""
-    pose = pose_about((-11.0, -17.0, 402.0), (0.15, 0.1, 0.0), middle=np.zeros(3))
+    pose = compute_pose_about((-11.0, -17.0, 402.0), (0.15, 0.1, 0.0), middle=np.zeros(3))
     width, height = 160.0, 120.0
     across, down = np.array([width, 0.0, 0.0]), np.array([0.0, height, 0.0])
-    plate = grid_surface(-0.5 * (across + down), across, down, albedo=0.8)
-    return [replace(plate, open_to_light=True).transform(pose), _wall()]
+    plate = build_grid_surface(-0.5 * (across + down), across, down, albedo=0.8)
+    return [replace(plate, open_to_light=True).transform(pose), _build_wall()]
 
 
 def expose_scene(
@@ -204,18 +204,20 @@ def expose_scene(
     return frames["lit"], decode_stripes(PROJECTOR, frames["lit"], frames["dark"], coded)
 
 
-def _ground() -> Surface:
+def _build_ground() -> Surface:
     """Build the plane on which all five spheres lie."""
     across, down = np.array([1.0, 0.0, 0.0]), CENTRES[3] - CENTRES[0]
     down = (down - (down @ across) * across) / np.linalg.norm(down[1:])
     below = CENTRES[1] + RADIUS_MM * np.cross(across, down)
-    return grid_surface(below - 300.0 * (across + down), 600.0 * across, 600.0 * down, albedo=0.5)
+    return build_grid_surface(
+        below - 300.0 * (across + down), 600.0 * across, 600.0 * down, albedo=0.5
+    )
 
 
-def _wall() -> Surface:
+def _build_wall() -> Surface:
     corner = np.array([-1500.0, -1500.0, 2.0 * DISTANCE_MM])
     across, down = np.array([3000.0, 0.0, 0.0]), np.array([0.0, 3000.0, 0.0])
-    return grid_surface(corner, across, down, albedo=0.3, encloses=True)
+    return build_grid_surface(corner, across, down, albedo=0.3, encloses=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,16 +257,16 @@ def take_captures(
 ) -> ChapterCaptures:
     """Render, expose and decode everything. Raises BoardNotFound if a board is not found."""
     readings = stage_readings(stage_stops)
-    poses, stage = board_poses(boards), stage_poses(readings, setup.seed)
+    poses, stage = list_board_poses(boards), stage_poses(readings, setup.seed)
     total = boards + len(stage) + 2
     progress("rendering", 0, total)
     shots = []
     for pose, stream in [*zip(poses, count(), strict=False), *zip(stage, count(100), strict=False)]:
-        shots.append(_board_shot(setup, pose, stream))
+        shots.append(_capture_board_shot(setup, pose, stream))
         progress("rendering", len(shots), total)
     spheres = _expose(setup, build_spheres(), 200)
     progress("rendering", total - 1, total)
-    plate = _expose(setup, plate_scene(), 300)
+    plate = _expose(setup, build_plate_scene(), 300)
     progress("rendering", total, total)
     return ChapterCaptures(
         setup,
@@ -278,9 +280,9 @@ def take_captures(
     )
 
 
-def _board_shot(setup: ChapterSetup, pose: RigidTransform, number: int) -> StripedShot:
+def _capture_board_shot(setup: ChapterSetup, pose: RigidTransform, number: int) -> StripedShot:
     """Capture the board, and a wall behind it."""
-    surfaces = [*(surface.transform(pose) for surface in setup.board.surfaces), _wall()]
+    surfaces = [*(surface.transform(pose) for surface in setup.board.surfaces), _build_wall()]
     lit, stripes = expose_scene(setup, surfaces, number)
     views = find_boards(lit, [BOARD], pair="chapter", shot=f"shot{number}")
     if not views:

@@ -14,15 +14,15 @@ import cv2
 import numpy as np
 
 from bodyscan.arrays import Array
-from bodyscan.calibration.board_views import PlanarView, planar_view
+from bodyscan.calibration.board_views import PlanarView, make_planar_view
 from bodyscan.calibration.boundary_points import (
     BIN_PX,
     BoundaryPoints,
-    boundaries_near,
     compute_box,
     concatenate,
     on_board,
     select,
+    select_boundaries_near,
     subsample,
 )
 from bodyscan.calibration.camera import CameraCalibration, calibrate_camera, locate_board
@@ -35,9 +35,9 @@ from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.laboratory.apparatus import BOARD, CAMERA, PROJECTOR, ChapterCaptures, StripedShot
 from bodyscan.laboratory.rivals import (
     calibrate_tsai,
+    estimate_projection_matrix,
     fit_baseline,
     fit_remapped_pinhole,
-    projection_matrix,
     split_projection_matrix,
 )
 
@@ -55,7 +55,7 @@ def calibrate_by_reference_plane(
     shots: Sequence[StripedShot],
 ) -> tuple[CameraCalibration, LocatedBoards]:
     """Calibrate by Zhang's method (section 3), which also gives the boards' poses."""
-    found = calibrate_camera(_planar_views(shots), CAMERA.width, CAMERA.height)
+    found = calibrate_camera(_make_planar_views(shots), CAMERA.width, CAMERA.height)
     return found, locate_boundaries(shots, found.camera, found.poses)
 
 
@@ -69,7 +69,7 @@ def calibrate_by_slide_stage(
     camera, camera_from_stage = calibrate_tsai(
         *_stack_stage_points(shots, readings), CAMERA.width, CAMERA.height, skewed=skewed
     )
-    return locate_boundaries(shots, camera, _stage_poses(camera_from_stage, readings))
+    return locate_boundaries(shots, camera, _compute_stage_poses(camera_from_stage, readings))
 
 
 def calibrate_by_matrix(shots: Sequence[StripedShot], readings: Array) -> LocatedBoards:
@@ -77,21 +77,21 @@ def calibrate_by_matrix(shots: Sequence[StripedShot], readings: Array) -> Locate
 
     The stripes' positions are read off each board by its own homography, which has no lens either.
     """
-    matrix = projection_matrix(*_stack_stage_points(shots, readings))
+    matrix = estimate_projection_matrix(*_stack_stage_points(shots, readings))
     camera, camera_from_stage = split_projection_matrix(matrix, CAMERA.width, CAMERA.height)
-    poses = _stage_poses(camera_from_stage, readings)
+    poses = _compute_stage_poses(camera_from_stage, readings)
     # The same test of what lies on the checkered area as for every other model.
     points = locate_boundaries(shots, camera, poses).points
     parts = [
         _read_by_homography(select(points, points.board == number), camera, view, pose)
-        for number, (view, pose) in enumerate(zip(_planar_views(shots), poses, strict=True))
+        for number, (view, pose) in enumerate(zip(_make_planar_views(shots), poses, strict=True))
     ]
     return LocatedBoards(camera, poses, concatenate(parts))
 
 
 def locate_boards(shots: Sequence[StripedShot], camera: Camera) -> LocatedBoards:
     """Locate boards held anywhere with a camera that is already known."""
-    poses = [locate_board(camera, view)[0] for view in _planar_views(shots)]
+    poses = [locate_board(camera, view)[0] for view in _make_planar_views(shots)]
     return locate_boundaries(shots, camera, poses)
 
 
@@ -109,7 +109,7 @@ def locate_boundaries(
             PROJECTOR,
             BOARD,
             pose,
-            boundaries_near(shot.stripes, compute_box(shot.view)),
+            select_boundaries_near(shot.stripes, compute_box(shot.view)),
             number,
             bin_px=bin_px,
         )
@@ -118,20 +118,22 @@ def locate_boundaries(
     return LocatedBoards(camera, camera_from_board, concatenate(parts))
 
 
-def _planar_views(shots: Sequence[StripedShot]) -> list[PlanarView]:
-    return [planar_view(shot.view, BOARD) for shot in shots]
+def _make_planar_views(shots: Sequence[StripedShot]) -> list[PlanarView]:
+    return [make_planar_view(shot.view, BOARD) for shot in shots]
 
 
 def _stack_stage_points(shots: Sequence[StripedShot], readings: Array) -> tuple[Array, Array]:
     """Stack all corners (N, 3) mm, frame of the board at reading 0, and their pixels (N, 2)."""
-    views = _planar_views(shots)
+    views = _make_planar_views(shots)
     points = [
         view.points + [0.0, 0.0, reading] for view, reading in zip(views, readings, strict=True)
     ]
     return np.concatenate(points), np.concatenate([view.pixels for view in views])
 
 
-def _stage_poses(camera_from_stage: RigidTransform, readings: Array) -> list[RigidTransform]:
+def _compute_stage_poses(
+    camera_from_stage: RigidTransform, readings: Array
+) -> list[RigidTransform]:
     return [
         camera_from_stage @ RigidTransform.from_translation([0.0, 0.0, reading])
         for reading in readings.tolist()
@@ -165,32 +167,32 @@ class Approach:
 Model = Callable[[BoundaryPoints, int, Axis], LightPlanes]
 
 
-def free_planes(points: BoundaryPoints, stripes: int, direction: Axis) -> LightPlanes:
+def fit_free_planes(points: BoundaryPoints, stripes: int, direction: Axis) -> LightPlanes:
     """Fit one free plane per stripe (Eq. 6)."""
     return fit_light_planes(points, stripes, direction).planes
 
 
-def pinhole_planes(points: BoundaryPoints, stripes: int, direction: Axis) -> LightPlanes:
+def fit_pinhole_planes(points: BoundaryPoints, stripes: int, direction: Axis) -> LightPlanes:
     """Fit the 2 x 4 matrix of Bolles et al. 1981."""
     few = subsample(points, 20_000)
     above, below = fit_pinhole(few.points, few.index.astype(float))
     return LightPlanes.from_planes(above - np.arange(stripes + 1.0)[:, None] * below, direction)
 
 
-def remapped_planes(points: BoundaryPoints, stripes: int, direction: Axis) -> LightPlanes:
+def fit_remapped_planes(points: BoundaryPoints, stripes: int, direction: Axis) -> LightPlanes:
     """Fit the 2 x 4 matrix with a re-mapped index."""
     few = subsample(points, 20_000)
     return fit_remapped_pinhole(few.points, few.index.astype(float), stripes, direction)
 
 
 PROJECTORS: dict[str, Model] = {
-    "2 x 4 matrix": pinhole_planes,
-    "2 x 4 matrix, index re-mapped": remapped_planes,
+    "2 x 4 matrix": fit_pinhole_planes,
+    "2 x 4 matrix, index re-mapped": fit_remapped_planes,
     "invariable baseline": partial(fit_baseline, variable=False, fit_tilt=False),
     "invariable baseline, tilted": partial(fit_baseline, variable=False),
     "variable baseline": partial(fit_baseline, variable=True, fit_tilt=False),
     "variable baseline, tilted": partial(fit_baseline, variable=True),
-    "free planes": free_planes,
+    "free planes": fit_free_planes,
 }
 """Every model of the projector that the chapter names. `tilted`: the baseline's direction in the
 image is estimated too, instead of being assumed to be the camera's x axis."""
@@ -230,13 +232,13 @@ def calibrate_all(captures: ChapterCaptures) -> Calibrations:
     )
     approaches = (
         # 3 x 4 and 2 x 4 matrices from the stage, no lens, the index taken as linear.
-        fit_approach("(i)", by_matrix, pinhole_planes),
+        fit_approach("(i)", by_matrix, fit_pinhole_planes),
         # Tsai's camera with its lens, and a re-mapped index.
-        fit_approach("(i) mended", stage, remapped_planes),
+        fit_approach("(i) mended", stage, fit_remapped_planes),
         # Tsai's camera from the stage, planes from the reference plane: the chapter's text, not its
         # heading `calibrated by slide stage`.
-        fit_approach("(ii)", second, free_planes),
-        fit_approach("(ii) with skew", with_skew, free_planes),
+        fit_approach("(ii)", second, fit_free_planes),
+        fit_approach("(ii) with skew", with_skew, fit_free_planes),
         Approach("(iii)", reference_boards.camera, planes.planes),
         ours,
     )
@@ -269,7 +271,7 @@ def calibrate_ours(
             view,
             (BoardStripes.from_points(camera, select(data, data.board == number)),),
         )
-        for number, view in enumerate(_planar_views(shots))
+        for number, view in enumerate(_make_planar_views(shots))
     ]
     flatness = {BOARD.name: BOARD.flatness_sigma_mm}
     refined = refine_jointly(camera, reference.poses, [fit.sheets], striped, flatness)

@@ -18,7 +18,7 @@ from bodyscan.evaluation.primitives import (
     measure_sphere,
 )
 from bodyscan.geometry.camera import camera_from_fields
-from bodyscan.geometry.light_planes import Axis, RayDepths, towards_camera
+from bodyscan.geometry.light_planes import Axis, RayDepths, orient_towards_camera
 from bodyscan.geometry.light_sheets import intersect_rays
 from bodyscan.geometry.robust import rms
 from bodyscan.geometry.transforms import fit_rigid_transform
@@ -129,7 +129,7 @@ class TrueSheets:
 
     def tangent_planes(self, s: Array) -> Array:
         """Compute planes that touch in the middle of the fan, where there is no smile."""
-        return towards_camera(self.setup.projector.plane(s))
+        return orient_towards_camera(self.setup.projector.plane(s))
 
 
 def make_true_approach(setup: ChapterSetup) -> Approach:

@@ -15,8 +15,8 @@ from matplotlib.axes import Axes
 
 from bodyscan.arrays import Array
 from bodyscan.files.atomic import write_bytes, write_text
-from bodyscan.geometry.light_planes import baseline_angle_tilt
-from bodyscan.geometry.robust import robust_scale
+from bodyscan.geometry.light_planes import compute_baseline_angle_tilt
+from bodyscan.geometry.robust import estimate_robust_scale
 from bodyscan.geometry.transforms import fit_rigid_transform
 from bodyscan.laboratory import apparatus
 from bodyscan.laboratory.apparatus import ChapterCaptures
@@ -30,7 +30,7 @@ from bodyscan.laboratory.measuring import (
     triangulate_pixels,
 )
 from bodyscan.progress import Progress, silent
-from bodyscan.reconstruction.triangulation import grid_normals
+from bodyscan.reconstruction.triangulation import estimate_grid_normals
 from bodyscan.report.charts import COLOURS, png, round_up, style
 
 CHAPTER_TABLE_2 = {
@@ -69,8 +69,8 @@ def reproduce(
     seed: of all noise.
     real_light: a bowed board, speckle and everything else that an ideal simulation leaves out.
     """
-    settings = apparatus.real_settings if real_light else apparatus.ideal_settings
-    setup = apparatus.chapter_setup(settings(), seed)
+    settings = apparatus.make_real_settings if real_light else apparatus.make_ideal_settings
+    setup = apparatus.build_chapter_setup(settings(), seed)
     captures = apparatus.take_captures(setup, progress=progress)
     calibrated = calibrate_all(captures)
     compared = [*calibrated.approaches, make_true_approach(setup)]
@@ -93,14 +93,14 @@ def reproduce(
         ],
     )
     progress("measuring", 1, 1)
-    text, figures = reproduction_text(found), figure_names(real_light)
+    text, figures = render_reproduction(found), name_figures(real_light)
     draw(captures, calibrated, Path(out), figures)
     name = "reproduction-real-light.md" if real_light else "reproduction.md"
     write_text(Path(out) / name, text)
     return text, (name, *figures)
 
 
-def figure_names(real_light: bool) -> tuple[str, str]:
+def name_figures(real_light: bool) -> tuple[str, str]:
     """Name the files of Fig. 6 and Fig. 7, which lie beside the text."""
     light = "-real-light" if real_light else ""
     return f"fig6-projector{light}.png", f"fig7-range-data{light}.png"
@@ -115,7 +115,7 @@ def draw(
     planes = {name: by_name[name].sheets.tangent_planes(s) for name in ("(iii)", "ours", "(i)")}
     distances = calibrated.planes.distances_mm
     known = distances[np.isfinite(distances)]
-    draw_projector(planes, s, apparatus.true_planes(captures.setup), known, out / names[0])
+    draw_projector(planes, s, apparatus.compute_true_planes(captures.setup), known, out / names[0])
 
     # Fig. 7: the spheres by each approach, aligned with the truth.
     measured, truth = captures.spheres.stripes.s, captures.spheres.truth
@@ -126,7 +126,7 @@ def draw(
         both = np.isfinite(points[..., 2]) & np.isfinite(truth.s)
         laid = np.full(points.shape, np.nan)
         laid[both] = fit_rigid_transform(points[both], true[both]).apply(points[both])
-        normals = grid_normals(laid.astype(np.float32)).astype(float)
+        normals = estimate_grid_normals(laid.astype(np.float32)).astype(float)
         data[name] = normals, laid[..., 2] - true[..., 2]
     draw_range_data(data, out / names[1])
 
@@ -143,10 +143,10 @@ def draw_projector(
     figure, axes = plt.subplots(2, 2, figsize=(10.0, 7.5), constrained_layout=True)
     labels = ("baseline, mm", "projection angle, degrees", "tilt angle, degrees")
     for part, (axis, label) in enumerate(zip(axes.ravel(), labels, strict=False)):
-        values = _baseline_angle_tilt(true)[part]
+        values = _describe_planes(true)[part]
         axis.plot(s, values, color="#333333", linewidth=3.0, alpha=0.35, label="true")
         for colour, (name, found) in zip(COLOURS, planes.items(), strict=False):
-            fitted = _baseline_angle_tilt(found)[part]
+            fitted = _describe_planes(found)[part]
             axis.plot(s, fitted, ".", color=colour, markersize=2.5, label=name)
         room = 0.6 * float(np.ptp(values)) + 1e-3
         if part != 1:
@@ -183,14 +183,14 @@ def draw_range_data(data: Mapping[str, tuple[Array, Array]], path: Path) -> None
     write_bytes(path, png(figure, 750))
 
 
-def _baseline_angle_tilt(planes: Array) -> tuple[Array, Array, Array]:
-    length, angle, tilt = baseline_angle_tilt(planes, apparatus.PROJECTOR.direction)
+def _describe_planes(planes: Array) -> tuple[Array, Array, Array]:
+    length, angle, tilt = compute_baseline_angle_tilt(planes, apparatus.PROJECTOR.direction)
     return length, np.degrees(angle), np.degrees(tilt)
 
 
 def _plot_residuals(axis: Axes, residuals_mm: Array) -> None:
     """Plot the distribution of residuals, and a normal curve with their robust sigma."""
-    sigma_mm = robust_scale(residuals_mm)
+    sigma_mm = estimate_robust_scale(residuals_mm)
     edges = np.linspace(-8.0 * sigma_mm, 8.0 * sigma_mm, 161)
     density, _ = np.histogram(residuals_mm, edges)
     density = density / (len(residuals_mm) * np.diff(edges))
@@ -206,14 +206,14 @@ def _plot_residuals(axis: Axes, residuals_mm: Array) -> None:
     axis.legend(frameon=False, loc="upper right")
 
 
-def reproduction_text(found: Reproduction) -> str:
+def render_reproduction(found: Reproduction) -> str:
     """Fill in the whole report, `reproduction.md.j2`, as Markdown."""
     template = (files("bodyscan.laboratory") / "reproduction.md.j2").read_text("utf-8")
     page = Environment(
         undefined=StrictUndefined, keep_trailing_newline=True, trim_blocks=True
     ).from_string(template)
-    sixth, seventh = figure_names(found.real_light)
-    whole_times, fine_times = _times(found.whole), _times(found.fine)
+    sixth, seventh = name_figures(found.real_light)
+    whole_times, fine_times = _compute_ratios(found.whole), _compute_ratios(found.fine)
     numbers = [f"No. {number}" for number in range(1, 6)]
     against_third = ["", *numbers, "mean over (iii)'s"]
     fitted = [
@@ -257,7 +257,7 @@ def reproduction_text(found: Reproduction) -> str:
     )
 
 
-def _times(all_: Iterable[ApproachAccuracy]) -> dict[str, float]:
+def _compute_ratios(all_: Iterable[ApproachAccuracy]) -> dict[str, float]:
     """Divide each approach's mean E by that of (iii)."""
     mean = {m.name: m.mean_e for m in all_}
     return {name: e / mean["(iii)"] for name, e in mean.items()}

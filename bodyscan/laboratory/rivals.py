@@ -27,7 +27,7 @@ from bodyscan.calibration.sheet_fit import fit_pinhole
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.light_planes import Axis, LightPlanes
-from bodyscan.geometry.robust import cauchy_weights, robust_scale
+from bodyscan.geometry.robust import compute_cauchy_weights, estimate_robust_scale
 from bodyscan.geometry.transforms import RigidTransform
 
 
@@ -39,10 +39,10 @@ def calibrate_tsai(
 
     skewed: estimate a skew as well, which Tsai's own model lacks.
     """
-    rough, pose = split_projection_matrix(projection_matrix(points, pixels), width, height)
+    rough, pose = split_projection_matrix(estimate_projection_matrix(points, pixels), width, height)
     start = [*pose.twist, rough.beta, rough.alpha / rough.beta, rough.u0, rough.v0, 0.0]
     start += [0.0] * skewed
-    solved = least_squares(_residuals, start, x_scale="jac", args=(points, pixels)).x
+    solved = least_squares(_compute_residuals, start, x_scale="jac", args=(points, pixels)).x
     focal, aspect, u0, v0, kappa, *skew = solved[6:].tolist()
     camera = Camera(
         focal * aspect, focal, skew[0] if skew else 0.0, u0, v0, Radial(), width, height
@@ -64,7 +64,7 @@ def _undo_kappa(camera: Camera, kappa: float) -> Array:
     return np.linalg.lstsq(rows, (real - ideal) * np.sqrt(real), rcond=None)[0]
 
 
-def _residuals(values: Array, points: Array, pixels: Array) -> Array:
+def _compute_residuals(values: Array, points: Array, pixels: Array) -> Array:
     """Compute residuals (2 N,) px in the ideal image."""
     focal, aspect, centre, kappa = values[6], values[7], values[8:10], values[10]
     in_camera = RigidTransform.from_rotation_vector(values[:3], values[3:6]).apply(points)
@@ -76,7 +76,7 @@ def _residuals(values: Array, points: Array, pixels: Array) -> Array:
     return ((in_camera[:, :2] / in_camera[:, 2:] - ideal) * scale).ravel()
 
 
-def projection_matrix(points: Array, pixels: Array) -> Array:
+def estimate_projection_matrix(points: Array, pixels: Array) -> Array:
     """Estimate the matrix (3, 4) with pixels (N, 2) ~ P X from points (N, 3) mm not in one plane.
 
     Direct linear transformation (Abdel-Aziz and Karara 1971) with Hartley's scaling.
@@ -137,8 +137,8 @@ def fit_baseline(
     """
     # Linear least squares for x = tan(tilt) y + tan(angle_i) z - l, weighted by how far an error of
     # one pixel moves x; points that disagree lose their weight (Cauchy).
-    x, y, z = _axes(data.points, direction)
-    across = np.abs(_axes(data.per_pixel, direction)[0])
+    x, y, z = _split_axes(data.points, direction)
+    across = np.abs(_split_axes(data.per_pixel, direction)[0])
     count, one = stripes + 1, np.ones_like(z)
     rows = np.arange(len(x))
     columns = [csr_array((z, (rows, data.index)), shape=(len(x), count))]
@@ -155,20 +155,20 @@ def fit_baseline(
         right = np.asarray(design.T @ (weights * x))
         solved = np.linalg.lstsq(normal, right, rcond=None)[0]
         scaled = (x - design @ solved) / sigma
-        robust = cauchy_weights(scaled, 1, 3.0 * robust_scale(scaled))
+        robust = compute_cauchy_weights(scaled, 1, 3.0 * estimate_robust_scale(scaled))
     observed = np.bincount(data.index, minlength=count) >= 12
     baseline = solved[count : 2 * count] if variable else np.full(count, solved[count])
     tilt = float(solved[-1]) if fit_tilt else 0.0
-    return _planes(np.where(observed, solved[:count], np.nan), baseline, tilt, direction)
+    return _build_planes(np.where(observed, solved[:count], np.nan), baseline, tilt, direction)
 
 
-def _axes(vectors: Array, direction: Axis) -> tuple[Array, Array, Array]:
+def _split_axes(vectors: Array, direction: Axis) -> tuple[Array, Array, Array]:
     """Split vectors into coordinates across the stripes, along them, and forward."""
     x, y, z = vectors.T
     return (y, x, z) if direction == "horizontal" else (x, y, z)
 
 
-def _planes(slope: Array, baseline: Array, tilt: float, direction: Axis) -> LightPlanes:
+def _build_planes(slope: Array, baseline: Array, tilt: float, direction: Axis) -> LightPlanes:
     """Build planes from the tangents `slope` (S + 1,) of projection angles, NaN for none."""
     across, along = np.ones_like(slope), np.full_like(slope, -tilt)
     first, second = (along, across) if direction == "horizontal" else (across, along)
@@ -192,21 +192,21 @@ def fit_remapped_pinhole(points: Array, s: Array, stripes: int, direction: Axis)
     matrix[0] = (matrix[0] - half * matrix[1]) / half
     matrix /= np.linalg.norm(matrix[1])
     whole = _append_ones((points - middle) / size)
-    index, powers = s / half - 1.0, _powers(s / half - 1.0)
+    index, powers = s / half - 1.0, _compute_powers(s / half - 1.0)
 
     def residuals(values: Array) -> Array:
         above, below = whole @ values[:4], whole @ values[4:8]
         return np.asarray(above / below - index - powers @ values[8:], np.float64)
 
     flat = np.concatenate([matrix.ravel(), np.zeros(3)])
-    noise = robust_scale(residuals(flat))
+    noise = estimate_robust_scale(residuals(flat))
     solved = least_squares(residuals, flat, loss="cauchy", f_scale=noise, x_scale="jac").x
     u = np.arange(stripes + 1.0) / half - 1.0
-    remapped = u + _powers(u) @ solved[8:]
+    remapped = u + _compute_powers(u) @ solved[8:]
     rows = solved[:4] - remapped[:, None] * solved[4:8]
     return LightPlanes.from_planes(rows @ np.linalg.inv(scale), direction)
 
 
-def _powers(u: Array) -> Array:
+def _compute_powers(u: Array) -> Array:
     """Compute powers 3 to 5 (N, 3) of the index u in [-1, 1]; the matrix has those from 0 to 2."""
     return np.stack([u**power for power in (3, 4, 5)], axis=-1)

@@ -91,7 +91,7 @@ def find_landmarks(body: RegisteredBody) -> dict[str, Landmark]:
     }
 
 
-def _near(body: RegisteredBody, part: int, centre: Array, radius_mm: float) -> Indices:
+def _select_near(body: RegisteredBody, part: int, centre: Array, radius_mm: float) -> Indices:
     """Measured vertices of a part of the scan within a radius."""
     close = np.abs(body.vertices - centre).max(axis=1) < radius_mm
     close &= np.isfinite(body.mesh.sigma_mm) & (body.parts == part)
@@ -111,7 +111,7 @@ def _climb(body: RegisteredBody, part: int, direction: Array, start: _Spot) -> _
     tangents = np.stack([first, np.cross(direction, first)])
     position = start.position
     for _ in range(3):
-        near = _near(body, part, position, WINDOW_MM)
+        near = _select_near(body, part, position, WINDOW_MM)
         if len(near) < 30:
             return start
         offset = body.vertices[near] - position
@@ -143,7 +143,7 @@ def _find_ends(body: RegisteredBody, spots: Mapping[str, _Spot]) -> dict[str, _S
         part = template.part_names.index(f"{side} foot")
         for name, direction in (("pternion", -along), ("acropodion", along)):
             spot = spots[f"{side} {name}"]
-            near = _near(body, part, spot.position, 2.0 * WINDOW_MM)
+            near = _select_near(body, part, spot.position, 2.0 * WINDOW_MM)
             if spot.found == "surface" and len(near):
                 far = near[int(np.argmax(body.vertices[near] @ direction))]
                 found[f"{side} {name}"] = _Spot(body.vertices[far], "refined")

@@ -13,7 +13,7 @@ from bodyscan.errors import BadInput
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.measurement.head import HeadTop, estimate_head_top
 from bodyscan.measurement.named import CROWN_MM, Measure, NamedMeasures, measure_by_name
-from bodyscan.measurement.outline import Range, bound_girths, girth_sigma
+from bodyscan.measurement.outline import Range, bound_girths, compute_girth_sigma
 from bodyscan.mesh.body import (
     HAIR,
     REGION_NAMES,
@@ -26,7 +26,7 @@ from bodyscan.mesh.body import (
 )
 from bodyscan.mesh.sliced_parts import Piece, find_body_frame, find_parts
 from bodyscan.mesh.slices import MeshSlicer
-from bodyscan.mesh.topology import face_areas, signed_volume
+from bodyscan.mesh.topology import compute_face_areas, compute_signed_volume
 
 
 @dataclass(frozen=True)
@@ -162,17 +162,17 @@ def measure(
     for height in (height for height in heights if height not in missing):
         pieces = sorted(parts.slices[height], key=lambda piece: piece.part)
         slices.append(Slice(height, tuple(_describe_loop(piece, mesh, breath) for piece in pieces)))
-    areas = face_areas(mesh.vertices, mesh.faces)
+    areas = compute_face_areas(mesh.vertices, mesh.faces)
     crown = mesh.vertices[mesh.faces, 2].max(axis=1) > stature - CROWN_MM
-    kinds, crown_measured = mesh.face_regions, _share(areas, ~mesh.filled, crown)
-    top = _crown_region(areas, kinds, crown & ~mesh.filled)
-    head = _head_top(vertices, mesh, stature, top) if crown_measured > 0.5 else None
+    kinds, crown_measured = mesh.face_regions, _compute_share(areas, ~mesh.filled, crown)
+    top = _find_crown_region(areas, kinds, crown & ~mesh.filled)
+    head = _find_head_top(vertices, mesh, stature, top) if crown_measured > 0.5 else None
     return Measurements(
         stature,
         crown_measured,
-        signed_volume(mesh.vertices, mesh.faces) / 1e6,
+        compute_signed_volume(mesh.vertices, mesh.faces) / 1e6,
         float(areas.sum()) / 1e6,
-        _share(areas, ~mesh.filled, np.ones_like(crown)),
+        _compute_share(areas, ~mesh.filled, np.ones_like(crown)),
         tuple(slices),
         frame.rig_from_body,
         breathes,
@@ -184,7 +184,7 @@ def measure(
     )
 
 
-def _crown_region(areas: Array, kinds: Bytes | None, crown: Mask) -> str | None:
+def _find_crown_region(areas: Array, kinds: Bytes | None, crown: Mask) -> str | None:
     """The region that makes up more than half of the crown, or "unsure"."""
     if kinds is None or not crown.any():
         return None
@@ -192,7 +192,9 @@ def _crown_region(areas: Array, kinds: Bytes | None, crown: Mask) -> str | None:
     return next((name for name, share in found.items() if share > 0.5), REGION_NAMES[UNSURE])
 
 
-def _head_top(vertices: Array, mesh: BodyMesh, stature: float, crown: str | None) -> HeadTop | None:
+def _find_head_top(
+    vertices: Array, mesh: BodyMesh, stature: float, crown: str | None
+) -> HeadTop | None:
     """Top of the head: the crown itself if it is bare, or an estimate from the skin around.
 
     vertices: body frame.
@@ -208,7 +210,7 @@ def _head_top(vertices: Array, mesh: BodyMesh, stature: float, crown: str | None
     return estimate_head_top(vertices[skin], stature)
 
 
-def heights_from(text: str) -> list[float]:
+def parse_heights(text: str) -> list[float]:
     """Heights written as "800,1050", mm. Raises BadInput if one is not a number, or seems to be the
     decimals of the one before."""
     words = text.split(",")
@@ -225,7 +227,7 @@ def heights_from(text: str) -> list[float]:
     return heights
 
 
-def _share(areas: Array, which: Mask, among: Mask) -> float:
+def _compute_share(areas: Array, which: Mask, among: Mask) -> float:
     return float(areas[which & among].sum() / max(areas[among].sum(), 1e-12))
 
 
@@ -235,10 +237,10 @@ def _describe_loop(piece: Piece, mesh: BodyMesh, breath: BreathAt | None) -> Gir
     known = loop.faces >= 0
     corners = mesh.faces[loop.faces]
     noise = np.where(known, mesh.sigma_mm[corners].mean(axis=1), np.nan)
-    sigma, breath_sigma = girth_sigma(loop, noise, sectors=4), None
+    sigma, breath_sigma = compute_girth_sigma(loop, noise, sectors=4), None
     if breath is not None:
         lean = np.where(known, breath.sigma_mm[corners].mean(axis=1), np.nan)
-        breath_sigma = girth_sigma(loop, lean, sectors=1)
+        breath_sigma = compute_girth_sigma(loop, lean, sectors=1)
     lows, highs = bound_girths(loop)
     depth, width = np.ptp(loop.segments[:, 0], axis=0)
     x, y = loop.centre

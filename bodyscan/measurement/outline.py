@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from bodyscan.arrays import Array, Floats, Indices, Mask
-from bodyscan.mesh.slices import Loop, hull_perimeter, keep_segments, split_runs
+from bodyscan.mesh.slices import Loop, compute_hull_perimeter, keep_segments, split_runs
 
 CREASE_MM = 15.0
 """Deep in a crease between two parts no camera sees the skin, and the surface bridges it."""
@@ -23,7 +23,7 @@ def bound_girths(loop: Loop) -> tuple[tuple[float, float], tuple[float, float]]:
     A body is convex where nothing was seen of it: at least straight from rim to rim, and at most
     along the tangents of both rims to where they meet.
     """
-    measured, runs = split_runs(replace(loop, measured=loop.measured & ~_near_creases(loop)))
+    measured, runs = split_runs(replace(loop, measured=loop.measured & ~_mark_near_creases(loop)))
     if measured.all():
         values = loop.girth_mm, loop.tape_mm
         return values, values
@@ -42,10 +42,10 @@ def bound_girths(loop: Loop) -> tuple[tuple[float, float], tuple[float, float]]:
         length = float(np.linalg.norm(np.diff(bulge, axis=0), axis=1).sum())
         longer += length - float(np.linalg.norm(bulge[-1] - bulge[0]))
     lows = closed.girth_mm, closed.tape_mm
-    return lows, (closed.girth_mm + longer, hull_perimeter(points))
+    return lows, (closed.girth_mm + longer, compute_hull_perimeter(points))
 
 
-def _near_creases(loop: Loop) -> Mask:
+def _mark_near_creases(loop: Loop) -> Mask:
     """Segments (N,) within CREASE_MM of where a loop was cut from another part."""
     along = np.cumsum(loop.lengths) - 0.5 * loop.lengths
     away = np.abs(along[:, None] - along[loop.faces < 0])
@@ -62,7 +62,10 @@ def _bulge(loop: Loop, before: Indices, gap: Indices, after: Indices) -> Array:
         return np.stack([first, last])
     along = chord / length
     outward = np.array([along[1], -along[0]])  # the body is on the left
-    rims = loop.segments[_rim(loop, before[::-1])[-1], 0], loop.segments[_rim(loop, after)[-1], 1]
+    rims = (
+        loop.segments[_cut_rim(loop, before[::-1])[-1], 0],
+        loop.segments[_cut_rim(loop, after)[-1], 1],
+    )
     leaving, arriving = first - rims[0], rims[1] - last
     rise = np.arctan2(leaving @ outward, leaving @ along)
     fall = np.arctan2(-(arriving @ outward), arriving @ along)
@@ -76,12 +79,12 @@ def _bulge(loop: Loop, before: Indices, gap: Indices, after: Indices) -> Array:
     return first + x[:, None] * along + y[:, None] * outward
 
 
-def _rim(loop: Loop, run: Indices) -> Indices:
+def _cut_rim(loop: Loop, run: Indices) -> Indices:
     """The first 20 mm of a run: a rim's direction is known to some degrees from that."""
     return run[: max(1, int(np.searchsorted(np.cumsum(loop.lengths[run]), 20.0)))]
 
 
-def girth_sigma(loop: Loop, sigma_mm: Array | Floats, *, sectors: int) -> float:
+def compute_girth_sigma(loop: Loop, sigma_mm: Array | Floats, *, sectors: int) -> float:
     """Standard deviation, mm, of a loop's tape girth due to its points' sigma_mm (N,) outwards.
 
     A tape that turns by an angle at a point grows by that angle times the point's displacement.

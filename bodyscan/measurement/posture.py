@@ -61,8 +61,8 @@ def find_posture(fitted: FittedBody, landmarks: Mapping[str, Array]) -> Posture:
         sinks.append(float(np.linalg.norm(hip - ankle) - (hip - ankle)[2]))
         foot = landmarks[f"{side} acropodion"] - landmarks[f"{side} pternion"]
         feet.append(float(np.degrees(np.arctan2(outward * foot[1], foot[0]))))
-        arms.append(_angle(elbow - shoulder, down))
-        elbows.append(_angle(elbow - shoulder, wrist - elbow))
+        arms.append(_measure_angle(elbow - shoulder, down))
+        elbows.append(_measure_angle(elbow - shoulder, wrist - elbow))
     heels = landmarks["left pternion"] - landmarks["right pternion"]
     x, _, z = rotation["head"][:, 0]
     return Posture(
@@ -75,7 +75,7 @@ def find_posture(fitted: FittedBody, landmarks: Mapping[str, Array]) -> Posture:
     )
 
 
-def _angle(one: Array, other: Array) -> float:
+def _measure_angle(one: Array, other: Array) -> float:
     """Angle between two vectors (3,), degrees."""
     cosine = one @ other / (np.linalg.norm(one) * np.linalg.norm(other))
     return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))

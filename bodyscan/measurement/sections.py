@@ -16,7 +16,7 @@ from scipy.spatial import ConvexHull
 from bodyscan.arrays import Array, Bytes, Mask
 from bodyscan.body_model.fitting import BASIS_MM
 from bodyscan.body_model.registered import RegisteredBody, vote_on_faces
-from bodyscan.mesh.slices import Loop, MeshSlicer, hull_perimeter
+from bodyscan.mesh.slices import Loop, MeshSlicer, compute_hull_perimeter
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -35,7 +35,7 @@ class Section:
     @cached_property
     def tape_mm(self) -> float:
         """Girth as a tape runs: the convex hull's perimeter."""
-        return hull_perimeter(self.points)
+        return compute_hull_perimeter(self.points)
 
     @cached_property
     def tape_measured(self) -> float:
@@ -50,7 +50,7 @@ class Section:
     @cached_property
     def min_tape_mm(self) -> float:
         """The least that the girth can be: straight across what was not measured."""
-        return hull_perimeter(self.points[self.observed]) if self.observed.any() else 0.0
+        return compute_hull_perimeter(self.points[self.observed]) if self.observed.any() else 0.0
 
     @property
     def positions(self) -> Array:

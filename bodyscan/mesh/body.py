@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from bodyscan.arrays import Array, Bytes, Floats, Indices, Mask
-from bodyscan.mesh.topology import drop_unused_vertices, face_areas, label_components
+from bodyscan.mesh.topology import compute_face_areas, drop_unused_vertices, label_components
 
 UNSURE, SKIN, HAIR, DARK_CLOTH = range(4)
 REGION_NAMES = ("unsure", "skin", "hair", "dark cloth")
@@ -94,7 +94,7 @@ class BodyMesh:
     @cached_property
     def filled_share(self) -> float:
         """Share of the surface's area that was filled."""
-        area = face_areas(self.vertices, self.faces)
+        area = compute_face_areas(self.vertices, self.faces)
         return float(area[self.filled].sum() / area.sum()) if area.any() else 0.0
 
     def at_mean_breath(self, sigmas: float = 0.0) -> BodyMesh:
@@ -158,7 +158,7 @@ def find_filled_patches(mesh: BodyMesh) -> list[FilledPatch]:
     if not len(filled):
         return []
     patch = label_components(filled, len(mesh.vertices))
-    area = face_areas(mesh.vertices, filled)
+    area = compute_face_areas(mesh.vertices, filled)
     total = np.bincount(patch, area)
     weighted = mesh.vertices[filled].mean(axis=1) * area[:, None]
     centre = np.stack([np.bincount(patch, column) / total for column in weighted.T], axis=1)

@@ -15,7 +15,7 @@ Numbers = NDArray[np.int32]
 
 
 @compiled
-def nearest_faces(pixels: Floats, faces: Indices, height: int, width: int) -> Numbers:
+def find_nearest_faces(pixels: Floats, faces: Indices, height: int, width: int) -> Numbers:
     """Find the index (height, width) of the nearest face at each pixel, -1 where there is none.
 
     pixels: (V, 3) column, row, depth of vertices; NaN for those behind the camera.
@@ -45,7 +45,7 @@ def nearest_faces(pixels: Floats, faces: Indices, height: int, width: int) -> Nu
 
 
 @compiled
-def nearest_points(pixels: Floats, size: int, height: int, width: int) -> Numbers:
+def find_nearest_points(pixels: Floats, size: int, height: int, width: int) -> Numbers:
     """Find the index (height, width) of the nearest point at each pixel, -1 where there is none.
 
     pixels: (N, 3) column, row, depth.

@@ -39,7 +39,7 @@ Layout = dict[str, tuple[str, ...]]
 """Properties of each element, in the order of the file."""
 
 
-def _layout(what: str, *, breath: bool = False, regions: bool = False) -> Layout:
+def _make_layout(what: str, *, breath: bool = False, regions: bool = False) -> Layout:
     """The layout of a cloud or a mesh, with or without displacements to mean breath and regions."""
     known = ("region",) if regions else ()
     vertex = (*_COLUMNS["positions"], *_COLUMNS["normals"], *_COLUMNS["colours"], "sigma_mm")
@@ -71,11 +71,13 @@ def write_ply(path: Path, body: BodyCloud | BodyMesh, up: str = "z") -> None:
         "colours": body.colours.T,
     }
     if isinstance(body, BodyCloud):
-        layout = _layout("cloud", regions=body.regions is not None)
+        layout = _make_layout("cloud", regions=body.regions is not None)
         vertices: dict[str, Any] = {"pairs_seen": body.pairs_seen}
         parts["positions"] = lay_axes(body.points, up).T
     else:
-        layout = _layout("mesh", breath=body.breath is not None, regions=body.regions is not None)
+        layout = _make_layout(
+            "mesh", breath=body.breath is not None, regions=body.regions is not None
+        )
         vertices, parts["positions"] = {}, lay_axes(body.vertices, up).T
         if body.breath is not None:
             parts["breath"] = np.stack([body.breath.mm, body.breath.sigma_mm])
@@ -90,11 +92,11 @@ def write_ply(path: Path, body: BodyCloud | BodyMesh, up: str = "z") -> None:
         columns.append(faces)
     records = []
     for names, values in zip(layout.values(), columns, strict=True):
-        records.append(np.empty(len(values[names[0]]), _fields(names)))
+        records.append(np.empty(len(values[names[0]]), _list_fields(names)))
         for name in names:
             records[-1][name] = values[name]
     with atomic_replacement(Path(path)) as temporary, temporary.open("wb") as stream:
-        stream.write(_header(layout, [len(rows) for rows in records], up))
+        stream.write(_make_header(layout, [len(rows) for rows in records], up))
         for rows in records:
             stream.write(rows.data)
 
@@ -102,7 +104,7 @@ def write_ply(path: Path, body: BodyCloud | BodyMesh, up: str = "z") -> None:
 def read_ply_cloud(path: Path) -> BodyCloud:
     """Read a cloud that `write_ply` wrote. Raises ResultError if the file is not one."""
     (vertices,) = _read(Path(path), "cloud")
-    regions = _regions(vertices, path)
+    regions = _read_regions(vertices, path)
     return BodyCloud(*_split_vertices(vertices), vertices["pairs_seen"].copy(), regions)
 
 
@@ -117,11 +119,11 @@ def read_ply_mesh(path: Path) -> BodyMesh:
     breath = None
     if "breath_mm" in (vertices.dtype.names or ()):
         breath = BreathAt(vertices["breath_mm"].copy(), vertices["breath_sigma_mm"].copy())
-    filled, regions = faces["filled"] != 0, _regions(vertices, path)
+    filled, regions = faces["filled"] != 0, _read_regions(vertices, path)
     return BodyMesh(points, corners, normals, colours, sigma_mm, filled, breath, regions)
 
 
-def _regions(vertices: Records, path: Path) -> Bytes | None:
+def _read_regions(vertices: Records, path: Path) -> Bytes | None:
     """Regions (V,), None in a file that was written before there were any."""
     if "region" not in (vertices.dtype.names or ()):
         return None
@@ -139,11 +141,11 @@ def _split_vertices(records: Records) -> tuple[Array, Floats, Floats, Bytes]:
     return columns("positions"), columns("normals"), sigma_mm, columns("colours")
 
 
-def _fields(names: Sequence[str]) -> np.dtype[Any]:
+def _list_fields(names: Sequence[str]) -> np.dtype[Any]:
     return np.dtype([(name, _TYPES[name][0]) for name in names])
 
 
-def _header(layout: Layout, counts: Sequence[int], up: str = "z") -> bytes:
+def _make_header(layout: Layout, counts: Sequence[int], up: str = "z") -> bytes:
     lines = ["ply", "format binary_little_endian 1.0", f"comment {describe_axes(up)}"]
     for (element, names), count in zip(layout.items(), counts, strict=False):
         lines += [f"element {element} {count}"]
@@ -161,9 +163,9 @@ def _read(path: Path, what: str) -> list[Records]:
     lines = _strip_comments(data[:start])
     counts = [int(line.split()[-1]) for line in lines if re.fullmatch(rb"element \w+ \d+", line)]
     states = product((False, True), repeat=2)
-    known = [_layout(what, breath=breath, regions=regions) for breath, regions in states]
-    layout = next((one for one in known if lines == _strip_comments(_header(one, counts))), {})
-    fields = [_fields(names) for names in layout.values()]
+    known = [_make_layout(what, breath=breath, regions=regions) for breath, regions in states]
+    layout = next((one for one in known if lines == _strip_comments(_make_header(one, counts))), {})
+    fields = [_list_fields(names) for names in layout.values()]
     sizes = [n * each.itemsize for n, each in zip(counts, fields, strict=False)]
     if not layout or len(data) != start + sum(sizes):
         raise ResultError(

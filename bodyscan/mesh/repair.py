@@ -14,16 +14,16 @@ from bodyscan.mesh.body import BodyMesh
 from bodyscan.mesh.topology import (
     RIM,
     UNSOUND,
+    compute_signed_volume,
     compute_topology,
+    compute_vertex_normals,
     connect,
-    directed_edges,
     drop_unused_vertices,
     find_twins,
+    find_used_vertices,
     label_components,
     label_corner_fans,
-    signed_volume,
-    used_vertices,
-    vertex_normals,
+    list_directed_edges,
 )
 from bodyscan.progress import THREADS
 
@@ -74,11 +74,11 @@ def extract_largest_piece(
     if points is not None and labels.any():
         of_vertex = np.empty(len(vertices), labels.dtype)
         of_vertex[faces] = labels[:, None]
-        used = used_vertices(faces, len(vertices))
+        used = find_used_vertices(faces, len(vertices))
         votes = of_vertex[used[cKDTree(vertices[used]).query(points)[1]]]
     largest = faces[labels == np.argmax(np.bincount(votes))]
     vertices, faces, _ = drop_unused_vertices(vertices, largest)
-    return vertices, faces if signed_volume(vertices, faces) > 0 else faces[:, ::-1].copy()
+    return vertices, faces if compute_signed_volume(vertices, faces) > 0 else faces[:, ::-1].copy()
 
 
 def collapse_slivers(mesh: BodyMesh) -> BodyMesh:
@@ -86,7 +86,7 @@ def collapse_slivers(mesh: BodyMesh) -> BodyMesh:
 
     Faces without area trip up other programs. Four decimals of a mm are written: far below sigmas.
     """
-    written, edges = np.round(mesh.vertices, 4), directed_edges(mesh.faces)
+    written, edges = np.round(mesh.vertices, 4), list_directed_edges(mesh.faces)
     edges = edges[(written[edges[:, 0]] == written[edges[:, 1]]).all(axis=1)]
     if not len(edges):
         return mesh
@@ -121,4 +121,4 @@ def decimate(mesh: BodyMesh, *, faces: int = 50_000) -> BodyMesh:
     nearest = np.asarray(cKDTree(mesh.vertices).query(vertices, workers=THREADS)[1])
     filled = np.any(np.isnan(mesh.sigma_mm)[nearest[corners]], axis=1)
     small = mesh.part(vertices, corners, nearest, filled)
-    return replace(small, normals=vertex_normals(vertices, corners))
+    return replace(small, normals=compute_vertex_normals(vertices, corners))

@@ -76,7 +76,7 @@ class Loop:
     @property
     def tape_mm(self) -> float:
         """Girth as a tape measures it, straight across hollows: the convex hull's perimeter."""
-        return hull_perimeter(self.segments[:, 0])
+        return compute_hull_perimeter(self.segments[:, 0])
 
     @cached_property
     def area_mm2(self) -> float:
@@ -98,7 +98,7 @@ class Loop:
         return float(self.lengths[self.measured].sum() / max(self.girth_mm, 1e-12))
 
 
-def hull_perimeter(points: Array) -> float:
+def compute_hull_perimeter(points: Array) -> float:
     """Compute the perimeter of the convex hull of points (N, 2)."""
     try:
         return float(ConvexHull(points).area)
@@ -113,13 +113,13 @@ def split_runs(loop: Loop, min_gap_mm: float = 15.0) -> tuple[Mask, list[Indices
         0.5 mm shorter than the curve.
     """
     measured = loop.measured.copy()
-    for run in _runs(measured):
+    for run in _split_equal_runs(measured):
         measured[run] |= loop.lengths[run].sum() < min_gap_mm
-    runs = _runs(measured)
+    runs = _split_equal_runs(measured)
     return np.array([measured[run[0]] for run in runs]), runs
 
 
-def _runs(labels: Indices | Mask) -> list[Indices]:
+def _split_equal_runs(labels: Indices | Mask) -> list[Indices]:
     """Indices of each stretch of equal labels (N,) around a closed curve, in order."""
     begins = np.flatnonzero(labels != np.roll(labels, 1))
     if not begins.size:

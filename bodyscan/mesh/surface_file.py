@@ -9,7 +9,12 @@ import numpy as np
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.errors import BadInput
-from bodyscan.mesh.topology import check_manifold, drop_unused_vertices, find_fault, signed_volume
+from bodyscan.mesh.topology import (
+    check_manifold,
+    compute_signed_volume,
+    drop_unused_vertices,
+    find_fault,
+)
 from bodyscan.outcome import Outcome
 
 UNITS_MM = {"millimetres": 1.0, "centimetres": 10.0, "inches": 25.4, "feet": 304.8, "metres": 1e3}
@@ -99,7 +104,7 @@ def _mend(vertices: Array, faces: Indices) -> tuple[Array, Indices, list[str]]:
     if len(vertices) < count:
         notes.append(f"removed {count - len(vertices)} unreferenced vertices")
     closed, _ = check_manifold(faces, len(vertices))
-    if closed and signed_volume(vertices - vertices.mean(axis=0), faces) < 0.0:
+    if closed and compute_signed_volume(vertices - vertices.mean(axis=0), faces) < 0.0:
         notes.append("faces pointed inwards: flipped")
         faces = np.ascontiguousarray(faces[:, ::-1])
     return vertices, faces, notes

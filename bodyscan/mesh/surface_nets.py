@@ -93,7 +93,7 @@ def tabulate_sheets() -> tuple[NDArray[np.int8], NDArray[np.int8]]:
     for case in range(256):
         neighbours = defaultdict[int, list[int]](list)
         for axis, side in product(range(3), range(2)):
-            for one, other in _links(case, axis, side):
+            for one, other in _find_links(case, axis, side):
                 neighbours[one].append(other)
                 neighbours[other].append(one)
         for first in sorted(neighbours):
@@ -108,7 +108,7 @@ def tabulate_sheets() -> tuple[NDArray[np.int8], NDArray[np.int8]]:
     return sheets, counts
 
 
-def _links(case: int, axis: int, side: int) -> list[tuple[int, int]]:
+def _find_links(case: int, axis: int, side: int) -> list[tuple[int, int]]:
     """Find pairs of edges that the surface joins across one face of a cell."""
     b, c = (axis + 1) % 3, (axis + 2) % 3
     around = [(0, 0), (1, 0), (1, 1), (0, 1)]
@@ -251,7 +251,7 @@ def _make_faces(
                     cell[0], cell[1], cell[2] = i, j, k
                     cell[(axis + 1) % 3] -= p
                     cell[(axis + 2) % 3] -= q
-                    corners[turn] = _vertex(
+                    corners[turn] = _find_vertex(
                         table, indices[brick], cell, cases, first, sheets, 4 * axis + p + 2 * q
                     )
                     whole &= corners[turn] >= 0
@@ -273,7 +273,7 @@ def _make_faces(
 
 
 @compiled
-def _vertex(
+def _find_vertex(
     table: Numbers,
     index: Numbers,
     cell: Indices,

@@ -74,24 +74,28 @@ class Topology:
 
 def compute_topology(vertices: Array, faces: Indices) -> Topology:
     """Compute the topology of vertices (V, 3) and faces (F, 3); unused vertices do not count."""
-    used, count = used_vertices(faces, len(vertices)), len(vertices)
+    used, count = find_used_vertices(faces, len(vertices)), len(vertices)
     closed, manifold = check_manifold(faces, count)
     edge_count = 3 * len(faces) // 2
     if not closed:
-        edge_count = len(np.unique(np.sort(directed_edges(faces), axis=1) @ [count, 1]))
+        edge_count = len(np.unique(np.sort(list_directed_edges(faces), axis=1) @ [count, 1]))
     labels = label_components(faces, count)
     components, euler = int(labels.max(initial=-1)) + 1, used.size - edge_count + len(faces)
-    return Topology(closed, manifold, components, int(euler), signed_volume(vertices, faces))
+    return Topology(
+        closed, manifold, components, int(euler), compute_signed_volume(vertices, faces)
+    )
 
 
 def check_manifold(faces: Indices, vertex_count: int) -> tuple[bool, bool]:
     """Compute the `closed` and `manifold` of `Topology` for faces (F, 3), without the rest."""
     twin = find_twins(faces, vertex_count)
     closed = bool(faces.size) and bool((twin >= 0).all())
-    return closed, closed and label_corner_fans(twin)[1] == used_vertices(faces, vertex_count).size
+    return closed, closed and label_corner_fans(twin)[1] == find_used_vertices(
+        faces, vertex_count
+    ).size
 
 
-def directed_edges(faces: Indices) -> Indices:
+def list_directed_edges(faces: Indices) -> Indices:
     """List edges (3 F, 2): edge k of face f, at k * F + f, runs from its corner k to the next."""
     return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
 
@@ -108,24 +112,24 @@ def connect(edges: Indices, count: int) -> tuple[int, NDArray[np.int32]]:
 
 def label_components(faces: Indices, vertex_count: int) -> NDArray[np.int32]:
     """Label (F,) each face with the number, from 0, of its connected component."""
-    count, labels = connect(directed_edges(faces), vertex_count)
+    count, labels = connect(list_directed_edges(faces), vertex_count)
     label = labels[faces[:, 0]]
     number = np.cumsum(np.bincount(label, minlength=count) > 0, dtype=np.int32) - 1
     return number[label]
 
 
-def signed_volume(vertices: Array, faces: Indices) -> float:
+def compute_signed_volume(vertices: Array, faces: Indices) -> float:
     """Compute the volume inside a closed mesh, mm^3; negative if its faces are oriented inwards."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     return float(np.einsum("fc,fc->", a, np.cross(b, c)) / 6.0)
 
 
-def face_areas(vertices: Array, faces: Indices) -> Array:
+def compute_face_areas(vertices: Array, faces: Indices) -> Array:
     """Compute the areas (F,) mm^2 of faces (F, 3)."""
-    return 0.5 * np.linalg.norm(face_normals(vertices, faces), axis=1)
+    return 0.5 * np.linalg.norm(compute_face_normals(vertices, faces), axis=1)
 
 
-def face_normals(vertices: Array, faces: Indices) -> Array:
+def compute_face_normals(vertices: Array, faces: Indices) -> Array:
     """Compute the normals (F, 3) of faces (F, 3), twice as long as their areas."""
     x, y, z = np.ascontiguousarray(vertices.T)
     a, b, c = faces.T
@@ -133,9 +137,9 @@ def face_normals(vertices: Array, faces: Indices) -> Array:
     return np.stack([uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx], axis=1)
 
 
-def vertex_normals(vertices: Array, faces: Indices) -> Floats:
+def compute_vertex_normals(vertices: Array, faces: Indices) -> Floats:
     """Compute unit normals (V, 3), the area-weighted mean of the faces around each vertex."""
-    cross = face_normals(vertices, faces)
+    cross = compute_face_normals(vertices, faces)
     corners, count = faces.ravel(), len(vertices)
     total = np.stack([np.bincount(corners, np.repeat(n, 3), count) for n in cross.T], axis=-1)
     length = np.linalg.norm(total, axis=-1, keepdims=True)
@@ -144,13 +148,13 @@ def vertex_normals(vertices: Array, faces: Indices) -> Floats:
 
 def drop_unused_vertices(vertices: Array, faces: Indices) -> tuple[Array, Indices, Indices]:
     """Drop vertices that no face uses: vertices (U, 3), faces renumbered, old indices (U,)."""
-    used = used_vertices(faces, len(vertices))
+    used = find_used_vertices(faces, len(vertices))
     number = np.full(len(vertices), -1, np.int64)
     number[used] = np.arange(used.size)
     return vertices[used], number[faces], used
 
 
-def used_vertices(faces: Indices, count: int) -> Indices:
+def find_used_vertices(faces: Indices, count: int) -> Indices:
     """Find the indices of the vertices (of `count`) that faces use, ascending."""
     used = np.zeros(count, bool)
     used[faces] = True

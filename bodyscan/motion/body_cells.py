@@ -41,12 +41,12 @@ class BodyCells:
         centres, mean_normals, cell = _average_in_cubes(points, normals, CELL_MM, 5)
         graph = _build_graph(centres, mean_normals, points[::4])
         landmarks = pick_one_per_cube(centres, 110.0)
-        distances = _geodesic_distances(graph, landmarks)
+        distances = _compute_geodesic_distances(graph, landmarks)
         return BodyCells(centres, mean_normals, graph, landmarks, distances), cell
 
     def distances(self, starts: Indices) -> Array:
         """Geodesic distances from cells (N,) to all cells, (N, C) mm."""
-        return _geodesic_distances(self.graph, starts)
+        return _compute_geodesic_distances(self.graph, starts)
 
     def find(self, points: Array, normals: Array) -> Indices:
         """Nearest cell (N,) of points (N, 3) with normals (N, 3), by position and orientation."""
@@ -97,7 +97,7 @@ class BodyCells:
         ]
 
 
-def rigid_fields(cells: BodyCells, centre: Array, lever_mm: float) -> Array:
+def build_rigid_fields(cells: BodyCells, centre: Array, lever_mm: float) -> Array:
     """Fields (C, 12, 6) of rotations by 1 / lever_mm about a centre and translations by 1 mm.
 
     A field holds, for each cell, the displacement (3,) of its centre, then the displacement's
@@ -126,7 +126,7 @@ def evaluate_field(field: Array, offsets: Array) -> Array:
     return field[:, :3] + np.einsum("nki,nk->ni", gradients, offsets)
 
 
-def field_in_camera(field: Array, rig_from_camera: RigidTransform) -> Array:
+def express_in_camera(field: Array, rig_from_camera: RigidTransform) -> Array:
     """Express a field (C, 12) of the rig frame in the camera frame."""
     rotation = rig_from_camera.rotation
     rotated = field.reshape(-1, 4, 3) @ rotation
@@ -143,7 +143,7 @@ def pick_one_per_cube(centres: Array, size_mm: float) -> Indices:
     return np.sort(order[np.unique(key[order], return_index=True)[1]])
 
 
-def _geodesic_distances(graph: sparse.csr_array, starts: Indices) -> Array:
+def _compute_geodesic_distances(graph: sparse.csr_array, starts: Indices) -> Array:
     # Each edge is stored in both directions: undirected, each would be tried twice.
     return np.asarray(dijkstra(graph, directed=True, indices=starts.astype(np.int32)))
 
@@ -187,7 +187,7 @@ def _build_graph(centres: Array, normals: Array, points: Array) -> sparse.csr_ar
         edges = edges[cKDTree(points).query(midpoints)[0] < 15.0]
         edges = np.concatenate([edges, opposite.result()])
     while True:
-        graph = _weighted_graph(centres, edges)
+        graph = _build_weighted_graph(centres, edges)
         label = connected_components(graph, directed=False)[1].astype(np.int64)
         sizes = np.bincount(label)
         if len(sizes) == 1:
@@ -199,7 +199,7 @@ def _build_graph(centres: Array, normals: Array, points: Array) -> sparse.csr_ar
         edges = np.concatenate([edges, [bridge]])
 
 
-def _weighted_graph(centres: Array, edges: Indices) -> sparse.csr_array:
+def _build_weighted_graph(centres: Array, edges: Indices) -> sparse.csr_array:
     """Symmetric graph (C, C) with the lengths of edges (N, 2), mm."""
     edges = np.unique(np.sort(edges, axis=1), axis=0)
     length = np.linalg.norm(centres[edges[:, 0]] - centres[edges[:, 1]], axis=1)

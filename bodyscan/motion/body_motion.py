@@ -319,9 +319,11 @@ class BodyMotion:
         return replace(self, kinds=tuple(kinds))
 
 
-def shape_sigmas(motion: BodyMotion, cells: BodyCells, observed: Mask) -> tuple[Array, Array]:
+def compute_shape_sigmas(
+    motion: BodyMotion, cells: BodyCells, observed: Mask
+) -> tuple[Array, Array]:
     """Standard deviations (C,) mm of the shape along the normals, without motions of the whole; and
-    those of `girth_sigmas`.
+    those of `compute_girth_sigmas`.
 
     observed: which pairs measured which cells, (P, C).
 
@@ -343,14 +345,14 @@ def shape_sigmas(motion: BodyMotion, cells: BodyCells, observed: Mask) -> tuple[
     shape = len(views), len(mark)
     means = sparse.csr_array((1.0 / views[mark], (mark, np.arange(len(mark)))), shape=shape) @ rows
     errors = means @ np.linalg.cholesky(motion.covariance)
-    girth = girth_sigmas(errors, cells.centres[cells.landmarks, 2], 60.0)
+    girth = compute_girth_sigmas(errors, cells.centres[cells.landmarks, 2], 60.0)
     variances = np.stack([np.sum(errors**2, axis=1), girth**2])
     kernel = np.exp(-0.5 * (cells.landmark_distances / 60.0) ** 2) * (views > 0)[:, None]
     sigma, girth = np.sqrt(variances @ kernel / np.maximum(kernel.sum(axis=0), 1e-12))
     return sigma, girth
 
 
-def girth_sigmas(errors: Array, height: Array, near_mm: float = 20.0) -> Array:
+def compute_girth_sigmas(errors: Array, height: Array, near_mm: float = 20.0) -> Array:
     """Standard deviations (C,) mm of displacements with factor errors (C, n), as they affect a girth.
 
     Only what cells within `near_mm` of height (C,) mm share changes a girth.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from bodyscan.arrays import Array, Indices
-from bodyscan.motion.body_cells import BodyCells, modulate_fields, rigid_fields
+from bodyscan.motion.body_cells import BodyCells, build_rigid_fields, modulate_fields
 
 PARTS = ("trunk", "head", "left arm", "right arm", "left leg", "right leg")
 LEGS = PARTS[-2:]
@@ -21,7 +21,7 @@ def name_parts(cells: BodyCells) -> Indices:
     stature = float(cells.centres[:, 2].max())
     height = cells.centres[:, 2] / stature
     offsets = cells.centres[:, :2] - np.median(cells.centres[:, :2], axis=0)
-    sideways = offsets @ leftward(cells) / stature
+    sideways = offsets @ find_leftward(cells) / stature
     part = np.where(height > NECK, PARTS.index("head"), PARTS.index("trunk"))
     part[height < CROTCH] = PARTS.index("right leg")
     part[(height < CROTCH) & (sideways > 0.0)] = PARTS.index("left leg")
@@ -44,11 +44,11 @@ def find_navel(cells: BodyCells) -> int:
     """The cell at a navel's height next to the middle of the body."""
     stature = float(cells.centres[:, 2].max())
     offsets = cells.centres[:, :2] - np.median(cells.centres[:, :2], axis=0)
-    aside = np.abs(offsets @ leftward(cells)) / stature
+    aside = np.abs(offsets @ find_leftward(cells)) / stature
     return int(np.argmin(np.abs(cells.centres[:, 2] / stature - 0.6) + aside))
 
 
-def ankles(cells: BodyCells) -> Array:
+def find_ankles(cells: BodyCells) -> Array:
     """Midpoint of the ankles, (3,) mm; below the middle of the body if no shin was measured."""
     stature = float(cells.centres[:, 2].max())
     shins = cells.centres[:, 2] < SHIN * stature
@@ -56,13 +56,13 @@ def ankles(cells: BodyCells) -> Array:
     return np.append(low[:, :2].mean(axis=0), ANKLE * stature)
 
 
-def weight_above_feet(cells: BodyCells) -> Array:
+def weigh_above_feet(cells: BodyCells) -> Array:
     """Weight (C,) of each cell: 0 in the feet, 1 above the ankles."""
     height = cells.centres[:, 2] / cells.centres[:, 2].max()
     return np.clip((height - FOOT) / (ANKLE - FOOT), 0.0, 1.0)
 
 
-def leftward(cells: BodyCells) -> Array:
+def find_leftward(cells: BodyCells) -> Array:
     """Unit vector (2,) to the subject's left, from the direction of the toes, or else the rig's x."""
     height = cells.centres[:, 2] / cells.centres[:, 2].max()
     feet, shins = height < FOOT, (height > ANKLE) & (height < SHIN)
@@ -74,7 +74,7 @@ def leftward(cells: BodyCells) -> Array:
     return np.array([-forward[1], forward[0]])
 
 
-def limb_weights(cells: BodyCells) -> dict[str, Array]:
+def compute_limb_weights(cells: BodyCells) -> dict[str, Array]:
     """Share (C,) with which each cell follows each of LIMBS: 1 on it, 0 on the trunk.
 
     It fades over 60 mm, the width of a neck's or shoulder's border. Forearms follow their arms too.
@@ -93,15 +93,15 @@ def limb_weights(cells: BodyCells) -> dict[str, Array]:
     return {limb: np.minimum((marks @ kernel) / total, 1.0) for limb, marks in members.items()}
 
 
-def limb_fields(cells: BodyCells, lever_mm: float) -> dict[str, Array]:
+def build_limb_fields(cells: BodyCells, lever_mm: float) -> dict[str, Array]:
     """Displacement fields (C, 12, 3) of each limb's rotation about its joint.
 
     The joint is the middle of the limb's border; limbs that were not measured have zero fields.
     """
     fields = {}
-    for limb, weight in limb_weights(cells).items():
+    for limb, weight in compute_limb_weights(cells).items():
         border = weight * (1.0 - weight)
         joint = border @ cells.centres / max(border.sum(), 1e-12)
-        rotations = rigid_fields(cells, joint, lever_mm)[..., :3]
+        rotations = build_rigid_fields(cells, joint, lever_mm)[..., :3]
         fields[limb] = modulate_fields(rotations, cells, weight[:, None])
     return fields

@@ -11,8 +11,13 @@ from scipy.special import log_ndtr
 
 from bodyscan.arrays import Array
 from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
-from bodyscan.motion.body_cells import BodyCells, modulate_fields, pick_one_per_cube, rigid_fields
-from bodyscan.motion.body_parts import PARTS, leftward, name_parts
+from bodyscan.motion.body_cells import (
+    BodyCells,
+    build_rigid_fields,
+    modulate_fields,
+    pick_one_per_cube,
+)
+from bodyscan.motion.body_parts import PARTS, find_leftward, name_parts
 from bodyscan.motion.temporal_modes import Breaths
 
 SIZES_MM = np.array([0.7, 1.0, 1.4, 2.0, 2.8])
@@ -23,21 +28,21 @@ COMMON = 3
 forward, lower ones mostly sideways."""
 
 
-def breath_fields(cells: BodyCells) -> Array:
+def build_breath_fields(cells: BodyCells) -> Array:
     """Displacement fields (C, 12, M): of the trunk as one, of chest against belly, in width
     alone, and of places forward and sideways.
 
     A breast, or the edge of the ribs, goes where the chest goes, whichever way its skin faces: the
     forward displacement is smoother than that along the normals. The fields are zero elsewhere.
     """
-    axes = _level_axes(cells)
-    level = rigid_fields(cells, np.zeros(3), 1.0)[..., 3:5] @ axes
+    axes = _find_level_axes(cells)
+    level = build_rigid_fields(cells, np.zeros(3), 1.0)[..., 3:5] @ axes
     both = []
     # They meet between the navel and the end of the sternum.
     chest = _smoothstep(cells.centres[:, 2:] / cells.centres[:, 2].max(), 0.60, 0.68)
-    for k, shape in enumerate(_mean_shape(cells, axes).T[..., None]):
+    for k, shape in enumerate(_evaluate_mean_shape(cells, axes).T[..., None]):
         wider = k * shape / 0.3
-        local = _local_functions(cells.centres, shape)
+        local = _factor_local_covariance(cells.centres, shape)
         # By 0.35 of the front's common displacement; chest and belly breathe independently (Konno and
         # Mead 1967): standing, the chest has 0.5 to 0.8 of a breath (Sharp et al. 1975, J. Appl.
         # Physiol. 39), 1 to 4 times the belly's.
@@ -47,7 +52,7 @@ def breath_fields(cells: BodyCells) -> Array:
     return np.concatenate([common, *(fields[..., COMMON:] for fields in both)], axis=2)
 
 
-def _local_functions(centres: Array, shape: Array) -> Array:
+def _factor_local_covariance(centres: Array, shape: Array) -> Array:
     """Low-rank factor (C, M) of a squared-exponential covariance of cells (C, 3), times shape (C, 1).
 
     The length is 80 mm: a breast, the side of a chest. A trunk's front is far from its back in a
@@ -137,14 +142,14 @@ def estimate_breath(
     )
 
 
-def breath_along_normals(cells: BodyCells) -> Array:
+def project_breath_on_normals(cells: BodyCells) -> Array:
     """Displacement (C,) along the normals by a breath that moves the trunk's front by 1 mm."""
-    axes = _level_axes(cells)
-    displacement = _mean_shape(cells, axes) @ axes.T
+    axes = _find_level_axes(cells)
+    displacement = _evaluate_mean_shape(cells, axes) @ axes.T
     return np.asarray(np.sum(displacement * cells.normals[:, :2], axis=1))
 
 
-def _mean_shape(cells: BodyCells, axes: Array) -> Array:
+def _evaluate_mean_shape(cells: BodyCells, axes: Array) -> Array:
     """Displacement (C, 2) along `axes` (forward, leftward) by a breath of 1 mm at the trunk's front.
 
     Ribs turn about the spine and a belly swells in front of it: displacement grows linearly with the
@@ -168,9 +173,9 @@ def _mean_shape(cells: BodyCells, axes: Array) -> Array:
     return weight[:, None] * np.stack([forward, 0.3 * sideways], axis=1)
 
 
-def _level_axes(cells: BodyCells) -> Array:
+def _find_level_axes(cells: BodyCells) -> Array:
     """Unit vectors forward and to the left of the subject, as columns, (2, 2)."""
-    left = leftward(cells)
+    left = find_leftward(cells)
     return np.array([[left[1], left[0]], [-left[0], left[1]]])
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodyscan.alignment.matching import Matches
-from bodyscan.alignment.overlaps import cauchy_weights
+from bodyscan.alignment.overlaps import weigh_by_cauchy
 from bodyscan.arrays import Array, Indices
 from bodyscan.compiled import compiled
 from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
@@ -36,7 +36,7 @@ class CellEquations:
             number,
             (matches.points - centres[cell], matches.normals),
             matches.distances,
-            cauchy_weights(matches),
+            weigh_by_cauchy(matches),
             (information, gradient),
         )
         information += np.swapaxes(np.tril(information, -1), 1, 2)

@@ -19,15 +19,15 @@ from bodyscan.alignment.icp import Alignment
 from bodyscan.alignment.matching import Matches, SampledPoints
 from bodyscan.alignment.overlaps import COARSE, OverlapPoints, map_overlaps, match_overlap
 from bodyscan.alignment.pose_evidence import MIN_LOG_RATIO, PoseEvidence, PostureStep
-from bodyscan.alignment.sway_prior import SwayPrior, centre_shifts
+from bodyscan.alignment.sway_prior import SwayPrior, compute_centre_shifts
 from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
-from bodyscan.geometry.robust import rms, rms_length
+from bodyscan.geometry.robust import compute_rms_length, rms
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.mesh.body import BodyMesh, BreathAt
 from bodyscan.motion.body_cells import BodyCells, evaluate_field
-from bodyscan.motion.body_motion import BodyMotion, girth_sigmas, shape_sigmas
+from bodyscan.motion.body_motion import BodyMotion, compute_girth_sigmas, compute_shape_sigmas
 from bodyscan.motion.body_parts import LIMBS
 from bodyscan.motion.cell_equations import CellEquations
 from bodyscan.progress import map_threads
@@ -95,7 +95,7 @@ class EstimatedMotion:
     def significant(self) -> bool:
         """Whether the motion is larger than its own error; if not, the object is taken as still."""
         seen = self.observed.any(axis=0)
-        return rms_length(self.displacements[self.observed]) >= rms(self.sigma_mm[seen])
+        return compute_rms_length(self.displacements[self.observed]) >= rms(self.sigma_mm[seen])
 
     def add_breath(self, surface: BodyMesh) -> BodyMesh:
         """Attach each vertex's displacement to mean breath, where it is known."""
@@ -186,7 +186,7 @@ def estimate_motion(
     found = _describe_motion(images, motion, cells, observed)
     if still or not found.significant:
         return aligned, None, evidence
-    times = solution.fit_times(seconds, 1e-3 * (_middle_of_scan(images) or 0.0))
+    times = solution.fit_times(seconds, 1e-3 * (_find_middle_of_scan(images) or 0.0))
     found = _add_step(found, motion, step) if step else found
     return moved, replace(found, times=times), evidence
 
@@ -196,8 +196,8 @@ def _describe_motion(
 ) -> EstimatedMotion:
     """Displacements, mm, from each pair's moment to the middle of the scan, with the sigmas of what
     is left in shape and girth, and the offset to mean breath."""
-    moment_ms = _middle_of_scan(images)
-    sigma_mm, girth_sigma_mm = shape_sigmas(motion, cells, observed)
+    moment_ms = _find_middle_of_scan(images)
+    sigma_mm, girth_sigma_mm = compute_shape_sigmas(motion, cells, observed)
     warps = motion.non_rigid(from_middle=True)
     return EstimatedMotion(
         cells,
@@ -206,7 +206,7 @@ def _describe_motion(
         observed,
         sigma_mm,
         moment_ms,
-        _offset_to_mean_breath(motion, cells, girth_sigma_mm, timed=moment_ms is not None),
+        _find_offset_to_mean_breath(motion, cells, girth_sigma_mm, timed=moment_ms is not None),
     )
 
 
@@ -221,7 +221,7 @@ def _add_step(found: EstimatedMotion, motion: BodyMotion, step: PostureStep) -> 
     return replace(found, breath=breath, step=displaced)
 
 
-def _middle_of_scan(images: Sequence[RangeImage]) -> float | None:
+def _find_middle_of_scan(images: Sequence[RangeImage]) -> float | None:
     """Midway between the first and the last frame, ms; None if no pair's moment is known."""
     ends = [i.span_ms or (i.time_ms, i.time_ms) for i in images if i.time_ms is not None]
     return 0.5 * (min(a for a, _ in ends) + max(b for _, b in ends)) if ends else None
@@ -307,17 +307,17 @@ def _begin(
     sway = np.repeat([np.radians(settings.sway_deg), settings.sway_mm], 3)
     boards = SwayPrior(0.0, 0.0, 0.0, 0.0).covariance([image.pair for image in images], prior)
     seconds = [None if image.time_ms is None else 1e-3 * image.time_ms for image in images]
-    middle_s = 1e-3 * (_middle_of_scan(images) or 0.0)
+    middle_s = 1e-3 * (_find_middle_of_scan(images) or 0.0)
     at_rest = BodyMotion.at_rest(cells, seconds, middle_s, boards, sway)
     if any(second is not None for second in seconds):
         return at_rest
-    ordered = _find_order(views, (at_rest, cells), _candidate_orders(sides), settings)
+    ordered = _find_order(views, (at_rest, cells), _propose_orders(sides), settings)
     if ordered is None:
         return at_rest
     return BodyMotion.at_rest(cells, ordered, 0.5 * max(ordered), boards, sway)
 
 
-def _candidate_orders(sides: Sequence[str]) -> list[list[float]]:
+def _propose_orders(sides: Sequence[str]) -> list[list[float]]:
     """Moments, s, at which pairs on these poles may have fired: one after another as the rig lists
     them, or so on each pole, all poles at once; 0.1 or 0.2 s apart."""
     numbers = list(range(len(sides))), [sides[:k].count(side) for k, side in enumerate(sides)]
@@ -375,13 +375,13 @@ def _solve(
         reach = max(reach / 2.0, settings.min_reach_mm)
         if remaining == ROUNDS - 1:
             # Calibrations warp surfaces by half of 0.1 mm; so little motion does no harm.
-            still = _rms_displacement(motion, NON_RIGID, observed) < 0.1
+            still = _compute_rms_displacement(motion, NON_RIGID, observed) < 0.1
             if still and _is_rigid_negligible(motion, observed, settings):
                 return _Solution(motion, reach, projected, negligible=True)
     return _Solution(motion, reach, projected)
 
 
-def _offset_to_mean_breath(
+def _find_offset_to_mean_breath(
     motion: BodyMotion, cells: BodyCells, girth_sigma_mm: Array, *, timed: bool
 ) -> BreathOffset:
     """At mean breath the temporal modes, which have zero mean, are zero.
@@ -397,7 +397,7 @@ def _offset_to_mean_breath(
         field = fields @ motion.breath.at_middle
         eigenvalues, eigenvectors = np.linalg.eigh(motion.breath.covariance)
         errors = errors @ (eigenvectors * np.sqrt(np.maximum(eigenvalues, 0.0)))
-    sigma_mm = girth_sigmas(errors, cells.centres[:, 2])
+    sigma_mm = compute_girth_sigmas(errors, cells.centres[:, 2])
     return BreathOffset(field, np.hypot(sigma_mm, girth_sigma_mm))
 
 
@@ -444,12 +444,12 @@ def _combine_directions(
 
 def _is_rigid_negligible(motion: BodyMotion, observed: Mask, settings: AlignmentSettings) -> bool:
     """Whether the whole body moved by less than the smallest sway that is assumed."""
-    return _rms_displacement(motion, RIGID, observed) < settings.min_sway * settings.sway_mm
+    return _compute_rms_displacement(motion, RIGID, observed) < settings.min_sway * settings.sway_mm
 
 
-def _rms_displacement(motion: BodyMotion, names: Sequence[str], observed: Mask) -> float:
+def _compute_rms_displacement(motion: BodyMotion, names: Sequence[str], observed: Mask) -> float:
     """RMS displacement by those kinds, mm."""
-    return rms_length(motion.displacements(names, from_middle=True)[observed][:, :3])
+    return compute_rms_length(motion.displacements(names, from_middle=True)[observed][:, :3])
 
 
 def _update_alignment(
@@ -461,7 +461,7 @@ def _update_alignment(
 ) -> Alignment:
     """Replace poses, displacements of the body's centre, and RMS distances of the overlaps."""
     twists = np.array([motion.twist(k, from_middle=True) for k in range(len(views))])
-    shift = np.linalg.norm(centre_shifts(twists), axis=1)
+    shift = np.linalg.norm(compute_centre_shifts(twists), axis=1)
     poses = [view.initial.retract(twist) for view, twist in zip(views, twists, strict=True)]
     rms_mm = {(names[i], names[j]): distance for (i, j), distance in distances.items()}
     return replace(

@@ -7,14 +7,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bodyscan.alignment.sway_prior import BODY_CENTRE, LEVER_MM, stance_correlation
+from bodyscan.alignment.sway_prior import BODY_CENTRE, LEVER_MM, correlate_stance
 from bodyscan.arrays import Array
 from bodyscan.geometry.linear_gaussian import invert_scaled
 from bodyscan.geometry.transforms import RigidTransform, adjoint
-from bodyscan.motion.body_cells import BodyCells, modulate_fields, rigid_fields
-from bodyscan.motion.body_parts import ankles, limb_fields, weight_above_feet
-from bodyscan.motion.breath import breath_fields
-from bodyscan.motion.temporal_modes import TemporalModes, breath_correlation
+from bodyscan.motion.body_cells import BodyCells, build_rigid_fields, modulate_fields
+from bodyscan.motion.body_parts import build_limb_fields, find_ankles, weigh_above_feet
+from bodyscan.motion.breath import build_breath_fields
+from bodyscan.motion.temporal_modes import TemporalModes, correlate_breath
 
 PART_MM = 250.0
 """Correlation length of free motion of parts: a forearm, half a thigh, a shoulder."""
@@ -25,7 +25,7 @@ class MotionKind:
     """One kind of motion: M displacement fields, each with amplitudes along J temporal modes."""
 
     name: str
-    fields: Array  # (C, 12, M) mm, see `rigid_fields`
+    fields: Array  # (C, 12, M) mm, see `build_rigid_fields`
     modes: TemporalModes
     size: float = 1.0  # prior standard deviation of the amplitudes
     # Prior information (M J, M J) of the amplitudes, instead of `size`.
@@ -61,23 +61,23 @@ def build_kinds(
     sway: standard deviations (6,) of a usual rotation (radians) and translation (mm) about the
         body's centre.
     """
-    stance = TemporalModes.from_correlation(stance_correlation, seconds, middle_s)
-    breathing = TemporalModes.from_correlation(breath_correlation, seconds, middle_s)
+    stance = TemporalModes.from_correlation(correlate_stance, seconds, middle_s)
+    breathing = TemporalModes.from_correlation(correlate_breath, seconds, middle_s)
     pairs = len(seconds)
     by_freedom = np.arange(6 * pairs).reshape(pairs, 6).T.ravel()
     constant = TemporalModes(np.eye(pairs), np.zeros(pairs))
-    pose = _whole_body("pose", cells, np.eye(6), constant)
+    pose = _build_whole_body("pose", cells, np.eye(6), constant)
     any_twist = adjoint(RigidTransform.from_translation(BODY_CENTRE)) * sway
-    translations = rigid_fields(cells, np.zeros(3), LEVER_MM)[:, :, 3:]
+    translations = build_rigid_fields(cells, np.zeros(3), LEVER_MM)[:, :, 3:]
     parts = modulate_fields(translations, cells, cells.covariance_factor(PART_MM, 0.02))
-    breath = MotionKind("breath", breath_fields(cells), breathing)
+    breath = MotionKind("breath", build_breath_fields(cells), breathing)
     return (
         replace(pose, precision=invert_scaled(boards)[np.ix_(by_freedom, by_freedom)]),
-        _lean(cells, stance),
-        _whole_body("sway", cells, any_twist, stance),
+        _build_lean(cells, stance),
+        _build_whole_body("sway", cells, any_twist, stance),
         *(
             MotionKind(name, field, stance, standing_size=2.0)
-            for name, field in limb_fields(cells, LEVER_MM).items()
+            for name, field in build_limb_fields(cells, LEVER_MM).items()
         ),
         MotionKind("parts", parts, stance),
         replace(breath, precision=np.eye(breath.count)),
@@ -91,8 +91,8 @@ def retime_kinds(
 
     No size in people who stand is assumed: who stands very still does so at any times.
     """
-    stance = TemporalModes.from_correlation(stance_correlation, seconds, middle_s)
-    breathing = TemporalModes.from_correlation(breath_correlation, seconds, middle_s)
+    stance = TemporalModes.from_correlation(correlate_stance, seconds, middle_s)
+    breathing = TemporalModes.from_correlation(correlate_breath, seconds, middle_s)
     retimed = []
     for kind in kinds:
         if kind.name in ("pose", "step"):
@@ -105,18 +105,20 @@ def retime_kinds(
     return tuple(retimed)
 
 
-def _whole_body(name: str, cells: BodyCells, twists: Array, modes: TemporalModes) -> MotionKind:
+def _build_whole_body(
+    name: str, cells: BodyCells, twists: Array, modes: TemporalModes
+) -> MotionKind:
     """A rigid motion of the whole body; twists: (6, M)."""
-    fields = rigid_fields(cells, np.zeros(3), 1.0) @ twists
+    fields = build_rigid_fields(cells, np.zeros(3), 1.0) @ twists
     return MotionKind(name, fields, modes, 2.0, twists=twists)
 
 
-def _lean(cells: BodyCells, modes: TemporalModes) -> MotionKind:
+def _build_lean(cells: BodyCells, modes: TemporalModes) -> MotionKind:
     """A lean about the ankles, as of an inverted pendulum (Winter 1995), and a turn; the feet stay.
 
     A unit of amplitude moves the middle of the body, 1 m above the ankles, by 1 mm.
     """
-    about_ankles = adjoint(RigidTransform.from_translation(ankles(cells)))[:, :3] / 1000.0
-    whole = _whole_body("lean", cells, about_ankles, modes)
-    fields = modulate_fields(whole.fields, cells, weight_above_feet(cells)[:, None])
+    about_ankles = adjoint(RigidTransform.from_translation(find_ankles(cells)))[:, :3] / 1000.0
+    whole = _build_whole_body("lean", cells, about_ankles, modes)
+    fields = modulate_fields(whole.fields, cells, weigh_above_feet(cells)[:, None])
     return replace(whole, fields=fields, remainder=fields - whole.fields)

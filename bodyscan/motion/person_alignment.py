@@ -10,9 +10,9 @@ import numpy as np
 from bodyscan.alignment.displaced_poles import (
     DisplacedPole,
     DisplacementSearch,
+    compute_motions_between,
     find_displaced_pole,
     free_pairs,
-    motions_between,
 )
 from bodyscan.alignment.icp import Alignment, align
 from bodyscan.alignment.pose_evidence import (
@@ -20,7 +20,7 @@ from bodyscan.alignment.pose_evidence import (
     Displacement,
     PostureStep,
     ScaleError,
-    common_basis,
+    build_common_basis,
     detect_displacement,
 )
 from bodyscan.arrays import Array
@@ -74,11 +74,10 @@ def align_person(
         alignment, motion, evidence = estimate_motion(
             images, rig_from_camera, aligned, boards, settings, poles, posture
         )
-        found: Displacement | None = None
-        if motion is None or evidence is None:
-            found = search.found
+        unknown = motion is None or evidence is None
+        found: Displacement | None = search.found if unknown else None
         if found is None and evidence is not None and common_error is None:
-            rival, known = motion.times.log_ratio if motion else 0.0, _pairs_of(displaced)
+            rival, known = motion.times.log_ratio if motion else 0.0, _collect_pairs(displaced)
             found = detect_displacement(evidence, rig_from_camera, poles, known, rival)
         warped = isinstance(common_error, CommonError)  # as by motion within moments
         if found is None and motion is not None and motion.times.factor != 1.0 and not warped:
@@ -90,26 +89,27 @@ def align_person(
                 # Offsets caused by a tracked head or arm are not pose errors.
                 again = _search(images, rig_from_camera, alignment, poles, displaced)
                 search = replace(search, offset_mm=again.offset_mm)
-            final = _measure_again(displaced, _connected_motions(rig_from_camera, alignment))
+            final = _measure_again(displaced, _select_connected_motions(rig_from_camera, alignment))
             return PersonAlignment(alignment, motion, final, common_error, search, factor, posture)
         if isinstance(found, PostureStep):
             posture = found
             continue
         if isinstance(found, ScaleError):
             common_error = found
-            for side in _pairs_by_pole(boards.names, poles):
+            for side in _group_by_pole(boards.names, poles):
                 boards = free_pairs(boards, side)
         elif isinstance(found, CommonError):
             common_error = found
-            basis = 30.0 * common_basis(boards.names, rig_from_camera)  # mm, as in `free_pairs`
-            boards = PoseCovariance(boards.names, boards.matrix + basis @ basis.T)
+            basis = build_common_basis(boards.names, rig_from_camera)
+            added = basis @ basis.T * 30.0**2  # mm^2, as in `free_pairs`
+            boards = PoseCovariance(boards.names, boards.matrix + added)
         else:
             displaced.append(found)
             boards = free_pairs(boards, found.pairs)
         aligned = align(images, rig_from_camera, boards, settings)
 
 
-def _pairs_by_pole(names: Collection[str], poles: Mapping[str, str]) -> list[list[str]]:
+def _group_by_pole(names: Collection[str], poles: Mapping[str, str]) -> list[list[str]]:
     """The pairs of each pole; pairs that are on none, one by one."""
     sides: dict[str, list[str]] = {}
     for name in names:
@@ -117,7 +117,7 @@ def _pairs_by_pole(names: Collection[str], poles: Mapping[str, str]) -> list[lis
     return list(sides.values())
 
 
-def _pairs_of(displaced: Sequence[DisplacedPole]) -> frozenset[str]:
+def _collect_pairs(displaced: Sequence[DisplacedPole]) -> frozenset[str]:
     return frozenset[str]().union(*(one.pairs for one in displaced))
 
 
@@ -129,7 +129,7 @@ def _search(
     known: Sequence[DisplacedPole],
 ) -> DisplacementSearch:
     """Search for another displaced pole, as long as a second one remains as reference."""
-    displaced = _pairs_of(known)
+    displaced = _collect_pairs(known)
     if (
         len({poles.get(image.pair, image.pair) for image in images if image.pair not in displaced})
         < 2
@@ -137,7 +137,7 @@ def _search(
         return DisplacementSearch(None, np.inf)
     moments = {image.pair: image.time_ms for image in images}
     return find_displaced_pole(
-        [(_connected_motions(rig_from_camera, aligned), moments)], poles, displaced
+        [(_select_connected_motions(rig_from_camera, aligned), moments)], poles, displaced
     )
 
 
@@ -148,7 +148,7 @@ def _measure_again(
 
     What overlaps no longer connect to those keeps the displacement that it was found with.
     """
-    standing = {name: motions[name] for name in motions.keys() - _pairs_of(displaced)}
+    standing = {name: motions[name] for name in motions.keys() - _collect_pairs(displaced)}
     again = []
     for one in displaced:
         moved = {name: motions[name] for name in motions.keys() & one.pairs}
@@ -159,9 +159,9 @@ def _measure_again(
     return tuple(again)
 
 
-def _connected_motions(
+def _select_connected_motions(
     rig_from_camera: Mapping[str, RigidTransform], found: Alignment
 ) -> dict[str, Array]:
     """Twists of the pairs that overlaps connect."""
     poses = {name: found.rig_from_camera[name] for name in found.motion_mm}
-    return motions_between(rig_from_camera, poses)
+    return compute_motions_between(rig_from_camera, poses)

@@ -8,7 +8,7 @@ import numpy as np
 
 from bodyscan.geometry.robust import rms
 from bodyscan.motion.body_parts import PARTS, name_parts
-from bodyscan.motion.breath import breath_along_normals
+from bodyscan.motion.breath import project_breath_on_normals
 from bodyscan.motion.estimation import EstimatedMotion
 
 
@@ -170,7 +170,7 @@ def measure_fullness(motion: EstimatedMotion) -> tuple[float, float] | None:
 
     None without a trunk.
     """
-    breathes = breath_along_normals(motion.cells) > 0.5
+    breathes = project_breath_on_normals(motion.cells) > 0.5
     if motion.breath is None or not breathes.any():
         return None
     normals = motion.cells.normals[breathes]

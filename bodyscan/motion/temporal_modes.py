@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bodyscan.alignment.sway_prior import stance_correlation
+from bodyscan.alignment.sway_prior import correlate_stance
 from bodyscan.arrays import Array
 
 MIN_SHARE = 1e-3  # of the largest eigenvalue; less is not worth an unknown
@@ -22,12 +22,12 @@ IRREGULAR = 0.25
 122), and they begin and end within 0.4 s."""
 
 
-def breath_correlation(seconds: Array) -> Array:
+def correlate_breath(seconds: Array) -> Array:
     """Correlation of a breath with itself after so many seconds, averaged over its duration."""
     phase = 2.0 * np.pi * np.asarray(seconds)[..., None] / BREATHS_S
     share = IRREGULAR**2
     return np.asarray(
-        (1.0 - share) * np.cos(phase).mean(axis=-1) + share * stance_correlation(2.0 * seconds)
+        (1.0 - share) * np.cos(phase).mean(axis=-1) + share * correlate_stance(2.0 * seconds)
     )
 
 
@@ -100,7 +100,7 @@ class Breaths:
             for n in SHARPNESSES
         ]
         # The small diagonal keeps the sum positive definite.
-        irregular = amplitudes_from_values @ stance_correlation(
+        irregular = amplitudes_from_values @ correlate_stance(
             2.0 * (knots[:, None] - knots)
         ) @ amplitudes_from_values.T + MIN_SHARE * np.eye(modes.count)
         # 16 breaths a minute, give or take a fifth: adults at rest breathe 12 to 20 times. Half a

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from bodyscan.arrays import Array, Floats, Indices
 from bodyscan.compiled import compiled
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.motion.body_cells import BodyCells, field_in_camera
+from bodyscan.motion.body_cells import BodyCells, express_in_camera
 from bodyscan.motion.estimation import EstimatedMotion
 from bodyscan.progress import map_threads
 from bodyscan.reconstruction.range_image import RangeImage
@@ -70,7 +70,7 @@ def warp_image(
         image.corner,
         size,
         (cell, depth),
-        (camera_from_rig.apply(cells.centres), field_in_camera(field, rig_from_camera)),
+        (camera_from_rig.apply(cells.centres), express_in_camera(field, rig_from_camera)),
     )
     return replace(image, points=points, normals=rotated, warped=True)
 

@@ -18,7 +18,7 @@ MARGIN_STRIPES = 1.5  # runs of boundaries need a neighbour, and limits are line
 FAR_MM = 1e5
 
 
-def stripes_in_volume(
+def find_stripes_in_volume(
     pair: PairCalibration, rig_from_camera: RigidTransform, volume: Volume
 ) -> StripeLimits | None:
     """Find the stripes that light what stands in the scan volume, or lies next to it at its bottom.
@@ -29,9 +29,9 @@ def stripes_in_volume(
     if pair.sheets is None:
         return None
     block_px = max(1, round(pair.camera.width / 40))
-    rays = _corner_rays(pair.camera, block_px)
-    near, far = volume_interval(rays, rig_from_camera, volume, raised_mm=0.0)
-    standing = volume_interval(rays, rig_from_camera, volume, raised_mm=25.0)[1]
+    rays = _compute_corner_rays(pair.camera, block_px)
+    near, far = compute_volume_interval(rays, rig_from_camera, volume, raised_mm=0.0)
+    standing = compute_volume_interval(rays, rig_from_camera, volume, raised_mm=25.0)[1]
     standing = np.maximum(np.minimum(standing, far), near)
     count = round(pair.sheets.stripes / 8) + 1
     s = np.linspace(0.0, pair.sheets.stripes, count)
@@ -48,7 +48,7 @@ def stripes_in_volume(
     limits = np.full((3, *near.shape), np.nan)
     for limit, z in zip(limits, (near, far, standing), strict=True):
         _interpolate_stripes(inverse, depth, 1.0 / z, limit)
-    near_by, far_by = _nonlinearity(rays, rig_from_camera, volume, (near, far), limits)
+    near_by, far_by = _measure_nonlinearity(rays, rig_from_camera, volume, (near, far), limits)
     limits += np.stack([-near_by, far_by, np.zeros_like(far)])
     limits += np.array([-MARGIN_STRIPES, MARGIN_STRIPES, 0.0])[:, None, None]
     unknown = np.array([-1e6, 1e6, 1e6])[:, None, None]  # all stripes
@@ -61,7 +61,7 @@ def stripes_in_volume(
     return StripeLimits(limits[0], limits[1], limits[2], rising, block_px, around_px=around_px)
 
 
-def volume_interval(
+def compute_volume_interval(
     rays: Array, rig_from_camera: RigidTransform, volume: Volume, *, raised_mm: float
 ) -> tuple[Array, Array]:
     """Depths z (...) mm at which rays (..., 3), camera frame, z = 1, enter and leave the volume.
@@ -84,7 +84,7 @@ def volume_interval(
     return enter.clip(50.0, FAR_MM), leave.clip(25.0, FAR_MM)
 
 
-def _nonlinearity(
+def _measure_nonlinearity(
     rays: Array,
     rig_from_camera: RigidTransform,
     volume: Volume,
@@ -102,8 +102,11 @@ def _nonlinearity(
     near, far = ends
     stripes = np.where(near < far, limits[1] - limits[0], 0.0)
     per_inverse = np.nan_to_num(stripes / np.where(near < far, 1.0 / near - 1.0 / far, np.inf))
-    middle = volume_interval(_block_means(rays), rig_from_camera, volume, raised_mm=0.0)
-    kinks = 1.0 / middle[0] - _block_means(1.0 / near), _block_means(1.0 / far) - 1.0 / middle[1]
+    middle = compute_volume_interval(_average_blocks(rays), rig_from_camera, volume, raised_mm=0.0)
+    kinks = (
+        1.0 / middle[0] - _average_blocks(1.0 / near),
+        _average_blocks(1.0 / far) - 1.0 / middle[1],
+    )
     window = np.ones((3, 3), np.uint8)
     largest = cv2.dilate(per_inverse, window)
     widths = (2.0 * largest * cv2.dilate(np.pad(k, 1), window[:2, :2])[1:, 1:] for k in kinks)
@@ -111,13 +114,13 @@ def _nonlinearity(
     return near_by, far_by
 
 
-def _block_means(corners: Array) -> Array:
+def _average_blocks(corners: Array) -> Array:
     """Mean of each block's four corners, (rows - 1, columns - 1, ...)."""
     rows = corners[1:] + corners[:-1]
     return 0.25 * (rows[:, 1:] + rows[:, :-1])
 
 
-def _corner_rays(camera: Camera, block_px: int) -> Array:
+def _compute_corner_rays(camera: Camera, block_px: int) -> Array:
     """Rays (rows, columns, 3) through the corners of blocks of pixels that cover the image."""
     sizes = camera.width, camera.height
     edges = (np.arange(0.0, size + block_px, block_px) - 0.5 for size in sizes)

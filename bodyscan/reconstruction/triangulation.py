@@ -16,7 +16,11 @@ from bodyscan.calibration.pair import PairCalibration
 from bodyscan.compiled import compiled
 from bodyscan.errors import BadInput
 from bodyscan.geometry.light_planes import LightSheets
-from bodyscan.geometry.light_sheets import intersect_rays, stripes_per_pixel, triangulate_image
+from bodyscan.geometry.light_sheets import (
+    intersect_rays,
+    measure_stripes_per_pixel,
+    triangulate_image,
+)
 from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
 from bodyscan.reconstruction.range_image import MAX_RATIO, Agreement, RangeImage
 from bodyscan.stripes.stripe_map import StripeMap
@@ -52,7 +56,7 @@ def reconstruct_range_image(pair: PairCalibration, stripes: StripeMap) -> RangeI
         pair.name,
         pair.camera,
         points,
-        grid_normals(points, np.isfinite(sigma_mm)),
+        estimate_grid_normals(points, np.isfinite(sigma_mm)),
         sigma_mm,
         stripes.lit.copy(),  # part of a stack of images, which would be kept alive with it
         stripes.beyond,
@@ -177,7 +181,7 @@ def _triangulate(
     """
     camera, ray_sigma = pair.camera, None
     if pair.rays is not None:
-        scale = np.float32(stripes_per_pixel(sheets, camera, s))
+        scale = np.float32(measure_stripes_per_pixel(sheets, camera, s))
         ray_sigma = scale * pair.rays.image(camera.width, camera.height)
     return triangulate_image(sheets, camera, s, sigma, ray_sigma)
 
@@ -201,7 +205,7 @@ def _triangulate_line(pair: PairCalibration, sheets: LightSheets, stripes: Strip
     return points, sigma_mm, common_mm
 
 
-def grid_normals(points: Floats, measured: Mask | None = None) -> Floats:
+def estimate_grid_normals(points: Floats, measured: Mask | None = None) -> Floats:
     """Unit normals (H, W, 3) towards the camera, from points (H, W, 3), in windows of 5 x 5 pixels.
 
     measured: where there are points, (H, W), if that is known.
@@ -223,7 +227,7 @@ def grid_normals(points: Floats, measured: Mask | None = None) -> Floats:
 
 @compiled
 def _fit_normals(points: Floats, inner: Mask, normals: Floats) -> None:
-    """Write the normals of `grid_normals` where the window is complete (h, w).
+    """Write the normals of `estimate_grid_normals` where the window is complete (h, w).
 
     Sums over five rows are formed once a column, and then over five columns.
     """

@@ -6,9 +6,9 @@ import networkx as nx
 import numpy as np
 
 from bodyscan.geometry.transforms import twist_jacobian
-from bodyscan.geometry.uncertainty import position_sigma
-from bodyscan.registration.cluster_covariance import normal_equations
-from bodyscan.registration.rig_frame import frame_target
+from bodyscan.geometry.uncertainty import compute_position_sigma
+from bodyscan.registration.cluster_covariance import build_normal_equations
+from bodyscan.registration.rig_frame import find_frame_target
 from bodyscan.registration.rig_solve import RigSolution
 from bodyscan.registration.view_graph import Target, by_target
 from bodyscan.rig.rig import Rig
@@ -32,7 +32,7 @@ def advise(rig: Rig, solution: RigSolution) -> list[str]:
 def pair_sigma_mm(solution: RigSolution, name: str) -> float:
     """Sigma of a camera's position over all axes, mm."""
     position = solution.rig_from_camera[name].translation
-    return float(np.linalg.norm(position_sigma(solution.covariance, name, position)))
+    return float(np.linalg.norm(compute_position_sigma(solution.covariance, name, position)))
 
 
 def find_articulation_shots(solution: RigSolution) -> tuple[Target, ...]:
@@ -48,13 +48,13 @@ def suggest_shots(rig: Rig, solution: RigSolution, pair: str) -> list[str]:
 
     As many repetitions as halve it, or MAX_SHOTS. No line if no two pairs share a shot.
     """
-    equations = normal_equations(
+    equations = build_normal_equations(
         solution.views,
         solution.cameras,
         solution.rig_from_camera,
         solution.rig_from_board,
         fixed_pair=rig.frame_pair.name if rig.frame_pair else None,
-        fixed_target=frame_target(rig),
+        fixed_target=find_frame_target(rig),
         motions=solution.motions,
     )
     visible_to = {
@@ -62,7 +62,9 @@ def suggest_shots(rig: Rig, solution: RigSolution, pair: str) -> list[str]:
         for target, views in by_target(solution.views).items()
     }
     # A board that holds the frame is no unknown: its part is not that of another shot there.
-    candidates = [t for t, pairs in visible_to.items() if len(pairs) > 1 and t != frame_target(rig)]
+    candidates = [
+        t for t, pairs in visible_to.items() if len(pairs) > 1 and t != find_frame_target(rig)
+    ]
     if not candidates:
         return []
     system, first = equations.system, 6 * equations.names.index(pair)

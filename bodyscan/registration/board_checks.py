@@ -11,10 +11,10 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from bodyscan.arrays import Array
-from bodyscan.boards.board_layout import corner_points, corners_per_face
+from bodyscan.boards.board_layout import compute_corner_points, count_corners_per_face
 from bodyscan.boards.board_map import fit_board_map
 from bodyscan.boards.view import BoardView
-from bodyscan.calibration.board_views import has_enough_corners, planar_view
+from bodyscan.calibration.board_views import has_enough_corners, make_planar_view
 from bodyscan.calibration.camera import CameraCalibration, calibrate_camera
 from bodyscan.errors import BadInput, DegeneratePoses
 from bodyscan.geometry.camera import Camera
@@ -43,7 +43,7 @@ def refuse_other_pitch(board: Board, views: Sequence[BoardView]) -> None:
         return
 
     def misfit(square_mm: float) -> float:
-        tried = corner_points(board.model_copy(update={"square_mm": square_mm}))[:, :2]
+        tried = compute_corner_points(board.model_copy(update={"square_mm": square_mm}))[:, :2]
         fits = ((tried[v.corner_ids], v.pixels) for v in complete)
         errors = [
             fit_board_map(printed, pixels).apply(printed) - pixels for printed, pixels in fits
@@ -61,7 +61,7 @@ def refuse_other_pitch(board: Board, views: Sequence[BoardView]) -> None:
         )
 
 
-def common_aspect(cameras: Iterable[tuple[Camera, Array]]) -> float:
+def find_common_aspect(cameras: Iterable[tuple[Camera, Array]]) -> float:
     """Return fy / fx if all cameras, each with the covariance (P, P) of its parameters, have one in
     common that is not 1, beyond 0.5 % and three sigmas; else 1."""
     ratios, variances = [], []
@@ -84,7 +84,7 @@ def correct_stretch(
     Printers stretch pages along one axis. In upright views that looks like pixels that are not square,
     of all cameras alike, and only then it is looked for; views of a turned board tell the two apart.
     """
-    ratio = common_aspect((one.camera, one.covariance) for one in cameras.values())
+    ratio = find_common_aspect((one.camera, one.covariance) for one in cameras.values())
     boards, notes = list(rig.boards), list[str]()
     for k, board in enumerate(rig.boards) if ratio != 1.0 else ():
         groups = [
@@ -93,7 +93,7 @@ def correct_stretch(
         ]
         groups = sorted(groups, key=lambda group: -len(group[1]))[:2]  # two cameras are enough
         count = sum(len(view.pixels) for _, group in groups for view in group)
-        misfit = partial(_misfit_of_stretch, board, groups)
+        misfit = partial(_compute_misfit_of_stretch, board, groups)
         bounds = min(1.0, ratio**2) / 1.01, max(1.0, ratio**2) * 1.01
         with suppress(DegeneratePoses):
             found = minimize_scalar(misfit, bounds=bounds, method="bounded")
@@ -107,19 +107,21 @@ def correct_stretch(
     return rig.model_copy(update={"boards": tuple(boards)}), notes
 
 
-def _misfit_of_stretch(
+def _compute_misfit_of_stretch(
     board: Board, groups: Sequence[tuple[Camera, Sequence[BoardView]]], stretch: float
 ) -> float:
     """Sum of the squared residuals, px2, of cameras calibrated with squares so many times as high."""
     tried, total = board.model_copy(update={"stretch": board.stretch * stretch}), 0.0
     for camera, views in groups:
-        planar = [planar_view(view, tried) for view in views if has_enough_corners(view, tried)]
+        planar = [
+            make_planar_view(view, tried) for view in views if has_enough_corners(view, tried)
+        ]
         found = calibrate_camera(planar, camera.width, camera.height, type(camera.lens)())
         total += found.rms_px**2 * sum(len(view.pixels) for view in planar)
     return total
 
 
-def boards_not_found(rig: Rig, views: Sequence[BoardView], images: int) -> list[str]:
+def list_boards_not_found(rig: Rig, views: Sequence[BoardView], images: int) -> list[str]:
     """One line for each board that no image shows as the rig file describes it."""
     found = {view.board for view in views}
     return [
@@ -133,10 +135,12 @@ def boards_not_found(rig: Rig, views: Sequence[BoardView], images: int) -> list[
 
 def describe_findings(rig: Rig, views: Sequence[BoardView], images: int) -> str:
     """How much of each board was seen and what to check, for when no camera could be calibrated."""
-    lines = boards_not_found(rig, views, images)
+    lines = list_boards_not_found(rig, views, images)
     for board in rig.boards:
         shares = [
-            len(view.pixels) / corners_per_face(board) for view in views if view.board == board.name
+            len(view.pixels) / count_corners_per_face(board)
+            for view in views
+            if view.board == board.name
         ]
         if shares:
             # The description may be wrong if the median view shows less than half of the corners.
@@ -152,16 +156,16 @@ def describe_findings(rig: Rig, views: Sequence[BoardView], images: int) -> str:
     return "\n  ".join(lines)
 
 
-def appearance_notes(rig: Rig, views: Sequence[BoardView]) -> list[str]:
+def note_appearance(rig: Rig, views: Sequence[BoardView]) -> list[str]:
     """One line for each difference between a board and its description in the rig file."""
     return [
         line
         for board in rig.boards
-        for line in _notes_of_board(board, [view for view in views if view.board == board.name])
+        for line in _note_board(board, [view for view in views if view.board == board.name])
     ]
 
 
-def _notes_of_board(board: Board, views: Sequence[BoardView]) -> Iterator[str]:
+def _note_board(board: Board, views: Sequence[BoardView]) -> Iterator[str]:
     def where(views: Iterable[BoardView]) -> str:
         pairs = sorted({view.pair for view in views})
         return f"{len(list(views))} views ({', '.join(pairs)})"

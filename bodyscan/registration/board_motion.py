@@ -22,7 +22,7 @@ from bodyscan.boards.view import ViewKey
 from bodyscan.calibration.board_views import LocatedView, apply_shape
 from bodyscan.calibration.camera import CORNERS
 from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
-from bodyscan.geometry.transforms import RigidTransform, adjoint, cross_matrix
+from bodyscan.geometry.transforms import RigidTransform, adjoint, make_cross_matrix
 from bodyscan.registration.joint_solve import JointSolution, linearize_reprojection
 
 
@@ -66,7 +66,7 @@ def _observe_motions(
         points = np.concatenate([view.points for view in views if view.board == board])
         middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
         radius = np.sqrt(np.mean(np.sum((points - middle) ** 2, axis=1)))
-        turns = np.concatenate([np.eye(3), cross_matrix(middle)]) / radius
+        turns = np.concatenate([np.eye(3), make_cross_matrix(middle)]) / radius
         bases[board] = np.hstack([turns, np.eye(6)[:, 3:]]), middle, radius
     targets = sorted({view.target for view in views})
     paths, systems = {}, []

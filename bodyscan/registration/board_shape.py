@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from bodyscan.arrays import Array
-from bodyscan.calibration.board_views import BoardShape, LocatedView, apply_shape, corner_keys
+from bodyscan.calibration.board_views import BoardShape, LocatedView, apply_shape, make_corner_keys
 from bodyscan.calibration.camera import CORNERS
 from bodyscan.calibration.model_selection import MIN_GAIN, ResidualPair, gain
 from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
@@ -30,30 +30,30 @@ def estimate_board_shapes(
     every: views, of boards as described, from which `judged` selects the consistent ones. The
         solution has shapes of all corners of these, or none.
     """
-    views, solution, flat = judged.select_consistent(every), judged.solution, _flat(every)
+    views, solution, flat = judged.select_consistent(every), judged.solution, _make_flat(every)
     targets = sorted({view.target for view in views})
     # Each freed coordinate lowers the squared residuals by one variance by noise alone, and with
     # 48 corners or more by 1.25 once in 700 times.
-    if len(targets) < 6 or _gain_per_unknown(views, solution, flat) < 1.25:
+    if len(targets) < 6 or _compute_gain_per_unknown(views, solution, flat) < 1.25:
         return Outcome(solution)
     held_out = _hold_out(views, solution, flat, root)
     shaped = refine_solution(views, replace(solution, shapes=flat), root=root)
     sizes = "; ".join(_describe(name, shape) for name, shape in sorted(shaped.shapes.items()))
     better_by = gain(held_out)
     figures = (
-        f"boards held out fit to {_median(held_out.rich):.3f} px with it, "
-        f"{_median(held_out.simple):.3f} without, by {better_by:.0f} standard errors"
+        f"boards held out fit to {_compute_median(held_out.rich):.3f} px with it, "
+        f"{_compute_median(held_out.simple):.3f} without, by {better_by:.0f} standard errors"
     )
     if better_by < MIN_GAIN:
         return Outcome(solution, (f"{sizes}: not used, {figures}",))
     return Outcome(shaped, (f"{sizes}: used, {figures}",))
 
 
-def _flat(views: Sequence[LocatedView]) -> dict[str, BoardShape]:
+def _make_flat(views: Sequence[LocatedView]) -> dict[str, BoardShape]:
     """Flat shapes of all corners that any view shows, by board."""
     boards = sorted({view.board for view in views})
     observed = (np.concatenate([v.points for v in views if v.board == name]) for name in boards)
-    nominal = (np.unique(corner_keys(points), axis=0) for points in observed)
+    nominal = (np.unique(make_corner_keys(points), axis=0) for points in observed)
     return {n: BoardShape(p, np.zeros_like(p)) for n, p in zip(boards, nominal, strict=True)}
 
 
@@ -66,7 +66,7 @@ def _describe(name: str, shape: BoardShape) -> str:
     )
 
 
-def _gain_per_unknown(
+def _compute_gain_per_unknown(
     views: Sequence[LocatedView], solution: JointSolution, shapes: Mapping[str, BoardShape]
 ) -> float:
     """Mean reduction of the squared residuals per coordinate of freed corners, in variances."""
@@ -121,10 +121,10 @@ def _hold_out(
     every = ResidualPair(
         np.concatenate(flat_residuals), np.concatenate(shaped_residuals), np.concatenate(part)
     )
-    return _without_extremes(every)
+    return _drop_extremes(every)
 
 
-def _without_extremes(compared: ResidualPair) -> ResidualPair:
+def _drop_extremes(compared: ResidualPair) -> ResidualPair:
     """Drop the board most in favour of the shape and the one most against it.
 
     Where half of the views leave a lens open beyond their boards, one board there would decide
@@ -137,6 +137,6 @@ def _without_extremes(compared: ResidualPair) -> ResidualPair:
     return ResidualPair(compared.simple[kept], compared.rich[kept], compared.cluster[kept])
 
 
-def _median(residuals: Array) -> float:
+def _compute_median(residuals: Array) -> float:
     """Median length, px."""
     return float(np.sqrt(np.median(np.sum(residuals**2, axis=1))))

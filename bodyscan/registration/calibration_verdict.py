@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodyscan.calibration.board_views import measure_covered_share
-from bodyscan.geometry.uncertainty import position_sigma
-from bodyscan.registration.board_checks import common_aspect
-from bodyscan.registration.rig_calibration import RigCalibration, nominal_size
+from bodyscan.geometry.uncertainty import compute_position_sigma
+from bodyscan.registration.board_checks import find_common_aspect
+from bodyscan.registration.rig_calibration import RigCalibration, find_nominal_size
 from bodyscan.verdict import Grade, Verdict
 
 
@@ -65,7 +65,7 @@ class PairFigures:
             yield times, not limit.at_least, sentence
 
 
-def figures_of(calibration: RigCalibration) -> list[PairFigures]:
+def collect_figures(calibration: RigCalibration) -> list[PairFigures]:
     """Collect the figures of every calibrated pair, in the order of the rig."""
     names = [pair.name for pair in calibration.rig.pairs if pair.name in calibration.pairs]
     return [_collect_figures(calibration, name) for name in names]
@@ -79,20 +79,20 @@ def grade_calibration(calibration: RigCalibration) -> Verdict:
     """
     failed = calibration.failed.items()
     findings = [(False, np.inf, f"pair {name} failed: {why}") for name, why in failed]
-    for pair in figures_of(calibration):
+    for pair in collect_figures(calibration):
         for times, error, words in pair.beyond():
             far = error and times > 2.0
             prefix = "recalibrate: " if far else ""
             findings.append((far, times, f"{prefix}pair {pair.name}: {words}"))
     pairs = calibration.pairs.values()
-    aspect = common_aspect((one.camera, one.camera_covariance) for one in pairs)
+    aspect = find_common_aspect((one.camera, one.camera_covariance) for one in pairs)
     if aspect != 1.0:
         words = (
             f"fy is {aspect:.3f} times fx in all cameras: pixels that are not square, or a print that "
             "is stretched, and lengths with it: measure squares both ways, turn the board in some shots"
         )
         findings.append((False, 1.0, words))
-    size = nominal_size(calibration.rig, calibration.rig_from_camera)
+    size = find_nominal_size(calibration.rig, calibration.rig_from_camera)
     if size and size.mark != "good":  # one in use is reported; a new one is not made
         findings.append((False, 1.0, f"{size.words}: {size.remedy}"))
     # What forbids its use comes first.
@@ -114,7 +114,7 @@ def _collect_figures(calibration: RigCalibration, name: str) -> PairFigures:
     quality, camera, corners = pair.quality, pair.camera, calibration.observed.get(name)
     position = calibration.rig_from_camera[name].translation
     striped, ours = pair.sheets is not None, not quality.imported
-    sigma = position_sigma(calibration.covariance, name, position)
+    sigma = compute_position_sigma(calibration.covariance, name, position)
     share = None
     if corners is not None:
         views = [

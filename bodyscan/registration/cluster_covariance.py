@@ -21,7 +21,7 @@ from bodyscan.calibration.board_views import (
     BoardShape,
     LocatedView,
     apply_shape,
-    max_displacement_mm,
+    compute_max_displacement_mm,
 )
 from bodyscan.calibration.camera import CORNERS
 from bodyscan.geometry.camera import Camera
@@ -60,7 +60,7 @@ class NormalEquations:
         return self.sum_parts(list(self.parts)) + self.prior.select(self.free)
 
 
-def normal_equations(
+def build_normal_equations(
     views: Sequence[LocatedView],
     cameras: Mapping[str, Camera],
     rig_from_camera: Mapping[str, RigidTransform],
@@ -109,7 +109,7 @@ def normal_equations(
         target: _eliminate_board(of_target, board, target == fixed_target)
         for target, of_target in sorted(systems.items())
     }
-    known = [(of_shape[name], _information(shape)) for name, shape in shapes.items()]
+    known = [(of_shape[name], _compute_information(shape)) for name, shape in shapes.items()]
     known += [(of_camera[name], np.diag(cameras[name].prior_sigmas ** -2)) for name in names]
     priors = [(block, LinearGaussianSystem.from_prior(each)) for block, each in known]
     prior = LinearGaussianSystem.assemble(priors, size)
@@ -158,7 +158,7 @@ def _by_every_corner(by_corner: Array) -> Array:
     return blocks.reshape(2 * count, 3 * count)
 
 
-def _information(shape: BoardShape) -> Array:
+def _compute_information(shape: BoardShape) -> Array:
     known = shape.compute_prior_jacobian(shape.size_sigma)
     return known.T @ known
 
@@ -183,7 +183,7 @@ def cluster_robust_covariance(
     free, variance = equations.free, equations.variance_px2
     inverse = equations.system.covariance()
     systems = [equations.sum_parts(cluster) for cluster in clusters]
-    inflation, pooled = variance_inflations(systems, inverse, variance)
+    inflation, pooled = estimate_variance_inflations(systems, inverse, variance)
     middle = equations.prior.select(free).information  # exact: not inflated
     for factor, system in zip(inflation, systems, strict=True):
         middle = middle + factor * system.information
@@ -215,7 +215,7 @@ def cluster_board_poses(
         for cluster in clusters:
             first = rig_from_board[cluster[0]]
             if cluster[0][1] == target[1] and (
-                max_displacement_mm(first, rig_from_board[target], size) < 0.05 * size
+                compute_max_displacement_mm(first, rig_from_board[target], size) < 0.05 * size
             ):
                 cluster.append(target)
                 break
@@ -224,7 +224,7 @@ def cluster_board_poses(
     return clusters
 
 
-def variance_inflations(
+def estimate_variance_inflations(
     clusters: Sequence[LinearGaussianSystem], covariance: Array, variance: float
 ) -> tuple[Array, float]:
     """Estimate the variance inflation of each cluster, (K,), and over all clusters.

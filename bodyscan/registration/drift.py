@@ -100,7 +100,7 @@ def find_drift(
     # The pair that fixes the rig frame has zero covariance: give it a micron.
     micron = np.diag(np.tile([1e-6**2] * 3 + [1e-3**2] * 3, len(pairs)))
     known = LinearGaussianSystem.from_prior(invert_scaled(prior.select(pairs) + micron))
-    candidates = _groups(pairs, poles)
+    candidates = _list_groups(pairs, poles)
     fit = before = _fit(shared, poses_of_pairs, known, [])
     while candidates:
         fits = [_fit(shared, poses_of_pairs, known, [*fit.groups, one]) for one in candidates]
@@ -122,7 +122,7 @@ def find_drift(
     )
 
 
-def _groups(pairs: Sequence[str], poles: Mapping[str, str]) -> list[Group]:
+def _list_groups(pairs: Sequence[str], poles: Mapping[str, str]) -> list[Group]:
     """Every pair, and every pole with several pairs."""
     groups: list[Group] = [(f"pair {name}", (name,)) for name in pairs]
     for pole in sorted({poles[name] for name in pairs if name in poles}):

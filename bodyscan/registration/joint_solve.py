@@ -16,7 +16,7 @@ import numpy as np
 from bodyscan.arrays import Array, Indices
 from bodyscan.boards.view import ViewKey
 from bodyscan.calibration.board_views import BoardShape, LocatedView, apply_shape
-from bodyscan.calibration.camera import CORNERS, camera_prior
+from bodyscan.calibration.camera import CORNERS, evaluate_camera_prior
 from bodyscan.geometry.camera import MATRIX, Camera, CameraPrior
 from bodyscan.geometry.least_squares import EXACT, Block, Noise, minimize
 from bodyscan.geometry.transforms import RigidTransform, adjoint, twist_jacobian
@@ -79,7 +79,7 @@ def refine_solution(
     # deviations of the minimum; that step leaves a few thousandths.
     return minimize(
         solution,
-        lambda state: _blocks(of_pair, state, unknowns, equal_noise, noise),
+        lambda state: _make_blocks(of_pair, state, unknowns, equal_noise, noise),
         unknowns.retract,
         unknowns=unknowns.count,
         steps=12,
@@ -137,7 +137,7 @@ class _Unknowns:
         return np.hstack([np.tile(columns, (len(corners), 1)), corners])
 
 
-def _blocks(
+def _make_blocks(
     of_pair: Sequence[Sequence[LocatedView]],
     solution: JointSolution,
     unknowns: _Unknowns,
@@ -174,7 +174,7 @@ def _blocks(
             known = np.diag(1.0 / camera.prior_sigmas[: len(MATRIX)])
             matrix = parameters[: len(MATRIX)]
             yield Block(np.zeros(len(MATRIX)), partial(np.asarray, known), matrix, EXACT)
-        yield camera_prior(camera, parameters)
+        yield evaluate_camera_prior(camera, parameters)
     for name, shape in solution.shapes.items():
         known = shape.compute_prior_jacobian()
         deviation = known @ shape.offsets.ravel()

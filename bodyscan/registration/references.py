@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodyscan.arrays import Array, Indices
-from bodyscan.boards.board_layout import corner_grid, corner_points
+from bodyscan.boards.board_layout import compute_corner_grid, compute_corner_points
 from bodyscan.boards.view import BoardView
 from bodyscan.errors import FailedWork
-from bodyscan.geometry.robust import rms_length
+from bodyscan.geometry.robust import compute_rms_length
 from bodyscan.geometry.transforms import fit_rigid_transform
 from bodyscan.outcome import Outcome
 from bodyscan.registration.rig_calibration import MAX_SIZE_ERROR, REFUSED_SIZE_ERROR
@@ -70,7 +70,7 @@ def find_rig_size(rig: Rig, solution: RigSolution, views: Sequence[BoardView]) -
             "certified length under `references`"
         )
     for reference in rig.references:
-        readings = list(_readings(rig, reference, solution, views))
+        readings = list(_list_readings(rig, reference, solution, views))
         if not readings:
             notes.append(
                 f"reference {reference.name} was measured in no shot, so that the size is what "
@@ -148,7 +148,7 @@ def _average(readings: Sequence[Reading]) -> tuple[float, float]:
     return mean, float(np.sqrt(max(scatter, 1.0) / weights.sum()))
 
 
-def _readings(
+def _list_readings(
     rig: Rig, reference: Reference, solution: RigSolution, views: Sequence[BoardView]
 ) -> Iterator[Reading]:
     """One reading for each shot in which two cameras saw enough of all its boards."""
@@ -195,8 +195,8 @@ def triangulate_corners(solution: RigSolution, views: Sequence[BoardView]) -> tu
 
 def _measure_board(board: Board, ids: Indices, points: Array, variance_inflation: float) -> Reading:
     """The length of one board, from the scale of a similarity onto its layout."""
-    layout = corner_points(board)
-    length = board_length(board)
+    layout = compute_corner_points(board)
+    length = compute_board_length(board)
     described, found = layout[ids], fit_rigid_transform(layout[ids], points).inverse().apply(points)
     arms = described - described.mean(axis=0)
     scale = float(np.sum(arms * found) / np.sum(arms**2))
@@ -208,10 +208,10 @@ def _measure_board(board: Board, ids: Indices, points: Array, variance_inflation
     return scale * length, float(sigma) * length
 
 
-def board_length(board: Board) -> float:
+def compute_board_length(board: Board) -> float:
     """Distance between the first and the last corner of a row of corners, mm."""
-    layout = corner_points(board)
-    return float(np.linalg.norm(layout[corner_grid(board)[0] - 1] - layout[0]))
+    layout = compute_corner_points(board)
+    return float(np.linalg.norm(layout[compute_corner_grid(board)[0] - 1] - layout[0]))
 
 
 def _measure_separation(
@@ -221,14 +221,14 @@ def _measure_separation(
     positions (N, 3) mm."""
     middles, residuals, levers = [], [], []
     for board, ids, points in boards:
-        described = corner_points(board)[ids]
+        described = compute_corner_points(board)[ids]
         rig_from_board = fit_rigid_transform(described, points)
         middle, centroid = np.array([*board.size_mm, 0.0]) / 2.0, described.mean(axis=0)
         middles.append(rig_from_board.apply(middle))
         residuals.append(rig_from_board.apply(described) - points)
         # Corners that err turn a board about their centroid: distance of the middle from it, in
         # units of the corners' RMS radius.
-        levers.append(np.linalg.norm(middle - centroid) / rms_length(described - centroid))
+        levers.append(np.linalg.norm(middle - centroid) / compute_rms_length(described - centroid))
     length = float(np.linalg.norm(middles[0] - middles[1]))
     along = (middles[0] - middles[1]) / length
     variance = sum(

@@ -109,7 +109,9 @@ class NominalSize:
         return f"square_mm may be wrong{where}; or correct `nominal`, or leave it out"
 
 
-def nominal_size(rig: Rig, rig_from_camera: Mapping[str, RigidTransform]) -> NominalSize | None:
+def find_nominal_size(
+    rig: Rig, rig_from_camera: Mapping[str, RigidTransform]
+) -> NominalSize | None:
     """The size by the median over all distances between cameras; None if fewer than two nominal
     positions are known."""
     nominal = {p.name: np.array(p.nominal.position_mm) for p in rig.pairs if p.nominal}
@@ -126,6 +128,6 @@ def nominal_size(rig: Rig, rig_from_camera: Mapping[str, RigidTransform]) -> Nom
 
 def refuse_wrong_size(rig: Rig, rig_from_camera: Mapping[str, RigidTransform]) -> None:
     """Raise FailedWork if the size is off by more than any tape measure errs."""
-    size = nominal_size(rig, rig_from_camera)
+    size = find_nominal_size(rig, rig_from_camera)
     if size is not None and size.mark == "bad":
         raise FailedWork(size.words, where=f"rig {rig.name}", remedy=size.remedy)

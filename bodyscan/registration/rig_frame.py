@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
-from bodyscan.calibration.board_views import LocatedView, board_symmetries
+from bodyscan.calibration.board_views import LocatedView, find_board_symmetries
 from bodyscan.errors import BadInput
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.view_graph import Target
@@ -16,7 +16,7 @@ from bodyscan.rig.pair import NominalPose, Pair
 from bodyscan.rig.rig import Rig
 
 
-def nominal_pose(nominal: NominalPose) -> RigidTransform:
+def compute_nominal_pose(nominal: NominalPose) -> RigidTransform:
     """`rig_from_camera` of a camera that looks from one point at another, upright."""
     position = np.array(nominal.position_mm)
     forward = np.array(nominal.look_at_mm) - position
@@ -27,7 +27,7 @@ def nominal_pose(nominal: NominalPose) -> RigidTransform:
     return RigidTransform(np.column_stack([right, np.cross(forward, right), forward]), position)
 
 
-def frame_target(rig: Rig) -> Target | None:
+def find_frame_target(rig: Rig) -> Target | None:
     """The (shot, board) that fixes the rig frame, or None if a pair does."""
     board, shot = rig.frame_board, rig.rig_frame.shot
     return (shot, board.name) if board and shot else None
@@ -73,7 +73,7 @@ def find_frame_board_rotation(
     face. Of all readings this takes the one that puts the cameras nearest to their nominal
     positions, or at least above the floor.
     """
-    target = frame_target(rig)
+    target = find_frame_target(rig)
     if (
         target is None
         or target not in root_from_board
@@ -91,7 +91,7 @@ def find_frame_board_rotation(
             total += float(np.linalg.norm(position - np.array(meant)))
         return total
 
-    return min(board_symmetries(rig.board(target[1])), key=total_displacement)
+    return min(find_board_symmetries(rig.board(target[1])), key=total_displacement)
 
 
 def find_rig_from_root(
@@ -103,7 +103,7 @@ def find_rig_from_root(
 
     Raises BadInput if the board or pair that should fix the frame was not seen or calibrated.
     """
-    target, pair = frame_target(rig), rig.frame_pair
+    target, pair = find_frame_target(rig), rig.frame_pair
     if target is not None:
         if target not in root_from_board:
             raise BadInput(
@@ -153,5 +153,7 @@ def _place_at_nominal_pose(
             where=f"rig {rig.name}",
             remedy=f"correct {source}, or name another pair in rig_frame",
         )
-    rig_from_camera = nominal_pose(pair.nominal) if pair.nominal else RigidTransform.identity()
+    rig_from_camera = (
+        compute_nominal_pose(pair.nominal) if pair.nominal else RigidTransform.identity()
+    )
     return rig_from_camera @ from_camera[pair.name].inverse()

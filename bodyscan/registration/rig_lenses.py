@@ -96,7 +96,7 @@ def _find_decentred(chosen: Mapping[str, ChosenLens]) -> list[str]:
         if lens.fit.camera.lens.kind in (Radial.kind, Brown.kind)
         and any(trial.kind == Brown.kind and trial.is_open for trial in lens.trials)
     ]
-    decentring = np.array([_decentring(chosen[name]) for name in open_]).ravel()
+    decentring = np.array([_measure_decentring(chosen[name]) for name in open_]).ravel()
     if not open_ or np.mean(decentring**2) < 1.0 + MIN_GAIN * np.sqrt(2.0 / len(decentring)):
         return []
     return [name for name in open_ if chosen[name].fit.camera.lens.kind == Radial.kind]
@@ -113,7 +113,7 @@ def _begin_with_brown(
     return replace(again, trials=(replace(simple, chosen=False), first, *again.trials[1:]))
 
 
-def _decentring(lens: ChosenLens) -> Array:
+def _measure_decentring(lens: ChosenLens) -> Array:
     """p1 and p2 in their sigmas, (2,), of the fit with Brown's lens."""
     fit = next(fit for fit in lens.tried if type(fit.camera.lens) is Brown)
     columns = [fit.camera.parameter_names.index(name) for name in ("p1", "p2")]

@@ -27,31 +27,31 @@ from bodyscan.outcome import Outcome
 from bodyscan.registration.board_motion import estimate_motions
 from bodyscan.registration.board_shape import estimate_board_shapes
 from bodyscan.registration.cluster_covariance import (
+    build_normal_equations,
     cluster_board_poses,
     cluster_robust_covariance,
-    normal_equations,
 )
 from bodyscan.registration.joint_solve import JointSolution, refine_solution, solve_poses
 from bodyscan.registration.rig_calibration import ObservedCorners
 from bodyscan.registration.rig_frame import (
     find_frame_board_rotation,
+    find_frame_target,
     find_rig_from_root,
-    frame_target,
     hold_frame,
 )
 from bodyscan.registration.rig_lenses import ChosenLenses, choose_lenses
 from bodyscan.registration.view_consistency import (
     ConsistentSolve,
-    error_limit,
+    compute_error_limit,
     find_inconsistent_views,
     solve_consistently,
 )
 from bodyscan.registration.view_graph import (
     Target,
+    build_view_graph,
     by_target,
-    initial_poses,
+    find_initial_poses,
     locate_boards_jointly,
-    view_graph,
 )
 from bodyscan.rig.rig import Rig
 
@@ -137,7 +137,7 @@ def solve_rig(
     groups of pairs share no view, only views whose board numbering leaves their poses open, or only
     views that contradict each other by far; BadInput if nothing fixes the rig frame.
     """
-    start, left_out = initial_poses(views, sorted(cameras))
+    start, left_out = find_initial_poses(views, sorted(cameras))
     shared = [view for view in views if view.pair in start]
     joined = {name: cameras[name] for name in sorted(start)}
     solved = _solve(rig, shared, joined, start)
@@ -158,7 +158,7 @@ def _solve(
     """Solve with the richest lenses, drop wrong views, choose the lenses, solve again, and take
     back views that fit after all. weigh: drop none; robust weights and their spread are the noise."""
     names = sorted(start)
-    graph = view_graph(views, names)
+    graph = build_view_graph(views, names)
     root = max(names, key=lambda name: (graph.degree(name), name))
     to_root = start[root].inverse()
     root_from_camera = {name: to_root @ pose for name, pose in start.items()}
@@ -189,7 +189,7 @@ def _judge_views(
     doubtful = [view for view in views if view.target in inconsistent]
     gross = {view.key for view in find_inconsistent_views(doubtful, solution, 30.0).value}
     kept = [view for view in views if view.key not in gross]
-    limit_px = error_limit(kept, solution.cameras)
+    limit_px = compute_error_limit(kept, solution.cameras)
     for loss_px in LOSSES_PX:
         solution = solve_poses(kept, solution, root=root, loss_px=loss_px)
     judged = solve_consistently(views, solution, root=root, limit_px=limit_px, wrong=gross)
@@ -235,7 +235,7 @@ def _transfer_to_rig_frame(rig: Rig, solved: _Solved) -> RigSolution:
     """The solution carried into the rig frame, with its covariance there."""
     solution, kept = solved.judged.solution, solved.judged.select_consistent(solved.views)
     rig = hold_frame(rig, kept, solution.cameras)
-    fixed = frame_target(rig)
+    fixed = find_frame_target(rig)
     turn = find_frame_board_rotation(rig, solution.root_from_camera, solution.root_from_board)
     oriented = {
         target: root_from_board @ turn.inverse() if target == fixed else root_from_board
@@ -244,7 +244,7 @@ def _transfer_to_rig_frame(rig: Rig, solved: _Solved) -> RigSolution:
     to_rig = find_rig_from_root(rig, solution.root_from_camera, oriented)
     rig_from_camera = {name: to_rig @ t for name, t in solution.root_from_camera.items()}
     rig_from_board = {target: to_rig @ t for target, t in oriented.items()}
-    equations = normal_equations(
+    equations = build_normal_equations(
         kept,  # a turned board's motion is the same, but its shape would be turned
         solution.cameras,
         rig_from_camera,
@@ -296,7 +296,7 @@ def _with_pose(solution: RigSolution, view: LocatedView) -> LocatedView:
     return replace(view, camera_from_board=camera_from_rig @ solution.rig_from_board[view.target])
 
 
-def solved_pair(
+def make_solved_pair(
     rig: Rig, solution: RigSolution, name: str, boundaries: Mapping[ViewKey, BoardBoundaries]
 ) -> LocatedPair:
     """A pair with the camera, and the poses and shapes of its boards, of the joint solve.
@@ -341,7 +341,7 @@ def update_poses(rig: Rig, solution: RigSolution, pair: PairCalibration) -> RigS
         view.target: locate_board(pair.camera, PlanarView(view.shot, view.points, view.pixels))[0]
         for view in solution.views
     }
-    frame = frame_target(rig)
+    frame = find_frame_target(rig)
     rig_from_camera = (
         solution.rig_from_board[frame] @ camera_from_board[frame].inverse()
         if frame in camera_from_board

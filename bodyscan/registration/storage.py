@@ -18,11 +18,11 @@ from pydantic import TypeAdapter, ValidationError
 
 from bodyscan.calibration.pair import PairCalibration, PairQuality
 from bodyscan.errors import CalibrationFileError
-from bodyscan.files.atomic import json_text, write_bytes, write_json, write_npz
-from bodyscan.files.hashing import content_hash, file_hash
+from bodyscan.files.atomic import format_json, write_bytes, write_json, write_npz
+from bodyscan.files.hashing import hash_content, hash_file
 from bodyscan.files.model import describe_first_error
 from bodyscan.files.reading import read_json_object, read_npz, read_regular
-from bodyscan.geometry.camera import camera_from_fields, camera_to_fields
+from bodyscan.geometry.camera import camera_from_fields, describe_camera
 from bodyscan.geometry.light_planes import LightSheets
 from bodyscan.geometry.light_sheets import sheets_from_arrays, sheets_to_arrays
 from bodyscan.geometry.transforms import RigidTransform
@@ -103,7 +103,7 @@ def save_calibration(calibration: RigCalibration, folder: Path) -> Path:
         "schema": SCHEMA,
         "version": VERSION,
         "software": f"bodyscan {__version__}",
-        "arrays_sha256": file_hash(folder / ARRAYS_NAME),
+        "arrays_sha256": hash_file(folder / ARRAYS_NAME),
         "rig": calibration.rig.model_dump(mode="json"),
         "pairs": {name: _describe_pair(calibration, name) for name in calibration.pairs},
         "boards": [
@@ -115,10 +115,10 @@ def save_calibration(calibration: RigCalibration, folder: Path) -> Path:
         "notes": calibration.notes,
         "advice": calibration.advice,
     }
-    plain = json.loads(json_text(content))
+    plain = json.loads(format_json(content))
     for name in DERIVED:
         (folder / name).unlink(missing_ok=True)
-    write_json(folder / FILE_NAME, plain | {HASH: content_hash(plain)})
+    write_json(folder / FILE_NAME, plain | {HASH: hash_content(plain)})
     return folder / FILE_NAME
 
 
@@ -159,7 +159,7 @@ def load_calibration(path: Path, *, accept_changed: bool = False) -> RigCalibrat
         ) from error
     except (OSError, LookupError, TypeError, AttributeError, ValueError, OverflowError) as error:
         raise CalibrationFileError(
-            f"is not a readable calibration ({_reason(error)})",
+            f"is not a readable calibration ({_format_reason(error)})",
             where=str(file),
             remedy="restore the file from a copy, or calibrate again",
         ) from error
@@ -194,9 +194,9 @@ def accept_calibration(path: Path) -> Path | None:
 def _find_arrays(file: Path, content: dict[str, Any]) -> Path:
     """The arrays beside the JSON, or the kept ones if a replacement was interrupted."""
     current = file.with_name(ARRAYS_NAME)
-    archived = file.parent / HISTORY / file_hash(file) / ARRAYS_NAME
+    archived = file.parent / HISTORY / hash_file(file) / ARRAYS_NAME
     expected = content.get("arrays_sha256")
-    if archived.exists() and file_hash(current) != expected and file_hash(archived) == expected:
+    if archived.exists() and hash_file(current) != expected and hash_file(archived) == expected:
         return archived
     return current
 
@@ -204,11 +204,11 @@ def _find_arrays(file: Path, content: dict[str, Any]) -> Path:
 def _refuse_changed(content: dict[str, Any], file: Path, arrays_file: Path) -> None:
     if content["version"] == VERSION:
         unhashed = {key: value for key, value in content.items() if key != HASH}
-        if content_hash(unhashed) != content[HASH]:
+        if hash_content(unhashed) != content[HASH]:
             raise CalibrationFileError(
                 "was changed after it was stored", where=str(file), remedy=CHANGED
             )
-    if file_hash(arrays_file) != content["arrays_sha256"]:
+    if hash_file(arrays_file) != content["arrays_sha256"]:
         raise CalibrationFileError(
             f"does not belong to {file.name}",
             where=str(arrays_file),
@@ -216,7 +216,7 @@ def _refuse_changed(content: dict[str, Any], file: Path, arrays_file: Path) -> N
         )
 
 
-def _reason(error: Exception) -> str:
+def _format_reason(error: Exception) -> str:
     if isinstance(error, ValidationError):
         return describe_first_error(error)
     if isinstance(error, KeyError):
@@ -226,14 +226,14 @@ def _reason(error: Exception) -> str:
 
 def calibration_id(path: Path) -> str:
     """SHA-256 of the calibration's JSON, which itself holds the hash of its arrays."""
-    return file_hash(path / FILE_NAME if path.is_dir() else path)
+    return hash_file(path / FILE_NAME if path.is_dir() else path)
 
 
 def _describe_pair(calibration: RigCalibration, name: str) -> dict[str, Any]:
     pair = calibration.pairs[name]
     crossing = {} if pair.crossing is None else {"crossing": _describe_light(pair.crossing)}
     return {
-        "camera": camera_to_fields(pair.camera),
+        "camera": describe_camera(pair.camera),
         "rig_from_camera": calibration.rig_from_camera[name].matrix,
         "light": None if pair.sheets is None else _describe_light(pair.sheets),
         "quality": asdict(pair.quality) | UNUSED_QUALITY,
@@ -251,9 +251,11 @@ def _read_calibration(content: dict[str, Any], arrays: dict[str, Any]) -> RigCal
             name,
             camera_from_fields(part["camera"]),
             arrays[f"{name}/camera_covariance"],
-            None if part["light"] is None else _light(part["light"], f"{name}/light/", arrays),
+            None if part["light"] is None else _read_light(part["light"], f"{name}/light/", arrays),
             _read_quality(part["quality"]),
-            _light(part["crossing"], f"{name}/crossing/", arrays) if "crossing" in part else None,
+            _read_light(part["crossing"], f"{name}/crossing/", arrays)
+            if "crossing" in part
+            else None,
             _read_ray_uncertainty(name, arrays),
         )
         for name, part in parts.items()
@@ -269,25 +271,27 @@ def _read_calibration(content: dict[str, Any], arrays: dict[str, Any]) -> RigCal
         Rig.model_validate(content["rig"]),
         pairs,
         {name: _transform(part["rig_from_camera"]) for name, part in parts.items()},
-        PoseCovariance(_texts(content["placing_covariance_order"]), arrays["placing_covariance"]),
+        PoseCovariance(
+            _convert_texts(content["placing_covariance_order"]), arrays["placing_covariance"]
+        ),
         boards,
         TypeAdapter(dict[str, str]).validate_python(content["failed"], strict=True),
-        _texts(content["notes"]),
-        _texts(content.get("advice", [])),
+        _convert_texts(content["notes"]),
+        _convert_texts(content.get("advice", [])),
         {
-            name: ObservedCorners(**_under(f"{name}/seen/", arrays))
+            name: ObservedCorners(**_select_under(f"{name}/seen/", arrays))
             for name in parts
             if f"{name}/seen/pixels" in arrays
         },
     )
 
 
-def _light(content: dict[str, Any], prefix: str, arrays: dict[str, Any]) -> LightSheets:
-    return sheets_from_arrays(content["kind"], _under(prefix, arrays), content["direction"])
+def _read_light(content: dict[str, Any], prefix: str, arrays: dict[str, Any]) -> LightSheets:
+    return sheets_from_arrays(content["kind"], _select_under(prefix, arrays), content["direction"])
 
 
 def _read_ray_uncertainty(name: str, arrays: dict[str, Any]) -> RayUncertainty | None:
-    parts = _under(f"{name}/rays/", arrays)
+    parts = _select_under(f"{name}/rays/", arrays)
     if not parts:
         return None
     for part in parts.values():
@@ -296,7 +300,7 @@ def _read_ray_uncertainty(name: str, arrays: dict[str, Any]) -> RayUncertainty |
     return RayUncertainty(**parts)
 
 
-def _under(prefix: str, arrays: dict[str, Any]) -> dict[str, Any]:
+def _select_under(prefix: str, arrays: dict[str, Any]) -> dict[str, Any]:
     return {k.removeprefix(prefix): array for k, array in arrays.items() if k.startswith(prefix)}
 
 
@@ -318,5 +322,5 @@ def _transform(matrix: Any) -> RigidTransform:
     return RigidTransform(array[:3, :3].copy(), array[:3, 3].copy())
 
 
-def _texts(values: Any) -> tuple[str, ...]:
+def _convert_texts(values: Any) -> tuple[str, ...]:
     return tuple(TypeAdapter(list[str]).validate_python(values, strict=True))

@@ -18,7 +18,7 @@ from bodyscan.boards.view import ViewKey
 from bodyscan.calibration.board_views import LocatedView, apply_shape
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.least_squares import Block, Noise, minimize
-from bodyscan.geometry.robust import rms_length
+from bodyscan.geometry.robust import compute_rms_length
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.outcome import Outcome
 from bodyscan.registration.joint_solve import JointSolution, linearize_reprojection, refine_solution
@@ -28,7 +28,7 @@ MIN_ERROR_PX = 0.2
 CORNERS = Noise("corners", group=2, min_scale=0.1 * MIN_ERROR_PX)
 
 
-def error_limit(views: Iterable[LocatedView], cameras: Mapping[str, Camera]) -> float:
+def compute_error_limit(views: Iterable[LocatedView], cameras: Mapping[str, Camera]) -> float:
     """Error in px above which a view is inconsistent, by those of views at the poses that each was
     located at by itself."""
     errors = [_measure_misfit(view, cameras, view.camera_from_board) for view in views]
@@ -78,7 +78,7 @@ def _examine_board(
     kept = [view for view in group if view not in bad]
     errors = _fit_from_two_starts(kept, solution, start) if kept else np.zeros(1)
     if errors.max() > limit_px:
-        agreeing = _largest_agreement(kept, solution, start, limit_px)
+        agreeing = _find_largest_agreement(kept, solution, start, limit_px)
         others = [view for view in kept if view not in agreeing]
         bad += others
         notes.append(
@@ -90,7 +90,7 @@ def _examine_board(
     return Outcome(bad, tuple(notes))
 
 
-def _largest_agreement(
+def _find_largest_agreement(
     views: list[LocatedView], solution: JointSolution, start: RigidTransform, limit_px: float
 ) -> list[LocatedView]:
     """Leave out views one by one, each time the one without which the others agree best.
@@ -115,7 +115,7 @@ def _fit_from_two_starts(
     and from `start`."""
     starts = [solution.root_from_camera[views[0].pair] @ views[0].camera_from_board]
     starts += [start] if len(views) > 1 else []
-    fits = [np.array([*map(rms_length, fit_board(views, solution, one))]) for one in starts]
+    fits = [np.array([*map(compute_rms_length, fit_board(views, solution, one))]) for one in starts]
     return min(fits, key=lambda rms: float(np.sum(rms**2)))
 
 
@@ -126,7 +126,7 @@ def fit_board(
     # The tolerance, in variances, is far less than separates a wrong view from a right one.
     fitted = minimize(
         root_from_board,
-        lambda pose: [_corners(view, solution, pose) for view in views],
+        lambda pose: [_evaluate_corners(view, solution, pose) for view in views],
         RigidTransform.retract,
         unknowns=6,
         steps=15,
@@ -136,7 +136,9 @@ def fit_board(
     return tuple(block.residuals.reshape(-1, 2) for block in fitted.blocks)
 
 
-def _corners(view: LocatedView, solution: JointSolution, root_from_board: RigidTransform) -> Block:
+def _evaluate_corners(
+    view: LocatedView, solution: JointSolution, root_from_board: RigidTransform
+) -> Block:
     """Reprojection errors, px; derivatives by the board's motion."""
     poses = solution.cameras, solution.root_from_camera, {view.target: root_from_board}
     residuals, linearize = linearize_reprojection([view], *poses)
@@ -147,7 +149,7 @@ def _measure_misfit(
     view: LocatedView, cameras: Mapping[str, Camera], camera_from_board: RigidTransform
 ) -> float:
     """RMS reprojection error of a view with its board at that pose, px."""
-    return rms_length(
+    return compute_rms_length(
         cameras[view.pair].project(camera_from_board.apply(view.points)) - view.pixels
     )
 

@@ -12,7 +12,7 @@ import networkx as nx
 import numpy as np
 
 from bodyscan.arrays import Array
-from bodyscan.calibration.board_views import LocatedView, max_displacement_mm
+from bodyscan.calibration.board_views import LocatedView, compute_max_displacement_mm
 from bodyscan.errors import RigDisconnected
 from bodyscan.files.messages import describe_similar_shots
 from bodyscan.geometry.transforms import RigidTransform
@@ -58,7 +58,7 @@ class RelativePose:
         return self.decided, min(self.votes - self.rivals, 2), self.corners
 
 
-def view_graph(views: Iterable[LocatedView], pairs: Sequence[str]) -> nx.Graph:
+def build_view_graph(views: Iterable[LocatedView], pairs: Sequence[str]) -> nx.Graph:
     """Nodes: pairs.  Edges: pairs that saw a board at the same moment; attribute `targets`."""
     graph = nx.Graph()
     graph.add_nodes_from(pairs)
@@ -70,7 +70,7 @@ def view_graph(views: Iterable[LocatedView], pairs: Sequence[str]) -> nx.Graph:
     return graph
 
 
-def initial_poses(
+def find_initial_poses(
     views: Sequence[LocatedView], pairs: Sequence[str]
 ) -> tuple[dict[str, RigidTransform], dict[str, str]]:
     """Poses of the pairs in a common frame, and the pairs left out, each with the reason.
@@ -81,20 +81,20 @@ def initial_poses(
     groups and what would tie them, the shots whose board numbering leaves a tie open, or the pairs
     of which no two agree.
     """
-    _refuse_disconnected(view_graph(views, pairs), views)
-    targets, reach = by_target(views), _median_distance(views)
+    _refuse_disconnected(build_view_graph(views, pairs), views)
+    targets, reach = by_target(views), _compute_median_distance(views)
     groups: list[Group] = [{name: RigidTransform.identity()} for name in pairs]
     ties: dict[tuple[int, int], RelativePose | None] = {}
     while len(groups) > 1:
         for i, j in combinations(range(len(groups)), 2):
             if (i, j) not in ties:
-                ties[i, j] = _tie(groups[i], groups[j], targets, reach)
+                ties[i, j] = _find_tie(groups[i], groups[j], targets, reach)
         found = {key: tie for key, tie in ties.items() if tie is not None}
         (i, j), best = max(found.items(), key=lambda item: item[1].strength)
         # Three shots that agree are a start even where others contradict them: the solve weighs views.
         if not best.decided and (best.ambiguous or best.votes < 3):
             if any(tie.ambiguous for tie in found.values()):
-                raise _open_tie(groups[i], groups[j], best)
+                raise _make_tie_error(groups[i], groups[j], best)
             return _keep_majority(groups, best)
         merged = groups[i] | {
             name: best.first_from_second @ group_from_camera
@@ -142,12 +142,12 @@ def locate_boards_jointly(
     kept: list[LocatedView] = []
     boards: dict[Target, RigidTransform] = {}
     inconsistent: set[Target] = set()
-    reach = _median_distance(views)
+    reach = _compute_median_distance(views)
     for target, group in by_target(views).items():
         root_from_board = _find_supported_pose(group, root_from_camera, reach)
         boards[target] = root_from_board
         for view in group:
-            readings = _readings(view, root_from_camera, root_from_board, reach)
+            readings = _list_readings(view, root_from_camera, root_from_board, reach)
             gap, resolved = min(readings, key=itemgetter(0))
             kept.append(resolved)
             if gap > 2.0 * AGREEMENT * reach:
@@ -155,7 +155,7 @@ def locate_boards_jointly(
     return kept, boards, inconsistent
 
 
-def _readings(
+def _list_readings(
     view: LocatedView,
     root_from_camera: Mapping[str, RigidTransform],
     root_from_board: RigidTransform,
@@ -164,7 +164,7 @@ def _readings(
     """Every numbering of a view's board, with its distance (mm) from a given pose."""
     root, limit = root_from_camera[view.pair], 0.3 * reach
     return [
-        (max_displacement_mm(root @ one.camera_from_board, root_from_board, limit), one)
+        (compute_max_displacement_mm(root @ one.camera_from_board, root_from_board, limit), one)
         for one in map(view.resolve, view.alternatives)
     ]
 
@@ -179,14 +179,14 @@ def _find_supported_pose(
         return sum(
             len(view.pixels)
             for view in group
-            if min(gap for gap, _ in _readings(view, root_from_camera, root_from_board, reach))
+            if min(gap for gap, _ in _list_readings(view, root_from_camera, root_from_board, reach))
             < AGREEMENT * reach
         )
 
     return max(candidates, key=support)
 
 
-def _median_distance(views: Sequence[LocatedView]) -> float:
+def _compute_median_distance(views: Sequence[LocatedView]) -> float:
     """Typical distance of boards from cameras, mm: the unit of all agreement, because the squares of
     a board may be given in any unit."""
     distances = [float(np.linalg.norm(view.camera_from_board.translation)) for view in views]
@@ -201,7 +201,7 @@ def by_target(views: Iterable[LocatedView]) -> dict[Target, list[LocatedView]]:
     return dict(sorted(groups.items()))
 
 
-def _tie(
+def _find_tie(
     first: Group, second: Group, targets: dict[Target, list[LocatedView]], reach: float
 ) -> RelativePose | None:
     """Let every target that both groups saw propose `first_from_second`; take the most agreed."""
@@ -209,15 +209,15 @@ def _tie(
     corners: dict[Target, int] = {}
     ambiguous = False
     for target, views in targets.items():
-        a = max((v for v in views if v.pair in first), key=_size, default=None)
-        b = max((v for v in views if v.pair in second), key=_size, default=None)
+        a = max((v for v in views if v.pair in first), key=_measure_size, default=None)
+        b = max((v for v in views if v.pair in second), key=_measure_size, default=None)
         if a is None or b is None:
             continue
         to_board = first[a.pair] @ a.camera_from_board
         from_board = (second[b.pair] @ b.camera_from_board).inverse()
         turns = a.alternatives if a.ambiguous else b.alternatives
         proposals[target] = [to_board @ turn @ from_board for turn in turns]
-        corners[target] = min(_size(a), _size(b))
+        corners[target] = min(_measure_size(a), _measure_size(b))
         ambiguous |= len(turns) > 1
     if not proposals:
         return None
@@ -225,7 +225,7 @@ def _tie(
     owner = np.repeat(np.arange(len(proposals)), [len(p) for p in proposals.values()])
     clearest = sorted(proposals, key=lambda target: -corners[target])[:12]
     candidates = [p for target in clearest for p in proposals[target]]
-    gaps = np.array([_gaps(candidate, everything, reach) for candidate in candidates])
+    gaps = np.array([_measure_gaps(candidate, everything, reach) for candidate in candidates])
     voters = [np.unique(owner[gap < 2.0 * AGREEMENT * reach]) for gap in gaps]
     votes = [len(targets_agreeing) for targets_agreeing in voters]
     best = int(np.argmax(votes))
@@ -233,7 +233,7 @@ def _tie(
     rivals = [
         count
         for count, candidate in zip(votes, candidates, strict=True)
-        if max_displacement_mm(candidate, candidates[best], reach) > 4.0 * AGREEMENT * reach
+        if compute_max_displacement_mm(candidate, candidates[best], reach) > 4.0 * AGREEMENT * reach
     ]
     return RelativePose(
         candidates[best],
@@ -245,12 +245,14 @@ def _tie(
     )
 
 
-def _size(view: LocatedView) -> int:
+def _measure_size(view: LocatedView) -> int:
     return len(view.pixels)
 
 
-def _gaps(candidate: RigidTransform, others: Sequence[RigidTransform], reach: float) -> Array:
-    """`max_displacement_mm` between one transform and many others, (N,) mm."""
+def _measure_gaps(
+    candidate: RigidTransform, others: Sequence[RigidTransform], reach: float
+) -> Array:
+    """`compute_max_displacement_mm` between one transform and many others, (N,) mm."""
     rotations = np.array([other.rotation for other in others])
     shifts = np.array([other.translation for other in others]) - candidate.translation
     cosines = (np.einsum("ij,nij->n", candidate.rotation, rotations) - 1.0) / 2.0
@@ -270,19 +272,19 @@ def _refuse_disconnected(graph: nx.Graph, views: Iterable[LocatedView]) -> None:
         )
 
 
-def _open_tie(first: Group, second: Group, tie: RelativePose) -> RigDisconnected:
+def _make_tie_error(first: Group, second: Group, tie: RelativePose) -> RigDisconnected:
     return RigDisconnected(
         f"the relative pose of {', '.join(sorted(first))} and {', '.join(sorted(second))} stays "
         "open: their shared board may be numbered from either end, and their views do not settle "
-        f"which (shots {_shots(tie.targets)}; at best {_shots(tie.agreeing)} agree). Possible "
-        "causes: too few shared shots, images not taken together, or shots named differently in "
-        "different cameras",
+        f"which (shots {_list_shots(tie.targets)}; at best {_list_shots(tie.agreeing)} agree). "
+        "Possible causes: too few shared shots, images not taken together, or shots named "
+        "differently in different cameras",
         remedy="look whether these images were taken together and bear the same shots' names. "
         "Then capture one or two more shots that both see, the board tilted differently; or use a "
         "ChArUco board, or one whose columns and rows differ in parity",
     )
 
 
-def _shots(targets: Iterable[Target]) -> str:
+def _list_shots(targets: Iterable[Target]) -> str:
     """Names of the shots, the first six."""
     return ", ".join(sorted({shot for shot, _ in targets})[:6])

@@ -16,7 +16,7 @@ NO_STANDARD = (
 )
 
 
-def screen_table(found: Sequence[Figure], synthetic: bool) -> ScreenTable:
+def make_screen_table(found: Sequence[Figure], synthetic: bool) -> ScreenTable:
     table = ScreenTable(title=f"acceptance{' (synthetic)' if synthetic else ''}")
     for heading in ("figure", "mm", "limit", "where"):
         table.add_column(heading, justify="right" if heading in ("mm", "limit") else "left")

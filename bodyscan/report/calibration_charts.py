@@ -18,7 +18,7 @@ from bodyscan.errors import BadInput
 from bodyscan.files.atomic import write_bytes
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.camera_tables import is_in_image
-from bodyscan.geometry.light_planes import baseline_angle_tilt
+from bodyscan.geometry.light_planes import compute_baseline_angle_tilt
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.registration.rig_calibration import ObservedCorners, RigCalibration
@@ -35,7 +35,7 @@ PLANES = {
 """Planes through the rig's axis, by the direction to the picture's right."""
 
 
-def coverage_chart(calibration: RigCalibration) -> bytes:
+def draw_coverage_chart(calibration: RigCalibration) -> bytes:
     """For each camera: its image, and where each view of a board lay in it."""
     with style():
         figure, axes = grid_of(len(calibration.observed))
@@ -46,20 +46,20 @@ def coverage_chart(calibration: RigCalibration) -> bytes:
                 PolyCollection(hulls, facecolor=BLUE, alpha=0.16, edgecolor=BLUE, linewidth=0.5)
             )
             axis.plot(*seen.pixels.T, ",", color=INK, alpha=0.5)
-            _picture_frame(axis, calibration.pairs[name].camera)
+            _limit_to_picture(axis, calibration.pairs[name].camera)
             axis.set_title(f"{name}: {len(views)} views", fontsize=9.0)
     return svg(figure)
 
 
-def residual_chart(calibration: RigCalibration) -> tuple[bytes, float]:
+def draw_residual_chart(calibration: RigCalibration) -> tuple[bytes, float]:
     """For each camera: RMS of the corners' residuals over its image (colour) and their mean
     (arrows). Also returns the factor by which the arrows are magnified."""
     maps = {
-        name: _residual_map(seen, calibration.pairs[name].camera)
+        name: _map_residuals(seen, calibration.pairs[name].camera)
         for name, seen in calibration.observed.items()
     }
-    rms_known = _finite([rms for rms, _, _ in maps.values()])
-    lengths = _finite([np.linalg.norm(mean, axis=-1) for _, mean, _ in maps.values()])
+    rms_known = _gather_finite([rms for rms, _, _ in maps.values()])
+    lengths = _gather_finite([np.linalg.norm(mean, axis=-1) for _, mean, _ in maps.values()])
     top = float(np.percentile(rms_known, 98))
     widest = max(calibration.pairs[name].camera.width for name in maps)
     # The longest arrow is about 8 % of the image's width.
@@ -79,15 +79,15 @@ def residual_chart(calibration: RigCalibration) -> tuple[bytes, float]:
                 width=0.008,
                 color=RED,
             )
-            _picture_frame(axis, camera)
+            _limit_to_picture(axis, camera)
             axis.set_title(name, fontsize=9.0)
         figure.colorbar(shown, ax=axes, shrink=0.6, label="RMS, px")
     return svg(figure), times
 
 
-def planes_chart(calibration: RigCalibration) -> bytes:
+def draw_planes_chart(calibration: RigCalibration) -> bytes:
     """Fig. 6 for every pair: baseline, projection angle and tilt of the light planes over s."""
-    colour, dash = line_styles(calibration)
+    colour, dash = choose_line_styles(calibration)
     with style():
         figure, axes = plt.subplots(3, 1, figsize=(9.6, 8.4), sharex=True, constrained_layout=True)
         for name, pair in calibration.pairs.items():
@@ -95,7 +95,7 @@ def planes_chart(calibration: RigCalibration) -> bytes:
                 continue
             s = np.arange(pair.sheets.stripes + 1.0)
             planes = pair.sheets.tangent_planes(s)
-            length, angle, tilt = baseline_angle_tilt(planes, pair.sheets.direction)
+            length, angle, tilt = compute_baseline_angle_tilt(planes, pair.sheets.direction)
             for axis, values in zip(
                 axes, (length, np.degrees(angle), np.degrees(tilt)), strict=True
             ):
@@ -114,7 +114,7 @@ def planes_chart(calibration: RigCalibration) -> bytes:
     return svg(figure)
 
 
-def shared_boards(calibration: RigCalibration) -> Array:
+def count_shared_boards(calibration: RigCalibration) -> Array:
     """Number of boards (P, P) that two pairs saw at the same moment, in the order of `observed`; zero
     on the diagonal."""
     seen = [set(one.target.tolist()) for one in calibration.observed.values()]
@@ -123,7 +123,7 @@ def shared_boards(calibration: RigCalibration) -> Array:
     return count
 
 
-def line_styles(calibration: RigCalibration) -> tuple[dict[str, str], dict[str, str]]:
+def choose_line_styles(calibration: RigCalibration) -> tuple[dict[str, str], dict[str, str]]:
     """A colour for the pairs of each pole, and a dash for each pair of a pole."""
     poles: dict[str, list[str]] = defaultdict(list)
     for pair in calibration.rig.pairs:
@@ -136,7 +136,7 @@ def line_styles(calibration: RigCalibration) -> tuple[dict[str, str], dict[str, 
     return colour, dash
 
 
-def _residual_map(seen: ObservedCorners, camera: Camera) -> tuple[Array, Array, Array]:
+def _map_residuals(seen: ObservedCorners, camera: Camera) -> tuple[Array, Array, Array]:
     """RMS (rows, columns) and mean (rows, columns, 2) of residuals, px, in 8 rows of 10 cells, and the
     cells' middles; NaN for fewer than three corners."""
     rows, columns = np.linspace(0, camera.height, 9) - 0.5, np.linspace(0, camera.width, 11) - 0.5
@@ -153,23 +153,23 @@ def _residual_map(seen: ObservedCorners, camera: Camera) -> tuple[Array, Array, 
     return rms, mean, 0.5 * np.stack(middles, axis=-1)
 
 
-def _picture_frame(axis: Axes, camera: Camera) -> None:
+def _limit_to_picture(axis: Axes, camera: Camera) -> None:
     axis.set(xlim=(-0.5, camera.width - 0.5), ylim=(camera.height - 0.5, -0.5), aspect="equal")
     axis.set_xticks([])
     axis.set_yticks([])
     axis.spines[:].set_visible(True)
 
 
-def _finite(arrays: list[Array]) -> Array:
+def _gather_finite(arrays: list[Array]) -> Array:
     """All known values in some arrays; a single 1 if there are none."""
     known = np.concatenate([array[np.isfinite(array)] for array in arrays])
     return known if known.size else np.ones(1)
 
 
-def rig_model(calibration: RigCalibration) -> dict[str, object]:
+def build_rig_model(calibration: RigCalibration) -> dict[str, object]:
     """Build the model for the viewer: cameras' fields of view, boards' outlines, volume and axes."""
     grey, dark = np.array([190, 197, 207], np.uint8), np.array([120, 130, 145], np.uint8)
-    colours, _ = line_styles(calibration)
+    colours, _ = choose_line_styles(calibration)
     parts: list[tuple[Array, Bytes]] = []
     for name, pose in calibration.rig_from_camera.items():
         camera = calibration.pairs[name].camera
@@ -177,7 +177,7 @@ def rig_model(calibration: RigCalibration) -> dict[str, object]:
         corners = np.array([[-0.5, -0.5], [right, -0.5], [right, bottom], [-0.5, bottom]])
         far = pose.apply(220.0 * np.nan_to_num(camera.rays(corners)))
         sides = np.stack([np.broadcast_to(pose.translation, far.shape), far], axis=1)
-        parts.append((np.concatenate([sides, _close(far)]), _rgb(colours[name])))
+        parts.append((np.concatenate([sides, _close(far)]), _convert_to_rgb(colours[name])))
     for (_, board_name), rig_from_board in calibration.rig_from_board.items():
         board = calibration.rig.board(board_name)
         x, y = board.size_mm
@@ -205,11 +205,11 @@ def _close(corners: Array) -> Array:
     return np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
 
 
-def _rgb(colour: str) -> Bytes:
+def _convert_to_rgb(colour: str) -> Bytes:
     return np.array([int(colour[k : k + 2], 16) for k in (1, 3, 5)], np.uint8)
 
 
-def sigma_at(
+def compute_sigma_at(
     points: Array,
     rig_from_camera: Mapping[str, RigidTransform],
     cameras: Mapping[str, Camera],
@@ -246,8 +246,8 @@ def sigma_at(
     return np.where(measured, np.sqrt(np.maximum(variance, 0.0)), np.nan), count
 
 
-def sigma_chart(calibration: RigCalibration) -> bytes:
-    """Maps of `sigma_at` in the planes x = 0 (front) and y = 0 (side) on one colour scale, as PNG.
+def draw_sigma_chart(calibration: RigCalibration) -> bytes:
+    """Maps of `compute_sigma_at` at x = 0 (front) and y = 0 (side) on one colour scale, as PNG.
 
     Light grey where nothing is measured. Raises BadInput if no sigma is known.
     """
@@ -270,9 +270,9 @@ def sigma_chart(calibration: RigCalibration) -> bytes:
     lit = {name for name, pair in calibration.pairs.items() if pair.sheets is not None}
     maps = {}
     for caption, right in PLANES.items():
-        points = plane_points(volume, np.array(right), 20.0)
+        points = make_plane_points(volume, np.array(right), 20.0)
         flat = points.reshape(-1, 3)
-        sigma, _ = sigma_at(flat, poses, cameras, calibration.covariance, lit)
+        sigma, _ = compute_sigma_at(flat, poses, cameras, calibration.covariance, lit)
         maps[caption] = sigma.reshape(points.shape[:2])
     known = np.concatenate([values[np.isfinite(values)] for values in maps.values()])
     top = float(np.percentile(known, 98)) if known.size else 1.0
@@ -302,11 +302,11 @@ def write_sigma_map(calibration: Path, path: Path | None = None) -> Path:
     path = path or (calibration if calibration.is_dir() else calibration.parent) / MAP_NAME
     if path.suffix.lower() != ".png":
         raise BadInput("the map is drawn as PNG", where=str(path), remedy="name it .png")
-    write_bytes(path, sigma_chart(load_calibration(calibration)))
+    write_bytes(path, draw_sigma_chart(load_calibration(calibration)))
     return path
 
 
-def plane_points(volume: Volume, right: Array, step_mm: float) -> Array:
+def make_plane_points(volume: Volume, right: Array, step_mm: float) -> Array:
     """Centres (rows, columns, 3) mm of cells about `step_mm` wide in the upright plane through the
     rig's axis along `right` (3,). Row 0 is the highest."""
     columns = max(round(2.0 * volume.radius_mm / step_mm), 1)

@@ -11,7 +11,7 @@ import numpy as np
 
 from bodyscan.calibration.camera import MIN_CLUSTERS
 from bodyscan.errors import BadInput
-from bodyscan.registration.calibration_verdict import LIMITS, figures_of, grade_calibration
+from bodyscan.registration.calibration_verdict import LIMITS, collect_figures, grade_calibration
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.storage import FILE_NAME, calibration_id, load_calibration
 from bodyscan.report import calibration_charts as draw
@@ -67,7 +67,9 @@ def calibration_page(folder: Path) -> Page:
     failed = [f"failed: {name}: {reason}" for name, reason in calibration.failed.items()]
     notes = (*failed, *(calibration.notes or ("Every image and view was used.",)))
     parts: dict[str, Callable[[], list[Block]]] = {
-        "The rig": lambda: [Viewer("Cameras in the rig frame", model, draw.rig_model(calibration))],
+        "The rig": lambda: [
+            Viewer("Cameras in the rig frame", model, draw.build_rig_model(calibration))
+        ],
         "Pairs": lambda: _tabulate_pairs(calibration),
         "How well the pairs are connected, and what would help": lambda: [
             Lines(calibration.advice or (f"No advice: {why}.",))
@@ -95,7 +97,7 @@ def calibration_page(folder: Path) -> Page:
 
 def _tabulate_pairs(calibration: RigCalibration) -> list[Block]:
     rows = []
-    for one in figures_of(calibration):
+    for one in collect_figures(calibration):
         pair = calibration.pairs[one.name]
         rows.append((*astuple(one), pair.quality.light_model, pair.camera.lens.kind))
     return [Table(PAIR_COLUMNS, tuple(rows)), Lines(tuple(_describe_lenses(calibration)))]
@@ -145,13 +147,13 @@ def _show_boards(calibration: RigCalibration) -> list[Block]:
             "boards lay in each image, and their residuals."
         )
         return [why]
-    residuals, times = draw.residual_chart(calibration)
+    residuals, times = draw.draw_residual_chart(calibration)
     return [
         Picture(
             "Coverage of each camera by boards",
             "Each camera's image, and the hull of the corners of every board seen in it. Empty "
             "corners of an image are where its lens is known least.",
-            draw.coverage_chart(calibration),
+            draw.draw_coverage_chart(calibration),
         ),
         Picture(
             "Residuals of corners",
@@ -180,7 +182,7 @@ def _show_planes(calibration: RigCalibration) -> list[Block]:
         "angle about the axis the stripes run along, and how far it leans. For horizontal "
         "stripes x and y are exchanged. Smooth curves are right; a projector's lens bends "
         "them, a rotating mirror hardly does. Of bent sheets: their tangent planes.",
-        draw.planes_chart(calibration),
+        draw.draw_planes_chart(calibration),
     )
     return [planes, tried, Lines(tuple(_describe_light_models(calibration)))]
 
@@ -188,7 +190,7 @@ def _show_planes(calibration: RigCalibration) -> list[Block]:
 def _show_shared_boards(calibration: RigCalibration) -> list[Block]:
     if len(calibration.observed) < 2:
         return ["There is nothing to share."]
-    shared = draw.shared_boards(calibration)
+    shared = draw.count_shared_boards(calibration)
     counts = np.where(shared > 0, shared, np.nan)
     caption = (
         "Number of boards that two pairs saw at the same moment, which connect them. Empty: none."
@@ -199,7 +201,7 @@ def _show_shared_boards(calibration: RigCalibration) -> list[Block]:
 
 def _show_sigma(calibration: RigCalibration) -> list[Block]:
     try:
-        picture = draw.sigma_chart(calibration)
+        picture = draw.draw_sigma_chart(calibration)
     except BadInput as error:
         return [f"There is no map: {error.what}; {error.remedy}."]
     return [

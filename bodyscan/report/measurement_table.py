@@ -13,7 +13,7 @@ import numpy as np
 from rich.table import Table
 
 from bodyscan.errors import BadInput
-from bodyscan.files.atomic import json_text, write_json, write_text
+from bodyscan.files.atomic import format_json, write_json, write_text
 from bodyscan.files.messages import require_suffix
 from bodyscan.fusion.storage import StoredScan
 from bodyscan.measurement.changes import MeasureChanges
@@ -71,7 +71,7 @@ def tables(measured: Measurements, changes: MeasureChanges | None = None) -> Ite
             )
     yield slices
     if measured.named is not None:
-        yield _named_table(measured.named)
+        yield _make_named_table(measured.named)
     if changes is not None:
         yield _changes_table(changes)
 
@@ -94,7 +94,7 @@ def _format_girth(value: float, between: Range, measured: float) -> str:
     return f"{value:.1f}" if known else f"{low:.0f} to {high:.0f}"
 
 
-def _named_table(named: NamedMeasures) -> Table:
+def _make_named_table(named: NamedMeasures) -> Table:
     """Measures by name with their 95 % intervals, the interval alone where too little was measured."""
     table = Table(title="measures by name, mm")
     for heading in ("measure", "value", "95 %", "the standard's stance"):
@@ -131,7 +131,7 @@ MEASURE_COLUMNS = (
 """Of a table of measures by name: one row for each person and measure."""
 
 
-def named_csv(
+def format_named_csv(
     named: NamedMeasures | str,
     facts: Mapping[str, Any],
     changes: MeasureChanges | None = None,
@@ -165,7 +165,7 @@ def named_csv(
     return _write_csv(MEASURE_COLUMNS + (of_change if changes else ()), rows)
 
 
-def landmarks_csv(named: NamedMeasures, facts: Mapping[str, Any]) -> str:
+def format_landmarks_csv(named: NamedMeasures, facts: Mapping[str, Any]) -> str:
     """Landmarks as CSV: x, y, z in mm, rig frame; sigma by axis."""
     columns = ("subject", "when", "name", "x", "y", "z", "sigma", "unit", "found")
     scan = {"subject": facts.get("subject"), "when": facts.get("when"), "unit": "mm"}
@@ -177,7 +177,7 @@ def landmarks_csv(named: NamedMeasures, facts: Mapping[str, Any]) -> str:
     return _write_csv(columns, rows)
 
 
-def landmarks_lnd(named: NamedMeasures, facts: Mapping[str, Any]) -> str:
+def format_landmarks_lnd(named: NamedMeasures, facts: Mapping[str, Any]) -> str:
     """Landmarks as CAESAR's .lnd files have them, in mm: number, three fields of its scanner's images
     (0 here), x, y, z, name."""
     lines = ["UNITS = mm", "AUX ="]
@@ -187,15 +187,19 @@ def landmarks_lnd(named: NamedMeasures, facts: Mapping[str, Any]) -> str:
     return "\n".join([*lines, "END =", ""])
 
 
-def landmarks_json(named: NamedMeasures, facts: Mapping[str, Any]) -> str:
+def format_landmarks_json(named: NamedMeasures, facts: Mapping[str, Any]) -> str:
     """Landmarks as JSON."""
     content = {"schema": "bodyscan-landmarks", "version": 1, "units": "mm", "frame": "rig"}
     scan = {"subject": facts.get("subject"), "when": facts.get("when")}
     landmarks = [asdict(landmark) for landmark in named.landmarks.values()]
-    return json_text(content | scan | {"landmarks": landmarks})
+    return format_json(content | scan | {"landmarks": landmarks})
 
 
-LANDMARK_FORMATS = {".csv": landmarks_csv, ".json": landmarks_json, ".lnd": landmarks_lnd}
+LANDMARK_FORMATS = {
+    ".csv": format_landmarks_csv,
+    ".json": format_landmarks_json,
+    ".lnd": format_landmarks_lnd,
+}
 
 
 def require_formats(
@@ -224,9 +228,9 @@ def write_measurements(
 ) -> None:
     """Write measurements as JSON, or as CSV if the path's suffix says so, with changes if any."""
     if path.suffix.lower() == ".csv":
-        write_text(path, measurements_csv(measured, facts, changes))
+        write_text(path, format_measurements_csv(measured, facts, changes))
     else:
-        write_json(path, measurements_document(measured, facts, changes))
+        write_json(path, make_measurements_document(measured, facts, changes))
 
 
 def write_measures(stored: StoredScan, folder: Path) -> str:
@@ -239,7 +243,7 @@ def write_measures(stored: StoredScan, folder: Path) -> str:
         reason, measured = error.what, measure(stored.mesh)
     named = measured.named
     write_measurements(folder / MEASUREMENTS, measured, stored.facts)
-    write_text(folder / "measures.csv", named_csv(named or reason, stored.facts))
+    write_text(folder / "measures.csv", format_named_csv(named or reason, stored.facts))
     if named is not None:
         for suffix in LANDMARK_FORMATS:
             write_landmarks(folder / f"landmarks{suffix}", named, stored.facts)
@@ -254,13 +258,13 @@ def _write_csv(columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str
     return text.getvalue()
 
 
-def measurements_document(
+def make_measurements_document(
     measured: Measurements,
     facts: Mapping[str, Any],
     changes: MeasureChanges | None = None,
 ) -> dict[str, Any]:
     """Content of `measurements.json`; facts: of the scan, as in its scan.json; changes, as in
-    `named_csv`."""
+    `format_named_csv`."""
     named = measured.named
     by_name = named and {
         "landmarks": [asdict(landmark) for landmark in named.landmarks.values()],
@@ -297,7 +301,7 @@ def _describe(measure: Measure) -> dict[str, Any]:
     return asdict(measure) | {"path_mm": np.round(measure.path_mm, 1)}
 
 
-def measurements_csv(
+def format_measurements_csv(
     measured: Measurements,
     facts: Mapping[str, Any],
     changes: MeasureChanges | None = None,
@@ -305,7 +309,7 @@ def measurements_csv(
     """Measurements as CSV: `Measurements.to_records`, each with the scan's subject, date and grade; or
     those by name, if they were asked for."""
     if measured.named is not None:
-        return named_csv(measured.named, facts, changes)
+        return format_named_csv(measured.named, facts, changes)
     scan = {"subject": facts.get("subject"), "when": facts.get("when")}
     scan["grade"] = (facts.get("verdict") or {}).get("grade")
     records = [scan | record for record in measured.to_records()]

@@ -21,7 +21,7 @@ from bodyscan.measurement.measurements import measure
 from bodyscan.measurement.named import MIN_MEASURED
 from bodyscan.mesh.body import BodyMesh
 from bodyscan.mesh.repair import decimate
-from bodyscan.report.measurement_table import MEASUREMENTS, measurements_document
+from bodyscan.report.measurement_table import MEASUREMENTS, make_measurements_document
 from bodyscan.report.model import Layer, Strokes, pack
 from bodyscan.report.page import Block, Column, Lines, Picture, Table, Viewer
 from bodyscan.report.pictures import Callout, draw_callouts
@@ -41,7 +41,7 @@ def show_measures(scan: StoredScan, folder: Path) -> list[Block]:
     """The measures by name of a scan in a folder. Raises BadInput if no standing body fits it."""
     content = _read_measures(folder)
     if content is None:
-        content = measurements_document(measure(scan.mesh, named=True), scan.facts)
+        content = make_measurements_document(measure(scan.mesh, named=True), scan.facts)
     measures: list[Content] = content["measures"]
     posture = content["posture"]
     arms, feet = (" and ".join(f"{a:.0f}" for a in posture[k]) for k in ("arms_deg", "feet_deg"))

@@ -107,5 +107,5 @@ def encode(array: NDArray[Any]) -> str:
     return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode("ascii")
 
 
-def css(colour: Sequence[int] | Bytes) -> str:
+def format_css(colour: Sequence[int] | Bytes) -> str:
     return "#{:02x}{:02x}{:02x}".format(*(int(part) for part in colour))

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from bodyscan.arrays import Array, Bytes, Floats, Indices
 from bodyscan.files.atomic import write_bytes
 from bodyscan.mesh.body import BodyCloud, BodyMesh
-from bodyscan.mesh.depth_buffer import nearest_faces, nearest_points
+from bodyscan.mesh.depth_buffer import find_nearest_faces, find_nearest_points
 from bodyscan.mesh.sliced_parts import find_body_frame
 from bodyscan.optional import optional
 from bodyscan.outcome import Outcome
@@ -69,7 +69,7 @@ def draw_mesh(
     """Shaded pictures of a mesh: filled faces orange, faces seen from their inside magenta."""
     base = np.full((len(mesh.faces), 3), 210, np.uint8)
     base[mesh.filled] = FILLED_TINT
-    frames = _frames(mesh.vertices, views, height_px)
+    frames = _make_frames(mesh.vertices, views, height_px)
     return png([_draw_faces(mesh, base, frame) for frame in frames], views)
 
 
@@ -89,7 +89,7 @@ def draw_callouts(
     of its side."""
     base, wide = np.full((len(mesh.faces), 3), 225, np.uint8), 250  # px, of a margin
     panels = []
-    frames = _frames(mesh.vertices, tuple(callouts), height_px)
+    frames = _make_frames(mesh.vertices, tuple(callouts), height_px)
     for view, frame in zip(callouts, frames, strict=True):
         margin = np.full((height_px, wide, 3), BACKGROUND, np.uint8)
         canvas = np.hstack([margin, _draw_faces(mesh, base, frame), margin])
@@ -142,7 +142,7 @@ class VisiblePoints:
         height_px: int = 900,
     ) -> VisiblePoints:
         """Of points (N, 3) with normals (N, 3), mm, rig frame."""
-        dot_mm, frames = _dot_size(points), _frames(points, views, height_px)
+        dot_mm, frames = _choose_dot_size(points), _make_frames(points, views, height_px)
         numbers = tuple(_find_visible(points, normals, frame, dot_mm) for frame in frames)
         return VisiblePoints(tuple(views), numbers)
 
@@ -153,7 +153,7 @@ class VisiblePoints:
 
     def draw_values(self, values: NDArray[np.floating], scale: Scale) -> bytes:
         """A picture by a number for each point, with the scale's bar."""
-        return self.draw(scale.colours(values), colour_bar(scale, len(self.numbers[0])))
+        return self.draw(scale.colours(values), draw_colour_bar(scale, len(self.numbers[0])))
 
 
 def draw_cloud(cloud: BodyCloud, visible: VisiblePoints, colour: str = "photo") -> bytes:
@@ -190,7 +190,7 @@ class _Frame:
         return projected
 
 
-def _frames(points: Array, views: Sequence[str], height_px: int) -> list[_Frame]:
+def _make_frames(points: Array, views: Sequence[str], height_px: int) -> list[_Frame]:
     """Frames of a subject's views, all with the scale of its greatest extent; what faces x is front
     where no feet tell which way the subject faces."""
     low, high = points.min(axis=0), points.max(axis=0)
@@ -199,7 +199,7 @@ def _frames(points: Array, views: Sequence[str], height_px: int) -> list[_Frame]
     body = find_body_frame(points[:: max(1, len(points) // 50_000)])
     frames = []
     for view in views:
-        axes = _axes(view) @ body.view_axes.T
+        axes = _make_axes(view) @ body.view_axes.T
         across = points @ axes[0]
         ends = np.array([across.min(), across.max()])
         width = int(np.ceil((np.ptp(ends) + 40.0) / step))
@@ -208,7 +208,7 @@ def _frames(points: Array, views: Sequence[str], height_px: int) -> list[_Frame]
     return frames
 
 
-def _axes(view: str) -> Array:
+def _make_axes(view: str) -> Array:
     """Rows (3, 3): the picture's right, its up, and the direction to the viewer, body frame."""
     azimuth = np.radians(AZIMUTHS_DEG[view])
     right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
@@ -218,7 +218,7 @@ def _axes(view: str) -> Array:
 
 def _draw_faces(mesh: BodyMesh, base: Bytes, frame: _Frame) -> Bytes:
     """Draw faces in their colours (F, 3), shaded by how they face the viewer."""
-    number = nearest_faces(frame.project(mesh.vertices), mesh.faces, frame.height, frame.width)
+    number = find_nearest_faces(frame.project(mesh.vertices), mesh.faces, frame.height, frame.width)
     hit = number >= 0
     face = number[hit]
     first, second, third = np.moveaxis(mesh.vertices[mesh.faces[face]], 1, 0)
@@ -238,11 +238,11 @@ def _find_visible(
     front = np.flatnonzero(normals @ frame.axes[2].astype(normals.dtype) > 0)
     size = max(1, int(np.ceil(dot_mm / frame.step_mm)))
     projected = frame.project(points.take(front, axis=0))
-    nearest = nearest_points(projected, size, frame.height, frame.width)
+    nearest = find_nearest_points(projected, size, frame.height, frame.width)
     return np.append(front, -1)[nearest]
 
 
-def _dot_size(points: Array) -> float:
+def _choose_dot_size(points: Array) -> float:
     """Size to draw a point, mm, so that a surface shows no holes: four times the median gap."""
     if len(points) < 2:
         return 0.0
@@ -271,7 +271,7 @@ class Scale:
         return np.where(np.isfinite(values)[:, None], colours, UNKNOWN).astype(np.uint8)
 
 
-def colour_bar(scale: Scale, height_px: int) -> Bytes:
+def draw_colour_bar(scale: Scale, height_px: int) -> Bytes:
     """Draw a colour bar with the numbers at its ends and middle beside it, and its caption."""
     panel = np.full((height_px, 130, 3), BACKGROUND, np.uint8)
     top, bottom = height_px // 6, height_px - height_px // 6

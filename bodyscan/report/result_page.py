@@ -34,7 +34,7 @@ def write_report(
     page = build_page(result, other)
     write_text(path, render(page))
     # As beside an export, so that `bodyscan forget` knows whom it shows.
-    shown = {"subject": page.subject, "compared_with": _subject_of(other)}
+    shown = {"subject": page.subject, "compared_with": _find_subject(other)}
     is_inside = path.parent.resolve() == folder.resolve()
     description = path.with_name(f"{path.name}.json")
     if shown["compared_with"] or (page.subject and not is_inside):
@@ -44,7 +44,7 @@ def write_report(
     return path, page.verdict
 
 
-def _subject_of(scan: Path | None) -> str | None:
+def _find_subject(scan: Path | None) -> str | None:
     """The pseudonym that a scan's folder, or its file in it, names; None for a surface without."""
     folder = scan if scan is None or scan.is_dir() else scan.parent
     if folder is None or not (folder / scans.FILE_NAME).is_file():

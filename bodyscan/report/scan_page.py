@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bodyscan.evaluation.surface import Comparison, compare_surfaces
-from bodyscan.fusion.storage import StoredScan, load_scan, read_facts, stored_verdict
+from bodyscan.fusion.storage import StoredScan, load_scan, read_facts, read_stored_verdict
 from bodyscan.fusion.verdict.coverage import MAX_FILLED
 from bodyscan.fusion.verdict.motion import MAX_MOTION_MM, MAX_RESIDUAL_MM
 from bodyscan.fusion.verdict.overlaps import MAX_DISAGREEMENT_MM
@@ -31,7 +31,7 @@ from bodyscan.progress import THREADS
 from bodyscan.registration.rig_calibration import FLOOR_AXES
 from bodyscan.report import charts
 from bodyscan.report.measures_section import show_measures
-from bodyscan.report.model import Layer, css, pack
+from bodyscan.report.model import Layer, format_css, pack
 from bodyscan.report.page import (
     Block,
     Column,
@@ -84,7 +84,7 @@ def scan_page(folder: Path, other: Path | None = None) -> Page:
         sections = _make_sections(scan, found, folder)
     return Page(
         f"Scan of {subject}" if subject else f"Scan {folder.resolve().name}",
-        stored_verdict(facts)
+        read_stored_verdict(facts)
         or Verdict("usable", ("this scan was made by a version of bodyscan that gave no verdict",)),
         is_synthetic(folder) or facts.get("simulated", False),
         (
@@ -137,11 +137,11 @@ def _show_body(scan: StoredScan, shown: Comparison | None, limit: float) -> list
         f"one ({len(scan.mesh.faces):,}), which the figures are of. Colours are those of the measured "
         "points: photo, number of pairs, sigma; grey or orange is what nothing measured."
     )
-    layers = colour_layers(small, scan.mesh, scan.cloud, shown, limit)
+    layers = make_colour_layers(small, scan.mesh, scan.cloud, shown, limit)
     return [Viewer("Body model", caption, pack(small, layers))]
 
 
-def colour_layers(
+def make_colour_layers(
     small: BodyMesh,
     mesh: BodyMesh,
     cloud: BodyCloud,
@@ -157,22 +157,29 @@ def colour_layers(
     nearest = np.asarray(cKDTree(cloud.points).query(small.vertices, workers=THREADS)[1])
     pairs = np.array(PAIRS, np.uint8)[np.clip(cloud.pairs_seen[nearest], 1, len(PAIRS)) - 1]
     pairs[made_up] = UNKNOWN
-    tint, grey = FILLED_TINT[::-1], (css(UNKNOWN), "filled, nothing measured")
+    tint, grey = FILLED_TINT[::-1], (format_css(UNKNOWN), "filled, nothing measured")
     found = [
         Layer("photo", small.colours, None, unlit=True),
         Layer("shape", np.full(small.vertices.shape, SKIN, np.uint8)),
         Layer("pairs", pairs, {"caption": "pairs that measured it", "swatches": [
-            *((css(c), f"{k}{' or more' if k == len(PAIRS) else ''}") for k, c in enumerate(PAIRS, 1)),
+            *(
+                (format_css(c), f"{k}{' or more' if k == len(PAIRS) else ''}")
+                for k, c in enumerate(PAIRS, 1)
+            ),
             grey,
         ]}),
-        _colour_layer("sigma", np.where(made_up, np.nan, small.sigma_mm), sigma, grey),
+        _make_colour_layer("sigma", np.where(made_up, np.nan, small.sigma_mm), sigma, grey),
         Layer("filled", np.where(made_up[:, None], tint, SKIN).astype(np.uint8), {
-            "swatches": [(css(SKIN), "measured"), (css(tint), "filled to close the mesh")],
+            "swatches": [
+                (format_css(SKIN), "measured"), (format_css(tint), "filled to close the mesh"),
+            ],
         }),
     ]  # fmt: skip
     if compute_cover_shares(small.regions) and small.regions is not None:
         region_colours = np.array(REGIONS, np.uint8)
-        swatches = [(css(colour), name) for colour, name in zip(REGIONS, REGION_NAMES, strict=True)]
+        swatches = [
+            (format_css(colour), name) for colour, name in zip(REGIONS, REGION_NAMES, strict=True)
+        ]
         found.append(Layer("regions", region_colours[small.regions], {"swatches": swatches}))
     if comparison is not None:
         # Of the full mesh's nearest vertex: reduction moves the surface by some tenths of a mm.
@@ -183,15 +190,17 @@ def colour_layers(
             Scale(-limit_mm, limit_mm, caption, charts.diverging()),
             (grey[0], "filled, not compared"),
         )
-        found.append(_colour_layer("deviation", np.where(made_up, np.nan, signed), scale, grey))
+        found.append(
+            _make_colour_layer("deviation", np.where(made_up, np.nan, signed), scale, grey)
+        )
     return found
 
 
-def _colour_layer(
+def _make_colour_layer(
     name: str, values: NDArray[np.floating], scale: Scale, unknown: tuple[str, str]
 ) -> Layer:
     """Colours by value, and the scale as a legend; unknown: colour of NaN, and what it means."""
-    gradient = [css(colour) for colour in scale.table[np.linspace(0, 255, 12).astype(int)]]
+    gradient = [format_css(colour) for colour in scale.table[np.linspace(0, 255, 12).astype(int)]]
     ends = [f"{scale.low:g}".replace("-", "−"), f"{scale.high:g}"]
     legend = {"caption": scale.caption, "gradient": gradient, "ends": ends, "swatches": [unknown]}
     return Layer(name, scale.colours(values), legend)

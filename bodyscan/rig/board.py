@@ -139,7 +139,7 @@ class Board(Model):
             yield ("dictionary",), wrong
 
 
-def dictionary_family(dictionary: str) -> str:
+def find_dictionary_family(dictionary: str) -> str:
     """Return a dictionary's family, which shares its first markers: DICT_4X4 of DICT_4X4_50."""
     head, _, count = dictionary.rpartition("_")
     return head if count.isdigit() else dictionary

@@ -14,10 +14,10 @@ from bodyscan.files.model import (
     ShotName,
     copy_errors,
     find_duplicates,
-    unknown_key_error,
+    make_unknown_key_error,
 )
-from bodyscan.rig.templates import frame_name_faults, path_fault
-from bodyscan.stripes.codes import image_kinds
+from bodyscan.rig.templates import find_frame_name_faults, find_path_fault
+from bodyscan.stripes.codes import list_image_kinds
 from bodyscan.stripes.stripe_code import ImageKind, StripeCode
 
 Names = str | tuple[str, ...]
@@ -43,15 +43,15 @@ class CaptureFolder(Model):
 
 def _find_name_faults(kind: ImageKind, names: Names) -> Iterator[Problem]:
     if isinstance(names, str):
-        numbering = frame_name_faults(names, kind.number) if kind.number else ()
-        for fault in [*numbering, *filter(None, [path_fault(names)])]:
+        numbering = find_frame_name_faults(names, kind.number) if kind.number else ()
+        for fault in [*numbering, *filter(None, [find_path_fault(names)])]:
             yield (kind.name,), fault
         return
     if kind.number is None:
         yield (kind.name,), "must be text: there is one image of this kind"
         return
     for index, name in enumerate(names):
-        fault = path_fault(name)
+        fault = find_path_fault(name)
         if fault:
             yield (kind.name, index), fault
 
@@ -68,8 +68,8 @@ class ImageNames(Model):
     def _refuse_unknown_kinds(cls, keys: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
         if not isinstance(keys, dict):
             return handler(keys)
-        known = [*cls.model_fields, *(kind.name for kind in image_kinds())]
-        errors = [unknown_key_error(key, known) for key in keys if key not in known]
+        known = [*cls.model_fields, *(kind.name for kind in list_image_kinds())]
+        errors = [make_unknown_key_error(key, known) for key in keys if key not in known]
         # Strict validation takes JSON's lists as tuples, but does not know that this was JSON.
         named = {k: tuple(v) if isinstance(v, list) else v for k, v in keys.items() if k in known}
         try:
@@ -103,7 +103,7 @@ class ImageNames(Model):
         return tuple(name for kind, count in counts for name in self.kind_names(kind, count))
 
     def problems(self) -> Iterator[Problem]:
-        for kind in image_kinds():
+        for kind in list_image_kinds():
             yield from _find_name_faults(kind, self.templates(kind))
 
 
@@ -169,14 +169,14 @@ class FrameNames(ImageNames):
         wrong = list(super().problems())
         single = {"lit": self.lit, "dark": self.dark, "board": self.board}
         for key, name in single.items():
-            fault = path_fault(name) if name is not None else None
+            fault = find_path_fault(name) if name is not None else None
             if fault:
                 wrong.append(((key,), fault))
         yield from wrong
         refused = {where[0] for where, _ in wrong}
         names = [*single.values()]
         for one in (self, self.crossing):
-            for kind in image_kinds():
+            for kind in list_image_kinds():
                 if kind.name not in refused:
                     names += one.kind_names(kind, kind.max_count)
         for _, twice in islice(find_duplicates(names), 1):  # not one error for each of a kind

@@ -14,13 +14,13 @@ from bodyscan.files.atomic import write_text
 from bodyscan.files.model import Model, Name, Problem, did_you_mean, find_duplicates
 from bodyscan.files.model_file import load_model
 from bodyscan.files.yaml_file import dump_yaml
-from bodyscan.rig.board import Board, dictionary_family
+from bodyscan.rig.board import Board, find_dictionary_family
 from bodyscan.rig.devices import CapturePlan
 from bodyscan.rig.frame_names import CaptureFolder, FrameNames, ImageNames
 from bodyscan.rig.gauge import Reference, RigFrame
 from bodyscan.rig.pair import Pair
-from bodyscan.rig.templates import template_faults
-from bodyscan.stripes.codes import image_kinds
+from bodyscan.rig.templates import find_template_faults
+from bodyscan.stripes.codes import list_image_kinds
 from bodyscan.stripes.stripe_code import StripeCode
 
 Node = TypeVar("Node", int, str)
@@ -168,7 +168,10 @@ def _find_marker_overlaps(boards: Sequence[Board]) -> Iterator[Problem]:
         ids = range(board.first_marker, board.first_marker + board.marker_count)
         for other, theirs in taken:
             shared = range(max(ids.start, theirs.start), min(ids.stop, theirs.stop))
-            family, its = dictionary_family(other.dictionary), dictionary_family(board.dictionary)
+            family, its = (
+                find_dictionary_family(other.dictionary),
+                find_dictionary_family(board.dictionary),
+            )
             if shared and family == its:
                 yield (
                     ("boards", index, "first_marker"),
@@ -207,7 +210,7 @@ def _find_wrong_counts(
     names: ImageNames, where: tuple[str, ...], codes: Sequence[tuple[str, StripeCode]]
 ) -> Iterator[Problem]:
     """Find lists of names that are longer or shorter than a pair's code requires."""
-    for kind in image_kinds():
+    for kind in list_image_kinds():
         given = names.templates(kind)
         for pair, code in codes if not isinstance(given, str) else ():
             count = code.image_counts.get(kind, len(given))
@@ -229,7 +232,7 @@ def _find_template_problems(rig: Rig) -> Iterator[Problem]:
         if folder.files:
             templates.append((("calibration", index, "files"), folder.files, False))
     for where, template, needs_frame in templates:
-        for fault in template_faults(template, many, needs_frame, bool(rig.exposures)):
+        for fault in find_template_faults(template, many, needs_frame, bool(rig.exposures)):
             yield where, fault
 
 

@@ -17,7 +17,7 @@ ANYTHING = "*"
 
 
 def fill(template: str, *, shot: str, pair: str, frame: str) -> str:
-    """Fill in a template without `template_faults`; returns a relative path."""
+    """Fill in a template without `find_template_faults`; returns a relative path."""
     return template.format(shot=shot, pair=pair, frame=frame)
 
 
@@ -31,13 +31,13 @@ def compile_names(path: str) -> tuple[re.Pattern[str], ...]:
 
 
 @lru_cache(maxsize=4096)
-def shot_pattern(template: str, pair: str, frame: str) -> tuple[re.Pattern[str], ...]:
+def compile_shot_pattern(template: str, pair: str, frame: str) -> tuple[re.Pattern[str], ...]:
     """Compile one pattern per part of a path; together they find the shot (group `shot`) in it."""
     marked = _split_pattern(fill(template, shot="\0", pair=pair, frame=frame))
     return tuple(_compile_part(part) for part in marked)
 
 
-def template_faults(
+def find_template_faults(
     template: str, many_pairs: bool, needs_frame: bool, exposures: bool = False
 ) -> Iterator[str]:
     """Find what is wrong with a file-name template, as messages that follow its key."""
@@ -68,12 +68,12 @@ def template_faults(
             f"must end in {', '.join(suffixes[:-1])}, or .* for any of these: only PNG, TIFF, BMP and "
             "JPEG images are read"
         )
-    fault = path_fault(template)
+    fault = find_path_fault(template)
     if fault:
         yield fault
 
 
-def frame_name_faults(name: str, number: str) -> Iterator[str]:
+def find_frame_name_faults(name: str, number: str) -> Iterator[str]:
     """Find what is wrong with a name such as `frames.pattern`, which holds `{bit}` (`number`)."""
     try:
         parts = list(Formatter().parse(name))
@@ -88,7 +88,7 @@ def frame_name_faults(name: str, number: str) -> Iterator[str]:
             yield f"may only hold {{{number}}} or such as {{{number}:02d}}, not {{{field}}}"
 
 
-def path_fault(path: str) -> str | None:
+def find_path_fault(path: str) -> str | None:
     """Return why a relative path might lead out of its starting folder, or None."""
     if "\\" in path or "\0" in path or re.match(r"[A-Za-z]:", path):
         return "must use / between folders, and neither \\ nor a drive letter"

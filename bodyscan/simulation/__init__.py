@@ -7,8 +7,8 @@ scene (what there is); render, rays, lens, projector, patterns, lamps, sensor (i
 
 from __future__ import annotations
 
-from bodyscan.simulation.presets import settings_for
+from bodyscan.simulation.presets import compose_settings
 from bodyscan.simulation.settings import SimulationSettings
 from bodyscan.simulation.simulate import simulate, simulate_board
 
-__all__ = ["SimulationSettings", "settings_for", "simulate", "simulate_board"]
+__all__ = ["SimulationSettings", "compose_settings", "simulate", "simulate_board"]

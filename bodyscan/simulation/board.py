@@ -12,7 +12,7 @@ from scipy.ndimage import map_coordinates
 from bodyscan.arrays import Array, Floats, Mask
 from bodyscan.errors import BadInput
 from bodyscan.rig.board import Board
-from bodyscan.simulation.scene import Surface, grid_surface, grid_triangles
+from bodyscan.simulation.scene import Surface, build_grid_surface, list_grid_triangles
 from bodyscan.simulation.settings import BoardMaking
 
 
@@ -54,8 +54,8 @@ def make_print(board: Board, face: int, making: BoardMaking) -> BoardPrint:
     """Draw the print of face 0 (front) or 1 (back); the back's markers follow the front's."""
     if board.kind == "aprilgrid":
         raise BadInput("boards of kind aprilgrid are not simulated", where=f"board {board.name}")
-    dark = _dark_squares(board)
-    markers = _markers(board, face, int((~dark).sum())) if board.kind == "charuco" else None
+    dark = _find_dark_squares(board)
+    markers = _find_markers(board, face, int((~dark).sum())) if board.kind == "charuco" else None
     modules = 3 if markers is None else markers.shape[1] + 2
     cells = np.zeros((board.rows + 2, board.columns + 2, modules, modules), bool)
     cells[1:-1, 1:-1] = dark[:, :, None, None]
@@ -66,13 +66,13 @@ def make_print(board: Board, face: int, making: BoardMaking) -> BoardPrint:
     return BoardPrint(board.square_mm, board.marker_mm or 0.5 * board.square_mm, albedo)
 
 
-def _dark_squares(board: Board) -> Mask:
+def _find_dark_squares(board: Board) -> Mask:
     row, column = np.indices((board.rows, board.columns))
     swapped = board.kind == "charuco" and board.legacy_layout and board.rows % 2 == 0
     return (row + column) % 2 == (1 if swapped else 0)
 
 
-def _markers(board: Board, face: int, count: int) -> Mask:
+def _find_markers(board: Board, face: int, count: int) -> Mask:
     """Look up dark modules (count, m, m) of the markers on one face, borders included."""
     if not hasattr(cv2.aruco, board.dictionary):
         raise BadInput(f"OpenCV has no marker dictionary {board.dictionary}", where=board.name)
@@ -106,9 +106,11 @@ def make_board(board: Board, making: BoardMaking, rng: np.random.Generator) -> M
     sheet = _draw_sheet(making, rng)
     for face in range(board.faces):
         error = _print_error(board, making, rng)
-        positions = _mesh_positions(board, flat=not sheet.any() and making.print_error_mm == 0)
-        vertices = _on_sheet(positions.reshape(-1, 2), board, face, error, sheet)
-        triangles = grid_triangles(positions.shape[1] - 1, positions.shape[0] - 1)
+        positions = _space_mesh_positions(
+            board, flat=not sheet.any() and making.print_error_mm == 0
+        )
+        vertices = _map_to_sheet(positions.reshape(-1, 2), board, face, error, sheet)
+        triangles = list_grid_triangles(positions.shape[1] - 1, positions.shape[0] - 1)
         printed = make_print(board, face, making)
         on_print = positions.reshape(-1, 2)
         surfaces.append(
@@ -118,12 +120,12 @@ def make_board(board: Board, making: BoardMaking, rng: np.random.Generator) -> M
         )
         c, r = np.meshgrid(np.arange(1, board.columns), np.arange(1, board.rows))
         inner = np.stack([c.ravel(), r.ravel()], axis=1).astype(float) * board.square_mm
-        corners.append(_on_sheet(inner, board, face, error, sheet))
-    surfaces += _sides(board, width, height, making)
+        corners.append(_map_to_sheet(inner, board, face, error, sheet))
+    surfaces += _build_sides(board, width, height, making)
     return MadeBoard(tuple(surfaces), np.concatenate(corners))
 
 
-def _mesh_positions(board: Board, flat: bool) -> Array:
+def _space_mesh_positions(board: Board, flat: bool) -> Array:
     """Space mesh vertices on the print, (rows, columns, 2) mm, margin included; 4 cells a square."""
 
     def line(squares: int) -> Array:
@@ -145,20 +147,20 @@ def _draw_sheet(making: BoardMaking, rng: np.random.Generator) -> Array:
     if high > 0:
         size = float(np.exp(rng.uniform(*np.log([max(low, 1e-3), high]))))
         shape = np.append(0.0, rng.standard_normal(3))
-        heights = _height(
+        heights = _compute_height(
             shape, *np.meshgrid(np.linspace(-0.5, 0.5, 21), np.linspace(-0.5, 0.5, 21))
         )
         sheet += size / float(np.ptp(heights)) * shape
     return sheet
 
 
-def _height(sheet: Array, across: Array, down: Array) -> Array:
+def _compute_height(sheet: Array, across: Array, down: Array) -> Array:
     """Compute the height towards the front, at positions from -1/2 to 1/2 along each side."""
     bowl = sheet[0] * (1.0 - 2.0 * (across**2 + down**2))
     return bowl + sheet[1] * across**2 + sheet[2] * down**2 + sheet[3] * across * down
 
 
-def _on_sheet(positions: Array, board: Board, face: int, error: Array, sheet: Array) -> Array:
+def _map_to_sheet(positions: Array, board: Board, face: int, error: Array, sheet: Array) -> Array:
     """Map positions on the print (N, 2) to the board frame (N, 3): print error, flip, bow."""
     square = board.square_mm
     grid = np.clip(positions / square, 0.0, [board.columns, board.rows])[:, ::-1].T
@@ -167,7 +169,7 @@ def _on_sheet(positions: Array, board: Board, face: int, error: Array, sheet: Ar
     if face == 1:
         x = board.columns * square - x
     across, down = x / (board.columns * square) - 0.5, y / (board.rows * square) - 0.5
-    height = _height(sheet, across, down)
+    height = _compute_height(sheet, across, down)
     return np.stack([x, y, face * board.thickness_mm - height], axis=1)
 
 
@@ -185,7 +187,7 @@ def _print_error(board: Board, making: BoardMaking, rng: np.random.Generator) ->
     return waves * making.print_error_mm / np.sqrt(3.0)
 
 
-def _sides(board: Board, width: float, height: float, making: BoardMaking) -> list[Surface]:
+def _build_sides(board: Board, width: float, height: float, making: BoardMaking) -> list[Surface]:
     """Build the sheet's edges, and its blank back if only one face is printed."""
     m, depth = board.margin_mm, np.array([0.0, 0.0, board.thickness_mm])
     x, y = np.array([width + 2 * m, 0.0, 0.0]), np.array([0.0, height + 2 * m, 0.0])
@@ -196,4 +198,4 @@ def _sides(board: Board, width: float, height: float, making: BoardMaking) -> li
         patches += [(start + y, x, depth), (start + x, y, depth)]
     if board.faces == 1:
         patches.append((start + depth + np.array([0.0, 0.0, 0.05]), x, y))
-    return [grid_surface(*patch, albedo=making.side) for patch in patches]
+    return [build_grid_surface(*patch, albedo=making.side) for patch in patches]

@@ -73,7 +73,9 @@ def compute_laser_light(scene: Scene, hits: Hits, projector: Projector, lamps: L
 
     covered, gloss = np.flatnonzero(hits.skin[chosen] > 0.5), np.zeros(len(s), np.float32)
     if covered.size and lamps.skin.gloss > 0:
-        mirrored = highlight(points[covered], towards[covered], normals[covered], lamps.skin)
+        mirrored = compute_highlight(
+            points[covered], towards[covered], normals[covered], lamps.skin
+        )
         full = np.float32(lamps.laser_grey * lamps.reach_mm**2) / square[covered]
         gloss[chosen[covered]] = full * mirrored * reaches[covered]
     return LaserLight(weight, s, gloss)
@@ -124,7 +126,7 @@ def _make_profile_kernel(shape_px: float) -> Floats:
     return np.asarray(kernel / kernel.sum(), np.float32)
 
 
-def highlight(points: Reals, towards: Reals, normals: Reals, skin: Skin) -> Floats:
+def compute_highlight(points: Reals, towards: Reals, normals: Reals, skin: Skin) -> Floats:
     """Compute gloss (N,) for a camera at the origin, relative to a white matt surface (Blinn 1977)."""
     view = -points / np.linalg.norm(points, axis=1, keepdims=True)
     light = towards / np.linalg.norm(towards, axis=1, keepdims=True)

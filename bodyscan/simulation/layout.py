@@ -14,7 +14,7 @@ from bodyscan.rig.pair import NominalPose, Pair
 from bodyscan.rig.rig import Rig
 from bodyscan.simulation.lens import TrueCamera
 from bodyscan.simulation.projector import MirrorProjector, PinholeProjector, Projector
-from bodyscan.simulation.scene import Surface, grid_surface
+from bodyscan.simulation.scene import Surface, build_grid_surface
 from bodyscan.simulation.settings import Optics, Projection, Room, SimulationSettings
 
 
@@ -54,13 +54,13 @@ def _build(
             remedy="Add nominal: {position_mm: [x, y, z], look_at_mm: [x, y, z]} to the rig file.",
         )
     optics = settings.optics
-    reach = float(np.linalg.norm(np.subtract(*_endpoints(pair.nominal))))
+    reach = float(np.linalg.norm(np.subtract(*_find_endpoints(pair.nominal))))
     camera = draw_camera(pair.camera.width, pair.camera.height, optics, rng)
     nominal = rig_from_nominal(pair.nominal)
     perturbed = _perturb(nominal, optics, reach, rng)
     rig_from_camera = nominal if fixed else perturbed
     horizontal = pair.projector is None or pair.projector.direction == "horizontal"
-    nominal_pose = pair.projector_nominal or _default_projector(nominal, reach, horizontal)
+    nominal_pose = pair.projector_nominal or _choose_projector(nominal, reach, horizontal)
     rig_from_projector = _perturb(rig_from_nominal(nominal_pose), optics, reach, rng)
     stripes = pair.projector.stripes if pair.projector else 2
     builder = build_mirror if settings.projection.kind == "mirror" else build_pinhole
@@ -97,7 +97,7 @@ def draw_camera(width: int, height: int, optics: Optics, rng: np.random.Generato
 
 def rig_from_nominal(nominal_pose: NominalPose) -> RigidTransform:
     """Compute the pose of a device that looks along its z axis, y down, upright in the rig."""
-    position, target = _endpoints(nominal_pose)
+    position, target = _find_endpoints(nominal_pose)
     forward = target - position
     forward = forward / np.linalg.norm(forward)
     right = np.cross(forward, [0.0, 0.0, 1.0])
@@ -107,11 +107,11 @@ def rig_from_nominal(nominal_pose: NominalPose) -> RigidTransform:
     return RigidTransform(np.stack([right, np.cross(forward, right), forward], axis=1), position)
 
 
-def _endpoints(nominal_pose: NominalPose) -> tuple[Array, Array]:
+def _find_endpoints(nominal_pose: NominalPose) -> tuple[Array, Array]:
     return np.array(nominal_pose.position_mm, float), np.array(nominal_pose.look_at_mm, float)
 
 
-def _default_projector(nominal: RigidTransform, reach: float, horizontal: bool) -> NominalPose:
+def _choose_projector(nominal: RigidTransform, reach: float, horizontal: bool) -> NominalPose:
     """Choose a projector's pose if the rig file has none: above the camera, or to its right."""
     axis = -nominal.rotation[:, 1] if horizontal else nominal.rotation[:, 0]
     position = nominal.translation + 0.22 * reach * axis
@@ -217,5 +217,5 @@ def build_room(pairs: Iterable[TruePair], room: Room) -> tuple[Surface, ...]:
     x, y = np.array([2.0 * half, 0.0, 0.0]), np.array([0.0, 2.0 * half, 0.0])
     up, corner = np.array([0.0, 0.0, 3.0 * half]), np.array([-half, -half, 0.0])
     walls = [(corner, x, up), (corner, y, up), (corner + y, x, up), (corner + x, y, up)]
-    floor = grid_surface(corner, x, y, albedo=room.floor, encloses=True)
-    return (floor, *(grid_surface(*wall, albedo=room.wall, encloses=True) for wall in walls))
+    floor = build_grid_surface(corner, x, y, albedo=room.floor, encloses=True)
+    return (floor, *(build_grid_surface(*wall, albedo=room.wall, encloses=True) for wall in walls))

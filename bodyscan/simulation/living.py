@@ -127,7 +127,7 @@ def animate(still: Surface, person: Person, rng: np.random.Generator) -> LivingB
     vertices = still.vertices
     height = float(vertices[:, 2].max())
     z = vertices[:, 2] / height
-    arms = [_arm_weights(still, side, height) for side in (-1.0, 1.0)]
+    arms = [_weigh_arm(still, side, height) for side in (-1.0, 1.0)]
     head = _smoothstep(z, 0.835, 0.885) * (1.0 - arms[0]) * (1.0 - arms[1])
     limbs = [(weights, np.radians(person.arms_deg)) for weights in arms]
     limbs += [(head, np.radians(person.head_deg))]
@@ -157,7 +157,7 @@ def animate(still: Surface, person: Person, rng: np.random.Generator) -> LivingB
         (start, start - 0.6),  # the belly follows the chest
     )
     trunk = (1.0 - arms[0]) * (1.0 - arms[1])
-    breath_modes = _breath_modes(vertices, trunk, height)
+    breath_modes = _compute_breath_modes(vertices, trunk, height)
     return LivingBody(
         still, joints, breath_modes, breath, Joint(_smoothstep(z, 0.035, 0.055), pivot, sway)
     )
@@ -169,14 +169,14 @@ def _smoothstep(values: Array, low: float, high: float) -> Array:
     return t * t * (3.0 - 2.0 * t)
 
 
-def _arm_weights(still: Surface, side: float, height: float) -> Array:
+def _weigh_arm(still: Surface, side: float, height: float) -> Array:
     """Weigh vertices (N,): 1 on the arm towards positive y (side 1) or negative y (-1)."""
     fingertip = int(np.argmax(side * still.vertices[:, 1]))
-    along = dijkstra(_edges(still), indices=[fingertip], limit=0.6 * height)[0]
+    along = dijkstra(_build_edges(still), indices=[fingertip], limit=0.6 * height)[0]
     return 1.0 - _smoothstep(along / height, 0.36, 0.46)
 
 
-def _edges(surface: Surface) -> csr_matrix:
+def _build_edges(surface: Surface) -> csr_matrix:
     """Build the graph (N, N) of edge lengths between vertices, mm, both directions."""
     ends = surface.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     lengths = np.linalg.norm(np.diff(surface.vertices[ends], axis=1)[:, 0], axis=1)
@@ -184,7 +184,7 @@ def _edges(surface: Surface) -> csr_matrix:
     return csr_matrix((lengths, (ends[:, 0], ends[:, 1])), shape=(count, count))
 
 
-def _breath_modes(vertices: Array, trunk: Array, height: float) -> Array:
+def _compute_breath_modes(vertices: Array, trunk: Array, height: float) -> Array:
     """Compute motion (N, 3, 2) per mm of chest and belly: front forward, sides out, back not."""
     heights = np.array([0.72, 0.60]) * height
     sigma = 0.065 * height

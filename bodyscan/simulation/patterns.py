@@ -35,7 +35,7 @@ def count_bits(stripes: int) -> int:
     return int(np.ceil(np.log2(stripes)))
 
 
-def gray_code_bits(stripes: int, first: int = 0) -> Mask:
+def compute_gray_code_bits(stripes: int, first: int = 0) -> Mask:
     """Compute whether pattern k of a Gray code lights stripe i, (bits, stripes), 0 highest.
 
     first: the number of stripe 0.
@@ -84,11 +84,13 @@ def _blur_light(values: Floats, blurs: tuple[float, ...]) -> Floats:
     if max(blurs) <= 0:
         return np.repeat(values[None], len(blurs), axis=0)
     padded = np.pad(values, PAD * FINE, mode="edge")
-    return np.asarray(oaconvolve(padded[None], _kernels(blurs), mode="valid", axes=1), np.float32)
+    return np.asarray(
+        oaconvolve(padded[None], _sample_kernels(blurs), mode="valid", axes=1), np.float32
+    )
 
 
 @lru_cache(maxsize=8)
-def _kernels(blurs: tuple[float, ...]) -> Floats:
+def _sample_kernels(blurs: tuple[float, ...]) -> Floats:
     """Sample Gaussians (B, k) of these sigmas in stripes, cut at four of them or at PAD."""
     position = np.arange(-PAD * FINE, PAD * FINE + 1) / FINE
     reached = np.minimum(4.0 * np.array(blurs), PAD)[:, None]
@@ -138,23 +140,25 @@ def make_patterns(code: StripeCode, frames: FrameNames) -> dict[str, Array]:
     if isinstance(code, PhaseShift):
         parts = 16  # values per stripe
         position = (np.arange(code.stripes * parts) + 0.5) / parts
-        waves = np.concatenate([_wave_images(wave, position) for wave in code.waves])
+        waves = np.concatenate([_compute_wave_images(wave, position) for wave in code.waves])
         phases = _name_images(frames, PHASE, waves)
         if not code.needs_gray:
             return phases
         halves = np.floor(2.0 * position / code.waves[0].period).astype(int)
-        bits = gray_code_bits(int(halves[-1]) + 1)[:, halves].astype(float)
-        return _bit_images(frames, bits, code.inverses) | phases
+        bits = compute_gray_code_bits(int(halves[-1]) + 1)[:, halves].astype(float)
+        return _name_bit_images(frames, bits, code.inverses) | phases
     if isinstance(code, Binary):
         last = code.first_code + code.stripes
         shifts = np.arange(count_bits(last))[::-1]
         bits = (np.arange(code.first_code, last) >> shifts[:, None] & 1).astype(float)
-        return _bit_images(frames, bits, code.inverses)
+        return _name_bit_images(frames, bits, code.inverses)
     inverses, first = (code.inverses, code.first_code) if isinstance(code, Gray) else (True, 0)
-    return _bit_images(frames, gray_code_bits(code.stripes, first).astype(float), inverses)
+    return _name_bit_images(
+        frames, compute_gray_code_bits(code.stripes, first).astype(float), inverses
+    )
 
 
-def _wave_images(wave: Wave, position: Array) -> Array:
+def _compute_wave_images(wave: Wave, position: Array) -> Array:
     """Compute images (steps, N), the wave shifted by a part of its period at each step."""
     step = wave.period / wave.steps * (1.0 if wave.shift == "forward" else -1.0)
     crest = wave.origin - wave.start * wave.period / (2.0 * np.pi)
@@ -166,7 +170,7 @@ def _wave_images(wave: Wave, position: Array) -> Array:
     )
 
 
-def _bit_images(frames: FrameNames, bits: Array, inverses: bool) -> dict[str, Array]:
+def _name_bit_images(frames: FrameNames, bits: Array, inverses: bool) -> dict[str, Array]:
     inverse = _name_images(frames, INVERSE, 1.0 - bits) if inverses else {}
     return _name_images(frames, PATTERN, bits) | inverse
 
@@ -191,7 +195,7 @@ def simulate_instrument(
         for bit, (pattern, inverse) in enumerate(zip(coded[:bits], coded[bits:], strict=True))
     )
     number = np.zeros(2**bits, np.uint8)
-    number[(1 << np.arange(bits)[::-1]) @ gray_code_bits(code.stripes)] = (
+    number[(1 << np.arange(bits)[::-1]) @ compute_gray_code_bits(code.stripes)] = (
         np.arange(code.stripes) + 1
     )
     index = number[words]

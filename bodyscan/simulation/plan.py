@@ -52,17 +52,17 @@ def plan_boards(
     area not yet covered near and far, new tilts, links between pairs that share no board yet.
     """
     board = rig.boards[0]
-    plan = [_floor_shot(rig, pairs)] if rig.rig_frame.shot else []
+    plan = [_plan_floor_shot(rig, pairs)] if rig.rig_frame.shot else []
     taken = {rig.rig_frame.shot}
     names = (name for i in range(10_000) if (name := f"b{i + 1:02d}") not in taken)
-    poses = _candidates(board, list(pairs.values()), rng)
+    poses = _draw_candidates(board, list(pairs.values()), rng)
     sights = {name: look(pair, poses, board) for name, pair in pairs.items()}
     striped = {
         name: _mask_visible(board, sight, True) & pairs[name].has_stripes
         for name, sight in sights.items()
     }
     visible = {name: _mask_visible(board, sight, False) for name, sight in sights.items()}
-    for pose in _choose_poses(*_merits(sights, striped, visible), shots):
+    for pose in _choose_poses(*_weigh_merits(sights, striped, visible), shots):
         stripes = tuple(name for name in pairs if striped[name][pose])
         lit = tuple(name for name in pairs if visible[name][pose] and name not in stripes)
         plan.append(BoardShot(next(names), board.name, poses[pose], stripes, lit))
@@ -71,7 +71,7 @@ def plan_boards(
 
 def look(pair: TruePair, poses: Sequence[RigidTransform], board: Board) -> Sight:
     """Compute what a pair sees of the board in each pose (rig_from_board)."""
-    points = _board_grid(board)
+    points = _make_board_grid(board)
     turns = np.stack([pose.rotation for pose in poses])
     shifts = np.stack([pose.translation for pose in poses])
     camera_from_rig = pair.rig_from_camera.inverse()
@@ -109,8 +109,8 @@ def _cover_cells(pixel: Array, within: Mask, far: Mask, width: int, height: int)
     return covered
 
 
-def _board_grid(board: Board) -> Array:
-    width, height, _ = _board_extent(board)
+def _make_board_grid(board: Board) -> Array:
+    width, height, _ = _compute_board_extent(board)
     x, y = np.meshgrid(np.linspace(0.0, width, 15), np.linspace(0.0, height, 13))
     return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
 
@@ -127,7 +127,7 @@ def _mask_visible(board: Board, sight: Sight, stripes: bool) -> Mask:
     return (sight.inside >= share) & (sight.angle_deg <= max_angle_deg) & printed
 
 
-def _floor_shot(rig: Rig, pairs: Mapping[str, TruePair]) -> BoardShot:
+def _plan_floor_shot(rig: Rig, pairs: Mapping[str, TruePair]) -> BoardShot:
     frame, board = rig.rig_frame, rig.frame_board
     assert board is not None
     x, y = np.array(frame.x_axis, float), np.array(frame.y_axis, float)
@@ -142,7 +142,7 @@ def _floor_shot(rig: Rig, pairs: Mapping[str, TruePair]) -> BoardShot:
     return BoardShot(str(frame.shot), board.name, pose, (), tuple(lit))
 
 
-def _candidates(
+def _draw_candidates(
     board: Board, pairs: Sequence[TruePair], rng: np.random.Generator
 ) -> list[RigidTransform]:
     """Draw poses near the middle of what pairs look at, facing them or turned between two poles."""
@@ -163,7 +163,7 @@ def _candidates(
 def _lift_above_floor(rig_from_board: RigidTransform, board: Board) -> RigidTransform:
     """Raise a pose if necessary so that the board just clears the floor."""
     margin = np.array([[-1.0, -1.0, 0.0], [1.0, 1.0, 0.0]]) * board.margin_mm
-    low, high = margin + [[0.0, 0.0, 0.0], [1.0, 1.0, 0.0]] * _board_extent(board)
+    low, high = margin + [[0.0, 0.0, 0.0], [1.0, 1.0, 0.0]] * _compute_board_extent(board)
     x, y = np.meshgrid([low[0], high[0]], [low[1], high[1]])
     corners = np.stack([x.ravel(), y.ravel(), np.zeros(4)], axis=1)
     short = 5.0 + board.thickness_mm - rig_from_board.apply(corners)[:, 2].min()
@@ -171,7 +171,7 @@ def _lift_above_floor(rig_from_board: RigidTransform, board: Board) -> RigidTran
     return RigidTransform(rig_from_board.rotation, rig_from_board.translation + lift)
 
 
-def _board_extent(board: Board) -> Array:
+def _compute_board_extent(board: Board) -> Array:
     """Compute width and height of the checkered area, and 0, (3,) mm."""
     return np.array([board.columns, board.rows, 0.0]) * board.square_mm
 
@@ -189,12 +189,17 @@ def _draw_pose(
         yaw, tilt = np.radians(rng.choice([-60.0, -30.0, 30.0, 60.0])), 0.4 * tilt
     roll = rng.choice([0.0, 0.5 * np.pi]) + rng.normal(0.0, 0.15)
     over = np.pi if board.faces == 2 and rng.random() < 0.35 else 0.0
-    lean = _rotation(tilt * np.array([np.cos(azimuth), np.sin(azimuth), 0.0]))
-    turn = _rotation([0, yaw, 0]) @ lean @ _rotation([0, 0, roll]) @ _rotation([0, over, 0])
-    return RigidTransform(turn, middle - turn @ _board_extent(board) / 2.0)
+    lean = _convert_rotation(tilt * np.array([np.cos(azimuth), np.sin(azimuth), 0.0]))
+    turn = (
+        _convert_rotation([0, yaw, 0])
+        @ lean
+        @ _convert_rotation([0, 0, roll])
+        @ _convert_rotation([0, over, 0])
+    )
+    return RigidTransform(turn, middle - turn @ _compute_board_extent(board) / 2.0)
 
 
-def _rotation(vector: ArrayLike) -> Array:
+def _convert_rotation(vector: ArrayLike) -> Array:
     return RigidTransform.from_rotation_vector(vector, np.zeros(3)).rotation
 
 
@@ -217,7 +222,7 @@ def _choose_poses(offered: Mask, worth: Array, needed: Array, shots: int) -> lis
     return chosen
 
 
-def _merits(
+def _weigh_merits(
     sights: Mapping[str, Sight], striped: Mapping[str, Mask], visible: Mapping[str, Mask]
 ) -> tuple[Mask, Array, Array]:
     """Every cell of every image three times, near and far; tilts to all sides; six boards per pair;

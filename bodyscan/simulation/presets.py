@@ -101,7 +101,7 @@ _WORKSHOP_LIGHT: Mapping[str, Mapping[str, Any]] = {
 }
 
 
-def settings_for(
+def compose_settings(
     projector: str,
     *,
     preset: str = IDEAL,

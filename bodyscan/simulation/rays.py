@@ -109,13 +109,15 @@ def trace_band(scene: Scene, band: Band, projector: Projector, lamps: Lamps) -> 
     """Cast the band's rays, or interpolate them, and light their ends."""
     rows, columns, samples, _ = band.rays.shape
     hits = scene.cast(band.corners.reshape(-1, 3))
-    corners = _light_fields(scene, hits, projector, lamps).reshape(-1, rows + 1, columns + 1)
+    corners = _compute_light_fields(scene, hits, projector, lamps).reshape(
+        -1, rows + 1, columns + 1
+    )
     even = _mask_smooth(hits, RayEnds(*corners))
     values = np.empty((len(fields(RayEnds)), rows, columns, samples), np.float32)
     offsets = sample_offsets(round(samples**0.5)).astype(np.float32)
     interpolate(corners, band.shift, offsets, even, values)
     cast = scene.cast(band.rays[~even].reshape(-1, 3))
-    values[:, ~even] = _light_fields(scene, cast, projector, lamps).reshape(
+    values[:, ~even] = _compute_light_fields(scene, cast, projector, lamps).reshape(
         len(values), -1, samples
     )
     ends = RayEnds(*values)
@@ -123,7 +125,7 @@ def trace_band(scene: Scene, band: Band, projector: Projector, lamps: Lamps) -> 
     return ends
 
 
-def _light_fields(scene: Scene, hits: Hits, projector: Projector, lamps: Lamps) -> Floats:
+def _compute_light_fields(scene: Scene, hits: Hits, projector: Projector, lamps: Lamps) -> Floats:
     """Compute fields (F, N) in the order of `RayEnds`."""
     white = replace(hits, albedo=np.ones_like(hits.albedo))
     light = compute_laser_light(scene, white, projector, lamps)
@@ -188,7 +190,7 @@ def interpolate(
 
 
 @compiled
-def mean_light(
+def average_light(
     weight: Floats, index: np.ndarray[tuple[int, ...], np.dtype[np.int32]], table: Floats
 ) -> Floats:
     """(R, C): mean over a pixel's K samples of weight x table[index], both (R, C, K); divides by K, not

@@ -15,7 +15,7 @@ from bodyscan.simulation.lamps import Lamps, compute_laser_light, spread_light
 from bodyscan.simulation.lens import TrueCamera
 from bodyscan.simulation.patterns import find_table_entries, make_light_table, make_patterns
 from bodyscan.simulation.projector import Projector
-from bodyscan.simulation.rays import Band, View, mean_light, trace_band
+from bodyscan.simulation.rays import Band, View, average_light, trace_band
 from bodyscan.simulation.scene import Scene
 from bodyscan.simulation.sensor import Brightness, add_speckle, blur, defocus, list_blurs, shade
 from bodyscan.simulation.settings import Projection
@@ -68,7 +68,7 @@ def render_pair(
     """
     frames = frames or FrameNames()
     code = code or Gray(stripes=projector.stripes, direction="vertical")
-    lit = _tables(code, projection, rng, frames, sequence)
+    lit = _tabulate_light(code, projection, rng, frames, sequence)
     dark = frames.dark if code.uses_dark else None if code.is_projected else ""
     unlit = () if dark is None or not sequence else (dark,)
     source = _Source(projector, lamps, projection)
@@ -191,7 +191,7 @@ class _LitRays:
 
     def light(self, table: Floats, *, gloss: bool = False) -> Floats:
         """Compute the grey level (R, C) of one frame, scattered or mirrored."""
-        return mean_light(self.gloss if gloss else self.weight, self.index, table.ravel())
+        return average_light(self.gloss if gloss else self.weight, self.index, table.ravel())
 
 
 def _dilate(near: Mask, depth: Floats, reach_mm: float, camera: TrueCamera) -> Mask:
@@ -216,7 +216,7 @@ def compute_pixel_truth(scene: Scene, camera: TrueCamera, projector: Projector) 
     return PixelTruth(depth.reshape(shape), np.where(lit, s, np.nan).reshape(shape))
 
 
-def _tables(
+def _tabulate_light(
     code: StripeCode,
     projection: Projection,
     rng: np.random.Generator,
@@ -231,14 +231,14 @@ def _tables(
     if projection.jitter_stripes > 0:
         drawn = rng.standard_normal((len(lights), code.stripes + 1))
         strays = projection.jitter_stripes * drawn
-    blurs = _blurs(projection)
+    blurs = _list_blurs(projection)
     return {
         name: make_light_table(light**projection.gamma, blurs, stray, len(light) // code.stripes)
         for (name, light), stray in zip(lights.items(), strays, strict=True)
     }
 
 
-def _blurs(projection: Projection) -> Array:
+def _list_blurs(projection: Projection) -> Array:
     """List sigmas in stripes from the best focus to the worst, in 12 steps."""
     if projection.defocus_stripes <= 0:
         return np.array([projection.blur_stripes])
@@ -247,7 +247,7 @@ def _blurs(projection: Projection) -> Array:
 
 
 def _blur_rows(depth: Floats, projection: Projection, lamps: Lamps) -> NDArray[np.int32] | None:
-    """Look up which of `_blurs` applies at each depth, taken for the distance to the projector."""
+    """Look up which of `_list_blurs` applies at each depth, taken for the distance to the projector."""
     if projection.defocus_stripes <= 0:
         return None
     return np.rint(defocus(depth, lamps.focus_mm) * 11).astype(np.int32)

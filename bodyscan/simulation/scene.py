@@ -64,7 +64,7 @@ class Scene:
         self.surfaces = tuple(surfaces)
         self._shadowable = np.array([not surface.open_to_light for surface in surfaces] + [False])
         standing = [surface for surface in surfaces if not surface.encloses]
-        self._ball = _bounding_ball(standing)
+        self._ball = _find_bounding_ball(standing)
         # Open3D holds Python's lock while it casts: threads of Python would take turns.
         self._rays = o3d.t.geometry.RaycastingScene(nthreads=2)
         self._varied = [_list_varied(surface) for surface in self.surfaces]
@@ -109,7 +109,7 @@ class Scene:
         towards: (N, 3) from each point to the source.
         """
         middle, radius = self._ball
-        aside = _distance_squared(points, towards, middle)
+        aside = _compute_distance_squared(points, towards, middle)
         chosen = np.flatnonzero(self._shadowable[surface] & (aside < radius**2))
         blocked = np.zeros(len(points), bool)
         if chosen.size:
@@ -125,7 +125,7 @@ class Scene:
         return blocked
 
 
-def _bounding_ball(surfaces: Iterable[Surface]) -> tuple[Array, float]:
+def _find_bounding_ball(surfaces: Iterable[Surface]) -> tuple[Array, float]:
     """Bound everything that can cast a shadow by a ball (middle, radius)."""
     corners = [[one.vertices.min(axis=0), one.vertices.max(axis=0)] for one in surfaces]
     if not corners:
@@ -134,7 +134,7 @@ def _bounding_ball(surfaces: Iterable[Surface]) -> tuple[Array, float]:
     return (low + high) / 2.0, float(np.linalg.norm(high - low)) / 2.0
 
 
-def _distance_squared(points: Floats, directions: Floats, middle: Array) -> Floats:
+def _compute_distance_squared(points: Floats, directions: Floats, middle: Array) -> Floats:
     """Compute the squared distance (N,) of one point from lines through points (N, 3)."""
     arm = points - middle.astype(np.float32)
     along = dot(arm, directions)
@@ -167,7 +167,7 @@ def _interpolate(values: Floats, corners: NDArray[np.integer], uv: Floats) -> Fl
     return first + uv[:, :1] * (second - first) + uv[:, 1:] * (third - first)
 
 
-def grid_surface(
+def build_grid_surface(
     corner: Array, across: Array, down: Array, steps: tuple[int, int] = (1, 1), **more: Any
 ) -> Surface:
     """Build a flat patch from a corner and two sides (3,), cut in steps; print_xy from 0 to 1."""
@@ -175,10 +175,10 @@ def grid_surface(
     x, y = np.meshgrid(np.linspace(0, 1, columns + 1), np.linspace(0, 1, rows + 1))
     print_xy = np.stack([x.ravel(), y.ravel()], axis=1)
     vertices = corner + print_xy @ np.stack([across, down])
-    return Surface(vertices, grid_triangles(columns, rows), print_xy=print_xy, **more)
+    return Surface(vertices, list_grid_triangles(columns, rows), print_xy=print_xy, **more)
 
 
-def grid_triangles(columns: int, rows: int) -> Indices:
+def list_grid_triangles(columns: int, rows: int) -> Indices:
     """List two triangles for each cell of a grid of (rows + 1) x (columns + 1) vertices."""
     first = (np.arange(rows)[:, None] * (columns + 1) + np.arange(columns)).ravel()
     below = first + columns + 1

@@ -46,7 +46,7 @@ def draw_flicker(
     }
 
 
-def exposure(lit: Floats, grey: float, lighting: Lighting) -> float:
+def choose_exposure(lit: Floats, grey: float, lighting: Lighting) -> float:
     """Choose the exposure at which the brightest thousandth of a lit image begins at `grey`."""
     bright = max(float(np.percentile(lit, 99.9)), 1e-3)
     return float(np.clip(grey / bright, lighting.shortest, lighting.longest))
@@ -60,7 +60,7 @@ class FixedPattern:
     grey: Floats
 
 
-def fixed_pattern(
+def draw_fixed_pattern(
     camera: TrueCamera, noise: Noise, rng: np.random.Generator
 ) -> FixedPattern | None:
     """Draw a sensor's fixed pattern; None if all its pixels respond equally."""
@@ -128,12 +128,12 @@ def blur(image: Floats, blurs: Sequence[tuple[float, Floats | None]]) -> Floats:
     result = np.zeros_like(image)
     for wide, share in blurs:
         if share is None:
-            return _gaussian(image, wide)
-        result += share * _gaussian(image, wide)
+            return _blur_gaussian(image, wide)
+        result += share * _blur_gaussian(image, wide)
     return result
 
 
-def _gaussian(image: Floats, sigma: float) -> Floats:
+def _blur_gaussian(image: Floats, sigma: float) -> Floats:
     if sigma <= 0:
         return image
     return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_REFLECT_101))

@@ -35,10 +35,10 @@ from bodyscan.simulation.scene import Scene, Surface
 from bodyscan.simulation.sensor import (
     Brightness,
     FixedPattern,
+    choose_exposure,
+    draw_fixed_pattern,
     draw_flicker,
     expose,
-    exposure,
-    fixed_pattern,
 )
 from bodyscan.simulation.settings import SimulationSettings
 
@@ -158,7 +158,7 @@ def simulate_board(
     _render_all(rig, truth, tasks, out, THREADS, silent)
 
 
-def random_stream(seed: int, *purpose: int) -> np.random.Generator:
+def start_random_stream(seed: int, *purpose: int) -> np.random.Generator:
     """Start random numbers of one purpose (`Stream`, and numbers below it) of a data set."""
     return np.random.default_rng([seed, *purpose])
 
@@ -174,21 +174,25 @@ def _decide(
     """Draw everything that is true of the data set before any image is made."""
     pairs = draw_true_pairs(rig, settings, seed)
     boards = {
-        board.name: make_board(board, settings.board, random_stream(seed, Stream.BOARDS, number))
+        board.name: make_board(
+            board, settings.board, start_random_stream(seed, Stream.BOARDS, number)
+        )
         for number, board in enumerate(rig.boards)
     }
     shots = count_default_shots(len(pairs)) if shots is None else shots
-    plan = plan_boards(rig, pairs, shots, random_stream(seed, Stream.PLAN)) if shots else []
+    plan = plan_boards(rig, pairs, shots, start_random_stream(seed, Stream.PLAN)) if shots else []
     truth = Truth(rig.name, seed, settings, pairs, boards, tuple(plan), None, None, {})
     if subject is None:
         return truth
     person = body.load_subject(
-        subject, settings.person, random_stream(seed, Stream.SKIN), settings.skin
+        subject, settings.person, start_random_stream(seed, Stream.SKIN), settings.skin
     )
     motion, sways = None, dict.fromkeys(pairs, RigidTransform.identity())
     if moves(settings.person):
         living = animate(
-            person, settings.person, random_stream(seed, Stream.LIFE, *([take] if take else []))
+            person,
+            settings.person,
+            start_random_stream(seed, Stream.LIFE, *([take] if take else [])),
         )
         times = files.compute_person_times(rig, PERSON_SHOT, settings.pace)
         every = [ms for by_frame in times.values() for ms in by_frame.values()]
@@ -201,7 +205,9 @@ def _decide(
 
 def draw_true_pairs(rig: Rig, settings: SimulationSettings, seed: int) -> dict[str, TruePair]:
     """Build the pairs of a data set with these settings and seed."""
-    return build_pairs(rig, settings, lambda number: random_stream(seed, Stream.PAIRS, number))
+    return build_pairs(
+        rig, settings, lambda number: start_random_stream(seed, Stream.PAIRS, number)
+    )
 
 
 def _list_tasks(truth: Truth, pair: str) -> list[Task]:
@@ -241,12 +247,12 @@ def _render_all(
     def render(numbered: tuple[int, TruePair]) -> None:
         nonlocal done
         number, pair = numbered
-        rays = random_stream(truth.seed, Stream.RAYS, number)
+        rays = start_random_stream(truth.seed, Stream.RAYS, number)
         view = View.from_camera(pair.camera, settings.optics, rays)
-        pixels = random_stream(truth.seed, Stream.PIXELS, number)
-        fixed = fixed_pattern(pair.camera, settings.noise, pixels)
+        pixels = start_random_stream(truth.seed, Stream.PIXELS, number)
+        fixed = draw_fixed_pattern(pair.camera, settings.noise, pixels)
         for task in tasks[pair.name]:
-            noise = random_stream(truth.seed, Stream.NOISE, number, task.number)
+            noise = start_random_stream(truth.seed, Stream.NOISE, number, task.number)
             _render_task(rig, pair, view, room, task, settings, out, noise, fixed)
             with lock:
                 done += 1
@@ -267,7 +273,7 @@ def _render_task(
     fixed: FixedPattern | None,
 ) -> None:
     """Cast, expose and write one pair's images of one shot; `fixed` is of its camera's sensor."""
-    scene, moving = _scenes(pair, room, task)
+    scene, moving = _build_scenes(pair, room, task)
     code, lighting = rig.pair(pair.name).projector, settings.lighting
     taken = settings.pace.order or rig.frames.sequence_names(code)
     flicker = draw_flicker(taken, settings, rng.spawn(1)[0])
@@ -281,7 +287,7 @@ def _render_task(
         scene, view, pair.projector, lamps, settings.projection, rng, frames=rig.frames, code=code,
         sequence=task.sequence, moving=moving, flicker=flicker,
     )  # fmt: skip
-    length = exposure(images[rig.frames.lit or "lit"], task.bright_grey, lighting)
+    length = choose_exposure(images[rig.frames.lit or "lit"], task.bright_grey, lighting)
     gains = {name: np.float32(flicker.get(name, Brightness()).gain) for name in images}
     exposed = {
         name: expose(image * length * gains[name], settings.noise, rng, fixed)
@@ -294,7 +300,9 @@ def _render_task(
         files.write_image(out / task.folder / name, grey)
 
 
-def _scenes(pair: TruePair, room: Sequence[Surface], task: Task) -> tuple[Scene, Moving | None]:
+def _build_scenes(
+    pair: TruePair, room: Sequence[Surface], task: Task
+) -> tuple[Scene, Moving | None]:
     """Build the scene in the camera's frame, and how it moves from frame to frame if it does."""
     camera_from_rig = pair.rig_from_camera.inverse()
     camera_from_surfaces = camera_from_rig @ task.rig_from_surfaces

@@ -20,7 +20,7 @@ from bodyscan.captures.folder import Captures, ImageSequence, open_captures
 from bodyscan.errors import BodyscanError
 from bodyscan.optional import optional
 from bodyscan.registration.advice import pair_sigma_mm, suggest_shots
-from bodyscan.registration.rig_frame import frame_target
+from bodyscan.registration.rig_frame import find_frame_target
 from bodyscan.registration.rig_solve import solve_rig
 from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig import find_connected_groups, load_rig
@@ -132,7 +132,7 @@ class BoardTour:
 
     def _find_frame_shot(self) -> dict[str, Any] | None:
         """Advice to take the shot that fixes the rig frame, as long as no pair saw its board there."""
-        target = frame_target(self.rig)
+        target = find_frame_target(self.rig)
         if target is None or target in {(view.shot, view.board) for view in self.views}:
             return None
         return {"say": "frame", "shot": target[0], "board": target[1]}
@@ -175,7 +175,7 @@ def _choose_next_hold(
     target = barest_pair if boards[barest_pair] < BOARDS else barest
     if boards[barest_pair] >= BOARDS and share[barest] >= 0.8:
         return {"say": "enough"}
-    row, column = divmod(int(np.argmin(_inner_first(cells[target]))), COLUMNS)
+    row, column = divmod(int(np.argmin(_prefer_rim(cells[target]))), COLUMNS)
     return {"say": "hold", "pair": target, "row": row, "column": column, "boards": boards[target]}
 
 
@@ -189,7 +189,7 @@ def _count_cells(pair: Pair, views: Sequence[BoardView]) -> Indices:
     return counts
 
 
-def _inner_first(counts: Indices) -> Array:
+def _prefer_rim(counts: Indices) -> Array:
     """Counts with a little added towards the rim, so that of equal cells the inner one is named."""
     rows, columns = np.indices(counts.shape)
     away = np.hypot(rows - (ROWS - 1) / 2.0, columns - (COLUMNS - 1) / 2.0)

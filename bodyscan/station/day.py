@@ -67,7 +67,7 @@ class Day:
         if event["event"] not in ("images", "job", "verdict", "stage", "cloud"):
             return None
         with self._lock:
-            row = self._rows.pop(job, None) or empty_row(job)
+            row = self._rows.pop(job, None) or make_empty_row(job)
             self._rows[job] = row = {**row, **self._changes(job, row, event)}
             return row
 
@@ -75,7 +75,7 @@ class Day:
         what = event["event"]
         if what == "images":
             begins = row["state"] in ("done", "set aside")  # taken again
-            started = {**empty_row(job), "note": row["note"]} if begins else {}
+            started = {**make_empty_row(job), "note": row["note"]} if begins else {}
             return {**started, "scan": event["scan"], "pairs": event["pairs"]}
         if what == "verdict":
             return make_verdict_cells(event["grade"], event["reasons"]) | {"final": event["final"]}
@@ -121,7 +121,7 @@ class Day:
         return self._cloud[1] if self._cloud[0] == job else None
 
 
-def empty_row(job: str) -> Row:
+def make_empty_row(job: str) -> Row:
     """The row of a scan of which nothing is known."""
     row: Row = dict.fromkeys(COLUMNS)
     row |= {"job": job, "state": "arriving", "note": "", "pairs": {}, "scan": "", "mark": None}
@@ -135,7 +135,11 @@ def make_verdict_cells(grade: str, reasons: Iterable[str]) -> Row:
 
 def read_row(folder: Path) -> Row:
     """The row of a job, from its folder."""
-    row, state, job = empty_row(folder.name), read_record(folder / STATE), read_record(folder / JOB)
+    row, state, job = (
+        make_empty_row(folder.name),
+        read_record(folder / STATE),
+        read_record(folder / JOB),
+    )
     facts, decided = read_record(folder / "scan" / "scan.json"), read_record(folder / DECIDED)
     row["subject"], row["scan"] = job.get("subject"), Path(str(job.get("source") or "")).name
     ended = state.get("state") in ("done", "set aside")
@@ -173,7 +177,7 @@ def read_girths(path: Path) -> Row:
         return {}  # no measures, or a damaged table
 
 
-def table_csv(rows: Iterable[Row]) -> str:
+def format_table_csv(rows: Iterable[Row]) -> str:
     """The rows as CSV; a cell that a spreadsheet would take for a formula begins with an apostrophe."""
 
     def cell(value: Any) -> Any:

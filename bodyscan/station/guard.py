@@ -87,12 +87,12 @@ class Guard:
             found = SimpleCookie(headers.get("cookie", "")).get(COOKIE)
         except CookieError:
             return False
-        return found is not None and _equal(found.value, self.token or "")
+        return found is not None and _compare_secrets(found.value, self.token or "")
 
     async def _require_token(self, scope: Scope, send: Send) -> None:
         """A right token in the link becomes a cookie; the link without it follows."""
         given = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
-        if scope["path"] != "/" or not _equal(given, self.token or ""):
+        if scope["path"] != "/" or not _compare_secrets(given, self.token or ""):
             await _answer(send, 401, "open the link that the station printed when it started")
             return
         secure = "; Secure" if scope["scheme"] == "https" else ""
@@ -109,7 +109,7 @@ def make_token() -> str:
     return secrets.token_urlsafe(24)
 
 
-def _equal(given: str, wanted: str) -> bool:
+def _compare_secrets(given: str, wanted: str) -> bool:
     return hmac.compare_digest(given.encode(), wanted.encode())
 
 

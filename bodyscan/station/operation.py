@@ -13,7 +13,7 @@ from typing import Any
 from bodyscan.capture.devices import Devices, open_devices
 from bodyscan.capture.exposure import find_exposures, measure_delays
 from bodyscan.capture.session import Shot, capture_shot, refuse_existing_shot
-from bodyscan.captures.folder import capture_path
+from bodyscan.captures.folder import resolve_capture_path
 from bodyscan.errors import BadInput, BodyscanError
 from bodyscan.jobs.watching import Watched, watch
 from bodyscan.rig.rig import Rig
@@ -99,7 +99,7 @@ class Operation:
         """
         if self.rig_file is None or not self.rig.calibration:
             raise BadInput("the rig file names no calibration captures")
-        folder = capture_path(self.rig_file, self.rig.calibration[0])
+        folder = resolve_capture_path(self.rig_file, self.rig.calibration[0])
         there = {path.name for path in folder.glob("*")}
         first = filter(None, [self.rig.rig_frame.shot])
         names = chain(first, (f"b{number:02d}" for number in range(1, 10_000)))

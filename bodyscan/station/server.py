@@ -23,7 +23,7 @@ from bodyscan.captures.folder import open_scan
 from bodyscan.errors import BadInput, BodyscanError
 from bodyscan.files.reading import read_regular
 from bodyscan.jobs.job import MEASURES
-from bodyscan.station.day import Day, Row, table_csv
+from bodyscan.station.day import Day, Row, format_table_csv
 from bodyscan.station.feed import Feed
 from bodyscan.station.guard import Guard, TooLarge
 from bodyscan.station.operation import Operation
@@ -105,12 +105,12 @@ class Station:
 
     async def body(self, request: Request) -> Response:
         model = await run_in_threadpool(self.day.body, self._row(request)["job"])
-        return JSONResponse(model) if model else _absent()
+        return JSONResponse(model) if model else _answer_absent()
 
     async def picture(self, request: Request) -> Response:
         scan = self.day.out / self._row(request)["job"] / "scan"
         found = [path for name in ("cloud.png", "mesh.png") if (path := scan / name).is_file()]
-        return FileResponse(found[0], media_type="image/png") if found else _absent()
+        return FileResponse(found[0], media_type="image/png") if found else _answer_absent()
 
     async def report(self, request: Request) -> Response:
         path = self.day.out / self._row(request)["job"] / "report" / "report.html"
@@ -118,21 +118,21 @@ class Station:
         return (
             FileResponse(path, media_type="text/html", headers=policy)
             if path.is_file()
-            else _absent()
+            else _answer_absent()
         )
 
     async def pair(self, request: Request) -> Response:
         look = partial(self._look, self._row(request), request.path_params["pair"])
         seen = await run_in_threadpool(look)
-        return JSONResponse(seen) if seen else _absent()
+        return JSONResponse(seen) if seen else _answer_absent()
 
     async def csv(self, request: Request) -> Response:
         attached = {"content-disposition": "attachment; filename=day.csv"}
-        return Response(table_csv(self.day.rows()), media_type="text/csv", headers=attached)
+        return Response(format_table_csv(self.day.rows()), media_type="text/csv", headers=attached)
 
     async def measures(self, request: Request) -> Response:
         path = self.day.out / MEASURES
-        return FileResponse(path, filename=MEASURES) if path.is_file() else _absent()
+        return FileResponse(path, filename=MEASURES) if path.is_file() else _answer_absent()
 
     async def rig(self, request: Request) -> Response:
         folders = [self.day.out / row["job"] for row in self.day.rows() if row["state"] == "done"]
@@ -234,12 +234,12 @@ async def _explain(request: Request, error: Exception) -> Response:
 
 
 async def _unknown(request: Request, error: Exception) -> Response:
-    return _absent()
+    return _answer_absent()
 
 
 async def _too_large(request: Request, error: Exception) -> Response:
     return JSONResponse({"what": "too long"}, 413)
 
 
-def _absent() -> Response:
+def _answer_absent() -> Response:
     return JSONResponse({"what": "there is no such thing here"}, 404)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from bodyscan.capture.devices import load_capture_rig
 from bodyscan.errors import BadInput, FailedWork
-from bodyscan.jobs.stages import rig_of
+from bodyscan.jobs.stages import read_rig_of
 from bodyscan.jobs.watching import Watched
 from bodyscan.station.day import Day
 from bodyscan.station.feed import Feed
@@ -51,7 +51,7 @@ def serve(
     if (address.certificate is None) != (address.key is None):
         raise BadInput("https needs both --certificate and --key")
     token = None if is_loopback(address.host) else make_token()
-    app = make_app(operation, names_of_host(address.host, address.port), token)
+    app = make_app(operation, list_names_of_host(address.host, address.port), token)
     say(f"open {address.link}{f'?token={token}' if token else ''}")
     if token and address.certificate is None:
         say(
@@ -86,7 +86,7 @@ def make_operation(watched: Watched, rig_file: Path | None) -> Operation:
     if not watched.inbox.is_dir():
         raise BadInput("there is no such folder", where=str(watched.inbox), remedy="make it first")
     watched.out.mkdir(parents=True, exist_ok=True, mode=0o700)
-    rig = rig_of(watched.calibration)
+    rig = read_rig_of(watched.calibration)
     if rig_file is not None:
         found = load_capture_rig(rig_file)
         if [pair.name for pair in found.pairs] != [pair.name for pair in rig.pairs]:
@@ -99,7 +99,7 @@ def make_operation(watched: Watched, rig_file: Path | None) -> Operation:
     return Operation(watched, rig_file, rig, Day(watched.out), Feed())
 
 
-def names_of_host(host: str, port: int) -> set[str]:
+def list_names_of_host(host: str, port: int) -> set[str]:
     """Names under which a browser may ask for a station that listens there, with the port."""
     names = {host}
     if is_loopback(host):

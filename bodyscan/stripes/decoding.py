@@ -33,7 +33,7 @@ def decode_stripes(
     ones.
     """
     try:
-        images, *crossing_images = images_by_kind(code, coded)
+        images, *crossing_images = split_by_kind(code, coded)
         stripes = _decode_direction(code, lit, dark, images, limits)
         if code.crossing is None:
             return stripes
@@ -119,7 +119,7 @@ def _decode_direction(
     return replace(stripes, s=s, sigma=sigma, beyond=beyond)
 
 
-def images_by_kind(code: StripeCode, coded: Greys) -> list[dict[ImageKind, Greys]]:
+def split_by_kind(code: StripeCode, coded: Greys) -> list[dict[ImageKind, Greys]]:
     """Split the images (F, H, W) of a code by kind, and those of the crossing stripes."""
     counts = [direction.image_counts for direction in code.directions]
     ends = np.cumsum([number for each in counts for number in each.values()])

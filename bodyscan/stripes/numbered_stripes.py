@@ -28,7 +28,7 @@ from scipy.special import ndtri
 
 from bodyscan.arrays import Floats, Greys, Mask
 from bodyscan.errors import DecodingFailed
-from bodyscan.geometry.robust import robust_scale
+from bodyscan.geometry.robust import estimate_robust_scale
 from bodyscan.stripes.boundaries import MIN_SIGMA_PX, Boundaries
 from bodyscan.stripes.scan_lines import ScanLines
 from bodyscan.stripes.stripe_coordinates import interpolate_stripes
@@ -137,7 +137,7 @@ def decode_line(lit: Greys, frame: Greys, direction: str) -> StripeMap:
     if seen.any():  # the room may have been darker while the line was on
         light -= room * np.median(light[seen] / room[seen])
     light -= np.median(light, axis=1, keepdims=True)
-    noise = robust_scale(light, UNIFORM_SIGMA)
+    noise = estimate_robust_scale(light, UNIFORM_SIGMA)
     peak, height = light.argmax(axis=1), light.max(axis=1)
     bright = height >= max(MIN_CONTRAST, 2.0 * MIN_CONTRAST_TO_NOISE * noise)
     half = np.count_nonzero(2.0 * light >= height[:, None], axis=1)
@@ -165,7 +165,7 @@ def decode_line(lit: Greys, frame: Greys, direction: str) -> StripeMap:
     position = peak[line] + bell @ step / total
     sigma = noise * np.sqrt(np.sum(step**2)) / total
     # A laser's speckle makes its line rougher than noise does.
-    rough = robust_scale(np.diff(position, 2)[np.diff(line, 2) == 0]) / 6.0**0.5
+    rough = estimate_robust_scale(np.diff(position, 2)[np.diff(line, 2) == 0]) / 6.0**0.5
     sigma = np.hypot(sigma * max(1.0, rough / np.median(sigma)), MIN_SIGMA_PX)
     pixel = np.rint(position).astype(np.int64)
     s, spread = np.full((2, *light.shape), np.nan, np.float32)

@@ -72,7 +72,7 @@ class ScanLines:
         Without inverses: twice the excess of the pattern over the mean of lit and dark.
         """
         patterns, inverses = self.patterns.reshape(-1), self._inverses.reshape(-1)
-        return _differences(
+        return _compute_differences(
             self.lit.ravel(), self.dark.ravel(), patterns, inverses, bit, pixels, variance
         )
 
@@ -84,7 +84,7 @@ class ScanLines:
         frames = (self.lit.ravel(), self.dark.ravel(), self.patterns[bit].ravel(), inverse)
         # With whole grey levels there is at least one wherever there is any light.
         min_contrast = np.float32(1.0 if self.lit.dtype == np.uint8 else 0.02)
-        _share(*frames, variance, min_contrast, share)
+        _fill_share(*frames, variance, min_contrast, share)
         return share.reshape(self.lit.shape)
 
     @property
@@ -124,7 +124,7 @@ def _difference(
 
 
 @compiled
-def _differences(
+def _compute_differences(
     lit: Greys,
     dark: Greys,
     patterns: Greys,
@@ -147,7 +147,7 @@ def _differences(
 
 
 @compiled
-def _share(
+def _fill_share(
     lit: Greys,
     dark: Greys,
     pattern: Greys,

@@ -45,7 +45,7 @@ def interpolate_stripes(
     return s, sigma
 
 
-def correlation_along_lines(boundaries: Boundaries) -> float:
+def measure_correlation(boundaries: Boundaries) -> float:
     """Compute the distance along a line, px, within which pixels share noise; 0 without stripes.
 
     A linear fall to zero at 1.4 stripes (2.4 if boundaries were smoothed) is right to a tenth.

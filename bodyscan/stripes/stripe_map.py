@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.arrays import Array, Bytes, Floats, Greys, Indices, Mask, whole_grey
+from bodyscan.arrays import Array, Bytes, Floats, Greys, Indices, Mask, round_to_grey
 from bodyscan.stripes.albedo_edges import Brightness, correct_across_lines
 from bodyscan.stripes.boundaries import MIN_SIGMA_PX, Boundaries, join_runs
 from bodyscan.stripes.scan_lines import ScanLines
@@ -77,7 +77,7 @@ def assemble_map(
     return StripeMap(
         s=s,
         sigma=sigma,
-        lit=whole_grey(lit),
+        lit=round_to_grey(lit),
         boundary_index=boundaries.index,
         boundary_pixels=np.stack(axes[::-1] if images.transposed else axes, axis=-1),
         boundary_sigma_px=boundaries.sigma_px.astype(np.float32),

@@ -17,7 +17,7 @@ MIN_CONTRAST = 4.0
 MIN_CONTRAST_TO_NOISE = 5.0
 
 
-def min_contrast(dtype: np.dtype[Any]) -> float:
+def find_min_contrast(dtype: np.dtype[Any]) -> float:
     """Minimum contrast in grey levels for images of type `dtype`: fewer whole levels are rounding
     errors; with finer ones, noise alone decides."""
     return MIN_CONTRAST if dtype == np.uint8 else 0.0
@@ -35,7 +35,9 @@ def find_usable_pixels(
     variance: (256,) of each grey level. fine_bit: see `find_direct_pixels`.
     """
     contrast = cv2.subtract(images.lit, images.dark)
-    needed = np.maximum(min_contrast(contrast.dtype), MIN_CONTRAST_TO_NOISE * np.sqrt(variance))
+    needed = np.maximum(
+        find_min_contrast(contrast.dtype), MIN_CONTRAST_TO_NOISE * np.sqrt(variance)
+    )
     if contrast.dtype == np.uint8:
         needed = np.minimum(np.ceil(needed), 255).astype(np.uint8)
         bright = contrast >= cv2.LUT(cv2.max(images.lit, images.dark), needed)

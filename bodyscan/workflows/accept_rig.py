@@ -22,9 +22,9 @@ from bodyscan.evaluation.acceptance import (
     Readings,
     SpacingRow,
     SphereRow,
-    acceptance_document,
     figures,
     grade_acceptance,
+    make_acceptance_document,
 )
 from bodyscan.files.atomic import write_json, write_text
 from bodyscan.fusion.cleaning import clean
@@ -81,7 +81,7 @@ def read_captures(
     for folder, captures, read in sites:
         for shot in captures.shots:
             try:
-                clouds = _clouds(calibration, captures, shot, progress)
+                clouds = _merge_clouds(calibration, captures, shot, progress)
                 total += read(file, folder.name, shot, clouds)
             except BodyscanError as error:
                 problem = "; ".join(filter(None, (error.what, error.remedy)))
@@ -104,7 +104,9 @@ def judge_readings(
     """
     found = figures(readings, file)
     origin = calibration_id(stored)
-    content = acceptance_document(readings, found, file, synthetic=synthetic, calibration_id=origin)
+    content = make_acceptance_document(
+        readings, found, file, synthetic=synthetic, calibration_id=origin
+    )
     file_path, page_path = out / FILE_NAME, out / "acceptance.html"
     write_json(file_path, content)
     notes: list[str] = []
@@ -142,7 +144,7 @@ def read_spheres(file: AcceptanceFile, site: str, shot: str, clouds: Sequence[_C
             one = artefacts.read_sphere(points, normals, sphere.fitted, radius)
             rows += [row(view, k, one)] if one.points >= MIN_POINTS else []
     pairs = combinations(range(1, len(centres) + 1), 2)
-    errors = artefacts.spacing_errors(spheres, centres)
+    errors = artefacts.compute_spacing_errors(spheres, centres)
     spacings = tuple(
         SpacingRow(site, shot, f"{a}-{b}", float(error))
         for (a, b), error in zip(pairs, errors, strict=True)
@@ -167,7 +169,7 @@ def read_plates(file: AcceptanceFile, site: str, shot: str, clouds: Sequence[_Cl
     return Readings(plates=tuple(rows))
 
 
-def _clouds(
+def _merge_clouds(
     calibration: RigCalibration, captures: Captures, shot: str, progress: Progress
 ) -> list[_Cloud]:
     """All pairs' points merged like a scan's, without alignment, then those of each pair; rig frame.

@@ -18,15 +18,15 @@ from bodyscan.optional import optional
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, attempt_each, silent, step
 from bodyscan.registration.advice import advise
-from bodyscan.registration.board_checks import boards_not_found, correct_stretch
+from bodyscan.registration.board_checks import correct_stretch, list_boards_not_found
 from bodyscan.registration.references import find_rig_size, rescale_boards, select_solving_views
 from bodyscan.registration.rig_calibration import RigCalibration, refuse_wrong_size
 from bodyscan.registration.rig_frame import hold_frame, refuse_without_frame_shot
 from bodyscan.registration.rig_solve import (
     RigSolution,
     collect_corners,
+    make_solved_pair,
     solve_rig,
-    solved_pair,
     update_poses,
 )
 from bodyscan.registration.sanity_checks import find_faults
@@ -40,7 +40,7 @@ from bodyscan.workflows.find_boards import (
     choose_frame,
     find_all_boards,
     locate_views,
-    no_pair_calibrated,
+    make_no_pair_error,
     require_cameras,
     write_found_corners,
 )
@@ -119,7 +119,7 @@ def solve_boards(
     failed = {name: reason for stage in stages for name, reason in stage.failures.items()}
     projecting = {pair.name for pair in rig.pairs if pair.projector}
     if not pairs.value or (projecting and not projecting & pairs.value.keys()):
-        raise no_pair_calibrated(rig, failed)
+        raise make_no_pair_error(rig, failed)
     for pair in pairs.value.values():
         solution = update_poses(solved.rig, solution, pair)
     notes = (*stretched, *solved.rig_notes, *(note for stage in stages for note in stage.notes))
@@ -198,7 +198,7 @@ def _fit_light(
 
     def fit(name: str) -> Outcome[PairCalibration]:
         boundaries = {key: near for key, near in stripes.value.items() if key[0] == name}
-        return calibrate_pair(solved_pair(solved.rig, solution, name, boundaries))
+        return calibrate_pair(make_solved_pair(solved.rig, solution, name, boundaries))
 
     # One after another: fits are many small steps, and two at once hand the interpreter's lock to
     # and fro 70,000 times a second, which costs more than it gains (12 pairs: 26 s instead of 19).
@@ -236,16 +236,16 @@ def add_remarks(solved: SolvedRig, progress: Progress = silent) -> RigCalibratio
     notes: list[str] = list(found.notes)
     advice: list[str] = []
     with optional("boards that were not found", notes.append):
-        notes += boards_not_found(found.rig, solved.views, solved.images)
+        notes += list_boards_not_found(found.rig, solved.views, solved.images)
     if len(solved.solution.rig_from_camera) > 1 and not found.failed:
         with step(progress, "advice"), optional("advice", notes.append):
             advice += advise(found.rig, solved.solution)
     with optional("boards by the stripes", notes.append):
-        advice += stripe_board_notes(found.pairs)
+        advice += note_stripe_boards(found.pairs)
     return replace(found, notes=tuple(notes), advice=tuple(advice))
 
 
-def stripe_board_notes(pairs: Mapping[str, PairCalibration]) -> Iterator[str]:
+def note_stripe_boards(pairs: Mapping[str, PairCalibration]) -> Iterator[str]:
     """Say how far the boards as measured by the stripes lie from their corners."""
     boards = {n: p.quality.boards_mm for n, p in pairs.items() if p.quality.boards_mm is not None}
     if boards:

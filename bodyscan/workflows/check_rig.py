@@ -14,9 +14,9 @@ from bodyscan.alignment.displaced_poles import (
     MIN_SCANS,
     DisplacementSearch,
     PairDrift,
+    compute_motions_between,
     estimate_drift,
     find_displaced_pole,
-    motions_between,
 )
 from bodyscan.alignment.icp import Alignment, align
 from bodyscan.alignment.sway_prior import BODY_CENTRE
@@ -202,13 +202,13 @@ def check_boards(
     stripes = _measure_stripe_offsets(calibration, captures, views.value, located.value, progress)
     notes = (*views.notes, *located.notes, *stripes.notes)
     if not drift.rig_from_board and not stripes.value:
-        raise _nothing_to_compare(captures, notes)
+        raise _make_nothing_error(captures, notes)
     checked = tuple(sorted({view.pair for view in (unique or located.value)}))
     unchecked = tuple(sorted(set(calibration.pairs) - set(checked)))
     return BoardCheck(drift, stripes.value, checked, unchecked, notes)
 
 
-def _nothing_to_compare(captures: Captures, notes: Sequence[str]) -> BoardNotFound:
+def _make_nothing_error(captures: Captures, notes: Sequence[str]) -> BoardNotFound:
     why = "".join(f"\n  {note}" for note in dict.fromkeys(notes))
     return BoardNotFound(
         "no board is seen by two calibrated pairs at once (one that looks the same when turned by 180 "
@@ -433,7 +433,9 @@ def judge_scans(
             change = pose @ rig_from_camera[name].inverse()
             shifts[name].append(change.apply(BODY_CENTRE) - BODY_CENTRE)
     motions = [
-        motions_between(rig_from_camera, {n: found.rig_from_camera[n] for n in found.motion_mm})
+        compute_motions_between(
+            rig_from_camera, {n: found.rig_from_camera[n] for n in found.motion_mm}
+        )
         for found in alignments
     ]
     return ScanCheck(

@@ -14,11 +14,11 @@ from bodyscan.calibration.boundary_points import (
     BoardBoundaries,
     Box,
     StripedView,
-    boundaries_near,
     compute_box,
     compute_print_box,
     crop_around,
     on_print,
+    select_boundaries_near,
     thin_bands,
 )
 from bodyscan.calibration.camera import CameraCalibration
@@ -141,7 +141,7 @@ def decode_on_boards(
         crop = crop_around(boxes)
         stripes = decode_sequence(sequence, pair, crop=crop)
         near = {
-            view.key: boundaries_near(stripes, around, crop)
+            view.key: select_boundaries_near(stripes, around, crop)
             for view, around in zip(group, boxes, strict=True)
         }
         if prints:
@@ -154,12 +154,14 @@ def decode_on_boards(
     )
     boundaries = {key: near for one in found.values() for key, near in one.boundaries.items()}
     failed, failure_notes = describe_failures(errors, {pair for pair, _, _ in boundaries})
-    failed |= _without_stripes(rig, views, {sequence.pair for sequence in sequences})
+    failed |= _list_without_stripes(rig, views, {sequence.pair for sequence in sequences})
     faults = {sequence: one.faults for sequence, one in found.items()}
-    return Outcome(boundaries, (*failure_notes, *fault_notes(faults)), failed)
+    return Outcome(boundaries, (*failure_notes, *list_fault_notes(faults)), failed)
 
 
-def _without_stripes(rig: Rig, views: Iterable[BoardView], decoded: set[str]) -> dict[str, str]:
+def _list_without_stripes(
+    rig: Rig, views: Iterable[BoardView], decoded: set[str]
+) -> dict[str, str]:
     """Pairs with a projector that saw the board but have no stripe sequence, with the reason."""
     shots = {view.pair: view.shot for view in views}
     return {
@@ -173,7 +175,7 @@ def _without_stripes(rig: Rig, views: Iterable[BoardView], decoded: set[str]) ->
     }
 
 
-def fault_notes(faults: Mapping[ImageSequence, Sequence[str]]) -> Iterator[str]:
+def list_fault_notes(faults: Mapping[ImageSequence, Sequence[str]]) -> Iterator[str]:
     """One line for each pair and each fault of its images, see `StripeMap.faults`."""
     found = ((sequence, fault) for sequence, several in faults.items() for fault in several)
     for (pair, fault), group in sorted(_group_faults(found).items()):

@@ -16,23 +16,23 @@ from bodyscan.arrays import Array, Floats, Indices
 from bodyscan.errors import BadInput
 from bodyscan.evaluation.body import (
     GirthErrors,
-    girth_errors,
+    compute_girth_errors,
+    compute_sway_residual,
+    measure_true_girths,
     measure_visible_coverage,
-    sway_residual,
-    true_girths,
 )
 from bodyscan.evaluation.surface import (
     Deviation,
-    deviation,
+    compute_signed_distances,
     fit_to_surface,
     normalize_errors,
-    signed_distances,
+    summarize_deviation,
 )
 from bodyscan.export.scan import transform_mesh
 from bodyscan.fusion.storage import StoredScan, load_scan
-from bodyscan.geometry.robust import rms, rms_length
+from bodyscan.geometry.robust import compute_rms_length, rms
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.geometry.uncertainty import position_sigma
+from bodyscan.geometry.uncertainty import compute_position_sigma
 from bodyscan.mesh.body import BodyMesh
 from bodyscan.mesh.topology import compute_topology
 from bodyscan.optional import optional
@@ -100,7 +100,7 @@ def compare_rig(calibration: RigCalibration, truth: Truth) -> RigDeviation:
         true = RigidTransform.from_matrix(truth.facts["pairs"][name]["rig_from_camera"])
         centres.append(found.translation - true.translation)
         rotations.append(np.degrees((found.inverse() @ true).angle))
-        sigmas.append(position_sigma(calibration.covariance, name, found.translation))
+        sigmas.append(compute_position_sigma(calibration.covariance, name, found.translation))
     return RigDeviation(names, np.array(centres), np.array(rotations), np.array(sigmas))
 
 
@@ -118,7 +118,7 @@ def evaluate_workspace(workspace: Path, body_at: BodyAt | None = None) -> str:
     rig = compare_rig(calibration, truth)
     lines = [
         "against the truth (synthetic):",
-        f"  camera centres          {rms_length(rig.centres_mm):.3f} mm RMS, rotations "
+        f"  camera centres          {compute_rms_length(rig.centres_mm):.3f} mm RMS, rotations "
         f"{rms(rig.rotations_deg):.4f} degrees RMS, {len(rig.names)} pairs",
     ]
     folder = workspace / "scan"
@@ -137,32 +137,34 @@ def _scan_lines(stored: StoredScan, calibration: RigCalibration, truth: Truth) -
     assert truth.vertices is not None
     assert truth.faces is not None
     surface, pairs = (truth.vertices, truth.faces), truth.facts["pairs"]
-    _, sway_mm = sway_residual(_aligned_poses(stored, calibration), pairs, truth.vertices)
+    _, sway_mm = compute_sway_residual(
+        _read_aligned_poses(stored, calibration), pairs, truth.vertices
+    )
     still_from_rig = RigidTransform.identity()
     if "motion" in truth.facts:  # fit to the body as it was then
         still_from_rig = fit_to_surface(stored.cloud.points, *surface)
     in_rig, body = stored.mesh, transform_mesh(stored.mesh, still_from_rig)
     points = still_from_rig.apply(stored.cloud.points)
-    cloud = signed_distances(points, *surface)
+    cloud = compute_signed_distances(points, *surface)
     measured = np.unique(body.faces[~body.filled])
-    mesh = signed_distances(body.vertices[measured], *surface)
+    mesh = compute_signed_distances(body.vertices[measured], *surface)
     lines: list[str] = []
 
     def part(what: str) -> AbstractContextManager[None]:
         return optional(what, lambda line: lines.append(f"  {line}"))
 
     with part("cloud"):
-        lines += _cloud_lines(cloud, stored.cloud.sigma_mm)
+        lines += _describe_cloud(cloud, stored.cloud.sigma_mm)
     with part("mesh"):
-        lines += _mesh_lines(mesh, in_rig)
+        lines += _describe_mesh(mesh, in_rig)
     with part("torso girths"):
-        girths = girth_errors(body, true_girths(*surface))
-        lines.append(f"  torso girths (tape)     {_girth_figures(girths)}")
+        girths = compute_girth_errors(body, measure_true_girths(*surface))
+        lines.append(f"  torso girths (tape)     {_format_girths(girths)}")
     if truth.at_mean_breath is not None:
         with part("torso girths at mean breath"):
-            true = true_girths(truth.at_mean_breath, truth.faces)
-            girths = girth_errors(body, true, mean_breath=True)
-            lines.append(f"  ... against mean breath {_girth_figures(girths)}")
+            true = measure_true_girths(truth.at_mean_breath, truth.faces)
+            girths = compute_girth_errors(body, true, mean_breath=True)
+            lines.append(f"  ... against mean breath {_format_girths(girths)}")
     with part("coverage"):
         visible, covered = measure_visible_coverage(points, *surface, pairs)
         lines.append(
@@ -173,17 +175,17 @@ def _scan_lines(stored: StoredScan, calibration: RigCalibration, truth: Truth) -
     return lines
 
 
-def _cloud_lines(signed_mm: Array, sigma_mm: Floats) -> Iterator[str]:
+def _describe_cloud(signed_mm: Array, sigma_mm: Floats) -> Iterator[str]:
     scale, beyond = normalize_errors(signed_mm, sigma_mm)
-    yield f"  cloud, {len(signed_mm):,} points   {_figures(deviation(signed_mm))}"
+    yield f"  cloud, {len(signed_mm):,} points   {_format_figures(summarize_deviation(signed_mm))}"
     yield (
         f"  error over sigma        {scale:.2f} (robust; 1 is right), {100.0 * beyond:.2f} % "
         "of the points beyond three sigmas"
     )
 
 
-def _mesh_lines(signed_mm: Array, mesh: BodyMesh) -> Iterator[str]:
-    yield f"  mesh, measured vertices {_figures(deviation(signed_mm))}"
+def _describe_mesh(signed_mm: Array, mesh: BodyMesh) -> Iterator[str]:
+    yield f"  mesh, measured vertices {_format_figures(summarize_deviation(signed_mm))}"
     shape = compute_topology(mesh.vertices, mesh.faces)
     yield (
         f"  mesh: {'closed' if shape.closed else 'open'}, "
@@ -193,7 +195,9 @@ def _mesh_lines(signed_mm: Array, mesh: BodyMesh) -> Iterator[str]:
     )
 
 
-def _aligned_poses(stored: StoredScan, calibration: RigCalibration) -> dict[str, RigidTransform]:
+def _read_aligned_poses(
+    stored: StoredScan, calibration: RigCalibration
+) -> dict[str, RigidTransform]:
     """rig_from_camera of the pairs in the scan, as aligned if they were."""
     measured = [name for name, points in stored.facts["measured"].items() if points]
     alignment = stored.facts["alignment"]
@@ -204,14 +208,14 @@ def _aligned_poses(stored: StoredScan, calibration: RigCalibration) -> dict[str,
     }
 
 
-def _girth_figures(girths: GirthErrors) -> str:
+def _format_girths(girths: GirthErrors) -> str:
     return (
         f"RMS {girths.rms_mm:.2f}, worst {girths.worst_mm:.2f} mm at {girths.worst_at_mm:.0f} mm, "
         f"{girths.heights} heights; stature {girths.stature_mm:+z.2f} mm"
     )
 
 
-def _figures(d: Deviation) -> str:
+def _format_figures(d: Deviation) -> str:
     return (
         f"bias {d.bias_mm:+z.3f}, median {d.median_mm:.3f}, RMS {d.rms_mm:.3f}, "
         f"95 % {d.p95_mm:.3f}, worst {d.worst_mm:.2f} mm"

@@ -12,15 +12,15 @@ from pathlib import Path
 import numpy as np
 
 from bodyscan.arrays import Array
-from bodyscan.boards.board_layout import corner_grid, corner_points
+from bodyscan.boards.board_layout import compute_corner_grid, compute_corner_points
 from bodyscan.boards.detection import find_boards
 from bodyscan.boards.detection_failure import describe_unfound, detect_any, estimate_first_marker
 from bodyscan.boards.view import BoardView, ViewKey, number_corners
 from bodyscan.calibration.board_views import (
     LocatedView,
-    board_symmetries,
+    find_board_symmetries,
     has_enough_corners,
-    planar_view,
+    make_planar_view,
 )
 from bodyscan.calibration.camera import (
     MIN_POSES,
@@ -36,13 +36,13 @@ from bodyscan.captures.images import measure_mosaic, read_board_image, read_sequ
 from bodyscan.errors import BadInput, BodyscanError, DegeneratePoses, FailedWork, format_list
 from bodyscan.files.corners_vnl import Corners, write_corners
 from bodyscan.geometry.lenses import FAMILY, LENSES
-from bodyscan.geometry.robust import rms_length
+from bodyscan.geometry.robust import compute_rms_length
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, attempt_each, map_threads, silent
 from bodyscan.registration.board_checks import (
-    appearance_notes,
     describe_findings,
+    note_appearance,
     refuse_other_pitch,
 )
 from bodyscan.registration.sanity_checks import find_camera_faults
@@ -82,7 +82,7 @@ def find_all_boards(rig: Rig, captures: Captures, progress: Progress = silent) -
 
     def find(sequence: ImageSequence) -> list[BoardView]:
         if sequence.board_path in captures.corners:
-            return _given_view(rig, captures, sequence)
+            return _read_given_view(rig, captures, sequence)
         image = read_board_image(sequence, rig.pair(sequence.pair))
         if first[sequence.pair] is sequence:
             mosaics[sequence.pair] = measure_mosaic(image)
@@ -108,7 +108,7 @@ def find_all_boards(rig: Rig, captures: Captures, progress: Progress = silent) -
         for pair, differ in sorted(mosaics.items())
         if differ > 0.05  # of grey images 0.01 at most
     ]
-    notes = (*map(str, refused.values()), *missing, *raw, *appearance_notes(rig, views))
+    notes = (*map(str, refused.values()), *missing, *raw, *note_appearance(rig, views))
     return FoundBoards(views, notes, refused=refused)
 
 
@@ -123,7 +123,10 @@ def _refuse_other_markers(
     found = [view for view in views if view.board == board.name]
     if board.kind == "checkerboard" or board.faces == 2 or not found:
         return
-    ids, (columns, rows) = np.concatenate([view.corner_ids for view in found]), corner_grid(board)
+    ids, (columns, rows) = (
+        np.concatenate([view.corner_ids for view in found]),
+        compute_corner_grid(board),
+    )
     whole = {0, columns - 1} <= set(ids % columns) and {0, rows - 1} <= set(ids // columns)
     pair, shot, _ = max(found, key=lambda view: len(view.pixels)).key
     sequence = next(s for s in captures.pair_sequences(pair) if s.shot == shot)
@@ -167,7 +170,7 @@ def choose_frame(rig: Rig, captures: Captures) -> Outcome[Rig]:
     return Outcome(rig.model_copy(update={"rig_frame": frame}), (note,))
 
 
-def _given_view(rig: Rig, captures: Captures, sequence: ImageSequence) -> list[BoardView]:
+def _read_given_view(rig: Rig, captures: Captures, sequence: ImageSequence) -> list[BoardView]:
     """The board whose corners were found elsewhere, [] if none were.
 
     Raises BadInput when the rig has several boards, because corners alone do not identify the board.
@@ -197,7 +200,7 @@ def write_found_corners(
     """
     if len(rig.boards) != 1:
         return
-    count = len(corner_points(rig.boards[0]))
+    count = len(compute_corner_points(rig.boards[0]))
     by_sequence = {(view.pair, view.shot): view for view in views}
 
     def row(sequence: ImageSequence) -> tuple[str, Corners]:
@@ -267,7 +270,7 @@ def calibrate_cameras(
     def fit(name: str) -> CameraCalibration:
         spec = rig.pair(name).camera
         planar = [
-            planar_view(view, rig.board(view.board))
+            make_planar_view(view, rig.board(view.board))
             for view in views
             if view.pair == name and has_enough_corners(view, rig.board(view.board))
         ]
@@ -280,14 +283,12 @@ def calibrate_cameras(
     cameras, errors = attempt_each(
         calibrate, names, BodyscanError, stage="calibrating cameras", progress=progress
     )
-    notes = [
-        line for name, found in cameras.items() for line in _known_notes(rig.pair(name), found)
-    ]
+    notes = [line for name, found in cameras.items() for line in _note_known(rig.pair(name), found)]
     failures = {name: str(error) for name, error in errors.items()}
     return Outcome(cameras, tuple(notes), failures)
 
 
-def _known_notes(pair: Pair, found: CameraCalibration) -> Iterator[str]:
+def _note_known(pair: Pair, found: CameraCalibration) -> Iterator[str]:
     known, name = pair.known, pair.name
     if known is None:
         return
@@ -323,11 +324,11 @@ def require_cameras(
             error = next(error for error in errors if error.what == common)
             failures[name] = f"{len(errors)} of its {taken} images cannot be used: {error}"
     if not cameras.value:
-        raise no_pair_calibrated(rig, failures, _describe_boardless(rig, boards, searched))
+        raise make_no_pair_error(rig, failures, _describe_boardless(rig, boards, searched))
     return replace(cameras, failures=failures)
 
 
-def no_pair_calibrated(rig: Rig, failed: Mapping[str, str], remedy: str = "") -> FailedWork:
+def make_no_pair_error(rig: Rig, failed: Mapping[str, str], remedy: str = "") -> FailedWork:
     """The error for a rig of which nothing is left, or only cameras whose projectors are not."""
     of_rig = "pair with a projector" if any(pair.projector for pair in rig.pairs) else "pair"
     what = f"no {of_rig} could be calibrated:{format_list(failed)}"
@@ -361,14 +362,14 @@ def locate_views(
     for name, found in cameras.items():
         # All at once: solving for one board's pose takes as many calls as for thirty.
         of_camera = [view for view in usable if view.pair == name]
-        planar = [planar_view(view, rig.board(view.board)) for view in of_camera]
+        planar = [make_planar_view(view, rig.board(view.board)) for view in of_camera]
         starts = [estimate_pose(found.camera, view) for view in planar]
         poses = zip(*locate_boards(found.camera, planar, starts), strict=True) if planar else ()
         fitted |= zip((view.key for view in of_camera), poses, strict=True)
     located, notes = [], []
     for view in usable:
         board, (pose, residuals) = rig.board(view.board), fitted[view.key]
-        rms = rms_length(residuals)
+        rms = compute_rms_length(residuals)
         # Real corners are good to a few tenths of a pixel: this is another board, or a mix-up.
         if rms > max(1.0, 6.0 * cameras[view.pair].rms_px):
             notes.append(
@@ -376,8 +377,10 @@ def locate_views(
                 f"{rms:.2f} px): view discarded, corners may be misnumbered"
             )
             continue
-        symmetries = board_symmetries(board) if view.turnable else board_symmetries(board)[:1]
-        points = corner_points(board)[view.corner_ids]
+        symmetries = (
+            find_board_symmetries(board) if view.turnable else find_board_symmetries(board)[:1]
+        )
+        points = compute_corner_points(board)[view.corner_ids]
         located.append(
             LocatedView(view.pair, view.shot, view.board, points, view.pixels, pose, symmetries)
         )

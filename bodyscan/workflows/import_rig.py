@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from bodyscan.arrays import Array
-from bodyscan.calibration.known_pair import KnownPair, parameter_sigmas, read_known_pair
+from bodyscan.calibration.known_pair import KnownPair, compute_parameter_sigmas, read_known_pair
 from bodyscan.calibration.pair import PairCalibration, PairQuality
 from bodyscan.errors import BadInput, BodyscanError, CalibrationFileError
 from bodyscan.files.messages import make_paths_relative
@@ -66,9 +66,9 @@ def import_rig(rig: Rig, folder: Path, sigma_px: float | None = None) -> RigCali
         rig_from_camera = {name: rig_frame @ pose for name, pose in rig_from_camera.items()}
     return RigCalibration(
         rig,
-        {name: _calibration_of(rig.pair(name), one) for name, one in known.items()},
+        {name: _make_calibration(rig.pair(name), one) for name, one in known.items()},
         rig_from_camera,
-        _covariance(known, rig_from_camera),
+        _compute_covariance(known, rig_from_camera),
         {},
         {name: make_paths_relative(str(error), folder) for name, error in failed.items()},
         tuple(
@@ -130,11 +130,11 @@ def _read(pair: Pair, folder: Path, *, posed: bool) -> KnownPair:
     return known
 
 
-def _calibration_of(pair: Pair, known: KnownPair) -> PairCalibration:
+def _make_calibration(pair: Pair, known: KnownPair) -> PairCalibration:
     camera, code = known.camera, pair.projector
     covariance = np.zeros((len(camera.parameters),) * 2)
     if known.sigma_px is not None:
-        covariance = np.diag(parameter_sigmas(camera, known.sigma_px) ** 2)
+        covariance = np.diag(compute_parameter_sigmas(camera, known.sigma_px) ** 2)
     quality = PairQuality(None, 0, imported=known.source, imported_sigma_px=known.sigma_px)
     if code is None:
         return PairCalibration(pair.name, camera, covariance, None, quality)
@@ -144,7 +144,7 @@ def _calibration_of(pair: Pair, known: KnownPair) -> PairCalibration:
     return PairCalibration(pair.name, camera, covariance, known.sheets(code), quality, crossing)
 
 
-def _covariance(
+def _compute_covariance(
     known: dict[str, KnownPair], rig_from_camera: dict[str, RigidTransform]
 ) -> PoseCovariance:
     """Covariance of the poses: each pair independently rotated by the sigma of its pixels, and shifted

@@ -24,11 +24,11 @@ from bodyscan.fusion.cleaning import cut_to_volume
 from bodyscan.outcome import Outcome
 from bodyscan.progress import THREADS, Progress, attempt_each, silent
 from bodyscan.reconstruction.range_image import RangeImage
-from bodyscan.reconstruction.scan_volume import stripes_in_volume
+from bodyscan.reconstruction.scan_volume import find_stripes_in_volume
 from bodyscan.reconstruction.triangulation import reconstruct_range_image
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.storage import load_calibration
-from bodyscan.workflows.decode import decode_sequence, fault_notes
+from bodyscan.workflows.decode import decode_sequence, list_fault_notes
 
 Reconstructed = tuple[RangeImage, tuple[str, ...]]
 """A range image, and what was wrong with the images, see `StripeMap.faults`."""
@@ -48,7 +48,7 @@ def reconstruct_sequence(
     Raises ImageError and DecodingFailed as `decode_sequence` does.
     """
     pair, at = calibration.pairs[sequence.pair], calibration.rig_from_camera[sequence.pair]
-    limits = stripes_in_volume(pair, at, calibration.rig.volume)
+    limits = find_stripes_in_volume(pair, at, calibration.rig.volume)
     spec = calibration.rig.pair(sequence.pair)
     stripes = decode_sequence(sequence, spec, limits=limits)
     image = replace(reconstruct_range_image(pair, stripes), rgb=read_colours(sequence, spec.camera))
@@ -107,7 +107,7 @@ def reconstruct_range_images(
     empty = (image.pair for image in images if not np.isfinite(image.points).any())
     notes = [f"{pair}: nothing that it measured lies inside the rig's `volume`" for pair in empty]
     faults = {sequence: several for sequence, (_, several) in found.items()}
-    notes += map(captures.relative, fault_notes(faults))
+    notes += map(captures.relative, list_fault_notes(faults))
     return Outcome(images, tuple(notes), failed)
 
 
@@ -141,7 +141,7 @@ class Preparation:
         ]
 
         def make(sequence: ImageSequence) -> _Made | None:
-            stamps = _stamps(captures, sequence)
+            stamps = _read_stamps(captures, sequence)
             try:
                 made = reconstruct_sequence(self.calibration, captures, sequence, volume_only=True)
             except BodyscanError:
@@ -163,7 +163,7 @@ class Preparation:
         return {
             sequence: one[0]
             for sequence, one in found.items()
-            if one is not None and _stamps(captures, sequence) == one[1]
+            if one is not None and _read_stamps(captures, sequence) == one[1]
         }
 
     def drop(self, folder: Path) -> None:
@@ -171,7 +171,7 @@ class Preparation:
         self._made.pop(folder, None)
 
 
-def _stamps(captures: Captures, sequence: ImageSequence) -> tuple[tuple[int, int], ...]:
+def _read_stamps(captures: Captures, sequence: ImageSequence) -> tuple[tuple[int, int], ...]:
     """Stamps of the images and of captures.yaml, which says when they were taken; (0, 0) for a
     missing file."""
     stamps = []

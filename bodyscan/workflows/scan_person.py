@@ -23,10 +23,10 @@ from bodyscan.fusion import storage
 from bodyscan.fusion.cleaning import clean, require_subject
 from bodyscan.fusion.consistency import Contradictions
 from bodyscan.fusion.merging import MergedCloud, merge
-from bodyscan.fusion.meshing import attach_attributes, closed_surface
+from bodyscan.fusion.meshing import attach_attributes, make_closed_surface
 from bodyscan.fusion.pose_variance import add_motion_variance, add_pose_variance
 from bodyscan.fusion.regions import label_regions
-from bodyscan.fusion.storage import Made, Origin, Scan, no_use
+from bodyscan.fusion.storage import Made, Origin, Scan, ignore_made
 from bodyscan.fusion.verdict import grade_scan
 from bodyscan.fusion.verdict.coverage import measure_coverage
 from bodyscan.fusion.verdict.evidence import ImageEvidence, RigEvidence, ScanEvidence
@@ -70,7 +70,7 @@ def scan_person(
     empty: Captures | None = None,
     reconstructed: Mapping[ImageSequence, Reconstructed] = MappingProxyType({}),
     announce: Announce = say_nothing,
-    made: Made = no_use,
+    made: Made = ignore_made,
 ) -> Scan:
     """Make a body model and mesh from images of a person.
 
@@ -211,7 +211,7 @@ def fuse(
     *,
     empty: Sequence[RangeImage] = (),
     announce: Announce = say_nothing,
-    made: Made = no_use,
+    made: Made = ignore_made,
     read_as: Callable[[str, str], RangeImage | None] = lambda one, other: None,
 ) -> Scan:
     """Fuse range images of one person, background included, to a body model and mesh.
@@ -237,7 +237,9 @@ def fuse(
     with step(progress, "merging"):
         merged = _merge(subject, settings.fusion)
     with step(progress, "judging"):
-        images = _image_evidence(calibration, measured, cleaned, subject, merged.contradictions)
+        images = _collect_image_evidence(
+            calibration, measured, cleaned, subject, merged.contradictions
+        )
         rig, facts = RigEvidence.from_calibration(calibration), (subject.aligned, subject.person)
         evidence = ScanEvidence(merged.cloud, rig, images, settings.use, *facts)
         evidence, verdict = _judge_points(evidence, measured.value, calibration, read_as)
@@ -309,7 +311,7 @@ def _merge(subject: _Subject, settings: FusionSettings) -> MergedCloud:
     return replace(merged, cloud=cloud)
 
 
-def _image_evidence(
+def _collect_image_evidence(
     calibration: RigCalibration,
     measured: Outcome[Sequence[RangeImage]],
     cleaned: Sequence[RangeImage],
@@ -358,7 +360,7 @@ def _mesh(
     with background() as other:
         # Meshing mostly uses one core, so regions are labelled on the other meanwhile.
         labelling = other.submit(label)
-        shape = closed_surface(cloud, settings.mesh, measured, subject.rig_from_camera)
+        shape = make_closed_surface(cloud, settings.mesh, measured, subject.rig_from_camera)
         known = labelling.result()
     mesh = attach_attributes(*shape, known, settings.mesh.reach_mm)
     if subject.motion:

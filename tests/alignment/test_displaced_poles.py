@@ -11,12 +11,17 @@ from bodyscan.alignment.displaced_poles import (
     DisplacedPole,
     DisplacementSearch,
     Scan,
+    compute_motions_between,
     find_displaced_pole,
     free_pairs,
     group_by_pole,
-    motions_between,
 )
-from bodyscan.alignment.sway_prior import BODY_CENTRE, LEVER_MM, centre_shifts, stance_correlation
+from bodyscan.alignment.sway_prior import (
+    BODY_CENTRE,
+    LEVER_MM,
+    compute_centre_shifts,
+    correlate_stance,
+)
 from bodyscan.arrays import Array
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 from bodyscan.geometry.uncertainty import PoseCovariance
@@ -41,7 +46,7 @@ def scanned(
     """Pairs one after another see a person who sways and turns, known to 0.1 mm; the second pole is
     off by `step`: a shift, mm, and a turn, degrees."""
     at_ms = every_ms * np.arange(len(NAMES))
-    alike = stance_correlation(1e-3 * (at_ms[:, None] - at_ms)) + 1e-9 * np.eye(len(NAMES))
+    alike = correlate_stance(1e-3 * (at_ms[:, None] - at_ms)) + 1e-9 * np.eye(len(NAMES))
     moved = np.linalg.cholesky(alike) @ rng.standard_normal((len(NAMES), 6))
     moved *= sway_mm * np.repeat([1.0, 0.3], 3)
     moved += 0.1 * rng.standard_normal(moved.shape)
@@ -49,7 +54,7 @@ def scanned(
     moved[own] += [*step[:3], *(LEVER_MM * np.radians(step[3:]))]
     turn = moved[:, 3:] / LEVER_MM
     twists = np.hstack([turn, moved[:, :3] - np.cross(turn, BODY_CENTRE)])
-    np.testing.assert_allclose(centre_shifts(twists), moved[:, :3])
+    np.testing.assert_allclose(compute_centre_shifts(twists), moved[:, :3])
     moments: dict[str, float | None] = dict(zip(NAMES, at_ms.tolist(), strict=True))
     return dict(zip(NAMES, twists, strict=True)), moments
 
@@ -138,7 +143,7 @@ def test_motions_are_those_of_alignment() -> None:
     twist = np.array([0.01, 0.0, -0.02, 3.0, 4.0, 5.0])
     before = {"a": RigidTransform.from_rotation_vector([0.1, 0.2, 0.3], [100.0, 200.0, 300.0])}
     after = {"a": before["a"].retract(twist)}
-    np.testing.assert_allclose(motions_between(before, after)["a"], twist, atol=1e-12)
+    np.testing.assert_allclose(compute_motions_between(before, after)["a"], twist, atol=1e-12)
 
 
 @pytest.mark.slow

@@ -19,7 +19,7 @@ from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.motion.object_refinement import refine_on_object
 from bodyscan.progress import map_threads
 from bodyscan.reconstruction.range_image import RangeImage
-from bodyscan.reconstruction.triangulation import grid_normals
+from bodyscan.reconstruction.triangulation import estimate_grid_normals
 from bodyscan.settings import AlignmentSettings
 
 CAMERA = Camera(380.0, 380.0, 0.0, 160.0, 128.0, Radial(), 320, 256)
@@ -51,7 +51,7 @@ def scanned() -> Scanned:
         seen = (rays * depth[..., None]).astype(np.float32)
         sigma = np.where(np.isfinite(depth), NOISE_MM, np.nan).astype(np.float32)
         grey = np.full(depth.shape, 150, np.uint8)
-        images.append(RangeImage(name, CAMERA, seen, grid_normals(seen), sigma, grey))
+        images.append(RangeImage(name, CAMERA, seen, estimate_grid_normals(seen), sigma, grey))
         placings[name] = place
     return images, placings
 

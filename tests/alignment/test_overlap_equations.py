@@ -8,7 +8,7 @@ from scipy import stats
 
 from bodyscan.alignment.displaced_poles import PairDrift, estimate_drift
 from bodyscan.alignment.matching import Matches
-from bodyscan.alignment.overlaps import linearize, motion_covariance, solve_motions
+from bodyscan.alignment.overlaps import compute_motion_covariance, linearize, solve_motions
 from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
 
 
@@ -121,7 +121,7 @@ def test_motions_are_known_by_the_prior_and_by_what_overlaps_say_of_their_differ
     has 1 / (1 / 2 a^2 + 1 / b^2); along y, of which the overlap says nothing, all stays."""
     a, b = 0.3, 0.1
     tie = LinearGaussianSystem(np.diag([0.0, 0.0, 0.0, b**-2, 0.0, 0.0]), np.zeros(6))
-    found = motion_covariance({(0, 1): tie}, a**2 * np.eye(12))
+    found = compute_motion_covariance({(0, 1): tie}, a**2 * np.eye(12))
     mean, difference = np.zeros(12), np.zeros(12)
     mean[[3, 9]], difference[[3, 9]] = 0.5, (1.0, -1.0)
     assert mean @ found @ mean == pytest.approx(a**2 / 2.0)

@@ -11,7 +11,7 @@ from bodyscan.alignment.pose_evidence import (
     Displacement,
     PoseEvidence,
     ScaleError,
-    common_basis,
+    build_common_basis,
     detect_displacement,
 )
 from bodyscan.alignment.sway_prior import BODY_CENTRE
@@ -84,7 +84,7 @@ def test_one_change_of_all_pairs_is_asked_for_before_any_pole(freedom: int) -> N
         forward /= np.linalg.norm(forward)
         axes = np.stack([right, np.cross(forward, right), forward], axis=1)
         placed[name] = RigidTransform(axes, PLACED[name].translation)
-    moved, sound = 2.0 * common_basis(NAMES, placed)[:, freedom], evidence(0.0 * OUT).system
+    moved, sound = 2.0 * build_common_basis(NAMES, placed)[:, freedom], evidence(0.0 * OUT).system
     vector = sound.vector + sound.information @ moved
     off = PoseEvidence(NAMES, LinearGaussianSystem(sound.information, vector))
     found = detect_displacement(off, placed, POLES)

@@ -7,7 +7,7 @@ import pytest
 
 from bodyscan.alignment.sway_prior import (
     SwayPrior,
-    centre_shifts,
+    compute_centre_shifts,
     reject_large_motions,
     select_tighter,
 )
@@ -38,7 +38,7 @@ def test_a_turn_about_the_bodys_centre_leaves_the_centre_where_it_is() -> None:
     turn = RigidTransform.from_rotation_vector([0.0, 0.1, 0.0], np.zeros(3))
     centre = np.array(BODY_CENTRE_MM)
     about_centre = np.concatenate([[0.0, 0.1, 0.0], -np.cross([0.0, 0.1, 0.0], centre)])
-    assert np.abs(centre_shifts(about_centre[None])).max() < 1e-9
+    assert np.abs(compute_centre_shifts(about_centre[None])).max() < 1e-9
     assert np.abs(turn.apply(centre) - centre).max() > 50.0
     # The prior allows that turn as freely as any other, and the shift it would be without.
     covariance = PRIOR.covariance(PAIRS, EXACT_BOARDS)[:6, :6]

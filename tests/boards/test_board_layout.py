@@ -9,7 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bodyscan.boards.board_layout import corner_points, corners_per_face, marker_corners
+from bodyscan.boards.board_layout import (
+    compute_corner_points,
+    compute_marker_corners,
+    count_corners_per_face,
+)
 from bodyscan.boards.board_map import fit_board_map
 from bodyscan.boards.view import Appearance, BoardView, number_corners
 from bodyscan.errors import CaptureError
@@ -25,7 +29,7 @@ def test_corner_ids_count_along_columns_and_back_follows_front(
     board = Board(
         name="b", columns=columns, rows=rows, square_mm=square, faces=2, thickness_mm=thickness
     )
-    points, count = corner_points(board), corners_per_face(board)
+    points, count = compute_corner_points(board), count_corners_per_face(board)
     assert points.shape == (2 * count, 3)
     for column, row in ((0, 0), (columns - 2, 0), (0, rows - 2), (columns - 2, rows - 2)):
         corner = row * (columns - 1) + column
@@ -43,8 +47,8 @@ def test_markers_stand_in_the_white_squares(size: tuple[int, int], legacy: bool)
         name="b", kind="charuco", columns=columns, rows=rows, square_mm=10, marker_mm=8,
         legacy_layout=legacy, faces=2, first_marker=5,
     )  # fmt: skip
-    ids, corners = marker_corners(board)
-    back_ids, back_corners = marker_corners(board, 1)
+    ids, corners = compute_marker_corners(board)
+    back_ids, back_corners = compute_marker_corners(board, 1)
     np.testing.assert_array_equal(ids, 5 + np.arange(columns * rows // 2))
     np.testing.assert_array_equal(back_ids, ids[-1] + 1 + np.arange(len(ids)))
     np.testing.assert_array_equal(corners, back_corners)

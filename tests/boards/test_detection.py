@@ -13,7 +13,7 @@ from board_rendering import render, true_corners, view_of
 
 from bodyscan.arrays import Array, Bytes, Floats
 from bodyscan.boards import checkerboard
-from bodyscan.boards.board_layout import corner_points
+from bodyscan.boards.board_layout import compute_corner_points
 from bodyscan.boards.board_map import fit_board_map
 from bodyscan.boards.detection import find_boards
 from bodyscan.boards.view import BoardView
@@ -65,7 +65,7 @@ def test_a_board_from_horizon_to_horizon_of_a_fisheye_is_found() -> None:
     print_[(np.abs(x - 150) > 170) | (np.abs(y - 105) > 125) | (theta > 1.5)] = 70.0
     picture = cv2.resize(print_.astype(np.float32), (640, 480), interpolation=cv2.INTER_AREA)
     (view,) = found(cv2.GaussianBlur(picture, (0, 0), 0.7).astype(np.uint8), PLAIN)
-    ideal = (corner_points(PLAIN)[view.corner_ids, :2] - board_from_camera) / 80.0
+    ideal = (compute_corner_points(PLAIN)[view.corner_ids, :2] - board_from_camera) / 80.0
     radius = np.linalg.norm(ideal, axis=1, keepdims=True)
     true = middle + focal * ideal / radius * np.arctan(radius)
     assert len(view.corner_ids) >= 52
@@ -262,7 +262,7 @@ def test_a_board_of_many_squares_is_found_and_one_covered_costs_no_search() -> N
 
 def planar_error_px(board: Board, view: BoardView) -> float:
     """How far corners stray from a homography with a gentle lens, RMS px."""
-    printed = corner_points(board)[view.corner_ids, :2]
+    printed = compute_corner_points(board)[view.corner_ids, :2]
     stray = fit_board_map(printed, view.pixels).apply(printed) - view.pixels
     return np.sqrt(np.mean(np.sum(stray**2, axis=1)))
 
@@ -309,7 +309,7 @@ def test_real_charuco_board(captures: Path, camera: str, at_least: int) -> None:
         image = cv2.imread(str(captures / "charuco-ring" / camera / f"{shot}.jpg"), 0)
         (view,) = found(image, board)
         assert len(view.corner_ids) >= at_least
-        objects.append(corner_points(board)[view.corner_ids].astype(np.float32))
+        objects.append(compute_corner_points(board)[view.corner_ids].astype(np.float32))
         pixels.append(view.pixels.astype(np.float32))
     flags = cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K3 | cv2.CALIB_FIX_ASPECT_RATIO
     matrix = np.array([[800.0, 0, 640], [0, 800, 512], [0, 0, 1]])

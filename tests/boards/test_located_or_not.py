@@ -11,7 +11,7 @@ import pytest
 from bodyscan.arrays import Array, Bytes
 from bodyscan.boards import detection_failure
 from bodyscan.boards.aprilgrid import locate_grid
-from bodyscan.boards.board_layout import marker_corners
+from bodyscan.boards.board_layout import compute_marker_corners
 from bodyscan.boards.charuco import Markers, fit_markers, locate_face
 from bodyscan.boards.detection_failure import describe_unfound
 from bodyscan.boards.view import AS_PRINTED, Appearance
@@ -37,7 +37,7 @@ def image_of(points: Array, scale: float = 1.0) -> Array:
 
 def shown(board: Board, count: int | None = None, wrong: int = 0) -> Markers:
     """The first markers of a board as printed; the wrong ones lie elsewhere."""
-    ids, points = marker_corners(board)
+    ids, points = compute_marker_corners(board)
     pixels = image_of(points[..., :2])
     pixels[:wrong] += np.random.default_rng(3).uniform(80.0, 300.0, (wrong, 1, 2))
     return Markers(np.asarray(ids)[:count], pixels[:count])
@@ -120,7 +120,7 @@ def test_at_a_glance_squares_that_are_not_whole_are_told_from_none() -> None:
 
 
 def printed() -> Array:
-    return np.asarray(marker_corners(BOARD)[1])[..., :2]
+    return np.asarray(compute_marker_corners(BOARD)[1])[..., :2]
 
 
 def test_markers_off_their_place_do_not_agree() -> None:
@@ -135,7 +135,7 @@ def test_markers_off_their_place_do_not_agree() -> None:
 
 
 def test_a_board_is_located_by_some_of_its_markers() -> None:
-    ids, points = marker_corners(BOARD)
+    ids, points = compute_marker_corners(BOARD)
     pixels = image_of(points[..., :2], 1.0)
     some = np.arange(3, 36, 4)
     position = locate_face(BOARD, Markers(np.asarray(ids)[some], pixels[some]))
@@ -152,7 +152,7 @@ TAGS = Board(name="t", kind="aprilgrid", columns=6, rows=5, square_mm=120, marke
 
 def tags(turn: int = 0, *, from_top: bool = False, wrong: int = 0, count: int = 30) -> Markers:
     """As a grid's first tags appear, each turned in its place; the wrong ones lie elsewhere."""
-    ids, points = marker_corners(TAGS)
+    ids, points = compute_marker_corners(TAGS)
     order = points.reshape(5, 6, 4, 2)
     order = order[::-1] if from_top else order
     pixels = image_of(np.roll(order.reshape(-1, 4, 2), turn, axis=1), 0.5)

@@ -12,14 +12,14 @@ from board_rendering import render, true_corners, view_of
 from small_captures import write
 
 from bodyscan.arrays import Array, Bytes
-from bodyscan.boards.board_layout import corner_points
+from bodyscan.boards.board_layout import compute_corner_points
 from bodyscan.boards.charuco import detect_markers
 from bodyscan.boards.detection import find_boards
 from bodyscan.boards.detection_failure import describe_unfound
 from bodyscan.boards.view import BoardView
 from bodyscan.captures.folder import open_captures
 from bodyscan.errors import BadInput
-from bodyscan.registration.board_checks import appearance_notes, refuse_other_pitch
+from bodyscan.registration.board_checks import note_appearance, refuse_other_pitch
 from bodyscan.rig.board import Board
 from bodyscan.rig.frame_names import CaptureFolder
 from bodyscan.rig.pair import CameraSpec, Pair
@@ -84,7 +84,7 @@ def test_either_of_the_two_historic_layouts_is_recognised(picture: Bytes) -> Non
     # A square off, and half of the markers, is what the other layout makes of the same picture.
     assert rms(view, true_corners(MARKED, PLACE)) < 0.012
     rig = Rig(name="r", boards=(described,), pairs=(CAMERA,))
-    assert "legacy_layout: false" in appearance_notes(rig, [view])[0]
+    assert "legacy_layout: false" in note_appearance(rig, [view])[0]
 
 
 @pytest.mark.slow
@@ -127,7 +127,7 @@ def tag_picture(*, border_bits: int, turns: int, from_below: bool) -> tuple[Byte
         cv2.GaussianBlur(fine, (0, 0), 2.1), (700, 512), interpolation=cv2.INTER_AREA
     )
     # 3 px of the sheet a mm, and half a gap and the rim before the first tag's square.
-    on_sheet = 3.0 * corner_points(TAGS)[:, :2] + 60 + gap / 2 - 0.5
+    on_sheet = 3.0 * compute_corner_points(TAGS)[:, :2] + 60 + gap / 2 - 0.5
     pixels = cv2.perspectiveTransform(on_sheet[None], bend)[0]
     noise = np.random.default_rng(0).normal(0, 1, small.shape)
     image = np.clip(0.7 * small + 20 + noise, 0, 255).astype(np.uint8)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from bodyscan.boards.checkerboard import board_regions, find_checkerboard, shows_lattice
+from bodyscan.boards.checkerboard import find_board_regions, find_checkerboard, shows_lattice
 from bodyscan.rig.board import Board
 
 BOARD = Board(name="b", kind="checkerboard", columns=10, rows=7, square_mm=30.0)
@@ -77,13 +77,13 @@ def test_regions_hold_boards_with_a_margin_the_larger_first() -> None:
         even = np.add.outer(np.arange(rows), np.arange(columns)) % 2
         part = np.kron(even, np.ones((10, 10))) * 150 + 40
         image[top : top + 10 * rows, left : left + 10 * columns] = part
-    found = board_regions(image, 13 * 8)
+    found = find_board_regions(image, 13 * 8)
     # 104 corners are asked for; seven tenths of that would be more than the second board has.
     assert len(found) == 1
     (one,) = found
     expected = (220 - 21 - 20, 120 - 13 - 20, 360 + 21 + 20, 210 + 13 + 20)
     assert np.abs(np.array(sides(one)) - expected).max() <= 3
-    both = board_regions(image, 45)
+    both = find_board_regions(image, 45)
     assert len(both) == 2
     assert both[0] == one
     expected = (500 - 12 - 20, 350 - 9 - 20, 580 + 12 + 20, 410 + 9 + 20)

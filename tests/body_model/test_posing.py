@@ -9,7 +9,7 @@ import pytest
 
 from bodyscan.body_model.fitting import differentiate
 from bodyscan.body_model.template import BodyShapeAndPose, load_template, pose_body
-from bodyscan.mesh.topology import compute_topology, vertex_normals
+from bodyscan.mesh.topology import compute_topology, compute_vertex_normals
 
 TEMPLATE = load_template()
 REST = BodyShapeAndPose(
@@ -56,7 +56,7 @@ def test_derivatives_are_those_of_the_posed_body(column: int) -> None:
     )
     some = np.arange(0, len(TEMPLATE.vertices), 97)
     posed = pose_body(TEMPLATE, body)
-    normals = vertex_normals(posed.vertices, TEMPLATE.faces)[some].astype(np.float64)
+    normals = compute_vertex_normals(posed.vertices, TEMPLATE.faces)[some].astype(np.float64)
     derivative = differentiate(TEMPLATE, body, posed, some, normals)[:, column]
     step = np.zeros(3 + 3 * len(TEMPLATE.joints) + len(TEMPLATE.shapes))
     step[column] = 1e-4

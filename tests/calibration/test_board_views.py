@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 
 from bodyscan.arrays import Indices
-from bodyscan.boards.board_layout import corner_points
+from bodyscan.boards.board_layout import compute_corner_points
 from bodyscan.boards.view import BoardView
 from bodyscan.calibration.board_views import (
     BoardFace,
     LocatedView,
-    board_symmetries,
+    compute_max_displacement_mm,
+    find_board_symmetries,
     has_enough_corners,
+    make_planar_view,
     match_corners,
-    max_displacement_mm,
     measure_covered_share,
-    planar_view,
 )
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.rig.board import Board
@@ -50,35 +50,36 @@ def test_corners_of_the_back_count_by_their_place_on_it() -> None:
     assert has_enough_corners(view(56 + block(5, 5)), two)
     assert not has_enough_corners(view(56 + block(8, 2)), two)
     np.testing.assert_array_equal(
-        planar_view(view(56 + block(2, 2)), two).points, corner_points(two)[[56, 57, 64, 65]]
+        make_planar_view(view(56 + block(2, 2)), two).points,
+        compute_corner_points(two)[[56, 57, 64, 65]],
     )
 
 
 def test_poses_differ_by_how_far_they_carry_what_is_at_reach() -> None:
     one = RigidTransform.from_rotation_vector([0.2, 0.1, 0.0], [5.0, 6.0, 7.0])
     other = one @ RigidTransform.from_rotation_vector([0.0, 0.0, 0.01], [3.0, 0.0, 4.0])
-    assert max_displacement_mm(one, other, 500.0) == pytest.approx(10.0)
-    assert max_displacement_mm(one, one, 500.0) == pytest.approx(0.0, abs=1e-6)
+    assert compute_max_displacement_mm(one, other, 500.0) == pytest.approx(10.0)
+    assert compute_max_displacement_mm(one, one, 500.0) == pytest.approx(0.0, abs=1e-6)
 
 
 def test_corners_fall_on_corners_of_a_board_that_looks_the_same() -> None:
     even = Board(name="e", kind="checkerboard", columns=8, rows=6, square_mm=30)
     both = even.model_copy(update={"faces": 2, "thickness_mm": 5.0})
-    assert [len(board_symmetries(each)) for each in (BOARD, even, both)] == [1, 2, 4]
-    points = corner_points(both)
+    assert [len(find_board_symmetries(each)) for each in (BOARD, even, both)] == [1, 2, 4]
+    points = compute_corner_points(both)
 
     def lattice(corners: np.ndarray) -> list[tuple[float, ...]]:
         return sorted(map(tuple, (np.round(corners, 6) + 0.0).tolist()))
 
-    for symmetry in board_symmetries(both):
+    for symmetry in find_board_symmetries(both):
         assert lattice(symmetry.apply(points)) == lattice(points)
         np.testing.assert_allclose((symmetry @ symmetry).matrix, np.eye(4), atol=1e-9)
 
 
 def test_an_alternative_taken_for_true_shows_the_same_points_to_the_camera() -> None:
     even = Board(name="e", kind="checkerboard", columns=8, rows=6, square_mm=30)
-    symmetries = board_symmetries(even)
-    points = corner_points(even)
+    symmetries = find_board_symmetries(even)
+    points = compute_corner_points(even)
     at = RigidTransform.from_rotation_vector([0.2, -0.3, 0.1], [10.0, 20.0, 900.0])
     seen = LocatedView("p", "s", "e", points, points[:, :2], at, symmetries)
     assert seen.ambiguous
@@ -91,13 +92,13 @@ def test_an_alternative_taken_for_true_shows_the_same_points_to_the_camera() -> 
 
 
 def test_corners_are_matched_by_position() -> None:
-    points = corner_points(BOARD)
+    points = compute_corner_points(BOARD)
     np.testing.assert_array_equal(match_corners(points[[7, 2]] + 1e-8, points), [7, 2])
     assert match_corners(points[:1] + 0.1, points).tolist() == [-1]
 
 
 def test_a_face_fits_corners_that_lie_on_a_cubic() -> None:
-    points = corner_points(BOARD).copy()
+    points = compute_corner_points(BOARD).copy()
     x, y = ((points[:, :2] - [135.0, 120.0]) / [105.0, 90.0]).T
     points[:, 2] = 7.0 + 0.3 * x**2 - 0.2 * x * y + 0.1 * y**3 + 0.05 * x * x * y
     face = BoardFace.fit(points)

@@ -11,7 +11,7 @@ from bodyscan.calibration.boundary_points import (
     BoundaryPoints,
     boundary_points,
     concatenate,
-    rays_on_board,
+    intersect_with_board,
     select,
     subsample,
 )
@@ -30,7 +30,7 @@ def on_board(points: np.ndarray) -> np.ndarray:
 
 
 def test_pixels_are_carried_along_their_rays_onto_the_board() -> None:
-    points = rays_on_board(CAMERA.rays(PIXELS), BOARD)
+    points = intersect_with_board(CAMERA.rays(PIXELS), BOARD)
     np.testing.assert_allclose(on_board(points)[:, 2], 0.0, atol=1e-9)
     np.testing.assert_allclose(CAMERA.project(points), PIXELS, atol=1e-6)
 
@@ -39,7 +39,7 @@ def test_of_a_bent_board_they_are_carried_onto_its_surface() -> None:
     def height(places: np.ndarray) -> np.ndarray:
         return np.asarray(0.5 - 2e-5 * np.sum((places - 100.0) ** 2, axis=-1))
 
-    points = rays_on_board(CAMERA.rays(PIXELS), BOARD, height)
+    points = intersect_with_board(CAMERA.rays(PIXELS), BOARD, height)
     np.testing.assert_allclose(CAMERA.project(points), PIXELS, atol=1e-6)
     there = on_board(points)
     # After two liftings less than a ten-thousandth of a millimetre is left; after one a hundredth.
@@ -55,9 +55,11 @@ def test_a_pixel_across_the_stripes_moves_a_point_on_its_board(
     found = boundary_points(CAMERA, BOARD, *seen, board=7, direction=direction)
     half = np.zeros(2)
     half[across] = 0.5
-    ahead, behind = (rays_on_board(CAMERA.rays(PIXELS + way * half), BOARD) for way in (1.0, -1.0))
+    ahead, behind = (
+        intersect_with_board(CAMERA.rays(PIXELS + way * half), BOARD) for way in (1.0, -1.0)
+    )
     np.testing.assert_allclose(found.per_pixel, ahead - behind, rtol=1e-3)
-    np.testing.assert_allclose(found.points, rays_on_board(CAMERA.rays(PIXELS), BOARD))
+    np.testing.assert_allclose(found.points, intersect_with_board(CAMERA.rays(PIXELS), BOARD))
     assert found.board.tolist() == [7, 7, 7]
     assert found.index.tolist() == [4, 5, 9]
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from bodyscan.arrays import Array
-from bodyscan.boards.board_layout import corner_points
+from bodyscan.boards.board_layout import compute_corner_points
 from bodyscan.calibration.board_views import LocatedView, PlanarView
 from bodyscan.calibration.boundary_points import BoardBoundaries, StripedView
 from bodyscan.calibration.camera import calibrate_camera
@@ -69,7 +69,7 @@ def calibrated(
 ) -> Outcome[PairCalibration]:
     rng = np.random.default_rng(seed)
     shots, views = [], []
-    points = corner_points(BOARD)
+    points = compute_corner_points(BOARD)
     printed = points + print_mm * rng.standard_normal(points.shape) * [1.0, 1.0, 0.0]
     for number, pose in enumerate(poses):
         pixels = CAMERA.project(pose.apply(printed))

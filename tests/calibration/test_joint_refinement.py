@@ -15,7 +15,7 @@ from bodyscan.calibration.board_views import PlanarView
 from bodyscan.calibration.boundary_points import (
     boundary_points,
     concatenate,
-    rays_on_board,
+    intersect_with_board,
     select,
     subsample,
 )
@@ -58,7 +58,7 @@ def crossings(pose: RigidTransform, bow_mm: float) -> tuple[Indices, Array]:
     index, pixels = SCENE.crossings(pose, 8)
 
     def stripe(pixels: Array) -> Array:
-        points = rays_on_board(CAMERA.rays(pixels), pose, lambda xy: bow(xy, bow_mm))
+        points = intersect_with_board(CAMERA.rays(pixels), pose, lambda xy: bow(xy, bow_mm))
         return MIRROR.stripe(points)
 
     for _ in range(3 if bow_mm else 0):

@@ -8,7 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bodyscan.calibration.known_pair import _projector, _require_baseline, parameter_sigmas
+from bodyscan.calibration.known_pair import (
+    _convert_projector,
+    _require_baseline,
+    compute_parameter_sigmas,
+)
 from bodyscan.calibration.model_selection import HeldOutModel
 from bodyscan.calibration.pair import PairQuality
 from bodyscan.errors import CalibrationFileError
@@ -25,7 +29,7 @@ def projector(size: tuple[int, int] | None, *ways: Any) -> Any:
         size=size, where="theirs.json", matrix=matrix, projector=lambda *size: size
     )
     code: Any = SimpleNamespace(directions=ways)
-    return _projector(found, code)
+    return _convert_projector(found, code)
 
 
 def stripes(
@@ -66,7 +70,7 @@ def test_a_projector_stands_millimetres_to_metres_from_its_camera(baseline_mm: f
 
 def test_each_parameter_by_itself_moves_no_pixel_by_more_than_sigma() -> None:
     camera = Camera(900.0, 910.0, 0.0, 320.0, 240.0, Radial(-0.1, 0.05), 640, 480)
-    sigmas = parameter_sigmas(camera, 0.5)
+    sigmas = compute_parameter_sigmas(camera, 0.5)
     u, v = np.meshgrid(np.linspace(0.0, 639.0, 41), np.linspace(0.0, 479.0, 41))
     pixels = np.stack([u, v], axis=-1).reshape(-1, 2)
     rays = camera.rays(pixels)

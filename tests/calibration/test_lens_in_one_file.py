@@ -16,7 +16,12 @@ from bodyscan.calibration.pair import PairCalibration, PairQuality
 from bodyscan.errors import BadInput
 from bodyscan.export.rig import export_rig
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.camera_tables import look_up, look_up_rays, projection_table, ray_table
+from bodyscan.geometry.camera_tables import (
+    look_up,
+    look_up_rays,
+    make_projection_table,
+    make_ray_table,
+)
 from bodyscan.geometry.lenses import LENSES
 from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.lenses.opencv import Radial
@@ -82,9 +87,9 @@ def test_its_rays_are_tabulated() -> None:
     wanted[::40, ::40] = True
     rows, columns = np.nonzero(wanted)
     pixels = np.column_stack([columns, rows]).astype(float)
-    rays = look_up_rays(ray_table(CAMERA), wanted)
+    rays = look_up_rays(make_ray_table(CAMERA), wanted)
     assert np.abs(CAMERA.project(rays) - pixels).max() < 1e-3
-    found = [look_up(projection_table(CAMERA), x, y) for x, y, _ in CAMERA.rays(pixels)]
+    found = [look_up(make_projection_table(CAMERA), x, y) for x, y, _ in CAMERA.rays(pixels)]
     assert np.abs(np.array(found) - pixels).max() < 1e-3
 
 

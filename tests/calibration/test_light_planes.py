@@ -13,7 +13,7 @@ from bodyscan.calibration.boundary_points import (
     select,
 )
 from bodyscan.calibration.sheet_fit import fit_light_planes
-from bodyscan.geometry.light_planes import LightPlanes, baseline_angle_tilt
+from bodyscan.geometry.light_planes import LightPlanes, compute_baseline_angle_tilt
 from bodyscan.geometry.transforms import RigidTransform
 
 STRIPES = 16
@@ -149,7 +149,7 @@ def test_horizontal_stripes_are_told_about_the_other_axis() -> None:
     planes = true_planes()
     turned = planes[:, [1, 0, 2, 3]]
     i = np.arange(STRIPES + 1.0)
-    baseline, angle, tilt = baseline_angle_tilt(turned, "horizontal")
+    baseline, angle, tilt = compute_baseline_angle_tilt(turned, "horizontal")
     assert np.allclose(baseline, 200.0 - 0.5 * i)
     assert np.allclose(angle, np.radians(20.0 + i))
     assert np.allclose(tilt, -np.arctan(0.02 / np.cos(np.radians(20.0 + i))))
@@ -159,7 +159,7 @@ def test_horizontal_stripes_are_told_about_the_other_axis() -> None:
 def test_equation_13_equals_equation_14(u: float, v: float, i: int) -> None:
     planes = LightPlanes(true_planes(), np.zeros((STRIPES + 1, 4, 4)), "vertical")
     ray = CAMERA.rays(np.array([[u, v]]))
-    baseline, angle, tilt = baseline_angle_tilt(planes.coefficients[i], "vertical")
+    baseline, angle, tilt = compute_baseline_angle_tilt(planes.coefficients[i], "vertical")
     # The chapter prints - tan(tilt): with its own Eq. 9 the sign must be + (docs/method.md).
     by_14 = baseline / (np.tan(angle) - ray[0, 0] + np.tan(tilt) * ray[0, 1])
     by_13 = planes.intersect(ray, np.array([float(i)])).depth[0]

@@ -15,10 +15,10 @@ from bodyscan.calibration.model_selection import (
     HeldOutErrors,
     HeldOutModel,
     ResidualPair,
+    compute_shared_weights,
     gain,
     hold_out,
     select_model,
-    shared_weights,
     split,
 )
 from bodyscan.geometry.light_planes import RayDepths
@@ -218,7 +218,7 @@ def test_what_no_model_explains_counts_for_less() -> None:
     one, other = np.ones((9, 2)), np.ones((9, 2))
     one[0], other[0] = 4.0 * 1.4826, -9.0  # four sigmas off in the better model
     one[1] = 50.0  # in one model alone
-    weights = shared_weights([one, other])
+    weights = compute_shared_weights([one, other])
     assert weights.shape == (9,)
     usual = 1.0 / (1.0 + 2.0 / (4.0 * 1.4826) ** 2)
     np.testing.assert_allclose(weights[2:], usual)

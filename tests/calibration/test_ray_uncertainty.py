@@ -10,12 +10,12 @@ import pytest
 from picture_boards import HEIGHT, MIDDLE, NOISE_PX, POINTS, WIDTH, calibrate_with_lenses
 
 from bodyscan.calibration.board_views import PlanarView
-from bodyscan.calibration.camera import ChosenLens, ray_uncertainty
+from bodyscan.calibration.camera import ChosenLens, estimate_ray_uncertainty
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.lenses.opencv import Radial, Rational
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
-from bodyscan.geometry.uncertainty import RayUncertainty, node_pixels
+from bodyscan.geometry.uncertainty import RayUncertainty, list_node_pixels
 
 FOCAL = 1400.0  # 30 degrees from the axis to the corner
 DEPTH_MM = 900.0
@@ -37,7 +37,7 @@ def calibrated(lens: Lens, reach: float, seed: int) -> tuple[Camera, ChosenLens]
 
 def errors_px(true: Camera, found: Camera, covered: float) -> np.ndarray:
     """(rows, columns), a coordinate's, less the motion that fits it best within `covered`."""
-    pixels = node_pixels(WIDTH, HEIGHT)
+    pixels = list_node_pixels(WIDTH, HEIGHT)
     points = true.rays(pixels) * DEPTH_MM
     apart = found.project(points) - pixels
     flat = points.reshape(-1, 3)
@@ -90,7 +90,7 @@ def told_by(richest: Camera, sigma_k1: float = 0.0, chosen: Camera = CHOSEN) -> 
     covariance[K1, K1] = sigma_k1**2
     fit: Any = SimpleNamespace(camera=richest, poses=poses, covariance=covariance)
     views = [PlanarView(f"s{k}", POINTS, POINTS[:, :2]) for k in range(2)]
-    return ray_uncertainty(chosen, fit, views)
+    return estimate_ray_uncertainty(chosen, fit, views)
 
 
 def test_a_lens_that_differs_moves_rays_off_the_axis() -> None:
@@ -115,7 +115,7 @@ def test_where_a_lens_folds_rays_are_as_uncertain_as_the_worst_that_it_has() -> 
     """r (1 - r^2 / 2) is 0.54 at most, less than the picture's corners are from its middle."""
     folding = Camera(FOCAL, FOCAL, 0.0, 645.0, 508.0, Radial(-0.5, 0.0), WIDTH, HEIGHT)
     found = told_by(folding.retract(1e-5 * np.eye(7)[K1]), 1e-5, folding)
-    pixels = node_pixels(WIDTH, HEIGHT)
+    pixels = list_node_pixels(WIDTH, HEIGHT)
     away = np.linalg.norm((pixels - [645.0, 508.0]) / FOCAL, axis=-1)
     folds = away > np.sqrt(2.0 / 3.0) * 2.0 / 3.0
     assert folds[0, 0]

@@ -17,7 +17,7 @@ from lit_boards import (
 )
 
 from bodyscan.calibration.boundary_points import boundary_points, concatenate
-from bodyscan.calibration.pair import board_offsets, find_odd_board
+from bodyscan.calibration.pair import compute_board_offsets, find_odd_board
 from bodyscan.calibration.sheet_selection import fit_light_sheets
 from bodyscan.errors import PairFailed
 
@@ -107,6 +107,6 @@ def test_a_board_that_stands_elsewhere_is_measured_there() -> None:
     fit = fit_light_sheets(data, scene.projector.stripes, scene.direction)
     # By its corners, board 2 lies 0.5 mm nearer than it does.
     nearer = np.where(data.board[:, None] == 2, data.points * (1.0 - 0.5 / 1400.0), data.points)
-    off = board_offsets(replace(data, points=nearer), fit.sheets)
+    off = compute_board_offsets(replace(data, points=nearer), fit.sheets)
     assert 0.25 < off[2] < 0.55
     assert np.abs(np.delete(off, 2)).max() < 0.05

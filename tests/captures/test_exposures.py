@@ -15,7 +15,7 @@ from stripe_rendering import code_light, render
 from bodyscan.captures.folder import open_scan
 from bodyscan.captures.images import merge_exposures, read_sequence
 from bodyscan.errors import ImageError, RigFileError
-from bodyscan.geometry.robust import robust_scale
+from bodyscan.geometry.robust import estimate_robust_scale
 from bodyscan.rig.rig import load_rig
 from bodyscan.stripes.codes import parse_stripe_code
 from bodyscan.stripes.decoding import decode_stripes
@@ -91,7 +91,9 @@ def test_sigmas_of_hair_and_of_skin_are_as_large_as_their_errors(code: dict[str,
         normalised = ((seen.s - s) / seen.sigma)[rows, 5:-5]
         # Of some 2,500 boundaries a robust sigma is known to 2 %; the least sigma of a boundary
         # covers imperfect devices, which these are not: sigmas may be a sixth too large.
-        assert robust_scale(normalised[np.isfinite(normalised)]) == pytest.approx(1.0, abs=0.2)
+        assert estimate_robust_scale(normalised[np.isfinite(normalised)]) == pytest.approx(
+            1.0, abs=0.2
+        )
 
 
 def test_the_merged_images_are_the_shorter_ones_with_less_noise() -> None:

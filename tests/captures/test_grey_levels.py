@@ -17,7 +17,7 @@ from bodyscan.captures.grey_png import decode_grey_png
 from bodyscan.captures.images import convert_to_greys, find_full_scale, read_image
 from bodyscan.errors import ImageError
 from bodyscan.rig.pair import CameraSpec
-from bodyscan.rig.templates import template_faults
+from bodyscan.rig.templates import find_template_faults
 
 CAMERA = CameraSpec(width=40, height=30)
 NOISE = np.random.default_rng(5).integers(0, 256, (30, 40), dtype=np.uint8)
@@ -96,7 +96,7 @@ def test_eight_bits_in_sixteen_are_read_if_the_rig_file_says_so(tmp_path: Path) 
 
 
 def test_a_video_is_named_with_the_command_that_unpacks_it() -> None:
-    said = list(template_faults("{shot}/{pair}.mp4", many_pairs=False, needs_frame=False))
+    said = list(find_template_faults("{shot}/{pair}.mp4", many_pairs=False, needs_frame=False))
     assert len(said) == 1
     assert "ffmpeg -i VIDEO" in said[0]
     assert "'{shot}/{pair}/{frame}.png'" in said[0]

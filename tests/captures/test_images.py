@@ -22,7 +22,7 @@ from small_captures import write_small_captures as small
 
 from bodyscan.captures.check import check, format_report
 from bodyscan.captures.folder import Captures, ImageSequence, open_captures
-from bodyscan.captures.grey_png import png_damage
+from bodyscan.captures.grey_png import find_png_damage
 from bodyscan.captures.image_header import NotAnImage, read_header
 from bodyscan.captures.images import (
     measure_mosaic,
@@ -175,8 +175,8 @@ def test_a_huge_image_is_refused_by_its_header(
 def test_every_changed_byte_of_a_png_is_noticed(place: int, change: int) -> None:
     data = bytearray(encoded(NOISE))
     data[place] ^= change
-    assert png_damage(bytes(data)) is not None
-    assert png_damage(encoded(NOISE)) is None
+    assert find_png_damage(bytes(data)) is not None
+    assert find_png_damage(encoded(NOISE)) is None
 
 
 @given(st.binary(max_size=200), st.sampled_from([b"", b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"]))

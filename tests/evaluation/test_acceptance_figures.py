@@ -16,16 +16,16 @@ from bodyscan.evaluation.acceptance import (
     Readings,
     SpacingRow,
     SphereRow,
-    acceptance_document,
     figures,
     grade_acceptance,
+    make_acceptance_document,
 )
 from bodyscan.evaluation.artefacts import (
+    compute_spacing_errors,
     locate_spheres,
     read_plate,
     read_sphere,
     require_spheres,
-    spacing_errors,
 )
 from bodyscan.evaluation.primitives import Sphere
 
@@ -110,7 +110,7 @@ def test_the_file_says_what_it_is_and_holds_every_figure_and_reading() -> None:
             return {"mode": mode}
 
     file: Any = Described()
-    found = acceptance_document(READ, figures(READ, file), file, synthetic=True)
+    found = make_acceptance_document(READ, figures(READ, file), file, synthetic=True)
     assert (found["schema"], found["version"]) == ("bodyscan-acceptance", 1)  # docs/formats.md
     assert found["synthetic"]
     assert found["artefacts"] == {"mode": "json"}
@@ -172,7 +172,9 @@ def test_spheres_are_told_apart_by_their_distances() -> None:
     readings = [read_sphere(points, np.tile(out, (3, 1)), one, 30.0) for one in found]
     longer = wanted * [1.001, 0.999, 1.0]
     hypotenuse = np.hypot(300.0, 200.0) - np.hypot(300.3, 199.8)
-    np.testing.assert_allclose(spacing_errors(readings, longer), [-0.3, 0.2, hypotenuse], atol=0.01)
+    np.testing.assert_allclose(
+        compute_spacing_errors(readings, longer), [-0.3, 0.2, hypotenuse], atol=0.01
+    )
 
 
 @pytest.mark.parametrize(

@@ -11,12 +11,12 @@ import pytest
 from made_bodies import mesh_of
 
 from bodyscan.evaluation.body import (
-    girth_errors,
+    compute_girth_errors,
+    compute_sway_residual,
+    measure_true_girths,
     measure_visible_coverage,
-    sway_residual,
-    true_girths,
 )
-from bodyscan.geometry.camera import Camera, camera_to_fields
+from bodyscan.geometry.camera import Camera, describe_camera
 from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BreathAt
@@ -32,7 +32,9 @@ def column(radius: float, height: float = 1700.0) -> tuple[np.ndarray, np.ndarra
 
 def test_a_body_half_a_millimetre_too_thick() -> None:
     vertices, faces = column(150.0)
-    found = girth_errors(mesh_of(*column(150.5, 1701.0)), true_girths(vertices, faces))
+    found = compute_girth_errors(
+        mesh_of(*column(150.5, 1701.0)), measure_true_girths(vertices, faces)
+    )
     assert found.heights > 30
     assert found.rms_mm == pytest.approx(2 * np.pi * 0.5, rel=1e-2)
     assert found.worst_mm == pytest.approx(found.rms_mm, rel=1e-3)
@@ -44,8 +46,10 @@ def test_breath_stays_in_unless_the_truth_is_at_mean_breath() -> None:
     body = mesh_of(vertices, faces)
     inside = np.full(len(vertices), 0.5, np.float32)
     breathing = replace(body, breath=BreathAt(inside, np.full_like(inside, 0.1)))
-    assert girth_errors(breathing, true_girths(vertices, faces)).rms_mm < 0.01
-    at_mean = girth_errors(breathing, true_girths(vertices, faces), mean_breath=True)
+    assert compute_girth_errors(breathing, measure_true_girths(vertices, faces)).rms_mm < 0.01
+    at_mean = compute_girth_errors(
+        breathing, measure_true_girths(vertices, faces), mean_breath=True
+    )
     assert at_mean.rms_mm == pytest.approx(2 * np.pi * 0.5, rel=2e-2)
 
 
@@ -53,7 +57,7 @@ def test_what_was_filled_is_not_judged() -> None:
     vertices, faces = column(150.0)
     thick, _ = column(160.0)
     body = mesh_of(thick, faces, np.ones(len(faces), bool))
-    assert girth_errors(body, true_girths(vertices, faces)).heights == 0
+    assert compute_girth_errors(body, measure_true_girths(vertices, faces)).heights == 0
 
 
 def pairs(sways: list[RigidTransform]) -> dict[str, dict[str, Any]]:
@@ -62,7 +66,7 @@ def pairs(sways: list[RigidTransform]) -> dict[str, dict[str, Any]]:
     camera = RigidTransform(turn, np.array([1500.0, 0.0, 850.0]))
     return {
         f"p{k}": {
-            "camera": camera_to_fields(CAMERA),
+            "camera": describe_camera(CAMERA),
             "rig_from_camera": camera.matrix,
             "projector": {"centre": [0.0, -300.0, 0.0]},
             "swayed_from_still": sway.matrix,
@@ -77,12 +81,14 @@ def test_sway_left_in_is_told_and_a_common_motion_is_not() -> None:
     aside = RigidTransform(np.eye(3), np.array([0.0, 0.6, 0.0]))
     true = pairs([RigidTransform.identity(), RigidTransform.identity()])
     cameras = {name: RigidTransform.from_matrix(p["rig_from_camera"]) for name, p in true.items()}
-    rig_from_still, left = sway_residual(
+    rig_from_still, left = compute_sway_residual(
         {name: common @ t for name, t in cameras.items()}, true, vertices
     )
     assert left < 1e-9
     np.testing.assert_allclose(rig_from_still.matrix, common.matrix, atol=1e-6)
-    _, left = sway_residual({"p0": cameras["p0"], "p1": aside @ cameras["p1"]}, true, vertices)
+    _, left = compute_sway_residual(
+        {"p0": cameras["p0"], "p1": aside @ cameras["p1"]}, true, vertices
+    )
     assert left == pytest.approx(0.3)
 
 
@@ -113,7 +119,7 @@ def test_no_camera_sees_beyond_the_middles_of_its_last_pixels() -> None:
     facts = {
         "rig_from_camera": still,
         "swayed_from_still": still,
-        "camera": camera_to_fields(coarse),
+        "camera": describe_camera(coarse),
         "projector": {"centre": [0.0, 0.0, 0.0]},
     }
     seen, _ = measure_visible_coverage(wall, wall, faces, {"p": facts})

@@ -10,16 +10,16 @@ from bodyscan.errors import FailedWork
 from bodyscan.evaluation.primitives import (
     Sphere,
     compare_centre_distances,
+    compute_mean_square_distance,
     find_spheres,
     fit_plane,
     fit_polynomial,
     fit_sphere,
-    mean_square_distance,
     measure_flatness,
     measure_sphere,
 )
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.reconstruction.triangulation import grid_normals
+from bodyscan.reconstruction.triangulation import estimate_grid_normals
 
 CENTRES = np.array(
     [[-73, -50, 405], [-11, -50, 405], [51, -50, 405], [-42, 8, 385], [20, 8, 385.0]]
@@ -53,7 +53,7 @@ def test_an_exact_cap_gives_its_sphere(x: float, z: float, radius: float, seed: 
     assert free.radius == pytest.approx(radius, abs=1e-5)
     assert np.allclose(held.centre, centre, atol=1e-6)
     assert held.radius == radius
-    assert mean_square_distance(points, free) < 1e-9
+    assert compute_mean_square_distance(points, free) < 1e-9
 
 
 def test_eq_19_is_the_noise_squared() -> None:
@@ -114,7 +114,7 @@ def range_image(noise: float = 0.0) -> np.ndarray:
 @pytest.mark.parametrize("noise", [0.0, 0.05])
 def test_spheres_are_found_in_reading_order(noise: float) -> None:
     points = range_image(noise)
-    normals = grid_normals(points.astype(np.float32)).astype(float)
+    normals = estimate_grid_normals(points.astype(np.float32)).astype(float)
     found = find_spheres(points, normals, 25.0, 5)
     # 3000 points each: what is not noise / sqrt(3000) comes from a few ground points near by.
     assert np.allclose(np.stack([s.centre for s in found]), CENTRES, atol=0.05)
@@ -122,7 +122,7 @@ def test_spheres_are_found_in_reading_order(noise: float) -> None:
 
 def test_missing_spheres_are_missed() -> None:
     points = range_image()
-    normals = grid_normals(points.astype(np.float32)).astype(float)
+    normals = estimate_grid_normals(points.astype(np.float32)).astype(float)
     with pytest.raises(FailedWork, match="2 spheres"):
         find_spheres(points[:, :100], normals[:, :100], 25.0, 5)
 

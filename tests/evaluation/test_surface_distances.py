@@ -15,10 +15,10 @@ from surface_coverage import coverage
 from bodyscan.errors import BadInput
 from bodyscan.evaluation.surface import (
     compare_surfaces,
-    deviation,
+    compute_signed_distances,
     fit_to_surface,
     sample_surface,
-    signed_distances,
+    summarize_deviation,
 )
 from bodyscan.geometry.transforms import RigidTransform
 
@@ -39,7 +39,7 @@ def box_distance(points: np.ndarray) -> np.ndarray:
 def test_distances_to_a_box(seed: int) -> None:
     rng = np.random.default_rng(seed)
     points = rng.uniform(LOW - 150.0, HIGH + 150.0, (200, 3))
-    found = signed_distances(points, VERTICES, FACES)
+    found = compute_signed_distances(points, VERTICES, FACES)
     # float32 around the box's own centre: 1e-4 mm at 300 mm, though the box stands 2 m away.
     np.testing.assert_allclose(found, box_distance(points), atol=1e-4)
 
@@ -47,7 +47,7 @@ def test_distances_to_a_box(seed: int) -> None:
 def test_small_distances_keep_their_sign() -> None:
     points, normals = sample_surface(VERTICES, FACES, 2000)
     step = np.random.default_rng(1).uniform(0.001, 0.5, len(points)) * np.tile([1, -1], 1000)
-    found = signed_distances(points + step[:, None] * normals, VERTICES, FACES)
+    found = compute_signed_distances(points + step[:, None] * normals, VERTICES, FACES)
     # Near an edge another face may be nearer; no sign is ever wrong.
     assert (np.sign(found) == np.sign(step)).all()
     assert np.mean(np.abs(found - step) < 1e-4) > 0.98
@@ -65,7 +65,7 @@ def test_a_point_beyond_a_corner_is_outside_however_obtuse_the_faces(seed: int) 
     normals = np.cross(sides[:, 0], sides[:, 1])
     points = rng.uniform(corners.min(axis=0) - 30.0, corners.max(axis=0) + 30.0, (1000, 3))
     outside = np.einsum("pfk,fk->pf", points[:, None] - corners[faces[:, 0]], normals) > 0.0
-    found = signed_distances(points, corners, faces)
+    found = compute_signed_distances(points, corners, faces)
     assert np.array_equal(found > 0.0, outside.any(axis=1))
 
 
@@ -120,7 +120,7 @@ def test_what_has_changed_by_millimetres_does_not_move_the_rest() -> None:
 
 
 def test_statistics() -> None:
-    found = deviation(np.array([0.0, 1.0, -1.0, 2.0]))
+    found = summarize_deviation(np.array([0.0, 1.0, -1.0, 2.0]))
     assert found.count == 4
     assert found.bias_mm == pytest.approx(0.5)
     assert found.median_mm == pytest.approx(1.0)

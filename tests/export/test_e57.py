@@ -15,7 +15,7 @@ from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
-from bodyscan.reconstruction.triangulation import grid_normals
+from bodyscan.reconstruction.triangulation import estimate_grid_normals
 
 CAMERA = Camera(100.0, 100.0, 0.0, 20.0, 15.0, Radial(), 40, 30)
 RIG_FROM_CAMERA = RigidTransform.from_rotation_vector([0.3, -1.1, 0.4], [650.0, -1120.0, 900.0])
@@ -30,7 +30,7 @@ def image(pair: str, visible: bool = True) -> RangeImage:
         points[:] = np.nan
     sigma = np.where(np.isfinite(points[..., 0]), 0.1, np.nan).astype(np.float32)
     grey = np.arange(CAMERA.width * CAMERA.height).reshape(points.shape[:2]).astype(np.uint8)
-    return RangeImage(pair, CAMERA, points, grid_normals(points), sigma, grey)
+    return RangeImage(pair, CAMERA, points, estimate_grid_normals(points), sigma, grey)
 
 
 def test_points_pose_and_colour_come_back(tmp_path: Path) -> None:

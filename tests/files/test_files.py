@@ -17,13 +17,13 @@ from small_workspace import run
 
 from bodyscan.files.atomic import (
     atomic_replacement,
+    format_json,
     hold_folder,
-    json_text,
     write_bytes,
     write_json,
     write_npz,
 )
-from bodyscan.files.hashing import content_hash, file_hash, file_hashes, list_files
+from bodyscan.files.hashing import hash_content, hash_file, hash_files, list_files
 from bodyscan.files.reading import read_npz
 
 RIGS = Path(__file__).parents[2] / "rigs"
@@ -83,13 +83,13 @@ def test_folders_are_created_and_the_umask_applies(tmp_path: Path) -> None:
 
 @given(st.lists(st.floats(allow_nan=False, allow_infinity=False)))
 def test_json_keeps_every_bit_of_a_float(values: list[float]) -> None:
-    back = json.loads(json_text({"values": np.array(values, dtype=np.float64)}))["values"]
+    back = json.loads(format_json({"values": np.array(values, dtype=np.float64)}))["values"]
     assert [v.hex() for v in back] == [v.hex() for v in values]
 
 
 def test_json_is_sorted_and_indented_with_a_line_per_row_of_a_matrix() -> None:
     content = {"b": np.eye(2), "a": [{"n": np.int64(3)}], "c": {}, "d": [], "e": None, "f": "é"}
-    text = json_text(content)
+    text = format_json(content)
     expected = {"a": [{"n": 3}], "b": [[1, 0], [0, 1]], "c": {}, "d": [], "e": None, "f": "é"}
     assert json.loads(text) == expected
     assert text.startswith(
@@ -146,22 +146,22 @@ def test_npz_never_pickles(tmp_path: Path) -> None:
 def test_every_byte_of_a_large_file_is_hashed(tmp_path: Path) -> None:
     path, content = tmp_path / "large", bytearray(range(256)) * (3 << 12)
     path.write_bytes(content)
-    whole = file_hash(path)
+    whole = hash_file(path)
     assert whole == hashlib.sha256(content).hexdigest()
     content[-1] ^= 1
     path.write_bytes(content)
-    assert file_hash(path) != whole
+    assert hash_file(path) != whole
 
 
 def test_the_hash_of_data_does_not_depend_on_the_order_of_keys() -> None:
     one = {"a": [1, 2], "b": {"c": None, "d": 0.5}}
     other = {"b": {"d": 0.5, "c": None}, "a": [1, 2]}
-    assert content_hash(one) == content_hash(other)
-    assert content_hash(one) != content_hash(one | {"a": [2, 1]})
-    assert content_hash({}) == hashlib.sha256(b"{}").hexdigest()
-    assert content_hash({"a": 1}) == hashlib.sha256(b'{"a":1}').hexdigest()
+    assert hash_content(one) == hash_content(other)
+    assert hash_content(one) != hash_content(one | {"a": [2, 1]})
+    assert hash_content({}) == hashlib.sha256(b"{}").hexdigest()
+    assert hash_content({"a": 1}) == hashlib.sha256(b'{"a":1}').hexdigest()
     with pytest.raises(ValueError, match="Out of range"):
-        content_hash({"a": float("nan")})
+        hash_content({"a": float("nan")})
 
 
 def test_files_are_listed_in_a_fixed_order_and_hashed_by_content(tmp_path: Path) -> None:
@@ -171,6 +171,6 @@ def test_files_are_listed_in_a_fixed_order_and_hashed_by_content(tmp_path: Path)
     (tmp_path / "b" / "0").symlink_to(tmp_path / "a", target_is_directory=True)
     found = [path.relative_to(tmp_path).as_posix() for path in list_files(tmp_path)]
     assert found == ["c", "a/3", "b/0", "b/1", "b/2"]  # the link is named and not followed
-    hashes = file_hashes({"z": tmp_path / "c", "y": tmp_path / "a" / "3"})
+    hashes = hash_files({"z": tmp_path / "c", "y": tmp_path / "a" / "3"})
     assert list(hashes) == ["y", "z"]
     assert hashes["z"] == hashlib.sha256(b"c").hexdigest()

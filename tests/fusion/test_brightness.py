@@ -12,9 +12,9 @@ from ray_cast_scan import Scan
 
 from bodyscan.arrays import Array
 from bodyscan.fusion.brightness import (
+    compute_log_irradiance,
     estimate_light_power,
     find_overlaps,
-    log_irradiance,
     solve_gains,
 )
 from bodyscan.fusion.merging import merge
@@ -118,7 +118,9 @@ def test_light_falls_off_with_the_square_of_the_distance_and_the_cosine() -> Non
         points = np.tile(centre - [0.0, 0.0, away], (4, 1)).astype(np.float32)
         # From 84 degrees on the room lights it.
         expected = np.log(np.maximum(np.cos(lean), 0.1) / away**2)
-        np.testing.assert_allclose(log_irradiance(points, normals, centre), expected, rtol=1e-5)
+        np.testing.assert_allclose(
+            compute_log_irradiance(points, normals, centre), expected, rtol=1e-5
+        )
 
 
 def overlap(ours: Array, theirs: Array, shade: float = 0.3) -> list[Any]:

@@ -12,7 +12,7 @@ import pytest
 from made_bodies import mesh_of
 from ray_cast_scan import Scan, load_rig
 
-from bodyscan.evaluation.surface import signed_distances
+from bodyscan.evaluation.surface import compute_signed_distances
 from bodyscan.fusion.cleaning import (
     clean,
     cut_to_volume,
@@ -32,7 +32,9 @@ def distances(scan: Scan, images: list[RangeImage]) -> np.ndarray:
     points = [
         scan.rig_from_camera[i.pair].apply(i.points[i.valid][::15].astype(float)) for i in images
     ]
-    return np.abs(signed_distances(np.concatenate(points), scan.truth.vertices, scan.truth.faces))
+    return np.abs(
+        compute_signed_distances(np.concatenate(points), scan.truth.vertices, scan.truth.faces)
+    )
 
 
 def test_floor_and_flying_pixels_go_and_the_body_stays(

@@ -12,7 +12,7 @@ from surface_coverage import coverage
 
 from bodyscan.arrays import Array
 from bodyscan.errors import ScanFailed
-from bodyscan.evaluation.surface import deviation, signed_distances
+from bodyscan.evaluation.surface import compute_signed_distances, summarize_deviation
 from bodyscan.fusion.merging import merge
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud
@@ -26,12 +26,12 @@ SETTINGS = FusionSettings(points=250_000)
 @pytest.fixture(scope="module")
 def off(scan: Scan, cloud: BodyCloud) -> Array:
     """How far off the body each point of the cloud is, mm."""
-    return signed_distances(cloud.points, scan.truth.vertices, scan.truth.faces)
+    return compute_signed_distances(cloud.points, scan.truth.vertices, scan.truth.faces)
 
 
 def test_the_cloud_lies_on_the_body(off: Array) -> None:
     """The targets for full-size images; here there are four times fewer pixels to average."""
-    found = deviation(off)
+    found = summarize_deviation(off)
     assert abs(found.bias_mm) < 0.03
     assert found.rms_mm < 0.15
     assert found.p95_mm < 0.30
@@ -98,9 +98,9 @@ def test_small_misalignments_are_averaged(scan: Scan, cleaned: list[RangeImage])
         for name, placing in scan.rig_from_camera.items()
     }
     cloud = merge(cleaned, moved, SETTINGS).cloud
-    off = signed_distances(cloud.points, scan.truth.vertices, scan.truth.faces)
+    off = compute_signed_distances(cloud.points, scan.truth.vertices, scan.truth.faces)
     # 0.2 mm and 0.1 mrad times 1.3 m are 0.24 mm along the normal where one pair sees alone.
-    assert deviation(off).rms_mm < 0.3
+    assert summarize_deviation(off).rms_mm < 0.3
     # Disagreement between pairs shows in sigma.
     assert 0.54 < np.median(np.abs(off) / cloud.sigma_mm) < 0.84
     assert _share_of_doubles(cloud, off, 0.6) < 0.01
@@ -111,7 +111,7 @@ def test_a_misplaced_pair_leaves_no_double_surface(scan: Scan, cleaned: list[Ran
     shift = RigidTransform(np.eye(3), np.array([0.0, 0.0, 3.0]))
     moved = {**scan.rig_from_camera, "p1-2": scan.rig_from_camera["p1-2"] @ shift}
     cloud = merge(cleaned, moved, SETTINGS).cloud
-    off = signed_distances(cloud.points, scan.truth.vertices, scan.truth.faces)
+    off = compute_signed_distances(cloud.points, scan.truth.vertices, scan.truth.faces)
     assert np.mean(np.abs(off) > 1.5) > 0.02  # what only that pair saw
     assert _share_of_doubles(cloud, off, 1.5) < 0.01
 

@@ -14,11 +14,11 @@ from scipy.sparse.csgraph import connected_components
 
 from benchmarks.self_intersections import self_intersections
 from bodyscan.errors import ScanFailed
-from bodyscan.evaluation.surface import deviation, signed_distances
+from bodyscan.evaluation.surface import compute_signed_distances, summarize_deviation
 from bodyscan.fusion.signed_distances import REACH_CELLS, find_near_bricks
 from bodyscan.mesh.body import HAIR, SKIN, UNSURE, BodyCloud, BodyMesh
 from bodyscan.mesh.surface_nets import SIDE
-from bodyscan.mesh.topology import compute_topology, signed_volume
+from bodyscan.mesh.topology import compute_signed_volume, compute_topology
 from bodyscan.progress import map_threads
 from bodyscan.settings import MeshSettings
 
@@ -57,7 +57,7 @@ def test_closed_manifold_one_piece_outward(scan: Scan, body: BodyMesh) -> None:
     # handle or two a hand, and nothing else may.
     assert found.euler in (-4, -2, 0, 2)
     assert handles_between(body, 900.0, 1330.0) == 0  # armpits: arms hang from shoulders alone
-    true_volume = signed_volume(scan.truth.vertices, scan.truth.faces)
+    true_volume = compute_signed_volume(scan.truth.vertices, scan.truth.faces)
     # The truth has a mouth and eye sockets that nobody can see into: about half a per cent.
     assert found.volume_mm3 == pytest.approx(true_volume, rel=0.015)
     np.testing.assert_array_equal(np.unique(body.faces), np.arange(len(body.vertices)))
@@ -85,8 +85,8 @@ def handles_between(body: BodyMesh, low_mm: float, high_mm: float) -> int:
 def test_measured_vertices_lie_on_the_body(scan: Scan, body: BodyMesh) -> None:
     measured = np.unique(body.faces[~body.filled])
     assert np.isfinite(body.sigma_mm[measured]).all()
-    found = deviation(
-        signed_distances(body.vertices[measured], scan.truth.vertices, scan.truth.faces)
+    found = summarize_deviation(
+        compute_signed_distances(body.vertices[measured], scan.truth.vertices, scan.truth.faces)
     )
     # Cells of 7 mm at depth 8: fingers, toes and ears suffer, the rest does not.
     assert abs(found.bias_mm) < 0.1
@@ -104,7 +104,7 @@ def test_normals_and_colours_belong_to_the_vertices(body: BodyMesh, cloud: BodyC
 
 def test_made_up_faces_are_marked(scan: Scan, body: BodyMesh) -> None:
     centres = body.vertices[body.faces].mean(axis=1)
-    off = np.abs(signed_distances(centres, scan.truth.vertices, scan.truth.faces))
+    off = np.abs(compute_signed_distances(centres, scan.truth.vertices, scan.truth.faces))
     assert 0.01 < body.filled.mean() < 0.15
     # What is far from the truth is known to be made up, and the soles are nobody's to see.
     assert body.filled[off > 8.0].mean() > 0.95

@@ -9,10 +9,10 @@ from bodyscan.arrays import Array, Mask
 from bodyscan.fusion.quadratic_fit import (
     QuadraticFit,
     close_holes,
+    compute_noise_gain,
     convolve_quadratics,
     fit_quadratics,
     fit_trimmed_windows,
-    noise_gain,
 )
 
 REACH = 3
@@ -134,9 +134,9 @@ def test_a_window_cut_by_a_rim_is_fitted_exactly() -> None:
 
 def test_correlated_noise_is_averaged_less() -> None:
     """Over half a pixel none is correlated; noise common to the window is not averaged at all."""
-    assert noise_gain(4, (0.0, 0.5)) == pytest.approx(1.0)
+    assert compute_noise_gain(4, (0.0, 0.5)) == pytest.approx(1.0)
     white = convolve_quadratics(np.zeros((9, 9), np.float32), np.ones((9, 9), np.float32), 4).sigma
-    assert noise_gain(4, (1e6, 1e6)) == pytest.approx(1.0 / white[4, 4], rel=1e-3)
+    assert compute_noise_gain(4, (1e6, 1e6)) == pytest.approx(1.0 / white[4, 4], rel=1e-3)
 
 
 def test_holes_of_a_few_pixels_are_closed_as_a_plane_goes_on() -> None:

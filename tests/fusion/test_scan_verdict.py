@@ -14,7 +14,7 @@ from ray_cast_scan import Truth, cast_scan, load_body, load_rig, nominal_placing
 from bodyscan.arrays import Array, Indices
 from bodyscan.errors import ScanFailed
 from bodyscan.fusion.cleaning import apply_mask
-from bodyscan.fusion.meshing import closed_surface
+from bodyscan.fusion.meshing import make_closed_surface
 from bodyscan.fusion.storage import Scan
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance
@@ -118,7 +118,7 @@ def test_two_people_are_told_before_there_is_a_mesh(
 
     def meshed(*about: Any) -> tuple[Array, Indices]:
         assert [verdict.grade for verdict in told] == ["repeat"]
-        return closed_surface(*about)
+        return make_closed_surface(*about)
 
     monkeypatch.setattr("bodyscan.workflows.scan_person.closed_surface", meshed)
     scan = fused(photographed(both), settings=NOT_FOLLOWED, announce=listen)

@@ -8,7 +8,7 @@ from made_bodies import cloud_of, ellipsoid
 
 from bodyscan.fusion.support import Support, fit_to_points, measure_support
 from bodyscan.mesh.body import BodyCloud
-from bodyscan.mesh.topology import vertex_normals
+from bodyscan.mesh.topology import compute_vertex_normals
 
 REACH_MM = 4.0
 UP = np.array([0.0, 0.0, 1.0])
@@ -83,7 +83,7 @@ def test_a_surface_settles_on_its_points() -> None:
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
     cloud = cloud_of(50.0 * ways, ways)
     bumpy = vertices * (1.0 + 0.01 * np.sin(vertices[:, :1] / 3.0))
-    normals = vertex_normals(bumpy, faces)
+    normals = compute_vertex_normals(bumpy, faces)
     around = measure_support(bumpy, normals, cloud, REACH_MM)
     moved = fit_to_points(bumpy, faces, normals, around)
     off = np.abs(np.linalg.norm(bumpy, axis=1) - 50.0).max()
@@ -97,7 +97,7 @@ def test_no_face_folds_over() -> None:
     vertices, faces = ellipsoid((50.0, 50.0, 50.0), resolution=40)
     rng = np.random.default_rng(0)
     count = len(vertices)
-    normals = vertex_normals(vertices, faces)
+    normals = compute_vertex_normals(vertices, faces)
     shifts = rng.uniform(-1.0, 1.0, count)
     everywhere = Support(
         np.zeros(count, np.int64),

@@ -15,10 +15,10 @@ from bodyscan.arrays import Array
 from bodyscan.fusion.cleaning import clean
 from bodyscan.fusion.verdict.evidence import Seam, SeamReport
 from bodyscan.fusion.verdict.overlaps import (
+    compute_patch_medians,
     estimate_step,
     find_misaligned,
     find_seams,
-    patch_medians,
 )
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance
@@ -180,7 +180,7 @@ def test_sigmas_of_patches_say_how_far_their_medians_scatter() -> None:
     apart = np.repeat(rng.standard_normal(400 * 16), 5) + 0.3
     points = np.column_stack([40.0 * (patch % 20) + 1.0, 40.0 * (patch // 20) + 39.0, 0.0 * patch])
     points[::2, :2] += [38.0, -38.0]
-    found, sigma = patch_medians(Matches(points, points, apart, apart, patch))
+    found, sigma = compute_patch_medians(Matches(points, points, apart, apart, patch))
     assert len(found) == 400, "all 40 mm of a patch go together"
     # Medians of 16 scatter by 1.25 / 4; the robust sigma of so few is 5 % low.
     assert sigma.mean() == pytest.approx(1.2533 / 4.0, rel=0.1)

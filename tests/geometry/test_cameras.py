@@ -10,8 +10,8 @@ from bodyscan.geometry.camera_tables import (
     look_up,
     look_up_derivatives,
     look_up_rays,
-    projection_table,
-    ray_table,
+    make_projection_table,
+    make_ray_table,
 )
 from bodyscan.geometry.lenses.opencv import Radial
 
@@ -34,14 +34,14 @@ def test_the_table_projects_as_the_camera_does(camera: Camera, seed: int) -> Non
     size = np.array([camera.width, camera.height])
     pixels = np.random.default_rng(seed).uniform(-0.5, size - 0.5, (60, 2))
     points = camera.rays(np.concatenate([pixels, pixels_of(camera)])) * 1234.5
-    found = pixels_in(projection_table(camera), points)
+    found = pixels_in(make_projection_table(camera), points)
     assert np.abs(found - camera.project(points)).max() < MOST_PX
 
 
 @pytest.mark.parametrize("camera", [SCANNER, WIDE])
 def test_a_scanners_table_is_finer_than_asked(camera: Camera) -> None:
     pixels = np.random.default_rng(0).uniform(0.0, [1279.0, 1023.0], (500, 2))
-    found = pixels_in(projection_table(camera), camera.rays(pixels))
+    found = pixels_in(make_projection_table(camera), camera.rays(pixels))
     assert np.abs(found - pixels).max() < 2e-4  # 1e-4 at the places it was fitted to
 
 
@@ -51,7 +51,7 @@ def test_what_lies_beside_the_image_has_no_pixel_in_it(camera: Camera) -> None:
     u, v = np.meshgrid([-30.0, 320.0, 670.0], [-30.0, 240.0, 510.0])
     beside = np.delete(np.stack([u, v], axis=-1).reshape(-1, 2), 4, axis=0)
     rays = np.concatenate([camera.rays(beside), [[9.0, 0.0, 1.0], [0.0, -1e6, 1.0]]])
-    found = pixels_in(projection_table(camera), rays)
+    found = pixels_in(make_projection_table(camera), rays)
     inside = (found > -0.5) & (found < np.array([camera.width, camera.height]) - 0.5)
     assert not inside.all(axis=1).any()
 
@@ -59,14 +59,14 @@ def test_what_lies_beside_the_image_has_no_pixel_in_it(camera: Camera) -> None:
 def test_where_the_lens_folds_back_nothing_is_seen() -> None:
     ray = np.array([[np.tan(np.radians(60.0)), 0.0, 1.0]])
     assert 0.0 < WIDE.project(ray)[0, 0] < 1279.0
-    assert np.all(pixels_in(projection_table(WIDE), ray) < -0.5)
+    assert np.all(pixels_in(make_projection_table(WIDE), ray) < -0.5)
 
 
 def test_a_lens_that_folds_within_the_picture_has_no_rays_beyond_and_shows_nothing_there() -> None:
     camera = Camera(900.0, 900.0, 0.0, 640.0, 512.0, Radial(-0.6, 0.0), 1280, 1024)
     wanted = np.zeros((1024, 1280), bool)
     wanted[::16, ::16] = True
-    rays = look_up_rays(ray_table(camera), wanted)
+    rays = look_up_rays(make_ray_table(camera), wanted)
     rows, columns = np.nonzero(wanted)
     pixels = np.stack([columns, rows], axis=-1).astype(float)
     known = np.all(np.isfinite(rays), axis=1)
@@ -81,14 +81,14 @@ def test_a_lens_that_folds_within_the_picture_has_no_rays_beyond_and_shows_nothi
     beyond = np.array(
         [[r * np.cos(a), r * np.sin(a), 1.0] for r in (0.8, 1.0, 1.2) for a in range(6)]
     )
-    assert np.all(pixels_in(projection_table(camera), beyond) < -0.5)
+    assert np.all(pixels_in(make_projection_table(camera), beyond) < -0.5)
 
 
 @patiently
 @given(cameras)
 def test_slopes_are_derivatives_of_the_projection(camera: Camera) -> None:
     rays = camera.rays(pixels_of(camera))
-    table = projection_table(camera)
+    table = make_projection_table(camera)
     found = np.array([look_up_derivatives(table, x, y) for x, y, _ in rays]).reshape(-1, 2, 2)
     by_point = camera.jacobians(rays)[1][:, :, :2]
     # Straight lines for what bends: a normal is turned by as much at most, 0.01 degrees.
@@ -99,7 +99,7 @@ def test_slopes_are_derivatives_of_the_projection(camera: Camera) -> None:
 @given(cameras, st.integers(0, 479))
 def test_rays_through_pixels_are_those_of_the_camera(camera: Camera, first: int) -> None:
     wanted = np.random.default_rng(first).random((min(12, 480 - first), 640)) < 0.1
-    rays = look_up_rays(ray_table(camera), wanted, first)
+    rays = look_up_rays(make_ray_table(camera), wanted, first)
     rows, columns = np.nonzero(wanted)
     pixels = np.stack([columns, rows + first], axis=-1).astype(float)
     assert np.max(np.abs(camera.project(rays) - pixels), initial=0.0) < MOST_PX
@@ -108,9 +108,9 @@ def test_rays_through_pixels_are_those_of_the_camera(camera: Camera, first: int)
 
 def test_equal_cameras_share_their_tables() -> None:
     again = Camera(1510.0, 1512.0, -0.5, 645.0, 508.0, Radial(-0.1, 0.05), 1280, 1024)
-    assert projection_table(SCANNER) is projection_table(again)
+    assert make_projection_table(SCANNER) is make_projection_table(again)
     other = SCANNER.retract(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1e-3, 0.0]))
-    assert projection_table(SCANNER) is not projection_table(other)
+    assert make_projection_table(SCANNER) is not make_projection_table(other)
 
 
 @given(cameras)

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bodyscan.errors import BadInput
-from bodyscan.geometry.camera import Camera, camera_from_fields, camera_to_fields
+from bodyscan.geometry.camera import Camera, camera_from_fields, describe_camera
 from bodyscan.geometry.lenses import LENSES, lens_from_opencv
 from bodyscan.geometry.lenses.fisheye import Fisheye
 from bodyscan.geometry.lenses.lens import Lens
@@ -140,7 +140,7 @@ def test_parameters_are_read_and_moved_by_name(camera: Camera) -> None:
 
 @given(cameras)
 def test_a_camera_is_read_as_it_was_written(camera: Camera) -> None:
-    assert camera_from_fields(camera_to_fields(camera)) == camera
+    assert camera_from_fields(describe_camera(camera)) == camera
 
 
 @given(lenses())
@@ -172,7 +172,7 @@ def test_points_in_whole_numbers_are_distorted_as_others_are(lens: Lens) -> None
 )
 def test_fields_of_no_camera_are_refused(changed: dict[str, Any], message: str) -> None:
     camera = Camera(600.0, 601.0, 0.0, 320.0, 240.0, LENSES["radial"](), 640, 480)
-    fields = camera_to_fields(camera) | changed
+    fields = describe_camera(camera) | changed
     with pytest.raises(ValueError, match=message):
         camera_from_fields({k: v for k, v in fields.items() if v is not None})
 

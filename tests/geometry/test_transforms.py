@@ -4,7 +4,12 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from bodyscan.arrays import Array
-from bodyscan.geometry.transforms import RigidTransform, adjoint, cross_matrix, fit_rigid_transform
+from bodyscan.geometry.transforms import (
+    RigidTransform,
+    adjoint,
+    fit_rigid_transform,
+    make_cross_matrix,
+)
 
 vectors = arrays(float, 3, elements=st.floats(-3.0, 3.0))
 lengths = arrays(float, 3, elements=st.floats(-2000.0, 2000.0))
@@ -42,7 +47,7 @@ def test_adjoint_carries_small_motions(a_from_b: RigidTransform, turn: Array, sh
 
 @given(vectors, vectors)
 def test_skew_is_the_cross_product(a: Array, b: Array) -> None:
-    assert np.allclose(cross_matrix(a) @ b, np.cross(a, b))
+    assert np.allclose(make_cross_matrix(a) @ b, np.cross(a, b))
 
 
 @given(transforms, st.integers(0, 2**32 - 1))

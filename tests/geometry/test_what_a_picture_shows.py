@@ -10,15 +10,15 @@ from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.camera_tables import is_in_image
 from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.light_planes import LightPlanes
-from bodyscan.geometry.light_sheets import intersect_rays, stripes_per_pixel
+from bodyscan.geometry.light_sheets import intersect_rays, measure_stripes_per_pixel
 from bodyscan.geometry.uncertainty import (
     COLUMNS,
     ROWS,
     PoseCovariance,
     RayUncertainty,
-    node_pixels,
+    compute_position_sigma,
+    list_node_pixels,
     point_covariance,
-    position_sigma,
 )
 from bodyscan.reconstruction.range_image import RangeImage
 
@@ -60,7 +60,7 @@ def test_where_a_lens_folds_back_into_the_picture_nothing_is_seen() -> None:
 
 
 def test_rays_are_known_between_nodes_as_linearly_as_at_them() -> None:
-    places = node_pixels(320, 240)
+    places = list_node_pixels(320, 240)
     assert places.shape == (ROWS, COLUMNS, 2)
     assert places[0, 0].tolist() == [0.0, 0.0]
     assert places[-1, -1].tolist() == [319.0, 239.0]
@@ -98,7 +98,7 @@ def test_covariances_of_pairs_are_those_of_motions_drawn_from_them() -> None:
     close(covariance.relative("a", "b"), drawn[:, 1] - drawn[:, 0])
     close(point_covariance(covariance.marginal("c"), point), moved[:, 2])
     np.testing.assert_allclose(
-        position_sigma(covariance, "b", point), moved[:, 1].std(axis=0), rtol=0.03
+        compute_position_sigma(covariance, "b", point), moved[:, 1].std(axis=0), rtol=0.03
     )
 
 
@@ -135,8 +135,8 @@ def test_at_one_depth_s_changes_from_pixel_to_pixel_by_their_angle_over_the_shee
     s, _ = flat_wall()
     # A pixel is 1/400, a stripe 1/100 of the depth; down the columns nothing changes. Along a sheet
     # depth changes by 8 mm of 800 to the next pixel: that is no longer linear by a hundredth.
-    assert stripes_per_pixel(sheets(), CAMERA, s) == pytest.approx(0.25, rel=0.02)
-    assert stripes_per_pixel(sheets(), CAMERA, np.full_like(s, np.nan)) == 0.0
+    assert measure_stripes_per_pixel(sheets(), CAMERA, s) == pytest.approx(0.25, rel=0.02)
+    assert measure_stripes_per_pixel(sheets(), CAMERA, np.full_like(s, np.nan)) == 0.0
 
 
 def test_rays_meet_their_sheets_and_depth_changes_with_s() -> None:

@@ -13,7 +13,7 @@ import pytest
 
 from bodyscan.errors import BadInput, FailedWork
 from bodyscan.files.atomic import write_json
-from bodyscan.jobs.job import Job, job_of
+from bodyscan.jobs.job import Job, make_job
 from bodyscan.jobs.pipeline import Pipeline
 from bodyscan.jobs.stages import KINDS
 from bodyscan.jobs.supervision import JobResult, ignore_events
@@ -24,8 +24,8 @@ from bodyscan.jobs.watching import (
     ResidentProcess,
     Watched,
     find_earlier,
+    find_retake_time,
     put_image,
-    retaken_since,
 )
 from bodyscan.rig.rig import Rig
 from bodyscan.settings import Resources
@@ -113,14 +113,14 @@ def test_a_retake_waits_until_every_image_is_new(rig: Rig, tmp_path: Path) -> No
             put_image(tmp_path, rig, "anna", pair, frame, IMAGE)
     state = tmp_path / "out" / "anna" / "state.json"
     write_json(state, {"state": "set aside", "job": "anna"})
-    assert retaken_since(tmp_path / "anna", state) == 0
+    assert find_retake_time(tmp_path / "anna", state) == 0
     assert find_earlier(tmp_path / "anna", state) == JobResult("anna", "set aside")
     time.sleep(0.02)
     *first, last = frames(rig)
     for pair, some in {"a": frames(rig), "b": first}.items():
         for frame in some:
             put_image(tmp_path, rig, "anna", pair, frame, IMAGE)
-    since = retaken_since(tmp_path / "anna", state)
+    since = find_retake_time(tmp_path / "anna", state)
     assert since > 0
     assert find_earlier(tmp_path / "anna", state) is None
     scan = IncomingScan(tmp_path / "anna", rig, since)
@@ -178,7 +178,7 @@ def resident(folder: Path, program: str) -> tuple[ResidentProcess, Job]:
     """A process that does what a program says, and a job for it that may take 1.5 s."""
     soon = Pipeline(name="watch", kind="fuse", resources=Resources(limit_minutes=0.025))
     watched = Watched(folder, folder, folder, soon, command=("-c", program))
-    job = job_of(folder / "anna", soon, folder, folder, "scan")
+    job = make_job(folder / "anna", soon, folder, folder, "scan")
     return ResidentProcess(watched), job
 
 

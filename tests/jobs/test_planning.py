@@ -13,7 +13,7 @@ from cheap_batch import jobs_of, run_cheap
 
 from bodyscan.files.hashing import list_files
 from bodyscan.jobs.job import Job
-from bodyscan.jobs.plan import origin_of, reason_to_run
+from bodyscan.jobs.plan import describe_origin, find_reason_to_run
 
 
 @pytest.fixture
@@ -32,7 +32,7 @@ def steps(day: Path, *changes: str, version: int = 1) -> list[str]:
 
 def reasons(job: Job, version: int = 1) -> list[str]:
     stages = cheap_job.kinds(version)["fuse"]
-    return [reason_to_run(job, origin_of(job, stage)) for stage in stages]
+    return [find_reason_to_run(job, describe_origin(job, stage)) for stage in stages]
 
 
 def test_times_and_places_do_not_count(day: Path) -> None:
@@ -127,7 +127,10 @@ def test_a_failure_is_told_the_next_time(make_scans: Callable[..., Path], tmp_pa
     run_cheap(scans, tmp_path / "out")
     (job,) = jobs_of(scans, tmp_path / "out")
     (scan, *_) = cheap_job.kinds()["fuse"]
-    assert reason_to_run(job, origin_of(job, scan)) == "it failed last time: ValueError: a bad day"
+    assert (
+        find_reason_to_run(job, describe_origin(job, scan))
+        == "it failed last time: ValueError: a bad day"
+    )
 
 
 def test_models_beside_scans_are_no_jobs(make_scans: Callable[..., Path], tmp_path: Path) -> None:

@@ -16,10 +16,15 @@ from cheap_batch import jobs_of
 from bodyscan.arrays import Array
 from bodyscan.jobs.display import print_json_lines, show_on_screen
 from bodyscan.jobs.job import Job
-from bodyscan.jobs.summary import find_drift, scans_to_repeat, write_day_measures, write_summary
+from bodyscan.jobs.summary import (
+    find_drift,
+    list_scans_to_repeat,
+    write_day_measures,
+    write_summary,
+)
 from bodyscan.jobs.supervision import JobResult
 from bodyscan.measurement.named import read_definitions
-from bodyscan.report.measurement_table import named_csv
+from bodyscan.report.measurement_table import format_named_csv
 from bodyscan.settings import BODY_CENTRE_MM
 
 NAMES = [f"s{number}" for number in range(9)]
@@ -77,10 +82,10 @@ def test_a_scan_has_a_row_of_figures(day: tuple[list[Job], Path]) -> None:
     assert float(table[0]["coverage_percent"]) == 92.5
     assert table[0]["pairs_measured"] == "1"
     assert table[3]["verdict_reasons"] == "moved, a lot"
-    assert scans_to_repeat(jobs) == ["s3"]
+    assert list_scans_to_repeat(jobs) == ["s3"]
     for job in jobs[:2]:
         (job.folder / "measures").mkdir()
-        text = named_csv("nobody stands there", {"subject": None})
+        text = format_named_csv("nobody stands there", {"subject": None})
         (job.folder / "measures" / "measures.csv").write_text(text, "utf-8")
     write_day_measures(jobs, out)
     measures = list(csv.DictReader((out / "measures.csv").open(newline="", encoding="utf-8")))

@@ -15,7 +15,7 @@ from bodyscan.laboratory.measuring import (
     measure_artefacts,
     triangulate_pixels,
 )
-from bodyscan.laboratory.reproduce import Reproduction, draw, figure_names, reproduction_text
+from bodyscan.laboratory.reproduce import Reproduction, draw, name_figures, render_reproduction
 
 Measured = dict[bool, dict[str, ApproachAccuracy]]
 
@@ -23,7 +23,9 @@ Measured = dict[bool, dict[str, ApproachAccuracy]]
 @pytest.fixture(scope="module")
 def captures() -> ChapterCaptures:
     # Two rays a pixel each way: boundaries are then some 0.02 px worse than in the real run.
-    return take_captures(apparatus.chapter_setup(apparatus.ideal_settings(2)), stage_stops=3)
+    return take_captures(
+        apparatus.build_chapter_setup(apparatus.make_ideal_settings(2)), stage_stops=3
+    )
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +53,7 @@ def test_boards_and_stage_are_wholly_in_the_picture(captures: ChapterCaptures) -
 
 def test_corners_are_the_simulated_boards(captures: ChapterCaptures) -> None:
     camera = captures.setup.view.camera
-    places = [*apparatus.board_poses(), *apparatus.stage_poses(apparatus.stage_readings(3), 0)]
+    places = [*apparatus.list_board_poses(), *apparatus.stage_poses(apparatus.stage_readings(3), 0)]
     for shot, place in zip((*captures.boards, *captures.stage), places, strict=True):
         true = camera.image(place.apply(captures.setup.board.corners))[shot.view.corner_ids]
         # Two rays a pixel move an edge by up to 0.1 px in one pixel; a corner has thirty of them.
@@ -70,7 +72,7 @@ def test_true_stripes_and_true_calibration_leave_nothing(captures: ChapterCaptur
 
 def test_a_smile_belongs_to_the_truth() -> None:
     """Under real light as well nothing is left of points that the true light says."""
-    setup = apparatus.chapter_setup(apparatus.real_settings(1))
+    setup = apparatus.build_chapter_setup(apparatus.make_real_settings(1))
     truth = make_true_approach(setup)
     u, v = np.meshgrid(np.arange(200.0, 500.0, 30.0), np.arange(150.0, 400.0, 30.0))
     rays = truth.camera.rays(np.column_stack([u.ravel(), v.ravel()]))
@@ -158,7 +160,7 @@ def test_the_report_says_all_of_it(
         by_reference=fine[-1:],
         sigmas=(compare_point_sigmas(calibrated.ours, captures),),
     )
-    text = reproduction_text(found)
+    text = render_reproduction(found)
     for wanted in ("Table 1", "Table 2", "mean square", "contradicts", "scale ppm"):
         assert wanted in text
     assert f"{fine[3].spheres[2].e_given:.5f}" in text
@@ -166,7 +168,7 @@ def test_the_report_says_all_of_it(
     for line in text.splitlines():
         if line.startswith("|"):
             assert line.endswith("|")
-    names = figure_names(real_light=False)
+    names = name_figures(real_light=False)
     draw(captures, calibrated, tmp_path, names)
     for name in names:
         assert f"({name})" in text

@@ -9,13 +9,13 @@ from lit_boards import Projector, Scene
 from bodyscan.arrays import Array
 from bodyscan.calibration.boundary_points import BoundaryPoints, boundary_points, concatenate
 from bodyscan.geometry.camera import camera_from_fields
-from bodyscan.geometry.light_planes import LightPlanes, baseline_angle_tilt
+from bodyscan.geometry.light_planes import LightPlanes, compute_baseline_angle_tilt
 from bodyscan.laboratory import apparatus
 from bodyscan.laboratory.approaches import PROJECTORS
 from bodyscan.laboratory.rivals import fit_baseline, fit_remapped_pinhole
 from bodyscan.simulation.files import describe_camera
 
-MIRROR = apparatus.chapter_setup(apparatus.ideal_settings(1)).projector
+MIRROR = apparatus.build_chapter_setup(apparatus.make_ideal_settings(1)).projector
 STRIPES = MIRROR.stripes
 ANGLES = np.radians(np.linspace(2.0, 38.0, STRIPES + 1))
 BASELINES = np.linspace(165.0, 150.0, STRIPES + 1)
@@ -53,7 +53,7 @@ def seen_of(light: Projector, noise_px: float = 0.0) -> BoundaryPoints:
     scene = Scene(camera, light, "vertical", board.square_mm, board.columns, board.rows)
     rng = np.random.default_rng(0)
     parts = []
-    for number, place in enumerate(apparatus.board_poses()):
+    for number, place in enumerate(apparatus.list_board_poses()):
         index, pixels = scene.crossings(place, every_px=16)
         pixels[:, 0] += noise_px * rng.standard_normal(len(pixels))
         sigma = np.full(len(index), max(noise_px, 0.01))
@@ -85,7 +85,7 @@ def test_an_invariable_baseline_is_found(tilt_deg: float) -> None:
     found = fit_baseline(points, STRIPES, "vertical", variable=False)
     # Points come from an iteration that ends at 1e-7 of a stripe.
     assert worst_offset(found, true) < 1e-4
-    length, _, tilt = baseline_angle_tilt(found.coefficients, "vertical")
+    length, _, tilt = compute_baseline_angle_tilt(found.coefficients, "vertical")
     assert np.nanmedian(length) == pytest.approx(160.0, abs=1e-3)
     assert np.degrees(np.nanmedian(tilt)) == pytest.approx(tilt_deg, abs=1e-4)
 

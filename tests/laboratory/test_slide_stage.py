@@ -9,7 +9,11 @@ from table_one import CAMERA
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.laboratory.rivals import calibrate_tsai, projection_matrix, split_projection_matrix
+from bodyscan.laboratory.rivals import (
+    calibrate_tsai,
+    estimate_projection_matrix,
+    split_projection_matrix,
+)
 
 GRID = np.stack(np.meshgrid(np.arange(20.0, 161, 20), np.arange(20.0, 121, 20)), -1).reshape(-1, 2)
 POINTS = np.concatenate([np.column_stack([GRID, np.full(48, z)]) for z in range(-60, 61, 20)])
@@ -29,7 +33,7 @@ def test_a_camera_without_lens_is_its_matrix(
     true = Camera(focal * aspect, focal, skew, 350.0, 230.0, Radial(), 640, 480)
     place = RigidTransform.from_rotation_vector(turn, [-90.0, -70.0, 450.0])
     pixels = true.project(place.apply(POINTS))
-    camera, found = split_projection_matrix(projection_matrix(POINTS, pixels), 640, 480)
+    camera, found = split_projection_matrix(estimate_projection_matrix(POINTS, pixels), 640, 480)
     # Rounding, magnified by the condition of the linear system (1e6 at the longest focal length).
     assert np.allclose(camera.matrix, true.matrix, atol=1e-4)
     assert np.allclose(found.matrix, place.matrix, atol=1e-4)
@@ -69,7 +73,7 @@ def test_tsai_sees_the_chapters_lens_nearly() -> None:
 
 def test_a_matrix_does_not_see_the_lens() -> None:
     pixels = CAMERA.project(PLACE.apply(POINTS))
-    camera, place = split_projection_matrix(projection_matrix(POINTS, pixels), 640, 480)
+    camera, place = split_projection_matrix(estimate_projection_matrix(POINTS, pixels), 640, 480)
     error = camera.project(place.apply(POINTS)) - pixels
     # Barrel distortion of up to 4 px, most of which scale and centre take up.
     assert 0.1 < np.sqrt(np.mean(error**2)) < 0.5

@@ -13,9 +13,9 @@ from standing_body import hanging, standing_body, trunk_tape
 
 from bodyscan.errors import BadInput
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.measurement.measurements import Slice, heights_from, measure
+from bodyscan.measurement.measurements import Slice, measure, parse_heights
 from bodyscan.mesh.body import DARK_CLOTH, HAIR, SKIN, BodyMesh, BreathAt
-from bodyscan.report.measurement_table import measurements_document, tables
+from bodyscan.report.measurement_table import make_measurements_document, tables
 
 SUBJECT = Path(__file__).parents[2] / "data" / "subjects" / "woman_average.ply"
 
@@ -118,7 +118,7 @@ def test_no_body_at_that_height(subject: BodyMesh) -> None:
 
 def test_table_and_document_say_the_same(subject: BodyMesh) -> None:
     found = measure(subject, [900.0])
-    said = measurements_document(found, {"subject": "s1", "calibration_id": "c", "when": None})
+    said = make_measurements_document(found, {"subject": "s1", "calibration_id": "c", "when": None})
     assert said["stature_mm"] == found.stature_mm
     assert said["slices"][0]["girths"][-1]["tape_mm"] == tape_mm(found.slices[0], "trunk")
     assert [table.row_count for table in tables(found)] == [4, 3]
@@ -178,11 +178,11 @@ def test_left_is_the_bodys_left_however_it_faces(degrees: float) -> None:
 
 
 def test_heights_are_numbers_with_commas_between() -> None:
-    assert heights_from("800,1050.5") == [800.0, 1050.5]
+    assert parse_heights("800,1050.5") == [800.0, 1050.5]
     with pytest.raises(BadInput, match="'800;1050' is not a list of heights"):
-        heights_from("800;1050")
+        parse_heights("800;1050")
     with pytest.raises(BadInput, match=r"is 5 the decimals of 1050\?") as asked:
-        heights_from("1050,5")
+        parse_heights("1050,5")
     assert "1050.5" in asked.value.remedy
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bodyscan.mesh.depth_buffer import nearest_faces, nearest_points
+from bodyscan.mesh.depth_buffer import find_nearest_faces, find_nearest_points
 
 HEIGHT, WIDTH = 30, 40
 
@@ -19,7 +19,7 @@ def test_the_nearest_of_all_faces_that_hold_a_pixel_is_shown() -> None:
     places = scattered(90)
     places[-1] = np.nan  # its faces cannot be seen
     faces = np.arange(90).reshape(-1, 3)
-    number = nearest_faces(places, faces, HEIGHT, WIDTH)
+    number = find_nearest_faces(places, faces, HEIGHT, WIDTH)
     a, b, c = np.moveaxis(places[faces].astype(float), 1, 0)
     nearest = np.full((HEIGHT, WIDTH), -1)
     for r in range(HEIGHT):
@@ -39,7 +39,7 @@ def test_the_nearest_of_all_faces_that_hold_a_pixel_is_shown() -> None:
 
 def test_the_nearest_of_all_dots_that_hold_a_pixel_is_shown() -> None:
     places, size = scattered(200), 3
-    number = nearest_points(places, size, HEIGHT, WIDTH)
+    number = find_nearest_points(places, size, HEIGHT, WIDTH)
     nearest = np.full((HEIGHT, WIDTH), -1)
     for n in np.argsort(-places[:, 2]):  # far to near: the nearest is written last
         column, row = np.floor(places[n, :2] + 0.5).astype(int)

@@ -14,11 +14,11 @@ from made_bodies import arrays, ellipsoid, mesh_of, together
 from made_scan import egg
 
 from benchmarks.self_intersections import self_intersections
-from bodyscan.evaluation.surface import deviation, signed_distances
+from bodyscan.evaluation.surface import compute_signed_distances, summarize_deviation
 from bodyscan.export.body_file import Provenance, write_body
 from bodyscan.mesh.body import BodyMesh
 from bodyscan.mesh.repair import close_mesh, collapse_slivers, decimate, extract_largest_piece
-from bodyscan.mesh.topology import compute_topology, directed_edges, face_areas
+from bodyscan.mesh.topology import compute_face_areas, compute_topology, list_directed_edges
 
 VERTICES, FACES = arrays(o3d.geometry.TriangleMesh.create_sphere(100.0, 12))
 VOLUME = compute_topology(VERTICES, FACES).volume_mm3
@@ -101,7 +101,7 @@ def test_the_edge_is_drawn_together_and_the_mesh_stays_closed() -> None:
     assert len(found.faces) == len(mesh.faces) - 2
     assert len(found.vertices) == len(mesh.vertices) - 1 == len(found.sigma_mm)
     assert len(found.filled) == len(found.faces)
-    edges = {tuple(edge) for edge in directed_edges(found.faces).tolist()}
+    edges = {tuple(edge) for edge in list_directed_edges(found.faces).tolist()}
     assert edges == {(b, a) for a, b in edges}
     np.testing.assert_allclose(
         np.ptp(found.vertices, axis=0), np.ptp(mesh.vertices, axis=0), atol=1e-4
@@ -119,7 +119,7 @@ def test_no_face_of_an_exported_obj_is_without_area(tmp_path: Path) -> None:
     rows = [line.split() for line in (tmp_path / "body.obj").read_text().splitlines()]
     vertices = np.array([row[1:4] for row in rows if row[0] == "v"], float)
     faces = np.array([[int(c.split("/")[0]) - 1 for c in row[1:]] for row in rows if row[0] == "f"])
-    assert face_areas(vertices, faces).min() > 0.0
+    assert compute_face_areas(vertices, faces).min() > 0.0
 
 
 def ball(resolution: int) -> tuple[np.ndarray, np.ndarray]:
@@ -144,11 +144,11 @@ def test_the_light_version_is_close_and_closed(body: BodyMesh) -> None:
     assert found.volume_mm3 == pytest.approx(
         compute_topology(body.vertices, body.faces).volume_mm3, rel=2e-3
     )
-    errors = deviation(signed_distances(lean.vertices, body.vertices, body.faces))
+    errors = summarize_deviation(compute_signed_distances(lean.vertices, body.vertices, body.faces))
     # Faces of 12 mm: on a radius of 40 mm a flat one is off by up to 0.3 mm.
     assert errors.p95_mm < 0.3
     assert errors.worst_mm <= 1.5
-    back = signed_distances(body.vertices, lean.vertices, lean.faces)
+    back = compute_signed_distances(body.vertices, lean.vertices, lean.faces)
     assert np.percentile(np.abs(back), 99.9) <= 0.7
     # A vertex set beside an edge may fold a face there, at fingers as thick as one face: 0.2 % of
     # 30,000 edges (35 here, some through several faces). At full size, with 50,000 faces, there are

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from made_bodies import arrays, cylinder, ellipsoid, together
 from scipy.special import ellipe
 
-from bodyscan.mesh.slices import Loop, MeshSlicer, hull_perimeter, keep_segments, split_runs
+from bodyscan.mesh.slices import Loop, MeshSlicer, compute_hull_perimeter, keep_segments, split_runs
 
 
 @pytest.mark.parametrize("height", [55.0, 100.0, 123.4])  # 100 lies on a ring of vertices
@@ -121,4 +121,6 @@ def test_figures_of_a_square() -> None:
     np.testing.assert_allclose(loop.centre, [20.0, 20.0])
     assert loop.measured_share == 1.0
     # A speck in one line has a hull as well: there and back.
-    assert hull_perimeter(np.array([[0.0, 0.0], [3.0, 4.0], [1.5, 2.0]])) == pytest.approx(10.0)
+    assert compute_hull_perimeter(np.array([[0.0, 0.0], [3.0, 4.0], [1.5, 2.0]])) == pytest.approx(
+        10.0
+    )

@@ -13,7 +13,7 @@ from trimesh import Trimesh
 from bodyscan.arrays import Array, Indices
 from bodyscan.errors import BadInput
 from bodyscan.mesh.surface_file import read_surface, refuse_size
-from bodyscan.mesh.topology import signed_volume
+from bodyscan.mesh.topology import compute_signed_volume
 
 VERTICES, FACES = ball().vertices, ball().faces
 
@@ -50,7 +50,9 @@ def test_what_can_mean_one_thing_is_mended_and_said(
     read = read_surface(path)
     assert len(read.value[0]) == len(VERTICES)
     assert len(read.value[1]) == len(FACES)
-    assert signed_volume(*read.value) == pytest.approx(signed_volume(VERTICES, FACES), rel=1e-6)
+    assert compute_signed_volume(*read.value) == pytest.approx(
+        compute_signed_volume(VERTICES, FACES), rel=1e-6
+    )
     assert any(said in note for note in read.notes)
     assert all(note.startswith(str(path)) for note in read.notes)
 
@@ -80,7 +82,9 @@ def test_the_formats_of_other_programs_are_read(suffix: str, tmp_path: Path) -> 
     vertices, faces = read_surface(path).value
     assert len(vertices) == len(VERTICES)
     # STL and GLB are float32, and joined vertices are in another order.
-    assert signed_volume(vertices, faces) == pytest.approx(signed_volume(VERTICES, FACES), rel=1e-5)
+    assert compute_signed_volume(vertices, faces) == pytest.approx(
+        compute_signed_volume(VERTICES, FACES), rel=1e-5
+    )
 
 
 @pytest.mark.parametrize(

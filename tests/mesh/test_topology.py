@@ -13,14 +13,14 @@ from bodyscan.arrays import Indices
 from bodyscan.mesh.topology import (
     RIM,
     UNSOUND,
+    compute_face_normals,
+    compute_signed_volume,
     compute_topology,
+    compute_vertex_normals,
     drop_unused_vertices,
-    face_normals,
     find_twins,
     label_components,
     label_corner_fans,
-    signed_volume,
-    vertex_normals,
 )
 
 make = o3d.geometry.TriangleMesh
@@ -104,17 +104,17 @@ def test_components_are_numbered_and_unused_vertices_dropped() -> None:
 @given(scale=st.floats(0.1, 100.0), shift=st.tuples(*[st.floats(-1000.0, 1000.0)] * 3))
 def test_volume_of_a_box(scale: float, shift: tuple[float, float, float]) -> None:
     vertices, faces = arrays(make.create_box(1.0, 2.0, 3.0))
-    volume = signed_volume(scale * vertices + np.array(shift), faces)
+    volume = compute_signed_volume(scale * vertices + np.array(shift), faces)
     # Differences of products of three coordinates of up to a thousand: 1e9 times 1e-16 each.
     assert volume == pytest.approx(6.0 * scale**3, rel=1e-9, abs=1e-5)
-    assert signed_volume(vertices, faces[:, ::-1]) == pytest.approx(-6.0)
+    assert compute_signed_volume(vertices, faces[:, ::-1]) == pytest.approx(-6.0)
 
 
 def test_normals() -> None:
     vertices, faces = arrays(make.create_sphere(10.0, resolution=40))
-    cosine = np.sum(vertex_normals(vertices, faces) * vertices, axis=1) / 10.0
+    cosine = np.sum(compute_vertex_normals(vertices, faces) * vertices, axis=1) / 10.0
     assert cosine.min() > 0.998  # facets of 4.5 degrees
     rng = np.random.default_rng(4)
     vertices, faces = rng.normal(size=(30, 3)), rng.integers(0, 30, (80, 3))
     a, b, c = (vertices[faces[:, k]] for k in range(3))
-    np.testing.assert_array_equal(face_normals(vertices, faces), np.cross(b - a, c - a))
+    np.testing.assert_array_equal(compute_face_normals(vertices, faces), np.cross(b - a, c - a))

@@ -12,10 +12,10 @@ from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.motion.body_cells import (
     BodyCells,
+    build_rigid_fields,
     evaluate_field,
-    field_in_camera,
+    express_in_camera,
     modulate_fields,
-    rigid_fields,
 )
 from bodyscan.motion.cell_equations import CellEquations
 
@@ -78,7 +78,7 @@ def test_slopes_are_those_of_a_function_along_the_surface(slabs: BodyCells) -> N
 
 def test_a_turn_carries_points_as_a_turn_does(slabs: BodyCells) -> None:
     centre = np.array([10.0, 20.0, 300.0])
-    field = rigid_fields(slabs, centre, 400.0) @ np.array([0.4, -0.3, 0.2, 1.0, 2.0, 3.0])
+    field = build_rigid_fields(slabs, centre, 400.0) @ np.array([0.4, -0.3, 0.2, 1.0, 2.0, 3.0])
     points = slabs.centres + np.random.default_rng(1).uniform(-15.0, 15.0, slabs.centres.shape)
     expected = np.cross([0.001, -0.00075, 0.0005], points - centre) + [1.0, 2.0, 3.0]
     np.testing.assert_allclose(evaluate_field(field, points - slabs.centres), expected, atol=1e-9)
@@ -87,7 +87,7 @@ def test_a_turn_carries_points_as_a_turn_does(slabs: BodyCells) -> None:
     back = place.inverse()
     off = back.apply(points) - back.apply(slabs.centres)
     np.testing.assert_allclose(
-        place.rotate(evaluate_field(field_in_camera(field, place), off)), expected, atol=1e-9
+        place.rotate(evaluate_field(express_in_camera(field, place), off)), expected, atol=1e-9
     )
 
 

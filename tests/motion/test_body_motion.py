@@ -16,8 +16,8 @@ from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
 from bodyscan.geometry.robust import rms
 from bodyscan.motion import body_motion
 from bodyscan.motion.body_cells import BodyCells
-from bodyscan.motion.body_motion import BodyMotion, girth_sigmas, shape_sigmas
-from bodyscan.motion.body_parts import ankles
+from bodyscan.motion.body_motion import BodyMotion, compute_girth_sigmas, compute_shape_sigmas
+from bodyscan.motion.body_parts import find_ankles
 from bodyscan.motion.breath import BreathEstimate
 from bodyscan.motion.motion_kinds import MotionKind, build_kinds
 from bodyscan.motion.temporal_modes import Breaths, TemporalModes
@@ -114,7 +114,7 @@ def test_a_pairs_placing_and_bends_make_up_all_displacements() -> None:
     np.testing.assert_array_equal(beside.non_rigid(), beside.displacements(("parts",)))
     # The foot stays; the ankle and what is above go about it, a metre up by a millimetre.
     np.testing.assert_allclose(lean.fields[0, :3], 0.0, atol=1e-12)
-    ankle = ankles(cells)
+    ankle = find_ankles(cells)
     np.testing.assert_allclose(ankle, [30.0, 0.0, 0.05 * 1700.0])
     for k, axis in enumerate(np.eye(3)):
         about = np.cross(axis, centres[2:] - ankle) / 1000.0
@@ -205,8 +205,8 @@ def test_a_girth_is_uncertain_by_what_all_around_it_shares() -> None:
     """Errors of many cells, each by itself, cancel around a girth; one of them all does not."""
     height = np.repeat([1000.0, 1200.0], 50)
     alone, together = np.eye(100), np.ones((100, 1))
-    np.testing.assert_allclose(girth_sigmas(together, height), 1.0)
-    np.testing.assert_allclose(girth_sigmas(alone, height), 50.0**-0.5)
+    np.testing.assert_allclose(compute_girth_sigmas(together, height), 1.0)
+    np.testing.assert_allclose(compute_girth_sigmas(alone, height), 50.0**-0.5)
 
 
 def test_a_place_that_two_saw_alike_is_as_uncertain_as_one_and_one_that_errs_by_itself_less(
@@ -221,8 +221,8 @@ def test_a_place_that_two_saw_alike_is_as_uncertain_as_one_and_one_that_errs_by_
     seen = np.zeros((4, len(cells.centres)), bool)
     left = cells.centres[:, 1] > 0.0
     seen[0, left], seen[1, ~left] = True, True
-    once, girth = shape_sigmas(motion, cells, seen)
+    once, girth = compute_shape_sigmas(motion, cells, seen)
     seen[2, left], seen[3, ~left] = True, True
-    twice, _ = shape_sigmas(motion, cells, seen)
+    twice, _ = compute_shape_sigmas(motion, cells, seen)
     assert 0.0 < rms(girth) < rms(once)
     assert rms(twice) == pytest.approx(rms(once) / np.sqrt(2.0), rel=0.05)

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from bodyscan.alignment.icp import Alignment, align
 from bodyscan.arrays import Array
 from bodyscan.motion.body_parts import PARTS
-from bodyscan.motion.breath import breath_along_normals
+from bodyscan.motion.breath import project_breath_on_normals
 from bodyscan.motion.estimation import EstimatedMotion, estimate_motion
 from bodyscan.motion.person_motion import PersonMotion
 from bodyscan.motion.warping import warp_to_middle
@@ -114,7 +114,7 @@ def test_the_way_to_mean_breath_is_told(
     cells, now = followed.cells, standing.at(standing.middle_s).vertices
     mean = standing.at(standing.middle_s, breathing=False).vertices
     near = cKDTree(now).query(cells.centres)[1]
-    front = breath_along_normals(cells) > 0.5
+    front = project_breath_on_normals(cells) > 0.5
     true = float(np.mean(np.sum((now - mean)[near] * cells.normals, axis=1)[front]))
     assert person.fuller_mm is not None and person.fuller_sigma_mm is not None  # noqa: PT018
     assert abs(true) > 0.25  # or the seed says nothing

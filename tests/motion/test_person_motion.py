@@ -13,12 +13,12 @@ from bodyscan.motion.body_cells import BodyCells
 from bodyscan.motion.body_parts import (
     LIMBS,
     PARTS,
-    leftward,
-    limb_fields,
-    limb_weights,
+    build_limb_fields,
+    compute_limb_weights,
+    find_leftward,
     name_parts,
 )
-from bodyscan.motion.breath import breath_along_normals, breath_fields
+from bodyscan.motion.breath import build_breath_fields, project_breath_on_normals
 from bodyscan.motion.estimation import BreathOffset, EstimatedMotion
 from bodyscan.motion.person_motion import (
     PartMotion,
@@ -44,7 +44,7 @@ def person() -> BodyCells:
 
 def test_each_turns_about_its_joint_and_nothing_else_goes_along() -> None:
     cells = person()
-    fields = limb_fields(cells, 400.0)
+    fields = build_limb_fields(cells, 400.0)
     assert set(fields) == set(LIMBS)
     hand, neck = int(np.argmax(cells.centres[:, 1])), at(cells, 0.0, 1450.0)
     other, foot = int(np.argmin(cells.centres[:, 1])), int(np.argmin(cells.centres[:, 2]))
@@ -62,7 +62,7 @@ def test_what_the_body_does_not_show_moves_nothing() -> None:
     legs = cells.centres * [1.0, 1.0, 0.0] + [0.0, 0.0, 100.0]
     legs[0, 2] = 1000.0
     low = BodyCells(legs, cells.normals, cells.graph, cells.landmarks, cells.landmark_distances)
-    assert np.abs(limb_fields(low, 400.0)["left arm"][1:]).max() < 1.0 + 1e-9
+    assert np.abs(build_limb_fields(low, 400.0)["left arm"][1:]).max() < 1.0 + 1e-9
 
 
 def at(cells: BodyCells, y: float, z: float) -> int:
@@ -125,20 +125,22 @@ def test_toes_tell_which_side_is_left(degrees: float) -> None:
     spin = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
     centres[:, :2] = centres[:, :2] @ spin.T
     standing = replace(cells, centres=centres)
-    np.testing.assert_allclose(leftward(standing), spin @ [0.0, 1.0], atol=1e-9)
+    np.testing.assert_allclose(find_leftward(standing), spin @ [0.0, 1.0], atol=1e-9)
 
 
 def test_who_shows_no_toes_faces_the_rigs_x() -> None:
-    np.testing.assert_allclose(leftward(person()), [0.0, 1.0])
+    np.testing.assert_allclose(find_leftward(person()), [0.0, 1.0])
     cells = person()
     legless = cells.centres[:, 2] > 300.0
-    np.testing.assert_allclose(leftward(replace(cells, centres=cells.centres[legless])), [0.0, 1.0])
+    np.testing.assert_allclose(
+        find_leftward(replace(cells, centres=cells.centres[legless])), [0.0, 1.0]
+    )
 
 
 def test_breath_shows_on_the_trunk() -> None:
     """Pubic bone 0.864, navel 1.017, collarbones 1.339 m, and the neck."""
     cells = person()
-    found = breath_along_normals(cells)
+    found = project_breath_on_normals(cells)
     assert found[at(cells, 0.0, 1125.0)] == pytest.approx(1.0)
     assert found[at(cells, 0.0, 1035.0)] == pytest.approx(1.0)
     half = found[at(cells, 0.0, 945.0)]
@@ -150,7 +152,7 @@ def test_breath_shows_on_the_trunk() -> None:
     assert found[at(cells, 780.0, 1365.0)] == 0.0
     # Skin that faces up or down as much as forward goes out by less, whatever it is that moves.
     slanting = replace(cells, normals=np.tile([0.6, 0.0, -0.8], (len(cells.centres), 1)))
-    assert breath_along_normals(slanting)[at(cells, 0.0, 1125.0)] == pytest.approx(0.6)
+    assert project_breath_on_normals(slanting)[at(cells, 0.0, 1125.0)] == pytest.approx(0.6)
 
 
 def deep(cells: BodyCells) -> BodyCells:
@@ -171,18 +173,18 @@ def test_a_trunk_swells_away_from_its_back_and_its_middle() -> None:
     full = (height > 1020.0) & (height < 1330.0) & (np.abs(cells.centres[:, 1]) < 250.0)
     x, y = cells.centres[full, :2].T
     for body in (cells, slanting):
-        as_one = breath_fields(body)[full, :3, 0]
+        as_one = build_breath_fields(body)[full, :3, 0]
         np.testing.assert_allclose(as_one[:, 0], 0.5 + x / 300.0, atol=0.03)
         np.testing.assert_allclose(as_one[:, 1], 0.3 * y / 200.0, atol=0.02)
-        np.testing.assert_allclose(breath_fields(body)[:, 2], 0.0, atol=1e-12)
+        np.testing.assert_allclose(build_breath_fields(body)[:, 2], 0.0, atol=1e-12)
 
 
 def test_a_breath_moves_the_front_of_the_trunk_alike_over_a_palm() -> None:
     """Products of the fields sum to how alike two cells move, times how far each may: all as one, and
     a third of it chest against belly, and by 80 mm, in few fields."""
     cells = person()
-    moves, apart = breath_along_normals(cells), cells.landmark_distances
-    fields = breath_fields(cells)
+    moves, apart = project_breath_on_normals(cells), cells.landmark_distances
+    fields = build_breath_fields(cells)
     assert np.abs(fields[:, 2]).max() == 0.0, "level"
     height = cells.centres[:, 2] / cells.centres[:, 2].max()
     upper = np.clip((height - 0.60) / 0.08, 0.0, 1.0)
@@ -249,7 +251,7 @@ def test_fullness_is_that_of_the_front_of_the_trunk() -> None:
     body = followed(cells, np.ones(1), np.zeros(1))
     assert measure_fullness(body) is None
     field = np.zeros((len(cells.centres), 12))
-    rises = breath_along_normals(cells) > 0.5
+    rises = project_breath_on_normals(cells) > 0.5
     field[rises, 0] = np.where(np.arange(rises.sum()) % 2, -1.0, -2.0)
     field[~rises, 0] = 50.0
     sigma = np.where(rises, 0.3, 9.0)
@@ -260,7 +262,7 @@ def test_fullness_is_that_of_the_front_of_the_trunk() -> None:
 def test_over_a_border_what_moves_passes_into_what_does_not_as_a_bell_curve_sums() -> None:
     """An arm of 21 cells: 105 mm within it, 96 % of a cell are the arm's."""
     cells = person()
-    arm = limb_weights(cells)["left arm"]
+    arm = compute_limb_weights(cells)["left arm"]
     part = name_parts(cells) == PARTS.index("left arm")
     along = cells.centres[:, 1]
     border = along[part].min() - 15.0

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.special import gamma, kv
 
-from bodyscan.alignment.sway_prior import stance_correlation
+from bodyscan.alignment.sway_prior import correlate_stance
 from bodyscan.arrays import Array, Indices
 from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
 from bodyscan.motion.breath import SIZES_MM, estimate_breath
@@ -17,13 +17,13 @@ from bodyscan.motion.temporal_modes import (
     SHARPNESSES,
     Breaths,
     TemporalModes,
-    breath_correlation,
+    correlate_breath,
 )
 
 
-@pytest.mark.parametrize("correlation", [stance_correlation, breath_correlation])
+@pytest.mark.parametrize("correlation", [correlate_stance, correlate_breath])
 def test_courses_sum_to_what_is_alike(correlation: object) -> None:
-    alike = stance_correlation if correlation is stance_correlation else breath_correlation
+    alike = correlate_stance if correlation is correlate_stance else correlate_breath
     seconds = np.linspace(0.1, 2.1, 12)
     courses = TemporalModes.from_correlation(
         alike, seconds.tolist(), 0.5 * (seconds[0] + seconds[-1])
@@ -35,9 +35,9 @@ def test_courses_sum_to_what_is_alike(correlation: object) -> None:
 
 
 def test_a_breath_comes_back_and_a_stance_does_not() -> None:
-    assert breath_correlation(np.array([1.9]))[0] < -0.5
-    assert stance_correlation(np.array([1.9]))[0] > 0.0
-    assert stance_correlation(np.array([0.01]))[0] > 0.999
+    assert correlate_breath(np.array([1.9]))[0] < -0.5
+    assert correlate_stance(np.array([1.9]))[0] > 0.0
+    assert correlate_stance(np.array([0.01]))[0] > 0.999
 
 
 def test_a_stance_is_materns_of_order_three_halves() -> None:
@@ -45,13 +45,13 @@ def test_a_stance_is_materns_of_order_three_halves() -> None:
     seconds = np.geomspace(0.01, 30.0, 40)
     scaled = np.sqrt(3.0) * seconds / 0.8
     bessel = 2.0**-0.5 / gamma(1.5) * scaled**1.5 * kv(1.5, scaled)
-    np.testing.assert_allclose(stance_correlation(-seconds), bessel, rtol=1e-9)
+    np.testing.assert_allclose(correlate_stance(-seconds), bessel, rtol=1e-9)
 
 
 def test_a_moment_that_is_not_known_is_like_no_other() -> None:
-    courses = TemporalModes.from_correlation(stance_correlation, [0.2, None, 0.6], 0.4)
+    courses = TemporalModes.from_correlation(correlate_stance, [0.2, None, 0.6], 0.4)
     assert np.all(courses.values[1] @ courses.values[[0, 2]].T == 0.0)
-    free = TemporalModes.from_correlation(stance_correlation, [None, None], 0.0)
+    free = TemporalModes.from_correlation(correlate_stance, [None, None], 0.0)
     np.testing.assert_array_equal(free.values, np.eye(2))
     np.testing.assert_array_equal(free.middle, np.zeros(2))
 
@@ -59,7 +59,7 @@ def test_a_moment_that_is_not_known_is_like_no_other() -> None:
 def test_each_breath_has_its_own_length_and_phase() -> None:
     """A tide of one of the lengths, at the moments and half way, is what one of them expects."""
     seconds = np.linspace(0.1, 2.1, 12)
-    courses = TemporalModes.from_correlation(breath_correlation, seconds.tolist(), 1.1)
+    courses = TemporalModes.from_correlation(correlate_breath, seconds.tolist(), 1.1)
     breaths = Breaths.from_modes(courses, seconds.tolist(), 1.1)
     waves = breaths.waves.reshape(len(SHARPNESSES), len(BREATHS_S), len(PHASES), courses.count, 2)
     length, begun, every = 4, 3, np.vstack([courses.values, courses.middle])
@@ -78,7 +78,7 @@ def test_each_breath_has_its_own_length_and_phase() -> None:
 
 
 def test_where_a_moment_is_not_known_any_breath_is() -> None:
-    courses = TemporalModes.from_correlation(breath_correlation, [0.2, None, 0.6], 0.4)
+    courses = TemporalModes.from_correlation(correlate_breath, [0.2, None, 0.6], 0.4)
     breaths = Breaths.from_modes(courses, [0.2, None, 0.6], 0.4)
     assert not breaths.waves.any()
     np.testing.assert_array_equal(breaths.irregular, np.eye(courses.count))
@@ -89,7 +89,7 @@ SECONDS = np.linspace(0.1, 2.9, 16)
 MIDDLE_S = 1.5
 FIELDS = 3
 NOISE_MM = 0.05
-COURSES = TemporalModes.from_correlation(breath_correlation, SECONDS.tolist(), MIDDLE_S)
+COURSES = TemporalModes.from_correlation(correlate_breath, SECONDS.tolist(), MIDDLE_S)
 BREATHS = Breaths.from_modes(COURSES, SECONDS.tolist(), MIDDLE_S)
 
 
@@ -137,7 +137,7 @@ def test_of_a_short_scan_a_breath_is_known_as_well_as_is_said(span_s: float) -> 
     """Though nobody breathes in sines: of 40 breaths 95 in a hundred are within two sigmas."""
     rng = np.random.default_rng(5)
     seconds = np.linspace(0.0, span_s, 6)
-    modes = TemporalModes.from_correlation(breath_correlation, seconds.tolist(), 0.5 * span_s)
+    modes = TemporalModes.from_correlation(correlate_breath, seconds.tolist(), 0.5 * span_s)
     breaths = Breaths.from_modes(modes, seconds.tolist(), 0.5 * span_s)
     errors = []
     for _ in range(40):

@@ -16,7 +16,7 @@ from bodyscan.fusion.smoothing import smooth
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.motion.body_cells import BodyCells, modulate_fields, rigid_fields
+from bodyscan.motion.body_cells import BodyCells, build_rigid_fields, modulate_fields
 from bodyscan.motion.warping import warp_image
 from bodyscan.reconstruction.range_image import RangeImage
 
@@ -39,7 +39,7 @@ def ball() -> tuple[RangeImage, BodyCells]:
 def test_a_rigid_motion_is_one(ball: tuple[RangeImage, BodyCells]) -> None:
     image, cells = ball
     turn, shift = np.array([0.004, -0.003, 0.002]), np.array([1.0, -2.0, 3.0])
-    field = rigid_fields(cells, CENTRE, 1.0) @ np.concatenate([turn, shift])
+    field = build_rigid_fields(cells, CENTRE, 1.0) @ np.concatenate([turn, shift])
     bent = warp_image(image, PLACE, cells, field)
     seen = image.valid
     moved = RigidTransform(np.eye(3), CENTRE + shift) @ RigidTransform.from_rotation_vector(
@@ -86,7 +86,9 @@ def test_what_is_cut_away_changes_nothing(ball: tuple[RangeImage, BodyCells]) ->
     depth = np.where(image.valid, image.points[..., 2], np.inf)
     for each in (whole, cut):
         np.testing.assert_array_equal(each.open_depth, depth)
-    field = rigid_fields(cells, CENTRE, 1.0) @ np.array([0.004, -0.003, 0.002, 1.0, -2.0, 3.0])
+    field = build_rigid_fields(cells, CENTRE, 1.0) @ np.array(
+        [0.004, -0.003, 0.002, 1.0, -2.0, 3.0]
+    )
     bent = [warp_image(each, PLACE, cells, field) for each in (whole, cut)]
     np.testing.assert_array_equal(bent[0].points[box], bent[1].points)
     np.testing.assert_array_equal(bent[0].normals[box], bent[1].normals)

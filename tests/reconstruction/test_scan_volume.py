@@ -19,10 +19,10 @@ from bodyscan.geometry.light_sheets import triangulate_image
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.scan_volume import (
     MARGIN_STRIPES,
-    _corner_rays,
-    _nonlinearity,
-    stripes_in_volume,
-    volume_interval,
+    _compute_corner_rays,
+    _measure_nonlinearity,
+    compute_volume_interval,
+    find_stripes_in_volume,
 )
 from bodyscan.rig.rig import Volume
 from bodyscan.stripes.stripe_limits import StripeLimits
@@ -53,7 +53,7 @@ def calibrated(rising: bool) -> PairCalibration:
 
 
 def limits_of(one: PairCalibration, at: RigidTransform, volume: Volume = VOLUME) -> StripeLimits:
-    limits = stripes_in_volume(one, at, volume)
+    limits = find_stripes_in_volume(one, at, volume)
     assert limits is not None
     return limits
 
@@ -117,7 +117,7 @@ def test_integers_are_stripes_and_columns_may_be_lines() -> None:
 
 def test_a_camera_may_stand_at_the_rigs_origin() -> None:
     """As it does where one pair fixes the rig frame, and stands inside of the volume then."""
-    limits = stripes_in_volume(pair(), RigidTransform.identity(), Volume())
+    limits = find_stripes_in_volume(pair(), RigidTransform.identity(), Volume())
     assert limits is not None
     assert np.isfinite(limits.around_px)
     assert limits.around_px > 1.0
@@ -134,12 +134,12 @@ def test_a_volume_out_of_sight_is_seen_nowhere() -> None:
 
 def test_without_a_projector_or_an_order_in_depth_all_stripes_count() -> None:
     at = looking_at_the_middle(500.0, 0.0, 0.0)
-    assert stripes_in_volume(replace(pair(), sheets=None), at, VOLUME) is None
+    assert find_stripes_in_volume(replace(pair(), sheets=None), at, VOLUME) is None
     # Sheets that fan out from a line in the middle of the picture: nearer above, farther below.
     coefficients = planes().coefficients.copy()
     coefficients[: STRIPES // 2] = coefficients[: STRIPES // 2][::-1]
     folded = replace(pair(), sheets=replace(planes(), coefficients=coefficients))
-    assert stripes_in_volume(folded, at, VOLUME) is None
+    assert find_stripes_in_volume(folded, at, VOLUME) is None
 
 
 @pytest.mark.parametrize("rising", [True, False])
@@ -163,7 +163,7 @@ def test_a_ray_is_in_the_volume_between_where_it_enters_and_leaves(
     at = looking_at_the_middle(distance_mm, turn, tilt)
     rng = np.random.default_rng(seed)
     rays = np.concatenate([rng.uniform(-0.6, 0.6, (200, 2)), np.ones((200, 1))], axis=1)
-    enter, leave = volume_interval(rays, at, VOLUME, raised_mm=20.0)
+    enter, leave = compute_volume_interval(rays, at, VOLUME, raised_mm=20.0)
     depth = rng.uniform(60.0, 3000.0, 200)
     x, y, z = at.apply(rays * depth[:, None]).T
     within = np.hypot(x, y) < VOLUME.radius_mm + 30.0
@@ -197,7 +197,7 @@ def test_a_level_ray_goes_through_the_wall_or_comes_nearest_to_the_axis_beside_i
     """From 500 mm beside the axis; with its room the volume's wall is 150 mm around that."""
     at = looking_at_the_middle(500.0, 0.7, 0.0)
     rays = np.array([[0.0, 0.0, 1.0], [0.2, 0.0, 1.0], [0.4, 0.0, 1.0], [-0.4, 0.0, 1.0]])
-    enter, leave = volume_interval(rays, at, VOLUME, raised_mm=0.0)
+    enter, leave = compute_volume_interval(rays, at, VOLUME, raised_mm=0.0)
     # Nearest where 500 mm are left of 1 + x^2; to either side by what is left of the radius.
     nearest = 500.0 / (1.0 + rays[:, 0] ** 2)
     beside = 500.0 * np.abs(rays[:, 0]) / np.hypot(1.0, rays[:, 0])
@@ -209,7 +209,7 @@ def test_a_level_ray_goes_through_the_wall_or_comes_nearest_to_the_axis_beside_i
 
 def test_blocks_begin_at_the_first_pixels_outer_edge_and_cover_the_picture() -> None:
     plain = Camera(100.0, 100.0, 0.0, 0.0, 0.0, Radial(), 25, 16)
-    rays = _corner_rays(plain, 10)
+    rays = _compute_corner_rays(plain, 10)
     assert rays.shape == (3, 4, 3)
     np.testing.assert_allclose(100.0 * rays[0, :, 0], [-0.5, 9.5, 19.5, 29.5])
     np.testing.assert_allclose(100.0 * rays[:, 0, 1], [-0.5, 9.5, 19.5])
@@ -218,12 +218,12 @@ def test_blocks_begin_at_the_first_pixels_outer_edge_and_cover_the_picture() -> 
 def test_limits_are_widened_as_much_on_the_left_as_on_the_right() -> None:
     """What a camera sees that looks down on a round volume is its own mirror image, stripes too."""
     at = looking_at_the_middle(600.0, 0.0, 0.5)
-    rays = _corner_rays(PLAIN, 8)
-    near, far = volume_interval(rays, at, VOLUME, raised_mm=0.0)
+    rays = _compute_corner_rays(PLAIN, 8)
+    near, far = compute_volume_interval(rays, at, VOLUME, raised_mm=0.0)
     np.testing.assert_allclose(near, near[:, ::-1], rtol=1e-9)
     finer = 1.0 + rays[..., 0] ** 2 + rays[..., 1]
     limits = 1e5 * finer * np.stack([1.0 / far, 1.0 / near, 1.0 / near])
-    for by in _nonlinearity(rays, at, VOLUME, (near, far), limits):
+    for by in _measure_nonlinearity(rays, at, VOLUME, (near, far), limits):
         assert np.count_nonzero(by) > 10
         # The two halves are rounded differently, and nothing else.
         np.testing.assert_allclose(by, by[:, ::-1], rtol=1e-6)
@@ -240,11 +240,11 @@ def test_no_pixel_inside_a_block_loses_more_than_the_margin(
     half as much it would cut 2 to 80 of them off. Along each ray s falls as 1e5 mm over depth."""
     at = looking_at_the_middle(distance_mm, 0.0, tilt)
     block_px, per_inverse = 8, 1e5
-    rays = _corner_rays(PLAIN, block_px)
-    near, far = volume_interval(rays, at, VOLUME, raised_mm=0.0)
+    rays = _compute_corner_rays(PLAIN, block_px)
+    near, far = compute_volume_interval(rays, at, VOLUME, raised_mm=0.0)
     limits = -per_inverse / np.stack([near, far, far])
-    near_by, far_by = _nonlinearity(rays, at, VOLUME, (near, far), limits)
-    enter, leave = volume_interval(PLAIN.pixel_rays(), at, VOLUME, raised_mm=0.0)
+    near_by, far_by = _measure_nonlinearity(rays, at, VOLUME, (near, far), limits)
+    enter, leave = compute_volume_interval(PLAIN.pixel_rays(), at, VOLUME, raised_mm=0.0)
     inside = enter < leave
 
     def linear(corners: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ from small_pair import CAMERA, pair, stripe_map
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.uncertainty import COLUMNS, ROWS, RayUncertainty
-from bodyscan.reconstruction.triangulation import grid_normals, reconstruct_range_image
+from bodyscan.reconstruction.triangulation import estimate_grid_normals, reconstruct_range_image
 from bodyscan.stripes.stripe_map import StripeMap
 
 
@@ -71,7 +71,7 @@ def test_normals_of_a_sphere_point_to_the_camera() -> None:
     rays = CAMERA.pixel_rays()
     centre, radius = np.array([0.0, 0.0, 600.0]), 80.0
     points = ball_points(CAMERA, centre, radius).astype(np.float32)
-    normals = grid_normals(points)
+    normals = estimate_grid_normals(points)
     true = (points - centre) / radius
     facing = -np.sum(true * rays, axis=-1) / np.linalg.norm(rays, axis=-1)
     middle = np.isfinite(normals[..., 0]) & (facing > 0.5)
@@ -84,7 +84,7 @@ def test_a_normal_needs_its_whole_window() -> None:
     rays = CAMERA.pixel_rays()
     points = (rays * 500.0).astype(np.float32)
     points[40, 70] = np.nan
-    unknown = np.isnan(grid_normals(points)).any(axis=-1)
+    unknown = np.isnan(estimate_grid_normals(points)).any(axis=-1)
     expected = np.ones_like(unknown)
     expected[2:-2, 2:-2] = False
     expected[38:43, 68:73] = True
@@ -97,7 +97,7 @@ def test_normals_are_those_of_planes_fitted_to_the_windows() -> None:
     camera = Camera(400.0, 400.0, 0.0, 15.0, 10.0, Radial(), 30, 20)
     rays = camera.pixel_rays()
     points = rays * rng.uniform(480.0, 520.0, rays.shape[:2])[..., None]
-    normals = grid_normals(points.astype(np.float32))
+    normals = estimate_grid_normals(points.astype(np.float32))
     for v, u in rng.integers([2, 2], [18, 28], (30, 2)):
         window = np.s_[v - 2 : v + 3, u - 2 : u + 3]
         ones = np.ones((25, 1))

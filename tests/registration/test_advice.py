@@ -11,7 +11,7 @@ from ring import ring_of_cameras, ring_rig, ring_views
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.geometry.uncertainty import position_sigma
+from bodyscan.geometry.uncertainty import compute_position_sigma
 from bodyscan.registration.advice import advise, find_articulation_shots
 from bodyscan.registration.rig_solve import RigSolution, solve_rig
 from bodyscan.rig.rig import Rig
@@ -62,7 +62,7 @@ SUGGESTED = re.compile(
 
 def sigma_of(solution: RigSolution, name: str) -> float:
     position = solution.rig_from_camera[name].translation
-    return float(np.linalg.norm(position_sigma(solution.covariance, name, position)))
+    return float(np.linalg.norm(compute_position_sigma(solution.covariance, name, position)))
 
 
 def test_shots_as_advised_reduce_the_sigma_of_the_worst_pair_as_told(ring: Ring) -> None:

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from ring import CHARUCO, ring_of_cameras, ring_rig, ring_views
 
-from bodyscan.boards.board_layout import corner_grid, corner_points
+from bodyscan.boards.board_layout import compute_corner_grid, compute_corner_points
 from bodyscan.boards.view import Appearance, BoardView
 from bodyscan.calibration.board_views import match_corners
 from bodyscan.registration.board_checks import (
-    appearance_notes,
-    boards_not_found,
-    common_aspect,
     correct_stretch,
     describe_findings,
+    find_common_aspect,
+    list_boards_not_found,
+    note_appearance,
 )
 from bodyscan.rig.board import Board
 from bodyscan.rig.rig import Rig
@@ -30,7 +30,7 @@ RIG = Rig.model_validate(
         "pairs": [{"name": "p", "camera": {"width": 9, "height": 9}}],
     }
 )
-COLUMNS, ROWS = corner_grid(MARKED)
+COLUMNS, ROWS = compute_corner_grid(MARKED)
 
 
 def view(columns: int, rows: int, appearance: Appearance | None = None) -> BoardView:
@@ -41,7 +41,7 @@ def view(columns: int, rows: int, appearance: Appearance | None = None) -> Board
 
 
 def said(*views: BoardView) -> Sequence[str]:
-    return appearance_notes(RIG, views)
+    return note_appearance(RIG, views)
 
 
 def test_every_other_look_is_told_with_how_many_views_had_it() -> None:
@@ -75,7 +75,7 @@ def partial_view(count: int) -> BoardView:
 
 
 def test_a_board_never_found_is_named_with_what_the_rig_file_says() -> None:
-    (note,) = boards_not_found(TWO_BOARDS, [partial_view(48)], 30)
+    (note,) = list_boards_not_found(TWO_BOARDS, [partial_view(48)], 30)
     assert "board unseen" in note
     assert "10 columns x 7 rows" in note
     assert "none of 30 images" in note
@@ -92,7 +92,7 @@ def test_a_stretched_print_is_told_from_pixels_that_are_not_square(stretch: floa
     placings, cameras = ring_of_cameras(heights=(700, 1200))
     placings = {name: placings[name] for name in ("p1-1", "p1-2")}
     cameras = {name: cameras[name] for name in placings}
-    points = corner_points(printed := CHARUCO.model_copy(update={"stretch": stretch}))
+    points = compute_corner_points(printed := CHARUCO.model_copy(update={"stretch": stretch}))
     views = [
         BoardView(v.pair, v.shot, v.board, match_corners(v.points, points), v.pixels)
         for v in ring_views(placings, cameras, shots=12, board=printed)[0]
@@ -103,4 +103,4 @@ def test_a_stretched_print_is_told_from_pixels_that_are_not_square(stretch: floa
     assert len(notes) == (stretch != 1.0)
     found = calibrate_cameras(corrected, views).value
     assert max(one.rms_px for one in found.values()) < 0.06, "with noise of 0.04"
-    assert common_aspect((one.camera, one.covariance) for one in found.values()) == 1.0
+    assert find_common_aspect((one.camera, one.covariance) for one in found.values()) == 1.0

@@ -20,7 +20,7 @@ from small_workspace import run
 
 from bodyscan.errors import BodyscanError, CalibrationFileError
 from bodyscan.files.atomic import write_npz
-from bodyscan.files.hashing import file_hash
+from bodyscan.files.hashing import hash_file
 from bodyscan.files.reading import read_npz
 from bodyscan.registration.storage import (
     accept_calibration,
@@ -146,7 +146,7 @@ def test_arrays_that_cannot_be_right_are_refused_though_their_hash_fits(
         arrays = dict(stored)
     ARRAYS[mistake](arrays)
     write_npz(copy / "calibration.npz", **arrays)
-    write(copy, read(copy) | {"arrays_sha256": file_hash(copy / "calibration.npz")})
+    write(copy, read(copy) | {"arrays_sha256": hash_file(copy / "calibration.npz")})
     with pytest.raises(CalibrationFileError):
         load_calibration(copy)
 

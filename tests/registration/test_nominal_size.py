@@ -11,7 +11,7 @@ import pytest
 from bodyscan.errors import FailedWork
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.calibration_verdict import PairFigures
-from bodyscan.registration.rig_calibration import nominal_size, refuse_wrong_size
+from bodyscan.registration.rig_calibration import find_nominal_size, refuse_wrong_size
 from bodyscan.rig.board import Board
 from bodyscan.rig.rig import Rig
 
@@ -43,7 +43,7 @@ def placed(factor: float) -> dict[str, RigidTransform]:
 
 def test_squares_of_another_size_show_in_the_size_of_the_rig() -> None:
     for factor, mark in ((1.04, "usable"), (1.02, "good"), (0.96, "usable")):
-        size = nominal_size(RIG, placed(factor))
+        size = find_nominal_size(RIG, placed(factor))
         assert size is not None
         assert size.mark == mark
         assert f"{factor:.3f} times" in size.words
@@ -62,7 +62,7 @@ def test_a_size_that_no_tape_measure_errs_by_is_refused(factor: float) -> None:
 
 def test_a_rig_without_boards_is_told_as_well() -> None:
     """What another program calibrated: only `nominal` can be mended here."""
-    size = nominal_size(RIG.model_copy(update={"boards": ()}), placed(1.05))
+    size = find_nominal_size(RIG.model_copy(update={"boards": ()}), placed(1.05))
     assert size is not None
     assert "correct `nominal`" in size.remedy
 
@@ -71,13 +71,13 @@ def test_one_camera_whose_nominal_place_is_wrong_hides_no_size() -> None:
     """Of five: six of ten distances are right."""
     places = {**PLACES, "d": (0.0, -1000.0, 500.0), "e": (700.0, 700.0, 1500.0)}
     stand = {n: RigidTransform(np.eye(3), 1.04 * np.array(p)) for n, p in places.items()}
-    size = nominal_size(rig_of({**places, "e": (700.0, 3700.0, 1500.0)}), stand)
+    size = find_nominal_size(rig_of({**places, "e": (700.0, 3700.0, 1500.0)}), stand)
     assert size is not None
     assert size.ratio == pytest.approx(1.04, abs=0.01)
 
 
 def test_one_camera_alone_has_no_size() -> None:
-    assert nominal_size(RIG, {"a": placed(1.0)["a"]}) is None
+    assert find_nominal_size(RIG, {"a": placed(1.0)["a"]}) is None
 
 
 AT_THE_LIMITS = PairFigures("p", 0.3, 6, 40.0, 0.3, 0.5, 4, 50.0, 0.5)

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from ring import CHARUCO, ring_of_cameras, ring_rig, ring_views
 
-from bodyscan.boards.board_layout import corner_points
+from bodyscan.boards.board_layout import compute_corner_points
 from bodyscan.boards.view import BoardView
 from bodyscan.errors import FailedWork
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.registration.references import (
-    board_length,
+    compute_board_length,
     find_rig_size,
     rescale_boards,
     select_solving_views,
@@ -68,7 +68,7 @@ def bar_views(rng: np.random.Generator, shots: int = 4, noise_px: float = 0.05) 
         middle = np.array([0.0, 0.0, 1050.0]) + rng.normal(0.0, 30.0, 3)
         for board, side in ((LEFT, -0.5), (RIGHT, 0.5)):
             own = [0.5 * board.columns * board.square_mm, 0.5 * board.rows * board.square_mm, 0.0]
-            points = corner_points(board) - own + [side * BAR_MM, 0.0, 0.0]
+            points = compute_corner_points(board) - own + [side * BAR_MM, 0.0, 0.0]
             there = points @ (turn.rotation @ facing).T + middle
             for name in ("p1-1", "p1-2"):
                 pixels = CAMERAS[name].project(PLACINGS[name].inverse().apply(there))
@@ -92,8 +92,10 @@ def test_a_bar_gives_the_size_within_its_sigma() -> None:
 
 
 def test_one_certified_board_does_as_well() -> None:
-    steel = Reference(name="steel", boards=("left",), length_mm=board_length(LEFT), sigma_mm=0.01)
-    assert board_length(LEFT) == pytest.approx(90.0)
+    steel = Reference(
+        name="steel", boards=("left",), length_mm=compute_board_length(LEFT), sigma_mm=0.01
+    )
+    assert compute_board_length(LEFT) == pytest.approx(90.0)
     views = bar_views(np.random.default_rng(0), noise_px=1e-6)
     size = find_rig_size(small_rig(steel), placed(SMALLER), views).value
     assert size.factor == pytest.approx(1.0 / SMALLER, abs=1e-6)

@@ -13,7 +13,7 @@ from bodyscan.geometry.camera import Camera, CameraPrior
 from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
-from bodyscan.registration.cluster_covariance import NormalEquations, normal_equations
+from bodyscan.registration.cluster_covariance import NormalEquations, build_normal_equations
 from bodyscan.registration.joint_solve import estimate_view_sigmas
 from bodyscan.registration.view_graph import Target
 
@@ -46,7 +46,7 @@ def views() -> list[LocatedView]:
 
 
 def equations(seen: list[LocatedView], fixed_target: Target | None = None) -> NormalEquations:
-    return normal_equations(
+    return build_normal_equations(
         seen, CAMERAS, PLACED, BOARDS, fixed_pair="a", fixed_target=fixed_target
     )
 
@@ -133,7 +133,7 @@ def test_cameras_that_are_known_take_no_degrees_of_freedom() -> None:
     priors = {n: CameraPrior(c.parameters, np.full(7, 1e-9)) for n, c in CAMERAS.items()}
     exact = {name: replace(camera, prior=priors[name]) for name, camera in CAMERAS.items()}
     seen = views()
-    found = normal_equations(seen, exact, PLACED, BOARDS, fixed_pair="a", fixed_target=None)
+    found = build_normal_equations(seen, exact, PLACED, BOARDS, fixed_pair="a", fixed_target=None)
     # Of 200 residuals with weights of 0.9, three boards and a pair take 24, unknown cameras 14.
     ratio = found.variance_px2 / equations(seen).variance_px2
     assert ratio == pytest.approx((180 - 24 - 14) / (180 - 24), rel=5e-3)

@@ -7,16 +7,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bodyscan.calibration.board_views import board_symmetries
+from bodyscan.calibration.board_views import find_board_symmetries
 from bodyscan.errors import BadInput
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.registration.rig_calibration import FLOOR_AXES, RigCalibration
 from bodyscan.registration.rig_frame import (
+    compute_nominal_pose,
     find_frame_board_rotation,
+    find_frame_target,
     find_rig_from_root,
-    frame_target,
-    nominal_pose,
     refuse_without_frame_shot,
     rig_from_world,
 )
@@ -87,7 +87,7 @@ def test_the_axes_are_told_to_be_the_floors_where_board_or_pair_says_where_it_is
 def test_a_nominal_pose_looks_where_it_says_and_stands_upright(
     position: tuple[float, float, float], look_at: tuple[float, float, float]
 ) -> None:
-    pose = nominal_pose(NominalPose(position_mm=position, look_at_mm=look_at))
+    pose = compute_nominal_pose(NominalPose(position_mm=position, look_at_mm=look_at))
     away = np.array(look_at) - position
     seen = pose.inverse().apply(np.array([look_at]))[0]
     np.testing.assert_allclose(seen, [0.0, 0.0, float(np.linalg.norm(away))], atol=1e-9)
@@ -106,7 +106,7 @@ def test_a_board_on_the_floor_is_the_frame() -> None:
     described = rig(
         {"shot": "s1", "origin_mm": (100, 50, 3), "x_axis": (0, 2, 0), "y_axis": (3, 0, 0)}
     )
-    assert frame_target(described) == ("s1", "b")
+    assert find_frame_target(described) == ("s1", "b")
     to_rig = find_rig_from_root(described, {}, {("s1", "b"): SOMEWHERE})
     on_board = np.array([[0.0, 0.0, 0.0], [10.0, 0.0, 0.0], [0.0, 10.0, 0.0], [0.0, 0.0, 10.0]])
     np.testing.assert_allclose(
@@ -121,9 +121,9 @@ def test_a_board_on_the_floor_is_the_frame() -> None:
 def test_a_pair_is_the_frame_at_its_nominal_pose_or_as_it_is() -> None:
     stands = {"position_mm": (1500, 0, 900), "look_at_mm": (0, 0, 900)}
     described = rig({"pair": "q"}, q=stands)
-    assert frame_target(described) is None
+    assert find_frame_target(described) is None
     to_rig = find_rig_from_root(described, {"q": SOMEWHERE}, {})
-    nominal = nominal_pose(NominalPose.model_validate(stands))
+    nominal = compute_nominal_pose(NominalPose.model_validate(stands))
     np.testing.assert_allclose((to_rig @ SOMEWHERE).matrix, nominal.matrix, atol=1e-9)
     to_rig = find_rig_from_root(rig({"pair": "q"}), {"q": SOMEWHERE}, {})
     np.testing.assert_allclose((to_rig @ SOMEWHERE).matrix, np.eye(4), atol=1e-12)
@@ -146,11 +146,12 @@ def test_of_all_readings_of_a_plain_board_the_one_that_puts_cameras_where_they_s
         for name, place in PLACES.items()
     }
     described = rig({"shot": "s1"}, TWO_FACES, **(stands if nominal else {}))
-    turn = board_symmetries(described.boards[0])[read]
+    turn = find_board_symmetries(described.boards[0])[read]
     axes = np.diag([1.0, -1.0, -1.0])  # the default: columns along x, face up
     lies = RigidTransform(axes, np.zeros(3))
     cameras = {
-        name: SOMEWHERE @ nominal_pose(NominalPose(position_mm=place, look_at_mm=(0, 0, 800)))
+        name: SOMEWHERE
+        @ compute_nominal_pose(NominalPose(position_mm=place, look_at_mm=(0, 0, 800)))
         for name, place in PLACES.items()
     }
     # What was seen is the board as it lies, read in one of its ways.
@@ -170,7 +171,7 @@ def test_a_plain_board_reads_alike_from_its_ends_and_faces_where_its_print_does(
     def readings(columns: int, faces: int) -> list[np.ndarray]:
         keys = {**PLAIN, "columns": columns, "faces": faces, "thickness_mm": 5.0 * (faces - 1)}
         places = np.array([[40.0, 80.0, 0.0], [0.0, 0.0, 0.0]])
-        return [turn.apply(places) for turn in board_symmetries(Board.model_validate(keys))]
+        return [turn.apply(places) for turn in find_board_symmetries(Board.model_validate(keys))]
 
     itself = np.array([[40.0, 80.0, 0.0], [0.0, 0.0, 0.0]])
     turned = np.array([[280.0, 160.0, 0.0], [320.0, 240.0, 0.0]])

@@ -14,7 +14,7 @@ from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.lenses.opencv import Brown, Radial
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.registration.cluster_covariance import normal_equations
+from bodyscan.registration.cluster_covariance import build_normal_equations
 from bodyscan.registration.joint_solve import JointSolution, refine_solution, solve_poses
 from bodyscan.registration.rig_solve import LOSSES_PX
 
@@ -103,7 +103,7 @@ def test_the_corners_variance_is_found_although_the_unknowns_take_some_up() -> N
             LocatedView(ROOT, view.shot, "b", corners, view.pixels, pose)
             for view, pose in zip(planar, fit.poses, strict=True)
         ]
-        equations = normal_equations(
+        equations = build_normal_equations(
             views,
             {ROOT: fit.camera},
             {ROOT: RigidTransform.identity()},

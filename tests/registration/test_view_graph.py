@@ -10,7 +10,11 @@ import pytest
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.errors import RigDisconnected
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.registration.view_graph import initial_poses, locate_boards_jointly, view_graph
+from bodyscan.registration.view_graph import (
+    build_view_graph,
+    find_initial_poses,
+    locate_boards_jointly,
+)
 
 PLACED = {
     "a": RigidTransform.identity(),
@@ -36,7 +40,7 @@ def view(pair: str, shot: int, aside_mm: float = 0.0, corners: int = 12) -> Loca
 
 
 def test_pairs_are_tied_by_the_boards_they_saw_at_one_moment() -> None:
-    graph = view_graph(
+    graph = build_view_graph(
         [view("a", 1), view("b", 1), view("b", 2), view("c", 2), view("a", 3)], "abcd"
     )
     assert sorted(map(sorted, graph.edges)) == [["a", "b"], ["b", "c"]]
@@ -47,7 +51,7 @@ def test_pairs_are_tied_by_the_boards_they_saw_at_one_moment() -> None:
 def test_poses_follow_along_a_chain_of_shared_boards() -> None:
     views = [view(pair, shot) for shot in (1, 2) for pair in "ab"]
     views += [view(pair, shot) for shot in (3, 4) for pair in "bc"]
-    found, left_out = initial_poses(views, "abc")
+    found, left_out = find_initial_poses(views, "abc")
     assert not left_out
     for one, other in (("a", "b"), ("a", "c")):
         np.testing.assert_allclose(
@@ -60,24 +64,24 @@ def test_poses_follow_along_a_chain_of_shared_boards() -> None:
 def test_a_pair_whose_pictures_were_taken_at_other_moments_is_left_out() -> None:
     views = [view(pair, shot) for shot in range(1, 6) for pair in "ab"]
     views += [view("c", shot, 150.0 * shot) for shot in range(1, 6)]
-    found, left_out = initial_poses(views, "abc")
+    found, left_out = find_initial_poses(views, "abc")
     assert set(found) == {"a", "b"}
     assert "c" in left_out["c"]
     with pytest.raises(RigDisconnected, match="differs from shot to shot"):
-        initial_poses([v for v in views if v.pair != "b"], "ac")
+        find_initial_poses([v for v in views if v.pair != "b"], "ac")
 
 
 def test_three_shots_that_agree_are_a_start_where_as_many_do_on_something_else() -> None:
     aside = [0.0, 10.0, 5.0, 0.0, 200.0, 400.0, 600.0, 605.0, 600.0]
     views = [view(pair, k, aside[k] * (pair == "c")) for k in range(9) for pair in "ac"]
-    found, left_out = initial_poses(views, "ac")
+    found, left_out = find_initial_poses(views, "ac")
     assert not left_out
     assert np.linalg.norm(found["c"].translation - found["a"].apply(PLACED["c"].translation)) < 20.0
 
 
 def test_pairs_that_share_nothing_are_named() -> None:
     with pytest.raises(RigDisconnected, match="no shared board view ties c to a, b"):
-        initial_poses([view("a", 1), view("b", 1), view("c", 2)], "abc")
+        find_initial_poses([view("a", 1), view("b", 1), view("c", 2)], "abc")
 
 
 def test_a_board_stands_where_most_corners_say_and_a_view_far_off_is_doubtful() -> None:
@@ -112,7 +116,7 @@ def test_a_board_numbered_from_its_other_end_is_numbered_as_the_other_pairs_see_
 
 def test_one_board_with_one_numbering_ties_two_pairs() -> None:
     """Nothing contradicts it, so its one vote is most."""
-    found, left_out = initial_poses([view("a", 1), view("b", 1)], "ab")
+    found, left_out = find_initial_poses([view("a", 1), view("b", 1)], "ab")
     assert not left_out
     between = (found["a"].inverse() @ found["b"]).matrix
     # Both views are exact: rounding of 1 m is left.

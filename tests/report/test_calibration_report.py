@@ -20,7 +20,11 @@ from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.registration.calibration_verdict import grade_calibration
 from bodyscan.registration.rig_calibration import ObservedCorners, RigCalibration
 from bodyscan.registration.storage import load_calibration, save_calibration
-from bodyscan.report.calibration_charts import shared_boards, sigma_at, sigma_chart
+from bodyscan.report.calibration_charts import (
+    compute_sigma_at,
+    count_shared_boards,
+    draw_sigma_chart,
+)
 from bodyscan.report.calibration_page import calibration_page
 from bodyscan.report.page import render
 from bodyscan.verdict import Verdict
@@ -99,7 +103,7 @@ def test_a_picture_that_boards_hardly_cover_is_named(calibration: RigCalibration
 
 
 def test_boards_in_common_are_counted_shot_by_shot(calibration: RigCalibration) -> None:
-    together = shared_boards(calibration)
+    together = count_shared_boards(calibration)
     assert together[0, 1] == together[1, 0] == 1
     assert together[1, 2] == 2
     assert np.all(np.diag(together) == 0)
@@ -155,12 +159,12 @@ def calibrated(
 
 def test_independent_shifts_average_out_and_shifts_in_common_do_not() -> None:
     placings, cameras = ring_of_cameras(heights=(1000,))
-    sigma, seen = sigma_at(MIDDLE, placings, cameras, shifts(placings, 0.3), ())
+    sigma, seen = compute_sigma_at(MIDDLE, placings, cameras, shifts(placings, 0.3), ())
     assert seen[0] == 3
     assert sigma[0] == pytest.approx(0.3 * np.sqrt(3) / np.sqrt(3))  # three axes, three pairs
     own = np.diag([0.0, 0.0, 0.0, *[0.3**2] * 3])
     together = PoseCovariance(tuple(placings), np.kron(np.ones((3, 3)), own).astype(float))
-    sigma, _ = sigma_at(MIDDLE, placings, cameras, together, ())
+    sigma, _ = compute_sigma_at(MIDDLE, placings, cameras, together, ())
     assert sigma[0] == pytest.approx(0.3 * np.sqrt(3))
 
 
@@ -172,7 +176,7 @@ def test_sigma_is_that_of_drawn_placings() -> None:
     mixing = rng.normal(size=(36, 36)) / 6.0 * np.tile([1e-4] * 3 + [0.1] * 3, 6)[:, None]
     points = rng.uniform([-300, -300, 700], [300, 300, 1500], (20, 3))
     covariance = PoseCovariance(names, mixing @ mixing.T)
-    sigma, seen = sigma_at(points, placings, cameras, covariance, names)
+    sigma, seen = compute_sigma_at(points, placings, cameras, covariance, names)
     sights = np.array([is_in_image(cameras[n], placings[n].inverse().apply(points)) for n in names])
     assert np.array_equal(sights.sum(axis=0), seen)
     squared = np.zeros(len(points))
@@ -193,10 +197,10 @@ def test_sigma_is_that_of_drawn_placings() -> None:
 def test_what_no_pair_sees_has_no_sigma() -> None:
     placings, cameras = ring_of_cameras(heights=(400,))
     own, above = shifts(placings, 0.3), np.array([[0.0, 0.0, 2100.0]])
-    sigma, seen = sigma_at(above, placings, cameras, own, placings)
+    sigma, seen = compute_sigma_at(above, placings, cameras, own, placings)
     assert seen[0] == 0
     assert np.isnan(sigma[0])
-    drawn, again = (sigma_chart(calibrated(placings, cameras, own)) for _ in range(2))
+    drawn, again = (draw_sigma_chart(calibrated(placings, cameras, own)) for _ in range(2))
     assert drawn == again
     picture = cv2.imdecode(np.frombuffer(drawn, np.uint8), cv2.IMREAD_COLOR)
     height, width = picture.shape[:2]
@@ -210,10 +214,10 @@ def test_what_no_pair_sees_has_no_sigma() -> None:
 def test_a_camera_measures_depth_only_with_another_or_with_its_projector() -> None:
     placings, cameras = ring_of_cameras(poles=1, heights=(1000,))
     own = shifts(placings, 0.3)
-    sigma, seen = sigma_at(MIDDLE, placings, cameras, own, ())
+    sigma, seen = compute_sigma_at(MIDDLE, placings, cameras, own, ())
     assert seen[0] == 1
     assert np.isnan(sigma[0])
-    sigma, _ = sigma_at(MIDDLE, placings, cameras, own, placings)
+    sigma, _ = compute_sigma_at(MIDDLE, placings, cameras, own, placings)
     assert sigma[0] == pytest.approx(0.3 * np.sqrt(3))
 
 
@@ -224,8 +228,8 @@ def test_no_map_is_drawn_of_what_is_not_known() -> None:
     with pytest.raises(
         BadInput, match=r"accuracy of the imported calibration of p1-1, p2-1, p3-1 is not known"
     ) as caught:
-        sigma_chart(calibration)
+        draw_sigma_chart(calibration)
     assert "--sigma-px" in caught.value.remedy
     one = {"p1-1": placings["p1-1"]}
     with pytest.raises(BadInput, match="no pose uncertainty to map"):
-        sigma_chart(calibrated(one, cameras, shifts(one, 0.0)))
+        draw_sigma_chart(calibrated(one, cameras, shifts(one, 0.0)))

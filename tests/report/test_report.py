@@ -32,7 +32,7 @@ from bodyscan.report.measures_section import show_measures
 from bodyscan.report.model import Layer, pack
 from bodyscan.report.page import Column, render
 from bodyscan.report.result_page import build_page
-from bodyscan.report.scan_page import colour_layers
+from bodyscan.report.scan_page import make_colour_layers
 
 
 @pytest.fixture(scope="module")
@@ -124,7 +124,7 @@ def test_what_covers_the_skin_is_a_layer_of_its_own() -> None:
     mesh = egg(20)
     hair = np.where(mesh.vertices[:, 2] > 1500.0, HAIR, SKIN).astype(np.uint8)
     cloud = BodyCloud(mesh.vertices, mesh.normals, mesh.sigma_mm, mesh.colours, mesh.colours[:, 0])
-    *_, last = colour_layers(replace(mesh, regions=hair), mesh, cloud, None, 1.0)
+    *_, last = make_colour_layers(replace(mesh, regions=hair), mesh, cloud, None, 1.0)
     assert last.name == "regions"
     assert len(np.unique(last.colours, axis=0)) == 2
 

@@ -14,9 +14,9 @@ from small_view import CAMERA, CRISP, LAMPS, projector, view, wall
 from bodyscan.arrays import Array, Floats
 from bodyscan.errors import BadInput
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.simulation import SimulationSettings, settings_for, simulate
+from bodyscan.simulation import SimulationSettings, compose_settings, simulate
 from bodyscan.simulation.body import load_subject
-from bodyscan.simulation.lamps import highlight, shape_mm, spread_light
+from bodyscan.simulation.lamps import compute_highlight, shape_mm, spread_light
 from bodyscan.simulation.living import LivingBody, animate, draw_signal, load_body, moves
 from bodyscan.simulation.presets import SUBJECTS
 from bodyscan.simulation.render import Moving, render_pair
@@ -126,7 +126,7 @@ def test_only_a_mannequin_stands_still() -> None:
 )
 def test_a_wrong_change_is_named(change: str, message: str) -> None:
     with pytest.raises(BadInput, match=message):
-        settings_for("mirror", changes=[change])
+        compose_settings("mirror", changes=[change])
 
 
 @pytest.mark.slow
@@ -233,9 +233,9 @@ def test_gloss_is_where_a_mirror_would_show_the_light() -> None:
     point, towards = np.array([[0.0, 0.0, 1000.0]]), np.array([[300.0, 0.0, -1000.0]])
     view_direction = np.array([0.0, 0.0, -1.0])
     half = view_direction + towards[0] / np.linalg.norm(towards)
-    assert highlight(point, towards, half[None], skin)[0] == pytest.approx(0.8)
+    assert compute_highlight(point, towards, half[None], skin)[0] == pytest.approx(0.8)
     tilted = half + [0.6, 0.0, 0.0]
-    assert highlight(point, towards, tilted[None], skin)[0] < 0.4
+    assert compute_highlight(point, towards, tilted[None], skin)[0] < 0.4
 
 
 def rendered(skin: Skin, share: float) -> dict[str, Floats]:

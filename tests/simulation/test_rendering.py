@@ -16,11 +16,11 @@ from bodyscan.rig.board import Board
 from bodyscan.simulation.board import make_print
 from bodyscan.simulation.layout import build_mirror, build_pinhole
 from bodyscan.simulation.lens import TrueCamera
-from bodyscan.simulation.patterns import gray_code_bits
+from bodyscan.simulation.patterns import compute_gray_code_bits
 from bodyscan.simulation.projector import MirrorProjector, PinholeProjector
 from bodyscan.simulation.rays import View, interpolate, trace_band
 from bodyscan.simulation.render import compute_pixel_truth, render_pair
-from bodyscan.simulation.scene import Scene, Surface, grid_surface
+from bodyscan.simulation.scene import Scene, Surface, build_grid_surface
 from bodyscan.simulation.sensor import blur, expose, list_blurs
 from bodyscan.simulation.settings import BoardMaking, Noise, Optics, Projection
 
@@ -58,7 +58,7 @@ def read(images: dict[str, np.ndarray]) -> np.ndarray:
     bits = [images[f"bit{k:02d}"] > images[f"bit{k:02d}-inverse"] for k in range(BITS)]
     table = np.full(2**BITS, -1)
     places = 2 ** np.arange(BITS)
-    table[places @ gray_code_bits(STRIPES)] = np.arange(STRIPES)
+    table[places @ compute_gray_code_bits(STRIPES)] = np.arange(STRIPES)
     return table[np.tensordot(places, np.stack(bits), axes=1)]
 
 
@@ -140,7 +140,7 @@ def test_shadow_falls_away_from_the_mirrored_apex() -> None:
 
 def test_a_surface_turned_away_from_the_light_stays_dark() -> None:
     """Seen from below, lit from above: a ledge whose upper side the light meets."""
-    ledge = grid_surface(
+    ledge = build_grid_surface(
         np.array([-200.0, -100.0, 900.0]), np.array([400.0, 0, 0]), np.array([0, 25.0, 300.0])
     )
     light = projector()
@@ -153,7 +153,7 @@ def test_a_surface_turned_away_from_the_light_stays_dark() -> None:
 def test_an_edge_lies_where_it_is() -> None:
     """Coverage of an upright edge, summed over rows, finds it to a hundredth of a pixel."""
     place = 17.3
-    half = grid_surface(
+    half = build_grid_surface(
         np.array([place, -2000.0, 1000.0]), np.array([2000.0, 0, 0]), np.array([0, 4000.0, 0])
     )
     straight = TrueCamera(190.0, 190.0, 0.0, 80.0, 64.0, 0.0, 0.0, 160, 128)
@@ -229,7 +229,7 @@ def furnished() -> Scene:
     board = Board(name="plain", kind="checkerboard", columns=6, rows=5, square_mm=50.0)
     places = np.array([[0, 0], [300, 0], [0, 250], [300, 250]], float)
     corner, down = np.array([20.0, -150, 900]), np.array([0, 250.0, 0])
-    slanting = grid_surface(corner, np.array([280.0, 0, 110]), down)
+    slanting = build_grid_surface(corner, np.array([280.0, 0, 110]), down)
     sheet = Surface(
         slanting.vertices,
         slanting.triangles,

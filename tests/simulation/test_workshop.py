@@ -11,28 +11,28 @@ from small_view import CAMERA, CRISP, LAMPS, projector, view, wall
 
 from bodyscan.errors import BadInput
 from bodyscan.rig.board import Board
-from bodyscan.simulation import SimulationSettings, settings_for
+from bodyscan.simulation import SimulationSettings, compose_settings
 from bodyscan.simulation.board import make_board, make_print
 from bodyscan.simulation.render import render_pair
 from bodyscan.simulation.scene import Scene
-from bodyscan.simulation.sensor import Brightness, draw_flicker, expose, fixed_pattern
+from bodyscan.simulation.sensor import Brightness, draw_fixed_pattern, draw_flicker, expose
 from bodyscan.simulation.settings import BoardMaking, Lighting, Noise, Pace
 
 
 def test_a_workshop_is_not_ideal_and_every_number_stays_free() -> None:
-    ideal, workshop = (settings_for("mirror", preset=name) for name in ("ideal", "workshop"))
+    ideal, workshop = (compose_settings("mirror", preset=name) for name in ("ideal", "workshop"))
     assert ideal == SimulationSettings()
     for part in ("optics", "projection", "lighting", "noise", "board"):
         assert getattr(ideal, part) != getattr(workshop, part)
     assert workshop.person == ideal.person
     changes = ["person.breath_mm=5", "pace.start=poles", "board.warp_mm=[0, 0]"]
-    changed = settings_for("pinhole", preset="workshop", subject="restless", changes=changes)
+    changed = compose_settings("pinhole", preset="workshop", subject="restless", changes=changes)
     assert (changed.person.breath_mm, changed.person.sway_mm_s) == (5.0, 14.0)
     assert changed.pace.start == "poles"
     assert changed.board.warp_mm == (0.0, 0.0)
     assert (changed.projection.kind, changed.projection.gamma) == ("pinhole", 2.2)
     with pytest.raises(BadInput, match="no preset 'garage' to simulate"):
-        settings_for("mirror", preset="garage")
+        compose_settings("mirror", preset="garage")
 
 
 def test_boards_are_bent_and_twisted_by_what_is_asked() -> None:
@@ -56,7 +56,7 @@ def test_boards_are_bent_and_twisted_by_what_is_asked() -> None:
 
 def test_pixels_are_their_own_in_every_image() -> None:
     noise = Noise(pixel_gain=0.02, pixel_grey=0.5, read_grey=0.01, photons=1e6)
-    fixed = fixed_pattern(CAMERA, noise, np.random.default_rng(0))
+    fixed = draw_fixed_pattern(CAMERA, noise, np.random.default_rng(0))
     assert fixed is not None
     grey = np.full((CAMERA.height, CAMERA.width), 100.0, np.float32)
     first, second = (
@@ -64,7 +64,7 @@ def test_pixels_are_their_own_in_every_image() -> None:
     )
     assert np.mean(first != second) < 0.1  # they differ where noise tips the rounding
     assert first.std() == pytest.approx(np.hypot(100 * 0.02, 0.5), rel=0.05)
-    assert fixed_pattern(CAMERA, Noise(), np.random.default_rng(0)) is None
+    assert draw_fixed_pattern(CAMERA, Noise(), np.random.default_rng(0)) is None
 
 
 def test_lamps_on_mains_beat_with_the_frames() -> None:

@@ -23,10 +23,10 @@ from bodyscan.jobs.watching import Watched
 from bodyscan.rig.rig import load_rig, write_rig
 from bodyscan.simulation.files import scale_rig
 from bodyscan.station.board_tour import BoardTour
-from bodyscan.station.day import GIRTHS, Day, table_csv
+from bodyscan.station.day import GIRTHS, Day, format_table_csv
 from bodyscan.station.feed import BACKLOG, Feed
 from bodyscan.station.operation import Operation
-from bodyscan.station.serving import make_operation, names_of_host
+from bodyscan.station.serving import list_names_of_host, make_operation
 
 try:
     from starlette.testclient import TestClient
@@ -102,7 +102,7 @@ JSON = {"content-type": "application/json"}
 def test_only_the_stations_own_pages_are_answered(
     operation: Operation, method: str, path: str, headers: dict[str, str], body: bytes, status: int
 ) -> None:
-    app = make_app(operation, names_of_host("127.0.0.1", 8765))
+    app = make_app(operation, list_names_of_host("127.0.0.1", 8765))
     with TestClient(app, base_url="http://127.0.0.1:8765") as client:
         answer = client.request(method, path, headers=headers, content=body)
         assert answer.status_code == status, answer.text
@@ -113,7 +113,7 @@ def test_only_the_stations_own_pages_are_answered(
 
 
 def test_from_another_computer_the_token_of_the_link_is_needed(operation: Operation) -> None:
-    app = make_app(operation, names_of_host("10.0.0.5", 8765), "secret")
+    app = make_app(operation, list_names_of_host("10.0.0.5", 8765), "secret")
     with TestClient(app, base_url="http://10.0.0.5:8765", follow_redirects=False) as client:
         for wrong in ("/", "/?token=", "/?token=secreT", "/api/state", "/api/state?token=secret"):
             assert client.get(wrong).status_code == 401
@@ -166,7 +166,7 @@ def test_what_people_decide_stays_and_what_is_taken_again_begins_anew(operation:
     day.decide("anna", {"decision": "discard", "note": "=HYPERLINK(1)<b>"})
     again = Day(out)
     assert (again.row("anna")["decision"], again.row("anna")["grade"]) == ("discard", "repeat")
-    assert ",'=HYPERLINK(1)<b>," in table_csv(again.rows())
+    assert ",'=HYPERLINK(1)<b>," in format_table_csv(again.rows())
     again.take({"event": "job", "job": "b", "state": "set aside", "reason": "is a link"})
     shutil.rmtree(out / "anna")  # as `forget` does
     assert [(row["job"], row["state"]) for row in again.rows()] == [("b", "set aside")]

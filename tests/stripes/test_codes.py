@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from bodyscan.errors import BadInput
 from bodyscan.geometry.light_planes import Axis
 from bodyscan.stripes.codes import parse_stripe_code
-from bodyscan.stripes.codes.gray import Gray, bits_needed
+from bodyscan.stripes.codes.gray import Gray, count_bits
 from bodyscan.stripes.codes.phase_shift import PhaseShift
 from bodyscan.stripes.codes.stripe_index import StripeIndex
 from bodyscan.stripes.gray.bit_words import BINARY, GRAY
@@ -157,7 +157,7 @@ def test_patterns_are_stripes_that_differ_in_one_bit_from_their_neighbours(
     frames, inverses = np.split(frames, 2)
     np.testing.assert_array_equal(inverses, 255 - frames)
     assert frames.dtype == np.uint8
-    assert frames.shape == (bits_needed(stripes), 40, 41)
+    assert frames.shape == (count_bits(stripes), 40, 41)
     assert set(np.unique(frames)) <= {0, 255}
     along, across = (2, 1) if direction == "horizontal" else (1, 2)
     assert np.all(frames == frames.take([0], axis=along))

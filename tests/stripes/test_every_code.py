@@ -11,7 +11,7 @@ from stripe_rendering import Field, boundary_errors, checkered, code_light, rend
 from bodyscan.arrays import Array, Bytes, Indices
 from bodyscan.errors import DecodingFailed
 from bodyscan.geometry.light_planes import Axis
-from bodyscan.geometry.robust import robust_scale
+from bodyscan.geometry.robust import estimate_robust_scale
 from bodyscan.stripes.codes import parse_stripe_code
 from bodyscan.stripes.decoding import decode_stripes
 from bodyscan.stripes.stripe_code import StripeCode
@@ -121,8 +121,8 @@ def test_sigmas_match_errors_in_dim_light(code: Code) -> None:
     known = np.isfinite(images[3]) & np.isfinite(seen.s)
     assert known.sum() > 0.98 * np.isfinite(images[3]).sum()
     # 1 would be perfect; the variance of grey levels is found a little too large.
-    assert 0.5 < robust_scale((seen.s - images[3])[known] / seen.sigma[known]) < 1.4
-    assert 0.55 < robust_scale(boundary_errors(seen, s_at) / seen.boundary_sigma_px) < 1.4
+    assert 0.5 < estimate_robust_scale((seen.s - images[3])[known] / seen.sigma[known]) < 1.4
+    assert 0.55 < estimate_robust_scale(boundary_errors(seen, s_at) / seen.boundary_sigma_px) < 1.4
 
 
 @pytest.mark.parametrize(

@@ -118,5 +118,5 @@ def test_a_name_that_is_taken_is_refused() -> None:
         codes.register(Another)
     with pytest.raises(ValueError, match="kind 'pattern' is already registered"):
         codes.register(Clash)
-    assert Clash.kinds[0] not in codes.image_kinds()
+    assert Clash.kinds[0] not in codes.list_image_kinds()
     assert issubclass(Clash, StripeCode)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from bodyscan.fusion.quadratic_fit import noise_gain, window_basis
+from bodyscan.fusion.quadratic_fit import compute_noise_gain, make_window_basis
 from bodyscan.stripes.phase.decoding import (
     CORRELATION_PX,
     PhaseOrder,
@@ -134,14 +134,14 @@ def test_a_fit_over_many_pixels_is_nearly_as_noisy_as_before_and_its_sigma_says_
     reach: int,
 ) -> None:
     """Found by the spread of fits to smoothed noise; a triangle of correlation is right to 6 %."""
-    basis = window_basis(reach)
+    basis = make_window_basis(reach)
     weights = np.linalg.solve(basis.T @ basis, basis.T)[0].reshape(2 * reach + 1, -1)
     noise = np.random.default_rng(5).normal(0.0, 0.1, (600, 600)).astype(np.float32)
     smooth, sigma = smooth_phase(noise, np.full_like(noise, 0.1))
     fits = cv2.filter2D(smooth, -1, weights)[9:-9, 9:-9]
     claimed = (
         sigma[300, 300]
-        * noise_gain(reach, (CORRELATION_PX, CORRELATION_PX))
+        * compute_noise_gain(reach, (CORRELATION_PX, CORRELATION_PX))
         * np.linalg.norm(weights)
     )
     assert claimed == pytest.approx(np.std(fits), rel=0.06)

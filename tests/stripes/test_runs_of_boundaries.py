@@ -18,9 +18,9 @@ from bodyscan.stripes.albedo_edges import (
 from bodyscan.stripes.boundaries import Boundaries, find_boundaries
 from bodyscan.stripes.scan_lines import ScanLines
 from bodyscan.stripes.stripe_coordinates import (
-    correlation_along_lines,
     estimate_scatter,
     interpolate_stripes,
+    measure_correlation,
     smooth_runs,
 )
 
@@ -286,11 +286,11 @@ def test_correlation_length_of_noise_along_lines(width: float) -> None:
         boundaries = run(even + 0.05 * rng.normal(size=len(index)), index, 0.05)
         s, _ = interpolate_stripes(boundaries, np.tile(codes, (2, 1)), np.ones((2, WIDTH), bool))
         off.append(s[1, 20:80] - (X[20:80] / width - 1))
-    alike = correlation_along_lines(boundaries)
+    alike = measure_correlation(boundaries)
     seen = np.array([np.mean([o[: 60 - k] * o[k:] for o in off]) for k in range(16)])
     line = np.maximum(0.0, 1.0 - np.arange(16) / alike)
     np.testing.assert_allclose(seen / seen[0], line, atol=0.16)
-    assert correlation_along_lines(run(even[:1], index[:1])) == 0.0
+    assert measure_correlation(run(even[:1], index[:1])) == 0.0
 
 
 def boundaries(count: int, *, claimed: float, line: int | None = None) -> Boundaries:

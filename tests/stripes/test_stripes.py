@@ -18,7 +18,7 @@ from stripe_rendering import (
 
 from bodyscan.arrays import Array, Bytes
 from bodyscan.boards.detection import find_boards
-from bodyscan.geometry.robust import robust_scale
+from bodyscan.geometry.robust import estimate_robust_scale
 from bodyscan.rig.board import Board
 
 
@@ -133,8 +133,8 @@ def test_real_stripes_on_a_real_board_are_smooth(captures: Path, pose: int) -> N
     stray_px = (index - design @ fitted) * 1.78
     # A plane lit by a projector: stripes 1.78 px wide. Measured 0.04 to 0.1 px, which is what the
     # sigmas say, in images whose finest stripes have only a fifth to a third of the full contrast.
-    assert robust_scale(stray_px) < 0.13
-    assert 0.7 < robust_scale(stray_px / sigma) < 1.4
+    assert estimate_robust_scale(stray_px) < 0.13
+    assert 0.7 < estimate_robust_scale(stray_px / sigma) < 1.4
 
 
 def test_stripes_that_end_and_begin_again_are_not_joined() -> None:

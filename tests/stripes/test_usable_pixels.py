@@ -14,8 +14,8 @@ from bodyscan.stripes.stripe_map import find_whole_numbers
 from bodyscan.stripes.usable_pixels import (
     find_code_jumps,
     find_half_covered_pixels,
+    find_min_contrast,
     find_usable_pixels,
-    min_contrast,
 )
 
 NAN = np.float32(np.nan)
@@ -71,8 +71,8 @@ def test_usable_pixels_have_contrast_and_are_not_saturated() -> None:
     assert not seen(100.4, 100.0, np.float32, variance=0.01)
     assert seen(253, 100, np.uint8)
     assert not seen(254, 100, np.uint8)
-    assert min_contrast(np.dtype(np.uint8)) == 4.0
-    assert min_contrast(np.dtype(np.float32)) == 0.0
+    assert find_min_contrast(np.dtype(np.uint8)) == 4.0
+    assert find_min_contrast(np.dtype(np.float32)) == 0.0
 
 
 def test_codes_that_were_not_projected_are_unusable() -> None:

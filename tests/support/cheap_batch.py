@@ -13,7 +13,7 @@ from typing import Any
 import cheap_job
 
 from bodyscan.errors import BodyscanError
-from bodyscan.files.hashing import file_hash, list_files
+from bodyscan.files.hashing import hash_file, list_files
 from bodyscan.jobs.job import Job, find_jobs
 from bodyscan.jobs.pipeline import load_pipeline
 
@@ -66,4 +66,4 @@ def results(out: Path) -> dict[str, str]:
     """The hash of every result and manifest; states, logs and locks tell of times and attempts."""
     running = {"state.json", "log.txt", "lock", "batch.lock", "summary.csv", "job.json", "was here"}
     paths = [path for path in list_files(out) if path.name not in running]
-    return {str(path.relative_to(out)): file_hash(path) for path in paths}
+    return {str(path.relative_to(out)): hash_file(path) for path in paths}

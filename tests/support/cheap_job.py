@@ -15,7 +15,7 @@ from pathlib import Path
 
 from bodyscan.errors import BodyscanError
 from bodyscan.jobs.job import Job
-from bodyscan.jobs.stages import Stage, results_of
+from bodyscan.jobs.stages import Stage, list_results_of
 from bodyscan.jobs.worker import main
 from bodyscan.progress import Progress
 from bodyscan.verdict import Announce, Verdict
@@ -69,7 +69,7 @@ def _do(job: Job) -> None:
 
 def kinds(scan_version: int = 1) -> dict[str, tuple[Stage, ...]]:
     made = Stage("scan", scan_version, ("fusion",), inputs, scan)
-    return {"fuse": (made, Stage("export", 1, ("export",), results_of("scan"), export))}
+    return {"fuse": (made, Stage("export", 1, ("export",), list_results_of("scan"), export))}
 
 
 def batch(scans: Path, out: Path, workers: int) -> int:

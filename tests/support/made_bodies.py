@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.mesh.body import BodyCloud, BodyMesh
-from bodyscan.mesh.topology import vertex_normals
+from bodyscan.mesh.topology import compute_vertex_normals
 
 
 def cloud_of(points: np.ndarray, normals: np.ndarray, sigma_mm: float = 0.1) -> BodyCloud:
@@ -37,7 +37,7 @@ def mesh_of(
     return BodyMesh(
         np.asarray(vertices, float),
         np.asarray(faces, np.int64),
-        vertex_normals(vertices, faces),
+        compute_vertex_normals(vertices, faces),
         np.broadcast_to(np.asarray(colours), (len(vertices), 3)).astype(np.uint8),
         sigma,
         np.isnan(sigma)[faces].any(axis=1) if filled is None else filled,

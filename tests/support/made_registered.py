@@ -12,7 +12,7 @@ from bodyscan.body_model.fitting import FittedBody
 from bodyscan.body_model.registered import RegisteredBody
 from bodyscan.body_model.template import BodyShapeAndPose, PosedBody, load_template, pose_body
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.mesh.topology import vertex_normals
+from bodyscan.mesh.topology import compute_vertex_normals
 
 TEMPLATE = load_template()
 
@@ -37,7 +37,7 @@ def make_body(
     centres = vertices[rng.integers(0, len(vertices), 80)]
     near = np.exp(-((vertices[:, None] - centres) ** 2).sum(axis=2) / (2.0 * 60.0**2))
     bumps = near @ rng.normal(size=80)
-    normals = vertex_normals(vertices, TEMPLATE.faces)
+    normals = compute_vertex_normals(vertices, TEMPLATE.faces)
     vertices = vertices + (bumps_mm * bumps / bumps.std())[:, None] * normals
     shift = -np.append(vertices[:, :2].mean(axis=0), vertices[:, 2].min())
     posed = PosedBody(posed.vertices + shift, posed.rotations, posed.joints + shift)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from bodyscan.fusion.meshing import attach_attributes, closed_surface
+from bodyscan.fusion.meshing import attach_attributes, make_closed_surface
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.settings import MeshSettings
 
 
 def mesh(cloud: BodyCloud, settings: MeshSettings, *seen: Any) -> BodyMesh:
     """seen: range images as measured, and their poses."""
-    return attach_attributes(*closed_surface(cloud, settings, *seen), cloud, settings.reach_mm)
+    return attach_attributes(*make_closed_surface(cloud, settings, *seen), cloud, settings.reach_mm)

@@ -8,14 +8,14 @@ from dataclasses import replace
 import numpy as np
 
 from bodyscan.arrays import Array
-from bodyscan.boards.board_layout import corner_points
+from bodyscan.boards.board_layout import compute_corner_points
 from bodyscan.boards.view import BoardView
-from bodyscan.calibration.board_views import LocatedView, PlanarView, board_symmetries
+from bodyscan.calibration.board_views import LocatedView, PlanarView, find_board_symmetries
 from bodyscan.calibration.camera import estimate_pose, locate_board, locate_boards
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.opencv import Radial
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.geometry.uncertainty import position_sigma
+from bodyscan.geometry.uncertainty import compute_position_sigma
 from bodyscan.registration.rig_solve import RigSolution
 from bodyscan.rig.board import Board
 from bodyscan.rig.pair import NominalPose
@@ -86,7 +86,7 @@ def centre_errors(
     return {
         name: (
             pose.translation - placings[name].translation,
-            position_sigma(placed.covariance, name, pose.translation),
+            compute_position_sigma(placed.covariance, name, pose.translation),
         )
         for name, pose in placed.rig_from_camera.items()
     }
@@ -140,7 +140,7 @@ def ring_views(
 ) -> tuple[list[LocatedView], dict[tuple[str, str], RigidTransform]]:
     """What each camera sees of each shot, located with the true camera; poses: of the shots' boards."""
     rng = np.random.default_rng(seed)
-    points = corner_points(board)
+    points = compute_corner_points(board)
     per_face = len(points) // board.faces
     seen: list[tuple[str, PlanarView, tuple[RigidTransform, ...]]] = []
     truth = {}
@@ -164,7 +164,7 @@ def ring_views(
             symmetries: tuple[RigidTransform, ...] = (RigidTransform.identity(),)
             if board.kind == "checkerboard":
                 # As a detector would: whichever end, and always as if it were the front.
-                symmetries = board_symmetries(board)
+                symmetries = find_board_symmetries(board)
                 label = symmetries[rng.integers(len(symmetries))]
                 if abs(label.inverse().apply(corners)[0, 2]) > 1e-9:
                     label = next(
@@ -196,7 +196,9 @@ def _located(
 
 def as_found(views: Sequence[LocatedView]) -> list[BoardView]:
     """The same views of CHARUCO as a detector gives them: corners by number, no pose."""
-    corners = {tuple(p): k for k, p in enumerate(np.round(corner_points(CHARUCO), 6).tolist())}
+    corners = {
+        tuple(p): k for k, p in enumerate(np.round(compute_corner_points(CHARUCO), 6).tolist())
+    }
     ids = [[corners[tuple(p)] for p in np.round(view.points, 6).tolist()] for view in views]
     return [
         BoardView(view.pair, view.shot, view.board, np.array(own), view.pixels)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from ring import CHARUCO, looking_at, ring_rig
 
-from bodyscan.boards.board_layout import corner_points, corners_per_face
+from bodyscan.boards.board_layout import compute_corner_points, count_corners_per_face
 from bodyscan.boards.view import BoardView
 from bodyscan.captures.folder import Captures, ImageSequence
 from bodyscan.geometry.camera import Camera
@@ -57,7 +57,7 @@ def seen_boards(
         angle = np.radians(12.0 * (k - 0.5 * (cameras - 1)))
         position = [1300.0 * np.cos(angle), 1300.0 * np.sin(angle), 1000.0 + 150.0 * (k % 2)]
         placings[f"c{k + 1}"] = looking_at(position, [0.0, 0.0, 1000.0])
-    corners = corner_points(CHARUCO)[: corners_per_face(CHARUCO)]
+    corners = compute_corner_points(CHARUCO)[: count_corners_per_face(CHARUCO)]
     to_middle = RigidTransform(np.eye(3), -corners.mean(axis=0))
     upright = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
     for number in range(shots):

@@ -13,7 +13,7 @@ from bodyscan.simulation.layout import build_mirror
 from bodyscan.simulation.lens import TrueCamera
 from bodyscan.simulation.projector import MirrorProjector
 from bodyscan.simulation.rays import View
-from bodyscan.simulation.scene import Surface, grid_surface
+from bodyscan.simulation.scene import Surface, build_grid_surface
 from bodyscan.simulation.settings import Optics, Projection
 
 CAMERA = TrueCamera(190.0, 190.6, -0.1, 81.0, 62.5, -0.1, 0.05, 160, 128)
@@ -35,7 +35,7 @@ def projector(
 
 def wall(z: float, size: float = 3000.0, **more: Any) -> Surface:
     corner = np.array([-size / 2, -size / 2, z])
-    return grid_surface(corner, np.array([size, 0, 0]), np.array([0, size, 0]), **more)
+    return build_grid_surface(corner, np.array([size, 0, 0]), np.array([0, size, 0]), **more)
 
 
 def view(optics: Optics = SHARP) -> View:

@@ -15,7 +15,7 @@ from bodyscan.calibration.boundary_points import BoardBoundaries
 from bodyscan.captures.folder import Captures, open_captures
 from bodyscan.cli.main import app
 from bodyscan.rig.rig import Rig, load_rig
-from bodyscan.simulation import settings_for, simulate
+from bodyscan.simulation import compose_settings, simulate
 from bodyscan.simulation.settings import Person
 from bodyscan.workflows.decode import decode_on_boards
 from bodyscan.workflows.find_boards import find_all_boards
@@ -97,7 +97,7 @@ def simulate_subject(
 ) -> None:
     """Simulate the small rig, with 2 x 2 rays a pixel for the simulator's 3 x 3: less than half the
     time, and the corners are found as well."""
-    settings = settings_for("mirror")
+    settings = compose_settings("mirror")
     settings = replace(
         settings, optics=replace(settings.optics, samples=2), person=person or settings.person
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from bodyscan.arrays import Array, Indices
-from bodyscan.evaluation.surface import covered_spots, sample_surface
+from bodyscan.evaluation.surface import find_covered_spots, sample_surface
 
 
 def coverage(
@@ -17,6 +17,6 @@ def coverage(
     samples: int = 200_000,
     spacing_mm: float = 2.0,
 ) -> float:
-    """Fraction of a surface's area that the points cover, see `covered_spots`."""
+    """Fraction of a surface's area that the points cover, see `find_covered_spots`."""
     spots, normals = sample_surface(vertices, faces, samples)
-    return float(np.mean(covered_spots(points, spots, normals, within_mm, spacing_mm)))
+    return float(np.mean(find_covered_spots(points, spots, normals, within_mm, spacing_mm)))

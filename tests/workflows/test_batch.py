@@ -12,7 +12,7 @@ import pytest
 from small_workspace import PROJECT, Workspace, run
 from typer.testing import Result
 
-from bodyscan.files.hashing import file_hash, list_files
+from bodyscan.files.hashing import hash_file, list_files
 
 SMALL = ("--set", "fusion.points=20000", "--set", "mesh.depth=6", "--set", "export.formats=glb")
 ODD = "б 'q\"\n"
@@ -124,7 +124,7 @@ def test_the_same_images_give_the_same_bytes(day: Path, night: tuple[Result, Res
     odd = next((day / "out").glob("q-*"))
     for stage in ("scan", "export", "report"):
         one, other = (
-            {p.name: file_hash(p) for p in list_files(day / "out" / job / stage)}
+            {p.name: hash_file(p) for p in list_files(day / "out" / job / stage)}
             for job in ("anna", odd.name)
         )
         assert one == other
@@ -167,7 +167,7 @@ def test_rigs_are_calibrated_in_batches(example: Path, tmp_path: Path) -> None:
     made = tmp_path / "out" / "small" / "calibration"
     assert (made / "calibration.json").exists()  # its notes name images by path, so it differs
     name = "calibration.npz"
-    assert file_hash(made / name) == file_hash(example / "made" / "calibration" / name)
+    assert hash_file(made / name) == hash_file(example / "made" / "calibration" / name)
     assert list((tmp_path / "out" / "small" / "rig").iterdir())
     assert events(batch(tmp_path, "--json", pipeline="calibrate"))[-1]["ran"] == 0
 

@@ -14,7 +14,7 @@ from stripe_rendering import code_light, render
 
 from bodyscan.arrays import Array
 from bodyscan.boards.view import BoardView
-from bodyscan.calibration.boundary_points import boundaries_near, compute_box, crop_around
+from bodyscan.calibration.boundary_points import compute_box, crop_around, select_boundaries_near
 from bodyscan.captures.folder import ImageSequence, open_scan
 from bodyscan.errors import BadInput, BodyscanError, CaptureError, DecodingFailed, ImageError
 from bodyscan.geometry.camera import Camera
@@ -24,7 +24,7 @@ from bodyscan.rig.frame_names import FrameNames
 from bodyscan.rig.rig import Rig, load_rig
 from bodyscan.stripes.codes.gray import Gray
 from bodyscan.workflows import decode, range_images
-from bodyscan.workflows.decode import decode_sequence, describe_failures, fault_notes
+from bodyscan.workflows.decode import decode_sequence, describe_failures, list_fault_notes
 from bodyscan.workflows.range_images import reconstruct_range_images, reconstruct_sequence
 from bodyscan.workflows.scan_person import require_one_moment
 
@@ -86,8 +86,8 @@ def test_a_crop_shows_the_same_boundaries_as_the_whole(tmp_path: Path) -> None:
     box = compute_box(view)
     crop = crop_around([box])
     assert crop == (slice(15, 116), slice(20, 181))  # half a corner box more on each side
-    whole = boundaries_near(decode_sequence(sequence, rig.pairs[0]), box)
-    cut = boundaries_near(decode_sequence(sequence, rig.pairs[0], crop=crop), box, crop)
+    whole = select_boundaries_near(decode_sequence(sequence, rig.pairs[0]), box)
+    cut = select_boundaries_near(decode_sequence(sequence, rig.pairs[0], crop=crop), box, crop)
     inside = np.all((whole.pixels > [22, 17]) & (whole.pixels < [178, 113]), axis=1)
     assert inside.sum() > 1500
     found = {(i, round(v)): u for i, (u, v) in zip(cut.index, cut.pixels, strict=True)}
@@ -125,7 +125,7 @@ def test_a_shot_without_its_crossing_images_keeps_the_others(tmp_path: Path) -> 
     known = np.isfinite(found.s)
     assert known.mean() > 0.9
     assert np.median(np.abs(found.s - s)[known]) < 0.1  # stripes; they are 3 pixels wide
-    (note,) = fault_notes({sequence: found.faults})
+    (note,) = list_fault_notes({sequence: found.faults})
     assert "row0.png" in note
     scan, projector = tmp_path / "scan", rig.pairs[0].projector
     assert projector is not None

@@ -16,7 +16,7 @@ from ring import board_poses, ring_of_cameras
 from small_workspace import run
 
 from bodyscan.arrays import Array
-from bodyscan.boards.board_layout import corner_points
+from bodyscan.boards.board_layout import compute_corner_points
 from bodyscan.boards.detection import find_boards
 from bodyscan.captures.check import check
 from bodyscan.errors import BodyscanError, CaptureError
@@ -45,7 +45,7 @@ def seen_corners(
             forward = placings[name].rotation[:, 2] if behind else forward
             ahead = float(camera_from_board.rotation[:, 2] @ (placings[name].rotation.T @ forward))
             ahead = abs(ahead) if behind else ahead
-            pixels = camera.project(camera_from_board.apply(corner_points(board)))
+            pixels = camera.project(camera_from_board.apply(compute_corner_points(board)))
             inside = np.all((pixels > 5) & (pixels < [1275, 1019]))
             if ahead > 0.4 and inside:
                 found[f"/elsewhere/{name}/s{number:02}.png"] = pixels + rng.normal(

@@ -12,7 +12,7 @@ from seen_boards import SeenBoards, seen_boards
 from small_workspace import run
 from verdict_given import verdict_given
 
-from bodyscan.files.hashing import file_hash
+from bodyscan.files.hashing import hash_file
 from bodyscan.fusion import verdict
 from bodyscan.fusion.storage import Scan, load_scan, make_room
 from bodyscan.registration.storage import load_calibration
@@ -120,7 +120,7 @@ def test_a_picture_that_cannot_be_drawn_costs_itself_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scan = make_scan(tmp_path / "scan")
-    before = {name: file_hash(scan.folder / name) for name in ("cloud.ply", "mesh.ply")}
+    before = {name: hash_file(scan.folder / name) for name in ("cloud.ply", "mesh.ply")}
     monkeypatch.setattr(pictures, "draw_mesh", broken)
     every = pictures.draw_pictures(scan.cloud), pictures.draw_pictures(scan.mesh)
     drawn = pictures.write_pictures(every, scan.folder)

@@ -23,7 +23,7 @@ from small_workspace import run
 
 from bodyscan.captures.folder import ImageSequence, open_scan
 from bodyscan.errors import ImageError
-from bodyscan.files.hashing import file_hash, list_files
+from bodyscan.files.hashing import hash_file, list_files
 from bodyscan.workflows.range_images import Preparation
 
 SMALL = ("--set", "fusion.points=20000", "--set", "mesh.depth=6", "--set", "export.formats=glb")
@@ -103,7 +103,7 @@ def test_what_arrives_is_fused_as_a_batch_would_and_never_twice(example: Path, d
 
 def _bytes(folder: Path) -> dict[str, str]:
     paths = [path for path in list_files(folder) if path.name not in OWN | {"job.json"}]
-    return {str(path.relative_to(folder)): file_hash(path) for path in paths}
+    return {str(path.relative_to(folder)): hash_file(path) for path in paths}
 
 
 def test_pairs_that_come_one_by_one_are_decoded_side_by_side(

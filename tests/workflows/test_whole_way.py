@@ -14,9 +14,13 @@ from small_workspace import COARSE, Workspace, run
 
 import bodyscan
 from bodyscan.arrays import Array
-from bodyscan.evaluation.surface import deviation, normalize_errors, signed_distances
+from bodyscan.evaluation.surface import (
+    compute_signed_distances,
+    normalize_errors,
+    summarize_deviation,
+)
 from bodyscan.fusion.storage import load_scan
-from bodyscan.geometry.robust import rms_length
+from bodyscan.geometry.robust import compute_rms_length
 from bodyscan.mesh.ply import read_ply_mesh
 from bodyscan.mesh.topology import compute_topology
 from bodyscan.registration.rig_calibration import RigCalibration
@@ -42,7 +46,7 @@ def test_all_pairs_are_calibrated(workspace: Workspace, calibration: RigCalibrat
 def test_cameras_stand_where_they_stand(workspace: Workspace, calibration: RigCalibration) -> None:
     rig = compare_rig(calibration, load_truth(workspace.folder / "truth"))
     # The bound for 12 pairs at full size; half the pixels and a quarter of the shots here.
-    assert rms_length(rig.centres_mm) < 0.6
+    assert compute_rms_length(rig.centres_mm) < 0.6
     held = rig.names.index("p1-2")
     assert np.all(np.abs(rig.centres_mm[held]) < 1e-9)
     others = [k for k in range(len(rig.names)) if k != held]
@@ -55,12 +59,12 @@ def distances(points: Array, workspace: Workspace) -> Array:
     truth = load_truth(workspace.folder / "truth")
     assert truth.vertices is not None
     assert truth.faces is not None
-    return signed_distances(points, truth.vertices, truth.faces)
+    return compute_signed_distances(points, truth.vertices, truth.faces)
 
 
 def test_the_cloud_lies_on_the_body(workspace: Workspace) -> None:
     stored = load_scan(workspace.folder / "scan")
-    found = deviation(distances(stored.cloud.points, workspace))
+    found = summarize_deviation(distances(stored.cloud.points, workspace))
     # The bounds for the first version.
     assert found.median_mm < 0.4
     assert found.rms_mm < 1.0
@@ -107,7 +111,7 @@ def test_cameras_that_see_colour_give_the_body_one_colour(
     result = run("scan", tmp_path / "person", *at, "--points", 110_000, *COARSE)
     assert result.exit_code == 0, result.output
     stored = load_scan(tmp_path / "scan")
-    assert deviation(distances(stored.cloud.points, workspace)).median_mm < 0.4
+    assert summarize_deviation(distances(stored.cloud.points, workspace)).median_mm < 0.4
     expected = np.exp(np.mean(np.log(list(balance.values())), axis=0))
     for colours in (stored.cloud.colours, stored.mesh.colours):
         bright = colours[colours.min(axis=1) > 20].astype(float)

@@ -65,12 +65,12 @@ class _Scene:
         self._seen.add(pair)
 
     def _render(self, shot: str) -> None:
-        from bodyscan.simulation import settings_for, simulate, simulate_board
+        from bodyscan.simulation import compose_settings, simulate, simulate_board
         from bodyscan.simulation.files import compute_person_times
         from bodyscan.simulation.simulate import CALIBRATION, PERSON, PERSON_SHOT
 
         kind, rig = self._kind, self._place.rig
-        settings = settings_for("mirror", preset=kind.preset, subject=kind.person)
+        settings = compose_settings("mirror", preset=kind.preset, subject=kind.person)
         settings = replace(settings, optics=replace(settings.optics, samples=kind.samples))
         out, rig_file = self._scratch / f"shot-{self._number}", self._scratch / "rig.yaml"
         write_rig(rig_file, rig)

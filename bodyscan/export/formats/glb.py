@@ -18,7 +18,7 @@ from bodyscan.export.formats import BodyFormat
 from bodyscan.export.texture import Texture
 from bodyscan.files.atomic import atomic_replacement
 from bodyscan.mesh.body import BodyCloud, BodyMesh
-from bodyscan.mesh.topology import vertex_normals
+from bodyscan.mesh.topology import compute_vertex_normals
 
 
 @dataclass(eq=False)
@@ -82,9 +82,9 @@ def write_glb(path: Path, body: BodyCloud | BodyMesh, texture: Texture | None = 
     """
     points = body.points if isinstance(body, BodyCloud) else body.vertices
     attributes = {
-        "POSITION": _y_up(points) / 1000.0,
-        "NORMAL": _y_up(body.normals),
-        "COLOR_0": _linear(body.colours),
+        "POSITION": _turn_y_up(points) / 1000.0,
+        "NORMAL": _turn_y_up(body.normals),
+        "COLOR_0": _linearize_colours(body.colours),
     }
     if body.regions is not None:
         attributes["_REGION"] = body.regions
@@ -111,9 +111,9 @@ def write_skinned_glb(path: Path, body: SkinnedBody, texture: Texture | None = N
     weights = np.take_along_axis(body.weights, four, axis=1).astype("<f4")
     buffer = _Buffer()
     attributes = {
-        "POSITION": _y_up(body.rest_vertices) / 1000.0,
-        "NORMAL": _y_up(vertex_normals(body.rest_vertices, body.mesh.faces)),
-        "COLOR_0": _linear(body.mesh.colours),
+        "POSITION": _turn_y_up(body.rest_vertices) / 1000.0,
+        "NORMAL": _turn_y_up(compute_vertex_normals(body.rest_vertices, body.mesh.faces)),
+        "COLOR_0": _linearize_colours(body.mesh.colours),
         "_FILLED": np.isnan(body.mesh.sigma_mm),
         "_PART": body.parts,
     }
@@ -125,7 +125,7 @@ def write_skinned_glb(path: Path, body: SkinnedBody, texture: Texture | None = N
         "WEIGHTS_0": buffer.add(weights[at], "VEC4"),
     }
     inverse = np.tile(np.eye(4, dtype="<f4"), (count, 1, 1))
-    inverse[:, 3, :3] = -_y_up(body.rest_joints) / 1000.0  # matrices are stored by columns
+    inverse[:, 3, :3] = -_turn_y_up(body.rest_joints) / 1000.0  # matrices are stored by columns
     skin = {
         "joints": list(range(1, count + 1)),
         "inverseBindMatrices": buffer.add(inverse, "MAT4", target=None),
@@ -135,7 +135,7 @@ def write_skinned_glb(path: Path, body: SkinnedBody, texture: Texture | None = N
     nodes = [{"mesh": 0, "skin": 0, "name": "body"}, *_list_bones(body)]
     for landmark in body.landmarks:
         nodes[1 + landmark.joint].setdefault("children", []).append(len(nodes))
-        place = _y_up(landmark.offset[None])[0] / 1000.0
+        place = _turn_y_up(landmark.offset[None])[0] / 1000.0
         extras = {"landmark": landmark.name, "sigma_mm": landmark.sigma_mm, "found": landmark.found}
         nodes.append({"name": landmark.name, "translation": place.tolist(), "extras": extras})
     buffer.write(path, {
@@ -154,8 +154,8 @@ def _list_bones(body: SkinnedBody) -> list[dict[str, Any]]:
         place = body.root if parent < 0 else body.rest_joints[joint] - body.rest_joints[parent]
         bones.append({
             "name": body.joint_names[joint],
-            "translation": (_y_up(place[None])[0] / 1000.0).tolist(),
-            "rotation": _quaternions(body.rotations[joint : joint + 1])[0].tolist(),
+            "translation": (_turn_y_up(place[None])[0] / 1000.0).tolist(),
+            "rotation": _compute_quaternions(body.rotations[joint : joint + 1])[0].tolist(),
         })  # fmt: skip
         if parent >= 0:
             bones[parent].setdefault("children", []).append(joint + 1)
@@ -170,7 +170,7 @@ def _make_clip(buffer: _Buffer, body: SkinnedBody) -> dict[str, Any]:
     channels: list[dict[str, Any]] = []
     for joint in range(1, len(body.joint_names)):
         stood = body.rotations[joint]
-        values = _quaternions(np.stack([stood, np.zeros(3), stood])).astype("<f4")
+        values = _compute_quaternions(np.stack([stood, np.zeros(3), stood])).astype("<f4")
         output = buffer.add(values, "VEC4", target=None)
         channels.append({
             "sampler": len(samplers), "target": {"node": joint + 1, "path": "rotation"},
@@ -179,17 +179,17 @@ def _make_clip(buffer: _Buffer, body: SkinnedBody) -> dict[str, Any]:
     return {"name": "rest pose", "samplers": samplers, "channels": channels}
 
 
-def _quaternions(rotations: Array) -> Array:
+def _compute_quaternions(rotations: Array) -> Array:
     """Quaternions (N, 4), x y z w, in glTF's axes, of rotation vectors (N, 3)."""
-    return np.asarray(Rotation.from_rotvec(_y_up(rotations)).as_quat())
+    return np.asarray(Rotation.from_rotvec(_turn_y_up(rotations)).as_quat())
 
 
-def _y_up(vectors: NDArray[np.floating]) -> NDArray[np.floating]:
+def _turn_y_up(vectors: NDArray[np.floating]) -> NDArray[np.floating]:
     """Rotate vectors (N, 3) from the rig frame (x front, y left, z up) to glTF's (left, up, front)."""
     return vectors[:, [1, 2, 0]]
 
 
-def _linear(colours: Bytes) -> NDArray[np.uint16]:
+def _linearize_colours(colours: Bytes) -> NDArray[np.uint16]:
     """Convert sRGB bytes (N, 3) to linear shorts (N, 4) with alpha, glTF's vertex colours."""
     encoded = np.arange(256) / 255.0
     linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)

@@ -20,7 +20,7 @@ from bodyscan.fusion.verdict.evidence import BAND_MM, Coverage, Finding, ScanEvi
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import SKIN, BodyMesh
-from bodyscan.mesh.topology import face_normals
+from bodyscan.mesh.topology import compute_face_normals
 from bodyscan.reconstruction.range_image import RangeImage
 
 MAX_FILLED = 0.12
@@ -41,7 +41,7 @@ def measure_coverage(
     """
     sample = slice(None, None, max(1, len(mesh.faces) // 20_000))
     points = mesh.vertices[mesh.faces[sample]].mean(axis=1)
-    cross = face_normals(mesh.vertices, mesh.faces[sample])
+    cross = compute_face_normals(mesh.vertices, mesh.faces[sample])
     doubled_area = np.linalg.norm(cross, axis=1)
     normals = cross / np.maximum(doubled_area[:, None], 1e-12)
     views = [_view_points(points, normals, image, rig_from_camera[image.pair]) for image in images]

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from bodyscan.alignment.icp import Alignment
-from bodyscan.alignment.sway_prior import centre_sigmas
+from bodyscan.alignment.sway_prior import compute_centre_sigmas
 from bodyscan.arrays import Array, Mask
 from bodyscan.fusion.consistency import Contradictions
 from bodyscan.mesh.body import BodyCloud, BodyMesh
@@ -18,7 +18,7 @@ from bodyscan.mesh.slices import MeshSlicer
 from bodyscan.motion.person_alignment import PersonAlignment
 from bodyscan.motion.person_motion import PersonMotion
 from bodyscan.reconstruction.range_image import Agreement
-from bodyscan.registration.rig_calibration import NominalSize, RigCalibration, nominal_size
+from bodyscan.registration.rig_calibration import NominalSize, RigCalibration, find_nominal_size
 from bodyscan.rig.rig import Volume
 from bodyscan.settings import UseLimits
 from bodyscan.verdict import Grade
@@ -55,7 +55,8 @@ class RigEvidence:
     nominal: distances between cameras compared with their nominal positions, if known.
     cameras: positions (N, 3) of all the rig's cameras; None for all round. What none of them could
         see is no reason to repeat.
-    boards_mm: sigma of each pair's pose as calibrated, at the body's centre: see `centre_sigmas`.
+    boards_mm: sigma of each pair's pose as calibrated, at the body's centre, see
+        `compute_centre_sigmas`.
     """
 
     volume: Volume
@@ -70,9 +71,9 @@ class RigEvidence:
         return RigEvidence(
             calibration.rig.volume,
             tuple(name for name, pair in pairs.items() if pair.quality.unjudged),
-            nominal_size(calibration.rig, poses),
+            find_nominal_size(calibration.rig, poses),
             np.array([pose.translation for pose in poses.values()]),
-            centre_sigmas(calibration.covariance),
+            compute_centre_sigmas(calibration.covariance),
         )
 
 

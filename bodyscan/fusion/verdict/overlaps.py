@@ -72,12 +72,12 @@ def _compare_pairs(
         match_projected(one, other, here, there, SEAM_REACH_MM),
         match_projected(other, one, there, here, SEAM_REACH_MM),
     )
-    patches = [patch_medians(matches) for matches in both]
+    patches = [compute_patch_medians(matches) for matches in both]
     distances, sigma = (np.concatenate(part) for part in zip(*patches, strict=True))
     return Seam((one.image.pair, other.image.pair), distances, sigma)
 
 
-def patch_medians(matches: Matches) -> tuple[Array, Array]:
+def compute_patch_medians(matches: Matches) -> tuple[Array, Array]:
     """Median distances of patches of 8 matches or more, and their sigmas from the scatter."""
     x, y, z = np.floor(matches.points / PATCH_MM).astype(np.int64).T
     # 4096 patches reach from one end of any volume to the other.

@@ -16,7 +16,7 @@ from bodyscan.fusion.cleaning import find_inside
 from bodyscan.fusion.verdict.evidence import Finding, ScanEvidence
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
-from bodyscan.reconstruction.scan_volume import volume_interval
+from bodyscan.reconstruction.scan_volume import compute_volume_interval
 from bodyscan.rig.rig import Volume
 from bodyscan.verdict import LEFT_OUT
 
@@ -41,7 +41,7 @@ def find_exchanged(
     Of a pair that is right, 20 % and more of the points lie within 10 mm of what the others
     measured; of a wrong one some 5 %, by chance.
     """
-    inside = {image.pair: _points_inside(image, rig_from_camera, volume) for image in images}
+    inside = {image.pair: _select_points_inside(image, rig_from_camera, volume) for image in images}
 
     def share_near(points: Array, left_out: Collection[str]) -> float:
         rest = [inside[name] for name in inside if name not in left_out]
@@ -57,13 +57,15 @@ def find_exchanged(
     found = {}
     for one, other in permutations(suspects, 2):
         image = read_as(one, other)
-        points = _points_inside(image, rig_from_camera, volume) if image else np.empty((0, 3))
+        points = (
+            _select_points_inside(image, rig_from_camera, volume) if image else np.empty((0, 3))
+        )
         if share_near(points, suspects) > max(0.2, 3.0 * share_near(inside[one], suspects)):
             found[one] = other
     return found if set(found) == set(found.values()) else {}
 
 
-def _points_inside(
+def _select_points_inside(
     image: RangeImage, rig_from_camera: Mapping[str, RigidTransform], volume: Volume
 ) -> Array:
     """Points (N, 3) of one pixel in 16 that are in the scan volume and not on the floor, rig frame."""
@@ -132,7 +134,7 @@ def find_misplaced(
         pose, camera = rig_from_camera[image.pair], image.camera
         axes = np.linspace(0.0, camera.width - 1.0, 20), np.linspace(0.0, camera.height - 1.0, 20)
         rays = camera.rays(np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2))
-        enter, leave = volume_interval(rays, pose, volume, raised_mm=0.0)
+        enter, leave = compute_volume_interval(rays, pose, volume, raised_mm=0.0)
         causes = (
             "Possible causes: its pose is wrong; its images are another pair's. Calibrate again"
         )
@@ -222,13 +224,17 @@ def find_floor(
     images: as decoded, not cleaned.
     rig_from_camera: as calibrated; a floor does not sway.
     """
-    heights = [_floor_heights(image, rig_from_camera[image.pair], volume) for image in images]
+    heights = [
+        _measure_floor_heights(image, rig_from_camera[image.pair], volume) for image in images
+    ]
     # 300 points, of one pixel in 16, are a patch of about 10 x 10 cm.
     medians = [float(np.median(some)) for some in heights if len(some) >= 300]
     return float(np.median(medians)) if len(medians) >= 2 else None
 
 
-def _floor_heights(image: RangeImage, rig_from_camera: RigidTransform, volume: Volume) -> Array:
+def _measure_floor_heights(
+    image: RangeImage, rig_from_camera: RigidTransform, volume: Volume
+) -> Array:
     """Heights (N,) of points that face upwards near z = 0, of one pixel in 4 along each axis."""
     some = image.subsample(4)
     valid = image.valid[some]

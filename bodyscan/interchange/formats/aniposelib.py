@@ -16,7 +16,7 @@ from typing import Any
 from bodyscan.files.atomic import write_text
 from bodyscan.interchange.foreign_file import ForeignFile
 from bodyscan.interchange.found_camera import FoundCamera, FoundCameras
-from bodyscan.interchange.rig_format import RigCameras, RigFormat, opencv_lens
+from bodyscan.interchange.rig_format import RigCameras, RigFormat, describe_opencv_lens
 
 NOTE = (
     "# Pixel centres at whole numbers; x_camera = R(rotation) x_rig + translation. matrix holds the\n"
@@ -39,7 +39,7 @@ def format_tables(cameras: RigCameras, head: str, mm_a_unit: float) -> str:
     """
     text = NOTE
     for number, (name, (camera, rig_from_camera)) in enumerate(cameras.items()):
-        is_fisheye, coefficients = opencv_lens(camera)
+        is_fisheye, coefficients = describe_opencv_lens(camera)
         pose = rig_from_camera.inverse()
         values = {
             "size": [camera.width, camera.height],

@@ -21,7 +21,7 @@ from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.interchange.foreign_file import ForeignFile
 from bodyscan.interchange.found_camera import FoundCamera, FoundCameras
-from bodyscan.interchange.rig_format import RigCameras, RigFormat, opencv_lens
+from bodyscan.interchange.rig_format import RigCameras, RigFormat, describe_opencv_lens
 
 PIXEL_CENTRE = 0.5  # COLMAP's pixels have their centres at + 0.5, ours at whole numbers
 SKEW_FILE = "bodyscan.json"
@@ -111,7 +111,7 @@ def _read_gammas(folder: Path) -> dict[str, float]:
 def _find_pose(image: Any) -> RigidTransform | None:
     """Return the pose of an image; None if it has none, or its camera has none in its rig."""
     try:
-        return _transform(image.cam_from_world()) if image.has_pose else None
+        return _convert_pose(image.cam_from_world()) if image.has_pose else None
     except RuntimeError:
         return None
 
@@ -124,7 +124,7 @@ def _find_pose_in_rig(model: Any, number: int) -> RigidTransform | None:
             if rig.is_ref_sensor(sensor):
                 return RigidTransform.identity()
             pose = rig.sensor_from_rig(sensor)
-            return None if pose is None else _transform(pose)
+            return None if pose is None else _convert_pose(pose)
     return None
 
 
@@ -173,7 +173,7 @@ def _build_model(cameras: Mapping[str, tuple[Camera, RigidTransform]]) -> pycolm
 def _make_camera(camera: Camera, camera_id: int) -> pycolmap.Camera:
     centre = [camera.u0 + PIXEL_CENTRE, camera.v0 + PIXEL_CENTRE]
     # COLMAP's OPENCV is a prefix of its FULL_OPENCV, which has OpenCV's first eight coefficients.
-    is_fisheye, coefficients = opencv_lens(camera)
+    is_fisheye, coefficients = describe_opencv_lens(camera)
     lens = np.append(coefficients, np.zeros(8))[:8]
     model = "FULL_OPENCV" if lens[4:].any() else "OPENCV_FISHEYE" if is_fisheye else "OPENCV"
     return pycolmap.Camera(
@@ -189,7 +189,7 @@ def _make_rigid3d(transform: RigidTransform) -> pycolmap.Rigid3d:
     return pycolmap.Rigid3d(transform.matrix[:3])
 
 
-def _transform(pose: Any) -> RigidTransform:
+def _convert_pose(pose: Any) -> RigidTransform:
     return RigidTransform.from_matrix(pose.matrix())
 
 

@@ -18,7 +18,7 @@ from bodyscan.files.yaml_file import dump_yaml
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.interchange.foreign_file import ForeignFile, read_document
 from bodyscan.interchange.found_camera import FoundCamera, FoundCameras
-from bodyscan.interchange.rig_format import RigCameras, RigFormat, opencv_lens
+from bodyscan.interchange.rig_format import RigCameras, RigFormat, describe_opencv_lens
 
 NOTE = """\
 # Metres. Pixel centres at whole numbers. `name` is the pair's. Kalibr's cameras have no skew: shear
@@ -34,7 +34,7 @@ def write_kalibr(cameras: RigCameras, path: Path) -> Path:
     content: dict[str, Any] = {}
     before: RigidTransform | None = None
     for number, (name, (camera, rig_from_camera)) in enumerate(cameras.items()):
-        is_fisheye, coefficients = opencv_lens(camera)
+        is_fisheye, coefficients = describe_opencv_lens(camera)
         if np.any(coefficients[4:]):
             what = (
                 f"Kalibr has no lens like {camera.lens.kind!r}: its radtan ends with k1, k2, p1, p2"
@@ -85,7 +85,7 @@ def read_kalibr(path: Path) -> FoundCameras:
     return readers
 
 
-def _pose_in_first(
+def _compute_pose_in_first(
     file: ForeignFile, cameras: Mapping[str, Any], number: int
 ) -> RigidTransform | None:
     """Compute a camera's pose, `camera_from_cam0`; None if neither chain nor IMU gives it."""
@@ -93,19 +93,19 @@ def _pose_in_first(
     for k in range(1, number + 1):
         key = f"cam{k}"
         if "T_cn_cnm1" in cameras[key]:
-            step = _transform(file, cameras, key, "T_cn_cnm1")
+            step = _read_transform(file, cameras, key, "T_cn_cnm1")
             pose = step @ pose if step and pose else None
         else:
             camera_from_imu, first = (
-                _transform(file, cameras, one, "T_cam_imu")
-                or _transform(file, cameras, one, "T_imu_cam", inverse=True)
+                _read_transform(file, cameras, one, "T_cam_imu")
+                or _read_transform(file, cameras, one, "T_imu_cam", inverse=True)
                 for one in (key, "cam0")
             )
             pose = camera_from_imu @ first.inverse() if camera_from_imu and first else None
     return pose
 
 
-def _transform(
+def _read_transform(
     file: ForeignFile, cameras: Mapping[str, Any], key: str, word: str, *, inverse: bool = False
 ) -> RigidTransform | None:
     if word not in cameras[key]:
@@ -133,7 +133,7 @@ def _read_camera(file: ForeignFile, cameras: Mapping[str, Any], number: int) -> 
         matrix,
         file.lens(lens, f"{key}.distortion_coeffs", around),
         file.size(entry["resolution"], f"{key}.resolution"),
-        _pose_in_first(file, cameras, number),
+        _compute_pose_in_first(file, cameras, number),
         file.where(key),
     )
 

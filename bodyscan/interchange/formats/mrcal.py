@@ -18,7 +18,7 @@ from bodyscan.errors import BadInput, CalibrationFileError
 from bodyscan.files.atomic import write_text
 from bodyscan.interchange.foreign_file import ForeignFile
 from bodyscan.interchange.found_camera import FoundCamera, FoundCameras
-from bodyscan.interchange.rig_format import RigCameras, RigFormat, opencv_lens
+from bodyscan.interchange.rig_format import RigCameras, RigFormat, describe_opencv_lens
 
 COEFFICIENTS = {"PINHOLE": 0, "OPENCV4": 4, "OPENCV5": 5, "OPENCV8": 8, "OPENCV12": 12}
 SUFFIX = ".cameramodel"
@@ -46,7 +46,7 @@ def read_mrcal(path: Path) -> FoundCameras:
 
 
 def _format_model(name: str, camera: Any, rig_from_camera: Any) -> str:
-    is_fisheye, coefficients = opencv_lens(camera)
+    is_fisheye, coefficients = describe_opencv_lens(camera)
     rest = np.flatnonzero(coefficients)
     used = int(rest[-1]) + 1 if len(rest) else 0
     model = next((m for m, count in COEFFICIENTS.items() if count >= used), None)

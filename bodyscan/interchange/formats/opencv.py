@@ -26,7 +26,7 @@ from bodyscan.interchange.rig_format import (
     Nodes,
     RigCameras,
     RigFormat,
-    opencv_lens,
+    describe_opencv_lens,
     projector_name,
 )
 
@@ -72,7 +72,7 @@ def write_opencv(cameras: RigCameras, path: Path) -> Path:
 
 
 def _write_camera(store: Any, camera: Camera, pose: RigidTransform) -> None:
-    is_fisheye, coefficients = opencv_lens(camera)
+    is_fisheye, coefficients = describe_opencv_lens(camera)
     store.write("image_width", camera.width)
     store.write("image_height", camera.height)
     store.write("camera_matrix", camera.matrix)

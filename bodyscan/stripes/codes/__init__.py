@@ -14,11 +14,11 @@ from pydantic import BeforeValidator, SerializeAsAny, ValidationError
 from pydantic_core import InitErrorDetails
 
 from bodyscan.files.model import (
-    choice_error,
     copy_errors,
     format_alternatives,
-    problem_error,
-    unknown_key_error,
+    make_choice_error,
+    make_problem_error,
+    make_unknown_key_error,
 )
 from bodyscan.stripes.stripe_code import DEFAULT_CODE, ImageKind, StripeCode
 
@@ -31,14 +31,14 @@ def register(*codes: type[StripeCode]) -> None:
         name = code.model_fields["code"].default
         if _CODES.get(name, code) is not code:
             raise ValueError(f"there is a stripe code {name!r} already")
-        known = {kind.name: kind for kind in image_kinds()}
+        known = {kind.name: kind for kind in list_image_kinds()}
         for kind in code.kinds:
             if known.get(kind.name, kind) != kind:
                 raise ValueError(f"image kind {kind.name!r} is already registered differently")
         _CODES[name] = code
 
 
-def image_kinds() -> tuple[ImageKind, ...]:
+def list_image_kinds() -> tuple[ImageKind, ...]:
     """List the kinds of images of all codes."""
     return tuple(dict.fromkeys(kind for code in _CODES.values() for kind in code.kinds))
 
@@ -53,14 +53,14 @@ def parse_stripe_code(keys: Any) -> Any:
         return keys
     name = keys.get("code", DEFAULT_CODE)
     code = _CODES.get(name) if isinstance(name, str) else None
-    errors = [] if code else [choice_error("code", str(name), _CODES)]
+    errors = [] if code else [make_choice_error("code", str(name), _CODES)]
     fields = (code or StripeCode).model_fields
     common = StripeCode.model_fields
     keys, crossing, crossing_errors = _split_crossing(keys)
     errors += crossing_errors
     for key, value in keys.items():
         if key not in fields and value is not None:
-            errors += _key_errors(key, code, fields)
+            errors += _explain_key(key, code, fields)
     values = {
         key: value
         for key, value in keys.items()
@@ -92,7 +92,7 @@ def _split_crossing(
         return others, given, []
     if not isinstance(given, dict):
         wrong = "must be a mapping (key: value): those of the projector's keys that differ"
-        return others, None, [problem_error((("crossing",), wrong))]
+        return others, None, [make_problem_error((("crossing",), wrong))]
     name, shared = others.get("code", DEFAULT_CODE), {}
     if given.get("code", name) == name:
         not_shared = ("stripes", "direction", "first_code")
@@ -108,18 +108,18 @@ def _split_crossing(
         return others, None, [{**error, "loc": ("crossing", *error["loc"])} for error in errors]
 
 
-def _key_errors(
+def _explain_key(
     key: str, code: type[StripeCode] | None, fields: dict[str, Any]
 ) -> list[InitErrorDetails]:
     """Explain why a key does not belong to a code; nothing for a key that an unknown code may take."""
     takers = [name for name, other in _CODES.items() if key in other.model_fields]
     if not takers:
-        return [unknown_key_error(key, fields)]
+        return [make_unknown_key_error(key, fields)]
     if code is None:
         return []
     here = code.model_fields["code"].default
     wanted = format_alternatives(takers).replace("'", "")
-    return [problem_error(((key,), f"is for code: {wanted} (the code here is {here})"))]
+    return [make_problem_error(((key,), f"is for code: {wanted} (the code here is {here})"))]
 
 
 AnyStripeCode = Annotated[SerializeAsAny[StripeCode], BeforeValidator(parse_stripe_code)]

@@ -27,7 +27,7 @@ INVERSE = ImageKind("inverse", "bit{bit:02d}-inverse", "bit", max_count=16)
 MAX_CODES = 1 << PATTERN.max_count
 
 
-def bits_needed(words: int) -> int:
+def count_bits(words: int) -> int:
     """Compute the number of bits, and so of patterns, for this many words (>= 2): ceil(log2(words))."""
     return max(1, (words - 1).bit_length())
 
@@ -54,7 +54,7 @@ class _NumberedStripes(StripeCode):
     @property
     def bits(self) -> int:
         """Number of patterns."""
-        return bits_needed(self.first_code + self.stripes)
+        return count_bits(self.first_code + self.stripes)
 
     @property
     @abstractmethod

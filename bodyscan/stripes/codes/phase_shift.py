@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 from pydantic import Field
 
 from bodyscan.files.model import Problem
-from bodyscan.stripes.codes.gray import INVERSE, PATTERN, bits_needed
+from bodyscan.stripes.codes.gray import INVERSE, PATTERN, count_bits
 from bodyscan.stripes.stripe_code import ImageKind, SequenceImages, Shift, StripeCode, Wave
 
 if TYPE_CHECKING:
@@ -118,7 +118,7 @@ class PhaseShift(StripeCode):
         phases = {PHASE: sum(wave.steps for wave in self.waves)}
         if not self.needs_gray:
             return phases
-        bits = bits_needed(self.half_periods)
+        bits = count_bits(self.half_periods)
         inverse = {INVERSE: bits} if self.inverses else {}
         return {PATTERN: bits} | inverse | phases
 
@@ -143,7 +143,7 @@ class PhaseShift(StripeCode):
                 for wave in self.waves
             ])  # fmt: skip
         halves = np.floor(s * (2.0 / self._lengths[0])).astype(np.int64)
-        bright = GRAY.bits(halves, bits_needed(self.half_periods))
+        bright = GRAY.bits(halves, count_bits(self.half_periods))
         return bright if kind == PATTERN else 1.0 - bright
 
     def decode(self, images: SequenceImages, limits: StripeLimits | None) -> StripeMap:

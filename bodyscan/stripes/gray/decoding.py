@@ -19,9 +19,9 @@ from bodyscan.stripes.gray.sequence_checks import check_exposure, check_words, r
 from bodyscan.stripes.grey_noise import measure_noise
 from bodyscan.stripes.scan_lines import ScanLines
 from bodyscan.stripes.stripe_coordinates import (
-    correlation_along_lines,
     estimate_scatter,
     interpolate_stripes,
+    measure_correlation,
 )
 from bodyscan.stripes.stripe_limits import StripeLimits
 from bodyscan.stripes.stripe_map import StripeMap, assemble_map
@@ -62,7 +62,7 @@ def decode_bits(
         fill_from_codes(s, sigma, codes, coded)
     s, sigma = correct_across_lines(s, sigma, brightness, boundaries.blur2)
     result = assemble_map(images, lit, s, sigma, boundaries, stripes, beyond)
-    along = correlation_along_lines(boundaries)
+    along = measure_correlation(boundaries)
     observed = int(np.count_nonzero(white) + np.count_nonzero(coded))
     return replace(
         result,

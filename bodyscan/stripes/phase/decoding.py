@@ -49,8 +49,8 @@ from bodyscan.stripes.usable_pixels import (
     check_illumination,
     find_code_jumps,
     find_half_covered_pixels,
+    find_min_contrast,
     find_usable_pixels,
-    min_contrast,
 )
 
 CORRELATION_PX = 1.2
@@ -89,7 +89,7 @@ def decode_wave(
     phases, added = remove_added_light(phases, measured, images.dark, images.contrast, usable, 0)
     measured = measure_wave(phases, wave) if added else measured
     noise = np.sqrt(variance[np.clip(measured.mean, 0, 255).astype(np.uint8)])
-    floor = min_contrast(phases.dtype) / 2.0
+    floor = find_min_contrast(phases.dtype) / 2.0
     usable &= measured.amplitude >= np.maximum(floor, MIN_CONTRAST_TO_NOISE * noise)
     coarse = (halves.astype(np.float32) + 0.5) / 2.0
     check_phase(measured.turn, coarse, usable)
@@ -199,7 +199,7 @@ def decode_waves(
     measured = [measure_wave(stack, wave) for wave, stack, _ in each]
     brightest = lines.max(axis=0)
     contrast = np.min([2.0 * wave.amplitude for wave in measured], axis=0)
-    bright = contrast >= min_contrast(lines.dtype)
+    bright = contrast >= find_min_contrast(lines.dtype)
     variance = measure_wave_noise(measured, stacks, bright & (brightest < SATURATED))
     noise = np.sqrt(variance[np.clip(np.rint(measured[0].mean), 0, 255).astype(np.uint8)])
     bright = bright & (contrast >= np.float32(2.0 * MIN_CONTRAST_TO_NOISE) * noise)
