@@ -120,7 +120,7 @@ def test_two_people_are_told_before_there_is_a_mesh(
         assert [verdict.grade for verdict in told] == ["repeat"]
         return make_closed_surface(*about)
 
-    monkeypatch.setattr("bodyscan.workflows.scan_person.closed_surface", meshed)
+    monkeypatch.setattr("bodyscan.workflows.scan_person.make_closed_surface", meshed)
     scan = fused(photographed(both), settings=NOT_FOLLOWED, announce=listen)
     assert scan.verdict.grade == "repeat"
     assert "two bodies" in said(scan)

@@ -226,7 +226,9 @@ def test_poles_are_set_free_one_after_the_other(
     )
     monkeypatch.setattr(person_alignment, "align", aligned)
     monkeypatch.setattr(
-        person_alignment, "_connected_motions", lambda *of: dict.fromkeys(connected, np.zeros(6))
+        person_alignment,
+        "_select_connected_motions",
+        lambda *of: dict.fromkeys(connected, np.zeros(6)),
     )
     nothing: Any = None
     found = person_alignment.align_person(
@@ -258,7 +260,7 @@ def test_what_a_followed_head_moved_by_is_no_place_of_a_pair_s_own(
     monkeypatch.setattr(
         person_alignment, "estimate_motion", lambda *of: ("followed", followed, None)
     )
-    monkeypatch.setattr(person_alignment, "_connected_motions", lambda *of: {})
+    monkeypatch.setattr(person_alignment, "_select_connected_motions", lambda *of: {})
     nothing: Any = None
     first: Any = "first"
     boards = PoseCovariance(("a",), np.eye(6))

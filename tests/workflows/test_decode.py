@@ -163,7 +163,7 @@ def test_a_sequence_that_fails_is_a_note_and_notes_are_in_the_order_of_shots(
         return SimpleNamespace(faults=("an image is missing",), crossing=None)
 
     monkeypatch.setattr(decode, "decode_sequence", decoded)
-    monkeypatch.setattr(decode, "boundaries_near", lambda *_: "boundaries")
+    monkeypatch.setattr(decode, "select_boundaries_near", lambda *_: "boundaries")
     views = [BoardView(s.pair, s.shot, "board", np.arange(4), np.zeros((4, 2))) for s in sequences]
     every = decode.decode_on_boards(rig, captures, views)
     assert list(every.value) == [("p1", "a", "board"), ("p2", "b", "board"), ("p1", "b", "board")]
@@ -191,7 +191,7 @@ def test_a_range_image_holds_at_the_time_of_the_finest_pattern(
     found = range_image()
     monkeypatch.setattr(range_images, "decode_sequence", lambda *_, **__: STRIPES)
     monkeypatch.setattr(range_images, "reconstruct_range_image", lambda *_: found)
-    monkeypatch.setattr(range_images, "stripes_in_volume", lambda *_: None)
+    monkeypatch.setattr(range_images, "find_stripes_in_volume", lambda *_: None)
     monkeypatch.setattr(range_images, "read_colours", lambda *_: found.points.astype(np.uint8))
     rig = SimpleNamespace(
         volume=None, pair=lambda _: SimpleNamespace(projector=code, camera=None), frames=frames

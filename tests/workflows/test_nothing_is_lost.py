@@ -98,8 +98,8 @@ def test_a_remark_that_fails_costs_itself_alone(ring: SeenBoards, calibrated: Pa
 def test_a_report_goes_on_after_a_section_that_fails(
     calibrated: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(calibration_charts, "rig_model", broken)
-    monkeypatch.setattr(calibration_charts, "sigma_chart", broken)
+    monkeypatch.setattr(calibration_charts, "build_rig_model", broken)
+    monkeypatch.setattr(calibration_charts, "draw_sigma_chart", broken)
     page = calibration_page.calibration_page(calibrated)
     told = {section.title: str(section.blocks) for section in page.sections}
     assert "KeyError" in told["The rig"]
