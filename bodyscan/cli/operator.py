@@ -287,11 +287,12 @@ def export(
         if not anyway:
             refuse_repeat(result, stored.facts)
         extra = {"registered": registered, "textured": texture}
-        written = export_scan(
-            stored, folder, formats.split(","),
-            (*ExportSettings().versions, *(version for version, wanted in extra.items() if wanted)),
-            texture_px=texture_px, deface=deface, frame=frame, up=up,
-        )  # fmt: skip
+        versions = *ExportSettings().versions, *(name for name, wanted in extra.items() if wanted)
+        with hold_folder(folder):
+            written = export_scan(
+                stored, folder, formats.split(","), versions,
+                texture_px=texture_px, deface=deface, frame=frame, up=up,
+            )  # fmt: skip
     _show_grade(output, stored)
     for path in written:
         output.add_files("export", path)

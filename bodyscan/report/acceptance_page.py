@@ -31,7 +31,7 @@ def make_screen_table(found: Sequence[Figure], synthetic: bool) -> ScreenTable:
     return table
 
 
-def acceptance_page(
+def make_acceptance_page(
     found: Sequence[Figure],
     readings: Readings,
     calibration: RigCalibration,

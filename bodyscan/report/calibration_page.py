@@ -54,7 +54,7 @@ PAIR_COLUMNS = (
 )
 
 
-def calibration_page(folder: Path) -> Page:
+def make_calibration_page(folder: Path) -> Page:
     """The report of the calibration in `folder`. Raises CalibrationFileError."""
     calibration = load_calibration(folder)
     shots = len({shot for shot, _ in calibration.rig_from_board})

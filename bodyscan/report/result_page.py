@@ -63,9 +63,9 @@ def build_page(result: Path, other: Path | None = None) -> Page:
     folder = result if result.is_dir() else result.parent
     names = {result.name} if result.is_file() else {path.name for path in folder.glob("*.json")}
     if scans.FILE_NAME in names:
-        from bodyscan.report.scan_page import scan_page
+        from bodyscan.report.scan_page import make_scan_page
 
-        return scan_page(folder, other)
+        return make_scan_page(folder, other)
     if calibrations.FILE_NAME not in names:
         raise BadInput(
             f"holds neither {calibrations.FILE_NAME} nor {scans.FILE_NAME}",
@@ -78,6 +78,6 @@ def build_page(result: Path, other: Path | None = None) -> Page:
             where=str(result),
             remedy="give a scan's folder; `bodyscan check-calibration` finds what moved in a rig",
         )
-    from bodyscan.report.calibration_page import calibration_page
+    from bodyscan.report.calibration_page import make_calibration_page
 
-    return calibration_page(folder)
+    return make_calibration_page(folder)

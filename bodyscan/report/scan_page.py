@@ -70,7 +70,7 @@ PAIRS = (
 """For one pair, two, ... and six or more."""
 
 
-def scan_page(folder: Path, other: Path | None = None) -> Page:
+def make_scan_page(folder: Path, other: Path | None = None) -> Page:
     """The report of the scan in `folder`, compared with `other` if given.
 
     A scan that gave no model has a report too: its reasons. Raises ResultError, BadInput.

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import FileResponse, JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
 
@@ -221,7 +221,7 @@ async def _object(request: Request) -> dict[str, Any]:
     """The JSON object in a request's body. Raises BadInput for anything else."""
     try:
         content = await request.json()
-    except (ValueError, RecursionError):
+    except (ValueError, RecursionError, ClientDisconnect):  # the last: cut off
         content = None
     if not isinstance(content, dict):
         raise BadInput("send a JSON object")

@@ -33,7 +33,7 @@ from bodyscan.optional import optional
 from bodyscan.progress import Progress, silent
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.storage import calibration_id
-from bodyscan.report.acceptance_page import acceptance_page
+from bodyscan.report.acceptance_page import make_acceptance_page
 from bodyscan.report.page import render
 from bodyscan.settings import FusionSettings
 from bodyscan.verdict import Verdict
@@ -112,7 +112,7 @@ def judge_readings(
     notes: list[str] = []
     page_path.unlink(missing_ok=True)  # left by an earlier test
     with optional("report", notes.append):
-        page = acceptance_page(found, readings, calibration, origin, synthetic)
+        page = make_acceptance_page(found, readings, calibration, origin, synthetic)
         write_text(page_path, render(page))
     verdict = grade_acceptance(found, readings)
     made = page_path if page_path.exists() else None

@@ -25,7 +25,7 @@ from bodyscan.report.calibration_charts import (
     count_shared_boards,
     draw_sigma_chart,
 )
-from bodyscan.report.calibration_page import calibration_page
+from bodyscan.report.calibration_page import make_calibration_page
 from bodyscan.report.page import render
 from bodyscan.verdict import Verdict
 
@@ -119,8 +119,8 @@ def test_everything_is_said_and_read_back_from_disk(
     for name, seen in calibration.observed.items():
         assert np.array_equal(stored.observed[name].pixels, seen.pixels)
         assert np.array_equal(stored.observed[name].target, seen.target)
-    text = render(calibration_page(tmp_path))
-    assert text == render(calibration_page(tmp_path))
+    text = render(make_calibration_page(tmp_path))
+    assert text == render(make_calibration_page(tmp_path))
     for part in ("Verdict: usable", "c9: saw nothing", "<li>n1</li>", "<li>a1</li>"):
         assert part in text
 
@@ -129,7 +129,7 @@ def test_a_calibration_of_before_has_a_report_too(
     calibration: RigCalibration, tmp_path: Path
 ) -> None:
     save_calibration(replace(calibration, observed={}), tmp_path)
-    text = render(calibration_page(tmp_path))
+    text = render(make_calibration_page(tmp_path))
     assert "calibrate again to see where the boards lay" in text
     assert "Sigma over the scan volume" in text
 

@@ -43,7 +43,7 @@ def boards(ring: SeenBoards, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def calibrated(boards: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The folder of a calibration whose remarks all failed."""
-    for name in ("boards_not_found", "advise", "stripe_board_notes"):
+    for name in ("list_boards_not_found", "advise", "note_stripe_boards"):
         monkeypatch.setattr(calibrate_rig, name, broken)
     calibrate_rig.calibrate_folder(tmp_path / "rig.yaml", tmp_path / "calibration")
     return tmp_path / "calibration"
@@ -100,7 +100,7 @@ def test_a_report_goes_on_after_a_section_that_fails(
 ) -> None:
     monkeypatch.setattr(calibration_charts, "build_rig_model", broken)
     monkeypatch.setattr(calibration_charts, "draw_sigma_chart", broken)
-    page = calibration_page.calibration_page(calibrated)
+    page = calibration_page.make_calibration_page(calibrated)
     told = {section.title: str(section.blocks) for section in page.sections}
     assert "KeyError" in told["The rig"]
     assert "KeyError" in told["How well each place is known"]

@@ -19,6 +19,7 @@ from bodyscan.evaluation.surface import (
     normalize_errors,
     summarize_deviation,
 )
+from bodyscan.files.atomic import hold_folder
 from bodyscan.fusion.storage import load_scan
 from bodyscan.geometry.robust import compute_rms_length
 from bodyscan.mesh.ply import read_ply_mesh
@@ -94,6 +95,9 @@ def test_exports_are_there_and_say_what_they_are(workspace: Workspace) -> None:
     assert shape.closed
     assert shape.components == 1
     assert shape.volume_mm3 > 0, "faces look outwards"
+    with hold_folder(folder):  # two at once would leave files of either
+        refused = run("export", workspace.folder / "scan", "--out", folder)
+    assert "another command is writing here" in str(refused.exception)
 
 
 def test_cameras_that_see_colour_give_the_body_one_colour(
