@@ -13,7 +13,7 @@ LIMBS = ("head", "left arm", "right arm", "left forearm", "right forearm")
 # Shares of the stature (Drillis and Contini 1966, rounded).
 NECK, CROTCH = 0.86, 0.47
 FOOT, ANKLE, SHIN = 0.03, 0.05, 0.15
-FOREARM, ARM = 0.25, 0.42  # from the fingertips; to the shoulder 0.44, less half a border
+FOREARM = 0.25  # from the fingertips
 
 
 def name_parts(cells: BodyCells) -> Indices:
@@ -36,7 +36,8 @@ def name_parts(cells: BodyCells) -> Indices:
         # Straight is the way to a thigh or a flank.
         if from_navel[tip] > 0.35 or from_navel[tip] > straight[tip] + 0.05:
             from_tip = cells.distances(np.array([tip]))[0] / stature
-            part[from_tip < ARM] = PARTS.index(name)
+            # To the shoulder 0.44, less half a border.
+            part[from_tip < 0.42] = PARTS.index(name)
     return part
 
 
