@@ -36,8 +36,8 @@ def name_parts(cells: BodyCells) -> Indices:
         # Straight is the way to a thigh or a flank.
         if from_navel[tip] > 0.35 or from_navel[tip] > straight[tip] + 0.05:
             from_tip = cells.distances(np.array([tip]))[0] / stature
-            # To the shoulder 0.44, less half a border.
-            part[from_tip < 0.42] = PARTS.index(name)
+            # To the shoulder 0.44, less the width of a border.
+            part[from_tip < 0.40] = PARTS.index(name)
     return part
 
 

@@ -49,9 +49,9 @@ def test_each_turns_about_its_joint_and_nothing_else_goes_along() -> None:
     hand, neck = int(np.argmax(cells.centres[:, 1])), at(cells, 0.0, 1450.0)
     other, foot = int(np.argmin(cells.centres[:, 1])), int(np.argmin(cells.centres[:, 2]))
     np.testing.assert_allclose(fields["left arm"][[other, foot], :3], 0.0, atol=1e-3)
-    # A turn about z carries a fingertip by the 705 mm of the arm / 400.
+    # A turn about z carries a fingertip by the 675 mm of the arm / 400.
     left = fields["left arm"]
-    assert left[hand, 0, 2] == pytest.approx(-705.0 / 400.0, abs=0.05)
+    assert left[hand, 0, 2] == pytest.approx(-675.0 / 400.0, abs=0.05)
     np.testing.assert_allclose(left[hand, 1:3, 2], 0.0, atol=1e-3)
     # The middle of a border stays nearly where it is: half of its cells' way there goes along.
     assert np.abs(fields["head"][neck, :3]).max() < 0.05
@@ -74,13 +74,13 @@ def named(cells: BodyCells, y: float, z: float) -> str:
 
 
 def test_parts_are_told_by_height_and_by_how_far_they_are_through_the_body() -> None:
-    """Stature 1.695 m: the neck at 1.458, the crotch at 0.797; from a fingertip 712 mm of arm."""
+    """Stature 1.695 m: the neck at 1.458, the crotch at 0.797; from a fingertip 678 mm of arm."""
     cells = person()
     assert [named(cells, 0.0, z) for z in (1665.0, 1485.0, 1425.0, 825.0)] == [
         "head", "head", "trunk", "trunk",
     ]  # fmt: skip
     for side, name in ((1.0, "left arm"), (-1.0, "right arm")):
-        assert [named(cells, side * y, 1365.0) for y in (840.0, 150.0, 120.0)] == [
+        assert [named(cells, side * y, 1365.0) for y in (840.0, 180.0, 150.0)] == [
             name, name, "trunk",
         ]  # fmt: skip
     split = cells.centres.copy()
@@ -260,7 +260,7 @@ def test_fullness_is_that_of_the_front_of_the_trunk() -> None:
 
 
 def test_over_a_border_what_moves_passes_into_what_does_not_as_a_bell_curve_sums() -> None:
-    """An arm of 24 cells: 105 mm within it, 96 % of a cell are the arm's."""
+    """An arm of 23 cells: 105 mm within it, 96 % of a cell are the arm's."""
     cells = person()
     arm = compute_limb_weights(cells)["left arm"]
     part = name_parts(cells) == PARTS.index("left arm")
