@@ -68,7 +68,7 @@ def test_a_test_is_written_down_and_the_page_of_an_earlier_one_does_not_stay(
     def broken(*_: object) -> None:
         raise OSError("no fonts")
 
-    monkeypatch.setattr(accept_rig, "acceptance_page", broken)
+    monkeypatch.setattr(accept_rig, "make_acceptance_page", broken)
     again = judge()
     assert again.page is None
     assert not found.page.exists()
