@@ -1,6 +1,6 @@
 """Many jobs: how many at once, here or on a cluster, a lock on the output folder, events, and the
-final state. A batch that was cut short resumes: `plan.reason_to_run` names the stages to run, `worker`
-renames a result once it is complete, and `hold_output` clears what was half written here."""
+final state. A batch that was cut short resumes: `plan.find_reason_to_run` names the stages to run,
+`worker` renames a result once it is complete, and `hold_output` clears what was half written here."""
 
 from __future__ import annotations
 

@@ -39,8 +39,9 @@ class MeasureChanges:
 def find_changes(earlier: NamedMeasures, later: NamedMeasures) -> tuple[Change, ...]:
     """Changes of all measures that both scans have.
 
-    The errors of both count as independent. On one person the template's landmarks err alike, which
-    makes the intervals too wide rather than too narrow; the scale of one calibration cancels.
+    The errors of both count as independent. On one person the errors of the template's landmarks are
+    correlated, which makes the intervals too wide rather than too narrow; the scale of one
+    calibration cancels.
     """
     changes = []
     for name, now in later.measures.items():

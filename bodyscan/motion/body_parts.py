@@ -19,9 +19,7 @@ FOREARM = 0.25  # from the fingertips
 def name_parts(cells: BodyCells) -> Indices:
     """Assign each cell (C,) an index in PARTS, whichever way the person faces."""
     stature = float(cells.centres[:, 2].max())
-    height = cells.centres[:, 2] / stature
-    offsets = cells.centres[:, :2] - np.median(cells.centres[:, :2], axis=0)
-    sideways = offsets @ find_leftward(cells) / stature
+    height, sideways = _measure_height_and_side(cells)
     part = np.where(height > NECK, PARTS.index("head"), PARTS.index("trunk"))
     part[height < CROTCH] = PARTS.index("right leg")
     part[(height < CROTCH) & (sideways > 0.0)] = PARTS.index("left leg")
@@ -43,10 +41,15 @@ def name_parts(cells: BodyCells) -> Indices:
 
 def find_navel(cells: BodyCells) -> int:
     """The cell at a navel's height next to the middle of the body."""
+    height, sideways = _measure_height_and_side(cells)
+    return int(np.argmin(np.abs(height - 0.6) + np.abs(sideways)))
+
+
+def _measure_height_and_side(cells: BodyCells) -> tuple[Array, Array]:
+    """Heights (C,) and distances (C,) to the left of the body's middle, as shares of the stature."""
     stature = float(cells.centres[:, 2].max())
     offsets = cells.centres[:, :2] - np.median(cells.centres[:, :2], axis=0)
-    aside = np.abs(offsets @ find_leftward(cells)) / stature
-    return int(np.argmin(np.abs(cells.centres[:, 2] / stature - 0.6) + aside))
+    return cells.centres[:, 2] / stature, offsets @ find_leftward(cells) / stature
 
 
 def find_ankles(cells: BodyCells) -> Array:

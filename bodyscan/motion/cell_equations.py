@@ -20,7 +20,7 @@ class CellEquations:
 
     cells: Indices  # those in which the pairs overlap, (c,)
     # Of the first pair's displacement field (12,) in each of them, a stack (c,); see
-    # `rigid_fields`. The second pair's acts oppositely.
+    # `build_rigid_fields`. The second pair's acts oppositely.
     system: LinearGaussianSystem
 
     @staticmethod

@@ -45,7 +45,7 @@ ROUNDS = 3  # the last with all points
 class BreathOffset:
     """Displacement from the middle of the scan to mean breath."""
 
-    field: Array  # (C, 12), see `rigid_fields`
+    field: Array  # (C, 12), see `build_rigid_fields`
     sigma_mm: Array  # standard deviation (C,) along the normals, as it affects a girth there
 
     def along_normals(self, cells: BodyCells, points: Array, normals: Array) -> tuple[Array, Array]:

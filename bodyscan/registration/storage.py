@@ -272,14 +272,14 @@ def _read_calibration(content: dict[str, Any], arrays: dict[str, Any]) -> RigCal
         pairs,
         {name: _transform(part["rig_from_camera"]) for name, part in parts.items()},
         PoseCovariance(
-            _convert_texts(content["placing_covariance_order"]), arrays["placing_covariance"]
+            _read_texts(content["placing_covariance_order"]), arrays["placing_covariance"]
         ),
         boards,
         TypeAdapter(dict[str, str]).validate_python(content["failed"], strict=True),
-        _convert_texts(content["notes"]),
-        _convert_texts(content.get("advice", [])),
+        _read_texts(content["notes"]),
+        _read_texts(content.get("advice", [])),
         {
-            name: ObservedCorners(**_select_under(f"{name}/seen/", arrays))
+            name: ObservedCorners(**_select_prefixed(f"{name}/seen/", arrays))
             for name in parts
             if f"{name}/seen/pixels" in arrays
         },
@@ -287,11 +287,13 @@ def _read_calibration(content: dict[str, Any], arrays: dict[str, Any]) -> RigCal
 
 
 def _read_light(content: dict[str, Any], prefix: str, arrays: dict[str, Any]) -> LightSheets:
-    return sheets_from_arrays(content["kind"], _select_under(prefix, arrays), content["direction"])
+    return sheets_from_arrays(
+        content["kind"], _select_prefixed(prefix, arrays), content["direction"]
+    )
 
 
 def _read_ray_uncertainty(name: str, arrays: dict[str, Any]) -> RayUncertainty | None:
-    parts = _select_under(f"{name}/rays/", arrays)
+    parts = _select_prefixed(f"{name}/rays/", arrays)
     if not parts:
         return None
     for part in parts.values():
@@ -300,7 +302,7 @@ def _read_ray_uncertainty(name: str, arrays: dict[str, Any]) -> RayUncertainty |
     return RayUncertainty(**parts)
 
 
-def _select_under(prefix: str, arrays: dict[str, Any]) -> dict[str, Any]:
+def _select_prefixed(prefix: str, arrays: dict[str, Any]) -> dict[str, Any]:
     return {k.removeprefix(prefix): array for k, array in arrays.items() if k.startswith(prefix)}
 
 
@@ -322,5 +324,5 @@ def _transform(matrix: Any) -> RigidTransform:
     return RigidTransform(array[:3, :3].copy(), array[:3, 3].copy())
 
 
-def _convert_texts(values: Any) -> tuple[str, ...]:
+def _read_texts(values: Any) -> tuple[str, ...]:
     return tuple(TypeAdapter(list[str]).validate_python(values, strict=True))

@@ -133,9 +133,9 @@ def decode_line(lit: Greys, frame: Greys, direction: str) -> StripeMap:
     lines = ScanLines.from_images(lit, lit, frame, None, direction)
     light = lines.patterns[0].astype(np.float32)
     room = lines.lit * np.float32(not np.array_equal(lit, frame[0]))
-    seen = room >= MIN_CONTRAST
-    if seen.any():  # the room may have been darker while the line was on
-        light -= room * np.median(light[seen] / room[seen])
+    visible = room >= MIN_CONTRAST
+    if visible.any():  # the room may have been darker while the line was on
+        light -= room * np.median(light[visible] / room[visible])
     light -= np.median(light, axis=1, keepdims=True)
     noise = estimate_robust_scale(light, UNIFORM_SIGMA)
     peak, height = light.argmax(axis=1), light.max(axis=1)
@@ -168,11 +168,11 @@ def decode_line(lit: Greys, frame: Greys, direction: str) -> StripeMap:
     rough = estimate_robust_scale(np.diff(position, 2)[np.diff(line, 2) == 0]) / 6.0**0.5
     sigma = np.hypot(sigma * max(1.0, rough / np.median(sigma)), MIN_SIGMA_PX)
     pixel = np.rint(position).astype(np.int64)
-    s, spread = np.full((2, *light.shape), np.nan, np.float32)
-    s[line, pixel], spread[line, pixel] = 0.0, sigma
+    s, sigmas = np.full((2, *light.shape), np.nan, np.float32)
+    s[line, pixel], sigmas[line, pixel] = 0.0, sigma
     index = np.zeros_like(line)
     rest_of = line.astype(np.float64), sigma, index, index[1:] > 0, 0.0
-    return assemble_map(lines, lit, s, spread, Boundaries(line, pixel, position, *rest_of), 1)
+    return assemble_map(lines, lit, s, sigmas, Boundaries(line, pixel, position, *rest_of), 1)
 
 
 class _Sweep:

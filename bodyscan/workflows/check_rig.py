@@ -202,13 +202,13 @@ def check_boards(
     stripes = _measure_stripe_offsets(calibration, captures, views.value, located.value, progress)
     notes = (*views.notes, *located.notes, *stripes.notes)
     if not drift.rig_from_board and not stripes.value:
-        raise _make_nothing_error(captures, notes)
+        raise _make_no_board_error(captures, notes)
     checked = tuple(sorted({view.pair for view in (unique or located.value)}))
     unchecked = tuple(sorted(set(calibration.pairs) - set(checked)))
     return BoardCheck(drift, stripes.value, checked, unchecked, notes)
 
 
-def _make_nothing_error(captures: Captures, notes: Sequence[str]) -> BoardNotFound:
+def _make_no_board_error(captures: Captures, notes: Sequence[str]) -> BoardNotFound:
     why = "".join(f"\n  {note}" for note in dict.fromkeys(notes))
     return BoardNotFound(
         "no board is seen by two calibrated pairs at once (one that looks the same when turned by 180 "

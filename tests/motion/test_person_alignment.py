@@ -126,7 +126,8 @@ def test_a_belly_drawn_in_while_one_pole_fired_is_no_pole(
     found = together(draw_belly_in(standing, "p1", 10.0), {})
     assert (sound.posture, found.displaced, found.common_error) == (None, (), None)
     assert found.posture is not None
-    assert "pole p1" in found.posture.pole  # p4, beside it, explains it nearly as well
+    # p4, beside it, explains it nearly as well.
+    assert found.posture.pole in ("pole p1", "pole p1 or pole p4")
     assert found.motion is not None
     assert describe_step(found.motion).startswith("the belly was")
     assert describe_step(found.motion).endswith("farther in")
