@@ -21,9 +21,9 @@ if [ -n "$missing" ] && command -v apt-get >/dev/null; then
         venv_package=python$version-venv
     fi
     case $missing in *venv*) ;; *) venv_package= ;; esac
-    $as_root apt-get update -qq
+    $as_root apt-get -o DPkg::Lock::Timeout=120 update -qq
     # shellcheck disable=SC2086
-    DEBIAN_FRONTEND=noninteractive $as_root apt-get install -y -qq --no-install-recommends \
+    DEBIAN_FRONTEND=noninteractive $as_root apt-get -o DPkg::Lock::Timeout=120 install -y -qq --no-install-recommends \
         libusb-1.0-0 libgl1 libegl1 libgomp1 libx11-6 $venv_package >/dev/null
 elif [ -n "$missing" ]; then
     echo "missing system libraries:$missing (names as on Linux; install them if open3d does not load)" >&2
