@@ -490,7 +490,7 @@ def estimate_ray_uncertainty(
     noise = np.einsum("npi,ij,npj->n", by_parameter, richest.covariance, by_parameter) / 2.0
     lens = np.sum(difference**2, axis=1) / 2.0
     return RayUncertainty(
-        *(_spread_over_nodes(np.sqrt(np.maximum(part, 0.0)), valid) for part in (noise, lens))
+        *(_fill_nodes(np.sqrt(np.maximum(part, 0.0)), valid) for part in (noise, lens))
     )
 
 
@@ -508,8 +508,8 @@ def _compute_changes(chosen: Camera, camera: Camera, points: Array) -> tuple[Arr
     )
 
 
-def _spread_over_nodes(values: Array, valid: Mask) -> Array:
-    """Spread values over all nodes; those without rays, where the lens folds, get the largest."""
+def _fill_nodes(values: Array, valid: Mask) -> Array:
+    """Give values to all nodes; those without rays, where the lens folds, get the largest."""
     filled = np.full(valid.shape, values.max(initial=0.0))
     filled[valid] = values
     return filled

@@ -89,11 +89,11 @@ def refuse_size(
 def _mend(vertices: Array, faces: Indices) -> tuple[Array, Indices, list[str]]:
     """Join, drop and turn as `read_surface` says; also what was done. What is sound stays as it is."""
     notes = []
-    places, same = np.unique(vertices, axis=0, return_inverse=True)
-    if len(places) < len(vertices):
-        doubled = len(vertices) - len(places)
+    distinct, same = np.unique(vertices, axis=0, return_inverse=True)
+    if len(distinct) < len(vertices):
+        doubled = len(vertices) - len(distinct)
         notes.append(f"merged {doubled} duplicate vertices")
-        vertices, faces = places, same.reshape(-1)[faces]
+        vertices, faces = distinct, same.reshape(-1)[faces]
     flat = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
     if flat.any():
         first = flat.argmax()

@@ -98,9 +98,9 @@ def fix_nodes(nodes: Any, value: str, line: str | None, **fixed: object) -> None
     fixed: more nodes and their values, such as Gain, which can be set once GainAuto is off. What a
         model does not have is passed over.
     """
-    off = dict.fromkeys(("ExposureAuto", "GainAuto", "BalanceWhiteAuto"), "Off")
+    automatics = dict.fromkeys(("ExposureAuto", "GainAuto", "BalanceWhiteAuto"), "Off")
     trigger = {"TriggerSelector": "FrameStart", "TriggerMode": "On"}
-    for name, wanted in {**off, **fixed, **trigger, "TriggerSource": line or "Software"}.items():
+    for name, wanted in {**automatics, **fixed, **trigger, "TriggerSource": line or "Software"}.items():
         with suppress(Exception):
             setattr(getattr(nodes, name), value, wanted)
 

@@ -163,8 +163,8 @@ def find_compressed(images: Sequence[RangeImage]) -> tuple[str, ...]:
         ratios = []
         for lines in (image.lit, image.lit.T):
             steps = cv2.absdiff(lines[1:], lines[:-1]).mean(axis=1)
-            places = steps[: len(steps) // 8 * 8].reshape(-1, 8).mean(axis=0)
-            ratios.append(places.max() / max(float(np.median(places)), 1e-9))
+            phases = steps[: len(steps) // 8 * 8].reshape(-1, 8).mean(axis=0)
+            ratios.append(phases.max() / max(float(np.median(phases)), 1e-9))
         if min(ratios) > 1.2:
             found.append(image.pair)
     return tuple(found)
