@@ -24,7 +24,7 @@ from bodyscan.body_model.template import load_template
 from bodyscan.errors import BadInput
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyMesh
-from bodyscan.mesh.sliced_parts import find_body_frame
+from bodyscan.mesh.body_frame import find_body_frame
 from bodyscan.mesh.topology import compute_vertex_normals
 
 SAMPLES = 80_000

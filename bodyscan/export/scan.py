@@ -24,8 +24,8 @@ from bodyscan.fusion.storage import StoredScan
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.measurement.landmarks import find_landmarks
 from bodyscan.mesh.body import BodyMesh
+from bodyscan.mesh.body_frame import find_body_frame
 from bodyscan.mesh.repair import collapse_slivers, decimate
-from bodyscan.mesh.sliced_parts import find_body_frame
 from bodyscan.settings import ExportSettings
 
 VERSIONS: dict[str, tuple[str, Callable[[BodyMesh], BodyMesh]]] = {

@@ -32,11 +32,11 @@ def make_closed_surface(
     rig_from_camera: dict[str, RigidTransform] | None = None,
 ) -> tuple[Array, Indices]:
     """One closed manifold surface around a cloud, with faces outward: vertices (V, 3) mm, only as
-    exact as the grid, and faces (F, 3).
+    exact as the grid, and faces (F, 3). `require_closed` checks that it is one.
 
     range_images: as measured, background included; gaps that they see through are not webbed over.
 
-    Raises ScanFailed if no closed surface comes out.
+    Raises ScanFailed if no surface comes out.
     """
     if len(cloud.points) < 1000:
         raise ScanFailed(
@@ -49,11 +49,14 @@ def make_closed_surface(
     if not len(faces):
         raise ScanFailed("no surface could be extracted: the points are inconsistent")
     some = cloud.points[:: -(-len(cloud.points) // 20_000)]
-    vertices, faces = extract_largest_piece(vertices, faces, some)
+    return extract_largest_piece(vertices, faces, some)
+
+
+def require_closed(vertices: Array, faces: Indices) -> None:
+    """Raise ScanFailed unless a surface is a closed manifold."""
     if not check_manifold(faces, len(vertices))[1]:
         found = compute_topology(vertices, faces)
         raise ScanFailed(f"no closed surface came out of the cloud ({found})")
-    return vertices, faces
 
 
 def compute_distances(

@@ -24,7 +24,8 @@ from bodyscan.mesh.body import (
     compute_region_shares,
     select_regions,
 )
-from bodyscan.mesh.sliced_parts import Piece, find_body_frame, find_parts
+from bodyscan.mesh.body_frame import find_body_frame
+from bodyscan.mesh.sliced_parts import Piece, find_parts
 from bodyscan.mesh.slices import MeshSlicer
 from bodyscan.mesh.topology import compute_face_areas, compute_signed_volume
 

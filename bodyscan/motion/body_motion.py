@@ -16,7 +16,7 @@ from itertools import pairwise
 import numpy as np
 from scipy import sparse
 from scipy.linalg import cho_solve
-from scipy.linalg.lapack import dpotrf, dpotri, dtrtri, dtrtrs
+from scipy.linalg.lapack import dpotrf, dtrtri, dtrtrs
 
 from bodyscan.alignment.sway_prior import BODY_CENTRE
 from bodyscan.arrays import Array, Indices, Mask
@@ -100,15 +100,15 @@ class BodyMotion:
         ends = np.cumsum([0, *(kind.count for kind in self.kinds)]).tolist()
         return tuple(slice(a, b) for a, b in pairwise(ends))
 
-    @cached_property
-    def covariance(self) -> Array:
-        """Posterior covariance of the amplitudes, (n, n)."""
-        lower = np.tril(dpotri(self.factor, lower=True)[0])
-        return (lower + np.tril(lower, -1).T) * self.units[:, None] * self.units
+    def whiten(self, columns: Array) -> Array:
+        """W (n, K) such that W^T W is the posterior covariance of the columns' (n, K) combinations of
+        amplitudes."""
+        scaled = np.asfortranarray(self.units[:, None] * columns)
+        return np.asarray(dtrtrs(self.factor, scaled, lower=True, overwrite_b=True)[0])
 
     @property
     def variances(self) -> Array:
-        """Posterior variances of the amplitudes, (n,), at half the cost of `covariance`."""
+        """Posterior variances of the amplitudes, (n,)."""
         inverse = dtrtri(self.factor, lower=True)[0]
         return np.asarray(np.einsum("ij,ij->j", inverse, inverse) * self.units**2)
 
@@ -213,7 +213,8 @@ class BodyMotion:
         # Poses come first: their columns of the lower triangle are complete but for their own block.
         columns = self.information[:, pose].copy()
         columns[pose] = np.tril(columns[pose]) + np.tril(columns[pose], -1).T
-        information = columns[pose] - columns.T @ self.covariance @ columns
+        whitened = self.whiten(columns)
+        information = columns[pose] - whitened.T @ whitened
         vector = self.vector[pose] - columns.T @ self.amplitudes
         by_pair = np.arange(len(vector)).reshape(6, -1).T.ravel()
         return LinearGaussianSystem(information, vector).select(by_pair)
@@ -245,10 +246,9 @@ class BodyMotion:
                 for g, kind in enumerate(self.kinds)
             ]
         )
-        information = np.tensordot(sign**2, matrices[:, :, fields], 1)
-        return LinearGaussianSystem(
-            information - cross @ self.covariance @ cross.T, vector - cross @ self.amplitudes
-        )
+        whitened = self.whiten(cross.T)
+        information = np.tensordot(sign**2, matrices[:, :, fields], 1) - whitened.T @ whitened
+        return LinearGaussianSystem(information, vector - cross @ self.amplitudes)
 
     def observation_matrix(self, pair: int, cells: Indices, normals: Array) -> Array:
         """Jacobian (c, n) of displacements along normals (c, 3) from the middle to a pair's moment."""
@@ -287,12 +287,10 @@ class BodyMotion:
         Motions of limbs could explain most of a breath too, but none of them moves the whole trunk
         periodically.
         """
-        breath = self.kind("breath")
-        block = self.slices[self.kinds.index(breath)]
-        unit = np.zeros((len(self.units), block.stop - block.start), order="F")
-        unit[block] = np.diag(self.units[block])
-        root = dtrtrs(self.factor, unit, lower=True, overwrite_b=True)[0]
-        posterior = np.linalg.inv(np.asarray(root.T @ root, np.float64))
+        breath, block = self.kinds[-1], self.slices[-1]
+        # Of the last amplitudes the corner of the factor is that of their marginal information.
+        corner = self.factor[block, block] / self.units[block, None]
+        posterior = corner @ corner.T
         system = LinearGaussianSystem(
             posterior - breath.prior_information, posterior @ self.amplitudes[block]
         )
@@ -344,7 +342,7 @@ def compute_shape_sigmas(
     views = np.bincount(mark, minlength=len(cells.landmarks))
     shape = len(views), len(mark)
     means = sparse.csr_array((1.0 / views[mark], (mark, np.arange(len(mark)))), shape=shape) @ rows
-    errors = means @ np.linalg.cholesky(motion.covariance)
+    errors = motion.whiten(means.T).T
     girth = compute_girth_sigmas(errors, cells.centres[cells.landmarks, 2], 60.0)
     variances = np.stack([np.sum(errors**2, axis=1), girth**2])
     kernel = np.exp(-0.5 * (cells.landmark_distances / 60.0) ** 2) * (views > 0)[:, None]

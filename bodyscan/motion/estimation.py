@@ -30,7 +30,7 @@ from bodyscan.motion.body_cells import BodyCells, evaluate_field
 from bodyscan.motion.body_motion import BodyMotion, compute_girth_sigmas, compute_shape_sigmas
 from bodyscan.motion.body_parts import LIMBS
 from bodyscan.motion.cell_equations import CellEquations
-from bodyscan.progress import map_threads
+from bodyscan.progress import background, map_threads
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.settings import AlignmentSettings
 
@@ -172,21 +172,24 @@ def estimate_motion(
     evidence = None if None in seconds else solution.pose_evidence(names)
     if solution.negligible:
         return aligned, None, evidence
-    distances = _map_matches(
-        lambda matches, cell: rms(matches.distances),
-        [view.select(COARSE) for view in views],
-        (motion, cells),
-        solution.reach_mm,
-        settings,
-    )
-    moved = _update_alignment(aligned, names, views, motion, distances)
+    with background() as other:
+        middle_s = 1e-3 * (_find_middle_of_scan(images) or 0.0)
+        timing = other.submit(solution.fit_times, seconds, middle_s)
+        distances = _map_matches(
+            lambda matches, cell: rms(matches.distances),
+            [view.select(COARSE) for view in views],
+            (motion, cells),
+            solution.reach_mm,
+            settings,
+        )
+        moved = _update_alignment(aligned, names, views, motion, distances)
+        found = _describe_motion(images, motion, cells, observed)
+        times = timing.result()
     # Overlaps that motion brings no closer are apart because of the pairs' own calibrations.
     no_closer = moved.rms_after_mm > 0.95 * aligned.rms_after_mm
     still = no_closer and _is_rigid_negligible(motion, observed, settings)
-    found = _describe_motion(images, motion, cells, observed)
     if still or not found.significant:
         return aligned, None, evidence
-    times = solution.fit_times(seconds, 1e-3 * (_find_middle_of_scan(images) or 0.0))
     found = _add_step(found, motion, step) if step else found
     return moved, replace(found, times=times), evidence
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from bodyscan.arrays import Array, Bytes
 from bodyscan.mesh.body import BodyCloud, BodyMesh
-from bodyscan.mesh.sliced_parts import find_body_frame
+from bodyscan.mesh.body_frame import find_body_frame
 
 Legend = dict[str, Any]
 

@@ -18,8 +18,8 @@ from scipy.spatial import cKDTree
 from bodyscan.arrays import Array, Bytes, Floats, Indices
 from bodyscan.files.atomic import write_bytes
 from bodyscan.mesh.body import BodyCloud, BodyMesh
+from bodyscan.mesh.body_frame import find_body_frame
 from bodyscan.mesh.depth_buffer import find_nearest_faces, find_nearest_points
-from bodyscan.mesh.sliced_parts import find_body_frame
 from bodyscan.optional import optional
 from bodyscan.outcome import Outcome
 

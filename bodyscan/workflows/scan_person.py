@@ -12,18 +12,20 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from bodyscan.alignment.icp import align
 from bodyscan.alignment.sway_prior import SwayPrior, select_tighter
+from bodyscan.arrays import Array, Indices
 from bodyscan.captures.folder import Captures, ImageSequence, open_scan
 from bodyscan.errors import BodyscanError, CaptureError, ScanFailed
 from bodyscan.fusion import storage
 from bodyscan.fusion.cleaning import clean, require_subject
 from bodyscan.fusion.consistency import Contradictions
 from bodyscan.fusion.merging import MergedCloud, merge
-from bodyscan.fusion.meshing import attach_attributes, make_closed_surface
+from bodyscan.fusion.meshing import attach_attributes, make_closed_surface, require_closed
 from bodyscan.fusion.pose_variance import add_motion_variance, add_pose_variance
 from bodyscan.fusion.regions import label_regions
 from bodyscan.fusion.storage import Made, Origin, Scan, ignore_made
@@ -59,6 +61,9 @@ from bodyscan.workflows.range_images import (
     reconstruct_range_images,
     reconstruct_sequence,
 )
+
+if TYPE_CHECKING:
+    from bodyscan.mesh.sliced_parts import BodyParts
 
 
 def scan_person(
@@ -245,12 +250,12 @@ def fuse(
         evidence, verdict = _judge_points(evidence, measured.value, calibration, read_as)
         announce(verdict, final=False)
     with step(progress, "meshing"):
-        cloud, mesh = _mesh(merged.cloud, measured.value, subject, settings, made)
+        cloud, mesh, parts = _mesh(merged.cloud, measured.value, subject, settings, made)
         # Also by the images of pairs that saw nothing of the subject.
         carried = {image.pair: image for image in subject.images}
         every = [carried.get(image.pair, image) for image in cleaned]
         coverage = measure_coverage(mesh, every, subject.rig_from_camera, calibration.pairs)
-        verdict = grade_scan(replace(evidence, mesh=mesh, coverage=coverage))
+        verdict = grade_scan(replace(evidence, mesh=mesh, coverage=coverage, find_parts=parts))
     return Scan(
         cloud,
         mesh,
@@ -344,8 +349,11 @@ def _mesh(
     subject: _Subject,
     settings: ScanSettings,
     made: Made,
-) -> tuple[BodyCloud, BodyMesh]:
-    """Label the cloud's regions, and mesh it; the mesh holds its displacement to mean breath."""
+) -> tuple[BodyCloud, BodyMesh, Callable[[], BodyParts]]:
+    """Label the cloud's regions, and mesh it; the mesh holds its displacement to mean breath.
+
+    Also returns what gives the parts of the mesh, or raises what went wrong with them.
+    """
 
     def label() -> BodyCloud:
         regions = label_regions(
@@ -358,12 +366,21 @@ def _mesh(
         return known
 
     with background() as other:
-        # Meshing mostly uses one core, so regions are labelled on the other meanwhile.
+        # Meshing mostly uses one core, so the other does meanwhile what it can.
         labelling = other.submit(label)
         shape = make_closed_surface(cloud, settings.mesh, measured, subject.rig_from_camera)
-        known = labelling.result()
-    mesh = attach_attributes(*shape, known, settings.mesh.reach_mm)
+        known, checking = labelling.result(), other.submit(require_closed, *shape)
+        parts = other.submit(_find_parts, *shape)
+        mesh = attach_attributes(*shape, known, settings.mesh.reach_mm)
+        checking.result()
     if subject.motion:
         mesh = subject.motion.add_breath(mesh)
     made(mesh)
-    return known, mesh
+    return known, mesh, parts.result
+
+
+def _find_parts(vertices: Array, faces: Indices) -> BodyParts:
+    # It needs networkx, which takes an eighth of a second to import.
+    from bodyscan.mesh.sliced_parts import find_mesh_parts
+
+    return find_mesh_parts(vertices, faces)

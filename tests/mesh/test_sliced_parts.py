@@ -8,7 +8,8 @@ from made_bodies import together
 from standing_body import HAND_ON_HIP, Rod, hanging, standing_body, trunk_tape
 
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.mesh.sliced_parts import BodyParts, find_body_frame, find_parts
+from bodyscan.mesh.body_frame import find_body_frame
+from bodyscan.mesh.sliced_parts import BodyParts, find_parts
 from bodyscan.mesh.slices import MeshSlicer
 
 FREE = {"trunk", "left arm", "right arm"}

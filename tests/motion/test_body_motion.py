@@ -53,7 +53,8 @@ def prior() -> Array:
 def test_amplitudes_are_those_of_what_was_seen_and_of_the_prior() -> None:
     motion, square = seen()
     truth = np.linalg.inv(square + prior())
-    np.testing.assert_allclose(motion.covariance, truth, rtol=1e-8, atol=1e-12)
+    whitened = motion.whiten(np.eye(len(truth)))
+    np.testing.assert_allclose(whitened.T @ whitened, truth, rtol=1e-8, atol=1e-12)
     np.testing.assert_allclose(motion.amplitudes, truth @ motion.vector, rtol=1e-8, atol=1e-12)
 
 
@@ -125,7 +126,7 @@ def test_a_pairs_placing_and_bends_make_up_all_displacements() -> None:
 def test_a_kind_is_as_large_as_the_evidence_and_people_say() -> None:
     """MacKay's: amplitudes over as many of them as were told, and six of the usual size."""
     motion, _ = seen()
-    told = 6.0 - np.sum(np.diag(motion.covariance)[12:]) / 0.8**2
+    told = 6.0 - np.sum(motion.variances[12:]) / 0.8**2
     size = np.sqrt((np.sum(motion.amplitudes[12:] ** 2) + 6.0) / (told + 6.0))
     pose, parts = motion._update_prior_variances().kinds
     assert parts.size == pytest.approx(size)

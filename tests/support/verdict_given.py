@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import fields
+from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -13,6 +14,7 @@ from bodyscan.alignment.icp import Alignment
 from bodyscan.fusion.verdict import grade_scan
 from bodyscan.fusion.verdict.evidence import Coverage, ImageEvidence, RigEvidence, ScanEvidence
 from bodyscan.mesh.body import BodyCloud, BodyMesh
+from bodyscan.mesh.sliced_parts import find_mesh_parts
 from bodyscan.motion.person_alignment import PersonAlignment
 from bodyscan.motion.person_motion import PersonMotion
 from bodyscan.rig.rig import Volume
@@ -46,7 +48,9 @@ def verdict_given(
     rig, images = _evidence(RigEvidence, given), _evidence(ImageEvidence, given)
     together = _evidence(PersonAlignment, given)
     assert not given, f"no evidence has {', '.join(given)}"
-    return grade_scan(ScanEvidence(cloud, rig, images, use, together, person, mesh, coverage))
+    parts = None if mesh is None else partial(find_mesh_parts, mesh.vertices, mesh.faces)
+    evidence = ScanEvidence(cloud, rig, images, use, together, person, mesh, coverage, parts)
+    return grade_scan(evidence)
 
 
 def _evidence(kind: type[Evidence], given: dict[str, Any]) -> Evidence:

@@ -100,7 +100,12 @@ def fix_nodes(nodes: Any, value: str, line: str | None, **fixed: object) -> None
     """
     automatics = dict.fromkeys(("ExposureAuto", "GainAuto", "BalanceWhiteAuto"), "Off")
     trigger = {"TriggerSelector": "FrameStart", "TriggerMode": "On"}
-    for name, wanted in {**automatics, **fixed, **trigger, "TriggerSource": line or "Software"}.items():
+    for name, wanted in {
+        **automatics,
+        **fixed,
+        **trigger,
+        "TriggerSource": line or "Software",
+    }.items():
         with suppress(Exception):
             setattr(getattr(nodes, name), value, wanted)
 

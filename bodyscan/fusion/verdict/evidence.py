@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,8 +14,6 @@ from bodyscan.alignment.sway_prior import compute_centre_sigmas
 from bodyscan.arrays import Array, Mask
 from bodyscan.fusion.consistency import Contradictions
 from bodyscan.mesh.body import BodyCloud, BodyMesh
-from bodyscan.mesh.sliced_parts import BodyParts, find_body_frame, find_parts
-from bodyscan.mesh.slices import MeshSlicer
 from bodyscan.motion.person_alignment import PersonAlignment
 from bodyscan.motion.person_motion import PersonMotion
 from bodyscan.reconstruction.range_image import Agreement
@@ -22,6 +21,9 @@ from bodyscan.registration.rig_calibration import NominalSize, RigCalibration, f
 from bodyscan.rig.rig import Volume
 from bodyscan.settings import UseLimits
 from bodyscan.verdict import Grade
+
+if TYPE_CHECKING:
+    from bodyscan.mesh.sliced_parts import BodyParts
 
 GIRTH_PER_MM = 2.0 * np.pi
 """mm by which a girth is wrong if its surface is displaced by 1 mm all round."""
@@ -163,6 +165,7 @@ class ScanEvidence:
     person_alignment: the result of alignment; None if it took no part.
     person: how a moving body moved.
     mesh, coverage: None while there is no mesh; findings that need it are then left out.
+    find_parts: gives the parts of the mesh, see `find_mesh_parts`.
     """
 
     cloud: BodyCloud
@@ -173,6 +176,7 @@ class ScanEvidence:
     person: PersonMotion | None = None
     mesh: BodyMesh | None = None
     coverage: Coverage | None = None
+    find_parts: Callable[[], BodyParts] | None = None
 
     @property
     def alignment(self) -> Alignment | None:
@@ -197,11 +201,7 @@ class ScanEvidence:
     @cached_property
     def parts(self) -> BodyParts | None:
         """The parts of the body, None without a `shape`."""
-        mesh = self.shape
-        if mesh is None:
-            return None
-        body_from_rig = find_body_frame(mesh.vertices).rig_from_body.inverse()
-        return find_parts(MeshSlicer(body_from_rig.apply(mesh.vertices), mesh.faces))
+        return self.find_parts() if self.find_parts and self.shape else None
 
 
 Check = Callable[[ScanEvidence], Iterable[Finding]]
