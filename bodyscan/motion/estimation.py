@@ -175,14 +175,9 @@ def estimate_motion(
     with background() as other:
         middle_s = 1e-3 * (_find_middle_of_scan(images) or 0.0)
         timing = other.submit(solution.fit_times, seconds, middle_s)
-        distances = _map_matches(
-            lambda matches, cell: rms(matches.distances),
-            [view.select(COARSE) for view in views],
-            (motion, cells),
-            solution.reach_mm,
-            settings,
+        moved = _update_alignment(
+            aligned, names, views, (motion, cells), solution.reach_mm, settings
         )
-        moved = _update_alignment(aligned, names, views, motion, distances)
         found = _describe_motion(images, motion, cells, observed)
         times = timing.result()
     # Overlaps that motion brings no closer are apart because of the pairs' own calibrations.
@@ -459,10 +454,19 @@ def _update_alignment(
     aligned: Alignment,
     names: Sequence[str],
     views: Sequence[_View],
-    motion: BodyMotion,
-    distances: Mapping[tuple[int, int], float],
+    person: tuple[BodyMotion, BodyCells],
+    reach_mm: float,
+    settings: AlignmentSettings,
 ) -> Alignment:
     """Replace poses, displacements of the body's centre, and RMS distances of the overlaps."""
+    motion, _ = person
+    distances = _map_matches(
+        lambda matches, cell: rms(matches.distances),
+        [view.select(COARSE) for view in views],
+        person,
+        reach_mm,
+        settings,
+    )
     twists = np.array([motion.twist(k, from_middle=True) for k in range(len(views))])
     shift = np.linalg.norm(compute_centre_shifts(twists), axis=1)
     poses = [view.initial.retract(twist) for view, twist in zip(views, twists, strict=True)]
