@@ -2,12 +2,13 @@
 pair is known, and where to hold the board next.
 
 Boards are found image by image, as they come, and the advice that follows from what pictures cover
-is there at once. The joint solve of all shots so far takes longer; it comes when it is ready.
+is there at once. The joint solve of all shots so far takes longer; it comes when it is ready. Once
+pictures are covered a whole calibration by the shots so far says whether they are enough.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -20,11 +21,18 @@ from bodyscan.captures.folder import Captures, ImageSequence, open_captures
 from bodyscan.errors import BodyscanError
 from bodyscan.optional import optional
 from bodyscan.registration.advice import pair_sigma_mm, suggest_shots
+from bodyscan.registration.calibration_verdict import collect_figures, grade_calibration
 from bodyscan.registration.rig_frame import find_frame_target
 from bodyscan.registration.rig_solve import solve_rig
 from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig import find_connected_groups, load_rig
-from bodyscan.workflows.find_boards import calibrate_cameras, find_all_boards, locate_views
+from bodyscan.workflows.calibrate_rig import solve_boards
+from bodyscan.workflows.find_boards import (
+    FoundBoards,
+    calibrate_cameras,
+    find_all_boards,
+    locate_views,
+)
 
 COLUMNS, ROWS = 4, 3
 """Cells of a picture: a person can tell one from another when told where to hold the board."""
@@ -45,7 +53,7 @@ class BoardTour:
     # stripes on it.
     lit: set[tuple[str, str]] = field(default_factory=set)
     missed: dict[str, list[str]] = field(default_factory=dict)
-    solved: dict[str, Any] = field(default_factory=dict)
+    solved: dict[str, Any] = field(default_factory=dict)  # see `solve`
     _pending: set[tuple[str, str]] = field(default_factory=set)
 
     def __post_init__(self) -> None:
@@ -86,7 +94,8 @@ class BoardTour:
             self.missed[shot] = sorted({p for p, one in self.looked if one == shot} - seeing)
 
     def solve(self) -> None:
-        """Solve for all cameras and poses by the boards so far; what fails is a line of advice."""
+        """Solve for all cameras and poses by the boards so far, and calibrate with them once they cover
+        the pictures; what fails is a line of advice."""
         notes: list[str] = []
         sigmas: dict[str, float] = {}
         images = len(self.looked)
@@ -100,16 +109,26 @@ class BoardTour:
                 worst = max(sorted(sigmas), key=lambda name: sigmas[name])
                 notes += suggest_shots(self.rig, solution, worst)
         finite = {name: sigma for name, sigma in sigmas.items() if np.isfinite(sigma)}
-        self.solved = {"images": images, "sigmas_mm": finite, "advice": notes}
+        solved = {"images": images, "sigmas_mm": finite, "advice": notes}
+        if self._choose_by_pictures()["say"] == "enough":
+            with optional("a trial calibration", notes.append):
+                solved["weakest"], reasons = self._calibrate()
+                solved["advice"] = [*reasons, *notes]
+        self.solved = solved
+
+    def _calibrate(self) -> tuple[str | None, Sequence[str]]:
+        """Calibrate by the boards so far: the pair that is farthest beyond a limit of its figures, None
+        if none is; and why the calibration would not be good."""
+        captures, boards = open_captures(self.rig, self.rig_file), FoundBoards(list(self.views))
+        found = solve_boards(self.rig, captures, boards, folder=self.rig_file.parent).calibration
+        beyond = [(each[0], pair.name) for pair in collect_figures(found) for each in pair.beyond()]
+        return max(beyond, default=(0.0, None))[1], grade_calibration(found).reasons
 
     def describe(self) -> dict[str, Any]:
         """Everything that a page shows of it."""
         by_pair = {pair.name: self._calibrating(pair.name) for pair in self.rig.pairs}
-        cells = {pair.name: _count_cells(pair, by_pair[pair.name]) for pair in self.rig.pairs}
+        cells = self._count_cells()
         last = list(self.missed)[-1:]
-        shared = self._count_shared_shots()
-        groups = self._find_groups((first, second) for first, second, _ in shared)
-        boards = {name: len(found) for name, found in by_pair.items()}
         return {
             "shots": len(self.seen),
             "last": last[0] if last else None,
@@ -123,9 +142,9 @@ class BoardTour:
                 }
                 for name, found in by_pair.items()
             ],
-            "groups": groups,
-            "shared": shared,
-            "next": self._find_frame_shot() or _choose_next_hold(cells, boards, groups),
+            "groups": self._find_groups(),
+            "shared": self._count_shared_shots(),
+            "next": self._choose_next(cells),
             "advice": self.solved.get("advice", []),
             "wanted": BOARDS,
         }
@@ -136,6 +155,27 @@ class BoardTour:
         if target is None or target in {(view.shot, view.board) for view in self.views}:
             return None
         return {"say": "frame", "shot": target[0], "board": target[1]}
+
+    def _choose_next(self, cells: Mapping[str, Indices]) -> dict[str, Any]:
+        """Where to hold the board next: until pictures are covered where they are not, then where the
+        pair that would not be good saw it least."""
+        hold = self._find_frame_shot() or self._choose_by_pictures()
+        if hold["say"] != "enough":
+            return hold
+        if self.solved.get("images") != len(self.looked) or "advice" not in self.solved:
+            return {"say": "checking"}
+        weakest = self.solved.get("weakest")
+        if weakest is None:
+            return hold
+        return _hold_in(weakest, cells[weakest], len(self._calibrating(weakest)))
+
+    def _choose_by_pictures(self) -> dict[str, Any]:
+        boards = {pair.name: len(self._calibrating(pair.name)) for pair in self.rig.pairs}
+        return _choose_next_hold(self._count_cells(), boards, self._find_groups())
+
+    def _count_cells(self) -> dict[str, Indices]:
+        """See the function `_count_cells`, by pair."""
+        return {p.name: _count_cells(p, self._calibrating(p.name)) for p in self.rig.pairs}
 
     def _calibrating(self, pair: str) -> list[BoardView]:
         """Boards that calibrate a pair: those on which it took its stripes, if it has any."""
@@ -151,8 +191,9 @@ class BoardTour:
                     counts[first, second] = counts.get((first, second), 0) + 1
         return [(first, second, count) for (first, second), count in sorted(counts.items())]
 
-    def _find_groups(self, ties: Iterable[tuple[str, str]]) -> list[list[str]]:
+    def _find_groups(self) -> list[list[str]]:
         """Pairs that shots tie together, the largest group first."""
+        ties = ((first, second) for first, second, _ in self._count_shared_shots())
         groups = find_connected_groups([pair.name for pair in self.rig.pairs], ties)
         return sorted(map(sorted, groups), key=lambda one: (-len(one), one))
 
@@ -175,8 +216,13 @@ def _choose_next_hold(
     target = barest_pair if boards[barest_pair] < BOARDS else barest
     if boards[barest_pair] >= BOARDS and share[barest] >= 0.8:
         return {"say": "enough"}
-    row, column = divmod(int(np.argmin(_prefer_rim(cells[target]))), COLUMNS)
-    return {"say": "hold", "pair": target, "row": row, "column": column, "boards": boards[target]}
+    return _hold_in(target, cells[target], boards[target])
+
+
+def _hold_in(pair: str, cells: Indices, boards: int) -> dict[str, Any]:
+    """Advice to hold the board where a pair with so many boards saw it least."""
+    row, column = divmod(int(np.argmin(_prefer_rim(cells))), COLUMNS)
+    return {"say": "hold", "pair": pair, "row": row, "column": column, "boards": boards}
 
 
 def _count_cells(pair: Pair, views: Sequence[BoardView]) -> Indices:

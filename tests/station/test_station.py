@@ -218,6 +218,10 @@ def test_the_board_is_held_where_stripes_are_lacking_until_it_was_everywhere() -
             pixels = (np.array([cell[1], cell[0]]) + 0.5)[None] * size
             tour.views.append(BoardView(pair.name, shot, "board", np.zeros(1, int), pixels))
         tour.seen.add(shot)
+    assert tour.describe()["next"] == {"say": "checking"}, "covered pictures are not yet a good rig"
+    tour.solved = {"images": 0, "advice": [], "weakest": "p3-1"}
+    assert (tour.describe()["next"]["say"], tour.describe()["next"]["pair"]) == ("hold", "p3-1")
+    tour.solved["weakest"] = None
     assert tour.describe()["next"] == {"say": "enough"}
     tour.lit |= {("p2-3", f"b{number}") for number in range(20)}
     held = tour.describe()["next"]
