@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from made_registered import make_body
 
-from bodyscan.body_model.fitting import differentiate
+from bodyscan.body_model.fitting import Surface, differentiate, fit_body
 from bodyscan.body_model.template import BodyShapeAndPose, load_template, pose_body
 from bodyscan.mesh.topology import compute_topology, compute_vertex_normals
 
@@ -64,3 +65,15 @@ def test_derivatives_are_those_of_the_posed_body(column: int) -> None:
     expected = np.einsum("vi,vi->v", ends[0] - ends[1], normals) / 2e-4
     # Central differences of float32 shapes: a hundredth of a millimetre per unit.
     assert derivative == pytest.approx(expected, abs=0.02 + 1e-4 * np.abs(expected).max())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [2, 7])
+def test_fingers_are_not_laid_on_their_neighbours(seed: int) -> None:
+    vertices, _, _ = make_body(seed)
+    normals = compute_vertex_normals(vertices, TEMPLATE.faces).astype(np.float64)
+    fitted = fit_body(TEMPLATE, Surface(vertices[::2], normals[::2]))
+    for side in ("left", "right"):
+        for name in ("dactylion", "radial styloid", "ulnar styloid"):
+            vertex = TEMPLATE.landmarks[f"{side} {name}"]
+            assert np.linalg.norm(fitted.vertices[vertex] - vertices[vertex]) < 8.0, name
