@@ -55,6 +55,11 @@ class DisplacedPole:
     rotation_deg: float
     all_moved: bool = False
 
+    @property
+    def size_mm(self) -> float:
+        """By shift and rotation together, at the lever arm."""
+        return float(np.hypot(self.shift_mm, LEVER_MM * np.radians(self.rotation_deg)))
+
     @staticmethod
     def from_motions(
         name: str, pairs: frozenset[str], motions: Mapping[str, Array]
@@ -202,8 +207,7 @@ def find_displaced_pole(
         each = _maximize_likelihood(measured, SWAYS_MM, same_pole, STEPS_MM)[0] - null
         candidates = _with_all_moved(candidates, each)
     gain, best = max(candidates, key=lambda one: one[0])
-    lever = np.radians(best.rotation_deg) * LEVER_MM
-    significant = gain > MIN_LOG_RATIO and np.hypot(best.shift_mm, lever) > MIN_STEP_MM
+    significant = gain > MIN_LOG_RATIO and best.size_mm > MIN_STEP_MM
     return DisplacementSearch(best if significant else None, detectable, sway_mm, offset_mm)
 
 

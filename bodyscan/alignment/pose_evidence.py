@@ -28,8 +28,8 @@ MIN_LOG_RATIO = 12.0
 """Log likelihood ratio that a displacement must reach. No model of people is exact: in ten sound
 scans of moving people it was -9 to 5.8, in thirteen for single pairs -9 to 3; for poles displaced by
 3 mm it is 70 and more, for a pair by 5 mm 530."""
-MIN_OUTWARD_MM = 0.3
-"""2 mm of a girth; for ten sound people it was 0.22 mm at most."""
+MIN_ERROR_MM = 0.3
+"""Of poses or scale: 2 mm of a girth; a scale's error was 0.22 mm at most for ten sound people."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +54,11 @@ class CommonError:
     @property
     def shift_mm(self) -> float:
         return float(np.linalg.norm(self.shift))
+
+    @property
+    def size_mm(self) -> float:
+        """See `DisplacedPole`."""
+        return float(np.hypot(self.shift_mm, LEVER_MM * np.radians(self.rotation_deg)))
 
 
 @dataclass(frozen=True)
@@ -186,10 +191,8 @@ def _is_harmful(found: Displacement) -> bool:
     if isinstance(found, PostureStep):
         return found.moved_mm > MIN_STEP_MM
     if isinstance(found, ScaleError):
-        return abs(found.outward_mm) > MIN_OUTWARD_MM
-    lever = LEVER_MM * np.radians(found.rotation_deg)
-    limit_mm = MIN_OUTWARD_MM if isinstance(found, CommonError) else MIN_STEP_MM
-    return float(np.hypot(found.shift_mm, lever)) > limit_mm
+        return abs(found.outward_mm) > MIN_ERROR_MM
+    return found.size_mm > MIN_ERROR_MM
 
 
 def _describe_displaced_pole(name: str, pairs: frozenset[str], steps: Array) -> DisplacedPole:

@@ -73,6 +73,10 @@ def step(shift_mm: float = 3.0, turn_deg: float = 0.1, **more: Any) -> Displaced
 
 
 PAIR_STEP = DisplacedPole("pair p1-1", frozenset({"p1-1"}), 5.0, 0.1)
+WARM = [
+    replace(PAIR_STEP, name=f"pair {p}", pairs=frozenset({p}), shift_mm=0.4)
+    for p in ("p1-1", "p2-1")
+]
 OTHER_STEP = DisplacedPole("pole p2", frozenset({"p2-1", "p2-2"}), 3.0, 0.1)
 MISSING = "s01/{}/lit.png: is missing\n  Copy it here."
 
@@ -109,7 +113,8 @@ FINDINGS: dict[str, tuple[dict[str, Any], str, str]] = {
         {"contradictions": everywhere(0.009), "displaced": [step()]}, "repeat", "even with the"),
     "a pole that moved": ({"displaced": [step()]}, "usable", "pole p1 is displaced by 3.0 mm"),
     "a pair that moved": ({"displaced": [PAIR_STEP]}, "repeat", "pair p1-1 is displaced by 5.0 mm"),
-    "two poles that moved": ({"displaced": [step(), OTHER_STEP]}, "repeat", "pole p2 is displaced"),
+    "two poles that moved": ({"displaced": [step(), OTHER_STEP]}, "repeat", "pole p1, pole p2 are dis"),
+    "warm cameras": ({"displaced": WARM}, "usable", "pair p1-1, pair p2-1 are displaced"),
     "one of all poles": ({"displaced": [step(all_moved=True)]}, "repeat", "pole p1 is displaced"),
     "a pole that turned": ({"displaced": [step(200.0, 14.0)]}, "usable", "pole p1 is displaced by 200"),
     "a person who turned": ({"displaced": [step(5.0, 14.0)]}, "repeat", "person turned by 14 degrees"),

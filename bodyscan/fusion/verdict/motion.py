@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from bodyscan.alignment.displaced_poles import STILL_MM
+from bodyscan.alignment.displaced_poles import STILL_MM, DisplacedPole
 from bodyscan.alignment.pose_evidence import ScaleError
 from bodyscan.fusion.verdict.evidence import GIRTH_PER_MM, Finding, ScanEvidence
 from bodyscan.motion.person_motion import describe_step
@@ -23,10 +23,10 @@ def check_displaced_poles(scan: ScanEvidence) -> Iterator[Finding]:
     """Poles and pairs that alignment found displaced, and corrected.
 
     What the correction left shows at the seams. But a single pair may instead measure wrongly, and
-    if several moved, the overlaps alone determine the body's size.
+    if several poles moved, the overlaps alone determine the body's size.
     """
-    steps = scan.person_alignment.displaced if scan.person_alignment else ()
-    for step in steps:
+    moved: list[DisplacedPole] = []
+    for step in scan.person_alignment.displaced if scan.person_alignment else ():
         # A bumped pole turns about its foot and carries its view of the body along, by the turn
         # times its distance, at least a metre. If the body's middle stays within a quarter of
         # that, and 5 degrees are too large for a bump, it was the body that turned.
@@ -41,13 +41,24 @@ def check_displaced_poles(scan: ScanEvidence) -> Iterator[Finding]:
                 step.pairs,
                 spoils=True,
             )
-            continue
-        yield Finding(
-            "repeat" if len(step.pairs) == 1 or len(steps) > 1 or step.all_moved else "usable",
-            f"{step.name} is displaced by {step.shift_mm:.1f} mm and {step.rotation_deg:.2f} degrees "
-            "from its calibrated pose, alone and in one step, which no motion of a person explains; it "
-            "was aligned with the others. Calibrate again, unless `timing` of captures.yaml is wrong",
-        )
+        else:
+            moved.append(step)
+    if not moved:
+        return
+    poles = [step for step in moved if len(step.pairs) > 1]
+    largest = max(moved, key=lambda step: step.size_mm)
+    far = len(poles) < len(moved) and largest.size_mm > MAX_MOTION_MM
+    unknown_size = len(poles) > 1 or any(step.all_moved for step in moved)
+    which = f"{largest.name} is displaced by"
+    if len(moved) > 1:
+        which = f"{', '.join(step.name for step in moved)} are displaced, by up to"
+    yield Finding(
+        "repeat" if far or unknown_size else "usable",
+        f"{which} {largest.shift_mm:.1f} mm and {largest.rotation_deg:.2f} degrees, from the "
+        "calibrated pose and in one step, which no motion of a person explains; this was corrected. "
+        "Possible causes: a knock; cameras or projectors are warmer or colder than when calibrated; "
+        "wrong `timing` in captures.yaml. Calibrate again",
+    )
 
 
 def check_posture_step(scan: ScanEvidence) -> Iterator[Finding]:
