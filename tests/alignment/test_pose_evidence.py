@@ -163,7 +163,9 @@ def test_of_three_pairs_two_that_stand_on_one_pole_and_moved_are_named() -> None
     assert found.pairs == {"p1-1", "p1-3"}
 
 
-@pytest.mark.parametrize("shifts", [of_pole("p2", [0.0, 0.6, 0.0]), of_pair("p1-2", [0.6, 0.0, 0.0])])
+@pytest.mark.parametrize(
+    "shifts", [of_pole("p2", [0.0, 0.6, 0.0]), of_pair("p1-2", [0.6, 0.0, 0.0])]
+)
 def test_where_overlaps_are_known_ten_times_better_a_smaller_displacement_counts(
     shifts: Array,
 ) -> None:
