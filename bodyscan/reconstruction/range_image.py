@@ -71,6 +71,7 @@ class RangeImage:
     warped: whether points were displaced to another moment, off the rays of their pixels.
     corner: row and column of the camera's image at which the kept part begins.
     saturated: share of the pixels lit by stripes of the scan volume that are white.
+    midtone_excess: how far grey levels are from proportional to light, see `StripeMap`.
     rgb: (h, w, 3) uint8, red, green and blue of the lit image; None of a grey camera.
     whole_depth, whole_colours: `open_depth` and `lit` from before cropping.
     correlation_px: distance along rows and columns within which noise is correlated, because depths
@@ -94,6 +95,7 @@ class RangeImage:
     whole_colours: Bytes | None = None
     correlation_px: tuple[float, float] = (0.0, 0.0)
     saturated: float = 0.0
+    midtone_excess: float = 0.0
     rgb: Bytes | None = None
 
     @property

@@ -106,7 +106,9 @@ FINDINGS: dict[str, tuple[dict[str, Any], str, str]] = {
     "noise": ({"alignment": alignment(0.1, 0.45)}, "usable", "disagree by 0.45 mm RMS"),
     "contradictions by noise": ({"contradictions": everywhere(0.03, 0.026)}, "good", ""),
     "contradictions": ({"contradictions": everywhere(0.01)}, "usable", "the pairs disagree"),
-    "JPEG": ({"contradictions": everywhere(0.01), "compressed": ("p1",)}, "usable", "causes: images w"),
+    "JPEG": ({"contradictions": everywhere(0.01), "compressed": tuple("ab")}, "usable", "as JPEG"),
+    "gamma": ({"contradictions": everywhere(0.01), "curved": tuple("ab")}, "usable", "a video gamma"),
+    "gamma that does no harm": ({"curved": tuple("ab")}, "good", ""),
     "many contradictions": ({"contradictions": everywhere(0.03)}, "repeat", "disagree: at"),
     # A focal length wrong by 1 %, taken for a pole that moved, costs 16.6 mm of girth.
     "contradictions of an aligned pole": (

@@ -10,7 +10,11 @@ import pytest
 from bodyscan.arrays import Bytes, Indices, Mask
 from bodyscan.errors import DecodingFailed, WrongDirection
 from bodyscan.stripes.gray.bit_words import BINARY, GRAY, WordCode
-from bodyscan.stripes.gray.sequence_checks import check_exposure, check_words
+from bodyscan.stripes.gray.sequence_checks import (
+    check_exposure,
+    check_words,
+    measure_midtone_excess,
+)
 from bodyscan.stripes.scan_lines import ScanLines
 from bodyscan.stripes.usable_pixels import check_direction, check_illumination
 
@@ -181,3 +185,15 @@ def test_a_finest_pattern_that_never_changes_is_refused(level: float) -> None:
     patterns[5], inverses[5] = level, 140.0 - level
     with pytest.raises(DecodingFailed, match="only 0% of neighbouring pixels"):
         check_pairs(patterns, inverses)
+
+
+@pytest.mark.parametrize("gamma", [1.0, 2.2])
+def test_half_of_the_light_is_brighter_than_half_after_a_video_gamma(gamma: float) -> None:
+    light = np.broadcast_to(np.clip((np.arange(200) % 40 - 12.0) / 16.0, 0.0, 1.0), (100, 200))
+    as_stored = [(230.0 * x ** (1.0 / gamma)).astype(np.uint8) for x in (light, 1.0 - light)]
+    lit, dark = np.full((100, 200), 230, np.uint8), np.zeros((100, 200), np.uint8)
+    images = ScanLines(lit, dark, as_stored[0][None], as_stored[1][None], transposed=False)
+    expected = 2.0 * 0.5 ** (1.0 / gamma) - 1.0
+    assert measure_midtone_excess(images) == pytest.approx(
+        expected, abs=0.02
+    )  # a tenth beside equal

@@ -8,7 +8,8 @@ from bodyscan.optional import optional
 from bodyscan.verdict import Grade, Verdict
 
 CHECKS: tuple[Check, ...] = (
-    *(rig.check_exchanged, rig.check_pairs, rig.check_calibration, rig.check_nominal_size),
+    *(rig.check_exchanged, rig.check_pictures, rig.check_pairs, rig.check_calibration),
+    rig.check_nominal_size,
     rig.check_stripe_directions,
     *(motion.check_common_error, motion.check_times, rig.check_floor, coverage.check_brightness),
     *(coverage.check_exposure, coverage.check_views, rig.check_silent_poles),
@@ -32,7 +33,8 @@ def grade_scan(scan: ScanEvidence) -> Verdict:
     """Grade a scan by the worst of all findings.
 
     The reasons come worst first, of equally bad ones those that explain others. A cause is as bad as
-    the worst of its consequences, which are no reasons of their own. A check that itself fails leaves
+    the worst of its consequences, which are no reasons of their own; one that is good by itself is no
+    reason without them. A check that itself fails leaves
     the scan usable at best, and is reported.
     """
     causes: list[Finding] = []
@@ -52,6 +54,8 @@ def grade_scan(scan: ScanEvidence) -> Verdict:
     def grade(cause: Finding) -> int:
         return min(WORST_FIRST.index(found.grade) for found in followers.get(cause, [cause]))
 
+    good = WORST_FIRST.index("good")
+    causes = [cause for cause in causes if grade(cause) < good]
     causes = sorted(causes, key=lambda cause: (grade(cause), not cause.explains))
     # Their own possible causes would be read as causes.
     consequences = [

@@ -116,18 +116,9 @@ class ImageEvidence:
     contradictions: Contradictions | None = None  # see `merge`
     floor_mm: float | None = None  # height at which the floor was measured, see `find_floor`
     compressed: tuple[str, ...] = ()  # pairs with images as JPEG leaves them, see `find_compressed`
+    curved: tuple[str, ...] = ()  # pairs whose grey levels are not proportional to light
     # Pairs whose images are another's, and whose: see `find_exchanged`.
     exchanged: Mapping[str, str] = field(default_factory=dict)
-
-    @property
-    def compression(self) -> str:
-        """The first of the possible causes if surfaces disagree; "" without compression."""
-        if not self.compressed:
-            return ""
-        return (
-            f"images were compressed as JPEG (blocks of 8 x 8 pixels show in those of "
-            f"{', '.join(self.compressed)}: save PNG or TIFF); "
-        )
 
 
 @dataclass(frozen=True, eq=False)

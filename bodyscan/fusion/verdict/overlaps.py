@@ -178,8 +178,9 @@ def check_disagreement(scan: ScanEvidence) -> Iterator[Finding]:
         yield Finding(
             "usable",
             f"the pairs disagree by {rms_mm:.2f} mm RMS where they overlap; their sigmas predict "
-            f"{expected_mm:.2f} mm. Possible causes: {scan.images.compression}the calibration is "
-            "another rig's; something was moved since; the person did not stand still",
+            f"{expected_mm:.2f} mm. Possible causes: the calibration is another "
+            "rig's; something was moved since; the person did not stand still",
+            frozenset(scan.alignment.rig_from_camera),
         )
 
 
@@ -205,7 +206,7 @@ def check_contradictions(scan: ScanEvidence) -> Iterator[Finding]:
         f"{f'{outlier} and the others' if outlier else 'the pairs'} disagree: at "
         f"{found.share:.1%} of the pairs' common points one sees no surface where the other does, "
         f"mostly from {found.heights_mm[0]:.0f} to {found.heights_mm[1]:.0f} mm. "
-        f"Possible causes: {scan.images.compression}an arm or the head moved; "
+        "Possible causes: an arm or the head moved; "
         + (
             f"the person turned or stepped aside meanwhile; {outlier} was moved since the calibration, "
             "or is from another scan; "
@@ -213,5 +214,5 @@ def check_contradictions(scan: ScanEvidence) -> Iterator[Finding]:
             else "the calibration is another rig's; something was moved since; "
         )
         + "cables or folders were exchanged",
-        report.groups[outlier] if report and outlier else frozenset(),
+        report.groups[outlier] if report and outlier else frozenset(found.pairs),
     )

@@ -15,7 +15,12 @@ from bodyscan.errors import DecodingFailed
 from bodyscan.stripes.albedo_edges import Brightness, correct_across_lines
 from bodyscan.stripes.boundaries import find_boundaries
 from bodyscan.stripes.gray.bit_words import WordCode
-from bodyscan.stripes.gray.sequence_checks import check_exposure, check_words, replace_flashed
+from bodyscan.stripes.gray.sequence_checks import (
+    check_exposure,
+    check_words,
+    measure_midtone_excess,
+    replace_flashed,
+)
 from bodyscan.stripes.grey_noise import measure_noise
 from bodyscan.stripes.scan_lines import ScanLines
 from bodyscan.stripes.stripe_coordinates import (
@@ -68,6 +73,7 @@ def decode_bits(
         result,
         correlation_px=(0.0, along) if images.transposed else (along, 0.0),
         saturated=int(np.count_nonzero(white)) / max(observed, 1),
+        midtone_excess=measure_midtone_excess(images),
         flash=flash,
     )
 

@@ -61,6 +61,28 @@ def check_exposure(images: ScanLines) -> None:
             )
 
 
+def measure_midtone_excess(images: ScanLines) -> float:
+    """Measure by how much half of the light is brighter than halfway between dark and lit, as a share
+    of their contrast: 0 if grey levels are proportional to light, 0.46 with a video gamma of 2.2.
+
+    Where pattern and inverse are equal each has half of the light: at the boundaries of the coarse
+    bits, which blur widens. Median over the brighter half of the pixels; 0 without inverses.
+    """
+    if images.inverses is None:
+        return 0.0
+    lit, dark = (image[::2].astype(np.float32) for image in (images.lit, images.dark))
+    contrast = lit - dark
+    bright = (contrast >= 20.0) & (lit < SATURATED)
+    bright &= contrast >= np.median(contrast[bright]) if bright.any() else False
+    excess = []
+    for pattern, inverse in zip(images.patterns[:5], images.inverses[:5], strict=True):
+        one, other = (image[::2][bright].astype(np.float32) for image in (pattern, inverse))
+        equal = np.abs(one - other) < 0.2 * contrast[bright]
+        excess.append(((one + other - lit[bright] - dark[bright]) / contrast[bright])[equal])
+    found = np.concatenate(excess)
+    return float(np.median(found)) if len(found) >= MIN_CHANGES else 0.0
+
+
 def check_words(
     images: ScanLines, words: Codes, code: WordCode, stripes: int, variance: Floats
 ) -> None:
