@@ -64,7 +64,7 @@ def reconstruct_range_image(pair: PairCalibration, stripes: StripeMap) -> RangeI
         common_mm=common_mm,
         correlation_px=correlation_px,
         saturated=stripes.saturated,
-        midtone_excess=stripes.midtone_excess,
+        nonlinearity=stripes.nonlinearity,
     )
 
 

@@ -31,7 +31,7 @@ class StripeMap:
     crossing, crossing_fault: the map of the stripes that run the other way, or why there is none.
     correlation_px: distance along rows and along columns within which pixels share noise.
     saturated: share of the pixels lit by wanted stripes that are white; 0 if not counted.
-    midtone_excess: see `measure_midtone_excess`; 0 if not measured.
+    nonlinearity: see `measure_nonlinearity`; 0 if not measured.
     flash: which frames other light reached, see `replace_flashed`; "" if none.
     """
 
@@ -47,7 +47,7 @@ class StripeMap:
     crossing_fault: str = ""
     correlation_px: tuple[float, float] = (0.0, 0.0)
     saturated: float = 0.0
-    midtone_excess: float = 0.0
+    nonlinearity: float = 0.0
     flash: str = ""
 
     @property

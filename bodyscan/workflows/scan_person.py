@@ -34,7 +34,6 @@ from bodyscan.fusion.verdict.coverage import measure_coverage
 from bodyscan.fusion.verdict.evidence import ImageEvidence, RigEvidence, ScanEvidence
 from bodyscan.fusion.verdict.overlaps import find_seams
 from bodyscan.fusion.verdict.rig import (
-    MAX_MIDTONE_EXCESS,
     find_compressed,
     find_exchanged,
     find_floor,
@@ -341,7 +340,7 @@ def _collect_image_evidence(
         contradictions,
         find_floor(unmoved, calibration.rig_from_camera, calibration.rig.volume),
         compressed=find_compressed(measured.value),
-        curved=tuple(i.pair for i in measured.value if i.midtone_excess > MAX_MIDTONE_EXCESS),
+        nonlinear=tuple(image.pair for image in measured.value if image.nonlinear),
     )
 
 

@@ -13,7 +13,7 @@ from bodyscan.stripes.gray.bit_words import BINARY, GRAY, WordCode
 from bodyscan.stripes.gray.sequence_checks import (
     check_exposure,
     check_words,
-    measure_midtone_excess,
+    measure_nonlinearity,
 )
 from bodyscan.stripes.scan_lines import ScanLines
 from bodyscan.stripes.usable_pixels import check_direction, check_illumination
@@ -194,6 +194,4 @@ def test_half_of_the_light_is_brighter_than_half_after_a_video_gamma(gamma: floa
     lit, dark = np.full((100, 200), 230, np.uint8), np.zeros((100, 200), np.uint8)
     images = ScanLines(lit, dark, as_stored[0][None], as_stored[1][None], transposed=False)
     expected = 2.0 * 0.5 ** (1.0 / gamma) - 1.0
-    assert measure_midtone_excess(images) == pytest.approx(
-        expected, abs=0.02
-    )  # a tenth beside equal
+    assert measure_nonlinearity(images) == pytest.approx(expected, abs=0.02)  # a tenth beside equal

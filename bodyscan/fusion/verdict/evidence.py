@@ -116,7 +116,7 @@ class ImageEvidence:
     contradictions: Contradictions | None = None  # see `merge`
     floor_mm: float | None = None  # height at which the floor was measured, see `find_floor`
     compressed: tuple[str, ...] = ()  # pairs with images as JPEG leaves them, see `find_compressed`
-    curved: tuple[str, ...] = ()  # pairs whose grey levels are not proportional to light
+    nonlinear: tuple[str, ...] = ()  # pairs whose grey levels are not proportional to light
     # Pairs whose images are another's, and whose: see `find_exchanged`.
     exchanged: Mapping[str, str] = field(default_factory=dict)
 

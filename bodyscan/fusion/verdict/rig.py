@@ -152,10 +152,6 @@ def find_misplaced(
     return found
 
 
-MAX_MIDTONE_EXCESS = 0.12
-"""Linear cameras of four sets have -0.12 to 0.01; a gamma of 2.2 gives 0.13 to 0.37, blur included."""
-
-
 def find_compressed(images: Sequence[RangeImage]) -> tuple[str, ...]:
     """Pairs in whose lit image grey levels step between blocks of 8 x 8 pixels, as JPEG leaves them.
 
@@ -179,7 +175,7 @@ def check_pictures(scan: ScanEvidence) -> Iterator[Finding]:
     where surfaces disagree."""
     changes = {
         "compressed as JPEG (blocks of 8 x 8 pixels show)": scan.images.compressed,
-        "given a video gamma (half of the light is brighter than half)": scan.images.curved,
+        "given a video gamma (half of the light is brighter than half)": scan.images.nonlinear,
     }
     found = {change: pairs for change, pairs in changes.items() if pairs}
     if found:

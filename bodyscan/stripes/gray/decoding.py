@@ -18,7 +18,7 @@ from bodyscan.stripes.gray.bit_words import WordCode
 from bodyscan.stripes.gray.sequence_checks import (
     check_exposure,
     check_words,
-    measure_midtone_excess,
+    measure_nonlinearity,
     replace_flashed,
 )
 from bodyscan.stripes.grey_noise import measure_noise
@@ -73,7 +73,7 @@ def decode_bits(
         result,
         correlation_px=(0.0, along) if images.transposed else (along, 0.0),
         saturated=int(np.count_nonzero(white)) / max(observed, 1),
-        midtone_excess=measure_midtone_excess(images),
+        nonlinearity=measure_nonlinearity(images),
         flash=flash,
     )
 

@@ -61,7 +61,7 @@ def check_exposure(images: ScanLines) -> None:
             )
 
 
-def measure_midtone_excess(images: ScanLines) -> float:
+def measure_nonlinearity(images: ScanLines) -> float:
     """Measure by how much half of the light is brighter than halfway between dark and lit, as a share
     of their contrast: 0 if grey levels are proportional to light, 0.46 with a video gamma of 2.2.
 
@@ -74,12 +74,12 @@ def measure_midtone_excess(images: ScanLines) -> float:
     contrast = lit - dark
     bright = (contrast >= 20.0) & (lit < SATURATED)
     bright &= contrast >= np.median(contrast[bright]) if bright.any() else False
-    excess = []
+    differences = []
     for pattern, inverse in zip(images.patterns[:5], images.inverses[:5], strict=True):
         one, other = (image[::2][bright].astype(np.float32) for image in (pattern, inverse))
         equal = np.abs(one - other) < 0.2 * contrast[bright]
-        excess.append(((one + other - lit[bright] - dark[bright]) / contrast[bright])[equal])
-    found = np.concatenate(excess)
+        differences.append(((one + other - lit[bright] - dark[bright]) / contrast[bright])[equal])
+    found = np.concatenate(differences)
     return float(np.median(found)) if len(found) >= MIN_CHANGES else 0.0
 
 
