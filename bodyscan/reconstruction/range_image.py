@@ -110,8 +110,8 @@ class RangeImage:
 
     @property
     def nonlinear(self) -> bool:
-        """Whether grey levels are far from proportional to light: of linear cameras of four sets
-        `nonlinearity` is -0.12 to 0.01, with a gamma of 2.2 0.13 to 0.37, blur included."""
+        """Whether grey levels are far from proportional to light: linear cameras of three rigs have a
+        `nonlinearity` of -0.12 to 0.01, with a gamma of 2.2 0.13 to 0.37, a consumer's 0.3."""
         return self.nonlinearity > 0.12
 
     @property

@@ -107,7 +107,7 @@ FINDINGS: dict[str, tuple[dict[str, Any], str, str]] = {
     "contradictions by noise": ({"contradictions": everywhere(0.03, 0.026)}, "good", ""),
     "contradictions": ({"contradictions": everywhere(0.01)}, "usable", "the pairs disagree"),
     "JPEG": ({"contradictions": everywhere(0.01), "compressed": tuple("ab")}, "usable", "as JPEG"),
-    "gamma": ({"contradictions": everywhere(0.01), "nonlinear": tuple("ab")}, "usable", "a video gamma"),
+    "gamma": ({"contradictions": everywhere(0.01), "nonlinear": tuple("ab")}, "usable", "video gamma"),
     "gamma that does no harm": ({"nonlinear": tuple("ab")}, "good", ""),
     "many contradictions": ({"contradictions": everywhere(0.03)}, "repeat", "disagree: at"),
     # A focal length wrong by 1 %, taken for a pole that moved, costs 16.6 mm of girth.
