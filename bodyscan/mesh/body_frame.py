@@ -45,8 +45,9 @@ def find_body_frame(vertices: Array) -> BodyFrame:
     feet, ankles = vertices[heights < 0.03, :2], vertices[(heights > 0.05) & (heights < 0.15), :2]
     # A raised foot has no sole on the floor: its ankle lies over none of `feet`.
     ankles = ankles[cKDTree(feet).query(ankles)[0] < 0.02 * vertices[:, 2].max()]
-    toes = feet.mean(axis=0) - ankles.mean(axis=0) if len(ankles) else np.zeros(2)
-    known = bool(np.linalg.norm(toes) > 0.01 * vertices[:, 2].max())
+    toes = _find_toes(feet, ankles, 0.12 * vertices[:, 2].max())
+    # Half of what round feet reach on average, where only their toes go beyond the ankle.
+    known = bool(np.linalg.norm(toes) > 0.005 * vertices[:, 2].max())
     along = axes.T @ toes
     # A stout body may be deeper than wide.
     forward = axes[:, int(known and abs(along[1]) > 2.0 * abs(along[0]))]
@@ -54,3 +55,16 @@ def find_body_frame(vertices: Array) -> BodyFrame:
     rotation = np.eye(3)
     rotation[:2, 0], rotation[:2, 1] = forward, [-forward[1], forward[0]]
     return BodyFrame(RigidTransform(rotation, np.array([middle[0], middle[1], 0.0])), known)
+
+
+def _find_toes(feet: Array, ankles: Array, reach_mm: float) -> Array:
+    """How far (2,) feet (N, 2) reach beyond the ankles (M, 2) closest to them, on average.
+
+    Each foot counts by itself: one of which little touches the floor would otherwise pull the mean of
+    the ankles, but not of the feet, to its side.
+    """
+    if len(ankles) == 0:
+        return np.zeros(2)
+    distance, nearest = cKDTree(ankles).query(feet)
+    own = distance < reach_mm
+    return (feet[own] - ankles[nearest[own]]).mean(axis=0) if own.any() else np.zeros(2)

@@ -89,7 +89,7 @@ def test_what_stands_beside_a_person_is_none_of_its_parts() -> None:
 
 
 @pytest.mark.parametrize("degrees", [0.0, 90.0, 180.0, -60.0])
-@pytest.mark.parametrize("raised_mm", [0.0, 150.0])
+@pytest.mark.parametrize("raised_mm", [0.0, 45.0, 150.0])
 def test_a_body_faces_where_its_feet_point(degrees: float, raised_mm: float) -> None:
     turn = RigidTransform.from_rotation_vector([0.0, 0.0, np.radians(degrees)], [300.0, -90.0, 0.0])
     vertices = standing_body(hanging(25.0))[0]
