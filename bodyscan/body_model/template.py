@@ -37,7 +37,7 @@ class BodyTemplate:
     part_names: tuple[str, ...]
     landmarks: Mapping[str, int]  # vertex of each landmark, by name
     # (L,), of each landmark's position along an axis: the 95 % quantile of the error, over 1.96, on
-    # 20 simulated bodies half of which have surface that the shapes cannot make.
+    # 18 simulated bodies half of which have surface that the shapes cannot make.
     landmark_sigma_mm: Array
     hidden: Mask  # (V,) bool, inside the mouth and the nostrils, which no camera sees
 

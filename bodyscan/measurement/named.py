@@ -12,8 +12,9 @@ tape       along the surface from landmark to landmark, straight across hollows
 chain      sum of straight distances from landmark to landmark
 
 Sections are of the scan's mesh; the template says where, and which part is which (`sections`).
-Intervals hold the noise of the surface, the breath, and the landmarks' uncertainty times how the
-measure changes there.
+Intervals hold the noise of the surface, the breath, and the landmarks' uncertainty: `sigma_mm` of a
+measure, of the level of a section (times how it changes there), or of the value of any other kind: the
+95 % quantile of errors over 1.96 on random bodies (`data/body/landmark_sigmas.py`).
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from scipy.spatial import ConvexHull
 from bodyscan.arrays import Array
 from bodyscan.body_model.fitting import BASIS_MM
 from bodyscan.body_model.registered import RegisteredBody, register_body
-from bodyscan.measurement.landmarks import Landmark, find_landmarks
+from bodyscan.measurement.landmarks import LANDMARK_INFLATION, Landmark, find_landmarks
 from bodyscan.measurement.posture import Posture, find_posture
 from bodyscan.measurement.sections import UP, BodySections, Section
 from bodyscan.mesh.body import BodyMesh
@@ -79,11 +80,10 @@ class NamedMeasures:
 
 @dataclass(frozen=True, eq=False)
 class _Body:
-    """What measures are taken of: landmarks (3,) mm, body frame, and their sigmas by axis."""
+    """What measures are taken of: landmarks (3,) mm, body frame."""
 
     sections: BodySections
     landmarks: Mapping[str, Array]
-    sigma_mm: Mapping[str, float]
 
     @cached_property
     def noise_mm(self) -> float:
@@ -144,7 +144,7 @@ def take_measures(registered: RegisteredBody) -> NamedMeasures:
     landmarks = find_landmarks(registered)
     to_body = registered.rig_from_body.inverse()
     positions = {name: to_body.apply(np.array(one.position_mm)) for name, one in landmarks.items()}
-    body = _Body(sections, positions, {name: one.sigma_mm for name, one in landmarks.items()})
+    body = _Body(sections, positions)
     posture = find_posture(registered.fitted, positions)
     measures, missing = {}, {}
     for definition in read_definitions():
@@ -162,16 +162,15 @@ class _NotThere(Exception):
 def _take(body: _Body, definition: Mapping[str, Any], posture: Posture) -> Measure:
     """Take one measure at its landmarks, and again where its level's uncertainty moves it."""
     kind = _KINDS[definition["kind"]]
-    taken = kind(body, definition, 0.0)
-    sigma_mm = float(np.max([body.sigma_mm[name] for name in definition["landmarks"]]))
-    if definition["kind"] in ("girth", "breadth", "depth"):
+    taken, sigma_mm = kind(body, definition, 0.0), LANDMARK_INFLATION * definition["sigma_mm"]
+    if "part" in definition:  # a section, moved along its normal
         moved = [kind(body, definition, step * sigma_mm).mm for step in (-1.96, -1.0, 1.0, 1.96)]
     else:
-        count = len(definition["landmarks"])
-        half_width = 1.96 * sigma_mm * (np.sqrt(2.0) if count > 1 else 1.0)
-        moved = [taken.mm - half_width, taken.mm + half_width]
+        moved = [taken.mm - 1.96 * sigma_mm, taken.mm + 1.96 * sigma_mm]
+    # The surface's errors are independent of the landmarks'.
     margin = 1.96 * taken.sigma_mm
-    low, high = min([taken.mm, *moved]) - margin, max([taken.mm, *moved]) + margin
+    low = taken.mm - float(np.hypot(taken.mm - min([taken.mm, *moved]), margin))
+    high = taken.mm + float(np.hypot(max([taken.mm, *moved]) - taken.mm, margin))
     if taken.measured < MIN_MEASURED:
         low = min(low, taken.min_mm)
     return Measure(
@@ -217,16 +216,24 @@ def _chain(body: _Body, definition: Mapping[str, Any], shift_mm: float) -> _Take
     return _Taken(length, 1.0, body.length_noise_mm, points)
 
 
-def _girth(body: _Body, definition: Mapping[str, Any], shift_mm: float) -> _Taken:
-    """Convex hull of a section, level or square to a limb; widest or narrowest where requested."""
-    points = [body.landmarks[name] for name in definition["landmarks"]]
+def locate_section(
+    landmarks: Mapping[str, Array], definition: Mapping[str, Any]
+) -> tuple[Array, Array]:
+    """Where a girth, breadth or depth is taken: the normal (3,) of its plane, and a point of the plane,
+    or of those between which it is sought, (S, 3)."""
+    first, last = (landmarks[definition["landmarks"][k]] for k in (0, -1))
     axis = UP
     if "along" in definition:
-        start, end = (body.landmarks[name] for name in definition["along"])
+        start, end = (landmarks[name] for name in definition["along"])
         axis = (start - end) / np.linalg.norm(start - end)
-    first, last = points[0], points[-1]
-    shares = definition.get("shares", [0.5])
-    levels = [float(axis @ (first + share * (last - first))) for share in shares]
+    shares = np.array(definition.get("shares", [0.5]))
+    return axis, first + shares[:, None] * (last - first)
+
+
+def _girth(body: _Body, definition: Mapping[str, Any], shift_mm: float) -> _Taken:
+    """Convex hull of a section, level or square to a limb; widest or narrowest where requested."""
+    axis, centres = locate_section(body.landmarks, definition)
+    levels = (centres @ axis).tolist()
     if "find" in definition:
         levels = np.linspace(levels[0], levels[-1], 15).tolist()
     cuts = _cut(body, definition, axis, [level + shift_mm for level in levels])
@@ -239,8 +246,8 @@ def _girth(body: _Body, definition: Mapping[str, Any], shift_mm: float) -> _Take
 
 def _extent(body: _Body, definition: Mapping[str, Any], shift_mm: float) -> _Taken:
     """Extent of a part's level section forward, or to the side."""
-    level = float(np.mean([body.landmarks[name][2] for name in definition["landmarks"]]))
-    cut = _cut(body, definition, UP, [level + shift_mm])[0]
+    up, centres = locate_section(body.landmarks, definition)
+    cut = _cut(body, definition, up, [float(centres[0] @ up) + shift_mm])[0]
     axis = 0 if definition["kind"] == "depth" else 1
     values = cut.points[:, axis]
     ends = [int(values.argmin()), int(values.argmax())]
@@ -273,7 +280,7 @@ def _tape(body: _Body, definition: Mapping[str, Any], shift_mm: float) -> _Taken
         out = outward - (outward @ along) * along
         out /= np.linalg.norm(out)
         across = np.cross(along, out)
-        cut = body.sections.cut(across, float(across @ a), ["trunk", "neck"])
+        cut = body.sections.cut(across, float(across @ a), "trunk")
         surface = np.zeros((0, 3)) if cut is None else cut.positions
         points = (surface - a) @ np.stack([along, out], axis=1)
         # The surface between two points of a trunk bulges by less than half of their distance.

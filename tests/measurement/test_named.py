@@ -49,7 +49,7 @@ def test_every_definition_is_whole() -> None:
     names = [definition["name"] for definition in definitions]
     assert len(set(names)) == len(names) >= 40
     for definition in definitions:
-        assert {"standard", "definition", "kind"} <= set(definition)
+        assert {"standard", "definition", "kind", "sigma_mm"} <= set(definition)
         assert set(definition["landmarks"]) <= set(TEMPLATE.landmarks)
         parts = definition.get("part", [])
         assert set([parts] if isinstance(parts, str) else parts) <= set(TEMPLATE.part_names)
@@ -90,6 +90,16 @@ def test_a_thigh_is_not_the_trunk_above_the_other_one() -> None:
         assert left is not None
         assert right is not None
         assert left.tape_mm == pytest.approx(right.tape_mm, rel=0.1)
+
+
+def test_a_tape_from_the_base_of_the_neck_leaves_the_neck() -> None:
+    body = register_exactly(*make_body(3))
+    neck = TEMPLATE.parts == TEMPLATE.part_names.index("neck")
+    wider = body.mesh.vertices + np.where(neck, 12.0, 0.0)[:, None] * body.mesh.normals
+    found = take_measures(replace(body, mesh=replace(body.mesh, vertices=wider))).measures
+    for name, one in take_measures(body).measures.items():
+        if "neck to bust" in name:
+            assert found[name].mm == pytest.approx(one.mm, abs=3.0), name
 
 
 def test_a_depth_is_measured_where_its_ends_are() -> None:
