@@ -47,6 +47,10 @@ def ignore_events(event: dict[str, Any]) -> None:
     """Ignore events, for callers that do not need them."""
 
 
+def ignore_start(process: Popen[str]) -> None:
+    """Leave a new process as it is."""
+
+
 def supervise_job(job: Job, process: Process, listen: Listen = ignore_events) -> JobResult:
     """Attempt a job in its folder, twice if necessary; return failures, never raise them."""
     path, since = job.folder, time.monotonic()
@@ -72,6 +76,7 @@ class JobProcess:
 
     threads: int  # of the libraries in it
     command: tuple[str, ...] = COMMAND  # arguments to this Python
+    started: Callable[[Popen[str]], None] = ignore_start  # called with each process
 
     def attempt(self, job: Job, listen: Listen) -> tuple[str, tuple[str, ...]]:
         """Why the job failed, "" if it did not; and the stages that ran."""
@@ -85,6 +90,7 @@ class JobProcess:
                 process = start_process((*self.command, str(folder)), self.threads, log)
             except OSError as error:
                 return f"its process cannot be started: {error.strerror}", ()
+            self.started(process)
             try:
                 return listen_to(process, job, listen)
             finally:

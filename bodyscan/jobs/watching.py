@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from subprocess import Popen
 from threading import Event
@@ -46,6 +46,7 @@ from bodyscan.jobs.pipeline import Pipeline
 from bodyscan.jobs.stages import KINDS, read_rig_of
 from bodyscan.jobs.supervision import (
     COMMAND,
+    JobProcess,
     JobResult,
     Listen,
     ignore_events,
@@ -218,13 +219,26 @@ def watch(
         raise BadInput("there is no such folder", where=str(watched.inbox), remedy="make it first")
     rig = read_rig_of(watched.calibration)
     with hold_output(watched.out):
-        process = ResidentProcess(watched)
-        pool = ThreadPoolExecutor(1)
+        process, rest = ResidentProcess(watched), _RestProcess(watched)
+        scans, others = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
 
-        def do(job: Job) -> JobResult:
+        def scan(job: Job) -> JobResult:
+            job = replace(job, until=KINDS["fuse"][0].name)
             return write_or_refuse(job) or supervise_job(job, process, listen)
 
-        watching = _Watching(watched, process, lambda job: pool.submit(do, job), listen)
+        def complete(job: Job, scanned: Future[JobResult]) -> JobResult:
+            before = scanned.result()
+            if before.state != "done":
+                return before
+            after = write_or_refuse(job) or supervise_job(job, rest, listen)
+            seconds = round(before.seconds + after.seconds, 1)
+            return replace(after, stages=before.stages + after.stages, seconds=seconds)
+
+        def submit(job: Job) -> Future[JobResult]:
+            # Measures and report take as long as a scan: the next person does not wait for them.
+            return others.submit(complete, job, scans.submit(scan, job))
+
+        watching = _Watching(watched, process, submit, listen)
         try:
             process.start()
             while True:
@@ -240,8 +254,9 @@ def watch(
                     return watching.summary()
                 time.sleep(0.1)
         finally:
-            pool.shutdown(wait=False, cancel_futures=True)
-            process.stop()
+            for pool, worker in ((scans, process), (others, rest)):
+                pool.shutdown(wait=False, cancel_futures=True)
+                worker.stop()
 
 
 @dataclass
@@ -359,6 +374,33 @@ def find_earlier(source: Path, state: Path) -> JobResult | None:
     names = ("job", "state", "attempts", "stages", "seconds", "reason")
     known = {name: content[name] for name in names if name in content}
     return JobResult(**{**known, "stages": tuple(known.get("stages", ()))})
+
+
+class _RestProcess:
+    """A new process for each attempt at the stages after a scan, which gives way to the scans."""
+
+    def __init__(self, watched: Watched) -> None:
+        threads, command = watched.pipeline.resources.threads, tuple(watched.command)
+        self._starter = JobProcess(threads, command, self._take)
+        self._process: Popen[str] | None = None
+        self._is_stopped = False
+
+    def attempt(self, job: Job, listen: Listen) -> tuple[str, tuple[str, ...]]:
+        """See `JobProcess`. Raises FailedWork once stopped, so that the job begins anew later."""
+        if self._is_stopped:
+            raise FailedWork("stopped")
+        return self._starter.attempt(job, listen)
+
+    def _take(self, process: Popen[str]) -> None:
+        self._process = process
+        with suppress(OSError):  # it has ended
+            os.setpriority(os.PRIO_PROCESS, process.pid, 10)
+
+    def stop(self) -> None:
+        """Kill it; none is started again."""
+        self._is_stopped = True
+        if self._process is not None:
+            self._process.kill()
 
 
 class ResidentProcess:

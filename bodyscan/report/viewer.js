@@ -244,7 +244,10 @@
     steer(canvas, view, home, changed);
     new ResizeObserver(changed).observe(canvas);
     if (figure.dataset.turning) {  // by itself until a person takes it
-      const again = () => { if (!canvas.isConnected || !figure.dataset.turning) return; view.azimuth -= 0.012; changed(); setTimeout(again, 40); };
+      // Drawn without a graphics card it takes a core, which a scan needs: five pictures a second then.
+      const drawer = gl.getExtension("WEBGL_debug_renderer_info");
+      const pause = drawer && /swiftshader|llvmpipe|software/i.test(gl.getParameter(drawer.UNMASKED_RENDERER_WEBGL)) ? 200 : 40;
+      const again = () => { if (!canvas.isConnected || !figure.dataset.turning) return; view.azimuth -= 0.0003 * pause; changed(); setTimeout(again, pause); };
       canvas.addEventListener("pointerdown", () => { delete figure.dataset.turning; });
       again();
     }

@@ -101,6 +101,14 @@ def test_what_arrives_is_fused_as_a_batch_would_and_never_twice(example: Path, d
     assert run("verify", day / "out").exit_code == 0
 
 
+def test_nobody_waits_for_the_measures_of_the_person_before(example: Path, day: Path) -> None:
+    for name in ("anna", "bea"):
+        feed(example / "pole" / "captures" / "person", day / "inbox" / name)
+    told = events(watch(day, "out", "--once"), "never")
+    of = [(e.get("job"), e["event"], e.get("state")) for e in told]
+    assert of.index(("bea", "verdict", None)) < of.index(("anna", "job", "done"))
+
+
 def _bytes(folder: Path) -> dict[str, str]:
     paths = [path for path in list_files(folder) if path.name not in OWN | {"job.json"}]
     return {str(path.relative_to(folder)): hash_file(path) for path in paths}

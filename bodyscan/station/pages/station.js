@@ -270,7 +270,8 @@
       for (const key of looks.keys()) looks.delete(key); // a retake has other pictures, the day many
       current = row.job;
     }
-    if (row.state === "running" && begun({ ...row, state: "arriving" })) current = row.job;
+    // Not by what is still done for the person before.
+    if (row.state === "running" && before?.state !== "running" && begun({ ...row, state: "arriving" })) current = row.job;
     const shown = row.job === current;
     if (shown && row.decision === "discard" && before?.decision !== "discard") current = "";
     if (shown) showNow();
