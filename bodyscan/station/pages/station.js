@@ -55,7 +55,7 @@
     $("stage").textContent = working ? `${row.part} ${row.total ? `${row.done}/${row.total}` : ""}` : "";
     $("whose").textContent = !row ? "" : row.body ? say("body", { job: row.subject || row.job }) : say("noBody");
     document.querySelector("#body canvas").setAttribute("aria-label", $("whose").textContent || say("noBody"));
-    $("decide").hidden = !row || (row.state !== "done" && row.state !== "set aside");
+    $("decide").hidden = !row || !(row.final || row.state === "done" || row.state === "set aside");
     for (const button of document.querySelectorAll("[data-decision]")) {
       button.setAttribute("aria-pressed", Boolean(row) && row.decision === button.dataset.decision);
     }
