@@ -15,6 +15,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from bodyscan.alignment.displaced_poles import STILL_MM
 from bodyscan.alignment.icp import Alignment
 from bodyscan.alignment.matching import Matches, SampledPoints
 from bodyscan.alignment.overlaps import COARSE, OverlapPoints, map_overlaps, match_overlap
@@ -174,7 +175,9 @@ def estimate_motion(
         return aligned, None, evidence
     with background() as other:
         middle_s = 1e-3 * (_find_middle_of_scan(images) or 0.0)
-        timing = other.submit(solution.fit_times, seconds, middle_s)
+        # What hardly moved says nothing about times: calibrations that disagree look like motion.
+        moves = _compute_rms_displacement(motion, (*RIGID, *NON_RIGID), observed) > STILL_MM
+        timing = other.submit(solution.fit_times, seconds if moves else (), middle_s)
         moved = _update_alignment(
             aligned, names, views, (motion, cells), solution.reach_mm, settings
         )
@@ -265,7 +268,7 @@ class _Solution:
         """By the evidence of the motion: a posture hardly changes within a tenth of a second, and does
         within a second."""
         times = [second for second in seconds if second is not None]
-        if len(times) < len(seconds):
+        if not times or len(times) < len(seconds):
             return TimeFit()
         factors = 1.0, 0.1, 10.0
 

@@ -163,14 +163,9 @@ def test_of_three_pairs_two_that_stand_on_one_pole_and_moved_are_named() -> None
     assert found.pairs == {"p1-1", "p1-3"}
 
 
-@pytest.mark.parametrize(
-    "shifts", [of_pole("p2", [0.0, 0.6, 0.0]), of_pair("p1-2", [0.6, 0.0, 0.0])]
-)
-def test_where_overlaps_are_known_ten_times_better_a_smaller_displacement_counts(
-    shifts: Array,
-) -> None:
-    """A focal length that is 0.05 % longer, as of a warm camera, displaces a pair by half of this."""
-    fine = PoseEvidence(NAMES, evidence(shifts, noise=0.1).system * 100.0)
-    found = detect_displacement(fine, PLACED, POLES)
-    assert isinstance(found, DisplacedPole)
-    assert found.size_mm == pytest.approx(0.6, abs=0.12)  # three sigmas of a single pair
+def test_overlaps_known_ten_times_better_show_a_smaller_displacement() -> None:
+    for shifts in (of_pole("p2", [0.0, 0.6, 0.0]), of_pair("p1-2", [0.6, 0.0, 0.0])):
+        fine = PoseEvidence(NAMES, evidence(shifts, noise=0.1).system * 100.0)
+        found = detect_displacement(fine, PLACED, POLES)
+        assert isinstance(found, DisplacedPole)
+        assert found.size_mm == pytest.approx(0.6, abs=0.12)  # three sigmas of a single pair
