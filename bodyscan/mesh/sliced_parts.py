@@ -207,7 +207,8 @@ def _name_trunk_and_legs(graph: nx.DiGraph[_Node], top: float) -> None:
         for node in trunk:  # lower: cloth, or thighs that touch all the way
             node.part = "trunk" if height > THIGH * top else LEGS
         below = sorted({n for at in trunk for n in graph.succ[at]}, key=lambda n: -n.area_mm2)
-        legs = [node for node in below[:2] if node.area_mm2 > 0.4 * below[0].area_mm2]
+        # Less is a stick; where the crotch was not measured, the filling divides one leg.
+        legs = [node for node in below[:2] if node.area_mm2 > 0.2 * below[0].area_mm2]
         # What ends higher up is a hand that touches a leg.
         below_each = [nx.descendants(graph, leg) | {leg} for leg in legs]
         standing = [{n for n in nodes if lowest[n] < 0.1 * top} for nodes in below_each]
