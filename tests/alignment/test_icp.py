@@ -75,10 +75,7 @@ def disagreement_mm(placings: dict[str, RigidTransform], truth: dict[str, RigidT
 
 
 @pytest.mark.parametrize("matching", ["projected", "open3d"])
-def test_pairs_come_together(
-    scanned: Scanned,
-    matching: Literal["projected", "open3d"],
-) -> None:
+def test_pairs_come_together(scanned: Scanned, matching: Literal["projected", "open3d"]) -> None:
     images, truth = scanned
     start = pushed(truth, 1.5)
     settings = AlignmentSettings(matching=matching, sway_mm=0.0, sway_deg=0.0)
@@ -154,9 +151,7 @@ def test_a_rig_is_refined_on_a_still_object(scanned: Scanned) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("matching", ["projected", "open3d"])
 def test_threads_change_nothing(
-    scanned: Scanned,
-    matching: Literal["projected", "open3d"],
-    monkeypatch: pytest.MonkeyPatch,
+    scanned: Scanned, matching: Literal["projected", "open3d"], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     images, truth = scanned
     start, prior = pushed(truth, 1.5), known_to(truth, 1.5, 0.02)

@@ -58,8 +58,7 @@ def test_a_trunk_is_cut_from_arms_that_hang_against_it() -> None:
 def test_of_arms_pressed_into_the_trunk_nothing_else_is_said() -> None:
     """No neck is left where they are deepest: the girth is that of all."""
     parts = parts_of(hanging(-3.0), (1000.0, 1100.0))
-    for height in (1000.0, 1100.0):
-        assert set(tapes(parts, height)) == {"trunk and left arm and right arm"}
+    assert all(set(tapes(parts, h)) == {"trunk and left arm and right arm"} for h in (1e3, 1.1e3))
 
 
 def test_a_hand_on_the_hip_is_no_part_of_the_trunk() -> None:
@@ -77,6 +76,16 @@ def test_thighs_that_touch_are_two_legs() -> None:
     assert set(found) == {"left leg", "right leg"}
     assert found["left leg"].touches == ("right leg",)
     assert found["left leg"].loop.tape_mm == pytest.approx(2.0 * np.pi * 70.0, rel=0.02)
+
+
+def test_a_leg_that_is_thin_below_the_crotch_is_no_other_body() -> None:
+    vertices, faces = standing_body(hanging(25.0))
+    thin = (
+        (vertices[:, 1] > 0.0) & (vertices[:, 1] < 200.0) & (np.abs(vertices[:, 2] - 760.0) < 80.0)
+    )
+    vertices[thin, :2] += 0.45 * (vertices[thin, :2].mean(axis=0) - vertices[thin, :2])
+    parts = find_parts(MeshSlicer(vertices, faces))
+    assert not any(p.part == "other" for pieces in parts.slices.values() for p in pieces)
 
 
 def test_what_stands_beside_a_person_is_none_of_its_parts() -> None:

@@ -17,12 +17,7 @@ S = np.linspace(2.5, 37.0, SHAPE[1]) + 0.8 * np.sin(np.arange(SHAPE[0]) / 9.0)[:
 
 
 def swept(
-    blur: float,
-    noise: float = 0.0,
-    *,
-    ramp: float = 0.0,
-    bright: float = 160.0,
-    flash: float = 0.0,
+    blur: float, noise: float = 0.0, *, ramp: float = 0.0, bright: float = 160.0, flash: float = 0.0
 ) -> StripeMap:
     """A stripe at a time, its edges blurred by so many stripes."""
     edges = np.arange(STRIPES + 1)[:, None, None]

@@ -10,11 +10,7 @@ import pytest
 from bodyscan.arrays import Bytes, Indices, Mask
 from bodyscan.errors import DecodingFailed, WrongDirection
 from bodyscan.stripes.gray.bit_words import BINARY, GRAY, WordCode
-from bodyscan.stripes.gray.sequence_checks import (
-    check_exposure,
-    check_words,
-    measure_nonlinearity,
-)
+from bodyscan.stripes.gray.sequence_checks import check_exposure, check_words, measure_nonlinearity
 from bodyscan.stripes.scan_lines import ScanLines
 from bodyscan.stripes.usable_pixels import check_direction, check_illumination
 
