@@ -15,7 +15,12 @@ import numpy as np
 from bodyscan.arrays import Array, Floats
 from bodyscan.compiled import compiled
 from bodyscan.fusion.brightness import EqualizedColours, equalize_colours
-from bodyscan.fusion.consistency import Consistency, Contradictions, compare_with_surface
+from bodyscan.fusion.consistency import (
+    Consistency,
+    Contradictions,
+    compare_with_surface,
+    estimate_displacement_sigma,
+)
 from bodyscan.fusion.smoothing import Numbers, SmoothSurface, smooth
 from bodyscan.fusion.voxel_thinning import Samples, take_samples
 from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
@@ -99,10 +104,11 @@ def average(
     chi2 = (square - total * mean**2) / np.maximum(count - 1.0, 1.0)
     inflation = estimate_sigma_inflation(samples, surfaces, consistency, poses) ** 2
     sigma_mm = np.sqrt(variance * np.maximum(inflation, chi2 / 9.0)) / total
+    displacement_mm = estimate_displacement_sigma(samples, surfaces, consistency)[kept]
     return BodyCloud(
         samples.points[kept] + mean[:, None] * samples.normals[kept],
         (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32),
-        sigma_mm.astype(np.float32),
+        np.hypot(sigma_mm, displacement_mm).astype(np.float32),
         np.clip(np.rint(levels), 0.0, 255.0).astype(np.uint8).repeat(3 // levels.shape[1], axis=1),
         count.astype(np.uint8),
     )

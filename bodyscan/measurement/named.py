@@ -19,7 +19,7 @@ measure, of the level of a section (times how it changes there), or of the value
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 from importlib import resources
@@ -28,7 +28,7 @@ from typing import Any
 
 import numpy as np
 import yaml
-from scipy.spatial import ConvexHull
+from scipy.spatial import ConvexHull, cKDTree
 
 from bodyscan.arrays import Array
 from bodyscan.body_model.fitting import BASIS_MM
@@ -90,10 +90,18 @@ class _Body:
         """Sigma of the surface at a point."""
         return float(np.median(self.sections.noise_mm))
 
-    @property
-    def length_noise_mm(self) -> float:
-        """Sigma of the distance between two points of the surface."""
-        return float(np.sqrt(2.0)) * self.noise_mm
+    @cached_property
+    def _tree(self) -> cKDTree:
+        return cKDTree(self.sections.body.vertices, compact_nodes=False, balanced_tree=False)
+
+    def find_length_noise(self, names: Sequence[str]) -> float:
+        """Sigma, mm, of the distance between landmarks due to the surface there. Raises _NotThere where
+        pairs disagree by more than the template's shapes lack: it may be laid over either."""
+        nearest = self._tree.query([self.landmarks[name] for name in names])[1]
+        worst = float(self.sections.noise_mm[nearest].max())
+        if 2.0 * worst > BASIS_MM:
+            raise _NotThere(f"pairs disagree by {2.0 * worst:.0f} mm at its landmarks")
+        return float(np.sqrt(2.0)) * max(worst, self.noise_mm)
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,13 +215,15 @@ def _distance(body: _Body, definition: Mapping[str, Any], shift_mm: float) -> _T
     axis = definition.get("axis")
     gap = other - one if axis is None else (other - one)["xyz".index(axis)]
     length = float(np.linalg.norm(gap))
-    return _Taken(length, 1.0, body.length_noise_mm, np.array([one, other]))
+    return _Taken(
+        length, 1.0, body.find_length_noise(definition["landmarks"]), np.array([one, other])
+    )
 
 
 def _chain(body: _Body, definition: Mapping[str, Any], shift_mm: float) -> _Taken:
     points = np.array([body.landmarks[name] for name in definition["landmarks"]])
     length = float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
-    return _Taken(length, 1.0, body.length_noise_mm, points)
+    return _Taken(length, 1.0, body.find_length_noise(definition["landmarks"]), points)
 
 
 def locate_section(
@@ -292,7 +302,9 @@ def _tape(body: _Body, definition: Mapping[str, Any], shift_mm: float) -> _Taken
         outer = outer[: int(np.argmax(outer == 1)) + 1]
         total += float(np.linalg.norm(np.diff(chain[outer], axis=0), axis=1).sum())
         paths.append(a + chain[outer][::-1] @ np.stack([along, out]))
-    return _Taken(total, 1.0, body.length_noise_mm, np.concatenate(paths))
+    return _Taken(
+        total, 1.0, body.find_length_noise(definition["landmarks"]), np.concatenate(paths)
+    )
 
 
 _KINDS = {

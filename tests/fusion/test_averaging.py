@@ -186,6 +186,13 @@ def test_second_skins_and_what_is_seen_through_contradict(further_mm: float) -> 
     assert len(consistency.against_index) > 0.6 * samples.starts[1]
 
 
+@pytest.mark.parametrize("further_mm", [4.0, 20.0])
+def test_where_surfaces_contradict_either_may_be_right(further_mm: float) -> None:
+    cloud, *_ = fused(further_mm, (0.1, 0.1))
+    # Half of their distance, to points one in 8 of which are looked at.
+    assert cloud.sigma_mm == pytest.approx(0.5 * further_mm, rel=0.15)
+
+
 def test_a_wall_in_front_says_nothing() -> None:
     """Only that the second camera does not see what lies behind."""
     _, _, consistency = seen_beside(-40.0)
