@@ -163,7 +163,7 @@ def estimate_displacement_sigma(
     tree = cKDTree(np.stack(mean[:3], axis=1))
     away, nearest = tree.query(samples.points, distance_upper_bound=90.0)
     near = np.isfinite(away)
-    sigma_mm[near] = 0.5 * mean[3][nearest[near]]
+    sigma_mm[near] = 0.5 * mean[3][np.asarray(nearest)[near]]
     return sigma_mm
 
 

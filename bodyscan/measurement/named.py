@@ -97,7 +97,7 @@ class _Body:
     def find_length_noise(self, names: Sequence[str]) -> float:
         """Sigma, mm, of the distance between landmarks due to the surface there. Raises _NotThere where
         pairs disagree by more than the template's shapes lack: it may be laid over either."""
-        nearest = self._tree.query([self.landmarks[name] for name in names])[1]
+        nearest = self._tree.query(np.array([self.landmarks[name] for name in names]))[1]
         worst = float(self.sections.noise_mm[nearest].max())
         if 2.0 * worst > BASIS_MM:
             raise _NotThere(f"pairs disagree by {2.0 * worst:.0f} mm at its landmarks")

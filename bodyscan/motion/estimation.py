@@ -177,7 +177,7 @@ def estimate_motion(
         middle_s = 1e-3 * (_find_middle_of_scan(images) or 0.0)
         # What hardly moved says nothing about times: calibrations that disagree look like motion.
         moves = _compute_rms_displacement(motion, (*RIGID, *NON_RIGID), observed) > STILL_MM
-        timing = other.submit(solution.fit_times, seconds if moves else (), middle_s)
+        timing = other.submit(solution.fit_times, seconds if moves else (), middle_s, sides)
         moved = _update_alignment(
             aligned, names, views, (motion, cells), solution.reach_mm, settings
         )
@@ -264,33 +264,41 @@ class _Solution:
         postures = {kinds: partial(equations, kinds) for kinds in steps}
         return PoseEvidence(tuple(names), self.motion.pose_equations(), postures)
 
-    def fit_times(self, seconds: Sequence[float | None], middle_s: float) -> TimeFit:
+    def fit_times(
+        self, seconds: Sequence[float | None], middle_s: float, sides: Sequence[str]
+    ) -> TimeFit:
         """By the evidence of the motion: a posture hardly changes within a tenth of a second, and does
-        within a second."""
+        within a second.
+
+        sides: the pole of each pair. Without any one of them the evidence must be the same: a pole
+        or a lens that changed looks like other times, but in its own overlaps alone.
+        """
         times = [second for second in seconds if second is not None]
         if not times or len(times) < len(seconds):
             return TimeFit()
-        factors = 1.0, 0.1, 10.0
 
-        def retime(factor: float, *, parts: bool = False) -> BodyMotion:
+        def log_evidence(factor: float, without: str | None = None) -> float:
             moments = [factor * second for second in times]
-            return self.motion.with_times(moments, factor * middle_s, parts=parts)
+            # Hips that shift are no lean or limb: whoever moves so would seem to need other times.
+            parts = without is not None
+            person = self.motion.with_times(moments, factor * middle_s, parts=parts)
+            fields = self.motion.find_fields([kind.name for kind in person.kinds])
+            projected = {
+                (a, b): system.select(fields)
+                for (a, b), system in self.projected.items()
+                if without not in (sides[a], sides[b])
+            }
+            return person.solve_projected(projected).log_evidence if projected else np.nan
 
-        persons = [retime(factor) for factor in factors]
-        fields = self.motion.find_fields([kind.name for kind in persons[0].kinds])
-        projected = {both: system.select(fields) for both, system in self.projected.items()}
-        solved = map_threads(lambda person: person.solve_projected(projected), persons)
-        stated, *others = (person.log_evidence for person in solved)
-        fits = [TimeFit(f, e - stated) for f, e in zip(factors[1:], others, strict=True)]
+        stated, *others = map_threads(log_evidence, (1.0, 0.1, 10.0))
+        fits = [TimeFit(f, e - stated) for f, e in zip((0.1, 10.0), others, strict=True)]
         best = max(fits, key=lambda one: one.log_ratio)
         if best.log_ratio <= MIN_LOG_RATIO:
             return TimeFit()
-        # Hips that shift are no lean or limb: whoever moves so would seem to need other times.
-        stated, other = (
-            retime(factor, parts=True).solve_projected(self.projected).log_evidence
-            for factor in (1.0, best.factor)
+        gains = map_threads(
+            lambda side: log_evidence(best.factor, side) - log_evidence(1.0, side), set(sides)
         )
-        return best if other > stated + MIN_LOG_RATIO else TimeFit()
+        return best if np.nanmin([*gains, best.log_ratio]) > MIN_LOG_RATIO else TimeFit()
 
 
 def _begin(
