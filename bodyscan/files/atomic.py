@@ -206,9 +206,9 @@ def sweep_scratch(*, with_own: bool = False) -> None:
             if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid():
                 continue
             holder = folder / "lock"
-            is_own = holder.exists() and f"process {os.getpid()} " in holder.read_text("utf-8")
-            if not (with_own and is_own):
-                if time.time() - found.st_mtime < 60.0:
+            held_by = holder.read_text("utf-8") if holder.exists() else ""
+            if not (with_own and f"process {os.getpid()} " in held_by):
+                if not held_by and time.time() - found.st_mtime < 60.0:
                     continue  # perhaps not locked yet
                 with lock_file(holder, wait=False):
                     pass
