@@ -4,6 +4,7 @@ final state. A batch that was cut short resumes: `plan.find_reason_to_run` names
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -136,6 +137,8 @@ def run_on_cluster(
     def run(jobs: Sequence[Job]) -> Iterator[JobResult]:
         try:
             client = Client(address, timeout=20, set_as_default=False)
+            # It prints tracebacks of what becomes a job's reason below.
+            logging.getLogger("distributed.client").setLevel(logging.CRITICAL + 1)
             client.wait_for_workers(1, timeout=20)
         except (OSError, ValueError) as error:
             raise FailedWork(
@@ -166,7 +169,7 @@ def _await_result(future: Any, job: str) -> JobResult:
     try:
         return future.result()
     except CancelledError as lost:  # with the scheduler, or the connection to it
-        return _cluster_lost(job, str(lost))
+        return _cluster_lost(job, str(lost).partition("\n")[0].rstrip("."))
     except Exception as error:
         return JobResult(job, "set aside", reason=f"on the cluster: {error}")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import shutil
 import signal
@@ -57,11 +58,12 @@ def test_a_lost_worker_loses_nothing_and_nothing_is_done_twice(
 
 
 def test_a_scheduler_that_dies_sets_the_rest_aside_with_a_remedy(
-    make_scans: Callable[..., Path], tmp_path: Path
+    make_scans: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("distributed", reason="dask.distributed is not installed")
     scans = make_scans(**{f"s{number}": "sleep 0.5" for number in range(6)})
-    out, outcomes = tmp_path / "out", []
+    out, outcomes, logged = tmp_path / "out", [], []
+    monkeypatch.setattr(logging.getLogger("distributed.client"), "handle", logged.append)
     command = ("-m", "distributed.cli.dask_scheduler", "--port", "0", "--no-dashboard")
     file = tmp_path / "scheduler.json"
     scheduler = _start(*command, "--scheduler-file", str(file))
@@ -85,6 +87,8 @@ def test_a_scheduler_that_dies_sets_the_rest_aside_with_a_remedy(
     aside = [outcome.reason for outcome in outcomes if outcome.state == "set aside"]
     assert aside
     assert all("scheduler" in reason and "start the same batch" in reason for reason in aside)
+    assert not any("\n" in reason for reason in aside)
+    assert not logged, "tracebacks between the lines of a batch"
 
 
 def _start(*arguments: str) -> subprocess.Popen[bytes]:
