@@ -136,7 +136,10 @@ def test_what_a_killed_batch_left_in_the_temporary_folder_is_swept(
         assert not other.exists()
         sweep_scratch(with_own=True)  # as on Ctrl-C, after which nothing is tidied up
         assert not folder.exists()
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["bodyscan-mine", "bodyscan-scratch-new"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "bodyscan-mine",
+        "bodyscan-scratch-new",
+    ]
 
 
 def test_a_bucket_that_is_not_there_is_named_by_its_url(
