@@ -62,7 +62,8 @@ def test_a_scheduler_that_dies_sets_the_rest_aside_with_a_remedy(
 ) -> None:
     pytest.importorskip("distributed", reason="dask.distributed is not installed")
     scans = make_scans(**{f"s{number}": "sleep 0.5" for number in range(6)})
-    out, outcomes, logged = tmp_path / "out", [], []
+    out, outcomes = tmp_path / "out", []
+    logged: list[logging.LogRecord] = []
     monkeypatch.setattr(logging.getLogger("distributed.client"), "handle", logged.append)
     command = ("-m", "distributed.cli.dask_scheduler", "--port", "0", "--no-dashboard")
     file = tmp_path / "scheduler.json"
