@@ -46,18 +46,15 @@ def test_times_and_places_do_not_count(day: Path) -> None:
     assert steps(moved) == ["", ""]
 
 
-def test_another_content_counts(day: Path) -> None:
-    (day / "scans" / "anna" / "image.txt").write_text("other")
-    assert steps(day) == ["inputs changed: image.txt has other content", ""]
-
-
-def test_files_that_come_and_go_count(day: Path) -> None:
+def test_content_and_files_that_come_and_go_count(day: Path) -> None:
     folder = day / "scans" / "anna"
+    (folder / "image.txt").write_text("other")
+    assert steps(day) == ["inputs changed: image.txt has other content", ""]
     (folder / "image.txt").rename(folder / "picture.txt")
     assert steps(day)[0] == "inputs changed: picture.txt is new, image.txt is gone"
 
 
-def test_settings_count_for_the_stages_that_obey_them(day: Path) -> None:
+def test_versions_count_and_settings_for_the_stages_that_obey_them(day: Path) -> None:
     assert steps(day, "fusion.points=2000") == [
         "settings changed: fusion.points 1000000 -> 2000",
         "",
@@ -67,9 +64,6 @@ def test_settings_count_for_the_stages_that_obey_them(day: Path) -> None:
         'settings changed: export.formats ["ply", "obj", "stl", "glb"] -> ["ply"]',
     ]
     assert steps(day, "resources.threads=1") == ["", ""]
-
-
-def test_the_version_of_a_stage_counts(day: Path) -> None:
     assert steps(day, version=2)[0] == "version 2 of the stage, it was 1"
 
 
@@ -90,15 +84,11 @@ def add(day: Path) -> tuple[Path, Path]:
     return added
 
 
-def test_files_that_a_person_added_do_not_count(day: Path) -> None:
+def test_files_that_a_person_added_do_not_count_and_are_kept(day: Path) -> None:
     added = add(day)
     assert steps(day) == ["", ""]
     assert run_cheap(day / "scans", day / "out").endings()["anna"]["stages"] == []
     assert all(path.read_text() == "mine" for path in added)
-
-
-def test_files_that_a_person_added_are_kept_when_a_stage_runs_again(day: Path) -> None:
-    added = add(day)
     (day / "scans" / "anna" / "image.txt").write_text("other")
     told = run_cheap(day / "scans", day / "out").events
     (kept,) = (day / "out" / "anna").glob("kept-scan-*")
