@@ -155,10 +155,8 @@ def _summarize(trials: Sequence[Trial]) -> str:
 
 def _landmark_errors(found: NamedMeasures, true: NamedMeasures) -> np.ndarray:
     """Distances (L,) mm of landmarks from the true ones."""
-    a, b = (
-        np.array([one.position_mm for _, one in sorted(named.landmarks.items())])
-        for named in (found, true)
-    )
+    names = sorted(found.landmarks)
+    a, b = (np.array([named.landmarks[n].position_mm for n in names]) for named in (found, true))
     return np.asarray(np.linalg.norm(a - b, axis=1))
 
 

@@ -129,7 +129,7 @@ def _make_texture(
 def _register(mesh: BodyMesh, rig_from_frame: RigidTransform | None) -> SkinnedBody:
     """Lay the parametric body over a scan's mesh, with its landmarks."""
     registered = register_body(mesh)
-    landmarks = find_landmarks(registered).values()
+    landmarks = [one for one in find_landmarks(registered).values() if one.found != "unseen"]
     carried = [(one.name, np.array(one.position_mm), one.sigma_mm, one.found) for one in landmarks]
     frame = RigidTransform.identity() if rig_from_frame is None else rig_from_frame.inverse()
     return make_skinned(registered, carried, frame)

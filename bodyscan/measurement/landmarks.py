@@ -9,9 +9,10 @@ from the front was tried for the waist and is wrong by four times as much.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.body_model.registered import RegisteredBody
@@ -45,7 +46,7 @@ class Landmark:
     """A landmark: position (x, y, z) mm, rig frame, and its standard deviation by axis.
 
     found: "surface" where the scan was measured there, "refined" if it was moved to what the surface
-        shows, else "template".
+        shows, "unseen" where nothing was measured within 40 mm, else "template".
     """
 
     name: str
@@ -79,6 +80,11 @@ def find_landmarks(body: RegisteredBody) -> dict[str, Landmark]:
             part = int(template.parts[vertex])
             spots[name] = _climb(body, part, direction, spots[name])
     spots |= _find_ends(body, spots)
+    seen = KDTree(body.vertices[np.isfinite(body.mesh.sigma_mm)])
+    for name, spot in spots.items():
+        # Sigmas were measured with 36 mm and less between a landmark and what was measured.
+        if seen.query(spot.position)[0] > 40.0:
+            spots[name] = replace(spot, found="unseen")
     sigmas = dict(zip(template.landmarks, template.landmark_sigma_mm.tolist(), strict=True))
     return {
         name: Landmark(

@@ -155,12 +155,17 @@ def take_measures(registered: RegisteredBody) -> NamedMeasures:
     body = _Body(sections, positions)
     posture = find_posture(registered.fitted, positions)
     measures, missing = {}, {}
+    unseen = {name for name, one in landmarks.items() if one.found == "unseen"}
     for definition in read_definitions():
         try:
+            needed = {*definition.get("landmarks", ()), *definition.get("along", ())}
+            if names := sorted(needed & unseen):
+                raise _NotThere(f"nothing was measured near its landmark {names[0]}")
             measures[definition["name"]] = _take(body, definition, posture)
         except _NotThere as reason:
             missing[definition["name"]] = str(reason)
-    return NamedMeasures(landmarks, measures, missing, posture, registered)
+    shown = {name: one for name, one in landmarks.items() if name not in unseen}
+    return NamedMeasures(shown, measures, missing, posture, registered)
 
 
 class _NotThere(Exception):

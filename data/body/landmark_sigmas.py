@@ -35,7 +35,7 @@ Errors = dict[str, list[float]]
 
 def add_landmark_errors(errors: Errors, found: NamedMeasures, true: NamedMeasures) -> None:
     """Absolute errors by axis, both sides together."""
-    for name in TEMPLATE.landmarks:
+    for name in found.landmarks:
         off = np.subtract(found.landmarks[name].position_mm, true.landmarks[name].position_mm)
         errors.setdefault(drop_side(name), []).extend(np.abs(off).tolist())
 

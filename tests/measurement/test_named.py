@@ -69,14 +69,20 @@ def test_a_web_between_arm_and_trunk_is_no_part_of_a_girth() -> None:
     reach = np.linalg.norm(body.fitted.vertices - armpit, axis=1)
     hidden = trunk & (reach < 110.0)
     web = body.mesh.vertices + np.where(hidden, 40.0, 0.0)[:, None] * body.mesh.normals
-    found = take_measures(
-        hide(replace(body, mesh=replace(body.mesh, vertices=web)), hidden)
-    ).measures
+    webbed = replace(body, mesh=replace(body.mesh, vertices=web))
+    found = take_measures(hide(webbed, hidden)).measures
     for name in ("bust girth", "chest breadth"):
         assert found[name].mm == pytest.approx(true[name].mm, abs=1.0), name
         low, high = found[name].interval_mm
         assert low < true[name].mm < high
     assert found["bust girth"].measured < 0.95
+
+
+def test_a_head_that_nobody_saw_has_no_landmarks() -> None:
+    head = TEMPLATE.parts == TEMPLATE.part_names.index("head")
+    named = take_measures(hide(register_exactly(*make_body(3)), head))
+    assert "pronasale" not in named.landmarks
+    assert named.missing["head length"] == "nothing was measured near its landmark glabella"
 
 
 def test_a_thigh_is_not_the_trunk_above_the_other_one() -> None:
@@ -102,18 +108,13 @@ def test_a_tape_from_the_base_of_the_neck_leaves_the_neck() -> None:
             assert found[name].mm == pytest.approx(one.mm, abs=3.0), name
 
 
-def test_a_depth_is_measured_where_its_ends_are() -> None:
+def test_a_depth_is_measured_where_its_ends_are_and_a_girth_all_around() -> None:
     body = register_exactly(*make_body(3))
     above = body.fitted.vertices[:, 2] - body.fitted.vertices[TEMPLATE.landmarks["left waist"]][2]
     flanks = (np.abs(body.mesh.normals[:, 1]) > 0.8) & (np.abs(above) < 100.0)
     found = take_measures(hide(body, flanks)).measures
     assert found["waist depth"].measured == 1.0
     assert found["waist breadth"].measured == 0.0
-
-
-def test_a_girth_of_which_a_tenth_was_not_seen_is_a_range() -> None:
-    body = register_exactly(*make_body(3))
-    above = body.fitted.vertices[:, 2] - body.fitted.vertices[TEMPLATE.landmarks["left waist"]][2]
     back = (body.mesh.normals[:, 0] < 0.0) & (np.abs(above) < 100.0)
     waist = take_measures(hide(body, back)).measures["waist girth"]
     assert waist.is_range
@@ -132,10 +133,9 @@ def test_changes_that_are_certain_exceed_both_scans_errors() -> None:
     body = register_exactly(*make_body(3))
     earlier, above = take_measures(body), body.vertices[:, 2]
     waist = body.fitted.vertices[TEMPLATE.landmarks["left waist"]][2]
-    belly = np.exp(-(((above - waist) / 60.0) ** 2)) * (
-        body.parts == TEMPLATE.part_names.index("trunk")
-    )
-    grown = body.mesh.vertices + 12.0 * belly[:, None] * body.mesh.normals
+    trunk = body.parts == TEMPLATE.part_names.index("trunk")
+    belly = 12.0 * np.exp(-(((above - waist) / 60.0) ** 2)) * trunk
+    grown = body.mesh.vertices + belly[:, None] * body.mesh.normals
     later = take_measures(replace(body, mesh=replace(body.mesh, vertices=grown)))
     changes = {one.name: one for one in find_changes(earlier, later)}
     assert changes["waist girth"].mm == pytest.approx(75.0, abs=8.0)
