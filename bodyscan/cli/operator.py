@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -440,11 +440,10 @@ def _run(
 def _listening(output: Output) -> Iterator[Listen]:
     """Show how jobs go; the process ends at once when it is interrupted."""
     from bodyscan.jobs import display
-    from bodyscan.jobs.supervision import ignore_events
 
-    quiet = nullcontext(ignore_events) if output.quiet else display.show_on_screen()
+    shown = display.show_failures() if output.quiet else display.show_on_screen()
     try:
-        with display.print_json_lines() if output.json else quiet as listen:
+        with display.print_json_lines() if output.json else shown as listen:
             yield listen
     except KeyboardInterrupt:
         sys.stdout.flush()

@@ -14,7 +14,7 @@ import pytest
 from cheap_batch import jobs_of
 
 from bodyscan.arrays import Array
-from bodyscan.jobs.display import print_json_lines, show_on_screen
+from bodyscan.jobs.display import print_json_lines, show_failures, show_on_screen
 from bodyscan.jobs.job import Job
 from bodyscan.jobs.summary import (
     find_drift,
@@ -133,6 +133,11 @@ def test_people_are_told_what_happened(capsys: pytest.CaptureFixture[str]) -> No
     assert "to be scanned again: b" in said
     assert "out/summary.csv" in said
     assert "pair p1-4, and 1 more: alignment moves it by 1.3 mm in the same direction" in said
+    with show_failures() as listen:
+        for event in EVENTS:
+            listen(event)
+    failures = "[red]a: set aside after 2 attempts: [/bold] broken\nto be scanned again: b\n"
+    assert capsys.readouterr() == ("", failures)
 
 
 def test_programs_are_told_in_json(capsys: pytest.CaptureFixture[str]) -> None:
