@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -433,6 +433,13 @@ def _run(
         if store:
             summary |= {"table": object_storage.put_summary(out, store)}
         listen(summary)
+    _conclude(output, summary)
+
+
+def _conclude(output: Output, summary: Mapping[str, Any]) -> None:
+    """Set the exit code, and name the scans to repeat, which may be done since an earlier run."""
+    if summary["repeat"]:
+        output.say(f"to be scanned again: {', '.join(summary['repeat'])}", wrong=True)
     output.exit_code = 1 if summary["set_aside"] or summary["repeat"] else 0
 
 
@@ -492,7 +499,7 @@ def watch(
     watched = Watched(inbox, out, calibration, _watch_settings(pipeline, changes), quiet_s)
     with _listening(output) as listen:
         summary = watch_inbox(watched, listen, once=once)
-    output.exit_code = 1 if summary["set_aside"] or summary["repeat"] else 0
+    _conclude(output, summary)
 
 
 def _watch_settings(pipeline: Path | None, changes: list[str] | None) -> Pipeline:

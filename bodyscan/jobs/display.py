@@ -59,7 +59,7 @@ def show_on_screen() -> Iterator[Listen]:
 
 @contextmanager
 def show_failures() -> Iterator[Listen]:
-    """Show only what the command fails for: jobs that are set aside, scans that are to be repeated."""
+    """Show on standard error only jobs that are set aside, and scans that are to be repeated."""
     console = Console(stderr=True)
 
     def listen(event: dict[str, Any]) -> None:
@@ -68,8 +68,6 @@ def show_failures() -> Iterator[Listen]:
                 console.print(Text(format_ending(event)), soft_wrap=True)
             case {"event": "verdict", "final": True, "grade": "repeat"}:
                 console.print(_format_verdict(event), soft_wrap=True)
-            case {"event": "summary", "repeat": [_, *_]}:
-                console.print(_format_repeat(event), soft_wrap=True, markup=False)
 
     yield listen
 
@@ -105,7 +103,6 @@ class _Screen:
         aside = len(event["set_aside"])
         text = f"{event['done']} of {event['jobs']} jobs done ({event['ran']} of them now)"
         text += f", {aside} set aside" if aside else ""
-        text += f"\n{_format_repeat(event)}" if event["repeat"] else ""
         if event["drifted"]:
             name, mm = next(iter(event["drifted"].items()))  # the largest first
             more = f", and {len(event['drifted']) - 1} more" if len(event["drifted"]) > 1 else ""
@@ -157,10 +154,6 @@ def _format_verdict(event: dict[str, Any]) -> Text:
     lost = ", ".join(reason.removeprefix(LEFT_OUT).partition(": ")[0] for reason in others)
     text += f"\n  also left out: {lost}" if lost else ""
     return Text(text, STYLES[MARKS.get(event["grade"], "bad")])
-
-
-def _format_repeat(event: dict[str, Any]) -> str:
-    return f"to be scanned again: {', '.join(event['repeat'])}"
 
 
 def format_ending(event: dict[str, Any]) -> str:

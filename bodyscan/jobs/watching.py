@@ -358,19 +358,18 @@ def find_retake_time(source: Path, state: Path) -> int:
 
 def find_earlier(source: Path, state: Path) -> JobResult | None:
     """How a scan's job ended before this watch began; None if its images, or a file of its results,
-    have changed or gone since."""
+    have changed or gone since, or if it was set aside, perhaps for want of memory or disk."""
     content = read_record(state)
-    if content.get("state") not in ("done", "set aside") or find_retake_time(source, state):
+    if content.get("state") != "done" or find_retake_time(source, state):
         return None
     folder, since = state.parent, state.stat().st_mtime_ns
-    if content["state"] == "done":
-        for stage in KINDS["fuse"]:
-            named = read_record(folder / stage.name / STAGE).get("outputs")
-            there = list_results_in(folder / stage.name)
-            if not isinstance(named, dict) or there.keys() != named.keys():
-                return None
-            if any(os.stat(path).st_ctime_ns > since for path in there.values()):
-                return None
+    for stage in KINDS["fuse"]:
+        named = read_record(folder / stage.name / STAGE).get("outputs")
+        there = list_results_in(folder / stage.name)
+        if not isinstance(named, dict) or there.keys() != named.keys():
+            return None
+        if any(os.stat(path).st_ctime_ns > since for path in there.values()):
+            return None
     names = ("job", "state", "attempts", "stages", "seconds", "reason")
     known = {name: content[name] for name in names if name in content}
     return JobResult(**{**known, "stages": tuple(known.get("stages", ()))})

@@ -114,7 +114,7 @@ def test_a_retake_waits_until_every_image_is_new(rig: Rig, tmp_path: Path) -> No
     state = tmp_path / "out" / "anna" / "state.json"
     write_json(state, {"state": "set aside", "job": "anna"})
     assert find_retake_time(tmp_path / "anna", state) == 0
-    assert find_earlier(tmp_path / "anna", state) == JobResult("anna", "set aside")
+    assert find_earlier(tmp_path / "anna", state) is None, "perhaps the disk was full: try again"
     time.sleep(0.02)
     *first, last = frames(rig)
     for pair, some in {"a": frames(rig), "b": first}.items():
