@@ -176,10 +176,8 @@ def _await_result(future: Any, job: str) -> JobResult:
 
 def _cluster_lost(job: str, why: str) -> JobResult:
     """The result of a job that was with a scheduler which is gone."""
-    reason = (
-        f"the cluster's scheduler no longer answers{f' ({why})' if why else ''}: start it, then "
-    )
-    return JobResult(job, "set aside", reason=f"{reason}start the same batch again")
+    lost = f"the cluster's scheduler no longer answers{f' ({why})' if why else ''}"
+    return JobResult(job, "set aside", reason=f"{lost}: start it, then start the same batch again")
 
 
 def stage_versions() -> dict[str, Any]:
