@@ -198,22 +198,26 @@ def _group_faults(
 def describe_failures(
     failures: Mapping[ImageSequence, BodyscanError], good: Collection[str]
 ) -> tuple[dict[str, str], list[str]]:
-    """Pairs that failed in every shot, with the reason or the first few of several; and, of pairs
-    that are good in some shot, one line for each reason."""
-    reasons: dict[str, list[str]] = defaultdict(list)
+    """Pairs that failed in every shot, with the reason or the first few of several (of those that
+    differ in brackets alone one); and, of pairs that are good in some shot, one line for each
+    reason."""
+    reasons: dict[str, dict[str, str]] = defaultdict(dict)
     notes = []
     groups = _group_faults((sequence, format_error(error)) for sequence, error in failures.items())
     for (pair, reason), group in groups.items():
         if pair not in good:
-            reasons[pair].append(reason)
+            reasons[pair].setdefault(reason.partition(" (")[0], reason)
         elif len(group) == 1:
             notes.append(str(failures[group[0]]))
         else:
             shots = ", ".join(sequence.shot for sequence in group)
             notes.append(f"{pair}: {reason}\n  in {len(group)} shots: {shots}")
-    several = "no stripe sequence can be decoded: "
-    failed = {
-        pair: found[0] if len(found) == 1 else several + "\n  or: ".join(found[:3])
-        for pair, found in reasons.items()
-    }
+    failed = {pair: _join(list(found.values())[:3]) for pair, found in reasons.items()}
     return failed, notes
+
+
+def _join(reasons: Sequence[str]) -> str:
+    """Several reasons in one line, then what to do, each remedy once."""
+    whats, _, remedies = zip(*(reason.partition("\n") for reason in reasons), strict=True)
+    several = "no stripe sequence can be decoded: " if len(reasons) > 1 else ""
+    return "\n".join((several + "; or: ".join(whats), *dict.fromkeys(filter(None, remedies))))
