@@ -32,14 +32,13 @@ def format_error(error: BodyscanError) -> str:
 def group_reasons(reasons: Mapping[str, str]) -> list[tuple[list[str], str]]:
     """Names that failed for one reason, and that reason; most names first.
 
-    Reasons that differ only in the name and in figures are one, and the first is given.
+    Reasons that differ only in the name, in figures and in brackets are one: the first is given.
     """
     groups: dict[str, list[str]] = {}
     for name, reason in reasons.items():
-        kind = re.sub(r"\d[\d.]*", "", reason.replace(name, ""))
+        kind = re.sub(r"\(.*?\)|\d[\d.]*", "", reason.replace(name, ""))
         groups.setdefault(kind, []).append(name)
-    found = [(names, reasons[names[0]]) for names in groups.values()]
-    return sorted(found, key=lambda group: -len(group[0]))
+    return [(names, reasons[names[0]]) for names in sorted(groups.values(), key=len, reverse=True)]
 
 
 def format_list(reasons: Mapping[str, str]) -> str:

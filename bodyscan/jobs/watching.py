@@ -370,9 +370,8 @@ def find_earlier(source: Path, state: Path) -> JobResult | None:
             return None
         if any(os.stat(path).st_ctime_ns > since for path in there.values()):
             return None
-    names = ("job", "state", "attempts", "stages", "seconds", "reason")
-    known = {name: content[name] for name in names if name in content}
-    return JobResult(**{**known, "stages": tuple(known.get("stages", ()))})
+    attempts, seconds = content.get("attempts", 0), content.get("seconds", 0.0)
+    return JobResult(folder.name, "done", attempts, tuple(content.get("stages", ())), seconds)
 
 
 class _RestProcess:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodyscan.calibration.board_views import measure_covered_share
+from bodyscan.errors import group_reasons
 from bodyscan.geometry.uncertainty import compute_position_sigma
 from bodyscan.registration.board_checks import find_common_aspect
 from bodyscan.registration.rig_calibration import RigCalibration, find_nominal_size
@@ -77,8 +78,10 @@ def grade_calibration(calibration: RigCalibration) -> Verdict:
     Pairs that failed cost a scan what they alone would have measured, and boards that covered little
     leave the rest of a picture to extrapolation: such a rig is usable, where it measures.
     """
-    failed = calibration.failed.items()
-    findings = [(False, np.inf, f"pair {name} failed: {why}") for name, why in failed]
+    findings = [
+        (False, np.inf, f"pair{'s' if len(names) > 1 else ''} {', '.join(names)} failed: {why}")
+        for names, why in group_reasons(calibration.failed)
+    ]
     for pair in collect_figures(calibration):
         for times, error, words in pair.beyond():
             far = error and times > 2.0

@@ -198,9 +198,8 @@ def _group_faults(
 def describe_failures(
     failures: Mapping[ImageSequence, BodyscanError], good: Collection[str]
 ) -> tuple[dict[str, str], list[str]]:
-    """Pairs that failed in every shot, with the reason or the first few of several (of those that
-    differ in brackets alone one); and, of pairs that are good in some shot, one line for each
-    reason."""
+    """Pairs that failed in every shot, with the first few reasons that differ outside of brackets;
+    and, of pairs that are good in some shot, one line for each reason."""
     reasons: dict[str, dict[str, str]] = defaultdict(dict)
     notes = []
     groups = _group_faults((sequence, format_error(error)) for sequence, error in failures.items())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -320,8 +319,7 @@ def require_cameras(
         errors = [error for sequence, error in boards.refused.items() if sequence.pair == name]
         if errors and taken - len(errors) < MIN_POSES:
             # The most common error: when images are few, one may be bad for a reason of its own.
-            common = Counter(error.what for error in errors).most_common(1)[0][0]
-            error = next(error for error in errors if error.what == common)
+            error = max(errors, key=lambda one: sum(each.what == one.what for each in errors))
             failures[name] = f"{len(errors)} of its {taken} images cannot be used: {error}"
     if not cameras.value:
         raise make_no_pair_error(rig, failures, _describe_boardless(rig, boards, searched))
