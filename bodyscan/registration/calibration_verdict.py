@@ -78,10 +78,8 @@ def grade_calibration(calibration: RigCalibration) -> Verdict:
     Pairs that failed cost a scan what they alone would have measured, and boards that covered little
     leave the rest of a picture to extrapolation: such a rig is usable, where it measures.
     """
-    findings = [
-        (False, np.inf, f"pair{'s' if len(names) > 1 else ''} {', '.join(names)} failed: {why}")
-        for names, why in group_reasons(calibration.failed)
-    ]
+    failed = group_reasons(calibration.failed)
+    findings = [(False, np.inf, f"failed: {', '.join(names)}: {why}") for names, why in failed]
     for pair in collect_figures(calibration):
         for times, error, words in pair.beyond():
             far = error and times > 2.0

@@ -216,7 +216,6 @@ def describe_failures(
 
 
 def _join(reasons: Sequence[str]) -> str:
-    """Several reasons in one line, then what to do, each remedy once."""
     whats, _, remedies = zip(*(reason.partition("\n") for reason in reasons), strict=True)
     several = "no stripe sequence can be decoded: " if len(reasons) > 1 else ""
     return "\n".join((several + "; or: ".join(whats), *dict.fromkeys(filter(None, remedies))))

@@ -117,10 +117,8 @@ def test_a_failure_is_told_the_next_time(make_scans: Callable[..., Path], tmp_pa
     run_cheap(scans, tmp_path / "out")
     (job,) = jobs_of(scans, tmp_path / "out")
     (scan, *_) = cheap_job.kinds()["fuse"]
-    assert (
-        find_reason_to_run(job, describe_origin(job, scan))
-        == "it failed last time: ValueError: a bad day"
-    )
+    reason = find_reason_to_run(job, describe_origin(job, scan))
+    assert reason == "it failed last time: ValueError: a bad day"
 
 
 def test_models_beside_scans_are_no_jobs(make_scans: Callable[..., Path], tmp_path: Path) -> None:

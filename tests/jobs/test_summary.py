@@ -97,8 +97,7 @@ def test_a_scan_has_a_row_of_figures(day: tuple[list[Job], Path]) -> None:
 def test_a_pair_that_all_scans_move_alike_is_told_from_one_that_sways(
     day: tuple[list[Job], Path],
 ) -> None:
-    """b by 3 mm on the mean of five scans; a sways by 0.5 mm along each axis."""
-    jobs, _ = day
+    jobs, _ = day  # b by 3 mm on the mean of five scans; a sways by 0.5 mm along each axis
     assert [one.pair for one in find_drift(jobs[4:])] == ["b"]
     assert find_drift(jobs[:2]) == []
 

@@ -79,7 +79,7 @@ def test_what_exceeds_a_limit_is_named_with_pair_value_and_limit(
     assert grade_calibration(calibration) == Verdict("good")
     failed = {"c9": "saw nothing (bit 0)", "d4": "is late", "c8": "saw nothing (2 of 3 bits)"}
     verdict = grade_calibration(replace(calibration, failed=failed))
-    reasons = ("pairs c9, c8 failed: saw nothing (bit 0)", "pair d4 failed: is late")
+    reasons = ("failed: c9, c8: saw nothing (bit 0)", "failed: d4: is late")
     assert verdict == Verdict("usable", reasons)
     name = min(calibration.pairs)
     verdict = grade_calibration(worse(calibration, name, corners_rms_px=0.4))
