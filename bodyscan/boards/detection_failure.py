@@ -69,10 +69,11 @@ def detect_any(image: Bytes, board: Board) -> tuple[Markers, Appearance]:
 
 def estimate_first_marker(board: Board, markers: Markers) -> int:
     """Estimate with which first marker most of the markers lie as on the board: the described one
-    unless another has at least two more."""
+    unless another has at least two more, of equals the nearest: two faces have the same layout."""
     best, found = board.first_marker, _count_agreeing(board, markers)
     middle = int(np.median(markers.ids)) if len(markers.ids) else 0
-    for first in range(max(0, middle - board.marker_count + 1), middle + 1):
+    firsts = range(max(0, middle - board.marker_count + 1), middle + 1)
+    for first in sorted(firsts, key=lambda first: abs(first - board.first_marker)):
         in_range = (markers.ids >= first) & (markers.ids < first + board.marker_count)
         if np.count_nonzero(in_range) < found + 2:
             continue

@@ -76,7 +76,10 @@ def init(
 
 
 def check(output: Output, rig_file: RigFile) -> None:
-    """Check a rig file and its capture folders, and list what is missing or wrong."""
+    """Check a rig file and its capture folders, and list what is missing or wrong.
+
+    Of images it reads the headers: damage behind them is named by what decodes them.
+    """
     from bodyscan.captures.check import check as look_over
     from bodyscan.captures.check import format_report
     from bodyscan.rig.rig import load_rig

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 
@@ -82,20 +82,25 @@ def correct_stretch(
     """Return the rig with its boards stretched as their views show, and a line on each that is.
 
     Printers stretch pages along one axis. In upright views that looks like pixels that are not square,
-    of all cameras alike, and only then it is looked for; views of a turned board tell the two apart.
+    of all cameras alike; in views of a turned board it cannot, and leaves large residuals.
     """
     ratio = find_common_aspect((one.camera, one.covariance) for one in cameras.values())
     boards, notes = list(rig.boards), list[str]()
-    for k, board in enumerate(rig.boards) if ratio != 1.0 else ():
+    for k, board in enumerate(rig.boards):
         groups = [
             (found.camera, [v for v in views if (v.pair, v.board) == (name, board.name)])
             for name, found in cameras.items()
         ]
-        groups = sorted(groups, key=lambda group: -len(group[1]))[:2]  # two cameras are enough
+        groups = sorted(groups, key=lambda group: -len(group[1]))[:2]
+        # Two cameras and some twenty views of each are enough.
+        groups = [(camera, every[:: 1 + len(every) // 20]) for camera, every in groups]
         count = sum(len(view.pixels) for _, group in groups for view in group)
         misfit = partial(_compute_misfit_of_stretch, board, groups)
-        bounds = min(1.0, ratio**2) / 1.01, max(1.0, ratio**2) * 1.01
         with suppress(DegeneratePoses):
+            about = ratio**2 if ratio != 1.0 else _estimate_stretch(misfit)
+            if about == 1.0:
+                continue
+            bounds = min(1.0, about) / 1.01, max(1.0, about) * 1.01
             found = minimize_scalar(misfit, bounds=bounds, method="bounded")
             # In variances of a corner: chance gives one, bent boards and simple lenses some tens.
             if misfit(1.0) - found.fun > 100.0 * found.fun / count:
@@ -119,6 +124,16 @@ def _compute_misfit_of_stretch(
         found = calibrate_camera(planar, camera.width, camera.height, type(camera.lens)())
         total += found.rms_px**2 * sum(len(view.pixels) for view in planar)
     return total
+
+
+def _estimate_stretch(misfit: Callable[[float], float]) -> float:
+    """Estimate where the misfit is least, by the parabola through three of it; 1 unless a stretch
+    explains more than it leaves, since a wrong lens or a bent board leaves most of its own misfit."""
+    step = 0.01
+    low, middle, high = (misfit(1.0 + n * step) for n in (-1, 0, 1))
+    slope, curvature = (high - low) / 2.0, low - 2.0 * middle + high
+    explains = curvature > 0.0 and 0.5 * slope**2 / curvature > 0.5 * middle
+    return 1.0 - step * slope / curvature if explains else 1.0
 
 
 def list_boards_not_found(rig: Rig, views: Sequence[BoardView], images: int) -> list[str]:

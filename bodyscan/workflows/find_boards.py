@@ -116,18 +116,16 @@ def _refuse_other_markers(
 ) -> None:
     """Raise BadInput if the markers of an image name another first marker than the rig file.
 
-    They are looked at again only if a border of the board's corners is in no view, as where numbers
-    are shifted.
+    They are looked at again only if the best view lacks a border of the corners, as where numbers are
+    shifted: of a row of markers then those agree that do not wrap into the next.
     """
     found = [view for view in views if view.board == board.name]
-    if board.kind == "checkerboard" or board.faces == 2 or not found:
+    if board.kind == "checkerboard" or not found:
         return
-    ids, (columns, rows) = (
-        np.concatenate([view.corner_ids for view in found]),
-        compute_corner_grid(board),
-    )
+    best, (columns, rows) = max(found, key=lambda view: len(view.pixels)), compute_corner_grid(board)
+    ids = best.corner_ids % (columns * rows)
     whole = {0, columns - 1} <= set(ids % columns) and {0, rows - 1} <= set(ids // columns)
-    pair, shot, _ = max(found, key=lambda view: len(view.pixels)).key
+    pair, shot, _ = best.key
     sequence = next(s for s in captures.pair_sequences(pair) if s.shot == shot)
     if whole or sequence.board_path in captures.corners:
         return

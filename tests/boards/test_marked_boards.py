@@ -154,19 +154,22 @@ def test_tags_that_stand_otherwise_than_described_are_refused() -> None:
     assert "or marker_mm 97.69 square" in refused.value.remedy
 
 
-@pytest.mark.parametrize("first", [1, 2, 5])
-def test_the_first_marker_is_read_off_the_markers(tmp_path: Path, first: int) -> None:
-    printed = MARKED.model_copy(update={"first_marker": first})
-    write(tmp_path / "captures" / "s" / "p.png", render([(printed, PLACE)], blur_px=0.8))
+@pytest.mark.parametrize(("first", "faces"), [(1, 1), (2, 2), (5, 1)])
+def test_the_first_marker_is_read_off_the_markers(tmp_path: Path, first: int, faces: int) -> None:
+    described = MARKED.model_copy(update={"faces": faces})
+    printed = described.model_copy(update={"first_marker": first})
+    for back in range(faces):
+        place = view_of(MARKED, 30, 60, 20, fill=0.8, back=back == 1)
+        write(tmp_path / "captures" / f"s{back}" / "p.png", render([(printed, place)], blur_px=0.8))
     rig = Rig(
-        name="r", boards=(MARKED,), pairs=(CAMERA,), files="{shot}/{pair}.png",
+        name="r", boards=(described,), pairs=(CAMERA,), files="{shot}/{pair}.png",
         calibration=(CaptureFolder(folder="captures"),),
     )  # fmt: skip
     captures = open_captures(rig, tmp_path / "rig.yaml")
     with pytest.raises(BadInput, match=f"on this board with first_marker {first}, not 0"):
         find_all_boards(rig, captures)
     right = rig.model_copy(update={"boards": (printed,)})
-    assert len(find_all_boards(right, captures).value) == 1
+    assert len(find_all_boards(right, captures).value) == faces
 
 
 def test_part_of_a_grid_is_enough() -> None:

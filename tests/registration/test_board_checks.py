@@ -6,11 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from ring import CHARUCO, ring_of_cameras, ring_rig, ring_views
+from ring import CHARUCO, board_poses, ring_of_cameras, ring_rig, ring_views
 
 from bodyscan.boards.board_layout import compute_corner_grid, compute_corner_points
 from bodyscan.boards.view import Appearance, BoardView
 from bodyscan.calibration.board_views import match_corners
+from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.board_checks import (
     correct_stretch,
     describe_findings,
@@ -87,15 +88,26 @@ def test_a_board_of_which_little_is_found_is_doubted() -> None:
     assert "may not be those" in said
 
 
-@pytest.mark.parametrize("stretch", [1.02, 0.92, 1.0])
-def test_a_stretched_print_is_told_from_pixels_that_are_not_square(stretch: float) -> None:
+@pytest.mark.parametrize(
+    ("stretch", "turned"), [(1.02, 0), (0.92, 0), (1.0, 0), (0.993, 1), (1.02, 1), (1.0, 1)]
+)
+def test_a_stretched_print_is_told_from_pixels_that_are_not_square(
+    stretch: float, turned: int
+) -> None:
+    """Upright boards give all cameras fy / fx in common; boards turned any way give residuals."""
     placings, cameras = ring_of_cameras(heights=(700, 1200))
     placings = {name: placings[name] for name in ("p1-1", "p1-2")}
     cameras = {name: cameras[name] for name in placings}
     points = compute_corner_points(printed := CHARUCO.model_copy(update={"stretch": stretch}))
+    middle = RigidTransform.from_translation([315, 245, 0])
+    poses = [
+        pose @ middle @ RigidTransform.from_rotation_vector([0, 0, turned * k], [0, 0, 0])
+        @ middle.inverse()
+        for k, pose in enumerate(board_poses(12, np.random.default_rng(0)))
+    ]  # fmt: skip
     views = [
         BoardView(v.pair, v.shot, v.board, match_corners(v.points, points), v.pixels)
-        for v in ring_views(placings, cameras, shots=12, board=printed)[0]
+        for v in ring_views(placings, cameras, poses=poses, board=printed)[0]
     ]
     found = calibrate_cameras(ring_rig(placings), views).value
     corrected, notes = correct_stretch(ring_rig(placings), views, found)
