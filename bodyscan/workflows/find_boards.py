@@ -122,7 +122,8 @@ def _refuse_other_markers(
     found = [view for view in views if view.board == board.name]
     if board.kind == "checkerboard" or not found:
         return
-    best, (columns, rows) = max(found, key=lambda view: len(view.pixels)), compute_corner_grid(board)
+    best = max(found, key=lambda view: len(view.pixels))
+    columns, rows = compute_corner_grid(board)
     ids = best.corner_ids % (columns * rows)
     whole = {0, columns - 1} <= set(ids % columns) and {0, rows - 1} <= set(ids // columns)
     pair, shot, _ = best.key
