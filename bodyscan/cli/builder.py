@@ -76,10 +76,7 @@ def init(
 
 
 def check(output: Output, rig_file: RigFile) -> None:
-    """Check a rig file and its capture folders, and list what is missing or wrong.
-
-    Of images it reads the headers: damage behind them is named by what decodes them.
-    """
+    """Check a rig file and its captures (images by their headers): list what is missing or wrong."""
     from bodyscan.captures.check import check as look_over
     from bodyscan.captures.check import format_report
     from bodyscan.rig.rig import load_rig

@@ -45,9 +45,7 @@ def refuse_other_pitch(board: Board, views: Sequence[BoardView]) -> None:
     def misfit(square_mm: float) -> float:
         tried = compute_corner_points(board.model_copy(update={"square_mm": square_mm}))[:, :2]
         fits = ((tried[v.corner_ids], v.pixels) for v in complete)
-        errors = [
-            fit_board_map(printed, pixels).apply(printed) - pixels for printed, pixels in fits
-        ]
+        errors = [fit_board_map(xy, pixels).apply(xy) - pixels for xy, pixels in fits]
         return float(np.median(np.abs(np.concatenate(errors))))
 
     side, square_mm = board.marker_mm, board.square_mm
@@ -118,22 +116,19 @@ def _compute_misfit_of_stretch(
     """Sum of the squared residuals, px2, of cameras calibrated with squares so many times as high."""
     tried, total = board.model_copy(update={"stretch": board.stretch * stretch}), 0.0
     for camera, views in groups:
-        planar = [
-            make_planar_view(view, tried) for view in views if has_enough_corners(view, tried)
-        ]
+        used = (view for view in views if has_enough_corners(view, tried))
+        planar = [make_planar_view(view, tried) for view in used]
         found = calibrate_camera(planar, camera.width, camera.height, type(camera.lens)())
         total += found.rms_px**2 * sum(len(view.pixels) for view in planar)
     return total
 
 
 def _estimate_stretch(misfit: Callable[[float], float]) -> float:
-    """Estimate where the misfit is least, by the parabola through three of it; 1 unless a stretch
-    explains more than it leaves, since a wrong lens or a bent board leaves most of its own misfit."""
-    step = 0.01
-    low, middle, high = (misfit(1.0 + n * step) for n in (-1, 0, 1))
+    """Estimate where the misfit is least, by a parabola; 1 unless the stretch explains more than it
+    leaves: a wrong lens or a bent board leaves most of its own."""
+    low, middle, high = (misfit(stretch) for stretch in (0.99, 1.0, 1.01))
     slope, curvature = (high - low) / 2.0, low - 2.0 * middle + high
-    explains = curvature > 0.0 and 0.5 * slope**2 / curvature > 0.5 * middle
-    return 1.0 - step * slope / curvature if explains else 1.0
+    return 1.0 - 0.01 * slope / curvature if slope**2 > middle * curvature > 0.0 else 1.0
 
 
 def list_boards_not_found(rig: Rig, views: Sequence[BoardView], images: int) -> list[str]:
@@ -152,32 +147,23 @@ def describe_findings(rig: Rig, views: Sequence[BoardView], images: int) -> str:
     """How much of each board was seen and what to check, for when no camera could be calibrated."""
     lines = list_boards_not_found(rig, views, images)
     for board in rig.boards:
-        shares = [
-            len(view.pixels) / count_corners_per_face(board)
-            for view in views
-            if view.board == board.name
-        ]
+        count = count_corners_per_face(board)
+        shares = [len(view.pixels) / count for view in views if view.board == board.name]
         if shares:
             # The description may be wrong if the median view shows less than half of the corners.
+            median = float(np.median(shares))
+            hint = ": its columns, rows or square_mm in the rig file may not be those of the board"
             lines.append(
                 f"{describe_board(board)} was found in {len(shares)} of {images} images, with "
-                f"{100 * float(np.median(shares)):.0f} % of its corners in the median view"
-                + (
-                    ": its columns, rows or square_mm in the rig file may not be those of the board"
-                    if np.median(shares) < 0.5
-                    else ""
-                )
+                f"{100 * median:.0f} % of its corners in the median view{hint if median < 0.5 else ''}"
             )
     return "\n  ".join(lines)
 
 
 def note_appearance(rig: Rig, views: Sequence[BoardView]) -> list[str]:
     """One line for each difference between a board and its description in the rig file."""
-    return [
-        line
-        for board in rig.boards
-        for line in _note_board(board, [view for view in views if view.board == board.name])
-    ]
+    each = ((board, [view for view in views if view.board == board.name]) for board in rig.boards)
+    return [line for board, own in each for line in _note_board(board, own)]
 
 
 def _note_board(board: Board, views: Sequence[BoardView]) -> Iterator[str]:
@@ -191,17 +177,14 @@ def _note_board(board: Board, views: Sequence[BoardView]) -> Iterator[str]:
     if inverted:
         yield f"board {board.name} is white on black in {where(inverted)}; using that"
     if mirrored:
-        cameras = {view.pair for view in mirrored} != {view.pair for view in views}
+        others = (
+            ". Other cameras see it as printed: if none looks at it from behind, the images of these "
+            "are flipped"
+        )
         yield (
             f"board {board.name} is mirrored in {where(mirrored)}, as in a mirror or through the "
             "glass it is printed on; using that"
-            + (
-                ". Other cameras see it as printed: if none looks at it from behind, the images "
-                "of these are flipped"
-                if cameras
-                else ""
-            )
-        )
+        ) + others * ({view.pair for view in mirrored} != {view.pair for view in views})
     if other:
         layout = "false" if board.legacy_layout else "true"
         yield (

@@ -119,10 +119,10 @@ def _refuse_other_markers(
     They are looked at again only if the best view lacks a border of the corners, as where numbers are
     shifted: of a row of markers then those agree that do not wrap into the next.
     """
-    found = [view for view in views if view.board == board.name]
-    if board.kind == "checkerboard" or not found:
+    found = (view for view in views if view.board == board.name)
+    best = max(found, key=lambda view: len(view.pixels), default=None)
+    if board.kind == "checkerboard" or best is None:
         return
-    best = max(found, key=lambda view: len(view.pixels))
     columns, rows = compute_corner_grid(board)
     ids = best.corner_ids % (columns * rows)
     whole = {0, columns - 1} <= set(ids % columns) and {0, rows - 1} <= set(ids // columns)
