@@ -139,12 +139,12 @@ class IncomingScan:
             stamp = (found.st_size, found.st_ctime_ns)  # a copy may keep the time of its original
             known = before.get(path)
             if known is None or stamp != (known.size, known.changed_ns):
-                known = _File(*stamp, now_s, _has_end_mark(path, found.st_size))
+                known = _File(*stamp, now_s, has_end_mark(path, found.st_size))
             self._files[path] = known
         return before != self._files
 
 
-def _has_end_mark(path: Path, size: int) -> bool:
+def has_end_mark(path: Path, size: int) -> bool:
     """Whether the last bytes show that the file is complete; False for formats without an end mark."""
     ends = {".png": b"IEND\xaeB`\x82", ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
     end = ends.get(path.suffix.lower())

@@ -8,7 +8,10 @@ pictures are covered a whole calibration by the shots so far says whether they a
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import os
+import time
+from collections.abc import Mapping, Sequence, Set
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -17,8 +20,9 @@ import numpy as np
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.boards.view import BoardView
-from bodyscan.captures.folder import Captures, ImageSequence, open_captures
+from bodyscan.captures.folder import Captures, ImageSequence, open_captures, resolve_capture_path
 from bodyscan.errors import BodyscanError
+from bodyscan.jobs.watching import STABLE_S, has_end_mark
 from bodyscan.optional import optional
 from bodyscan.registration.advice import pair_sigma_mm, suggest_shots
 from bodyscan.registration.calibration_verdict import collect_figures, grade_calibration
@@ -39,6 +43,9 @@ COLUMNS, ROWS = 4, 3
 BOARDS = 6
 """Boards that each pair should see: three determine a camera, six show when one is bad."""
 
+Image = tuple[str, str]  # a pair and a shot
+Stamp = tuple[int, int]  # size and time of a file
+
 
 @dataclass
 class BoardTour:
@@ -46,15 +53,19 @@ class BoardTour:
 
     rig_file: Path
     views: list[BoardView] = field(default_factory=list)  # boards found so far
-    # Pairs and shots in whose images they were looked for.
-    looked: set[tuple[str, str]] = field(default_factory=set)
-    seen: set[str] = field(default_factory=set)  # the shots of these
+    # Pairs and shots in whose images they were looked for, and size and time of each.
+    looked: Mapping[Image, Stamp] = field(default_factory=dict)
+    images: int = 0  # how many these are, and those that were taken again
+    seen: Set[str] = frozenset()  # their shots
     # Pairs and shots of which only the lit image was taken, which places a board but shows no
     # stripes on it.
-    lit: set[tuple[str, str]] = field(default_factory=set)
-    missed: dict[str, list[str]] = field(default_factory=dict)
+    lit: Set[Image] = frozenset()
+    missed: Mapping[str, list[str]] = field(default_factory=dict)
     solved: dict[str, Any] = field(default_factory=dict)  # see `solve`
-    _pending: set[tuple[str, str]] = field(default_factory=set)
+    refused: Sequence[str] = ()  # why the captures cannot be opened
+    _pending: dict[Image, tuple[Stamp, float]] = field(default_factory=dict)  # and since when
+    _folders: Mapping[str, int] | None = None  # when a name came into each
+    _changed_s: float = -np.inf
 
     def __post_init__(self) -> None:
         self.rig = load_rig(self.rig_file)
@@ -62,13 +73,17 @@ class BoardTour:
     def look(self) -> list[str]:
         """Find boards in the images that have come since, and return the names of their shots.
 
-        Pairs take turns, so a shot's images come one by one. One is looked at when it was there at the
-        look before, too: until then it may be half written.
+        Pairs take turns, so a shot's images come one by one; one that was taken again is looked at
+        again. What other threads read meanwhile is replaced, never changed.
         """
+        if not self._may_have_changed():
+            return []
         try:
             captures = open_captures(self.rig, self.rig_file)
-        except BodyscanError:
-            return []  # nothing yet
+        except BodyscanError as error:
+            self.refused = [str(error)]  # such as no image yet
+            return []
+        self.refused = []
         projecting = {pair.name for pair in self.rig.pairs if pair.projector}
         by_image = {(s.pair, s.shot): s for s in captures.sequences}
         self.lit = {
@@ -76,29 +91,62 @@ class BoardTour:
             for image, s in by_image.items()
             if s.pair in projecting and s.board_path.exists() and not s.has_stripes
         }
-        there = {i for i, s in by_image.items() if i not in self.looked and s.board_path.exists()}
-        fresh, self._pending = there & self._pending, there - self._pending
+        fresh = self._find_whole({image: s.board_path for image, s in by_image.items()})
         if fresh:
+            self.images += len(fresh)
+            self.looked = {**self.looked, **fresh}
             self._find(captures, tuple(s for image, s in by_image.items() if image in fresh))
         return sorted({shot for _, shot in fresh})
 
+    def _find_whole(self, images: Mapping[Image, Path]) -> dict[Image, Stamp]:
+        """Images that were not looked at as they are now, and that are whole."""
+        now_s, before, fresh = time.monotonic(), self._pending, dict[Image, Stamp]()
+        self._pending = {}
+        for image, path in images.items():
+            with suppress(OSError):  # not there yet
+                found = path.stat()
+                stamp = (found.st_size, found.st_ctime_ns)
+                if self.looked.get(image) == stamp:
+                    continue
+                was, since_s = before.get(image, (None, now_s))
+                since_s = since_s if was == stamp else now_s
+                if has_end_mark(path, stamp[0]) or now_s - since_s >= STABLE_S:
+                    fresh[image] = stamp
+                else:
+                    self._pending[image] = stamp, since_s
+        return fresh
+
+    def _may_have_changed(self) -> bool:
+        """Whether files may have come in the last second: folders say when a name came into them, in
+        steps of hundredths of a second."""
+        now_s, before = time.monotonic(), self._folders
+        roots = [resolve_capture_path(self.rig_file, entry) for entry in self.rig.calibration]
+        walks = (os.walk(root) for root in roots)
+        with suppress(FileNotFoundError):  # removed meanwhile: it is another at the next look
+            self._folders = {p: os.stat(p).st_mtime_ns for walk in walks for p, _, _ in walk}
+        if self._folders != before or self._pending or self.rig.follow_links:
+            self._changed_s = now_s
+        return now_s - self._changed_s < 1.0
+
     def _find(self, captures: Captures, fresh: tuple[ImageSequence, ...]) -> None:
         shots = tuple(dict.fromkeys(s.shot for s in fresh))
-        self.looked |= {(s.pair, s.shot) for s in fresh}
         self.seen |= set(shots)
+        again = {(s.pair, s.shot) for s in fresh}
+        self.views = [view for view in self.views if (view.pair, view.shot) not in again]
         found = find_all_boards(self.rig, replace(captures, shots=shots, sequences=fresh))
-        self.views += found.value
+        self.views = [*self.views, *found.value]
         for shot in shots:
             seeing = {view.pair for view in self.views if view.shot == shot}
-            self.missed.pop(shot, None)  # so that the last shot is the last of them
-            self.missed[shot] = sorted({p for p, one in self.looked if one == shot} - seeing)
+            missed = sorted({p for p, one in self.looked if one == shot} - seeing)
+            # The last shot is the last of them.
+            self.missed = {k: v for k, v in self.missed.items() if k != shot} | {shot: missed}
 
     def solve(self) -> None:
         """Solve for all cameras and poses by the boards so far, and calibrate with them once they cover
         the pictures; what fails is a line of advice."""
         notes: list[str] = []
         sigmas: dict[str, float] = {}
-        images = len(self.looked)
+        images = self.images
         with optional("sigmas", notes.append):
             cameras = calibrate_cameras(self.rig, self.views, folder=self.rig_file.parent).value
             located = locate_views(self.rig, self.views, cameras).value
@@ -128,11 +176,11 @@ class BoardTour:
         """Everything that a page shows of it."""
         by_pair = {pair.name: self._calibrating(pair.name) for pair in self.rig.pairs}
         cells = self._count_cells()
-        last = list(self.missed)[-1:]
+        last, missed = next(reversed(self.missed.items()), (None, []))
         return {
             "shots": len(self.seen),
-            "last": last[0] if last else None,
-            "missed": self.missed[last[0]] if last else [],
+            "last": last,
+            "missed": missed,
             "pairs": [
                 {
                     "name": name,
@@ -145,7 +193,7 @@ class BoardTour:
             "groups": self._find_groups(),
             "shared": self._count_shared_shots(),
             "next": self._choose_next(cells),
-            "advice": self.solved.get("advice", []),
+            "advice": [*self.refused, *self.solved.get("advice", [])],
             "wanted": BOARDS,
         }
 
@@ -162,7 +210,7 @@ class BoardTour:
         hold = self._find_frame_shot() or self._choose_by_pictures()
         if hold["say"] != "enough":
             return hold
-        if self.solved.get("images") != len(self.looked) or "advice" not in self.solved:
+        if self.solved.get("images") != self.images or "advice" not in self.solved:
             return {"say": "checking"}
         weakest = self.solved.get("weakest")
         if weakest is None:

@@ -166,7 +166,7 @@ class Operation:
 
     def _look_at_boards(self) -> None:
         assert self.tour is not None
-        while not self.stopped.wait(0.15):
+        while not self.stopped.wait(0.1):
             try:
                 if self.tour.look():
                     self.feed.publish({"kind": "boards", **self.tour.describe()})
@@ -178,7 +178,7 @@ class Operation:
         assert self.tour is not None
         before = 0
         while not self.stopped.wait(0.5):
-            images, solved = len(self.tour.looked), self.tour.solved.get("images", 0)
+            images, solved = self.tour.images, self.tour.solved.get("images", 0)
             if images == before > solved and len(self.tour.seen) > 2:
                 self.tour.solve()
                 self.feed.publish({"kind": "boards", **self.tour.describe()})

@@ -193,16 +193,25 @@ def test_a_board_is_found_pair_by_pair_as_the_simulated_rig_takes_its_images(
         with pytest.raises(BadInput, match="b01, b02 and so on"):
             capture_shot(devices, replace(shot, name="table"))
     tour = BoardTour(tmp_path / "rig.yaml")
+    assert tour.look() == []
+    assert "the capture folder does not exist" in tour.describe()["advice"][0]
     shutil.copytree(shot.folder, tmp_path / "shots", ignore=shutil.ignore_patterns("*.png"))
     names = [pair.name for pair in rig.pairs]
     for number, name in enumerate(names, start=1):
-        shutil.copytree(
-            tmp_path / "taken/b01" / name, tmp_path / "shots/b01" / name, dirs_exist_ok=True
-        )
-        assert (tour.look(), tour.look(), tour.look()) == ([], ["b01"], [])
+        there = tmp_path / "shots/b01" / name
+        shutil.copytree(tmp_path / "taken/b01" / name, there, dirs_exist_ok=True)
+        whole = (there / "lit.png").read_bytes()
+        (there / "lit.png").write_bytes(whole[:-9])
+        assert tour.look() == [], "half written"
+        (there / "lit.png").write_bytes(whole)
+        assert (tour.look(), tour.look()) == (["b01"], [])
         told = tour.describe()
         assert [pair["boards"] for pair in told["pairs"]] == [1] * number + [0] * (4 - number)
         assert (told["shots"], told["last"], told["missed"]) == (1, "b01", [])
+        assert (told["advice"], tour.images) == ([], number)
+    shutil.copyfile(tmp_path / "taken/b01" / names[0] / "dark.png", there / "again.png")
+    (there / "again.png").replace(there / "lit.png")
+    assert (tour.look(), tour.describe()["missed"]) == (["b01"], names[3:]), "taken again"
 
 
 def test_the_board_is_held_where_stripes_are_lacking_until_it_was_everywhere() -> None:
@@ -217,16 +226,16 @@ def test_the_board_is_held_where_stripes_are_lacking_until_it_was_everywhere() -
             size = np.array([pair.camera.width / 4, pair.camera.height / 3])
             pixels = (np.array([cell[1], cell[0]]) + 0.5)[None] * size
             tour.views.append(BoardView(pair.name, shot, "board", np.zeros(1, int), pixels))
-        tour.seen.add(shot)
+        tour.seen |= {shot}
     assert tour.describe()["next"] == {"say": "checking"}, "covered pictures are not yet a good rig"
     tour.solved = {"images": 0, "advice": [], "weakest": "p3-1"}
     assert (tour.describe()["next"]["say"], tour.describe()["next"]["pair"]) == ("hold", "p3-1")
     tour.solved["weakest"] = None
     assert tour.describe()["next"] == {"say": "enough"}
-    tour.lit |= {("p2-3", f"b{number}") for number in range(20)}
+    tour.lit = {("p2-3", f"b{number}") for number in range(20)}
     held = tour.describe()["next"]
     assert (held["say"], held["pair"], held["boards"]) == ("hold", "p2-3", 4)
-    tour.lit.clear()
+    tour.lit = set()
     tour.views = [
         v
         for v in tour.views
