@@ -60,7 +60,7 @@ class BoardTour:
     # Pairs and shots of which only the lit image was taken, which places a board but shows no
     # stripes on it.
     lit: Set[Image] = frozenset()
-    missed: Mapping[str, list[str]] = field(default_factory=dict)
+    missed: dict[str, list[str]] = field(default_factory=dict)
     solved: dict[str, Any] = field(default_factory=dict)  # see `solve`
     refused: Sequence[str] = ()  # why the captures cannot be opened
     _pending: dict[Image, tuple[Stamp, float]] = field(default_factory=dict)  # and since when
