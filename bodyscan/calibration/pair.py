@@ -218,10 +218,7 @@ def _refine(
         bent_mm={name: warp.out_of_plane_mm for name, warp in joint.warps.items()},
     )
     return replace(
-        calibration,
-        camera=joint.camera,
-        camera_covariance=joint.camera_covariance,
-        quality=quality,
+        calibration, camera=joint.camera, camera_covariance=joint.camera_covariance, quality=quality
     ), [replace(light, sheets=next(refined)) if light in smooth else light for light in lights]
 
 

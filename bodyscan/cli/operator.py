@@ -189,8 +189,7 @@ def measure(
         typer.Option(help="Default: `measurements.json` inside the result; .csv for CSV."),
     ] = None,
     named: Annotated[
-        bool,
-        typer.Option("--named", help="Lay a body over the scan: landmarks, measures by name."),
+        bool, typer.Option("--named", help="Lay a body over the scan: landmarks, measures by name.")
     ] = False,
     landmarks: Annotated[
         Path | None,

@@ -118,11 +118,7 @@ def combine_directions(
     return (points, sigma_mm, common_mm), sigmas
 
 
-def _measure_offset(
-    one: Depths,
-    other: Depths,
-    sigmas: Sequence[Floats],
-) -> tuple[float, bool]:
+def _measure_offset(one: Depths, other: Depths, sigmas: Sequence[Floats]) -> tuple[float, bool]:
     """Robust sigma of the directions' difference, in stripes of the less depth-sensitive one, and
     whether that is the other.
 

@@ -132,9 +132,7 @@ MEASURE_COLUMNS = (
 
 
 def format_named_csv(
-    named: NamedMeasures | str,
-    facts: Mapping[str, Any],
-    changes: MeasureChanges | None = None,
+    named: NamedMeasures | str, facts: Mapping[str, Any], changes: MeasureChanges | None = None
 ) -> str:
     """Named measures as CSV: a row for each, lengths in mm; no value where it is a range, neither value
     nor interval where it could not be taken, for a reason.
@@ -259,9 +257,7 @@ def _write_csv(columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str
 
 
 def make_measurements_document(
-    measured: Measurements,
-    facts: Mapping[str, Any],
-    changes: MeasureChanges | None = None,
+    measured: Measurements, facts: Mapping[str, Any], changes: MeasureChanges | None = None
 ) -> dict[str, Any]:
     """Content of `measurements.json`; facts: of the scan, as in its scan.json; changes, as in
     `format_named_csv`."""
@@ -302,9 +298,7 @@ def _describe(measure: Measure) -> dict[str, Any]:
 
 
 def format_measurements_csv(
-    measured: Measurements,
-    facts: Mapping[str, Any],
-    changes: MeasureChanges | None = None,
+    measured: Measurements, facts: Mapping[str, Any], changes: MeasureChanges | None = None
 ) -> str:
     """Measurements as CSV: `Measurements.to_records`, each with the scan's subject, date and grade; or
     those by name, if they were asked for."""

@@ -10,15 +10,17 @@ from __future__ import annotations
 
 import os
 import time
+from collections import Counter
 from collections.abc import Mapping, Sequence, Set
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from bodyscan.arrays import Array, Indices
+from bodyscan.arrays import Indices
 from bodyscan.boards.view import BoardView
 from bodyscan.captures.folder import Captures, ImageSequence, open_captures, resolve_capture_path
 from bodyscan.errors import BodyscanError
@@ -43,8 +45,7 @@ COLUMNS, ROWS = 4, 3
 BOARDS = 6
 """Boards that each pair should see: three determine a camera, six show when one is bad."""
 
-Image = tuple[str, str]  # a pair and a shot
-Stamp = tuple[int, int]  # size and time of a file
+Stamp = tuple[str, str, int, int]
 
 
 @dataclass
@@ -53,17 +54,16 @@ class BoardTour:
 
     rig_file: Path
     views: list[BoardView] = field(default_factory=list)  # boards found so far
-    # Pairs and shots in whose images they were looked for, and size and time of each.
-    looked: Mapping[Image, Stamp] = field(default_factory=dict)
-    images: int = 0  # how many these are, and those that were taken again
+    # Pair, shot, size and time of the images in which they were looked for, retaken ones too.
+    looked: Set[Stamp] = frozenset()
     seen: Set[str] = frozenset()  # their shots
     # Pairs and shots of which only the lit image was taken, which places a board but shows no
     # stripes on it.
-    lit: Set[Image] = frozenset()
+    lit: Set[tuple[str, str]] = frozenset()
     missed: dict[str, list[str]] = field(default_factory=dict)
     solved: dict[str, Any] = field(default_factory=dict)  # see `solve`
     refused: Sequence[str] = ()  # why the captures cannot be opened
-    _pending: dict[Image, tuple[Stamp, float]] = field(default_factory=dict)  # and since when
+    _pending: Mapping[Stamp, float] = field(default_factory=dict)  # and since when, s
     _folders: Mapping[str, int] | None = None  # when a name came into each
     _changed_s: float = -np.inf
 
@@ -84,37 +84,23 @@ class BoardTour:
             self.refused = [str(error)]  # such as no image yet
             return []
         self.refused = []
-        projecting = {pair.name for pair in self.rig.pairs if pair.projector}
-        by_image = {(s.pair, s.shot): s for s in captures.sequences}
-        self.lit = {
-            image
-            for image, s in by_image.items()
-            if s.pair in projecting and s.board_path.exists() and not s.has_stripes
+        there = {(s.pair, s.shot): s for s in captures.sequences if s.board_path.exists()}
+        projected = {pair.name for pair in self.rig.pairs if pair.projector}
+        self.lit = {i for i, s in there.items() if i[0] in projected and not s.has_stripes}
+        files = ((image, s.board_path.stat()) for image, s in there.items())
+        stamps = {(*i, file.st_size, file.st_ctime_ns) for i, file in files} - self.looked
+        now_s = time.monotonic()
+        since_s = {stamp: self._pending.get(stamp, now_s) for stamp in stamps}
+        fresh = {
+            stamp[:2]: stamp
+            for stamp, since in since_s.items()
+            if now_s - since >= STABLE_S or has_end_mark(there[stamp[:2]].board_path, stamp[2])
         }
-        fresh = self._find_whole({image: s.board_path for image, s in by_image.items()})
+        self._pending = {one: since for one, since in since_s.items() if one not in fresh.values()}
         if fresh:
-            self.images += len(fresh)
-            self.looked = {**self.looked, **fresh}
-            self._find(captures, tuple(s for image, s in by_image.items() if image in fresh))
+            self.looked |= set(fresh.values())
+            self._find(captures, tuple(there[image] for image in fresh))
         return sorted({shot for _, shot in fresh})
-
-    def _find_whole(self, images: Mapping[Image, Path]) -> dict[Image, Stamp]:
-        """Images that were not looked at as they are now, and that are whole."""
-        now_s, before, fresh = time.monotonic(), self._pending, dict[Image, Stamp]()
-        self._pending = {}
-        for image, path in images.items():
-            with suppress(OSError):  # not there yet
-                found = path.stat()
-                stamp = (found.st_size, found.st_ctime_ns)
-                if self.looked.get(image) == stamp:
-                    continue
-                was, since_s = before.get(image, (None, now_s))
-                since_s = since_s if was == stamp else now_s
-                if has_end_mark(path, stamp[0]) or now_s - since_s >= STABLE_S:
-                    fresh[image] = stamp
-                else:
-                    self._pending[image] = stamp, since_s
-        return fresh
 
     def _may_have_changed(self) -> bool:
         """Whether files may have come in the last second: folders say when a name came into them, in
@@ -132,12 +118,12 @@ class BoardTour:
         shots = tuple(dict.fromkeys(s.shot for s in fresh))
         self.seen |= set(shots)
         again = {(s.pair, s.shot) for s in fresh}
-        self.views = [view for view in self.views if (view.pair, view.shot) not in again]
+        kept = [view for view in self.views if (view.pair, view.shot) not in again]
         found = find_all_boards(self.rig, replace(captures, shots=shots, sequences=fresh))
-        self.views = [*self.views, *found.value]
+        self.views = kept + found.value
         for shot in shots:
             seeing = {view.pair for view in self.views if view.shot == shot}
-            missed = sorted({p for p, one in self.looked if one == shot} - seeing)
+            missed = sorted({pair for pair, one, *_ in self.looked if one == shot} - seeing)
             # The last shot is the last of them.
             self.missed = {k: v for k, v in self.missed.items() if k != shot} | {shot: missed}
 
@@ -146,7 +132,7 @@ class BoardTour:
         the pictures; what fails is a line of advice."""
         notes: list[str] = []
         sigmas: dict[str, float] = {}
-        images = self.images
+        images = len(self.looked)
         with optional("sigmas", notes.append):
             cameras = calibrate_cameras(self.rig, self.views, folder=self.rig_file.parent).value
             located = locate_views(self.rig, self.views, cameras).value
@@ -197,20 +183,16 @@ class BoardTour:
             "wanted": BOARDS,
         }
 
-    def _find_frame_shot(self) -> dict[str, Any] | None:
-        """Advice to take the shot that fixes the rig frame, as long as no pair saw its board there."""
-        target = find_frame_target(self.rig)
-        if target is None or target in {(view.shot, view.board) for view in self.views}:
-            return None
-        return {"say": "frame", "shot": target[0], "board": target[1]}
-
     def _choose_next(self, cells: Mapping[str, Indices]) -> dict[str, Any]:
         """Where to hold the board next: until pictures are covered where they are not, then where the
         pair that would not be good saw it least."""
-        hold = self._find_frame_shot() or self._choose_by_pictures()
+        target = find_frame_target(self.rig)
+        if target is not None and target not in {(view.shot, view.board) for view in self.views}:
+            return {"say": "frame", "shot": target[0], "board": target[1]}
+        hold = self._choose_by_pictures()
         if hold["say"] != "enough":
             return hold
-        if self.solved.get("images") != self.images or "advice" not in self.solved:
+        if self.solved.get("images") != len(self.looked) or "advice" not in self.solved:
             return {"say": "checking"}
         weakest = self.solved.get("weakest")
         if weakest is None:
@@ -231,13 +213,9 @@ class BoardTour:
 
     def _count_shared_shots(self) -> list[tuple[str, str, int]]:
         """Pairs of pairs, and how many shots they share."""
-        counts: dict[tuple[str, str], int] = {}
-        for shot in self.seen:
-            names = sorted({view.pair for view in self.views if view.shot == shot})
-            for k, first in enumerate(names):
-                for second in names[k + 1 :]:
-                    counts[first, second] = counts.get((first, second), 0) + 1
-        return [(first, second, count) for (first, second), count in sorted(counts.items())]
+        shots = (sorted({v.pair for v in self.views if v.shot == shot}) for shot in self.seen)
+        counts = Counter(two for names in shots for two in combinations(names, 2))
+        return [(*two, count) for two, count in sorted(counts.items())]
 
     def _find_groups(self) -> list[list[str]]:
         """Pairs that shots tie together, the largest group first."""
@@ -269,7 +247,10 @@ def _choose_next_hold(
 
 def _hold_in(pair: str, cells: Indices, boards: int) -> dict[str, Any]:
     """Advice to hold the board where a pair with so many boards saw it least."""
-    row, column = divmod(int(np.argmin(_prefer_rim(cells))), COLUMNS)
+    rows, columns = np.indices(cells.shape)
+    rim = np.hypot(rows - (ROWS - 1) / 2.0, columns - (COLUMNS - 1) / 2.0)
+    # Of equal cells the inner one is named.
+    row, column = divmod(int(np.argmin(cells + 0.01 * rim)), COLUMNS)
     return {"say": "hold", "pair": pair, "row": row, "column": column, "boards": boards}
 
 
@@ -281,10 +262,3 @@ def _count_cells(pair: Pair, views: Sequence[BoardView]) -> Indices:
         column, row = (np.clip(view.pixels / size, 0.0, 0.999) * [COLUMNS, ROWS]).astype(int).T
         counts.ravel()[np.unique(row * COLUMNS + column)] += 1
     return counts
-
-
-def _prefer_rim(counts: Indices) -> Array:
-    """Counts with a little added towards the rim, so that of equal cells the inner one is named."""
-    rows, columns = np.indices(counts.shape)
-    away = np.hypot(rows - (ROWS - 1) / 2.0, columns - (COLUMNS - 1) / 2.0)
-    return np.asarray(counts + 0.01 * away)

@@ -135,11 +135,8 @@ def make_verdict_cells(grade: str, reasons: Iterable[str]) -> Row:
 
 def read_row(folder: Path) -> Row:
     """The row of a job, from its folder."""
-    row, state, job = (
-        make_empty_row(folder.name),
-        read_record(folder / STATE),
-        read_record(folder / JOB),
-    )
+    row = make_empty_row(folder.name)
+    state, job = read_record(folder / STATE), read_record(folder / JOB)
     facts, decided = read_record(folder / "scan" / "scan.json"), read_record(folder / DECIDED)
     row["subject"], row["scan"] = job.get("subject"), Path(str(job.get("source") or "")).name
     ended = state.get("state") in ("done", "set aside")

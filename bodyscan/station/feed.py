@@ -21,14 +21,9 @@ class Feed:
 
     def __init__(self) -> None:
         self._events: deque[tuple[int, str]] = deque(maxlen=BACKLOG)
-        self._number = 0
+        self.number = 0  # of the last event
         self._readers: set[asyncio.Event] = set()
         self._loop: asyncio.AbstractEventLoop | None = None
-
-    @property
-    def number(self) -> int:
-        """Number of the last event."""
-        return self._number
 
     def publish(self, event: dict[str, Any]) -> None:
         """Hand an event to all readers."""
@@ -40,8 +35,8 @@ class Feed:
             loop.call_soon_threadsafe(self._append, data)
 
     def _append(self, data: str) -> None:
-        self._number += 1
-        self._events.append((self._number, data))
+        self.number += 1
+        self._events.append((self.number, data))
         for reader in self._readers:
             reader.set()
 
@@ -56,9 +51,9 @@ class Feed:
         try:
             while True:
                 news.clear()
-                first = self._events[0][0] if self._events else self._number + 1
-                if not first - 1 <= after <= self._number:
-                    after = self._number
+                first = self._events[0][0] if self._events else self.number + 1
+                if not first - 1 <= after <= self.number:
+                    after = self.number
                     yield f"id: {after}\nevent: anew\ndata: {{}}\n\n"
                 for number, data in [one for one in self._events if one[0] > after]:
                     after = number

@@ -170,15 +170,15 @@ class Operation:
             try:
                 if self.tour.look():
                     self.feed.publish({"kind": "boards", **self.tour.describe()})
-            except BodyscanError as error:
-                self._complain(str(error))  # such as a board of another size
+            except Exception as error:  # such as a board of another size; the next look is another
+                self._complain(str(error))
 
     def _solve_boards(self) -> None:
         """Solve whenever no image came for a moment: while they come, the advice is more urgent."""
         assert self.tour is not None
         before = 0
         while not self.stopped.wait(0.5):
-            images, solved = self.tour.images, self.tour.solved.get("images", 0)
+            images, solved = len(self.tour.looked), self.tour.solved.get("images", 0)
             if images == before > solved and len(self.tour.seen) > 2:
                 self.tour.solve()
                 self.feed.publish({"kind": "boards", **self.tour.describe()})

@@ -9,6 +9,7 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from functools import partial
 from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -109,17 +110,12 @@ class Station:
 
     async def picture(self, request: Request) -> Response:
         scan = self.day.out / self._row(request)["job"] / "scan"
-        found = [path for name in ("cloud.png", "mesh.png") if (path := scan / name).is_file()]
-        return FileResponse(found[0], media_type="image/png") if found else _answer_absent()
+        return _send(scan / ("cloud.png" if (scan / "cloud.png").is_file() else "mesh.png"))
 
     async def report(self, request: Request) -> Response:
         path = self.day.out / self._row(request)["job"] / "report" / "report.html"
         policy = {"content-security-policy": REPORT_POLICY}
-        return (
-            FileResponse(path, media_type="text/html", headers=policy)
-            if path.is_file()
-            else _answer_absent()
-        )
+        return _send(path, headers=policy)
 
     async def pair(self, request: Request) -> Response:
         look = partial(self._look, self._row(request), request.path_params["pair"])
@@ -131,8 +127,7 @@ class Station:
         return Response(format_table_csv(self.day.rows()), media_type="text/csv", headers=attached)
 
     async def measures(self, request: Request) -> Response:
-        path = self.day.out / MEASURES
-        return FileResponse(path, filename=MEASURES) if path.is_file() else _answer_absent()
+        return _send(self.day.out / MEASURES, filename=MEASURES)
 
     async def rig(self, request: Request) -> Response:
         folders = [self.day.out / row["job"] for row in self.day.rows() if row["state"] == "done"]
@@ -239,6 +234,10 @@ async def _unknown(request: Request, error: Exception) -> Response:
 
 async def _too_large(request: Request, error: Exception) -> Response:
     return JSONResponse({"what": "too long"}, 413)
+
+
+def _send(path: Path, **how: Any) -> Response:
+    return FileResponse(path, **how) if path.is_file() else _answer_absent()
 
 
 def _answer_absent() -> Response:
