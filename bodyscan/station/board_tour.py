@@ -3,7 +3,7 @@ pair is known, and where to hold the board next.
 
 Boards are found image by image, as they come, and the advice that follows from what pictures cover
 is there at once. The joint solve of all shots so far takes longer; it comes when it is ready. Once
-pictures are covered a whole calibration by the shots so far says whether they are enough.
+every pair has its boards a whole calibration by the shots so far says whether they are enough.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from bodyscan.errors import BodyscanError
 from bodyscan.jobs.watching import STABLE_S, has_end_mark
 from bodyscan.optional import optional
 from bodyscan.registration.advice import pair_sigma_mm, suggest_shots
-from bodyscan.registration.calibration_verdict import collect_figures, grade_calibration
+from bodyscan.registration.calibration_verdict import LIMITS, collect_figures, grade_calibration
 from bodyscan.registration.rig_frame import find_frame_target
 from bodyscan.registration.rig_solve import solve_rig
 from bodyscan.rig.pair import Pair
@@ -42,8 +42,8 @@ from bodyscan.workflows.find_boards import (
 
 COLUMNS, ROWS = 4, 3
 """Cells of a picture: a person can tell one from another when told where to hold the board."""
-BOARDS = 6
-"""Boards that each pair should see: three determine a camera, six show when one is bad."""
+BOARDS = int(LIMITS["stripe_shots"].value)
+"""Boards that each pair should see with its stripes: with fewer no calibration is good."""
 
 Stamp = tuple[str, str, int, int]
 
@@ -64,7 +64,7 @@ class BoardTour:
     solved: dict[str, Any] = field(default_factory=dict)  # see `solve`
     refused: Sequence[str] = ()  # why the captures cannot be opened
     _pending: Mapping[Stamp, float] = field(default_factory=dict)  # and since when, s
-    _folders: Mapping[str, int] | None = None  # when a name came into each
+    _folders: Mapping[str, int] | None = None  # when each changed
     _changed_s: float = -np.inf
 
     def __post_init__(self) -> None:
@@ -109,7 +109,7 @@ class BoardTour:
         roots = [resolve_capture_path(self.rig_file, entry) for entry in self.rig.calibration]
         walks = (os.walk(root) for root in roots)
         with suppress(FileNotFoundError):  # removed meanwhile: it is another at the next look
-            self._folders = {p: os.stat(p).st_mtime_ns for walk in walks for p, _, _ in walk}
+            self._folders = {p: os.stat(p).st_ctime_ns for walk in walks for p, _, _ in walk}
         if self._folders != before or self._pending or self.rig.follow_links:
             self._changed_s = now_s
         return now_s - self._changed_s < 1.0
@@ -128,8 +128,8 @@ class BoardTour:
             self.missed = {k: v for k, v in self.missed.items() if k != shot} | {shot: missed}
 
     def solve(self) -> None:
-        """Solve for all cameras and poses by the boards so far, and calibrate with them once they cover
-        the pictures; what fails is a line of advice."""
+        """Solve for all cameras and poses by the boards so far, and calibrate with them once every
+        pair has its boards; what fails is a line of advice."""
         notes: list[str] = []
         sigmas: dict[str, float] = {}
         images = len(self.looked)
@@ -144,9 +144,11 @@ class BoardTour:
                 notes += suggest_shots(self.rig, solution, worst)
         finite = {name: sigma for name, sigma in sigmas.items() if np.isfinite(sigma)}
         solved = {"images": images, "sigmas_mm": finite, "advice": notes}
-        if self._choose_by_pictures()["say"] == "enough":
+        boards = min(len(self._calibrating(pair.name)) for pair in self.rig.pairs)
+        if boards >= BOARDS and self._choose_by_pictures()["say"] != "tie":
             with optional("a trial calibration", notes.append):
                 solved["weakest"], reasons = self._calibrate()
+                solved["enough"] = not reasons
                 solved["advice"] = [*reasons, *notes]
         self.solved = solved
 
@@ -184,19 +186,17 @@ class BoardTour:
         }
 
     def _choose_next(self, cells: Mapping[str, Indices]) -> dict[str, Any]:
-        """Where to hold the board next: until pictures are covered where they are not, then where the
-        pair that would not be good saw it least."""
+        """Where to hold the board next: where pictures are not covered, or where the pair saw it least
+        that a calibration by all of these shots found not to be good."""
         target = find_frame_target(self.rig)
         if target is not None and target not in {(view.shot, view.board) for view in self.views}:
             return {"say": "frame", "shot": target[0], "board": target[1]}
         hold = self._choose_by_pictures()
-        if hold["say"] != "enough":
+        if self.solved.get("images") != len(self.looked) or hold["say"] == "tie":
             return hold
-        if self.solved.get("images") != len(self.looked) or "advice" not in self.solved:
-            return {"say": "checking"}
-        weakest = self.solved.get("weakest")
-        if weakest is None:
-            return hold
+        if self.solved.get("enough"):
+            return {"say": "enough"}
+        weakest = self.solved.get("weakest") or hold.get("pair") or self.rig.pairs[0].name
         return _hold_in(weakest, cells[weakest], len(self._calibrating(weakest)))
 
     def _choose_by_pictures(self) -> dict[str, Any]:
@@ -228,7 +228,7 @@ def _choose_next_hold(
     cells: Mapping[str, Indices], boards: Mapping[str, int], groups: Sequence[Sequence[str]]
 ) -> dict[str, Any]:
     """Where to hold the board next, as words' keys and what goes into them: first where it was
-    hardly seen, then what ties groups together, then what images lack, then nothing.
+    hardly seen, then what ties groups together, then what images lack.
 
     cells: of each pair, see `_count_cells`. boards: how many calibrate each pair. groups: of pairs that
         shots tie together.
@@ -241,7 +241,7 @@ def _choose_next_hold(
     barest = min(share, key=lambda name: share[name])
     target = barest_pair if boards[barest_pair] < BOARDS else barest
     if boards[barest_pair] >= BOARDS and share[barest] >= 0.8:
-        return {"say": "enough"}
+        return {"say": "checking"}  # by a calibration
     return _hold_in(target, cells[target], boards[target])
 
 

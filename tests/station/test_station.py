@@ -219,13 +219,14 @@ def test_the_board_is_held_where_stripes_are_lacking_until_it_was_everywhere() -
             tour.views.append(BoardView(pair.name, shot, "board", np.zeros(1, int), pixels))
         tour.seen |= {shot}
     assert tour.describe()["next"] == {"say": "checking"}, "covered pictures are not yet a good rig"
-    tour.solved = {"images": 0, "advice": [], "weakest": "p3-1"}
+    tour.solved = {"images": 0, "advice": [], "weakest": "p3-1", "enough": False}
     assert (tour.describe()["next"]["say"], tour.describe()["next"]["pair"]) == ("hold", "p3-1")
-    tour.solved["weakest"] = None
+    tour.solved = {"images": 0, "advice": [], "weakest": None, "enough": True}
     assert tour.describe()["next"] == {"say": "enough"}
-    tour.lit = {("p2-3", f"b{number}") for number in range(20)}
+    tour.looked = {("p1-1", "late", 0, 0)}
+    tour.lit = {("p2-3", f"b{number}") for number in range(21)}
     held = tour.describe()["next"]
-    assert (held["say"], held["pair"], held["boards"]) == ("hold", "p2-3", 4)
+    assert (held["say"], held["pair"], held["boards"]) == ("hold", "p2-3", 3)
     tour.lit = set()
     tour.views = [
         v
