@@ -8,7 +8,7 @@ calibration left open of the pairs' poses is estimated with them.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -67,13 +67,16 @@ class BodyMotion:
         return BodyMotion(kinds, fields, vector, matrix, vector, matrix, np.ones(count), breaths)
 
     def with_times(
-        self, seconds: Sequence[float | None], middle_s: float, *, parts: bool = False
+        self,
+        seconds: Sequence[float | None],
+        middle_s: float,
+        omitted: Collection[str] = ("parts",),
     ) -> BodyMotion:
-        """At rest at other times, with or without the motion of parts.
+        """At rest at other times, without some kinds of motion.
 
         seconds: each pair's moment.
         """
-        kinds = retime_kinds(self.kinds, seconds, middle_s, parts=parts)
+        kinds = retime_kinds(self.kinds, seconds, middle_s, omitted)
         vector = np.zeros(sum(kind.count for kind in kinds))
         fields = np.concatenate([kind.fields for kind in kinds], axis=2)
         breaths = Breaths.from_modes(kinds[-1].modes, seconds, middle_s)
@@ -288,6 +291,8 @@ class BodyMotion:
         periodically.
         """
         breath, block = self.kinds[-1], self.slices[-1]
+        if breath.name != "breath":
+            return self
         # Of the last amplitudes the corner of the factor is that of their marginal information.
         corner = self.factor[block, block] / self.units[block, None]
         posterior = corner @ corner.T

@@ -7,7 +7,7 @@ This is done only if the overlaps require it; a mannequin stays as aligned.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from types import MappingProxyType
@@ -270,18 +270,19 @@ class _Solution:
         """By the evidence of the motion: a posture hardly changes within a tenth of a second, and does
         within a second.
 
-        sides: the pole of each pair. Without any one of them the evidence must be the same: a pole
-        or a lens that changed looks like other times, but in its own overlaps alone.
+        sides: the pole of each pair. The evidence must be the same without any one of them, whose
+        displacement or lens looks like other times; and without breath, since who holds it, or is a
+        mannequin, seems to be scanned within a moment.
         """
         times = [second for second in seconds if second is not None]
         if not times or len(times) < len(seconds):
             return TimeFit()
 
-        def log_evidence(factor: float, without: str | None = None) -> float:
+        def log_evidence(
+            factor: float, omitted: Collection[str], without: str | None = None
+        ) -> float:
             moments = [factor * second for second in times]
-            # Hips that shift are no lean or limb: whoever moves so would seem to need other times.
-            parts = without is not None
-            person = self.motion.with_times(moments, factor * middle_s, parts=parts)
+            person = self.motion.with_times(moments, factor * middle_s, omitted)
             fields = self.motion.find_fields([kind.name for kind in person.kinds])
             projected = {
                 (a, b): system.select(fields)
@@ -290,15 +291,17 @@ class _Solution:
             }
             return person.solve_projected(projected).log_evidence if projected else np.nan
 
-        stated, *others = map_threads(log_evidence, (1.0, 0.1, 10.0))
+        stated, *others = map_threads(lambda f: log_evidence(f, ("parts",)), (1.0, 0.1, 10.0))
         fits = [TimeFit(f, e - stated) for f, e in zip((0.1, 10.0), others, strict=True)]
         best = max(fits, key=lambda one: one.log_ratio)
         if best.log_ratio <= MIN_LOG_RATIO:
             return TimeFit()
+        # With parts: hips that shift are no lean or limb, and would seem to need other times too.
         gains = map_threads(
-            lambda side: log_evidence(best.factor, side) - log_evidence(1.0, side), set(sides)
+            lambda left: log_evidence(best.factor, *left) - log_evidence(1.0, *left),
+            [(("breath",), None), *(((), side) for side in dict.fromkeys(sides))],
         )
-        return best if np.nanmin([*gains, best.log_ratio]) > MIN_LOG_RATIO else TimeFit()
+        return best if np.nanmin(gains) > MIN_LOG_RATIO else TimeFit()
 
 
 def _begin(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -85,9 +85,12 @@ def build_kinds(
 
 
 def retime_kinds(
-    kinds: Sequence[MotionKind], seconds: Sequence[float | None], middle_s: float, *, parts: bool
+    kinds: Sequence[MotionKind],
+    seconds: Sequence[float | None],
+    middle_s: float,
+    omitted: Collection[str] = ("parts",),
 ) -> tuple[MotionKind, ...]:
-    """All kinds, `parts` only if asked, with the modes of other moments, the breath of unit variance.
+    """All kinds but those omitted, with the modes of other moments, the breath of unit variance.
 
     No size in people who stand is assumed: who stands very still does so at any times.
     """
@@ -95,12 +98,14 @@ def retime_kinds(
     breathing = TemporalModes.from_correlation(correlate_breath, seconds, middle_s)
     retimed = []
     for kind in kinds:
+        if kind.name in omitted:
+            continue
         if kind.name in ("pose", "step"):
             retimed.append(kind)
         elif kind.name == "breath":
             identity = np.eye(kind.fields.shape[2] * breathing.count)
             retimed.append(replace(kind, modes=breathing, precision=identity))
-        elif parts or kind.name != "parts":
+        else:
             retimed.append(replace(kind, modes=stance, standing_size=0.0))
     return tuple(retimed)
 
