@@ -78,13 +78,11 @@ class Contradictions:
         index = np.concatenate([one.against_index for one in consistency])
         heights = samples.points[index[bright[index]], 2]
         low, high = np.percentile(heights, (10, 90)) if len(heights) else (0.0, 0.0)
-        sigma = np.concatenate(
-            [
-                np.hypot(samples.sigma_mm[index], surface.sigma_mm[at])
-                for one, surface in zip(consistency, surfaces, strict=True)
-                for index, at in ((one.index, one.at), (one.against_index, one.against_at))
-            ]
-        )
+        sigma = np.concatenate([
+            np.hypot(samples.sigma_mm[index], surface.sigma_mm[at])
+            for one, surface in zip(consistency, surfaces, strict=True)
+            for index, at in ((one.index, one.at), (one.against_index, one.against_at))
+        ])  # fmt: skip
         beyond = erfc(agreement_mm / (np.sqrt(2.0) * np.maximum(sigma, 1e-6)))
         by_noise = float(beyond.mean()) if len(beyond) else 0.0
         ends = float(low), float(high)
@@ -143,9 +141,8 @@ def estimate_displacement_sigma(
         for index in (against, [one.index[bright[one.index]] for one in consistency])
     ]
     disputed = (counts[0] > 10) & (counts[0] > 0.2 * (counts[0] + counts[1]))
-    sigma_mm = np.zeros(len(samples.points))
     if not disputed.any():
-        return sigma_mm
+        return np.zeros(len(cube))
     chosen = [index[disputed[cube[index]]] for index in against]
     distance = np.concatenate(
         [
@@ -160,11 +157,8 @@ def estimate_displacement_sigma(
         for values in (*samples.points[index].astype(np.float64).T, distance)
     ]
     # Around a limb: its other side, which one pole alone may have seen, is an arm's width away.
-    tree = cKDTree(np.stack(mean[:3], axis=1))
-    away, nearest = tree.query(samples.points, distance_upper_bound=90.0)
-    near = np.isfinite(away)
-    sigma_mm[near] = 0.5 * mean[3][np.asarray(nearest)[near]]
-    return sigma_mm
+    tree, half = cKDTree(np.stack(mean[:3], axis=1)), np.append(0.5 * mean[3], 0.0)
+    return np.asarray(half[tree.query(samples.points, distance_upper_bound=90.0)[1]])
 
 
 def compare_with_surface(

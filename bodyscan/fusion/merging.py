@@ -73,10 +73,8 @@ def merge(
     colours = equalize_colours(samples, surfaces, consistency)
     cloud = average(samples, surfaces, consistency, colours, poses)
     pairs = [surface.pair for surface in surfaces]
-    contradictions = Contradictions.count(
-        pairs, consistency, samples, surfaces, settings.agreement_mm
-    )
-    return MergedCloud(cloud, contradictions)
+    found = Contradictions.count(pairs, consistency, samples, surfaces, settings.agreement_mm)
+    return MergedCloud(cloud, found)
 
 
 def average(

@@ -72,10 +72,7 @@ class BodyMotion:
         middle_s: float,
         omitted: Collection[str] = ("parts",),
     ) -> BodyMotion:
-        """At rest at other times, without some kinds of motion.
-
-        seconds: each pair's moment.
-        """
+        """At rest at other times of the pairs, without some kinds of motion."""
         kinds = retime_kinds(self.kinds, seconds, middle_s, omitted)
         vector = np.zeros(sum(kind.count for kind in kinds))
         fields = np.concatenate([kind.fields for kind in kinds], axis=2)

@@ -270,9 +270,8 @@ class _Solution:
         """By the evidence of the motion: a posture hardly changes within a tenth of a second, and does
         within a second.
 
-        sides: the pole of each pair. The evidence must be the same without any one of them, whose
-        displacement or lens looks like other times; and without breath, since who holds it, or is a
-        mannequin, seems to be scanned within a moment.
+        sides: the pole of each pair. The evidence must be the same without any one of them, which may
+        be displaced, and without breath: who holds it seems to be scanned within a moment.
         """
         times = [second for second in seconds if second is not None]
         if not times or len(times) < len(seconds):
