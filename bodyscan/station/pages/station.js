@@ -13,6 +13,9 @@
   const say = (key, values = {}) => String(words[key] ?? key).replace(/\{(\w+)\}/g, (_, name) => values[name] ?? "");
   const number = (value, digits = 1) => (value === null || value === undefined ? "–" : value.toLocaleString(words["#"], { minimumFractionDigits: digits, maximumFractionDigits: digits }));
 
+  // What kind of reason it is, in the reader's language; its sentence with the figures is English.
+  const explain = (text) => (words.kinds || []).find(([parts]) => parts.some((part) => text.includes(part)))?.[1];
+
   function make(name, attributes = {}, ...inside) {
     const made = document.createElement(name);
     for (const [key, value] of Object.entries(attributes)) {
@@ -49,7 +52,7 @@
     $("grade").textContent = say(key) + (SIGNS[key] && !row.final ? ` (${say("sofar")})` : "");
     $("what-to-do").textContent = say(`${key}What`);
     const reasons = !row ? [] : row.state === "set aside" ? [row.reason] : row.reasons || [];
-    $("reasons").replaceChildren(...reasons.filter(Boolean).map((text) => make("li", {}, text)));
+    $("reasons").replaceChildren(...reasons.filter(Boolean).map((text) => make("li", {}, explain(text) ? make("strong", { lang: words["#"] }, explain(text)) : null, explain(text) ? make("br") : null, text)));
     $("in-english").hidden = words["#"] === "en" || !reasons.length;
     const working = row && row.state !== "done" && row.state !== "set aside" && row.part;
     $("stage").textContent = working ? `${row.part} ${row.total ? `${row.done}/${row.total}` : ""}` : "";
@@ -181,7 +184,7 @@
     return make("tr", { class: row.decision === "discard" ? "discard" : null },
       make("td", {}, picture),
       make("td", { class: "job" }, make("strong", {}, row.job), make("div", { class: "why" }, [row.subject !== row.job && row.subject, row.note].filter(Boolean).join(" · "))),
-      make("td", { class: "verdict" }, make("span", { class: `badge ${SIGNS[key] ? key : key === "aside" ? "bad" : ""}` }, `${SIGNS[key] || (key === "aside" ? "✗" : "…")} ${say(key)}`), decided, why ? make("div", { class: "why", lang: "en" }, why) : null),
+      make("td", { class: "verdict" }, make("span", { class: `badge ${SIGNS[key] ? key : key === "aside" ? "bad" : ""}` }, `${SIGNS[key] || (key === "aside" ? "✗" : "…")} ${say(key)}`), decided, why ? make("div", { class: "why", lang: explain(why) ? words["#"] : "en", title: why }, explain(why) || why) : null),
       figure("sway", row.sway_mm), figure("breath", row.breath_mm), figure("covered", row.coverage_percent), figure("stature", row.stature_mm, 0),
       figure("chest", row.chest_mm, 0), figure("waist", row.waist_mm, 0), figure("hip", row.hip_mm, 0),
       make("td", {}, row.body === "mesh" ? make("a", { href: scanPath(row.job, "report"), target: "_blank", rel: "noopener" }, say("report")) : ""));
