@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import json
 import re
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -17,7 +18,7 @@ import numpy as np
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect, Request
-from starlette.responses import FileResponse, JSONResponse, Response, StreamingResponse
+from starlette.responses import FileResponse, Response, StreamingResponse
 from starlette.routing import Route
 
 from bodyscan.captures.folder import open_scan
@@ -62,7 +63,7 @@ class Station:
 
     async def state(self, request: Request) -> Response:
         operation = self.operation
-        return JSONResponse({
+        return _answer({
             "number": self.feed.number,
             "rows": self.day.rows(),
             "capture": operation.capturing,
@@ -75,7 +76,7 @@ class Station:
     async def events(self, request: Request) -> Response:
         last = request.headers.get("last-event-id") or request.query_params.get("after", "0")
         if self.readers >= READERS:
-            return JSONResponse({"what": "too many pages are open"}, 503)
+            return _answer({"what": "too many pages are open"}, 503)
         after = int(last) if last.isdecimal() and len(last) < 16 else 0
         return StreamingResponse(self._read(after), media_type="text/event-stream")
 
@@ -91,22 +92,22 @@ class Station:
         subject = (await _object(request)).get("subject")
         if not isinstance(subject, str) or not re.fullmatch(r"\w[\w.-]{0,59}", subject):
             raise BadInput("a pseudonym has letters, digits, '_', '-' and '.' only, 60 at most")
-        return JSONResponse({"scan": self.operation.request_person(subject)})
+        return _answer({"scan": self.operation.request_person(subject)})
 
     async def board(self, request: Request) -> Response:
-        return JSONResponse({"shot": self.operation.request_board()})
+        return _answer({"shot": self.operation.request_board()})
 
     async def boards(self, request: Request) -> Response:
-        return JSONResponse(await run_in_threadpool(self.operation.tour_boards))
+        return _answer(await run_in_threadpool(self.operation.tour_boards))
 
     async def decide(self, request: Request) -> Response:
         row = self.day.decide(request.path_params["job"], await _object(request))
         self.feed.publish({"kind": "scan", "row": row})
-        return JSONResponse(row)
+        return _answer(row)
 
     async def body(self, request: Request) -> Response:
         model = await run_in_threadpool(self.day.body, self._row(request)["job"])
-        return JSONResponse(model) if model else _answer_absent()
+        return _answer(model) if model else _answer_absent()
 
     async def picture(self, request: Request) -> Response:
         scan = self.day.out / self._row(request)["job"] / "scan"
@@ -120,18 +121,19 @@ class Station:
     async def pair(self, request: Request) -> Response:
         look = partial(self._look, self._row(request), request.path_params["pair"])
         seen = await run_in_threadpool(look)
-        return JSONResponse(seen) if seen else _answer_absent()
+        return _answer(seen) if seen else _answer_absent()
 
     async def csv(self, request: Request) -> Response:
         attached = {"content-disposition": "attachment; filename=day.csv"}
-        return Response(format_table_csv(self.day.rows()), media_type="text/csv", headers=attached)
+        table = format_table_csv(self.day.rows()).encode("utf-8", "backslashreplace")
+        return Response(table, media_type="text/csv", headers=attached)
 
     async def measures(self, request: Request) -> Response:
         return _send(self.day.out / MEASURES, filename=MEASURES)
 
     async def rig(self, request: Request) -> Response:
         folders = [self.day.out / row["job"] for row in self.day.rows() if row["state"] == "done"]
-        return JSONResponse({
+        return _answer({
             "calibration": await run_in_threadpool(describe_rig, self.operation.watched.calibration),
             "series": await run_in_threadpool(find_series, folders),
         })  # fmt: skip
@@ -187,7 +189,7 @@ def make_app(operation: Operation, hosts: set[str], token: str | None = None) ->
             Route(f"{scan}/report", station.report),
             Route(f"{scan}/pairs/{{pair}}", station.pair),
         ],
-        exception_handlers={BodyscanError: _explain, KeyError: _unknown, TooLarge: _too_large},
+        exception_handlers=dict.fromkeys((BodyscanError, KeyError, TooLarge), _explain),
         lifespan=run,
     )
     return Guard(app, hosts, token)
@@ -224,16 +226,14 @@ async def _object(request: Request) -> dict[str, Any]:
 
 
 async def _explain(request: Request, error: Exception) -> Response:
-    assert isinstance(error, BodyscanError)
-    return JSONResponse({"what": error.what, "remedy": error.remedy}, 409)
+    if isinstance(error, BodyscanError):
+        return _answer({"what": error.what, "remedy": error.remedy}, 409)
+    return _answer({"what": "too long"}, 413) if isinstance(error, TooLarge) else _answer_absent()
 
 
-async def _unknown(request: Request, error: Exception) -> Response:
-    return _answer_absent()
-
-
-async def _too_large(request: Request, error: Exception) -> Response:
-    return JSONResponse({"what": "too long"}, 413)
+def _answer(content: Any, status: int = 200) -> Response:
+    """JSON in ASCII, as names of files need not be UTF-8."""
+    return Response(json.dumps(content, allow_nan=False), status, media_type="application/json")
 
 
 def _send(path: Path, **how: Any) -> Response:
@@ -241,4 +241,4 @@ def _send(path: Path, **how: Any) -> Response:
 
 
 def _answer_absent() -> Response:
-    return JSONResponse({"what": "there is no such thing here"}, 404)
+    return _answer({"what": "there is no such thing here"}, 404)

@@ -155,11 +155,14 @@ def test_what_people_decide_stays_and_what_is_taken_again_begins_anew(operation:
     again = Day(out)
     assert (again.row("anna")["decision"], again.row("anna")["grade"]) == ("discard", "repeat")
     assert ",'=HYPERLINK(1)<b>," in format_table_csv(again.rows())
-    again.take({"event": "job", "job": "b", "state": "set aside", "reason": "is a link"})
+    operation.day = again
+    operation.listen({"event": "job", "job": "\udce9", "state": "set aside", "reason": "no UTF-8"})
+    with TestClient(make_app(operation, {"testserver"})) as client:
+        assert all(r"\udce9" in client.get(f"/api/{what}").text for what in ("state", "day.csv"))
     shutil.rmtree(out / "anna")  # as `forget` does
-    assert [(row["job"], row["state"]) for row in again.rows()] == [("b", "set aside")]
+    assert [(row["job"], row["state"]) for row in again.rows()] == [("\udce9", "set aside")]
     operation.listen({"event": "images", "job": "anna", "scan": "anna", "pairs": {"p": [2, 9]}})
-    assert (day.row("anna")["grade"], day.row("anna")["state"]) == (None, "arriving")
+    assert (again.row("anna")["grade"], again.row("anna")["state"]) == (None, "arriving")
 
 
 def test_only_reasons_that_scans_can_have_are_translated() -> None:
@@ -201,8 +204,7 @@ def test_a_board_is_found_pair_by_pair_as_the_rig_takes_its_images(tmp_path: Pat
         assert (tour.look(), tour.look()) == (["b01"], [])
         told = tour.describe()
         assert [pair["boards"] for pair in told["pairs"]] == [1] * number + [0] * (4 - number)
-        assert (told["shots"], told["last"], told["missed"]) == (1, "b01", [])
-        assert (told["advice"], len(tour.looked)) == ([], number)
+        assert (told["shots"], told["last"], told["missed"], told["advice"]) == (1, "b01", [], [])
     shutil.copyfile(tmp_path / "taken/b01" / names[0] / "dark.png", there / "again.png")
     (there / "again.png").replace(there / "lit.png")
     assert (tour.look(), tour.describe()["missed"]) == (["b01"], names[3:]), "taken again"
@@ -228,8 +230,7 @@ def test_the_board_is_held_where_stripes_are_lacking_until_it_was_everywhere() -
     assert tour.describe()["next"] == {"say": "enough"}
     tour.looked = {("p1-1", "late", 0, 0)}
     tour.lit = {("p2-3", f"b{number}") for number in range(21)}
-    held = tour.describe()["next"]
-    assert (held["say"], held["pair"], held["boards"]) == ("hold", "p2-3", 3)
+    assert tour.describe()["next"].items() >= {"say": "hold", "pair": "p2-3", "boards": 3}.items()
     tour.lit = set()
     even = {"floor", *(f"b{number}" for number in range(0, 24, 2))}
     tour.views = [v for v in tour.views if (v.pair in names[:6]) == (v.shot in even)]
