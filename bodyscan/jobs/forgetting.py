@@ -3,7 +3,7 @@
 A folder is a subject's if its captures.yaml, scan.json or job.json says so, together with
 everything below it that is not another subject's, and the images that the job was made from.
 Elsewhere an export or report is recognised by the JSON beside it, and measurements by their own
-content. Rows of summaries and entries of manifests about the subject are removed too. What may
+content. Rows of our tables and entries of manifests about the subject are removed too. What may
 show a person and names none is listed.
 """
 
@@ -24,7 +24,7 @@ from bodyscan.captures.captures_file import FILE_NAME as CAPTURES
 from bodyscan.errors import BadInput
 from bodyscan.files.atomic import lock_file, restrict_to_owner, write_text
 from bodyscan.files.yaml_file import YamlError, read_yaml
-from bodyscan.jobs.job import BATCH_LOCK, CALIBRATION, JOB, MANIFEST, MEASURES, SUMMARY
+from bodyscan.jobs.job import BATCH_LOCK, CALIBRATION, JOB, MANIFEST
 from bodyscan.jobs.summary import write_out_manifest
 
 # Removed in this order, so that the file which names the owner goes last: an interrupted removal
@@ -43,7 +43,7 @@ class SubjectFiles:
     files: tuple[Path, ...]  # of the subject
     folders: tuple[Path, ...]  # of the subject alone
     tables: tuple[Path, ...]  # folders of batches, whose manifests are rewritten
-    rows: tuple[Path, ...]  # their tables that have rows of the subject
+    rows: tuple[Path, ...]  # our tables, or copies of them, that have rows of the subject
     unreadable: tuple[Path, ...]  # files that should name a folder's owner, and do not
     # Folders whose images or bodies name nobody, with how many there are in and below them.
     unnamed: dict[Path, int]
@@ -58,6 +58,7 @@ def find_subject(subject: str, workspace: Path) -> SubjectFiles:
     tables: list[Path] = []
     unreadable: list[Path] = []
     unnamed: dict[Path, int] = {}
+    csvs: list[Path] = []
     named = {workspace, *workspace.parents}
     walked = list(_walk(workspace, None, unreadable))
     sources = _find_sources(subject, walked)
@@ -66,6 +67,7 @@ def find_subject(subject: str, workspace: Path) -> SubjectFiles:
             owner = subject
         found = set(names) if owner == subject else _find_exports(folder, names, subject)
         files += (folder / name for name in found)
+        csvs += (folder / name for name in names if name not in found and name.endswith(".csv"))
         if owner == subject and folder != workspace:
             folders.append(folder)
         if BATCH_LOCK in names and owner is None:
@@ -76,8 +78,7 @@ def find_subject(subject: str, workspace: Path) -> SubjectFiles:
             unnamed[folder] = count
     order = {name: rank for rank, name in enumerate(_MARKERS, start=1)}
     files.sort(key=lambda path: (order.get(path.name, 0), path))
-    every = [out / name for out in tables for name in (SUMMARY, MEASURES)]
-    rows = [table for table in every if _drop_rows(subject, table) is not None]
+    rows = [table for table in csvs if _drop_rows(subject, table) is not None]
     return SubjectFiles(
         *(tuple(files), tuple(folders), tuple(tables), tuple(rows), tuple(unreadable)),
         _count_by_folder(unnamed, named),
@@ -100,7 +101,7 @@ def _find_sources(subject: str, walked: Sequence[_Folder]) -> set[Path]:
 def _may_show_someone(name: str, names: Sequence[str]) -> bool:
     """Whether a file may be an image or a body, and has no JSON beside it."""
     images = (".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg", ".pgm", ".exr", ".npy")
-    bodies = (".ply", ".obj", ".stl", ".glb", ".e57")
+    bodies = (".ply", ".obj", ".stl", ".glb", ".e57", ".html", ".lnd")
     return name.lower().endswith((*images, *bodies)) and f"{name}.json" not in names
 
 
@@ -208,18 +209,19 @@ def _find_exports(folder: Path, names: list[str], subject: str) -> set[str]:
 
 
 def _drop_rows(subject: str, path: Path) -> str | None:
-    """A table without the subject's rows; None if it has none."""
+    """A table without the subject's rows; None if it has none, or is not of ours: those begin so."""
     try:
-        text = path.read_text("utf-8")
-    except OSError:
+        with path.open(encoding="utf-8", newline="") as stream:
+            if not stream.readline().startswith(("subject,when,", "job,subject,when,")):
+                return None
+            stream.seek(0)
+            rows = list(csv.reader(stream))
+    except (OSError, ValueError, csv.Error):
         return None
-    reader = csv.DictReader(io.StringIO(text))
-    rows = list(reader)
-    kept = [row for row in rows if row.get("subject") != subject]
+    column = rows[0].index("subject")
+    kept = [row for row in rows if row[column : column + 1] != [subject]]
     if len(kept) == len(rows):
         return None
     written = io.StringIO()
-    table = csv.DictWriter(written, reader.fieldnames or ())
-    table.writeheader()
-    table.writerows(kept)
+    csv.writer(written).writerows(kept)
     return written.getvalue()

@@ -188,6 +188,8 @@ def _find_rigs(folder: Path, out: Path) -> list[Path]:
 
 def _find_folders(folder: Path, out: Path) -> list[Path]:
     results = os.path.realpath(out)
+    if out.is_dir() and any(out.iterdir()) and not (out / BATCH_LOCK).exists():
+        results = ""  # a folder of images, which `require_writable` refuses
     return [
         path
         for path in sorted(folder.absolute().iterdir())

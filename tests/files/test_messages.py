@@ -65,6 +65,7 @@ def test_a_folder_need_not_exist_to_be_writable(tmp_path: Path) -> None:
         ("watch day --calibration rig --out day/out", "lies inside"),
         ("batch pipeline.yaml --scans day --calibration rig --out day", "contains"),
         ("batch pipeline.yaml --scans day --calibration rig --out rig", "is"),
+        ("batch pipeline.yaml --scans day --calibration rig --out day/anna", "is"),
         ("calibrate-rig small.yaml --out captures/calibration", "is"),
         ("accept --spheres day/anna --calibration rig --out day/anna/new", "lies inside"),
     ],
@@ -74,6 +75,7 @@ def test_no_result_goes_where_images_or_a_calibration_are_read(
 ) -> None:
     for folder in ("day/anna", "day/empty", "captures/calibration"):
         (tmp_path / folder).mkdir(parents=True)
+    (tmp_path / "day/anna/lit.png").touch()
     (tmp_path / "link").symlink_to("day/anna")
     shutil.copytree(STORED / "calibration", tmp_path / "rig")
     (tmp_path / "pipeline.yaml").write_text("version: 1\nname: small\nkind: fuse\n")

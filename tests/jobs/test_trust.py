@@ -119,20 +119,26 @@ def test_what_was_written_elsewhere_and_into_others_results_goes_too(day: Path) 
         (place / "r.html").write_text("r")
         side = '{"subject": "elder", "compared_with": "mallow"}'
         (place / "r.html.json").write_text(side)
-    found = set(forget_subject("mallow", day).files)
+    (notes / "copied.csv").write_text("subject,when,x\nmallow,now,1\nelder,now,2\n")
+    (notes / "own.csv").write_text("subject,street\nmallow,High Street\n")  # another program's
+    forgotten = forget_subject("mallow", day)
+    found = set(forgotten.files)
+    assert (notes / "copied.csv").read_text() == "subject,when,x\nelder,now,2\n"
+    assert notes / "copied.csv" in forgotten.rows
     assert {notes / "m.json", notes / "r.html", notes / "r.html.json"} <= found
     assert day / "out" / "e1" / "scan" / "r.html" in found
-    assert [path.name for path in notes.iterdir()] == ["own.json"]
+    assert {path.name for path in notes.iterdir()} == {"copied.csv", "own.csv", "own.json"}
     assert (day / "out" / "e1" / "scan" / "0.bin").exists()
 
 
 def test_bodies_and_images_that_name_nobody_are_listed_for_the_operator(day: Path) -> None:
-    for name in ("half/mesh.ply", "shots/a/lit.png", "shots/b/lit.png", "board/c/lit.png"):
+    images = ("shots/a/lit.png", "shots/b/lit.png", "board/c/lit.png")
+    for name in ("half/mesh.ply", "page/r.html", *images):
         (day / name).parent.mkdir(parents=True)
         (day / name).write_text("x")
     (day / "board" / "captures.yaml").write_text("kind: calibration\n")
     found = find_subject("mallow", day)
-    assert found.unnamed == {day / "half": 1, day / "shots": 2}
+    assert found.unnamed == {day / "half": 1, day / "page": 1, day / "shots": 2}
     assert not set(found.unnamed) & {path.parent for path in found.files}
 
 
