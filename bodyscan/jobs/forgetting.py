@@ -27,8 +27,7 @@ from bodyscan.files.yaml_file import YamlError, read_yaml
 from bodyscan.jobs.job import BATCH_LOCK, CALIBRATION, JOB, MANIFEST
 from bodyscan.jobs.summary import write_out_manifest
 
-# Removed in this order, so that the file which names the owner goes last: an interrupted removal
-# can be continued.
+# Removed in this order, who names the owner last: an interrupted removal can be continued.
 _MARKERS = ("scan.json", JOB, CAPTURES)
 
 _Folder = tuple[Path, list[str], str | bool | None]
@@ -58,7 +57,6 @@ def find_subject(subject: str, workspace: Path) -> SubjectFiles:
     tables: list[Path] = []
     unreadable: list[Path] = []
     unnamed: dict[Path, int] = {}
-    csvs: list[Path] = []
     named = {workspace, *workspace.parents}
     walked = list(_walk(workspace, None, unreadable))
     sources = _find_sources(subject, walked)
@@ -67,7 +65,6 @@ def find_subject(subject: str, workspace: Path) -> SubjectFiles:
             owner = subject
         found = set(names) if owner == subject else _find_exports(folder, names, subject)
         files += (folder / name for name in found)
-        csvs += (folder / name for name in names if name not in found and name.endswith(".csv"))
         if owner == subject and folder != workspace:
             folders.append(folder)
         if BATCH_LOCK in names and owner is None:
@@ -78,7 +75,8 @@ def find_subject(subject: str, workspace: Path) -> SubjectFiles:
             unnamed[folder] = count
     order = {name: rank for rank, name in enumerate(_MARKERS, start=1)}
     files.sort(key=lambda path: (order.get(path.name, 0), path))
-    rows = [table for table in csvs if _drop_rows(subject, table) is not None]
+    every = {folder / name for folder, names, _ in walked for name in names} - set(files)
+    rows = [path for path in sorted(every) if path.suffix == ".csv" and _drop_rows(subject, path)]
     return SubjectFiles(
         *(tuple(files), tuple(folders), tuple(tables), tuple(rows), tuple(unreadable)),
         _count_by_folder(unnamed, named),
@@ -126,7 +124,7 @@ def forget_subject(subject: str, workspace: Path) -> SubjectFiles:
             locks.enter_context(lock_file(out / BATCH_LOCK, wait=False))
         require_found(found, subject, workspace)
         for table in found.rows:
-            write_text(table, _drop_rows(subject, table) or "")
+            write_text(table, _drop_rows(subject, table))
         for path in found.files:
             path.unlink(missing_ok=True)
         for folder in sorted(found.folders, reverse=True):
@@ -208,20 +206,20 @@ def _find_exports(folder: Path, names: list[str], subject: str) -> set[str]:
     return found
 
 
-def _drop_rows(subject: str, path: Path) -> str | None:
-    """A table without the subject's rows; None if it has none, or is not of ours: those begin so."""
+def _drop_rows(subject: str, path: Path) -> str:
+    """A table without the subject's rows; "" if it has none, or is not of ours: those begin so."""
     try:
         with path.open(encoding="utf-8", newline="") as stream:
             if not stream.readline().startswith(("subject,when,", "job,subject,when,")):
-                return None
+                return ""
             stream.seek(0)
             rows = list(csv.reader(stream))
     except (OSError, ValueError, csv.Error):
-        return None
+        return ""
     column = rows[0].index("subject")
     kept = [row for row in rows if row[column : column + 1] != [subject]]
     if len(kept) == len(rows):
-        return None
+        return ""
     written = io.StringIO()
     csv.writer(written).writerows(kept)
     return written.getvalue()
