@@ -16,6 +16,7 @@ class BodyscanError(Exception):
     exit_code = 1
 
     def __init__(self, what: str, *, where: str = "", remedy: str = "") -> None:
+        what = re.sub(r"(\S{200})\S{100,}", r"\1...", what)  # it may quote a damaged file
         super().__init__(what, where, remedy)
         self.what, self.where, self.remedy = what, where, remedy
 
@@ -42,8 +43,7 @@ def group_reasons(reasons: Mapping[str, str]) -> list[tuple[list[str], str]]:
 
 
 def format_list(reasons: Mapping[str, str]) -> str:
-    """Format several failures: names and reason, one a line; a remedy stands once, after all those
-    that it helps."""
+    """Format several failures, one a line; a remedy stands once, after all those that it helps."""
     groups: dict[str, list[str]] = {}
     for names, reason in group_reasons(reasons):
         what, _, remedy = reason.partition("\n")
