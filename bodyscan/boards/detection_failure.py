@@ -23,7 +23,7 @@ MIN_MARKERS = 4
 
 
 def describe_unfound(image: Bytes, board: Board, *, quick: bool = False) -> str:
-    """Describe what the image (H, W) shows instead of the board, to follow the board's name.
+    """Describe what the image (H, W) shows instead of the board; continues a sentence that names it.
 
     quick: in a tenth of a second; "" for a board with markers.
     """

@@ -270,7 +270,7 @@ MIN_CLUSTERS = 4
 
 @dataclass(frozen=True, eq=False)
 class ChosenLens:
-    """The chosen lens."""
+    """The selected lens, its fit, and the trials of the others."""
 
     fit: CameraCalibration  # the camera fitted with it
     # How each lens did; () if there were too few clusters of poses, or one lens only.

@@ -308,7 +308,7 @@ def _compute_corner_jacobian(state: _State, k: int, board: StripedBoard) -> Arra
 
 
 def _differentiate_rays(camera: Camera, rays: Array) -> Array:
-    """Derivatives of the rays (..., 3) of fixed pixels by the camera's parameters, (..., 2, P)."""
+    """Derivatives (..., 2, P) of rays (x, y, 1) through fixed pixels by the camera's P parameters."""
     by_parameter, _ = camera.jacobians(rays.reshape(-1, 3))
     by_parameter = by_parameter.reshape(*rays.shape[:-1], 2, -1)
     return -(camera.rays_by_pixels(rays) @ by_parameter)
@@ -338,7 +338,7 @@ def _whiten_offsets(sheets: SmoothSheets, at: Any, stripes: BoardStripes, points
 
 
 def _compute_offset_sigma(stripes: BoardStripes, points: Array, by_point: Array) -> Array:
-    """Standard deviation of the offsets for that of the pixels, (N,), in the offsets' unit."""
+    """Standard deviation (N,) of the offsets, in their unit, propagated from that of the pixels."""
     per_pixel = np.abs(np.sum(by_point * (points[1] - points[0]), axis=1)) / 0.5
     return np.maximum(per_pixel, 1e-12) * stripes.sigma_px
 

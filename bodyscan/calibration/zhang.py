@@ -46,7 +46,7 @@ def _solve_full_matrix(homographies: Sequence[Array]) -> Array | None:
 
 
 def _solve_central_matrix(homographies: Sequence[Array]) -> Array:
-    """Solve for A with a focal length only."""
+    """Solve for the focal length alone: no skew, principal point at the origin."""
     rows, right = [], []
     for h in homographies:
         for row in (

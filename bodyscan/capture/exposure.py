@@ -76,7 +76,7 @@ def find_exposures(devices: Devices) -> Iterator[tuple[str, Exposure]]:
 
 
 def _settle(camera: Camera, projector: Projector, lit: str, dark: str) -> Exposure:
-    """Change a camera's exposure until it fits, or eight times: each halves it, or lands."""
+    """Adjust a camera's exposure until the image is well exposed, in at most eight tries."""
     assert camera.exposure_ms is not None
     found = Exposure(camera.exposure_ms)
     camera.begin("exposure", [lit, dark] * 8)

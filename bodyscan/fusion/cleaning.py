@@ -63,7 +63,7 @@ def require_subject(cleaned: Sequence[RangeImage]) -> list[RangeImage]:
     valid = [image for image in cleaned if image.valid.any()]
     if not valid:
         raise ScanFailed(
-            "nobody stands in the scan volume",
+            "nobody is in the scan volume",
             remedy="look at the lit images; check `volume` in the calibration's calibration.json, and "
             "that a folder given with --empty shows the rig without anybody",
         )

@@ -191,7 +191,7 @@ def read_rig_of(calibration: Path) -> Rig:
 
 
 def _list_images(captures: Captures, base: Path) -> dict[str, Path]:
-    """Every existing image, and the files that describe them, by path relative to `base`."""
+    """Every existing image and the files that describe them; keys: captures/<path below base>."""
     paths = [p for s in captures.sequences for p in s.paths if p not in set(s.missing)]
     paths += captures.described_in
     return {f"captures/{Path(os.path.relpath(path, base)).as_posix()}": path for path in paths}

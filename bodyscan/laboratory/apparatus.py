@@ -127,7 +127,7 @@ def compute_true_planes(setup: ChapterSetup) -> Array:
 
 
 def list_board_poses(count: int = 3) -> list[RigidTransform]:
-    """List camera_from_board of the three poses, or of `count` poses."""
+    """List camera_from_board of the first `count` of ten fixed poses (the chapter: three)."""
     # The board's middle, mm, and its rotation; the first three, and more if they are not enough.
     poses = (
         ((-11.0, -17.0, 400.0), (0.0, 0.45, 0.02)),

@@ -31,7 +31,7 @@ class HeadTop:
 
 @dataclass(frozen=True, eq=False)
 class _Ellipsoid:
-    """centre: (3,) mm.  size: logarithms of the axes over AXES_MM, common and for each, (4,)."""
+    """centre: (3,) mm. size: (4,) log scale of AXES_MM, common to all axes, then per axis."""
 
     centre: Array
     size: Array

@@ -23,7 +23,7 @@ class MeshSlicer:
 
     @cached_property
     def height_ranges(self) -> tuple[Indices, Array, Array]:
-        """The faces from the lowest up (F,), and the lowest and highest z (F,) mm of each."""
+        """Face indices (F,) sorted by lowest z, and the lowest and highest z (F,), mm, in order."""
         # Corner by corner: numpy's reduction over rows of three takes ten times as long.
         heights = np.ascontiguousarray(self.vertices[:, 2])
         a, b, c = (heights[self.faces[:, k]] for k in range(3))

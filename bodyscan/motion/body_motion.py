@@ -96,7 +96,7 @@ class BodyMotion:
 
     @cached_property
     def slices(self) -> tuple[slice, ...]:
-        """The amplitudes of each kind."""
+        """For each kind of motion, the slice of `amplitudes` that belongs to it."""
         ends = np.cumsum([0, *(kind.count for kind in self.kinds)]).tolist()
         return tuple(slice(a, b) for a, b in pairwise(ends))
 

@@ -96,8 +96,8 @@ def _compute_gain_per_unknown(
 def _hold_out(
     views: Sequence[LocatedView], solution: JointSolution, shapes: dict[str, BoardShape], root: str
 ) -> ResidualPair:
-    """Residuals of held-out boards, flat and in the shape found from the rest, both posed by the
-    rest's cameras."""
+    """Residuals of held-out boards, flat and with the shape fitted to the rest; cameras are the
+    rest's in both."""
     targets = sorted({view.target for view in views})
     flat_residuals, shaped_residuals, part = [], [], []
     for half in range(2):

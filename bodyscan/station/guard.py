@@ -90,7 +90,7 @@ class Guard:
         return found is not None and _compare_secrets(found.value, self.token or "")
 
     async def _require_token(self, scope: Scope, send: Send) -> None:
-        """A right token in the link becomes a cookie; the link without it follows."""
+        """Exchange a valid ?token= in the link for a cookie (303 to "/"); answer 401 otherwise."""
         given = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
         if scope["path"] != "/" or not _compare_secrets(given, self.token or ""):
             await _answer(send, 401, "open the link that the station printed when it started")

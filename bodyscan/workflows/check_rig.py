@@ -392,7 +392,7 @@ class ScanCheck:
         return tuple(lines)
 
     def repair(self, calibration: RigCalibration) -> RigCalibration:
-        """Raises FailedWork: scans do not determine the poses well enough."""
+        """Always raises FailedWork: scans alone do not determine the poses well enough."""
         raise FailedWork(
             "scans of people show that something moved, but not exactly where it is now",
             remedy="take a few shots of the board and repair from those",

@@ -102,8 +102,8 @@ class PrintAreas:
     def select(
         self, view: BoardView, boundaries: BoardBoundaries, views: int, turn: int
     ) -> BoardBoundaries:
-        """Means of the boundaries on the print of a view's board, one of so many of its pair: see
-        `thin_bands`."""
+        """Mean boundaries on the print of a view's board, thinned to one of `views` views of its pair:
+        see `thin_bands`."""
         code = self.rig.pair(view.pair).projector
         assert code is not None
         shot = StripedView(self.located[view.key], self.rig.board(view.board), boundaries)

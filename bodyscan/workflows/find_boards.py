@@ -326,7 +326,7 @@ def require_cameras(
 
 
 def make_no_pair_error(rig: Rig, failed: Mapping[str, str], remedy: str = "") -> FailedWork:
-    """The error for a rig of which nothing is left, or only cameras whose projectors are not."""
+    """The error when no pair could be calibrated: in a rig with projectors, none that has one."""
     of_rig = "pair with a projector" if any(pair.projector for pair in rig.pairs) else "pair"
     what = f"no {of_rig} could be calibrated:{format_list(failed)}"
     return FailedWork(what, where=f"rig {rig.name}", remedy=remedy)

@@ -168,12 +168,12 @@ def test_a_scan_without_a_model_has_a_report_of_why(tmp_path: Path) -> None:
         "calibration_id": "01",
         "subject": None,
         "when": None,
-        "verdict": {"grade": "repeat", "reasons": ["nobody stands in the scan volume"]},
+        "verdict": {"grade": "repeat", "reasons": ["nobody is in the scan volume"]},
     }
     write_json(tmp_path / "scan.json", facts)
     text = render(build_page(tmp_path))
     assert "Verdict: repeat" in text
-    assert "nobody stands" in text
+    assert "nobody is in the scan volume" in text
 
 
 @pytest.mark.parametrize("content", ["", "{}", "[]", '{"schema": "bodyscan-scan"}'])

@@ -56,7 +56,7 @@ class FolderCamera(Camera):
             except OSError:
                 pass  # not there yet
             if time.monotonic() > deadline:
-                raise FrameLost("has not come", where=str(self._path))
+                raise FrameLost("did not appear in time", where=str(self._path))
             time.sleep(0.01)
 
 

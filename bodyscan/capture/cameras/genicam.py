@@ -92,7 +92,7 @@ class GenicamCamera(Camera):
     def take(self, timeout_s: float) -> Picture:
         buffer = self._handle.try_fetch(timeout=timeout_s)
         if buffer is None:
-            raise FrameLost("a frame has not come", where=f"pair {self._pair}")
+            raise FrameLost("timed out waiting for a frame", where=f"pair {self._pair}")
         with buffer:
             if not buffer.payload.components:
                 raise FrameLost("a frame is damaged", where=f"pair {self._pair}")

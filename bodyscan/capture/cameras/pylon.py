@@ -118,7 +118,7 @@ class PylonCamera(Camera):
         number, picture = self._early
         expected, self._next = self._next, (number if self._next is None else self._next) + 1
         if self._kind.line is not None and expected is not None and number > expected:
-            raise self._make_lost(f"frame {expected} was lost on its way")
+            raise self._make_lost(f"frame {expected} was dropped")
         self._early = None
         return picture
 
@@ -129,7 +129,7 @@ class PylonCamera(Camera):
         milliseconds = int(1000.0 * timeout_s)
         with self._handle.RetrieveResult(milliseconds, pylon.TimeoutHandling_Return) as buffer:
             if not buffer.IsValid():
-                raise self._make_lost("a frame has not come")
+                raise self._make_lost("timed out waiting for a frame")
             if not buffer.GrabSucceeded():
                 raise self._make_lost(f"a frame is damaged: {buffer.ErrorDescription}")
             image, received_ms = np.array(buffer.Array), now_ms()

@@ -134,7 +134,7 @@ def check_exposure(scan: ScanEvidence) -> Iterator[Finding]:
 
 
 def check_brightness(scan: ScanEvidence) -> Iterator[Finding]:
-    """Images so dark that hair and cloth cannot be told from skin, whose relief sigmas then lack."""
+    """Images too dark to tell hair and cloth from skin; their points then lack the relief sigma."""
     grey = float(np.median(scan.cloud.grey))
     if 0.0 < grey * DARK < MIN_GREY:
         yield Finding(
@@ -211,7 +211,7 @@ def check_gaps(scan: ScanEvidence) -> Iterator[Finding]:
     if scan.mesh and _sees_one_side(scan):
         yield Finding(
             "usable",
-            "one side only was seen, as the cameras stand: the mesh's other side is filled "
+            "the cameras saw only one side: the other side of the mesh is filled in "
             f"({scan.mesh.filled_share:.0%} of its surface)",
         )
         return

@@ -164,7 +164,7 @@ def check_seams(scan: ScanEvidence) -> Iterator[Finding]:
         yield Finding(
             "usable",
             f"{', '.join(names)} shares no surface with the others: if the person, or a pole, moved in "
-            "between, nothing would show it",
+            "between captures, it would go undetected",
             frozenset(names),
         )
 

@@ -85,7 +85,7 @@ def check_exchanged(scan: ScanEvidence) -> Iterator[Finding]:
     names += [f"{one} are those of {of}" for one, of in taken.items() if taken[of] != one]
     yield Finding(
         "repeat",
-        f"the images of {', '.join(names)}: read as such, they show what the other pairs measured. "
+        f"the images of {', '.join(names)}: with that corrected, they agree with the other pairs. "
         "Exchange the cables, or the names of the folders, and scan again",
         frozenset(taken),
         frozenset(taken),
@@ -139,7 +139,7 @@ def find_misplaced(
             "Possible causes: its pose is wrong; its images are another pair's. Calibrate again"
         )
         if np.mean(enter < leave) < 0.2:
-            found[image.pair] = f"by its pose it looks past the scan volume. {causes}"
+            found[image.pair] = f"its calibrated pose points it away from the scan volume. {causes}"
             continue
         count = int(np.count_nonzero(image.valid))
         axis_mm = float(np.linalg.norm(pose.translation[:2]))

@@ -53,11 +53,11 @@ class Lens(ABC):
 
     @abstractmethod
     def by_coefficients(self, ideal: Array) -> Array:
-        """Derivatives (..., 2, K) of real points by the coefficients, at ideal points (..., 2)."""
+        """Jacobian (..., 2, K) of distorted points by the coefficients, at ideal points (..., 2)."""
 
     @abstractmethod
     def by_point(self, ideal: Array) -> Array:
-        """Derivatives (..., 2, 2) of real points by the ideal ones (..., 2)."""
+        """Jacobian (..., 2, 2) of distorted points by the ideal ones (..., 2)."""
 
     def fit_to(self, other: Lens, ideal: Array) -> Self:
         """Fit this kind of lens, starting here, to what `other` does to the points (N, 2)."""

@@ -117,7 +117,7 @@ def _find_pose(image: Any) -> RigidTransform | None:
 
 
 def _find_pose_in_rig(model: Any, number: int) -> RigidTransform | None:
-    """Return a camera's pose in a rig of several sensors, None if there is none."""
+    """Return camera_from_rig in a rig of several sensors (identity for the reference), or None."""
     sensor = pycolmap.sensor_t(pycolmap.SensorType.CAMERA, number)
     for rig in model.rigs.values():
         if rig.num_sensors() > 1 and rig.has_sensor(sensor):

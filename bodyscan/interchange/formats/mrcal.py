@@ -108,12 +108,12 @@ def _parse_literal(file: ForeignFile) -> dict[Any, Any]:
     except (SyntaxError, ValueError, MemoryError, RecursionError) as error:
         line = getattr(error, "lineno", None)
         raise CalibrationFileError(
-            "is not a cameramodel of mrcal's",
+            "is not an mrcal cameramodel",
             where=f"{file.path}:{line}" if line else str(file.path),
             remedy="give the file as mrcal wrote it",
         ) from None
     if not isinstance(content, dict):
-        raise file.error("is not a cameramodel of mrcal's")
+        raise file.error("is not an mrcal cameramodel")
     return content
 
 
