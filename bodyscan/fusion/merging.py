@@ -7,7 +7,7 @@ projecting the point into it. No search tree is built.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -57,24 +57,21 @@ def merge(
     """
     channels = 1 if all(image.rgb is None for image in range_images) else 3
     smoothed = map_threads(
-        lambda image: smooth(
-            image, rig_from_camera[image.pair], settings.window_mm, channels=channels
-        ),
+        lambda im: smooth(im, rig_from_camera[im.pair], settings.window_mm, channels=channels),
         range_images,
     )
     surfaces = [surface for surface in smoothed if surface is not None]
     samples = take_samples(surfaces, settings.points)
+    limits_mm = settings.agreement_mm, settings.double_mm
     consistency = map_threads(
-        lambda number: compare_with_surface(
-            samples, surfaces[number], number, settings.agreement_mm, settings.double_mm
-        ),
-        range(len(surfaces)),
+        lambda k: compare_with_surface(samples, surfaces[k], k, *limits_mm), range(len(surfaces))
     )
     colours = equalize_colours(samples, surfaces, consistency)
-    cloud = average(samples, surfaces, consistency, colours, poses)
+    displaced_mm, double = estimate_displacement_sigma(samples, surfaces, consistency)
+    cloud = average(samples, surfaces, consistency, colours, poses, displaced_mm)
     pairs = [surface.pair for surface in surfaces]
     found = Contradictions.count(pairs, consistency, samples, surfaces, settings.agreement_mm)
-    return MergedCloud(cloud, found)
+    return MergedCloud(cloud, replace(found, double=double))
 
 
 def average(
@@ -83,8 +80,12 @@ def average(
     consistency: Sequence[Consistency],
     colours: EqualizedColours,
     poses: PoseCovariance | None = None,
+    displaced_mm: Array | float = 0.0,
 ) -> BodyCloud:
-    """Average each sample with the surfaces that agree with it; outvoted samples are dropped."""
+    """Average each sample with the surfaces that agree with it; outvoted samples are dropped.
+
+    displaced_mm: what is added to the samples' sigmas, (N,), see `estimate_displacement_sigma`.
+    """
     weight, sigma_mm = samples.weight, samples.sigma_mm
     # Of weights, shifts, their squares, variances, surfaces, contradictions, normals, and colours.
     sums = np.zeros((len(weight), 9 + colours.samples.shape[1]))
@@ -102,7 +103,7 @@ def average(
     chi2 = (square - total * mean**2) / np.maximum(count - 1.0, 1.0)
     inflation = estimate_sigma_inflation(samples, surfaces, consistency, poses) ** 2
     sigma_mm = np.sqrt(variance * np.maximum(inflation, chi2 / 9.0)) / total
-    displacement_mm = estimate_displacement_sigma(samples, surfaces, consistency)[kept]
+    displacement_mm = np.broadcast_to(displaced_mm, kept.shape)[kept]
     return BodyCloud(
         samples.points[kept] + mean[:, None] * samples.normals[kept],
         (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32),

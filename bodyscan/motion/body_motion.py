@@ -331,12 +331,10 @@ def compute_shape_sigmas(
     """
     pair, mark = np.nonzero(observed[:, cells.landmarks])
     cell = cells.landmarks[mark]
-    rows = np.concatenate(
-        [
-            motion.observation_matrix(k, cell[pair == k], cells.normals[cell[pair == k]])
-            for k in np.unique(pair)
-        ]
-    )
+    rows = np.concatenate([
+        motion.observation_matrix(k, cell[pair == k], cells.normals[cell[pair == k]])
+        for k in np.unique(pair)
+    ])  # fmt: skip
     offsets, normals = cells.centres[cell] - BODY_CENTRE, cells.normals[cell]
     rigid = np.linalg.qr(np.hstack([np.cross(offsets, normals), normals]))[0]
     rows -= rigid @ (rigid.T @ rows)

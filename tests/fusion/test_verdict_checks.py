@@ -106,6 +106,8 @@ FINDINGS: dict[str, tuple[dict[str, Any], str, str]] = {
     "noise": ({"alignment": alignment(0.1, 0.45)}, "usable", "disagree by 0.45 mm RMS"),
     "contradictions by noise": ({"contradictions": everywhere(0.03, 0.026)}, "good", ""),
     "contradictions": ({"contradictions": everywhere(0.01)}, "usable", "the pairs disagree"),
+    "a hand": ({"contradictions": replace(everywhere(0.001), double=2)}, "good", ""),
+    "an arm": ({"contradictions": replace(everywhere(0.001), double=3)}, "usable", "an arm or the"),
     "JPEG": ({"contradictions": everywhere(0.01), "compressed": tuple("ab")}, "usable", "as JPEG"),
     "gamma": ({"contradictions": everywhere(0.01), "nonlinear": tuple("ab")}, "usable", "video gamma"),
     "gamma that does no harm": ({"nonlinear": tuple("ab")}, "good", ""),
