@@ -139,7 +139,6 @@ def measure(
 
     heights_mm: heights of the slices; every 100 mm of the body if None.
     mean_breath: measure a breathing person as at mean breath, instead of at the scan's moment.
-
     named: whether to lay a body over the scan (seconds), for landmarks and measures by name.
 
     Raises BadInput for a height at which there is no body, or if no standing body fits the scan.
@@ -237,15 +236,17 @@ def _describe_loop(piece: Piece, mesh: BodyMesh, breath: BreathAt | None) -> Gir
     loop, kinds = piece.loop, mesh.face_regions
     known = loop.faces >= 0
     corners = mesh.faces[loop.faces]
-    noise = np.where(known, mesh.sigma_mm[corners].mean(axis=1), np.nan)
+    # What moves along the normal of a slope, as of a shoulder, moves farther in a level slice.
+    level = mesh.normals[corners, :2].mean(axis=1)
+    aslant = 1.0 / np.clip(np.linalg.norm(level, axis=1), 0.1, 1.0)
+    noise = np.where(known, mesh.sigma_mm[corners].mean(axis=1) * aslant, np.nan)
     sigma, breath_sigma = compute_girth_sigma(loop, noise, sectors=4), None
     if breath is not None:
-        lean = np.where(known, breath.sigma_mm[corners].mean(axis=1), np.nan)
+        lean = np.where(known, breath.sigma_mm[corners].mean(axis=1) * aslant, np.nan)
         breath_sigma = compute_girth_sigma(loop, lean, sectors=1)
     lows, highs = bound_girths(loop)
-    depth, width = np.ptp(loop.segments[:, 0], axis=0)
-    x, y = loop.centre
-    values = loop.girth_mm, loop.tape_mm
+    depth, width = np.ptp(loop.segments[:, 0], axis=0).tolist()
+    (x, y), values = loop.centre.tolist(), (loop.girth_mm, loop.tape_mm)
     girths, tapes = (
         (max(min(value, low) - 1.96 * sigma, 0.0), max(value, high) + 1.96 * sigma)
         for value, low, high in zip(values, lows, highs, strict=True)
@@ -254,10 +255,9 @@ def _describe_loop(piece: Piece, mesh: BodyMesh, breath: BreathAt | None) -> Gir
     return Girth(
         piece.part,
         *values,
-        float(width),
-        float(depth),
+        *(width, depth),
         loop.area_mm2,
-        (float(x), float(y)),
+        (x, y),
         loop.measured_share,
         girths,
         tapes,

@@ -152,11 +152,12 @@ def test_a_girth_that_touches_another_part_is_a_range() -> None:
 def test_every_girth_has_the_width_of_noise_and_breath() -> None:
     still = mesh_of(*cylinder(100.0, 0.0, 1000.0))
     sigma = np.full(len(still.vertices), 0.3, np.float32)
-    noisy = replace(still, sigma_mm=sigma)
-    (girth,) = measure(noisy, [500.0]).slices[0].girths
-    assert np.ptp(girth.tape_range_mm) == pytest.approx(2.0 * 1.96 * np.pi * 0.3, rel=0.02)
-    assert np.ptp(girth.girth_range_mm) == pytest.approx(2.0 * 1.96 * np.pi * 0.3, rel=0.02)
-    breathing = replace(noisy, breath=BreathAt(0.0 * sigma, sigma))
+    for level in (1.0, 0.5):  # of the normals: a slope of 60 degrees moves twice as far in a slice
+        noisy = replace(still, sigma_mm=sigma, normals=np.float32(level) * still.normals)
+        (girth,) = measure(noisy, [500.0]).slices[0].girths
+        width = np.ptp([girth.tape_range_mm, girth.girth_range_mm], axis=1)
+        assert width == pytest.approx(2.0 * 1.96 * np.pi * 0.3 / level, rel=0.02)
+    breathing = replace(still, sigma_mm=sigma, breath=BreathAt(0.0 * sigma, sigma))
     for mean_breath in (True, False):
         (girth,) = measure(breathing, [500.0], mean_breath=mean_breath).slices[0].girths
         assert girth.breath_sigma_mm == pytest.approx(2.0 * np.pi * 0.3, rel=0.02)
