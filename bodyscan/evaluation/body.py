@@ -19,7 +19,7 @@ from bodyscan.measurement.measurements import Measurements, measure
 from bodyscan.mesh.body import BodyMesh
 
 STEP_MM = 20.0
-TORSO = (0.46, 0.86)  # of the stature: crotch to shoulders
+TORSO = (0.46, 0.80)  # of the stature: crotch to shoulders, where 1 mm of height is 9 of girth
 WHOLE = 0.97  # of a girth measured, and not hair: what is filled is a declared guess
 
 

@@ -35,7 +35,7 @@ def test_a_body_half_a_millimetre_too_thick() -> None:
     found = compute_girth_errors(
         mesh_of(*column(150.5, 1701.0)), measure_true_girths(vertices, faces)
     )
-    assert found.heights > 30
+    assert found.heights > 25
     assert found.rms_mm == pytest.approx(2 * np.pi * 0.5, rel=1e-2)
     assert found.worst_mm == pytest.approx(found.rms_mm, rel=1e-3)
     assert found.stature_mm == pytest.approx(1.0)
