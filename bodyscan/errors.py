@@ -10,13 +10,22 @@ import re
 from collections.abc import Mapping
 
 
+def escape_control(text: str) -> str:
+    """Escape control characters, which would disturb a terminal or a table."""
+    return "".join(
+        letter if letter.isprintable() or letter == "\n" else ascii(letter)[1:-1] for letter in text
+    )
+
+
 class BodyscanError(Exception):
     """Root of all errors: `what` went wrong, `where` (file, line, pair, shot), and the `remedy`."""
 
     exit_code = 1
 
     def __init__(self, what: str, *, where: str = "", remedy: str = "") -> None:
-        what = re.sub(r"(\S{200})\S{100,}", r"\1...", what)  # it may quote a damaged file
+        # Both may quote a damaged file.
+        what = re.sub(r"(\S{200})\S{100,}", r"\1...", escape_control(what))
+        where = escape_control(where)
         super().__init__(what, where, remedy)
         self.what, self.where, self.remedy = what, where, remedy
 

@@ -25,7 +25,7 @@ from bodyscan.cli.options import (
     RigFile,
     ScanFolder,
 )
-from bodyscan.errors import BadInput, FailedWork
+from bodyscan.errors import BadInput, FailedWork, escape_control
 from bodyscan.files.atomic import hold_folder, scratch_folder, sweep_scratch
 from bodyscan.files.messages import require_writable
 from bodyscan.progress import step
@@ -556,7 +556,6 @@ def verify(
     ],
 ) -> None:
     """Compare images, calibration and results with the manifest, and find any byte that changed."""
-    from bodyscan.jobs.job import escape_control
     from bodyscan.jobs.verification import verify as look
 
     verified = look(folder)
@@ -586,7 +585,6 @@ def forget(
 ) -> None:
     """Remove every file of a subject: images, jobs, results, exports, rows of summaries."""
     from bodyscan.jobs import forgetting
-    from bodyscan.jobs.job import escape_control
 
     found = forgetting.find_subject(subject, workspace)
     forgetting.require_found(found, subject, workspace)

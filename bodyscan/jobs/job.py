@@ -121,13 +121,6 @@ def _resolve(folder: Path, relative: str) -> Path:
     return Path(os.path.normpath(folder.absolute() / relative))
 
 
-def escape_control(text: str) -> str:
-    """Escape control characters, which would disturb a terminal or a table."""
-    return "".join(
-        letter if letter.isprintable() or letter == "\n" else ascii(letter)[1:-1] for letter in text
-    )
-
-
 CALIBRATION = "calibration.json"
 RESULTS = (CALIBRATION, "scan.json")
 """Files that mark a folder as written by bodyscan rather than by cameras."""

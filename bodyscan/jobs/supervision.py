@@ -15,8 +15,9 @@ from pathlib import Path
 from subprocess import PIPE, Popen
 from typing import Any, Protocol
 
+from bodyscan.errors import escape_control
 from bodyscan.files.atomic import write_json
-from bodyscan.jobs.job import LOG, STATE, Job, escape_control
+from bodyscan.jobs.job import LOG, STATE, Job
 
 Listen = Callable[[dict[str, Any]], None]
 
