@@ -185,7 +185,7 @@ def test_nobody_is_forgotten_unasked(answer: str, tmp_path: Path) -> None:
 
 def test_rows_of_a_summary_are_not_forgotten_unasked(tmp_path: Path, bodyscan: Command) -> None:
     (tmp_path / "batch.lock").touch()
-    (tmp_path / "summary.csv").write_text("job,subject\na,mallow\n")
+    (tmp_path / "summary.csv").write_text("job,subject,when,\na,mallow,,\n")
     done = bodyscan("forget", "mallow", "--workspace", tmp_path)
     assert (done.returncode, "--yes" in done.stderr) == (2, True)
     assert "mallow" in (tmp_path / "summary.csv").read_text()

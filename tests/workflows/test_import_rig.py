@@ -202,7 +202,7 @@ def test_a_pair_that_cannot_be_read_costs_that_pair(folder: Path) -> None:
     found = imported(folder, content)
     assert list(found.pairs) == ["a"]
     assert "did you mean 'K_camera_" in found.failed["b"]
-    assert grade_calibration(found).reasons[0].startswith("pair b failed")
+    assert grade_calibration(found).reasons[0].startswith("failed: b")
     content["pairs"] = content["pairs"][1:]
     with pytest.raises(CalibrationFileError, match="K_camera_c"):
         imported(folder, content)
