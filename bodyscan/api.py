@@ -56,7 +56,7 @@ if TYPE_CHECKING:
 
 AnyPath: TypeAlias = str | PathLike[str]
 
-_HOMES = {
+_MODULE_OF = {
     "BodyCloud": "bodyscan.mesh.body",
     "BodyMesh": "bodyscan.mesh.body",
     "Comparison": "bodyscan.evaluation.surface",
@@ -362,6 +362,6 @@ def write_report(result: AnyPath, path: AnyPath | None = None) -> Verdict:
 if not TYPE_CHECKING:
 
     def __getattr__(name: str) -> Any:
-        if name not in _HOMES:
+        if name not in _MODULE_OF:
             raise AttributeError(f"module 'bodyscan' has no attribute {name!r}")
-        return getattr(import_module(_HOMES[name]), name)
+        return getattr(import_module(_MODULE_OF[name]), name)

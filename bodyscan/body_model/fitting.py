@@ -314,7 +314,7 @@ def _step(
     sigma_mm: float,
     region: _Region,
 ) -> tuple[BodyShapeAndPose, float]:
-    """One Gauss-Newton step, and the cost before it. sigma_mm: of a matched distance."""
+    """One Gauss-Newton step of pose and shape, and the cost before it; sigma_mm: of a distance."""
     moving = region.moving
     precision = np.concatenate(
         [

@@ -60,7 +60,7 @@ def equalize_colours(
         find_overlaps(samples, surfaces, consistency, of_samples, of_surfaces, channel)
         for channel in range(samples.colours.shape[1])
     ]
-    power = estimate_light_power([(one.ratio, one.shade) for found in overlaps for one in found])
+    power = estimate_light_exponent([(one.ratio, one.shade) for found in overlaps for one in found])
     gains = np.stack([_solve_channel(found, power, len(surfaces)) for found in overlaps], axis=1)
     coloured = [bool((one.colours != one.colours[:, :1]).any()) for one in surfaces]
     if any(coloured):  # whose white balance the body has
@@ -131,11 +131,11 @@ def _solve_channel(overlaps: Sequence[Overlap], power: float, count: int) -> Flo
     )
 
 
-def estimate_light_power(overlaps: Sequence[tuple[Floats, Floats]]) -> float:
-    """Estimate the power, 0 to 1, of irradiance to which levels are proportional.
+def estimate_light_exponent(overlaps: Sequence[tuple[Floats, Floats]]) -> float:
+    """Estimate the exponent, 0 to 1, of irradiance to which grey levels are proportional.
 
-    overlaps: logarithms (N,) of one camera's levels over another's, and of the light's. Fitted
-        within each overlap by the least sum of absolute errors.
+    overlaps: log ratios (N,) of two cameras' levels, and of their irradiances. Least absolute error,
+        each overlap about its medians.
     """
     if not overlaps:
         return 0.0

@@ -65,10 +65,8 @@ class Contradictions:
         surfaces: Sequence[SmoothSurface],
         agreement_mm: float,
     ) -> Contradictions:
-        """Count what each pair's surface shows of all samples; consistency: one for each pair.
-
-        Hair and dark cloth are left out.
-        """
+        """Count, for each pair's surface, how many samples of each other pair it confirms or
+        contradicts, without hair and dark cloth; consistency, surfaces: one for each pair."""
         bright = _find_bright(samples)
 
         def count_by_pair(index: Numbers) -> Counts:

@@ -114,6 +114,7 @@ class BowedSheets(SmoothSheets):
         )
 
     def _by_parameter(self, basis: Array, terms: Array, by_point: Array) -> Array:
+        """Derivatives (..., P) of the offset by the parameters: coefficients in order, then x0."""
         sizes = self._sizes[:-1]
         columns = [-terms[..., k, None] * basis[..., :size] for k, size in enumerate(sizes)]
         return np.concatenate([*columns, by_point[..., :1]], axis=-1)

@@ -130,12 +130,12 @@ def _expand_sides(definition: dict[str, Any]) -> list[dict[str, Any]]:
     if not definition.get("sides"):
         return [definition]
 
-    def name(value: Any, side: str) -> Any:
+    def fill_in(value: Any, side: str) -> Any:
         if isinstance(value, list):
-            return [name(one, side) for one in value]
+            return [fill_in(one, side) for one in value]
         return value.replace("{side}", side) if isinstance(value, str) else value
 
-    return [{k: name(v, side) for k, v in definition.items()} for side in ("left", "right")]
+    return [{k: fill_in(v, side) for k, v in definition.items()} for side in ("left", "right")]
 
 
 def measure_by_name(mesh: BodyMesh) -> NamedMeasures:

@@ -101,7 +101,7 @@ class PersonMotion:
         )
 
 
-def describe_step(motion: EstimatedMotion) -> str:
+def describe_posture(motion: EstimatedMotion) -> str:
     """What stood elsewhere while one pole fired, where that was farthest: "the belly was 8 mm or
     more farther in"; empty without a step of posture."""
     if motion.step is None:
@@ -110,7 +110,7 @@ def describe_step(motion: EstimatedMotion) -> str:
     farthest = int(np.argmax(length))
     part = PARTS[name_parts(motion.cells)[farthest]]
     if part != "trunk":
-        return f"the {part} was {length[farthest]:.0f} mm or more elsewhere"
+        return f"the {part} was {length[farthest]:.0f} mm or more farther away"
     # They meet between the navel and the end of the sternum.
     belly = motion.cells.centres[farthest, 2] < 0.64 * motion.cells.centres[:, 2].max()
     outward = -np.sum(motion.step * motion.cells.normals, axis=1)

@@ -120,7 +120,7 @@ def moves(person: Person) -> bool:
 
 
 def animate(still: Surface, person: Person, rng: np.random.Generator) -> LivingBody:
-    """Give a still surface joints, breath and sway; lengths are shares of the stature (ANSUR II).
+    """Add moving arms and head, breath and sway to a still surface (body heights after ANSUR II).
 
     Raises BadInput for one without arms or a head.
     """

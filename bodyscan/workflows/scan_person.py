@@ -86,7 +86,7 @@ def scan_person(
     Raises ScanFailed if no pair, or no part of a body inside the scan volume, is left; CaptureError
     if a pair took stripes in two shots.
     """
-    require_one_moment(captures)
+    require_single_shot(captures)
     images = reconstruct_range_images(
         calibration, captures, progress, made=reconstructed, volume_only=True
     )
@@ -105,7 +105,7 @@ def scan_person(
     )  # fmt: skip
 
 
-def require_one_moment(captures: Captures) -> None:
+def require_single_shot(captures: Captures) -> None:
     """Raise CaptureError if a pair took its stripes twice: two poses, or two persons, would be one."""
     shots: dict[str, list[str]] = {}
     for sequence in captures.sequences:

@@ -13,7 +13,7 @@ from ray_cast_scan import Scan
 from bodyscan.arrays import Array
 from bodyscan.fusion.brightness import (
     compute_log_irradiance,
-    estimate_light_power,
+    estimate_light_exponent,
     find_overlaps,
     solve_gains,
 )
@@ -46,14 +46,14 @@ def test_the_power_of_light_is_told_whatever_the_exposures_and_some_stains() -> 
         ratio[::10] += 1.0  # highlights
         overlaps.append((ratio.astype(np.float32), shade))
     # Where light falls off to a third, 0.05 of the power is 5 % of grey, which nobody sees.
-    assert estimate_light_power(overlaps) == pytest.approx(0.8, abs=0.05)
-    assert estimate_light_power([]) == 0.0
+    assert estimate_light_exponent(overlaps) == pytest.approx(0.8, abs=0.05)
+    assert estimate_light_exponent([]) == 0.0
 
 
 def test_light_that_the_room_gives_is_not_taken_for_more_than_matt() -> None:
     shade = np.linspace(-1.0, 1.0, 500).astype(np.float32)
-    assert estimate_light_power([(-0.5 * shade, shade)]) == 0.0
-    assert estimate_light_power([(3.0 * shade, shade)]) == 1.0
+    assert estimate_light_exponent([(-0.5 * shade, shade)]) == 0.0
+    assert estimate_light_exponent([(3.0 * shade, shade)]) == 1.0
 
 
 def test_no_seams_between_exposures(scan: Scan, cleaned: list[RangeImage]) -> None:

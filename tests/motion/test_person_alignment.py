@@ -21,7 +21,7 @@ from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.motion import person_alignment
 from bodyscan.motion.estimation import TimeFit
 from bodyscan.motion.person_alignment import PersonAlignment, align_person
-from bodyscan.motion.person_motion import describe_step
+from bodyscan.motion.person_motion import describe_posture
 from bodyscan.settings import AlignmentSettings
 
 RIG = load_rig("four-pole-16")
@@ -130,8 +130,8 @@ def test_a_belly_drawn_in_while_one_pole_fired_is_no_pole(
     # p4, beside it, explains it nearly as well.
     assert found.posture.pole in ("pole p1", "pole p1 or pole p4")
     assert found.motion is not None
-    assert describe_step(found.motion).startswith("the belly was")
-    assert describe_step(found.motion).endswith("farther in")
+    assert describe_posture(found.motion).startswith("the belly was")
+    assert describe_posture(found.motion).endswith("farther in")
     assert found.motion.breath is not None
     assert found.motion.breath.sigma_mm.max() > 3.0, "girths hold both"
 

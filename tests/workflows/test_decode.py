@@ -26,7 +26,7 @@ from bodyscan.stripes.codes.gray import Gray
 from bodyscan.workflows import decode, range_images
 from bodyscan.workflows.decode import decode_sequence, describe_failures, list_fault_notes
 from bodyscan.workflows.range_images import reconstruct_range_images, reconstruct_sequence
-from bodyscan.workflows.scan_person import require_one_moment
+from bodyscan.workflows.scan_person import require_single_shot
 
 TWO_WAYS = """
 version: 1
@@ -220,9 +220,9 @@ def test_two_shots_of_a_pair_are_no_one_person() -> None:
         sequences = [SimpleNamespace(pair=p, shot=s, has_stripes=True) for p, s in taken]
         return SimpleNamespace(sequences=sequences, folders=["scans/anna"])
 
-    require_one_moment(captured(("a", "s1"), ("b", "s2")))  # poles one after another
+    require_single_shot(captured(("a", "s1"), ("b", "s2")))  # poles one after another
     with pytest.raises(CaptureError, match=r"scans/anna: pair a .* 2 shots \(s1, s2\)") as caught:
-        require_one_moment(captured(("a", "s1"), ("b", "s1"), ("a", "s2")))
+        require_single_shot(captured(("a", "s1"), ("b", "s1"), ("a", "s2")))
     assert "name: s1" in caught.value.remedy
 
 

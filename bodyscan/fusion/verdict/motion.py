@@ -9,7 +9,7 @@ import numpy as np
 from bodyscan.alignment.displaced_poles import STILL_MM, DisplacedPole
 from bodyscan.alignment.pose_evidence import ScaleError
 from bodyscan.fusion.verdict.evidence import GIRTH_PER_MM, Finding, ScanEvidence
-from bodyscan.motion.person_motion import describe_step
+from bodyscan.motion.person_motion import describe_posture
 from bodyscan.settings import UseLimits
 
 UNCORRECTED_SHARE = 0.2
@@ -68,8 +68,8 @@ def check_posture_step(scan: ScanEvidence) -> Iterator[Finding]:
         return
     yield Finding(
         "usable",
-        f"{describe_step(found.motion)} while {found.posture.pole} fired than while others did: it was "
-        "aligned with theirs, and girths there hold both. Stand still, breathe quietly and scan again",
+        f"{describe_posture(found.motion)} while {found.posture.pole} fired than while others did: "
+        "the two were aligned, so girths there mix both. Stand still, breathe quietly and scan again",
         explains=found.posture.pairs,
     )
 
