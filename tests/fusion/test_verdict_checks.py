@@ -325,6 +325,7 @@ def scattered(columns: Sequence[Column], counts: Sequence[int]) -> BodyCloud:
 TRUNK: Column = ((0.0, 0.0), (300.0, 300.0), 0.0, TALL_MM)
 SHAPES = ("more than one person", "besides one person's", "touches the", "mm wide and")
 PERSON = standing_body(hanging(25.0))
+AT_CROTCH = [*hanging(25.0), ((0, 480, 805), (0, 150, 805), 22)]
 
 
 def beside(thing: tuple[Array, Indices]) -> tuple[Array, Indices]:
@@ -338,8 +339,9 @@ def beside(thing: tuple[Array, Indices]) -> tuple[Array, Indices]:
         (standing_body(hanging(25.0), scale=0.6), "good", ""),
         (standing_body(hanging(20.0), stout=1.25), "good", ""),
         (standing_body(hanging(25.0), apart_mm=66.0), "good", ""),  # thighs that touch
-        (standing_body(hanging(0.0)), "usable", "the left arm touches the trunk from"),
+        (standing_body(hanging(0.0)), "usable", "the left arm touches the"),
         (standing_body(HAND_ON_HIP), "usable", "hold the arms off"),
+        (standing_body(AT_CROTCH), "usable", "leg and trunk"),
         (beside(PERSON), "repeat", "more than one person: at heights"),
         (beside(cylinder(15.0, 0.0, 1000.0)), "usable", "a stick"),
         (beside(cylinder(130.0, 0.0, 450.0)), "usable", "causes: a stool"),

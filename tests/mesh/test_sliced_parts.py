@@ -37,8 +37,7 @@ def test_free_arms_and_legs_are_told_apart_at_any_size(scale: float, stout: floa
     assert at_waist["trunk"] == pytest.approx(trunk_tape(scale, stout), rel=3e-3)
     assert set(tapes(parts, 1600.0 * scale)) == {"head"}
     assert at_waist["left arm"] == pytest.approx(at_waist["right arm"], rel=0.02)
-    near = [c for c in parts.contacts if "leg" not in c.parts[0] and c.low_mm < 1150.0 * scale]
-    assert not near
+    assert not [c for c in parts.contacts if "leg" not in c.parts[0] and c.low_mm < 1150.0 * scale]
 
 
 def test_a_trunk_is_cut_from_arms_that_hang_against_it() -> None:
@@ -90,8 +89,7 @@ def test_a_leg_that_is_thin_below_the_crotch_is_no_other_body() -> None:
 
 def test_what_stands_beside_a_person_is_none_of_its_parts() -> None:
     body = standing_body(hanging(25.0))
-    beside = standing_body(hanging(25.0))
-    two = together(body, (beside[0] + [0.0, 1300.0, 0.0], beside[1]))
+    two = together(body, (body[0] + [0.0, 1300.0, 0.0], body[1]))
     parts = find_parts(MeshSlicer(*two), [1000.0])
     assert sum(piece.part == "trunk" for piece in parts.slices[1000.0]) == 1
     assert "other" in {piece.part for piece in parts.slices[1000.0]}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import pairwise
 
 import numpy as np
 from scipy import ndimage
@@ -48,16 +49,11 @@ def check_limbs(scan: ScanEvidence) -> Iterator[Finding]:
     """What is no trunk, leg or arm of one person: another one, or a thing beside the legs."""
     if scan.parts is None:
         return
-    largest = {
-        height: max(piece.loop.area_mm2 for piece in pieces)
-        for height, pieces in scan.parts.slices.items()
-        if pieces
-    }
+    slices = scan.parts.slices.items()
+    areas = {h: [(p.part, p.loop.area_mm2) for p in pieces] for h, pieces in slices if pieces}
+    largest = {h: max(area for _, area in some) for h, some in areas.items()}
     other = {
-        height: max(
-            (p.loop.area_mm2 for p in scan.parts.slices[height] if p.part == "other"), default=0.0
-        )
-        for height in largest
+        h: max([0.0, *(a for part, a in some if part == "other")]) for h, some in areas.items()
     }
     # An arm has 0.2 of the trunk's area; a stick of 20 mm has 300 mm2.
     bodies = [height for height, area in other.items() if area > 0.35 * largest[height]]
@@ -130,13 +126,16 @@ def check_contacts(scan: ScanEvidence) -> Iterator[Finding]:
     if scan.parts is None:
         return
     top = max(scan.parts.slices)
-    for contact in scan.parts.contacts:
-        arm = next((part for part in contact.parts if part.endswith("arm")), None)
-        other = next((part for part in contact.parts if part != arm), None)
-        at_armpit = contact.high_mm > (ARMPIT - 0.06) * top
-        if arm and other and contact.high_mm - contact.low_mm > (0.06 if at_armpit else 0.01) * top:
-            yield Finding(
-                "usable",
-                f"the {arm} touches the {other} from {contact.low_mm:.0f} to {contact.high_mm:.0f} mm: "
-                "hold the arms off. Girths there are given as a range, or of both parts together",
-            )
+    for arm in ("left arm", "right arm"):
+        mine = sorted((c for c in scan.parts.contacts if arm in c.parts), key=lambda c: c.low_mm)
+        # From a leg to the trunk above it is one contact.
+        gaps = [above.low_mm - below.high_mm > 0.02 * top for below, above in pairwise(mine)]
+        for some in np.split(np.array(mine, object), np.flatnonzero(gaps) + 1) if mine else ():
+            low, high = some[0].low_mm, some[-1].high_mm
+            others = dict.fromkeys(part for one in some for part in one.parts if part != arm)
+            if high - low > (0.06 if high > (ARMPIT - 0.06) * top else 0.01) * top:
+                yield Finding(
+                    "usable",
+                    f"the {arm} touches the {' and '.join(others)} from {low:.0f} to {high:.0f} mm: "
+                    "hold the arms off. Girths there are given as a range, or of both parts together",
+                )
