@@ -47,8 +47,8 @@ def compute_sway_residual(
 
 @dataclass(frozen=True)
 class GirthErrors:
-    """Tape girths of the trunk, mesh minus truth, in slices (`heights` many) where at least 97 % of
-    the girth was measured: RMS, worst error and its height; and the error of the stature."""
+    """Tape girths of the trunk, mesh minus truth, in slices (`heights` many) where at least 97 % was
+    measured and no arm touches, which makes a range: RMS, worst and its height; and the stature's."""
 
     heights: int
     rms_mm: float
@@ -79,7 +79,7 @@ def compute_girth_errors(
     errors = {}
     for one, other in both:
         found, wanted = one.find_girth("trunk"), other.find_girth("trunk")
-        if found and wanted and found.measured_skin >= WHOLE:
+        if found and wanted and found.measured_skin >= WHOLE and not found.touches:
             errors[one.height_mm] = found.tape_mm - wanted.tape_mm
     sizes = np.abs(list(errors.values())) if errors else np.array([np.nan])
     worst_at = list(errors)[int(np.argmax(sizes))] if errors else float("nan")
