@@ -22,7 +22,7 @@ from bodyscan.export.texture import Texture, make_texture
 from bodyscan.files.model import did_you_mean
 from bodyscan.fusion.storage import StoredScan
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.measurement.landmarks import find_landmarks
+from bodyscan.measurement.landmarks import drop_unseen, find_landmarks
 from bodyscan.mesh.body import BodyMesh
 from bodyscan.mesh.body_frame import find_body_frame
 from bodyscan.mesh.repair import collapse_slivers, decimate
@@ -129,7 +129,7 @@ def _make_texture(
 def _register(mesh: BodyMesh, rig_from_frame: RigidTransform | None) -> SkinnedBody:
     """Lay the parametric body over a scan's mesh, with its landmarks."""
     registered = register_body(mesh)
-    landmarks = [one for one in find_landmarks(registered).values() if one.found != "unseen"]
+    landmarks = drop_unseen(find_landmarks(registered)).values()
     carried = [(one.name, np.array(one.position_mm), one.sigma_mm, one.found) for one in landmarks]
     frame = RigidTransform.identity() if rig_from_frame is None else rig_from_frame.inverse()
     return make_skinned(registered, carried, frame)

@@ -85,8 +85,8 @@ class Contradictions:
         ])  # fmt: skip
         beyond = erfc(agreement_mm / (np.sqrt(2.0) * np.maximum(sigma, 1e-6)))
         by_noise = float(beyond.mean()) if len(beyond) else 0.0
-        at_mm = float(low), float(high)
-        return Contradictions(tuple(pairs), agreed + against, against, by_noise, at_mm)
+        ends_mm = float(low), float(high)
+        return Contradictions(tuple(pairs), agreed + against, against, by_noise, ends_mm)
 
     @property
     def share(self) -> float:
@@ -160,8 +160,8 @@ def estimate_displacement_sigma(
     farthest = mean + 1.64 * np.sqrt(np.maximum(square - mean**2, 0.0))
     # Around a limb: its other side, which one pole alone may have seen, is an arm's width away. Along
     # it, where poles share nothing: limbs hang or stand, and a hand moves with its forearm.
-    places = np.column_stack([np.tile([x, y], 2).T, 0.5 * np.append(z, z - 300.0)])
-    near = cKDTree(places).query(samples.points * [1.0, 1.0, 0.5], distance_upper_bound=90.0)[1]
+    centres = np.column_stack([np.tile([x, y], 2).T, 0.5 * np.append(z, z - 300.0)])
+    near = cKDTree(centres).query(samples.points * [1.0, 1.0, 0.5], distance_upper_bound=90.0)[1]
     return np.append(np.tile(farthest, 2), 0.0)[np.asarray(near)], len(farthest)
 
 

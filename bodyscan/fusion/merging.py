@@ -103,11 +103,11 @@ def average(
     chi2 = (square - total * mean**2) / np.maximum(count - 1.0, 1.0)
     inflation = estimate_sigma_inflation(samples, surfaces, consistency, poses) ** 2
     sigma_mm = np.sqrt(variance * np.maximum(inflation, chi2 / 9.0)) / total
-    displacement_mm = np.broadcast_to(displaced_mm, kept.shape)[kept]
+    displaced_mm = np.broadcast_to(displaced_mm, kept.shape)[kept]
     return BodyCloud(
         samples.points[kept] + mean[:, None] * samples.normals[kept],
         (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32),
-        np.hypot(sigma_mm, displacement_mm).astype(np.float32),
+        np.hypot(sigma_mm, displaced_mm).astype(np.float32),
         np.clip(np.rint(levels), 0.0, 255.0).astype(np.uint8).repeat(3 // levels.shape[1], axis=1),
         count.astype(np.uint8),
     )

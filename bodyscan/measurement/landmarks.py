@@ -80,11 +80,11 @@ def find_landmarks(body: RegisteredBody) -> dict[str, Landmark]:
             part = int(template.parts[vertex])
             spots[name] = _climb(body, part, direction, spots[name])
     spots |= _find_ends(body, spots)
-    seen = KDTree(body.vertices[np.isfinite(body.mesh.sigma_mm)])
-    for name, spot in spots.items():
-        # Sigmas were measured with 36 mm and less between a landmark and what was measured.
-        if seen.query(spot.position)[0] > 40.0:
-            spots[name] = replace(spot, found="unseen")
+    observed = KDTree(body.vertices[np.isfinite(body.mesh.sigma_mm)])
+    away_mm = np.asarray(observed.query(np.array([one.position for one in spots.values()]))[0])
+    # Sigmas were measured with 36 mm and less between a landmark and what was measured.
+    far = [name for name, away in zip(spots, away_mm, strict=True) if away > 40.0]
+    spots |= {name: replace(spots[name], found="unseen") for name in far}
     sigmas = dict(zip(template.landmarks, template.landmark_sigma_mm.tolist(), strict=True))
     return {
         name: Landmark(
@@ -95,6 +95,11 @@ def find_landmarks(body: RegisteredBody) -> dict[str, Landmark]:
         )
         for name, spot in spots.items()
     }
+
+
+def drop_unseen(landmarks: Mapping[str, Landmark]) -> dict[str, Landmark]:
+    """The landmarks near which something was measured."""
+    return {name: one for name, one in landmarks.items() if one.found != "unseen"}
 
 
 def _select_near(body: RegisteredBody, part: int, centre: Array, radius_mm: float) -> Indices:

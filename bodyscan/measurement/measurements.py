@@ -246,7 +246,8 @@ def _describe_loop(piece: Piece, mesh: BodyMesh, breath: BreathAt | None) -> Gir
         breath_sigma = compute_girth_sigma(loop, lean, sectors=1)
     lows, highs = bound_girths(loop)
     depth, width = np.ptp(loop.segments[:, 0], axis=0).tolist()
-    (x, y), values = loop.centre.tolist(), (loop.girth_mm, loop.tape_mm)
+    x, y = loop.centre.tolist()
+    values = loop.girth_mm, loop.tape_mm
     girths, tapes = (
         (max(min(value, low) - 1.96 * sigma, 0.0), max(value, high) + 1.96 * sigma)
         for value, low, high in zip(values, lows, highs, strict=True)
@@ -255,7 +256,8 @@ def _describe_loop(piece: Piece, mesh: BodyMesh, breath: BreathAt | None) -> Gir
     return Girth(
         piece.part,
         *values,
-        *(width, depth),
+        width,
+        depth,
         loop.area_mm2,
         (x, y),
         loop.measured_share,

@@ -33,7 +33,7 @@ from scipy.spatial import ConvexHull, cKDTree
 from bodyscan.arrays import Array
 from bodyscan.body_model.fitting import BASIS_MM
 from bodyscan.body_model.registered import RegisteredBody, register_body
-from bodyscan.measurement.landmarks import LANDMARK_INFLATION, Landmark, find_landmarks
+from bodyscan.measurement.landmarks import LANDMARK_INFLATION, Landmark, drop_unseen, find_landmarks
 from bodyscan.measurement.posture import Posture, find_posture
 from bodyscan.measurement.sections import UP, BodySections, Section
 from bodyscan.mesh.body import BodyMesh
@@ -155,17 +155,16 @@ def take_measures(registered: RegisteredBody) -> NamedMeasures:
     body = _Body(sections, positions)
     posture = find_posture(registered.fitted, positions)
     measures, missing = {}, {}
-    unseen = {name for name, one in landmarks.items() if one.found == "unseen"}
+    observed = drop_unseen(landmarks)
     for definition in read_definitions():
         try:
             needed = {*definition.get("landmarks", ()), *definition.get("along", ())}
-            if names := sorted(needed & unseen):
+            if names := sorted(needed - observed.keys()):
                 raise _NotThere(f"nothing was measured near its landmark {names[0]}")
             measures[definition["name"]] = _take(body, definition, posture)
         except _NotThere as reason:
             missing[definition["name"]] = str(reason)
-    shown = {name: one for name, one in landmarks.items() if name not in unseen}
-    return NamedMeasures(shown, measures, missing, posture, registered)
+    return NamedMeasures(observed, measures, missing, posture, registered)
 
 
 class _NotThere(Exception):

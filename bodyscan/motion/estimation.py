@@ -277,9 +277,7 @@ class _Solution:
         if not times or len(times) < len(seconds):
             return TimeFit()
 
-        def log_evidence(
-            factor: float, omitted: Collection[str], without: str | None = None
-        ) -> float:
+        def log_evidence(factor: float, omitted: Collection[str], without: str = "") -> float:
             moments = [factor * second for second in times]
             person = self.motion.with_times(moments, factor * middle_s, omitted)
             fields = self.motion.find_fields([kind.name for kind in person.kinds])
@@ -298,7 +296,7 @@ class _Solution:
         # With parts: hips that shift are no lean or limb, and would seem to need other times too.
         gains = map_threads(
             lambda left: log_evidence(best.factor, *left) - log_evidence(1.0, *left),
-            [(("breath",), None), *(((), side) for side in dict.fromkeys(sides))],
+            [(("breath",), ""), *(((), side) for side in dict.fromkeys(sides))],
         )
         return best if np.nanmin(gains) > MIN_LOG_RATIO else TimeFit()
 

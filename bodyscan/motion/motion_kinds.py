@@ -88,7 +88,7 @@ def retime_kinds(
     kinds: Sequence[MotionKind],
     seconds: Sequence[float | None],
     middle_s: float,
-    omitted: Collection[str] = ("parts",),
+    omitted: Collection[str],
 ) -> tuple[MotionKind, ...]:
     """All kinds but those omitted, with the modes of other moments, the breath of unit variance.
 

@@ -102,15 +102,15 @@ class PersonMotion:
 
 
 def describe_posture(motion: EstimatedMotion) -> str:
-    """What stood elsewhere while one pole fired, where that was farthest: "the belly was 8 mm or
-    more farther in"; empty without a step of posture."""
+    """Describe where the posture while one pole fired differed most from that at other times, such as
+    "the belly was 8 mm or more farther in"; empty without a step of posture."""
     if motion.step is None:
         return ""
     length = np.linalg.norm(motion.step, axis=1)
     farthest = int(np.argmax(length))
     part = PARTS[name_parts(motion.cells)[farthest]]
     if part != "trunk":
-        return f"the {part} was {length[farthest]:.0f} mm or more farther away"
+        return f"the {part} was at least {length[farthest]:.0f} mm farther away"
     # They meet between the navel and the end of the sternum.
     belly = motion.cells.centres[farthest, 2] < 0.64 * motion.cells.centres[:, 2].max()
     outward = -np.sum(motion.step * motion.cells.normals, axis=1)

@@ -162,8 +162,8 @@ def describe_findings(rig: Rig, views: Sequence[BoardView], images: int) -> str:
 
 def note_appearance(rig: Rig, views: Sequence[BoardView]) -> list[str]:
     """One line for each difference between a board and its description in the rig file."""
-    each = ((board, [view for view in views if view.board == board.name]) for board in rig.boards)
-    return [line for board, own in each for line in _note_board(board, own)]
+    by_board = ((board, [v for v in views if v.board == board.name]) for board in rig.boards)
+    return [line for board, of_it in by_board for line in _note_board(board, of_it)]
 
 
 def _note_board(board: Board, views: Sequence[BoardView]) -> Iterator[str]:

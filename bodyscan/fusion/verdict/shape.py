@@ -52,9 +52,7 @@ def check_limbs(scan: ScanEvidence) -> Iterator[Finding]:
     slices = scan.parts.slices.items()
     areas = {h: [(p.part, p.loop.area_mm2) for p in pieces] for h, pieces in slices if pieces}
     largest = {h: max(area for _, area in some) for h, some in areas.items()}
-    other = {
-        h: max([0.0, *(a for part, a in some if part == "other")]) for h, some in areas.items()
-    }
+    other = {h: max((a for p, a in some if p == "other"), default=0.0) for h, some in areas.items()}
     # An arm has 0.2 of the trunk's area; a stick of 20 mm has 300 mm2.
     bodies = [height for height, area in other.items() if area > 0.35 * largest[height]]
     things = [height for height, area in other.items() if area > 300.0]
