@@ -122,7 +122,7 @@ CHARUCO = "square_mm: 30, kind: charuco"
         ("  - folder: captures", "  folder: captures", "calibration: must be a list (got a map"),
         ("square_mm: 30", "square_mm: \u00a030", "square_mm: has a no-break space (U+00A0)"),
         ("    camera: *camera", "  \u00a0 camera: *camera", "not YAML: has a no-break space (U+00A0)"),
-        ("square_mm: 30", "square_mm:\u00a030", "4:40: boards[0].square_mm:\xa030: has a no-break"),
+        ("square_mm: 30", "square_mm:\u00a030", "4:40: boards[0].square_mm:\\xa030: has a no-break"),
         ("name: p2", "name: \u201cp2\u201d", "pairs[1].name: has a left double quotation mark"),
         ("version: 1", "version: 1\nrig_frame: {pair: p9}", "rig_frame.pair: names no pair"),
         ("version: 1", "version: 1\nrig_frame: {pair: p1, shot: b}", "together with shot"),
