@@ -16,8 +16,8 @@ from bodyscan.calibration.boundary_points import (
     select,
     subsample,
 )
-from bodyscan.calibration.camera import LensTrial
 from bodyscan.calibration.joint_refinement import BoardStripes, StripedBoard, refine_jointly
+from bodyscan.calibration.lens_selection import LensTrial
 from bodyscan.calibration.model_selection import HeldOutModel
 from bodyscan.calibration.sheet_fit import fit_pinhole, fit_sheets
 from bodyscan.calibration.sheet_selection import fit_light_sheets

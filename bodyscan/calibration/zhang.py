@@ -23,17 +23,17 @@ def matrix_from_homographies(homographies: Sequence[Array], width: int, height: 
     )
     scaled = [size @ h for h in homographies]
     scaled = [h / np.linalg.norm(h[:, :2]) * np.sqrt(2) for h in scaled]
-    matrix = _solve_full_matrix(scaled)
+    rows = [_form_constraint(h, 0, 1) for h in scaled]
+    rows += [_form_constraint(h, 0, 0) - _form_constraint(h, 1, 1) for h in scaled]
+    matrix = _solve_full_matrix(np.stack(rows))
     if matrix is None:
-        matrix = _solve_central_matrix(scaled)
+        matrix = _solve_central_matrix(np.stack(rows))
     return np.linalg.inv(size) @ matrix
 
 
-def _solve_full_matrix(homographies: Sequence[Array]) -> Array | None:
+def _solve_full_matrix(rows: Array) -> Array | None:
     """Solve for A with skew and principal point; None if the solution is no camera."""
-    rows = [_form_constraint(h, 0, 1) for h in homographies]
-    rows += [_form_constraint(h, 0, 0) - _form_constraint(h, 1, 1) for h in homographies]
-    _, _, vt = np.linalg.svd(np.stack(rows))
+    _, _, vt = np.linalg.svd(rows)
     b11, b12, b22, b13, b23, b33 = vt[-1] * np.sign(vt[-1][0])
     conic = np.array([[b11, b12, b13], [b12, b22, b23], [b13, b23, b33]])
     if np.any(np.linalg.eigvalsh(conic) <= 0):
@@ -45,17 +45,10 @@ def _solve_full_matrix(homographies: Sequence[Array]) -> Array | None:
     return matrix if plausible and 0.7 < matrix[0, 0] / matrix[1, 1] < 1.4 else None
 
 
-def _solve_central_matrix(homographies: Sequence[Array]) -> Array:
+def _solve_central_matrix(rows: Array) -> Array:
     """Solve for the focal length alone: no skew, principal point at the origin."""
-    rows, right = [], []
-    for h in homographies:
-        for row in (
-            _form_constraint(h, 0, 1),
-            _form_constraint(h, 0, 0) - _form_constraint(h, 1, 1),
-        ):
-            rows.append([row[0] + row[2]])
-            right.append(-row[5])
-    inverse_square = np.linalg.lstsq(np.array(rows), np.array(right), rcond=None)[0][0]
+    square = rows[:, 0] + rows[:, 2]
+    inverse_square = -(square @ rows[:, 5]) / (square @ square)
     focal = 1.0 / np.sqrt(inverse_square) if inverse_square > 0 else 2.4
     return np.diag([focal, focal, 1.0])
 

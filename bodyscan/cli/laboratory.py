@@ -144,7 +144,7 @@ def accept(
     overwrite: Overwrite = False,
 ) -> None:
     """Measure spheres and a plate of known size at several places, and judge the figures."""
-    from bodyscan.evaluation.acceptance import limit_from, load_acceptance
+    from bodyscan.evaluation.acceptance import load_acceptance
     from bodyscan.registration.storage import load_calibration
     from bodyscan.report.acceptance_page import NO_STANDARD, make_screen_table
     from bodyscan.report.page import is_synthetic
@@ -153,7 +153,7 @@ def accept(
     captured = [*(spheres or ()), *(plate or ())]
     if not captured:
         raise BadInput("there is nothing to measure", remedy="give --spheres and --plate folders")
-    file = load_acceptance(artefact, dict(limit_from(text) for text in limit or ()))
+    file = load_acceptance(artefact, limit or ())
     place = calibration if calibration.is_dir() else calibration.parent
     folder = out or place.parent / "acceptance"
     require_writable(folder, *captured, calibration)

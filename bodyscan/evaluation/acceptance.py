@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -12,7 +12,7 @@ from pydantic import Field
 
 from bodyscan.errors import BadInput
 from bodyscan.files.model import Model, Problem
-from bodyscan.files.model_file import apply_changes, load_model
+from bodyscan.files.model_file import apply_settings, load_model
 from bodyscan.rig.gauge import Vector
 from bodyscan.verdict import Verdict
 
@@ -61,8 +61,9 @@ class AcceptanceFile(Model):
     limits: Limits = Limits()
 
 
-def load_acceptance(path: Path | None, changes: Mapping[str, float] = {}) -> AcceptanceFile:
-    """Read an acceptance file, or take the defaults if `path` is None, and change some limits.
+def load_acceptance(path: Path | None, limits: Iterable[str] = ()) -> AcceptanceFile:
+    """Read an acceptance file, or take the defaults if `path` is None, and change limits such as
+    `flatness_mm=0.5`.
 
     Raises BadInput that names every problem.
     """
@@ -70,19 +71,7 @@ def load_acceptance(path: Path | None, changes: Mapping[str, float] = {}) -> Acc
     remedy = "Correct the acceptance file; docs/report.md explains every key."
     if path is not None:
         file = load_model(path, AcceptanceFile, BadInput, remedy=remedy)
-    limits: dict[tuple[str | int, ...], float]
-    limits = {("limits", name): value for name, value in changes.items()}
-    return apply_changes(file, limits, BadInput)
-
-
-def limit_from(text: str) -> tuple[str, float]:
-    """Parse `flatness_mm=0.5` into name and value. Raises BadInput."""
-    name, _, value = text.partition("=")
-    try:
-        return name.strip(), float(value)
-    except ValueError:
-        remedy = "write it as --limit flatness_mm=0.5"
-        raise BadInput(f"{text!r} is not a limit", remedy=remedy) from None
+    return apply_settings(file, (f"limits.{text}" for text in limits), BadInput)
 
 
 ALL = "all pairs"

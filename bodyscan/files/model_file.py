@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
@@ -90,16 +90,8 @@ def apply_settings(model: M, changes: Iterable[str], error: type[BadInput]) -> M
 
     Raises `error`, which names every wrong change by its path.
     """
-    return apply_changes(model, dict(_parse_change(text, error) for text in changes), error)
-
-
-def apply_changes(model: M, changes: Mapping[Where, Any], error: type[BadInput]) -> M:
-    """`model` with the values at some paths replaced, validated again.
-
-    Raises `error`, which names every wrong change by its path.
-    """
     data: dict[Any, Any] = model.model_dump(mode="json", exclude_unset=True)
-    for where, value in changes.items():
+    for where, value in (_parse_change(text, error) for text in changes):
         inside = data
         for part in where[:-1]:
             deeper = inside.setdefault(part, {})

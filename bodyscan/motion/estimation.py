@@ -344,18 +344,14 @@ def _find_order(
     A posture hardly changes from a moment to the next, in the right order alone: of a man whose pairs
     fired in turn the log evidence rose by 160, in other orders it fell by thousands.
     """
-    motion, cells = person
-    linearize = partial(
-        CellEquations.from_matches, centres=cells.centres, correlated=settings.correlated
-    )
+    motion, _ = person
     coarse = [view.select(COARSE) for view in views]
-    equations = _map_matches(linearize, coarse, person, settings.reach_mm, settings)
-    if not equations:
+    projected = _project_overlaps(coarse, person, settings.reach_mm, settings)
+    if not projected:
         return None
     persons = [motion.with_times([None] * len(views), 0.0)]
     persons += [motion.with_times(order, 0.5 * max(order)) for order in orders]
     fields = motion.find_fields([kind.name for kind in persons[0].kinds])
-    projected = motion.project(_combine_directions(equations))
     chosen = {both: system.select(fields) for both, system in projected.items()}
     unknown, *found = (person.solve_projected(chosen).log_evidence for person in persons)
     best = int(np.argmax(found))
@@ -370,16 +366,12 @@ def _solve(
 ) -> _Solution | None:
     """Match and update the motion in turn; None if nothing overlaps. person: initial state."""
     motion, cells = person
-    linearize = partial(
-        CellEquations.from_matches, centres=cells.centres, correlated=settings.correlated
-    )
     coarse, reach = [view.select(COARSE) for view in views], settings.reach_mm
     for remaining in range(ROUNDS, 0, -1):
         points = coarse if remaining > 1 else views
-        equations = _map_matches(linearize, points, (motion, cells), reach, settings)
-        if not equations:
+        projected = _project_overlaps(points, (motion, cells), reach, settings)
+        if not projected:
             return None
-        projected = motion.project(_combine_directions(equations))
         motion = motion.solve_projected(projected)
         reach = max(reach / 2.0, settings.min_reach_mm)
         if remaining == ROUNDS - 1:
@@ -408,6 +400,24 @@ def _find_offset_to_mean_breath(
         errors = errors @ (eigenvectors * np.sqrt(np.maximum(eigenvalues, 0.0)))
     sigma_mm = compute_girth_sigmas(errors, cells.centres[:, 2])
     return BreathOffset(field, np.hypot(sigma_mm, girth_sigma_mm))
+
+
+def _project_overlaps(
+    views: Sequence[_View],
+    person: tuple[BodyMotion, BodyCells],
+    reach_mm: float,
+    settings: AlignmentSettings,
+) -> dict[tuple[int, int], LinearGaussianSystem]:
+    """Equations of the motion from each two pairs that overlap, see `BodyMotion.project`."""
+    motion, cells = person
+    linearize = partial(
+        CellEquations.from_matches, centres=cells.centres, correlated=settings.correlated
+    )
+    gathered: dict[tuple[int, int], list[CellEquations]] = {}
+    for (i, j), one in _map_matches(linearize, views, person, reach_mm, settings).items():
+        # Added to the other direction's: errors of one direction on curved surfaces cancel.
+        gathered.setdefault((min(i, j), max(i, j)), []).append(one if i < j else one.swap())
+    return motion.project({both: CellEquations.sum(parts) for both, parts in gathered.items()})
 
 
 def _map_matches(
@@ -439,16 +449,6 @@ def _map_matches(
         return None if matches is None else measure(matches, view.cell[matches.source])
 
     return map_overlaps(len(views), measure_two)
-
-
-def _combine_directions(
-    equations: Mapping[tuple[int, int], CellEquations],
-) -> dict[tuple[int, int], CellEquations]:
-    """Add both directions of each overlap: errors of one direction on curved surfaces cancel."""
-    gathered: dict[tuple[int, int], list[CellEquations]] = {}
-    for (i, j), one in equations.items():
-        gathered.setdefault((min(i, j), max(i, j)), []).append(one if i < j else one.swap())
-    return {both: CellEquations.sum(parts) for both, parts in gathered.items()}
 
 
 def _is_rigid_negligible(motion: BodyMotion, observed: Mask, settings: AlignmentSettings) -> bool:

@@ -15,7 +15,7 @@ import numpy as np
 
 from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import LocatedView, PlanarView
-from bodyscan.calibration.camera import ChosenLens, LensTrial, choose_lens
+from bodyscan.calibration.lens_selection import ChosenLens, LensTrial, choose_lens
 from bodyscan.calibration.model_selection import MIN_GAIN
 from bodyscan.geometry.lenses import FAMILY
 from bodyscan.geometry.lenses.lens import Lens

@@ -18,7 +18,8 @@ from bodyscan.arrays import Array
 from bodyscan.boards.view import ViewKey
 from bodyscan.calibration.board_views import BoardShape, LocatedView, PlanarView, apply_shape
 from bodyscan.calibration.boundary_points import BoardBoundaries, StripedView
-from bodyscan.calibration.camera import CORNERS, LensTrial, locate_board, locate_boards
+from bodyscan.calibration.camera import CORNERS, locate_board, locate_boards
+from bodyscan.calibration.lens_selection import LensTrial
 from bodyscan.calibration.pair import LocatedPair, PairCalibration
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from bodyscan.calibration.camera import MIN_CLUSTERS
-from bodyscan.errors import BadInput, group_reasons
+from bodyscan.calibration.lens_selection import MIN_CLUSTERS
+from bodyscan.errors import BadInput
 from bodyscan.registration.calibration_verdict import LIMITS, collect_figures, grade_calibration
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.storage import FILE_NAME, calibration_id, load_calibration
@@ -64,10 +64,7 @@ def make_calibration_page(folder: Path) -> Page:
     )
     imported = "another program calibrated the rig"
     why = imported if calibration.is_import else "there is a single pair"
-    failed = [
-        f"failed: {', '.join(names)}: {why}" for names, why in group_reasons(calibration.failed)
-    ]
-    notes = (*failed, *(calibration.notes or ("Every image and view was used.",)))
+    notes = calibration.notes or ("Every image and view was used.",)
     parts: dict[str, Callable[[], list[Block]]] = {
         "The rig": lambda: [
             Viewer("Cameras in the rig frame", model, draw.build_rig_model(calibration))

@@ -25,11 +25,11 @@ from bodyscan.calibration.camera import (
     MIN_POSES,
     CameraCalibration,
     calibrate_known_camera,
-    calibrate_widest,
     estimate_pose,
     locate_boards,
 )
 from bodyscan.calibration.known_pair import read_known_camera
+from bodyscan.calibration.lens_selection import calibrate_widest
 from bodyscan.captures.folder import Captures, ImageSequence
 from bodyscan.captures.images import measure_mosaic, read_board_image, read_sequence
 from bodyscan.errors import BadInput, BodyscanError, DegeneratePoses, FailedWork, format_list

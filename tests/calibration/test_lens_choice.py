@@ -7,7 +7,7 @@ import pytest
 from picture_boards import HEIGHT, NOISE_PX, WIDTH, calibrate_with_lenses, seen
 
 from bodyscan.calibration.board_views import PlanarView
-from bodyscan.calibration.camera import calibrate_widest, choose_lens, cluster_poses
+from bodyscan.calibration.lens_selection import calibrate_widest, choose_lens, cluster_poses
 from bodyscan.geometry.lenses import FAMILY
 from bodyscan.geometry.lenses.fisheye import Fisheye
 from bodyscan.geometry.lenses.lens import Lens

@@ -10,7 +10,7 @@ import pytest
 from picture_boards import HEIGHT, MIDDLE, NOISE_PX, POINTS, WIDTH, calibrate_with_lenses
 
 from bodyscan.calibration.board_views import PlanarView
-from bodyscan.calibration.camera import ChosenLens, estimate_ray_uncertainty
+from bodyscan.calibration.lens_selection import ChosenLens, estimate_ray_uncertainty
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.lenses.opencv import Radial, Rational

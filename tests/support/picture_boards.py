@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from bodyscan.calibration.board_views import PlanarView
-from bodyscan.calibration.camera import ChosenLens, calibrate_widest, choose_lens
+from bodyscan.calibration.lens_selection import ChosenLens, calibrate_widest, choose_lens
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses import FAMILY
 from bodyscan.geometry.lenses.lens import Lens

@@ -49,7 +49,7 @@ def test_a_test_is_written_down_and_the_page_of_an_earlier_one_does_not_stay(
     monkeypatch.setattr(accept_rig, "calibration_id", lambda stored: "0123")
     calibration: Any = SimpleNamespace(rig=SimpleNamespace(name="r"), axes="wherever")
     readings = Readings((SphereRow("a", "s01", ALL, 1, 5000, 0.3, 0.2, 0.1),), (), ())
-    file = load_acceptance(None, {"probing_size_mm": 0.4})
+    file = load_acceptance(None, ["probing_size_mm=0.4"])
 
     def judge() -> accept_rig.Acceptance:
         return accept_rig.judge_readings(
