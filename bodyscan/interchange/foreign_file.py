@@ -93,7 +93,7 @@ class ForeignFile:
         """Raises CalibrationFileError unless the table of that name has all of the words."""
         for word in words:
             if word not in table:
-                raise self.error(f"has no {word}", key, f"it has {', '.join(table)}")
+                raise self.error(f"has no {word}", key, f"it has {', '.join(map(str, table))}")
 
     def numbers(self, value: Any, name: str, *counts: int) -> Array:
         """`value` as a flat array of one of these lengths."""

@@ -41,15 +41,11 @@ class FoundCamera:
                 where=self.where,
                 remedy=remedy,
             )
-        u0, v0 = float(self.matrix[0, 2]), float(self.matrix[1, 2])
+        centre, half = self.matrix[:2, 2], np.array([width, height]) / 2.0
         # Of a camera of known size: a shift lens moves its axis by less than half an image.
-        margin = 0.5 if self.size else 0.0
-        if not (
-            -margin * width < u0 < (1.0 + margin) * width
-            and -margin * height < v0 < (1.0 + margin) * height
-        ):
+        if np.any(np.abs(centre / half - 1.0) >= (2.0 if self.size else 1.0)):
             raise CalibrationFileError(
-                f"has its principal point at ({u0:.1f}, {v0:.1f}), outside of an image of "
+                f"has its principal point at ({centre[0]:.1f}, {centre[1]:.1f}), outside an image of "
                 f"{width} x {height} px: it is of another camera, or of images of another size",
                 where=self.where,
                 remedy=remedy,

@@ -260,7 +260,7 @@ WRONG = [
     ("mrcal", "1000, 1010", "1000", r":6: intrinsics: holds 11 numbers, not 12"),
     ("mrcal", "1000, 1010", "1000, -1010", r":6: intrinsics: has focal lengths 1000 and -1010"),
     ("mrcal", "1000, 1010", "1e999, 1010", r":6: intrinsics: holds a number that is not finite"),
-    ("mrcal", "'imagersize'", "'size'", r"has no 'imagersize'"),
+    ("mrcal", "'imagersize'", "'size'", r"has no imagersize"),
     ("mrcal", "[ 1280, 720,]", "[ 1280, 720", r":\d+: is not an mrcal cameramodel"),
     ("aniposelib", "-0.2, 0.05, 0.0, 0.0, 0.0", "-0.2, nan, 0, 0, 0", r":5: cam_0.distortions: .*f"),
     ("aniposelib", "size", "sizes", r":1: cam_0: has no size"),

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 
-from bodyscan.arrays import Array, Floats
+from bodyscan.arrays import Array
 from bodyscan.errors import DecodingFailed
 from bodyscan.stripes.phase.decoding import (
     check_agreement,
@@ -16,7 +16,7 @@ from bodyscan.stripes.phase.decoding import (
     check_several_waves,
     check_wave_images,
 )
-from bodyscan.stripes.phase.waves import measure_wave, remove_added_light
+from bodyscan.stripes.phase.waves import balance_images, measure_wave
 from bodyscan.stripes.scan_lines import ScanLines
 from bodyscan.stripes.stripe_code import Wave
 
@@ -26,9 +26,9 @@ EVERY = np.ones(S.shape, bool)
 COARSE = ((np.floor(2.0 * S / PERIOD) + 0.5) / 2.0).astype(np.float32)
 
 
-def shares() -> Array:
-    """(4, 3, 800) how bright each image is between dark and lit."""
-    turns = S / PERIOD - np.arange(STEPS)[:, None, None] / STEPS
+def shares(steps: int = STEPS) -> Array:
+    """(steps, 3, 800) how bright each image is between dark and lit."""
+    turns = S / PERIOD - np.arange(steps)[:, None, None] / steps
     return np.asarray(0.5 + 0.5 * np.cos(2.0 * np.pi * turns))
 
 
@@ -55,17 +55,26 @@ def test_all_images_together_are_half_as_bright_at_each_pixel(offset: float, sig
         check_images(shares() + offset * sign)
 
 
-@pytest.mark.parametrize(("flicker", "flash"), [(1.2, 0.0), (1.0, 0.3)])
-def test_light_that_reached_one_image_is_removed_and_flicker_is_not(
-    flicker: float, flash: float
+@pytest.mark.parametrize("steps", [3, 4])
+@pytest.mark.parametrize(
+    ("gain", "added", "message"),
+    [
+        (1.2, 0.0, r"phase image 5 has 1\.(19|20) times .*"),
+        (1.0, 0.3, r"phase image 5 has 1\.0. times .* and \+(29|30)% of the contrast .*"),
+        (1.05, 0.0, ""),
+    ],
+)
+def test_what_one_image_of_a_wave_has_and_the_others_have_not_is_named_and_removed(
+    steps: int, gain: float, added: float, message: str
 ) -> None:
-    share, light = flicker ** (np.arange(4) == 1)[:, None, None] * shares(), np.full(S.shape, 200.0)
-    share[2] += flash
-    images, wave = (200.0 * share).astype(np.float32), Wave(PERIOD, STEPS)
-    arguments = images, measure_wave(images, wave), 0 * light, light.astype(np.float32), EVERY, 3
-    found, told = remove_added_light(*arguments)
-    assert told.startswith("other light reached phase image 5 (30%") == (flash > 0.0)
-    np.testing.assert_allclose(found[2], 200.0 * shares()[2], atol=2.0)
+    right = np.repeat(20.0 + 200.0 * shares(steps) ** 1.4, 20, axis=1).astype(np.float32)
+    images = right.copy()
+    images[2] += (gain - 1.0) * (right[2] - 20.0) + 200.0 * added
+    black, contrast = (np.full(right.shape[1:], grey, np.float32) for grey in (20.0, 200.0))
+    wave = measure_wave(images, Wave(PERIOD, steps))
+    found, _, told = balance_images(images, wave, black, contrast, contrast > 0.0, 3)
+    assert re.fullmatch(message, told)
+    np.testing.assert_allclose(found, right, atol=4.0)
 
 
 def test_phases_lie_in_their_half_periods_and_do_not_jump_between_them() -> None:
@@ -81,17 +90,14 @@ def test_phases_lie_in_their_half_periods_and_do_not_jump_between_them() -> None
 def check_waves(bright: float = 1.0, copied: float | None = None) -> None:
     """Check waves of 8 and of 20 stripes; of the second the mean is so bright, and its
     second image the first plus so many grey levels."""
-    waves: list[Any] = []
-    images: list[Floats] = []
-    for length, times in ((8.0, 1.0), (20.0, bright)):
-        turns = S / length - np.arange(STEPS)[:, None, None] / STEPS
-        stack: Floats = (times * (120.0 + 100.0 * np.cos(2.0 * np.pi * turns))).astype(np.float32)
-        mean, amplitude = np.full(S.shape, 120.0 * times), np.full(S.shape, 100.0)
-        waves.append(SimpleNamespace(wave=Wave(length, STEPS), mean=mean, amplitude=amplitude))
-        images.append(stack)
+    waves, images = [Wave(8.0, STEPS), Wave(20.0, STEPS)], []
+    for wave, times in zip(waves, (1.0, bright), strict=True):
+        turns = S / wave.period - np.arange(STEPS)[:, None, None] / STEPS
+        images.append((times * (120.0 + 100.0 * np.cos(2.0 * np.pi * turns))).astype(np.float32))
     if copied is not None:
         images[1][1] = images[1][0] + copied
-    check_several_waves(waves, images, EVERY, 64)
+    measured = [measure_wave(*each) for each in zip(images, waves, strict=True)]
+    check_several_waves(measured, images, EVERY, 64)
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])

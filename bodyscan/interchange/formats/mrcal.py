@@ -78,9 +78,7 @@ def _read_model(path: Path) -> FoundCamera:
     kind = re.sub(r"^(LENSMODEL|DISTORTION)_", "", model)
     kind = "PINHOLE" if kind == "NONE" else kind
     pose_key = "extrinsics" if "extrinsics" in content else "rt_cam_ref"
-    for word in ("intrinsics", pose_key, "imagersize"):
-        if word not in content:
-            raise file.error(f"has no {word!r}", remedy=f"it has {', '.join(map(str, content))}")
+    file.require(content, ("intrinsics", pose_key, "imagersize"), "")
     if kind not in COEFFICIENTS:
         known = ", ".join(f"LENSMODEL_{name}" for name in COEFFICIENTS)
         remedy = f"mrcal-convert-lensmodel makes one of {known}"

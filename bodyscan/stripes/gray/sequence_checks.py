@@ -42,14 +42,10 @@ def check_exposure(images: ScanLines) -> None:
     check_illumination(bright, lit)
     if images.inverses is not None:
         return
-    bright &= lit < SATURATED
-    bright &= contrast >= np.median(contrast[bright])
-    light, black = (image[some][bright].astype(float) for image in (images.lit, images.dark))
-    for bit, pattern in enumerate(images.patterns):
-        level = pattern[some][bright].astype(float)
-        outside = np.maximum(np.maximum(level - light, black - level) - 4.0, 0.0)  # 4: noise
-        error = float(np.mean(np.minimum(outside / (light - black), 1.0)))
-        share = (level - black) / (light - black)
+    shares, contrast = _sample_shares(images)
+    for bit, share in enumerate(shares["pattern"]):
+        outside = np.maximum(np.abs(share - 0.5) - 0.5 - 4.0 / contrast, 0.0)  # 4: noise
+        error = float(np.mean(np.minimum(outside, 1.0)))
         # What is added moves boundaries by as much, in pixels, where light blurs by one.
         has_boundaries = 0.05 < float(np.mean(share > 0.5)) < 0.95
         added = abs(_measure_added_light(share)) if has_boundaries else 0.0
@@ -61,6 +57,21 @@ def check_exposure(images: ScanLines) -> None:
             )
 
 
+def _sample_shares(images: ScanLines) -> tuple[dict[str, Floats], Floats]:
+    """Brightness (bits, N) of each "pattern" and "inverse", 0 as dark, 1 as lit, at some of the
+    brighter half of the pixels, and the contrast of these (N,), grey levels."""
+    step = max(1, round(math.sqrt(images.lit.size / 50_000)))  # that many pixels are enough
+    some = (..., slice(None, None, step), slice(None, None, step))
+    contrast = images.lit[some].astype(np.float32) - images.dark[some]
+    bright = (contrast >= MIN_CONTRAST) & (images.lit[some] < SATURATED)
+    bright &= contrast >= np.median(contrast[bright]) if bright.any() else False
+    black, contrast = images.dark[some][bright].astype(np.float32), contrast[bright]
+    frames = {"pattern": images.patterns, "inverse": images.inverses}
+    taken = {name: stack for name, stack in frames.items() if stack is not None}
+    shares = {name: (stack[some][:, bright] - black) / contrast for name, stack in taken.items()}
+    return shares, contrast
+
+
 def measure_nonlinearity(images: ScanLines) -> float:
     """Measure by how much half of the light is brighter than halfway between dark and lit, as a share
     of their contrast: 0 if grey levels are proportional to light, 0.46 with a video gamma of 2.2.
@@ -70,17 +81,10 @@ def measure_nonlinearity(images: ScanLines) -> float:
     """
     if images.inverses is None:
         return 0.0
-    some = slice(None, None, max(1, images.lit.size // 50_000))  # that many pixels are enough
-    lit, dark = (image[some].astype(np.float32) for image in (images.lit, images.dark))
-    contrast = lit - dark
-    bright = (contrast >= 20.0) & (lit < SATURATED)
-    bright &= contrast >= np.median(contrast[bright]) if bright.any() else False
-    differences = []
-    for pattern, inverse in zip(images.patterns[:5], images.inverses[:5], strict=True):
-        one, other = (image[some][bright].astype(np.float32) for image in (pattern, inverse))
-        equal = np.abs(one - other) < 0.2 * contrast[bright]
-        differences.append(((one + other - lit[bright] - dark[bright]) / contrast[bright])[equal])
-    found = np.concatenate(differences)
+    shares, contrast = _sample_shares(images)
+    pattern, inverse = shares["pattern"][:5], shares["inverse"][:5]
+    equal = (np.abs(pattern - inverse) < 0.2) & (contrast >= 20.0)
+    found = (pattern + inverse - 1.0)[equal]
     return float(np.median(found)) if len(found) >= MIN_CHANGES else 0.0
 
 
@@ -131,7 +135,7 @@ def _find_fault(
     min_share = 0.75 if images.inverses is None else 0.5 if code.single else 0.6
     worst = min(shares, key=lambda bit: shares[bit], default=0)
     if shares and shares[worst] < min_share:
-        return _find_repeated(images, good) or (
+        return _find_repeated(images) or (
             f"where bit {worst} changes, only {shares[worst]:.0%} of neighbouring pixels are in "
             "neighbouring stripes"
         )
@@ -139,7 +143,7 @@ def _find_fault(
     beyond = float(np.mean((numbers < 0) | (numbers >= stripes))) if numbers.size else 0.0
     if beyond > 0.05:
         return f"{beyond:.0%} of the codes lie beyond the last stripe"
-    if code.single and (repeated := _find_repeated(images, good)):
+    if code.single and (repeated := _find_repeated(images)):
         return repeated
     opposite = _measure_folds(code.stripes(words[:: 2 * step]), good[:: 2 * step])
     if opposite > 0.15:
@@ -147,22 +151,14 @@ def _find_fault(
     return ""
 
 
-def _find_repeated(images: ScanLines, good: Mask) -> str:
+def _find_repeated(images: ScanLines) -> str:
     """Describe two images of the code that are one image; "" if all differ.
 
-    good: (L, P) pixels to compare. No two change at the same places in a Gray code; those that hardly
-    change there may be equal.
+    No two change at the same places in a Gray code; those that hardly change may be equal.
     """
-    step = max(1, round(math.sqrt(np.count_nonzero(good) / 5_000)))
-    some = (..., slice(None, None, step), slice(None, None, step))
-    lit, dark = (image[some][good[some]].astype(np.float32) for image in (images.lit, images.dark))
-    names = [f"pattern of bit {bit}" for bit in range(len(images.patterns))]
-    shares = (images.patterns[some][:, good[some]] - dark) / (lit - dark)
-    if images.inverses is not None:
-        names += [f"inverse of bit {bit}" for bit in range(len(images.inverses))]
-        shares = np.concatenate(
-            [shares, (images.inverses[some][:, good[some]] - dark) / (lit - dark)]
-        )
+    kinds, _ = _sample_shares(images)
+    names = [f"{kind} of bit {bit}" for kind, shares in kinds.items() for bit in range(len(shares))]
+    shares = np.concatenate(list(kinds.values()))[:, ::5]
     white, black = np.mean(shares > 0.75, axis=1), np.mean(shares < 0.25, axis=1)
     changing = np.flatnonzero(np.minimum(white, black) > 0.2)
     for k, one in enumerate(changing):
@@ -181,20 +177,10 @@ def replace_flashed(images: ScanLines) -> tuple[ScanLines, str]:
     """
     if images.inverses is None:
         return images, ""
-    step = max(1, round(math.sqrt(images.lit.size / 50_000)))
-    some = (..., slice(None, None, step), slice(None, None, step))
-    contrast = images.lit[some].astype(np.float32) - images.dark[some]
-    lit = contrast >= MIN_CONTRAST
-    if not lit.any():
-        return images, ""
-    bright = contrast >= np.median(contrast[lit])
-    black, contrast = images.dark[some][bright].astype(np.float32), contrast[bright]
-    frames = {"pattern": images.patterns, "inverse": images.inverses}
-    found = []
-    for bit in range(len(images.patterns)):
-        shares = {
-            name: (stack[bit][some][bright] - black) / contrast for name, stack in frames.items()
-        }
+    frames, found = {"pattern": images.patterns, "inverse": images.inverses}, []
+    kinds, contrast = _sample_shares(images)
+    for bit in range(len(images.patterns) if contrast.size else 0):
+        shares = {name: share[bit] for name, share in kinds.items()}
         added = float(np.median(shares["pattern"] + shares["inverse"] - 1.0))
         light = {name: abs(_measure_added_light(share)) for name, share in shares.items()}
         sound, flashed = sorted(light, key=lambda name: light[name])

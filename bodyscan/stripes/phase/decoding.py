@@ -32,11 +32,11 @@ from bodyscan.stripes.phase.projector_response import (
 )
 from bodyscan.stripes.phase.waves import (
     MeasuredWave,
+    balance_images,
     convert_like,
     estimate_white_and_black,
     measure_wave,
     measure_wave_noise,
-    remove_added_light,
     split_waves,
 )
 from bodyscan.stripes.scan_lines import ScanLines, transpose
@@ -86,8 +86,9 @@ def decode_wave(
     phases = transpose(phases) if images.transposed else phases
     check_wave_images(images, phases, usable)
     measured = measure_wave(phases, wave)
-    phases, added = remove_added_light(phases, measured, images.dark, images.contrast, usable, 0)
-    measured = measure_wave(phases, wave) if added else measured
+    _, measured, uneven = balance_images(
+        phases, measured, images.dark, images.contrast, usable, first=0
+    )
     noise = np.sqrt(variance[np.clip(measured.mean, 0, 255).astype(np.uint8)])
     floor = find_min_contrast(phases.dtype) / 2.0
     usable &= measured.amplitude >= np.maximum(floor, MIN_CONTRAST_TO_NOISE * noise)
@@ -100,7 +101,7 @@ def decode_wave(
     s[~usable] = np.nan
     s, sigma = smooth_phase(s, np.where(usable, sigma * period, np.float32(np.nan)))
     result = assemble_from_pixels(images, lit, s, sigma, variance, stripes)
-    flash = "; ".join(filter(None, (flash, added)))
+    flash = "; ".join(filter(None, (flash, uneven)))
     return replace(result, correlation_px=(CORRELATION_PX, CORRELATION_PX), flash=flash)
 
 
@@ -206,14 +207,13 @@ def decode_waves(
     check_illumination(bright, brightest)
     good = bright & (brightest < SATURATED)
     flash = []
-    for k, (wave, stack, first) in enumerate(each):
-        if len(each) > 1 and wave.period * MIN_PERIODS <= stripes:
+    for k, (_, stack, first) in enumerate(each):
+        if len(each) > 1:
             white, black = estimate_white_and_black(measured[:k] + measured[k + 1 :])
-            stacks[k], added = remove_added_light(
+            stacks[k], measured[k], uneven = balance_images(
                 stack, measured[k], black, white - black, good, int(first)
             )
-            measured[k] = measure_wave(stacks[k], wave) if added else measured[k]
-            flash += [added] if added else []
+            flash += [uneven] if uneven else []
     check_several_waves(measured, stacks, good, stripes)
     usable = good & ~find_half_covered_pixels(contrast, bright)
     corrected = _correct_waves(measured, usable, stripes)
@@ -274,8 +274,8 @@ def check_agreement(order: PhaseOrder) -> None:
         what = f"the waves begin {offset:.2f} of a period apart"
     raise DecodingFailed(
         what,
-        remedy="check whether the images are in their order, and `steps`, `period` or `periods`, "
-        "`start_deg` (for waves written as sines -90) and `shift` right",
+        remedy="check whether the images are in their order and exposed alike, and `steps`, `period` "
+        "or `periods`, `start_deg` (for waves written as sines -90) and `shift` right",
     )
 
 
