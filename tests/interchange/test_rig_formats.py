@@ -149,15 +149,9 @@ def test_what_python_programs_read_projects_the_same(points: Array, tmp_path: Pa
         rotation, shift = np.split(np.array(model["extrinsics"]), 2)
         told = [(rotation, shift, matrix, np.array(lens), points)]
         for table, metres in ((anipose[f"cam_{k}"], 1.0), (caliscope[str(k)], 1000.0)):
-            told.append(
-                (
-                    np.array(table["rotation"]),
-                    metres * np.array(table["translation"]),
-                    np.array(table["matrix"]),
-                    np.array(table["distortions"]),
-                    points,
-                )
-            )
+            words = "rotation", "translation", "matrix", "distortions"
+            rotation, shift, matrix, lens = (np.array(table[word]) for word in words)
+            told.append((rotation, metres * shift, matrix, lens, points))
         own = kalibr[f"cam{k}"]
         chain = np.array(own.get("T_cn_cnm1", np.eye(4))) @ chain
         fx, fy, cx, cy = own["intrinsics"]

@@ -42,9 +42,9 @@ def check_exposure(images: ScanLines) -> None:
     check_illumination(bright, lit)
     if images.inverses is not None:
         return
-    shares, contrast = _sample_shares(images)
+    shares, levels = _sample_shares(images)
     for bit, share in enumerate(shares["pattern"]):
-        outside = np.maximum(np.abs(share - 0.5) - 0.5 - 4.0 / contrast, 0.0)  # 4: noise
+        outside = np.maximum(np.abs(share - 0.5) - 0.5 - 4.0 / levels, 0.0)  # 4: noise
         error = float(np.mean(np.minimum(outside, 1.0)))
         # What is added moves boundaries by as much, in pixels, where light blurs by one.
         has_boundaries = 0.05 < float(np.mean(share > 0.5)) < 0.95

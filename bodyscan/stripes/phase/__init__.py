@@ -1,4 +1,1 @@
-"""Decoding of phase-shifted waves.
-
-decoding: waves, their phase_order, and the projector_response that bends them.
-"""
+"""Decoding of phase-shifted waves, and of what the projector's response does to them."""

@@ -34,6 +34,8 @@ from bodyscan.stripes.phase.waves import (
     MeasuredWave,
     balance_images,
     convert_like,
+    describe_gains,
+    estimate_gains,
     estimate_white_and_black,
     measure_wave,
     measure_wave_noise,
@@ -86,9 +88,8 @@ def decode_wave(
     phases = transpose(phases) if images.transposed else phases
     check_wave_images(images, phases, usable)
     measured = measure_wave(phases, wave)
-    _, measured, uneven = balance_images(
-        phases, measured, images.dark, images.contrast, usable, first=0
-    )
+    gains = estimate_gains(phases, measured, images.dark, images.contrast, usable)
+    _, measured = balance_images(phases, measured, images.dark, images.contrast, gains)
     noise = np.sqrt(variance[np.clip(measured.mean, 0, 255).astype(np.uint8)])
     floor = find_min_contrast(phases.dtype) / 2.0
     usable &= measured.amplitude >= np.maximum(floor, MIN_CONTRAST_TO_NOISE * noise)
@@ -101,7 +102,7 @@ def decode_wave(
     s[~usable] = np.nan
     s, sigma = smooth_phase(s, np.where(usable, sigma * period, np.float32(np.nan)))
     result = assemble_from_pixels(images, lit, s, sigma, variance, stripes)
-    flash = "; ".join(filter(None, (flash, uneven)))
+    flash = "; ".join(filter(None, (flash, *describe_gains(gains, wave.period))))
     return replace(result, correlation_px=(CORRELATION_PX, CORRELATION_PX), flash=flash)
 
 
@@ -192,12 +193,9 @@ def decode_waves(
     """
     transposed = direction == "horizontal"
     lines = transpose(images) if transposed else images
-    firsts = np.cumsum([0, *(wave.steps for wave in waves[:-1])])
-    each = sorted(
-        zip(waves, split_waves(lines, waves), firsts, strict=True), key=lambda one: one[0].period
-    )
-    stacks = [stack for _, stack, _ in each]
-    measured = [measure_wave(stack, wave) for wave, stack, _ in each]
+    each = sorted(zip(waves, split_waves(lines, waves), strict=True), key=lambda one: one[0].period)
+    stacks = [stack for _, stack in each]
+    measured = [measure_wave(stack, wave) for wave, stack in each]
     brightest = lines.max(axis=0)
     contrast = np.min([2.0 * wave.amplitude for wave in measured], axis=0)
     bright = contrast >= find_min_contrast(lines.dtype)
@@ -206,14 +204,7 @@ def decode_waves(
     bright = bright & (contrast >= np.float32(2.0 * MIN_CONTRAST_TO_NOISE) * noise)
     check_illumination(bright, brightest)
     good = bright & (brightest < SATURATED)
-    flash = []
-    for k, (_, stack, first) in enumerate(each):
-        if len(each) > 1:
-            white, black = estimate_white_and_black(measured[:k] + measured[k + 1 :])
-            stacks[k], measured[k], uneven = balance_images(
-                stack, measured[k], black, white - black, good, int(first)
-            )
-            flash += [uneven] if uneven else []
+    uneven = _balance_waves(measured, stacks, good)
     check_several_waves(measured, stacks, good, stripes)
     usable = good & ~find_half_covered_pixels(contrast, bright)
     corrected = _correct_waves(measured, usable, stripes)
@@ -227,8 +218,31 @@ def decode_waves(
     lit_all, unlit = (convert_like(grey, lines) for grey in estimate_white_and_black(measured))
     light = ScanLines(lit_all, unlit, lines[:0], None, transposed)
     result = assemble_from_pixels(light, lit, s, sigma, variance, stripes)
-    correlation_px = CORRELATION_PX, CORRELATION_PX
-    return replace(result, correlation_px=correlation_px, flash="; ".join(flash))
+    return replace(result, correlation_px=(CORRELATION_PX, CORRELATION_PX), flash="; ".join(uneven))
+
+
+def _balance_waves(waves: list[MeasuredWave], stacks: list[Greys], good: Mask) -> list[str]:
+    """Balance the images of waves in place, each by white and black of the others; say which differ.
+
+    The wave with the worst image goes first: by it the others seem wrong too.
+    """
+    told = []
+    for _ in waves[1:]:
+        others = [estimate_white_and_black(waves[:k] + waves[k + 1 :]) for k in range(len(waves))]
+        each = [
+            estimate_gains(stack, wave, black, white - black, good)
+            for stack, wave, (white, black) in zip(stacks, waves, others, strict=True)
+        ]
+        errors = [np.abs(gains - [[1.0], [0.0]]).max() for gains in each]
+        if not max(errors):
+            break
+        worst = int(np.argmax(errors))
+        white, black = others[worst]
+        stacks[worst], waves[worst] = balance_images(
+            stacks[worst], waves[worst], black, white - black, each[worst]
+        )
+        told += describe_gains(each[worst], waves[worst].wave.period)
+    return told
 
 
 def _correct_waves(waves: list[MeasuredWave], usable: Mask, stripes: int) -> list[MeasuredWave]:

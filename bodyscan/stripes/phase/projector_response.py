@@ -88,7 +88,8 @@ def estimate_error_against(
     sums = np.bincount(bin_of, arrows.real, bins) + 1.0j * np.bincount(bin_of, arrows.imag, bins)
     # Below a mean length of 0.3 a bin's phases point anywhere.
     clear = (count >= 50) & (np.abs(sums) >= 0.3 * count)
-    if np.count_nonzero(clear) <= 4 * len(MULTIPLES):
+    # Over less than a period of its own the error looks like a whole turn of the finer wave.
+    if np.count_nonzero(clear) < bins / wave.wave.steps:
         return None
     curve = np.unwrap(np.angle(sums[clear])) / (2.0 * np.pi)
     middle = ((np.arange(bins) + 0.5) / bins)[clear]

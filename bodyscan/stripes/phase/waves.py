@@ -61,8 +61,7 @@ def estimate_white_and_black(waves: Sequence[MeasuredWave]) -> tuple[Floats, Flo
 
 
 def estimate_white_image(images: Greys, waves: tuple[Wave, ...]) -> Greys:
-    """Estimate the image under all of the projector's light, (H, W), from images (F, H, W) of
-    waves."""
+    """Estimate the image (H, W) under all of the projector's light from images (F, H, W) of waves."""
     parts = zip(split_waves(images, waves), waves, strict=True)
     white, _ = estimate_white_and_black([measure_wave(part, wave) for part, wave in parts])
     return convert_like(white, images)
@@ -80,63 +79,60 @@ def split_waves(images: Greys, waves: tuple[Wave, ...]) -> list[Greys]:
 
 
 def balance_images(
-    images: Greys,
-    wave: MeasuredWave,
-    black: Greys | Floats,
-    contrast: Floats,
-    usable: Mask,
-    first: int,
-) -> tuple[Greys, MeasuredWave, str]:
-    """Remove what one image of a wave has and the others have not: a gain, or light such as a flash;
-    also measure the wave again, and say which image, "" if none.
+    images: Greys, wave: MeasuredWave, black: Greys | Floats, contrast: Floats, gains: Array
+) -> tuple[Greys, MeasuredWave]:
+    """Remove gains, see `estimate_gains`, from the images of a wave, and measure it again."""
+    if np.array_equal(gains.T, [[1.0, 0.0]] * len(images)):
+        return images, wave
+    gain, added = gains.astype(np.float32)
+    light = images.astype(np.float32) - black - np.multiply.outer(added, contrast)
+    balanced: Floats = light / gain[:, None, None] + black
+    return balanced, measure_wave(balanced, wave.wave)
+
+
+def describe_gains(gains: Array, period: float) -> list[str]:
+    """Say which images differ so much that it moves the phase of four by 0.01 of a period, and how."""
+    return [
+        f"image {step} of the wave of {period:g} stripes has {gain:.2f} times the light of the others "
+        f"and {added:+.0%} of the contrast besides (exposure, flicker, a flash?): both are removed"
+        for step, (gain, added) in enumerate(gains.T)
+        if max(abs(added), abs(gain - 1.0) / 2.0) > 0.05
+    ]
+
+
+def estimate_gains(
+    images: Greys, wave: MeasuredWave, black: Greys | Floats, contrast: Floats, usable: Mask
+) -> Array:
+    """Estimate what one image of a wave has and the others have not: a gain, and light such as a
+    flash, as a share of the contrast, (2, steps); all 1 and 0 if none has, or if only a part of
+    a period is shown.
 
     images: (steps, L, P) of the wave. black, contrast: (L, P), without the projector's light, and what
-        all of it adds. usable: (L, P). first: number of the first image.
+        all of it adds. usable: (L, P).
 
     Over a whole period each image is the first one shifted, whatever the wave's shape: all have one
-    mean and one amplitude.
+    mean and one amplitude. What is wrong in one image moves the phases by which it is seen: each
+    iteration leaves half of it.
     """
-    some = np.flatnonzero(usable)
-    some = np.random.default_rng(0).choice(
-        some, min(len(some), 10_000)
-    )  # every n-th has few phases
-    levels = images.reshape(len(images), -1)[:, some] - black.ravel()[some].astype(np.float32)
-    gain, added = _estimate_gains(levels / contrast.ravel()[some], wave.wave)
-    change = np.maximum(np.abs(added), np.abs(gain - 1.0) / 2.0)
-    if change.max() < 0.02:  # subjects that show a period unevenly give 0.014
-        return images, wave, ""
-    light = images.astype(np.float32) - black - np.multiply.outer(added, contrast)
-    corrected = light / gain[:, None, None] + black
-    named = "; ".join(
-        f"phase image {first + k} has {gain[k]:.2f} times the light of its wave's other images and "
-        f"{added[k]:+.0%} of the contrast besides (exposure, flicker, a flash?): both are removed"
-        for k in np.flatnonzero(
-            change > 0.05
-        )  # of four images, moves the phase by 0.01 of a period
-    )
-    return corrected, measure_wave(corrected, wave.wave), named
-
-
-def _estimate_gains(levels: Floats, wave: Wave) -> tuple[Floats, Floats]:
-    """Estimate each image's gain, and the light added to it, from levels (steps, N) as shares of the
-    contrast; 1 and 0 if they show a part of a period only.
-
-    What is wrong in one image moves the phases by which it is seen: each iteration leaves half of it.
-    """
-    bins = 24
-    gain, added = np.ones((len(levels), 1)), np.zeros((len(levels), 1))
+    lit = np.flatnonzero(usable)  # every n-th of which may have few phases
+    some = np.random.default_rng(0).choice(lit, min(len(lit), 10_000))
+    light = images.reshape(len(images), -1)[:, some] - black.ravel()[some].astype(np.float32)
+    levels = light / contrast.ravel()[some]
+    bins, even = 24, np.stack([np.ones(len(levels)), np.zeros(len(levels))])
+    gain, added = even[:, :, None]
     for _ in range(6):
-        turn = measure_wave(((levels - added) / gain)[:, None], wave).turn[0]
-        bin_of = (turn * bins).astype(int) % bins
+        balanced = ((levels - added) / gain).astype(np.float32)
+        bin_of = (measure_wave(balanced[:, None], wave.wave).turn[0] * bins).astype(int) % bins
         if np.bincount(bin_of, minlength=bins).min() <= levels.shape[1] / (8 * bins):
-            return np.ones(len(levels), np.float32), np.zeros(len(levels), np.float32)
-        shape = np.fft.rfft(
-            [np.median(levels[:, bin_of == k], axis=1) for k in range(bins)], axis=0
-        )
+            return even
+        profile = [np.median(levels[:, bin_of == k], axis=1) for k in range(bins)]
+        shape = np.fft.rfft(profile, axis=0)
         mean, amplitude = shape[0].real / bins, np.abs(shape[1])
         gain = (amplitude / np.median(amplitude))[:, None]
         added = mean[:, None] - gain * np.median(mean)
-    return gain[:, 0].astype(np.float32), added[:, 0].astype(np.float32)
+    # Subjects that show a period unevenly give 0.014.
+    is_even = max(np.abs(added).max(), np.abs(gain - 1.0).max() / 2.0) < 0.02
+    return even if is_even else np.stack([gain[:, 0], added[:, 0]])
 
 
 def measure_wave_noise(
