@@ -200,10 +200,10 @@ def describe_failures(
 ) -> tuple[dict[str, str], list[str]]:
     """Pairs that failed in every shot, with the first few reasons that differ outside of brackets;
     and, of pairs that are good in some shot, one line for each reason."""
-    told = [(sequence, format_error(error)) for sequence, error in failures.items()]
-    notes = list(list_fault_notes({one: [why] for one, why in told if one.pair in good}))
+    found = [(sequence, format_error(error)) for sequence, error in failures.items()]
+    notes = list(list_fault_notes({one: [why] for one, why in found if one.pair in good}))
     reasons: dict[str, dict[str, str]] = defaultdict(dict)
-    for pair, reason in _group_faults(each for each in told if each[0].pair not in good):
+    for pair, reason in _group_faults(each for each in found if each[0].pair not in good):
         reasons[pair].setdefault(reason.partition(" (")[0], reason)
     failed = {pair: _join(list(found.values())[:3]) for pair, found in reasons.items()}
     return failed, notes

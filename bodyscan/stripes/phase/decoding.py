@@ -226,7 +226,7 @@ def _balance_waves(waves: list[MeasuredWave], stacks: list[Greys], good: Mask) -
 
     The wave with the worst image goes first: by it the others seem wrong too.
     """
-    told = []
+    notes = []
     for _ in waves[1:]:
         others = [estimate_white_and_black(waves[:k] + waves[k + 1 :]) for k in range(len(waves))]
         each = [
@@ -241,8 +241,8 @@ def _balance_waves(waves: list[MeasuredWave], stacks: list[Greys], good: Mask) -
         stacks[worst], waves[worst] = balance_images(
             stacks[worst], waves[worst], black, white - black, each[worst]
         )
-        told += describe_gains(each[worst], waves[worst].wave.period)
-    return told
+        notes += describe_gains(each[worst], waves[worst].wave.period)
+    return notes
 
 
 def _correct_waves(waves: list[MeasuredWave], usable: Mask, stripes: int) -> list[MeasuredWave]:
