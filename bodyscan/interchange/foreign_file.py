@@ -25,10 +25,7 @@ from bodyscan.geometry.transforms import RigidTransform
 MAX_BYTES = 100_000_000  # mrcal's files hold all corners of a calibration, some megabytes
 MAX_VALUES = 1_000_000  # OpenCV's as well
 
-LENS_KEYS = (
-    *("distortion_model", "camera_model", "lens_model", "projection_model", "camera_type"),
-    *("model", "type", "lens"),
-)
+LENS_KEYS = re.compile("model|type|lens|distortion|projection", re.IGNORECASE)
 LENS_WORDS = {
     "fisheye": r"(opencv)?fisheye|(pinhole)?equi(distant)?|kannalabrandt[48]?|kb4",
     "polynomial": r"plumbbob|rationalpolynomial|(pinhole)?radtan|radialtangential|brown(conrady)?"
@@ -36,8 +33,8 @@ LENS_WORDS = {
     "other": r"ds|doublesphere|e?ucm|omni(directional)?|mei|fov|atan|scaramuzza|ocam|division|ftheta"
     r"|thinprism(fisheye)?|fisheye624|cahvore?|stereographic|equirectangular",
 }
-"""In small letters and digits alone. A camera's product name may stand under all keys but the first:
-there only `other` is refused."""
+"""In small letters and digits alone. A camera's product name may stand under any key but that of the
+distortion: there only `other` is refused."""
 
 
 @dataclass(frozen=True)
@@ -148,12 +145,14 @@ class ForeignFile:
         found = False
         for key, value in around.items():
             word = re.sub(r"[^a-z0-9]", "", str(value).lower())
-            if key.lower() in ("fisheye", "fisheye_model", "is_fisheye"):
+            if "fisheye" in key.lower():
                 found |= word in ("true", "1", "yes")
-            elif key.lower() in LENS_KEYS and isinstance(value, str) and word:
+            elif LENS_KEYS.search(key) and isinstance(value, str) and word:
                 kinds = [kind for kind, words in LENS_WORDS.items() if re.fullmatch(words, word)]
                 found |= "fisheye" in kinds
-                if "other" in kinds or (not kinds and key.lower() == LENS_KEYS[0]):
+                if "other" in kinds or (
+                    not kinds and re.search("distortion_?(model|type)", key, re.I)
+                ):
                     raise self.error(
                         f"{value!r} is a lens that is not supported",
                         f"{owner}.{key}".removeprefix("."),

@@ -393,6 +393,9 @@ ROS_NODES = {"matrix": "camera_matrix", "distortion": "distortion_coefficients"}
         ),
         ("MODEL", "thin_prism_fisheye", None),
         ("distortion_model: MODEL", "camera_model: omni", None),
+        ("distortion_model: MODEL", "distortion_type: fisheye", Fisheye(-0.2, 0.05)),
+        ("distortion_model: MODEL", "isFisheye: true", Fisheye(-0.2, 0.05)),
+        ("distortion_model: MODEL", "model_type: MEI", None),
     ],
 )
 def test_words_beside_coefficients_decide_the_lens(
@@ -401,7 +404,7 @@ def test_words_beside_coefficients_decide_the_lens(
     path = tmp_path / "ros.yaml"
     path.write_text(ROS_CAMERA.replace(old, new))
     if lens is None:
-        with pytest.raises(CalibrationFileError, match=r":3: \w+_model: '.*' is a lens"):
+        with pytest.raises(CalibrationFileError, match=r":3: \w+: '.*' is a lens"):
             read_nodes(path, ROS_NODES)
     else:
         assert read_nodes(path, ROS_NODES).lens == lens
