@@ -342,20 +342,25 @@ def compute_shape_sigmas(
     views = np.bincount(mark, minlength=len(cells.landmarks))
     shape = len(views), len(mark)
     means = sparse.csr_array((1.0 / views[mark], (mark, np.arange(len(mark)))), shape=shape) @ rows
-    errors = motion.whiten(means.T).T
-    girth = compute_girth_sigmas(errors, cells.centres[cells.landmarks, 2], 60.0)
+    errors, marks = motion.whiten(means.T).T, cells.landmarks
+    girth = compute_girth_sigmas(errors, cells.centres[marks], cells.normals[marks], 60.0)
     variances = np.stack([np.sum(errors**2, axis=1), girth**2])
     kernel = np.exp(-0.5 * (cells.landmark_distances / 60.0) ** 2) * (views > 0)[:, None]
     sigma, girth = np.sqrt(variances @ kernel / np.maximum(kernel.sum(axis=0), 1e-12))
     return sigma, girth
 
 
-def compute_girth_sigmas(errors: Array, height: Array, near_mm: float = 20.0) -> Array:
+def compute_girth_sigmas(
+    errors: Array, centres: Array, normals: Array, near_mm: float = 20.0
+) -> Array:
     """Standard deviations (C,) mm of displacements with factor errors (C, n), as they affect a girth.
 
-    Only what cells within `near_mm` of height (C,) mm share changes a girth.
+    Only what cells within `near_mm` of height share does, by the angle that a tape turns at each.
     """
-    kernel = np.exp(-0.5 * ((height[:, None] - height) / near_mm) ** 2)
+    kernel = np.exp(-0.5 * ((centres[:, None, 2] - centres[:, 2]) / near_mm) ** 2)
+    towards = np.arctan2(normals[:, 1], normals[:, 0])
+    alike = np.exp((np.cos(towards[:, None] - towards) - 1.0) / 0.2**2)
+    kernel /= np.sum(kernel * alike, axis=0)
     sigma = np.linalg.norm(errors, axis=1)
     return sigma * np.linalg.norm(kernel @ errors, axis=1) / np.maximum(kernel @ sigma, 1e-12)
 

@@ -392,13 +392,13 @@ def _find_offset_to_mean_breath(
     fields = motion.kind("breath").fields
     errors = np.einsum("cim,ci->cm", fields[:, :3], cells.normals)
     if motion.breath is None or not timed:
-        # Breathed in is farther from the mean than out: 97.5 % of breaths are within 1.96 times 2 mm.
-        field, errors = np.zeros(fields.shape[:2]), 2.0 * errors
+        # Breathed in is farther from the mean than out: 97.5 % of breaths are within 1.96 times 2.2 mm.
+        field, errors = np.zeros(fields.shape[:2]), 2.2 * errors
     else:
         field = fields @ motion.breath.at_middle
         eigenvalues, eigenvectors = np.linalg.eigh(motion.breath.covariance)
         errors = errors @ (eigenvectors * np.sqrt(np.maximum(eigenvalues, 0.0)))
-    sigma_mm = compute_girth_sigmas(errors, cells.centres[:, 2])
+    sigma_mm = compute_girth_sigmas(errors, cells.centres, cells.normals)
     return BreathOffset(field, np.hypot(sigma_mm, girth_sigma_mm))
 
 

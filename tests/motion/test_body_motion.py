@@ -203,11 +203,13 @@ def cells(standing: LivingScan) -> BodyCells:
 
 
 def test_a_girth_is_uncertain_by_what_all_around_it_shares() -> None:
-    """Errors of many cells, each by itself, cancel around a girth; one of them all does not."""
-    height = np.repeat([1000.0, 1200.0], 50)
-    alone, together = np.eye(100), np.ones((100, 1))
-    np.testing.assert_allclose(compute_girth_sigmas(together, height), 1.0)
-    np.testing.assert_allclose(compute_girth_sigmas(alone, height), 50.0**-0.5)
+    """Errors of many cells cancel around a girth, one of them all does not; few turn as far as many."""
+    centres = np.repeat([[0.0, 0.0, 1000.0], [0.0, 0.0, 1200.0]], 100, axis=0)
+    quarters = np.tile(np.repeat([0, 1, 2, 3], [40, 10, 40, 10]), 2)
+    normals = np.array([[1.0, 0, 0], [0, 1.0, 0], [-1.0, 0, 0], [0, -1.0, 0]])[quarters]
+    both = np.eye(2)[quarters % 2]
+    for errors, sigma in ((np.ones((200, 1)), 1.0), (np.eye(200), 0.125), (both, 0.5**0.5)):
+        np.testing.assert_allclose(compute_girth_sigmas(errors, centres, normals), sigma)
 
 
 def test_a_place_that_two_saw_alike_is_as_uncertain_as_one_and_one_that_errs_by_itself_less(

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.special import gamma, kv
@@ -10,6 +13,7 @@ from bodyscan.alignment.sway_prior import correlate_stance
 from bodyscan.arrays import Array, Indices
 from bodyscan.geometry.linear_gaussian import LinearGaussianSystem
 from bodyscan.motion.breath import SIZES_MM, estimate_breath
+from bodyscan.motion.estimation import _find_offset_to_mean_breath
 from bodyscan.motion.temporal_modes import (
     BREATHS_S,
     IRREGULAR,
@@ -21,23 +25,13 @@ from bodyscan.motion.temporal_modes import (
 )
 
 
-@pytest.mark.parametrize("correlation", [correlate_stance, correlate_breath])
-def test_courses_sum_to_what_is_alike(correlation: object) -> None:
-    alike = correlate_stance if correlation is correlate_stance else correlate_breath
+@pytest.mark.parametrize("correlate", [correlate_stance, correlate_breath])
+def test_modes_sum_to_the_correlation(correlate: Any) -> None:
     seconds = np.linspace(0.1, 2.1, 12)
-    courses = TemporalModes.from_correlation(
-        alike, seconds.tolist(), 0.5 * (seconds[0] + seconds[-1])
-    )
-    every = np.vstack([courses.values, courses.middle])
-    at = np.append(seconds, 1.1)
-    # Less than a thousandth of the first course is left out, of each of the others.
-    np.testing.assert_allclose(every @ every.T, alike(at[:, None] - at), atol=0.01)
-
-
-def test_a_breath_comes_back_and_a_stance_does_not() -> None:
-    assert correlate_breath(np.array([1.9]))[0] < -0.5
-    assert correlate_stance(np.array([1.9]))[0] > 0.0
-    assert correlate_stance(np.array([0.01]))[0] > 0.999
+    modes = TemporalModes.from_correlation(correlate, seconds.tolist(), 1.1)
+    every, at = np.vstack([modes.values, modes.middle]), np.append(seconds, 1.1)
+    # Less than a thousandth of the first mode is left out, of each of the others.
+    np.testing.assert_allclose(every @ every.T, correlate(at[:, None] - at), atol=0.01)
 
 
 def test_a_stance_is_materns_of_order_three_halves() -> None:
@@ -51,6 +45,10 @@ def test_a_stance_is_materns_of_order_three_halves() -> None:
 def test_a_moment_that_is_not_known_is_like_no_other() -> None:
     courses = TemporalModes.from_correlation(correlate_stance, [0.2, None, 0.6], 0.4)
     assert np.all(courses.values[1] @ courses.values[[0, 2]].T == 0.0)
+    breaths = Breaths.from_modes(courses, [0.2, None, 0.6], 0.4)
+    assert not breaths.waves.any(), "any breath is as likely"
+    np.testing.assert_array_equal(breaths.irregular, np.eye(courses.count))
+    assert breaths.priors == 1.0
     free = TemporalModes.from_correlation(correlate_stance, [None, None], 0.0)
     np.testing.assert_array_equal(free.values, np.eye(2))
     np.testing.assert_array_equal(free.middle, np.zeros(2))
@@ -75,14 +73,7 @@ def test_each_breath_has_its_own_length_and_phase() -> None:
     assert BREATHS_S[by_length.argmax()] == pytest.approx(3.75, rel=0.07)
     assert by_length[[0, -1]].max() < 0.15 * by_length.max()
     assert np.linalg.eigvalsh(breaths.irregular).min() > 0.0
-
-
-def test_where_a_moment_is_not_known_any_breath_is() -> None:
-    courses = TemporalModes.from_correlation(correlate_breath, [0.2, None, 0.6], 0.4)
-    breaths = Breaths.from_modes(courses, [0.2, None, 0.6], 0.4)
-    assert not breaths.waves.any()
-    np.testing.assert_array_equal(breaths.irregular, np.eye(courses.count))
-    assert breaths.priors == 1.0
+    assert correlate_breath(np.array([1.9]))[0] < -0.5, "it comes back"
 
 
 SECONDS = np.linspace(0.1, 2.9, 16)
@@ -155,6 +146,19 @@ def test_of_a_short_scan_a_breath_is_known_as_well_as_is_said(span_s: float) -> 
         errors.append((-found.at_middle[0] - true[-1]) / np.sqrt(found.covariance[0, 0]))
     assert np.mean(np.abs(errors) < 1.96) >= 0.9
     assert np.sqrt(np.mean(np.square(errors))) > 0.4, "nor is more left open than is"
+
+
+def test_without_times_a_girth_holds_breaths_of_every_depth_and_moment() -> None:
+    """All around moves outwards as the front does, give or take 0.6 of it."""
+    rng, count = np.random.default_rng(0), 100_000
+    depth = 0.25 * rng.uniform(2.0, 8.0, count) * (1.0 + 0.6 * rng.standard_normal(count))
+    kind = SimpleNamespace(fields=np.full((4, 12, 2), [1.0, 0.6]))
+    body: Any = SimpleNamespace(
+        centres=np.zeros((4, 3)), normals=np.eye(3)[[0, 1, 0, 1]], breath=None, kind=lambda _: kind
+    )
+    sigma = _find_offset_to_mean_breath(body, body, np.zeros(4), timed=False).sigma_mm
+    highest = np.quantile(depth * breathe(rng.random(count), 1.0, 0.0), 0.975)
+    np.testing.assert_allclose(1.96 * sigma, highest, rtol=0.03)
 
 
 @pytest.mark.parametrize("deep_mm", [0.7, 1.4, 2.8])
