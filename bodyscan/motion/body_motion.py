@@ -358,9 +358,9 @@ def compute_girth_sigmas(
     Only what cells within `near_mm` of height share does, by the angle that a tape turns at each.
     """
     kernel = np.exp(-0.5 * ((centres[:, None, 2] - centres[:, 2]) / near_mm) ** 2)
-    towards = np.arctan2(normals[:, 1], normals[:, 0])
-    alike = np.exp((np.cos(towards[:, None] - towards) - 1.0) / 0.2**2)
-    kernel /= np.sum(kernel * alike, axis=0)
+    heading = np.arctan2(normals[:, 1], normals[:, 0])
+    near = np.exp((np.cos(heading[:, None] - heading) - 1.0) / 0.2**2)
+    kernel /= np.sum(kernel * near, axis=0)
     sigma = np.linalg.norm(errors, axis=1)
     return sigma * np.linalg.norm(kernel @ errors, axis=1) / np.maximum(kernel @ sigma, 1e-12)
 

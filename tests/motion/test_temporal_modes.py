@@ -48,7 +48,6 @@ def test_a_moment_that_is_not_known_is_like_no_other() -> None:
     breaths = Breaths.from_modes(courses, [0.2, None, 0.6], 0.4)
     assert not breaths.waves.any(), "any breath is as likely"
     np.testing.assert_array_equal(breaths.irregular, np.eye(courses.count))
-    assert breaths.priors == 1.0
     free = TemporalModes.from_correlation(correlate_stance, [None, None], 0.0)
     np.testing.assert_array_equal(free.values, np.eye(2))
     np.testing.assert_array_equal(free.middle, np.zeros(2))
