@@ -150,9 +150,8 @@ class ForeignFile:
             elif LENS_KEYS.search(key) and isinstance(value, str) and word:
                 kinds = [kind for kind, words in LENS_WORDS.items() if re.fullmatch(words, word)]
                 found |= "fisheye" in kinds
-                if "other" in kinds or (
-                    not kinds and re.search("distortion_?(model|type)", key, re.I)
-                ):
+                is_model = re.search("distortion_?(model|type)", key, re.IGNORECASE)
+                if "other" in kinds or (is_model and not kinds):
                     raise self.error(
                         f"{value!r} is a lens that is not supported",
                         f"{owner}.{key}".removeprefix("."),

@@ -244,7 +244,7 @@ WRONG = [
     ("kalibr", "radtan", "fov", r":12: cam1.distortion_model: 'fov' is a lens"),
     ("kalibr", "1000.0, 1010.0", "9" * 400 + ", 1010.0", r":5: cam0.intrinsics: holds what is not a n"),
     ("kalibr", "  note: no camera", "  note: a\n  note: b", r":9: right.note: is given twice"),
-    ("kalibr", "pinhole", "ds", r":2: cam0.camera_model: 'ds' is a model that is not supported"),
+    ("kalibr", "pinhole", "ds", r":2: cam0.camera_model: 'ds' is a lens that is not supported"),
     ("kalibr", "cam0", "camera0", r"no cam0"),
     ("kalibr", "[1.0, 0.0, 0.0, -0.2]", "[-1.0, 0.0, 0.0, -0.2]", r"T_cn_cnm1: is a reflection"),
     ("kalibr", "[1.0, 0.0, 0.0, -0.2]", "[1.1, 0.0, 0.0, -0.2]", r"T_cn_cnm1: is not a rotation"),

@@ -64,11 +64,15 @@ def test_a_frame_taken_twice_or_missing_is_named(good: Sequence, bit: int) -> No
             read(with_frame(good, name, bit, getattr(good, name)[bit - 1]))
 
 
-@pytest.mark.parametrize(("name", "bit", "added"), [("patterns", 5, 40), ("inverses", 3, 90)])
+@pytest.mark.parametrize(
+    ("name", "bit", "added", "part"),
+    [("patterns", 5, 40, 1.0), ("inverses", 3, 90, 1.0), ("patterns", 1, 150, 0.2)],
+)
 def test_a_frame_that_a_flash_lit_is_named_and_made_from_the_other(
-    good: Sequence, name: str, bit: int, added: int
+    good: Sequence, name: str, bit: int, added: int, part: float
 ) -> None:
-    lit = np.minimum(getattr(good, name)[bit].astype(int) + added, 255).astype(np.uint8)
+    light = added * (np.arange(good.lit.shape[1]) < part * good.lit.shape[1])
+    lit = np.minimum(getattr(good, name)[bit] + light, 255).astype(np.uint8)
     found, calm = read(with_frame(good, name, bit, lit)), read(good)
     (fault,) = found.faults
     assert f"the {name[:-1]} of bit {bit} is" in fault

@@ -121,17 +121,14 @@ def _read_camera(file: ForeignFile, cameras: Mapping[str, Any], number: int) -> 
     entry = cameras[key]
     words = ("camera_model", "intrinsics", "distortion_model", "resolution")
     file.require(entry, words, key)
-    if entry["camera_model"] != "pinhole":
-        wrong = f"{entry['camera_model']!r} is a model that is not supported, pinhole is"
-        remedy = "calibrate it with pinhole-radtan or pinhole-equi"
-        raise file.error(wrong, f"{key}.camera_model", remedy)
-    lens = [] if entry["distortion_model"] == "none" else entry.get("distortion_coeffs", [])
-    around = {"distortion_model": str(entry["distortion_model"])}
+    given = [] if entry["distortion_model"] == "none" else entry.get("distortion_coeffs", [])
+    around = {word: str(entry[word]) for word in ("camera_model", "distortion_model")}
+    lens = file.lens(given, f"{key}.distortion_coeffs", around)
     matrix = file.pinhole_matrix(entry["intrinsics"], f"{key}.intrinsics")
     matrix[0, 1] = file.numbers(entry.get("skew", 0.0), f"{key}.skew", 1)[0]
     return FoundCamera(
         matrix,
-        file.lens(lens, f"{key}.distortion_coeffs", around),
+        lens,
         file.size(entry["resolution"], f"{key}.resolution"),
         _compute_pose_in_first(file, cameras, number),
         file.where(key),

@@ -75,8 +75,7 @@ def _read_model(path: Path) -> FoundCamera:
     file = ForeignFile.read(path)
     content = _parse_literal(file)
     model = str(content.get("lensmodel", content.get("distortion_model", "")))
-    kind = re.sub(r"^(LENSMODEL|DISTORTION)_", "", model)
-    kind = "PINHOLE" if kind == "NONE" else kind
+    kind = re.sub(r"^(LENSMODEL|DISTORTION)_", "", model).replace("NONE", "PINHOLE")
     pose_key = "extrinsics" if "extrinsics" in content else "rt_cam_ref"
     file.require(content, ("intrinsics", pose_key, "imagersize"), "")
     if kind not in COEFFICIENTS:

@@ -181,18 +181,32 @@ def replace_flashed(images: ScanLines) -> tuple[ScanLines, str]:
     kinds, contrast = _sample_shares(images)
     for bit in range(len(images.patterns) if contrast.size else 0):
         shares = {name: share[bit] for name, share in kinds.items()}
-        added = float(np.median(shares["pattern"] + shares["inverse"] - 1.0))
+        excess = shares["pattern"] + shares["inverse"] - 1.0
+        added = float(np.median(excess))
         light = {name: abs(_measure_added_light(share)) for name, share in shares.items()}
         sound, flashed = sorted(light, key=lambda name: light[name])
-        if abs(added) > 0.05 and light[sound] < 0.25 * abs(added) < light[flashed]:
-            stack = frames[flashed] = frames[flashed].copy()
-            grey = images.lit.astype(np.float32) + images.dark - frames[sound][bit]
-            stack[bit] = np.clip(grey, 0.0, 255.0).astype(stack.dtype)
-            found.append(
-                f"the {flashed} of bit {bit} is {abs(added):.0%} of the contrast "
-                f"{'brighter' if added > 0.0 else 'darker'} than lit and dark image allow, as with a "
-                f"flash or a lamp, and is made from its {sound}"
-            )
+        where, sum_error = "all over", 0.0
+        if not (abs(added) > 0.05 and light[sound] < 0.25 * abs(added) < light[flashed]):
+            # In a part of the picture: there a sound frame is never brighter than lit, a flashed one is
+            # where it is white.
+            part = excess - added > 0.25
+            over = {
+                name: np.mean(share[part] > 1.15) for name, share in shares.items() if part.any()
+            }
+            sound, flashed = sorted(over, key=lambda name: over[name]) or ("", "")
+            if np.mean(part) < 0.03 or over[sound] > 0.02 or over[flashed] < 0.2:
+                continue
+            added, sum_error = float(np.median(excess[part])), added
+            where = f"in {np.mean(part):.0%} of the picture"
+        stack = frames[flashed] = frames[flashed].copy()
+        grey = images.lit.astype(np.float32) + images.dark - frames[sound][bit]
+        grey += sum_error * images.contrast
+        stack[bit] = np.clip(grey, 0.0, 255.0).astype(stack.dtype)
+        found.append(
+            f"the {flashed} of bit {bit} is {abs(added):.0%} of the contrast "
+            f"{'brighter' if added > 0.0 else 'darker'} than lit and dark image allow, {where}, as "
+            f"with a flash or a lamp, and is made from its {sound}"
+        )
     return replace(images, patterns=frames["pattern"], inverses=frames["inverse"]), "; ".join(found)
 
 
