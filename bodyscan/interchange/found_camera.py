@@ -95,10 +95,9 @@ def find_camera(cameras: FoundCameras, name: str, where: str) -> FoundCamera:
             usable.append(other)
         except CalibrationFileError as error:
             reasons.append(f"{other} cannot be used ({error.where}: {error.what})")
-    has = f"it has {', '.join(usable) or 'none that can be used'}"
-    listed = [has, *reasons[:8]]  # more cannot be read at a glance
+    reasons[8:] = ["say which is meant in the rig file"]  # more cannot be read at a glance
     raise CalibrationFileError(
         f"has no camera {name!r}{did_you_mean(name, cameras)}",
         where=where,
-        remedy="; ".join([*listed, "say which is meant in the rig file"]),
+        remedy="; ".join([f"it has {', '.join(usable) or 'none that can be used'}", *reasons]),
     )

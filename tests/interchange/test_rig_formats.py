@@ -376,6 +376,7 @@ distortion_model: MODEL
 camera_matrix: {rows: 3, cols: 3, data: [1000.0, 0, 640, 0, 1010, 360, 0, 0, 1]}
 distortion_coefficients: {rows: 1, cols: 4, data: [-0.2, 0.05, 0.0, 0.0]}
 """
+BROWN = lens_from_opencv(np.array([-0.2, 0.05, 0, 0, 0]))
 ROS_NODES = {"matrix": "camera_matrix", "distortion": "distortion_coefficients"}
 
 
@@ -383,14 +384,10 @@ ROS_NODES = {"matrix": "camera_matrix", "distortion": "distortion_coefficients"}
     ("old", "new", "lens"),
     [
         ("MODEL", "equidistant", Fisheye(-0.2, 0.05)),
-        ("MODEL", "plumb_bob", lens_from_opencv(np.array([-0.2, 0.05, 0, 0, 0]))),
+        ("MODEL", "plumb_bob", BROWN),
         ("distortion_model: MODEL", "fisheye_model: 1", Fisheye(-0.2, 0.05)),
         ("distortion_model: MODEL", "model: fisheye", Fisheye(-0.2, 0.05)),
-        (
-            "distortion_model: MODEL",
-            "camera_model: my-camera 7",
-            lens_from_opencv(np.array([-0.2, 0.05, 0, 0, 0])),
-        ),
+        ("distortion_model: MODEL", "camera_model: my-camera 7", BROWN),
         ("MODEL", "thin_prism_fisheye", None),
         ("distortion_model: MODEL", "camera_model: omni", None),
         ("distortion_model: MODEL", "distortion_type: fisheye", Fisheye(-0.2, 0.05)),
@@ -439,9 +436,7 @@ def test_every_dialect_of_yaml_is_read(tmp_path: Path, head: str, tail: str) -> 
 def test_what_json_cannot_hold_is_named_with_its_line(tmp_path: Path) -> None:
     path = tmp_path / "any.json"
     path.write_text(re.sub(r"-0\.2\d*", "NaN", storage("json"), count=1))
-    with pytest.raises(
-        CalibrationFileError, match=r"any.json:\d+: kc: holds a number that is not fin"
-    ):
+    with pytest.raises(CalibrationFileError, match=r"any.json:\d+: kc: holds a number that"):
         read_nodes(path, NODES)
     path.write_text('{"a": ' + "[" * 100_000)
     with pytest.raises(CalibrationFileError, match="nested"):

@@ -135,8 +135,7 @@ def _read_camera(
     name, model = f"camera {camera.camera_id}", camera.model.name
     if model not in PERSPECTIVE + FISHEYES:
         what = f"has a camera of COLMAP's model {model}, which is not supported"
-        known = ", ".join(PERSPECTIVE + FISHEYES)
-        raise file.error(what, remedy=f"calibrate it with one of {known}")
+        raise file.error(what, remedy=f"calibrate it with {', '.join(PERSPECTIVE + FISHEYES)}")
     centre = camera.principal_point_x - PIXEL_CENTRE, camera.principal_point_y - PIXEL_CENTRE
     four = [camera.focal_length_x, camera.focal_length_y, *centre]
     matrix = file.pinhole_matrix(four, name)

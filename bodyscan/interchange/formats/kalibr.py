@@ -119,8 +119,7 @@ def _read_transform(
 def _read_camera(file: ForeignFile, cameras: Mapping[str, Any], number: int) -> FoundCamera:
     key = f"cam{number}"
     entry = cameras[key]
-    words = ("camera_model", "intrinsics", "distortion_model", "resolution")
-    file.require(entry, words, key)
+    file.require(entry, ("camera_model", "intrinsics", "distortion_model", "resolution"), key)
     given = [] if entry["distortion_model"] == "none" else entry.get("distortion_coeffs", [])
     around = {word: str(entry[word]) for word in ("camera_model", "distortion_model")}
     lens = file.lens(given, f"{key}.distortion_coeffs", around)

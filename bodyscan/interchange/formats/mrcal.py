@@ -79,8 +79,7 @@ def _read_model(path: Path) -> FoundCamera:
     pose_key = "extrinsics" if "extrinsics" in content else "rt_cam_ref"
     file.require(content, ("intrinsics", pose_key, "imagersize"), "")
     if kind not in COEFFICIENTS:
-        known = ", ".join(f"LENSMODEL_{name}" for name in COEFFICIENTS)
-        remedy = f"mrcal-convert-lensmodel makes one of {known}"
+        remedy = f"mrcal-convert-lensmodel makes LENSMODEL_ {', '.join(COEFFICIENTS)}"
         raise file.error(f"{model!r} is a lens that is not supported", "lensmodel", remedy)
     numbers = file.numbers(content["intrinsics"], "intrinsics", 4 + COEFFICIENTS[kind])
     matrix = file.pinhole_matrix(numbers[:4], "intrinsics")

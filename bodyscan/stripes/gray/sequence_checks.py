@@ -33,8 +33,7 @@ def check_exposure(images: ScanLines) -> None:
     lit, dark = images.lit[some].astype(np.int16), images.dark[some].astype(np.int16)
     contrast = lit - dark
     bright = contrast >= MIN_CONTRAST
-    inverted = contrast <= -MIN_CONTRAST
-    if np.mean(inverted) > max(float(np.mean(bright)), 1e-3):
+    if np.mean(contrast <= -MIN_CONTRAST) > max(float(np.mean(bright)), 1e-3):
         raise DecodingFailed(
             "the dark frame is brighter than the lit frame",
             remedy="check whether the names of the two are exchanged in the rig file",
@@ -181,26 +180,26 @@ def replace_flashed(images: ScanLines) -> tuple[ScanLines, str]:
     kinds, contrast = _sample_shares(images)
     for bit in range(len(images.patterns) if contrast.size else 0):
         shares = {name: share[bit] for name, share in kinds.items()}
-        excess = shares["pattern"] + shares["inverse"] - 1.0
-        added = float(np.median(excess))
+        sum_errors = shares["pattern"] + shares["inverse"] - 1.0
+        added = float(np.median(sum_errors))
         light = {name: abs(_measure_added_light(share)) for name, share in shares.items()}
         sound, flashed = sorted(light, key=lambda name: light[name])
-        where, sum_error = "all over", 0.0
+        where, typical = "all over", 0.0
         if not (abs(added) > 0.05 and light[sound] < 0.25 * abs(added) < light[flashed]):
             # In a part of the picture: there a sound frame is never brighter than lit, a flashed one is
             # where it is white.
-            part = excess - added > 0.25
+            part = sum_errors - added > 0.25
             over = {
                 name: np.mean(share[part] > 1.15) for name, share in shares.items() if part.any()
             }
             sound, flashed = sorted(over, key=lambda name: over[name]) or ("", "")
             if np.mean(part) < 0.03 or over[sound] > 0.02 or over[flashed] < 0.2:
                 continue
-            added, sum_error = float(np.median(excess[part])), added
+            added, typical = float(np.median(sum_errors[part])), added
             where = f"in {np.mean(part):.0%} of the picture"
         stack = frames[flashed] = frames[flashed].copy()
         grey = images.lit.astype(np.float32) + images.dark - frames[sound][bit]
-        grey += sum_error * images.contrast
+        grey += typical * images.contrast
         stack[bit] = np.clip(grey, 0.0, 255.0).astype(stack.dtype)
         found.append(
             f"the {flashed} of bit {bit} is {abs(added):.0%} of the contrast "
