@@ -41,10 +41,6 @@ class Devices:
     cameras: Mapping[str, Camera]
     projectors: Mapping[str, Projector]
 
-    @property
-    def simulated(self) -> bool:
-        return any(camera.is_simulated for camera in self.cameras.values())
-
 
 def load_capture_rig(path: Path) -> Rig:
     """Read a rig file and check its devices too. Raises RigFileError, by line."""
@@ -78,13 +74,12 @@ def find_device_problems(rig: Rig) -> Iterator[Problem]:
     """What is wrong with the keys of the rig's devices, each mistake once."""
     if rig.capture is None:
         return
-    found = dict[Problem, None]()
+    found: list[Problem] = []
     for pair in rig.pairs:
-        found |= dict.fromkeys(_find_key_problems(rig.capture, pair.name, "camera", CAMERAS))
+        found += _find_key_problems(rig.capture, pair.name, "camera", CAMERAS)
         if pair.projector:
-            roles = _find_key_problems(rig.capture, pair.name, "projector", PROJECTORS)
-            found |= dict.fromkeys(roles)
-    yield from found
+            found += _find_key_problems(rig.capture, pair.name, "projector", PROJECTORS)
+    yield from dict.fromkeys(found)
 
 
 def _find_key_problems(
@@ -119,9 +114,8 @@ def open_devices(rig: Rig, base: Path) -> Iterator[Devices]:
     with ExitStack() as closing:
         for pair in rig.pairs:
             place = Place(rig, pair, base, shared, closing)
-            cameras[pair.name] = camera = _parse(CAMERAS, plan.device("camera", pair.name)).open(
-                place
-            )
+            kind = _parse(CAMERAS, plan.device("camera", pair.name))
+            cameras[pair.name] = camera = kind.open(place)
             closing.callback(camera.close)
             if plan.exposure_ms is not None and camera.exposure_ms is not None:
                 camera.expose(plan.exposure_ms)

@@ -7,6 +7,7 @@ folder finds every image with its time.
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import suppress
@@ -283,7 +284,7 @@ def _describe(devices: Devices, shot: Shot) -> None:
         kind=shot.kind,
         when=datetime.now().replace(microsecond=0) if shot.kind == "scan" else None,
         subject=shot.subject,
-        simulated=devices.simulated or None,
+        simulated=any(camera.is_simulated for camera in devices.cameras.values()) or None,
         shots=(*(one for one in shots if one.name != shot.name), entry),
         timing=Timing(times=TIMES) if timed else None,
     )
@@ -294,10 +295,7 @@ def _describe(devices: Devices, shot: Shot) -> None:
 
 def _describe_lost(lost: Mapping[Frame, str]) -> dict[str, str]:
     """Why each pair misses frames, and how many."""
-    counts: dict[str, list[str]] = {}
-    for (pair, _), reason in lost.items():
-        counts.setdefault(pair, []).append(reason)
-    return {
-        pair: f"{len(reasons)} frames are missing after three attempts: {reasons[0]}"
-        for pair, reasons in counts.items()
-    }
+    counts = Counter(pair for pair, _ in lost)
+    reasons = {pair: reason for (pair, _), reason in reversed([*lost.items()])}
+    after = "frames are missing after three attempts"
+    return {pair: f"{count} {after}: {reasons[pair]}" for pair, count in counts.items()}

@@ -512,9 +512,12 @@ def _watch_settings(pipeline: Path | None, changes: list[str] | None) -> Pipelin
 
 def station(
     output: Output,
-    calibration: Calibration,
     inbox: Annotated[Path, typer.Option(help="Folder in which each scan appears as a folder.")],
     out: OutFolder,
+    calibration: Annotated[
+        Path | None,
+        typer.Option(help="Default: `calibration` beside the rig file; the page can make it."),
+    ] = None,
     rig: Annotated[
         Path | None,
         typer.Option(metavar="RIG.YAML", help="Rig file: its devices, and its shots of the board."),
@@ -533,13 +536,14 @@ def station(
     changes: Changes = None,
     quiet_s: QuietSeconds = 30.0,
 ) -> None:
-    """Serve a page for the people at a rig: scan, see the verdict, the day, the rig, calibrate.
+    """Serve a page for the people at a rig: calibrate, scan, see the verdict, the day, the rig.
 
     It does what `watch` does, and shows it. docs/station.md describes the pages.
     """
     from bodyscan.jobs.watching import Watched
     from bodyscan.station.serving import Address, serve
 
+    calibration = calibration or (rig.parent if rig else Path()) / "calibration"
     require_writable(out, inbox, calibration)
     settings = _watch_settings(pipeline, changes)
     watched = Watched(inbox, out, calibration, settings, quiet_s, preview=True)

@@ -48,10 +48,6 @@ def ignore_events(event: dict[str, Any]) -> None:
     """Ignore events, for callers that do not need them."""
 
 
-def ignore_start(process: Popen[str]) -> None:
-    """Leave a new process as it is."""
-
-
 def supervise_job(job: Job, process: Process, listen: Listen = ignore_events) -> JobResult:
     """Attempt a job in its folder, twice if necessary; return failures, never raise them."""
     path, since = job.folder, time.monotonic()
@@ -77,7 +73,7 @@ class JobProcess:
 
     threads: int  # of the libraries in it
     command: tuple[str, ...] = COMMAND  # arguments to this Python
-    started: Callable[[Popen[str]], None] = ignore_start  # called with each process
+    started: Callable[[Popen[str]], None] = lambda process: None  # called with each process
 
     def attempt(self, job: Job, listen: Listen) -> tuple[str, tuple[str, ...]]:
         """Why the job failed, "" if it did not; and the stages that ran."""

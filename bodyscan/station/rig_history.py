@@ -24,17 +24,18 @@ WINDOW = 5
 """Scans of which a point is the mean: fewer tell sway from drift badly, more hide a warm-up."""
 
 
-def describe_rig(calibration: Path) -> dict[str, Any]:
-    """Which calibration is in use, and how old it is."""
-    file = calibration / CALIBRATION if calibration.is_dir() else calibration
+def describe_rig(calibration: Path, name: str) -> dict[str, Any]:
+    """Which calibration is in use, and how old it is; the rig's name alone if there is none yet."""
+    file = calibration / CALIBRATION
+    if not file.exists():
+        return {"name": name, "id": None}
     content = json.loads(file.read_text("utf-8"))
     written = datetime.fromtimestamp(file.stat().st_mtime, UTC)
     return {
-        "name": content["rig"]["name"],
+        "name": name,
         "id": calibration_id(calibration)[:12],
         "written": written.isoformat(timespec="seconds"),
         "pairs": list(content["pairs"]),
-        "failed": content["failed"],
     }
 
 
@@ -46,18 +47,16 @@ def find_series(folders: Iterable[Path]) -> dict[str, list[dict[str, Any]]]:
     """
     shifts: dict[str, list[Array]] = defaultdict(list)
     series: dict[str, list[dict[str, Any]]] = defaultdict(list)
-    scans: list[tuple[str, dict[str, Array]]] = []
     for folder in folders:
+        motions: dict[str, Array] = {}
         with suppress(OSError, BodyscanError, KeyError, ValueError):  # no result, or a damaged one
             motions = _read_motions(folder, (folder / "scan" / "scan.json").stat().st_mtime_ns)
-            scans.append((folder.name, motions))
-    for job, motions in scans:
         for pair, shift in sorted(motions.items()):
             shifts[pair].append(shift)
             if len(shifts[pair]) < MIN_SCANS:
                 continue
             found = estimate_drift(pair, np.array(shifts[pair][-WINDOW:]))
-            point = {"job": job, "mm": found.shift_mm, "sigma_mm": found.sigma_mm}
+            point = {"job": folder.name, "mm": found.shift_mm, "sigma_mm": found.sigma_mm}
             series[pair].append(point | {"limit_mm": found.limit_mm, "moved": found.moved})
     return dict(series)
 

@@ -25,8 +25,7 @@ from bodyscan.captures.folder import open_scan
 from bodyscan.errors import BadInput, BodyscanError
 from bodyscan.files.reading import read_regular
 from bodyscan.jobs.job import MEASURES
-from bodyscan.station.day import Day, Row, format_table_csv
-from bodyscan.station.feed import Feed
+from bodyscan.station.day import Row, format_table_csv
 from bodyscan.station.guard import Guard, TooLarge
 from bodyscan.station.operation import Operation
 from bodyscan.station.rig_history import describe_rig, find_series
@@ -53,24 +52,17 @@ class Station:
     operation: Operation
     readers: int = 0
 
-    @property
-    def day(self) -> Day:
-        return self.operation.day
-
-    @property
-    def feed(self) -> Feed:
-        return self.operation.feed
-
     async def state(self, request: Request) -> Response:
         operation = self.operation
+        calibration = operation.watched.calibration
         return _answer({
-            "number": self.feed.number,
-            "rows": self.day.rows(),
+            "number": self.operation.feed.number,
+            "rows": self.operation.day.rows(),
             "capture": operation.capturing,
             "can_capture": operation.can_capture,
             "has_rig": operation.rig_file is not None,
             "trouble": operation.trouble,
-            "rig": await run_in_threadpool(describe_rig, operation.watched.calibration),
+            "rig": await run_in_threadpool(describe_rig, calibration, operation.rig.name),
         })  # fmt: skip
 
     async def events(self, request: Request) -> Response:
@@ -83,7 +75,7 @@ class Station:
     async def _read(self, after: int) -> AsyncIterator[str]:
         self.readers += 1
         try:
-            async for text in self.feed.read(after):
+            async for text in self.operation.feed.read(after):
                 yield text
         finally:
             self.readers -= 1
@@ -97,24 +89,28 @@ class Station:
     async def board(self, request: Request) -> Response:
         return _answer({"shot": self.operation.request_board()})
 
+    async def calibrate(self, request: Request) -> Response:
+        self.operation.request_calibration()
+        return _answer({})
+
     async def boards(self, request: Request) -> Response:
         return _answer(await run_in_threadpool(self.operation.tour_boards))
 
     async def decide(self, request: Request) -> Response:
-        row = self.day.decide(request.path_params["job"], await _object(request))
-        self.feed.publish({"kind": "scan", "row": row})
+        row = self.operation.day.decide(request.path_params["job"], await _object(request))
+        self.operation.feed.publish({"kind": "scan", "row": row})
         return _answer(row)
 
     async def body(self, request: Request) -> Response:
-        model = await run_in_threadpool(self.day.body, self._row(request)["job"])
+        model = await run_in_threadpool(self.operation.day.body, self._row(request)["job"])
         return _answer(model) if model else _answer_absent()
 
     async def picture(self, request: Request) -> Response:
-        scan = self.day.out / self._row(request)["job"] / "scan"
+        scan = self.operation.day.out / self._row(request)["job"] / "scan"
         return _send(scan / ("cloud.png" if (scan / "cloud.png").is_file() else "mesh.png"))
 
     async def report(self, request: Request) -> Response:
-        path = self.day.out / self._row(request)["job"] / "report" / "report.html"
+        path = self.operation.day.out / self._row(request)["job"] / "report" / "report.html"
         policy = {"content-security-policy": REPORT_POLICY}
         return _send(path, headers=policy)
 
@@ -125,22 +121,20 @@ class Station:
 
     async def csv(self, request: Request) -> Response:
         attached = {"content-disposition": "attachment; filename=day.csv"}
-        table = format_table_csv(self.day.rows()).encode("utf-8", "backslashreplace")
+        table = format_table_csv(self.operation.day.rows()).encode("utf-8", "backslashreplace")
         return Response(table, media_type="text/csv", headers=attached)
 
     async def measures(self, request: Request) -> Response:
-        return _send(self.day.out / MEASURES, filename=MEASURES)
+        return _send(self.operation.day.out / MEASURES, filename=MEASURES)
 
     async def rig(self, request: Request) -> Response:
-        folders = [self.day.out / row["job"] for row in self.day.rows() if row["state"] == "done"]
-        return _answer({
-            "calibration": await run_in_threadpool(describe_rig, self.operation.watched.calibration),
-            "series": await run_in_threadpool(find_series, folders),
-        })  # fmt: skip
+        day = self.operation.day
+        folders = [day.out / row["job"] for row in day.rows() if row["state"] == "done"]
+        return _answer(await run_in_threadpool(find_series, folders))
 
     def _row(self, request: Request) -> Row:
         """The row that an address names. Raises KeyError for anything else."""
-        return self.day.row(request.path_params["job"])
+        return self.operation.day.row(request.path_params["job"])
 
     def _look(self, row: Row, pair: str) -> dict[str, Any] | None:
         """A pair's lit image, small, and how bright it is; None if it is not there."""
@@ -180,6 +174,7 @@ def make_app(operation: Operation, hosts: set[str], token: str | None = None) ->
             Route("/api/start", station.start, methods=["POST"]),
             Route("/api/board", station.board, methods=["POST"]),
             Route("/api/boards", station.boards),
+            Route("/api/calibrate", station.calibrate, methods=["POST"]),
             Route("/api/rig", station.rig),
             Route("/api/day.csv", station.csv),
             Route("/api/measures.csv", station.measures),

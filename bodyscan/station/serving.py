@@ -11,6 +11,7 @@ from pathlib import Path
 
 from bodyscan.capture.devices import load_capture_rig
 from bodyscan.errors import BadInput, FailedWork
+from bodyscan.jobs.job import CALIBRATION
 from bodyscan.jobs.stages import read_rig_of
 from bodyscan.jobs.watching import Watched
 from bodyscan.station.day import Day
@@ -82,20 +83,20 @@ def serve(
 
 
 def make_operation(watched: Watched, rig_file: Path | None) -> Operation:
-    """What a station does. Raises BadInput if the calibration or the rig file cannot be used."""
+    """What a station does. Raises BadInput for a calibration or rig file that cannot be used."""
     if not watched.inbox.is_dir():
         raise BadInput("there is no such folder", where=str(watched.inbox), remedy="make it first")
     watched.out.mkdir(parents=True, exist_ok=True, mode=0o700)
-    rig = read_rig_of(watched.calibration)
-    if rig_file is not None:
-        found = load_capture_rig(rig_file)
-        if [pair.name for pair in found.pairs] != [pair.name for pair in rig.pairs]:
-            raise BadInput(
-                "has other pairs than the calibration",
-                where=str(rig_file),
-                remedy="give the rig file that was calibrated",
-            )
-        rig = found
+    is_there = (watched.calibration / CALIBRATION).exists()
+    calibrated = read_rig_of(watched.calibration) if is_there or rig_file is None else None
+    rig = calibrated if rig_file is None else load_capture_rig(rig_file)
+    assert rig is not None
+    if calibrated and [pair.name for pair in rig.pairs] != [pair.name for pair in calibrated.pairs]:
+        raise BadInput(
+            "has other pairs than the calibration",
+            where=str(rig_file),
+            remedy="give the rig file that was calibrated, or another folder to calibrate into",
+        )
     return Operation(watched, rig_file, rig, Day(watched.out), Feed())
 
 
@@ -113,9 +114,7 @@ def list_names_of_host(host: str, port: int) -> set[str]:
 
 def is_loopback(host: str) -> bool:
     """Whether only this computer reaches it."""
-    if host == "localhost":
-        return True
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
-        return False
+        return host == "localhost"

@@ -70,10 +70,12 @@ class FoundBoards(Outcome[list[BoardView]]):
         return len(captures.sequences) - len(self.refused)
 
 
-def find_all_boards(rig: Rig, captures: Captures, progress: Progress = silent) -> FoundBoards:
+def find_all_boards(
+    rig: Rig, captures: Captures, progress: Progress = silent, *, explain: bool = True
+) -> FoundBoards:
     """Find boards in the board image of every sequence: the lit one, or one taken for the board.
 
-    Images that cannot be read, or that show no board, become notes.
+    Images that cannot be read, or that show no board, become notes, which `explain` why they do.
     """
 
     first = {sequence.pair: sequence for sequence in reversed(captures.sequences)}
@@ -95,7 +97,7 @@ def find_all_boards(rig: Rig, captures: Captures, progress: Progress = silent) -
         refuse_other_pitch(board, views)
         _refuse_other_markers(rig, captures, board, views)
     without = [s for s, each in found.items() if not each and s.board_path not in captures.corners]
-    described = _look_closer(rig, views, without)
+    described = _look_closer(rig, views, without) if explain else {}
     missing = [
         f"{s.board_path} (pair {s.pair}, shot {s.shot}): no board found"
         + (f": {described[s]}" if s in described else "")

@@ -7,7 +7,7 @@
   const ROWS = 3, COLUMNS = 4; // of a picture's cells, as station/board_tour.py has them
   const scans = new Map(), looks = new Map(), drawn = { job: "", kind: "" };
   let drawnRows = new WeakMap(); // of Today: all made anew at each event would load all pictures again
-  let words = {}, capture = { state: "idle" }, hasRig = false, canCapture = false, current = "", stream = null, boards = null;
+  let words = {}, capture = { state: "idle" }, rig = {}, hasRig = false, canCapture = false, current = "", stream = null, boards = null;
 
   const $ = (id) => document.getElementById(id);
   const say = (key, values = {}) => String(words[key] ?? key).replace(/\{(\w+)\}/g, (_, name) => values[name] ?? "");
@@ -39,7 +39,7 @@
   // -- Now
 
   function standing(row) {
-    if (!row) return "waiting";
+    if (!row) return rig.id === null ? "uncalibrated" : "waiting";
     if (row.state === "set aside") return "aside";
     if (row.mark) return row.mark;
     return row.state === "running" ? "running" : "arriving";
@@ -118,29 +118,33 @@
   }
 
   function showCapture() {
-    $("start").hidden = !canCapture;
+    $("start").hidden = !canCapture || rig.id === null;
     $("board").hidden = !canCapture;
     const busy = !["idle", "failed"].includes(capture.state);
-    for (const button of [$("start").querySelector("button"), $("board")]) button.disabled = busy;
+    for (const button of [$("start").querySelector("button"), $("board"), $("calibrate")]) button.disabled = busy;
     $("taking").hidden = capture.state !== "taking";
     if (capture.total) $("taking").value = capture.done / capture.total;
     const lost = Object.entries(capture.lost || {}).map(([pair, reason]) => say("lostFrames", { pair, reason }));
-    const text = capture.state === "idle" ? (capture.lost ? say("taken") : "") : say(capture.state, capture);
-    for (const id of ["capture", "board-capture"]) $(id).textContent = [text, ...lost].filter(Boolean).join("\n");
+    const part = capture.state === "calibrating" && capture.part ? `: ${capture.part} ${capture.done}/${capture.total}` : "";
+    const made = capture.calibrated ? say("calibrated", { verdict: say(capture.calibrated) }) : capture.lost ? say("taken") : "";
+    const text = capture.state === "idle" ? made : say(capture.state, capture) + part;
+    for (const id of ["capture", "board-capture"]) $(id).textContent = [text, ...lost, ...(capture.reasons || [])].filter(Boolean).join("\n");
   }
 
   async function decide(decision) {
     const job = current, before = scans.get(job);
     if (!before) return;
-    if (decision === "discard" && !(await confirmed(say("askDiscard", { job })))) return;
+    if (decision === "discard" && !(await confirmed(say("askDiscard", { job }), "discard"))) return;
     try {
       take(await ask(scanPath(job), { decision, note: $("note").value }));
       if (decision === "repeat") { $("subject").value = before.subject || ""; $("subject").focus(); }
     } catch (error) { complain(error); }
   }
 
-  function confirmed(question) {
+  function confirmed(question, yes) {
     $("question").textContent = question;
+    $("yes").textContent = say(yes);
+    $("yes").className = yes === "discard" ? "danger" : "";
     const dialog = $("ask");
     dialog.returnValue = "no";
     dialog.showModal();
@@ -194,10 +198,10 @@
 
   async function showRig() {
     if ($("rig").hidden) return;
-    const found = await ask("api/rig").catch(complain);
-    if (!found) return;
-    const { calibration, series } = found, days = Math.floor((Date.now() - Date.parse(calibration.written)) / 864e5);
-    $("calibration").textContent = say("inUse", { ...calibration, days, pairs: calibration.pairs.length });
+    const series = await ask("api/rig").catch(complain);
+    if (!series) return;
+    const days = Math.floor((Date.now() - Date.parse(rig.written)) / 864e5);
+    $("calibration").textContent = rig.id ? say("inUse", { ...rig, days, pairs: rig.pairs.length }) : say("uncalibratedWhat");
     const lasts = Object.entries(series).map(([pair, points]) => [pair, points[points.length - 1]]);
     const moved = lasts.filter(([, point]) => point.moved).map(([pair]) => pair);
     $("moved").textContent = moved.length ? say("moved", { pairs: moved.join(", ") }) : lasts.length ? say("steady") : say("few");
@@ -242,6 +246,9 @@
     if (!boards || $("calibrating").hidden) return;
     const next = boards.next, place = next.say === "hold" ? words.places[next.row * COLUMNS + next.column] : "";
     const list = (names) => (names || []).join(", ");
+    $("calibrate").hidden = boards.shots < 3;
+    $("calibrate").classList.toggle("main", next.say === "enough");
+    $("board").classList.toggle("main", next.say !== "enough");
     $("hold").textContent = say(next.say, { ...next, place, one: list(next.one), other: list(next.other) });
     $("missed").textContent = boards.missed.length ? say("missed", { shot: boards.last, pairs: list(boards.missed) }) : "";
     $("covered").replaceChildren(...boards.pairs.map((pair) => {
@@ -260,6 +267,12 @@
     const head = make("tr", {}, make("td"), ...names.map((name) => make("th", { scope: "col" }, name)));
     $("shared").replaceChildren(head, ...names.map((a) => make("tr", {}, make("th", { scope: "row" }, a), ...names.map((b) => make("td", { class: "number" }, a === b ? "" : String(counts.get(`${a}/${b}`) || 0))))));
     $("advice").replaceChildren(...boards.advice.map((line) => make("li", {}, line)));
+  }
+
+  // Without a question where it can do no harm.
+  async function calibrate() {
+    const harmless = rig.id === null && boards.next.say === "enough";
+    if (harmless || (await confirmed(say("askCalibrate", boards), "calibrate"))) ask("api/calibrate", {}).catch(complain);
   }
 
   // -- events
@@ -284,6 +297,7 @@
 
   function hear(event) {
     if (event.kind === "scan") take(event.row);
+    if (event.kind === "rig") connect(); // another calibration is in use
     if (event.kind === "boards") { boards = event; showBoards(); }
     if (event.kind === "trouble") complain({ message: event.text });
     if (event.kind === "exposure") $("capture").textContent += `\n${event.text}`;
@@ -305,13 +319,13 @@
       const state = await ask("api/state");
       scans.clear();
       for (const row of state.rows) scans.set(row.job, row);
-      ({ capture, has_rig: hasRig, can_capture: canCapture } = state);
+      ({ capture, rig, has_rig: hasRig, can_capture: canCapture } = state);
       const unfinished = state.rows.filter((row) => row.state === "running" || (row.state === "arriving" && Object.keys(row.pairs).length));
       const last = unfinished[unfinished.length - 1] || state.rows[state.rows.length - 1];
       current = last && last.decision !== "discard" ? last.job : "";
       $("trouble").hidden = !state.trouble;
       $("trouble").textContent = state.trouble;
-      document.title = `${state.rig.name} – bodyscan`;
+      document.title = `${rig.name} – bodyscan`;
       showAll();
       stream = new EventSource(`api/events?after=${state.number}`);
       stream.onopen = () => online(true);
@@ -379,6 +393,7 @@
       ask("api/start", { subject: $("subject").value.trim() }).catch(complain);
     });
     $("board").addEventListener("click", () => ask("api/board", {}).catch(complain));
+    $("calibrate").addEventListener("click", calibrate);
     $("trouble").addEventListener("click", () => { $("trouble").hidden = true; });
     window.addEventListener("hashchange", show);
     show();
