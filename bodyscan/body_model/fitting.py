@@ -35,10 +35,6 @@ NORMAL_MM = 80.0
 never match."""
 BASIS_MM = 4.0
 """What bodies have that the basis cannot make, RMS: asymmetry, muscles, cloth."""
-PATCHES = 500.0
-"""Patches of 60 x 60 mm on a body of 1.8 m^2."""
-START_ARMS_DEG = (15.0, 35.0, 55.0)
-"""Arms from the trunk at which fits start; each finds arms within 15 degrees of it."""
 JOINT_DEG = {
     "pelvis": 10.0, "lumbar": 8.0, "thorax": 8.0, "neck": 12.0, "head": 12.0, "clavicle": 8.0,
     "upper arm": 30.0, "forearm": 25.0, "hand": 20.0, "thigh": 12.0, "shank": 8.0, "foot": 12.0,
@@ -122,7 +118,8 @@ def fit_body(template: BodyTemplate, surface: Surface) -> FittedBody:
     """Fit a template to a standing body's surface (body frame, floor at z = 0)."""
     tree = KDTree(join_positions_normals(surface.points, surface.normals))
     whole = _cover_whole(template, surface)
-    starts = [_start(template, surface, arms) for arms in START_ARMS_DEG]
+    # Degrees of the arms from the trunk; each start finds arms within 15 of it.
+    starts = [_start(template, surface, arms) for arms in (15.0, 35.0, 55.0)]
     coarse = (120.0, 100.0, 80.0, 70.0, 60.0, 50.0, 40.0)
     tried = [_fit_pose(template, surface, tree, start, coarse, whole) for start in starts]
     body, _ = min(tried, key=lambda pair: pair[1])
@@ -332,8 +329,8 @@ def _step(
         at, normals = some.vertices[used], some.normals[used]
         jacobian = differentiate(template, body, posed, at, normals)[:, moving]
         residual = np.einsum("vi,vi->v", posed.vertices[at] - some.points[used], normals)
-        # What the basis cannot make is smooth over 50 mm: as many observations as such patches.
-        patches = PATCHES * region.share / max(len(some.weights) / 2, 1)
+        # What the basis cannot make is smooth over 50 mm: a body has 500 such patches in 1.8 m^2.
+        patches = 500.0 * region.share / max(len(some.weights) / 2, 1)
         weights = some.weights[used] / sigma_mm**2 * patches
         information += (jacobian * weights[:, None]).T @ jacobian
         gradient += jacobian.T @ (weights * residual)

@@ -38,8 +38,6 @@ FrameTimes: TypeAlias = Mapping[tuple[str, str], Mapping[str, float]]
 
 # Milliseconds since 1970 are 2e12, and are accepted.
 Milliseconds = Annotated[float, Field(ge=0.0, le=1e13)]
-STEP_MS = (0.2, 2000.0)
-"""From one frame to the next: half of the fastest projectors', and twice as slow as anyone stands."""
 UNITS_MS = {"nanoseconds": 1e-6, "microseconds": 1e-3, "seconds": 1e3}
 Start = Literal["one-after-another", "together", "poles"] | dict[Name, Milliseconds]
 
@@ -196,7 +194,7 @@ def compute_frame_times(timing: Timing, rig: Rig, sequences: Sequences, folder: 
 
 def _step_fault(step_ms: float) -> str:
     """What is wrong with a time from frame to frame, naming the unit that would fit; "" if nothing."""
-    low, high = STEP_MS
+    low, high = 0.2, 2000.0  # half of the fastest projectors', twice as slow as anyone stands
     if low <= step_ms <= high:
         return ""
     unit = next((u for u, ms in UNITS_MS.items() if 1.0 <= ms * step_ms <= 1000.0), "")

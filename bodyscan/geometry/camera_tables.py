@@ -102,9 +102,6 @@ def _derivatives(c: Array, i: int, j: int, k: int, x: float, y: float) -> tuple[
     )
 
 
-CELLS_PX = (32, 16, 8)
-"""Cell widths; the widest that keeps the tolerance is used. The first is enough for a scanner's
-lens; the last holds one that nearly folds within its image to about 1e-3 px."""
 MARGIN_PX = 1.5
 """Extent of the table beyond the outermost pixel centres: outside it is outside the image."""
 OUTSIDE = -2.0
@@ -151,7 +148,8 @@ def _fit_within_tolerance(
     px_per_unit: float,
     outside: float,
 ) -> Table:
-    for cell in CELLS_PX:
+    # In px: the first is enough for a scanner's lens; the last holds one that nearly folds to 1e-3 px.
+    for cell in (32, 16, 8):
         cells = -(-camera.width // cell), -(-camera.height // cell)
         table, error = fit_table(function, low, high, cells, outside)
         # A five-hundredth of the precision to which corners and boundaries are found.

@@ -14,8 +14,6 @@ from scipy.stats import truncnorm
 from bodyscan.arrays import Array
 from bodyscan.geometry.least_squares import EXACT, Block, Noise, Solution, minimize
 
-BRAINCASE_MM = 85.0
-"""Below the top of the hair: brows begin 95 to 125 mm below the top of an adult's head."""
 AXES_MM = np.array([97.0, 76.0, 97.0])
 """Half the length and breadth of heads (ANSUR II: 195 and 151 mm), and height of the top over brows."""
 SKIN = Noise("skin from a braincase", cauchy=2.5, known=1.0)
@@ -64,7 +62,8 @@ def estimate_head_top(skin: Array, hair_top_mm: float) -> HeadTop | None:
     """
     if not len(skin):
         return None
-    case, low = skin[skin[:, 2] > hair_top_mm - BRAINCASE_MM], float(skin[:, 2].max())
+    # Brows begin 95 to 125 mm below the top of an adult's head.
+    case, low = skin[skin[:, 2] > hair_top_mm - 85.0], float(skin[:, 2].max())
     # One point per cell of 15 mm, a braincase's smallest dents: closer points have correlated errors.
     _, first = np.unique(np.floor(case / 15.0).astype(int), axis=0, return_index=True)
     if len(first) < 12:  # 27 cm2 of skin, half a forehead

@@ -12,8 +12,6 @@ from bodyscan.mesh.slices import Loop, compute_hull_perimeter, keep_segments, sp
 
 CREASE_MM = 15.0
 """Deep in a crease between two parts no camera sees the skin, and the surface bridges it."""
-MAX_BULGE = 0.75
-"""Of a gap's width: half a circle has 0.5, and the end of a flat trunk more."""
 Range = tuple[float, float]
 
 
@@ -70,7 +68,8 @@ def _bulge(loop: Loop, before: Indices, gap: Indices, after: Indices) -> Array:
     rise = np.arctan2(leaving @ outward, leaving @ along)
     fall = np.arctan2(-(arriving @ outward), arriving @ along)
     angle = np.linspace(0.0, np.pi, 19)
-    x, y = 0.5 * length * (1.0 - np.cos(angle)), MAX_BULGE * length * np.sin(angle)
+    # A bulge of 0.75 of the gap's width: half a circle has 0.5, and the end of a flat trunk more.
+    x, y = 0.5 * length * (1.0 - np.cos(angle)), 0.75 * length * np.sin(angle)
     if rise <= 0.0 and fall <= 0.0:
         y = np.zeros_like(y)
     for slope, away in ((rise, x), (fall, length - x)):

@@ -16,9 +16,6 @@ from bodyscan.motion.body_parts import build_limb_fields, find_ankles, weigh_abo
 from bodyscan.motion.breath import build_breath_fields
 from bodyscan.motion.temporal_modes import TemporalModes, correlate_breath
 
-PART_MM = 250.0
-"""Correlation length of free motion of parts: a forearm, half a thigh, a shoulder."""
-
 
 @dataclass(frozen=True, eq=False)
 class MotionKind:
@@ -69,7 +66,8 @@ def build_kinds(
     pose = _build_whole_body("pose", cells, np.eye(6), constant)
     any_twist = adjoint(RigidTransform.from_translation(BODY_CENTRE)) * sway
     translations = build_rigid_fields(cells, np.zeros(3), LEVER_MM)[:, :, 3:]
-    parts = modulate_fields(translations, cells, cells.covariance_factor(PART_MM, 0.02))
+    # Parts move freely over 250 mm: a forearm, half a thigh, a shoulder.
+    parts = modulate_fields(translations, cells, cells.covariance_factor(250.0, 0.02))
     breath = MotionKind("breath", build_breath_fields(cells), breathing)
     return (
         replace(pose, precision=invert_scaled(boards)[np.ix_(by_freedom, by_freedom)]),

@@ -25,8 +25,6 @@ SMOOTHERS = (
 """Local quadratic fits to 5 and to 7 equally spaced values (Savitzky and Golay 1964)."""
 REACH_PX = 6.0
 """Greatest distance over which a run is smoothed."""
-MIN_SCATTER = 1.2
-"""Sigmas too small by this factor are corrected; less may be due to the surface."""
 
 
 def interpolate_stripes(
@@ -236,4 +234,4 @@ def estimate_scatter(boundaries: Boundaries) -> float:
         residual += gain * boundaries.position[first + k]
         variance += (gain * boundaries.sigma_px[first + k]) ** 2
     ratio = SIGMAS_PER_MEDIAN * float(np.median(np.abs(residual / np.sqrt(variance))))
-    return ratio if ratio > MIN_SCATTER else 1.0
+    return ratio if ratio > 1.2 else 1.0  # less may be due to the surface

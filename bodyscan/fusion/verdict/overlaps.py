@@ -33,8 +33,6 @@ MAX_DISAGREEMENT_MM = 0.4
 """RMS distance of overlapping surfaces in a good scan, if their sigmas do not predict more."""
 SEAM_REACH_MM = 40.0
 """A pole displaced by more shares no surface any more; an arm is farther from the trunk."""
-PATCH_MM = 40.0
-"""A limb's width: anything narrower affects no girth."""
 
 
 def find_seams(
@@ -79,7 +77,8 @@ def _compare_pairs(
 
 def compute_patch_medians(matches: Matches) -> tuple[Array, Array]:
     """Median distances of patches of 8 matches or more, and their sigmas from the scatter."""
-    x, y, z = np.floor(matches.points / PATCH_MM).astype(np.int64).T
+    # In mm, a limb's width: anything narrower affects no girth.
+    x, y, z = np.floor(matches.points / 40.0).astype(np.int64).T
     # 4096 patches reach from one end of any volume to the other.
     key = (x * 4096 + y) * 4096 + z
     _, number, count = np.unique(key, return_inverse=True, return_counts=True)

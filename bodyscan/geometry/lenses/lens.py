@@ -16,8 +16,6 @@ import numpy as np
 from bodyscan.arrays import Array
 from bodyscan.errors import BadInput
 
-NEWTON_STEPS = 20
-"""Five or six reach rounding; close to where a lens folds it takes more."""
 TOLERANCE, NOT_FOUND = 1e-14, 1e-9
 """A millionth of a pixel is about 1e-9."""
 
@@ -87,7 +85,7 @@ class Lens(ABC):
         real = np.asarray(real, float)
         with np.errstate(all="ignore"):
             ideal = _at_most(real, 0.9 * self.fold_radius)
-            for _ in range(NEWTON_STEPS):
+            for _ in range(20):  # 5 or 6 reach rounding, more near to where a lens folds
                 (a, b), (c, d) = np.moveaxis(self.by_point(ideal), (-2, -1), (0, 1))
                 residual = self.distort(ideal) - real
                 x, y, scale = residual[..., 0], residual[..., 1], a * d - b * c
