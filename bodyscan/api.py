@@ -263,7 +263,8 @@ def save_scan(
     stored, written = Path(calibration), Path(folder)
     axes = load_calibration(stored).axes
     origin = Origin(calibration_id(stored), subject, when, axes=axes)
-    save_facts(scan, written, origin, save_body(scan, written))
+    with save_body(scan, written) as digests:
+        save_facts(scan, written, origin, digests)
     return load_scan(folder)
 
 
@@ -356,7 +357,7 @@ def write_report(result: AnyPath, path: AnyPath | None = None) -> Verdict:
     """
     from bodyscan.report.result_page import write_report as write
 
-    return write(Path(result), None if path is None else Path(path))[1]
+    return write(Path(result), None if path is None else Path(path))[1].verdict
 
 
 if not TYPE_CHECKING:

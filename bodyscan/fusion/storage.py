@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from pathlib import Path
@@ -147,8 +148,12 @@ def clear(folder: Path) -> None:
                 path.unlink()
 
 
-def save_body(scan: Scan, folder: Path) -> dict[str, str]:
-    """Write the cloud and the mesh into `folder`; return their SHA-256 by name."""
+@contextmanager
+def save_body(scan: Scan, folder: Path) -> Iterator[dict[str, str]]:
+    """Write the cloud and the mesh into `folder`; yield their SHA-256 by name, for `save_facts`.
+
+    Both are removed if one cannot be written or the block raises: without scan.json they are nobody's.
+    """
     (folder / FILE_NAME).unlink(missing_ok=True)
 
     def write(name: str) -> str:
@@ -156,13 +161,18 @@ def save_body(scan: Scan, folder: Path) -> dict[str, str]:
         return hash_file(folder / name)
 
     names = (CLOUD_NAME, MESH_NAME)
-    return dict(zip(names, map_threads(write, names), strict=True))
+    try:
+        yield dict(zip(names, map_threads(write, names), strict=True))
+    except BaseException:
+        for name in names:
+            (folder / name).unlink(missing_ok=True)
+        raise
 
 
 def save_facts(scan: Scan, folder: Path, origin: Origin, digests: Mapping[str, str]) -> Path:
     """Write scan.json, which makes the files in `folder` a result; return its path.
 
-    digests: as `save_body` returns them.
+    digests: as `save_body` yields them.
     """
     write_json(
         folder / FILE_NAME,
@@ -298,13 +308,9 @@ def load_scan(folder: Path) -> StoredScan:
         raise ResultError(f"this scan gave no model: {reasons}", where=str(folder / FILE_NAME))
     for name, digest in facts["sha256"].items():
         file = folder / name
-        try:
-            same = hash_file(file) == digest
-        except OSError as error:
-            missing = isinstance(error, FileNotFoundError)
-            reason = "there is no such file" if missing else str(error)
-            raise ResultError(reason, where=str(file), remedy=REMEDY) from error
-        if not same:
+        if not file.is_file():
+            raise ResultError("there is no such file", where=str(file), remedy=REMEDY)
+        if hash_file(file) != digest:
             raise ResultError("was changed or cut short", where=str(file), remedy=REMEDY)
     cloud, mesh = read_ply_cloud(folder / CLOUD_NAME), read_ply_mesh(folder / MESH_NAME)
     return StoredScan(cloud, mesh, facts)

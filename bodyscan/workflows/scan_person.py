@@ -174,9 +174,8 @@ def scan_folder(
             storage.clear(out)
             storage.save_failure(error, out, origin)
             raise
-        with step(progress, "writing"):
-            storage.clear(out)
-            digests = storage.save_body(scan, out)
+        storage.clear(out)
+        with step(progress, "writing"), storage.save_body(scan, out) as digests:
             announce(scan.verdict, final=True)
             pictures = write_pictures((each.result() for each in drawn), out)
             # Last, so that what is killed before its end is no result, and is made again.

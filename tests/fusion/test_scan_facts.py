@@ -108,13 +108,9 @@ def test_a_result_is_not_replaced_unasked(result: Path, tmp_path: Path) -> None:
 def test_nothing_of_one_person_stays_beside_anothers(result: Path) -> None:
     clear(result)
     assert sorted(path.name for path in result.iterdir()) == ["holiday.png", "notes.txt"]
-
-
-def test_a_folder_without_a_result_is_left_as_it_is(result: Path) -> None:
-    (result / "scan.json").unlink()
-    before = sorted(result.iterdir())
+    (result / "mesh.ply").write_text("of no result")
     clear(result)
-    assert sorted(result.iterdir()) == before
+    assert (result / "mesh.ply").exists()
 
 
 @pytest.fixture

@@ -83,6 +83,7 @@ def test_a_scan_that_is_killed_before_its_pictures_is_made_by_the_same_command(
         kill.setattr(scan_person, "write_pictures", killed)
         with pytest.raises(KeyboardInterrupt):
             scan_person.scan_folder(tmp_path, tmp_path, out, Mock())
+        assert not any(out.glob("*"))
     make_room(out, overwrite=False)
     scan_person.scan_folder(tmp_path, tmp_path, out, Mock())
     assert load_scan(out).facts["subject"] == "anna"
