@@ -57,6 +57,7 @@ def read_json_object(path: Path) -> dict[str, Any]:
         content = json.loads(
             data.decode("utf-8"),
             parse_float=_parse_finite,
+            parse_int=lambda text: int(text) if len(text) < 300 else _parse_finite(text),
             parse_constant=_parse_finite,
             object_pairs_hook=_refuse_duplicate_keys,
         )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from bodyscan.captures.folder import Captures, open_captures, open_scan
 from bodyscan.errors import BadInput, CalibrationFileError, CaptureError
+from bodyscan.files.reading import read_json_object
 from bodyscan.jobs.job import CALIBRATION, RIG_FILE, Job, list_results_in
 from bodyscan.progress import Progress, step
 from bodyscan.rig.rig import Rig, load_rig
@@ -181,7 +181,7 @@ def read_rig_of(calibration: Path) -> Rig:
     """The rig file's content as stored in a calibration; its arrays are not loaded."""
     path = calibration / CALIBRATION
     try:
-        return Rig.model_validate(json.loads(path.read_text("utf-8"))["rig"])
+        return Rig.model_validate(read_json_object(path)["rig"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise CalibrationFileError(
             f"is not a readable calibration ({type(error).__name__})",

@@ -204,11 +204,11 @@ def _find_arrays(file: Path, content: dict[str, Any]) -> Path:
 def _refuse_changed(content: dict[str, Any], file: Path, arrays_file: Path) -> None:
     if content["version"] == VERSION:
         unhashed = {key: value for key, value in content.items() if key != HASH}
-        if hash_content(unhashed) != content[HASH]:
+        if hash_content(unhashed) != content.get(HASH):
             raise CalibrationFileError(
                 "was changed after it was stored", where=str(file), remedy=CHANGED
             )
-    if hash_file(arrays_file) != content["arrays_sha256"]:
+    if hash_file(arrays_file) != content.get("arrays_sha256"):
         raise CalibrationFileError(
             f"does not belong to {file.name}",
             where=str(arrays_file),
