@@ -189,7 +189,7 @@ def open_check(rig: Rig, folder: Path) -> tuple[Kind, Captures]:
     shots.
     """
     listing = Listing(Path(folder), follow_links=rig.follow_links)
-    file = load_captures_file(Path(folder), rig) if listing.has(FILE_NAME) else None
+    file = load_captures_file(folder, rig) if listing.has(FILE_NAME, broken=True) else None
     kind: Kind = file.kind if file is not None else "scan"
     captures = _open(rig, Path(folder), kind, rig.files, None)
     if file is None and len(captures.shots) > 1:
@@ -243,7 +243,7 @@ def _open(
     named: files that count as present, since their corners are known.
     """
     listing = Listing(folder, follow_links=rig.follow_links, named=named)
-    file = load_captures_file(folder, rig) if listing.has(FILE_NAME) else None
+    file = load_captures_file(folder, rig) if listing.has(FILE_NAME, broken=True) else None
     if file is not None and file.kind != kind:
         raise CaptureError(
             f"is of kind {file.kind}, but {kind} captures are wanted here",

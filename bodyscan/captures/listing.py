@@ -36,8 +36,11 @@ class Listing:
         self._real_root = os.path.realpath(root)
         self._entries: dict[str, dict[str, bool]] = {}
 
-    def has(self, relative: str) -> bool:
-        """Test whether a file or folder with that relative path (parts joined by /) exists."""
+    def has(self, relative: str, *, broken: bool = False) -> bool:
+        """Test whether a file or folder with that relative path (parts joined by /) exists.
+
+        broken: a link that leads nowhere counts, too.
+        """
         parent, _, name = relative.rpartition("/")
         is_link = self._read(parent).get(name)
         if is_link is None:
@@ -54,7 +57,7 @@ class Listing:
                 "--follow-links to `scan` or `check-calibration`; else copy what it points to here, "
                 "or name that folder.",
             )
-        return path.exists()
+        return broken or path.exists()
 
     def find(self, relative: str) -> str:
         """Replace a path that contains `*` by the file that matches if there is just one."""

@@ -278,6 +278,9 @@ def test_symbolic_links_within_the_folder_and_to_it_are_followed(tmp_path: Path)
     captures = opened(rig_path)
     assert captures.shots == ("b1", "b2", "b3", "b4")
     assert not any(s.missing for s in captures.sequences)
+    (tmp_path / "captures" / "captures.yaml").symlink_to("captures.yaml")
+    with pytest.raises(CaptureError, match="cannot be read"):
+        opened(rig_path)
 
 
 def test_shots_are_called_as_people_call_them(tmp_path: Path) -> None:
