@@ -173,9 +173,7 @@ def hold_folder(folder: Path) -> Iterator[None]:
                     where=str(folder),
                     remedy="wait until it has ended, or give another --out",
                 ) from None
-            for path in folder.iterdir():
-                if re.fullmatch(r"\..+\.[0-9a-f]{12}\.tmp(\.\w+)?", path.name):
-                    path.unlink()
+            sweep_temporary(folder)
         yield
     finally:
         if handle is not None:
@@ -183,6 +181,13 @@ def hold_folder(folder: Path) -> Iterator[None]:
         if is_new:
             with suppress(OSError):  # not empty
                 folder.rmdir()
+
+
+def sweep_temporary(folder: Path) -> None:
+    """Remove what killed writers left half written in a folder that this process holds."""
+    for path in folder.iterdir():
+        if re.fullmatch(r"\..+\.[0-9a-f]{12}\.tmp(\.\w+)?", path.name):
+            path.unlink(missing_ok=True)
 
 
 @contextmanager

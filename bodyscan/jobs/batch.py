@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from bodyscan.errors import BadInput, BodyscanError, FailedWork
-from bodyscan.files.atomic import lock_file, restrict_to_owner
-from bodyscan.jobs.job import BATCH_LOCK, Job, write_job
+from bodyscan.files.atomic import lock_file, restrict_to_owner, sweep_temporary
+from bodyscan.jobs.job import BATCH_LOCK, JOB, Job, write_job
 from bodyscan.jobs.stages import KINDS
 from bodyscan.jobs.supervision import (
     COMMAND,
@@ -62,17 +62,13 @@ def run_batch(
 def hold_output(out: Path) -> Iterator[None]:
     """Make an output folder and lock it; what a killed batch was writing there is removed.
 
-    Raises BadInput if another batch is working in it, or it is not writable.
+    Raises BadInput if another batch is working in it, OSError if it is not writable.
     """
     with restrict_to_owner():
-        try:
-            out.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise BadInput(f"cannot be written: {error.strerror}", where=str(out)) from error
+        out.mkdir(parents=True, exist_ok=True)
         with lock_file(out / BATCH_LOCK, wait=False):
-            for name in ("summary.*.tmp.csv", "measures.*.tmp.csv", "manifest.*.tmp.json"):
-                for path in out.glob(f".{name}"):
-                    path.unlink(missing_ok=True)
+            for folder in (out, *(path.parent for path in out.glob(f"*/{JOB}"))):
+                sweep_temporary(folder)
             yield
 
 
@@ -208,10 +204,7 @@ def run_on_worker(
 
 
 def finish(jobs: Sequence[Job], outcomes: Sequence[JobResult], out: Path) -> dict[str, object]:
-    """Write the table and the manifest over all jobs; returns the event that ends a batch.
-
-    Raises FailedWork if they cannot be written.
-    """
+    """Write the table and the manifest over all jobs; returns the event that ends a batch."""
     from bodyscan.jobs.summary import (
         find_drift,
         list_scans_to_repeat,
@@ -220,17 +213,10 @@ def finish(jobs: Sequence[Job], outcomes: Sequence[JobResult], out: Path) -> dic
         write_summary,
     )
 
-    try:
-        with restrict_to_owner():
-            table = write_summary(jobs, outcomes, out)
-            measures = write_day_measures(jobs, out)
-            write_out_manifest(out)
-    except OSError as error:
-        raise FailedWork(
-            f"the summary cannot be written: {error.strerror}",
-            where=str(out),
-            remedy="make room, then start the same batch again: jobs that are done stay done",
-        ) from error
+    with restrict_to_owner():
+        table = write_summary(jobs, outcomes, out)
+        measures = write_day_measures(jobs, out)
+        write_out_manifest(out)
     aside = [outcome.job for outcome in outcomes if outcome.state != "done"]
     done = [job for job in jobs if job.name not in aside]
     return {

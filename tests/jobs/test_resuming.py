@@ -82,12 +82,14 @@ def test_half_made_folders_are_taken_away_and_not_believed(
     half = out / "a" / ".making-scan-0123"
     half.mkdir(parents=True)
     (half / "0.bin").write_bytes(b"half")
-    (out / ".summary.0123.tmp.csv").write_text("half")
+    for name in (".summary.0123456789ab.tmp.csv", "b/job.json", "b/.station.0123456789ab.tmp.json"):
+        (out / name).parent.mkdir(exist_ok=True)
+        (out / name).write_text("half")
     (out / "a" / "scan").mkdir()  # without stage.json: nothing vouches for it
     (out / "a" / "scan" / "0.bin").write_bytes(b"half")
     assert run_cheap(scans, out).endings()["a"]["stages"] == ["scan", "export"]
     assert not half.exists()
-    assert not list(out.glob(".summary*"))
+    assert not list(out.rglob("*.tmp*"))
     assert (out / "a" / "scan" / "0.bin").stat().st_size > 4
 
 
