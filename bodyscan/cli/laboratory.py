@@ -85,7 +85,7 @@ def simulate(
         changes=changes or (),
     )  # fmt: skip
     if subject is not None:
-        output.notes(read_surface(subject).notes)
+        output.notes(read_surface(subject, "metres").notes)
     with output.stages() as progress:
         run(
             rig_file, out, subject=subject, scale=scale, seed=seed, settings=settings,

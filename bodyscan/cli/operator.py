@@ -168,12 +168,9 @@ def report(
     """Write a report on a calibration or a scan: one HTML file that opens anywhere and prints."""
     from bodyscan.report.result_page import write_report
 
-    if compare is not None and compare.is_file():
-        from bodyscan.mesh.surface_file import read_surface
-
-        output.notes(read_surface(compare).notes)
-    path, verdict = write_report(result, out, compare)
-    output.verdict(verdict)
+    path, page = write_report(result, out, compare)
+    output.notes(page.notes)
+    output.verdict(page.verdict)
     output.add_files("report", path)
 
 

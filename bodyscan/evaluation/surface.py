@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +15,9 @@ from bodyscan.fusion.storage import FILE_NAME, load_scan
 from bodyscan.geometry.robust import rms
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyMesh
-from bodyscan.mesh.surface_file import read_surface, refuse_size
+from bodyscan.mesh.surface_file import read_surface
 from bodyscan.mesh.topology import compute_face_normals, find_twins
+from bodyscan.outcome import Outcome
 
 
 @dataclass(frozen=True)
@@ -127,6 +128,7 @@ class Comparison:
     signed_mm: their distances, positive outside the other surface, (N,).
     figures: statistics of the distances.
     fitted: whether the scan was first fitted to the other, by `other_from_scan`.
+    notes: what the other was taken as, and whether it can be compared.
     """
 
     name: str
@@ -136,6 +138,7 @@ class Comparison:
     figures: Deviation
     fitted: bool
     other_from_scan: RigidTransform
+    notes: tuple[str, ...] = ()
 
 
 def compare_surfaces(mesh: BodyMesh, other: Path | BodyMesh) -> list[Comparison]:
@@ -144,19 +147,23 @@ def compare_surfaces(mesh: BodyMesh, other: Path | BodyMesh) -> list[Comparison]
     First as they stand, then with the scan fitted to the other as a whole. Raises ResultError or
     BadInput if `other` cannot be read, or cannot be the same subject.
     """
-    if isinstance(other, BodyMesh):
-        name, is_scan, vertices, faces = "the other", True, other.vertices, other.faces
-    else:
-        name, is_scan = _name(other), _is_scan(other)
-        vertices, faces = _load_reference(other, np.ptp(mesh.vertices, axis=0))
+    name, is_scan, read = _read_other(other, np.ptp(mesh.vertices, axis=0))
+    vertices, faces = read.value
     measured = np.unique(mesh.faces[~mesh.filled])
     points = mesh.vertices[measured]
     fit = fit_to_surface(points, vertices, faces)
-    return [
+    standing, moved = (
         Comparison(name, is_scan, measured, signed, summarize_deviation(signed), fitted, pose)
         for pose, fitted in ((RigidTransform.identity(), False), (fit, True))
         for signed in (compute_signed_distances(pose.apply(points), vertices, faces),)
-    ]
+    )
+    notes, median_mm = read.notes, moved.figures.median_mm
+    if median_mm > 20.0:  # beyond which the fit gives no weight to begin with
+        notes += (
+            f"{name}: even fitted, half of the scan lies {median_mm:,.0f} mm or more from it: it is of "
+            "another person or pose, or another axis is up",
+        )
+    return [replace(standing, notes=notes), replace(moved, notes=notes)]
 
 
 def fit_to_surface(points: Array, vertices: Array, faces: Indices) -> RigidTransform:
@@ -166,7 +173,7 @@ def fit_to_surface(points: Array, vertices: Array, faces: Indices) -> RigidTrans
     a corner's tangent plane lies outside a round surface.
     """
     scene, centre = _build_centred_scene(vertices, faces)
-    some = points[:: max(1, len(points) // 30_000)]
+    some = points[:: max(1, len(points) // 10_000)]
     found = RigidTransform.from_translation(-centre)
     for reach in [40.0] * 10 + [10.0] * 4 + [3.0] * 4:  # mm
         moved = found.apply(some)
@@ -179,29 +186,25 @@ def fit_to_surface(points: Array, vertices: Array, faces: Indices) -> RigidTrans
     return RigidTransform.from_translation(centre) @ found
 
 
-def _is_scan(path: Path) -> bool:
-    return path.is_dir() or path.name == FILE_NAME
+def _read_other(
+    other: Path | BodyMesh, sides_mm: Array
+) -> tuple[str, bool, Outcome[tuple[Array, Indices]]]:
+    """Read what a scan of sides (3,) is compared with: its name (`truth/subject.ply`, a scan's folder),
+    whether it is a scan, its vertices (V, 3) mm and faces (F, 3).
 
-
-def _name(path: Path) -> str:
-    """`truth/subject.ply`, but `scan` for a scan's folder."""
-    whole = path.resolve()
-    if path.name == FILE_NAME:
-        return whole.parent.name
-    return whole.name if path.is_dir() else f"{whole.parent.name}/{whole.name}"
-
-
-def _load_reference(path: Path, sides_mm: Array) -> tuple[Array, Indices]:
-    """Vertices (V, 3) mm and faces (F, 3) to compare a scan of these sides (3,) with; raises BadInput
-    if the size does not fit such a scan: 0.2 to 5 times the longest side."""
-    if _is_scan(path):
-        mesh = load_scan(path if path.is_dir() else path.parent).mesh
-        return mesh.vertices, mesh.faces
+    Raises BadInput for a surface whose longest side is not 0.2 to 5 times the scan's.
+    """
+    if isinstance(other, BodyMesh):
+        return "the other", True, Outcome((other.vertices, other.faces))
+    folder = other.parent if other.name == FILE_NAME else other
+    whole = folder.resolve()
+    if folder.is_dir():
+        mesh = load_scan(folder).mesh
+        return whole.name, True, Outcome((mesh.vertices, mesh.faces))
     size_mm = float(sides_mm.max())
     sizes_mm = (0.2 * size_mm, size_mm, 5.0 * size_mm)
-    vertices, faces = read_surface(path).value
-    refuse_size(vertices, path, "millimetres", sizes_mm, int(sides_mm.argmax()))
-    return vertices, faces
+    read = read_surface(other, "millimetres", sizes_mm, int(sides_mm.argmax()))
+    return f"{whole.parent.name}/{whole.name}", False, read
 
 
 def _build_centred_scene(vertices: Array, faces: Indices) -> tuple[Any, Array]:

@@ -130,6 +130,7 @@ class Page:
     axes: str  # where the rig frame lies, in words
     sections: Sequence[Section] = ()
     subject: str | None = None  # pseudonym of the person shown
+    notes: tuple[str, ...] = ()  # for whoever has it written
 
 
 def is_synthetic(folder: Path) -> bool:

@@ -10,15 +10,14 @@ from bodyscan.files.messages import require_suffix
 from bodyscan.fusion import storage as scans
 from bodyscan.registration import storage as calibrations
 from bodyscan.report.page import Page, render
-from bodyscan.verdict import Verdict
 
 REMEDY = "give the folder that `bodyscan calibrate-rig` or `bodyscan scan` wrote"
 
 
 def write_report(
     result: Path, path: Path | None = None, other: Path | None = None
-) -> tuple[Path, Verdict]:
-    """Write the report; return its path and its verdict.
+) -> tuple[Path, Page]:
+    """Write the report; return its path and what it shows.
 
     result: what calibrate-rig or scan wrote.
     path: report.html in the result if None.
@@ -41,7 +40,7 @@ def write_report(
         write_json(description, {key: value for key, value in shown.items() if value})
     else:
         description.unlink(missing_ok=True)  # of an earlier comparison
-    return path, page.verdict
+    return path, page
 
 
 def _find_subject(scan: Path | None) -> str | None:

@@ -78,6 +78,7 @@ def make_scan_page(folder: Path, other: Path | None = None) -> Page:
     facts = read_facts(folder)
     subject = facts.get("subject")
     sections: list[Section] = []
+    found: list[Comparison] = []
     if "sha256" in facts:
         scan = load_scan(folder)
         found = compare_surfaces(scan.mesh, other) if other else []
@@ -96,6 +97,7 @@ def make_scan_page(folder: Path, other: Path | None = None) -> Page:
         facts.get("axes", FLOOR_AXES),
         sections,
         subject,
+        found[0].notes if found else (),
     )
 
 
@@ -298,6 +300,7 @@ def _compare(
         f"{shown.name}; what was filled is left out. To fit it, the scan was moved by {moved:.2f} mm "
         f"and turned by {np.degrees(fit.angle):.3f} degrees as a whole.",
         Table(columns, rows),
+        Lines(shown.notes),
         Picture(
             "Deviation map",
             f"Front, left side, back; the scan {words[shown.fitted]}. Red: outside of {shown.name}, "

@@ -10,12 +10,11 @@ import open3d as o3d
 
 from bodyscan.arrays import Array, Mask
 from bodyscan.files.atomic import atomic_replacement
-from bodyscan.mesh.surface_file import read_surface, refuse_size
+from bodyscan.mesh.surface_file import read_surface
 from bodyscan.simulation.scene import Surface
 from bodyscan.simulation.settings import Person, Skin
 
-MATT = Skin()
-"""Skin all over, that lets no light in."""
+MATT = Skin()  # all over, and lets no light in
 
 
 def load_subject(
@@ -29,12 +28,13 @@ def load_subject(
 
     Raises BadInput for what is no surface, or in another unit or axis.
     """
-    points, faces = read_surface(path).value
-    refuse_size(points, path, "metres")
+    points, faces = read_surface(path, "metres").value
     mesh = o3d.geometry.TriangleMesh(
         o3d.utility.Vector3dVector(points), o3d.utility.Vector3iVector(faces.astype(np.int32))
     )
-    mesh = mesh.subdivide_loop(person.subdivisions)
+    # It warns of each unsound edge, of which `read_surface` tells.
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        mesh = mesh.subdivide_loop(person.subdivisions)
     mesh.compute_vertex_normals()
     turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     vertices = np.asarray(mesh.vertices) @ turn.T * (1000.0 * person.size)

@@ -122,7 +122,7 @@ def moves(person: Person) -> bool:
 def animate(still: Surface, person: Person, rng: np.random.Generator) -> LivingBody:
     """Add moving arms and head, breath and sway to a still surface (body heights after ANSUR II).
 
-    Raises BadInput for one without arms or a head.
+    Raises BadInput for one without a chest, arms or a head.
     """
     vertices = still.vertices
     height = float(vertices[:, 2].max())
@@ -131,9 +131,12 @@ def animate(still: Surface, person: Person, rng: np.random.Generator) -> LivingB
     head = _smoothstep(z, 0.835, 0.885) * (1.0 - arms[0]) * (1.0 - arms[1])
     limbs = [(weights, np.radians(person.arms_deg)) for weights in arms]
     limbs += [(head, np.radians(person.head_deg))]
-    if not all(np.any((weights > 0.3) & (weights < 0.7)) for weights, _ in limbs):
+    trunk = (1.0 - arms[0]) * (1.0 - arms[1])
+    chest = vertices[(trunk > 0.99) & (z > 0.6) & (z < 0.72)]
+    is_flat = len(chest) == 0 or np.ptp(chest[:, :2], axis=0).min() < 0.01 * height
+    if is_flat or not all(np.any((weights > 0.3) & (weights < 0.7)) for weights, _ in limbs):
         raise BadInput(
-            "the subject has no arms and head that could move",
+            "the subject has no chest, arms and head that could move",
             remedy="give a standing person, or --subject-preset mannequin",
         )
     joints = tuple(
@@ -156,7 +159,6 @@ def animate(still: Surface, person: Person, rng: np.random.Generator) -> LivingB
         person.breath_s * float(rng.uniform(0.95, 1.05)),
         (start, start - 0.6),  # the belly follows the chest
     )
-    trunk = (1.0 - arms[0]) * (1.0 - arms[1])
     breath_modes = _compute_breath_modes(vertices, trunk, height)
     return LivingBody(
         still, joints, breath_modes, breath, Joint(_smoothstep(z, 0.035, 0.055), pivot, sway)

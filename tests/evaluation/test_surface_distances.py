@@ -162,8 +162,12 @@ def test_only_what_was_measured_is_compared(tmp_path: Path) -> None:
     assert (standing.fitted, fitted.fitted) == (False, True)
     assert (standing.is_scan, standing.name) == (False, f"{tmp_path.name}/other.ply")
     for one in (standing, fitted):
+        assert "z up: 400 mm tall" in one.notes[0]
         np.testing.assert_array_equal(one.vertices, np.unique(faces[~filled]))
         assert np.abs(one.signed_mm).max() < 0.01
+    other = write(tmp_path / "other.ply", *cylinder(90.0, 0.0, 400.0))
+    (*_, note) = compare_surfaces(mesh_of(vertices, faces), other)[1].notes
+    assert "even fitted, half of the scan lies 4" in note
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +13,12 @@ from trimesh import Trimesh
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.errors import BadInput
-from bodyscan.mesh.surface_file import read_surface, refuse_size
+from bodyscan.mesh.surface_file import PERSON_MM, refuse_size
+from bodyscan.mesh.surface_file import read_surface as read_of_size
 from bodyscan.mesh.topology import compute_signed_volume
 
 VERTICES, FACES = ball().vertices, ball().faces
+read_surface = partial(read_of_size, unit="millimetres", sizes_mm=(1.0, 100.0, 1e6))
 
 
 def write(folder: Path, vertices: Array, faces: Indices) -> Path:
@@ -30,14 +33,16 @@ def test_a_sound_mesh_is_read_as_it_is(tmp_path: Path) -> None:
     read = read_surface(write(tmp_path, VERTICES, FACES))
     np.testing.assert_array_equal(read.value[0], VERTICES)
     np.testing.assert_array_equal(read.value[1], FACES)
-    assert read.notes == ()
+    assert "taken as millimetres, z up: " in read.notes[0]
+    some = np.where(np.arange(len(FACES))[:, None] == 7, FACES[:, ::-1], FACES)
+    assert ": 4 faces, such as " in read_surface(write(tmp_path, VERTICES, some)).notes[0]
 
 
 @pytest.mark.parametrize(
     ("vertices", "faces", "said"),
     [
-        (VERTICES, FACES[:, ::-1], "faces pointed inwards"),
         (VERTICES + 1e4, FACES[:, ::-1], "faces pointed inwards"),
+        (VERTICES, FACES[1:, ::-1], "faces pointed inwards"),
         (np.vstack([VERTICES, [[9e3, 0, 0], [0, 0, -9e3]]]), FACES, "2 unreferenced vertices"),
         (VERTICES, np.vstack([FACES, [[4, 4, 5]]]), f"twice (the first is {len(FACES)})"),
         (VERTICES[FACES].reshape(-1, 3), np.arange(FACES.size).reshape(-1, 3)[:, ::-1], "merged"),
@@ -49,9 +54,9 @@ def test_what_can_mean_one_thing_is_mended_and_said(
     path = write(tmp_path, vertices, faces)
     read = read_surface(path)
     assert len(read.value[0]) == len(VERTICES)
-    assert len(read.value[1]) == len(FACES)
+    assert 0 <= len(FACES) - len(read.value[1]) <= 1
     assert compute_signed_volume(*read.value) == pytest.approx(
-        compute_signed_volume(VERTICES, FACES), rel=1e-6
+        compute_signed_volume(VERTICES, FACES), rel=1e-2
     )
     assert any(said in note for note in read.notes)
     assert all(note.startswith(str(path)) for note in read.notes)
@@ -104,8 +109,8 @@ def test_a_person_in_another_unit_or_who_lies_is_refused(
 ) -> None:
     corners = np.array([[0.0, 0.0, 0.0], size])
     if said is None:
-        return refuse_size(corners, Path("made.ply"), "metres")
+        return refuse_size(corners, Path("made.ply"), "metres", PERSON_MM, 2)
     with pytest.raises(BadInput) as refused:
-        refuse_size(corners, Path("made.ply"), "metres")
+        refuse_size(corners, Path("made.ply"), "metres", PERSON_MM, 2)
     assert said in str(refused.value)
     return None

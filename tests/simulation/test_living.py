@@ -101,11 +101,11 @@ def test_arms_turn_about_shoulders_and_the_head_about_the_neck() -> None:
     assert [joint.weights[hands[0]] for joint in body.limbs] == [1.0, 0.0, 0.0]
 
 
-def test_what_has_no_limbs_cannot_move() -> None:
-    corners = 1000.0 * np.eye(4, 3)
-    block = Surface(corners, np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]))
-    with pytest.raises(BadInput, match="no arms and head"):
-        animate(block, STANDING, np.random.default_rng(0))
+def test_what_has_no_limbs_or_no_chest_cannot_move(living: LivingBody) -> None:
+    block = Surface(1000.0 * np.eye(4, 3), np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]))
+    for still in (block, replace(living.rest, vertices=living.rest.vertices * [0.0, 1.0, 1.0])):
+        with pytest.raises(BadInput, match="no chest, arms and head"):
+            animate(still, STANDING, np.random.default_rng(0))
 
 
 def test_only_a_mannequin_stands_still() -> None:
