@@ -30,9 +30,6 @@ from bodyscan.geometry.robust import rms
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.topology import compute_vertex_normals, list_directed_edges
 
-NORMAL_MM = 80.0
-"""Distance that counts as much as normals at right angles: the opposite sides of an arm, 80 mm apart,
-never match."""
 BASIS_MM = 4.0
 """What bodies have that the basis cannot make, RMS: asymmetry, muscles, cloth."""
 JOINT_DEG = {
@@ -152,7 +149,8 @@ def _measure_distance(
 
 def join_positions_normals(points: Array, normals: Array) -> Array:
     """Points (N, 6) whose distance is that of position and normal together, mm."""
-    return np.hstack([points, NORMAL_MM / np.sqrt(2.0) * normals])
+    # Normals at right angles count as 80 mm: the opposite sides of an arm, so far apart, never match.
+    return np.hstack([points, 80.0 / np.sqrt(2.0) * normals])
 
 
 def _start(template: BodyTemplate, surface: Surface, arms_deg: float) -> BodyShapeAndPose:

@@ -20,8 +20,6 @@ Codes = NDArray[np.uint16]
 MIN_CONTRAST = 4
 FINE_BITS = 3
 """The finest bits, which blur and noise may hide."""
-CLEAR_SIGMAS = 4.0
-"""Sigmas of pattern minus inverse beyond which noise alone cannot have decided a bit."""
 MIN_CHANGES = 50
 
 
@@ -226,7 +224,7 @@ def _find_clear(patterns: Greys, inverses: Greys, variance: Floats) -> Mask:
     """Where noise alone cannot have decided a bit, for patterns and inverses of any equal shape."""
     noise2 = sum(variance[level.astype(np.uint8, copy=False)] for level in (patterns, inverses))
     difference = patterns.astype(np.float32) - inverses
-    return np.asarray(np.square(difference) >= CLEAR_SIGMAS**2 * noise2)
+    return np.asarray(np.square(difference) >= 4.0**2 * noise2)  # 4 sigmas
 
 
 def _compare_pairs(patterns: Greys, inverses: Greys, variance: Floats) -> str:

@@ -58,9 +58,6 @@ from bodyscan.stripes.usable_pixels import (
 CORRELATION_PX = 1.2
 """Distance within which neighbours share noise after `smooth_phase`: the fit keeps all that varies
 slowly, so a mean of many pixels is as noisy as before."""
-MAX_OFFSET = 0.06
-"""Share of the finest period, between waves overall; the smallest wrong start, 30 degrees, gives
-0.083 of it for any whole ratio of their periods except 12 k + 1."""
 MIN_GAIN = -2.0 * math.log(1e-4)
 """Minimum difference of the second-best order's chi squared: a wrong order has a chance of 1e-4 then,
 one flying pixel in ten thousand, which cleaning finds."""
@@ -281,7 +278,9 @@ def check_several_waves(
 def check_agreement(order: PhaseOrder) -> None:
     """Raise DecodingFailed if the waves of most pixels disagree, or begin at different s."""
     offset = max(order.offsets, key=abs, default=0.0)
-    if order.agreed >= 0.6 and abs(offset) < MAX_OFFSET:
+    # The smallest wrong start, 30 degrees, gives 0.083 of the finest period for any whole ratio of
+    # the waves' periods except 12 k + 1.
+    if order.agreed >= 0.6 and abs(offset) < 0.06:
         return
     what = f"the phases of the waves agree at only {order.agreed:.0%} of the pixels"
     if order.agreed >= 0.6:
