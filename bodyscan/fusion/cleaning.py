@@ -64,8 +64,8 @@ def require_subject(cleaned: Sequence[RangeImage]) -> list[RangeImage]:
     if not valid:
         raise ScanFailed(
             "nobody is in the scan volume",
-            remedy="look at the lit images; check `volume` in the calibration's calibration.json, and "
-            "that a folder given with --empty shows the rig without anybody",
+            remedy="look at the lit images; check `volume` in the calibration's calibration.json, that "
+            "square_mm is in mm, and that a folder given with --empty shows the rig without anybody",
         )
     return valid
 

@@ -160,6 +160,14 @@ def test_findings_by_their_cost(scan: MadeScan, name: str) -> None:
     assert grade != "good" or not verdict.reasons
 
 
+@pytest.mark.parametrize("factor", [1.0, 0.1])
+def test_lengths_in_centimetres_come_first(scan: MadeScan, factor: float) -> None:
+    points = scan.cloud.points * (1700.0 * factor / np.ptp(scan.cloud.points, axis=0).max())
+    cameras = points.mean(axis=0) + 1500.0 * factor * np.eye(3)
+    verdict = verdict_given(replace(scan.cloud, points=points), cameras=cameras)
+    assert ("is square_mm of the boards in mm?" in "".join(verdict.reasons[:1])) == (factor < 1.0)
+
+
 def test_pairs_that_failed_for_the_same_reason_share_a_line(scan: MadeScan) -> None:
     failed = {name: MISSING.format(name) for name in ("p1-1", "p1-2")} | {"p2-1": "too dark"}
     assert verdict_given(scan.cloud, failed=failed) == Verdict(

@@ -213,13 +213,22 @@ def check_calibration(scan: ScanEvidence) -> Iterator[Finding]:
 
 def check_nominal_size(scan: ScanEvidence) -> Iterator[Finding]:
     """The rig's size, because whoever scans need not have read the notes on the calibration."""
-    size = scan.rig.nominal
-    if size is None or size.mark == "good":
-        return
-    yield Finding(
-        "repeat" if size.mark == "bad" else "usable",
-        f"{size.words}, and every girth may be wrong by the same share: {size.remedy}",
-    )
+    size, cameras, points = scan.rig.nominal, scan.rig.cameras, scan.cloud.points
+    if size is not None and size.mark != "good":
+        yield Finding(
+            "repeat" if size.mark == "bad" else "usable",
+            f"{size.words}, and every girth may be wrong by the same share: {size.remedy}",
+        )
+    elif size is None and cameras is not None:
+        extent = float(np.ptp(points, axis=0).max())
+        distance = float(np.median(np.linalg.norm(cameras - points.mean(axis=0), axis=1)))
+        if extent < 230.0 and distance < 250.0:  # tenths of a person, and of what shows all of one
+            yield Finding(
+                "usable",
+                f"the body is {extent:.0f} mm large and seen from {distance:.0f} mm, as a person is in "
+                "cm: is square_mm of the boards in mm? Calibrate again with its right value",
+                spoils=True,
+            )
 
 
 def check_stripe_directions(scan: ScanEvidence) -> Iterator[Finding]:
