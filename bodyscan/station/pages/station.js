@@ -249,7 +249,8 @@
     $("calibrate").hidden = boards.shots < 3;
     $("calibrate").classList.toggle("main", next.say === "enough");
     $("board").classList.toggle("main", next.say !== "enough");
-    $("hold").textContent = say(next.say, { ...next, place, one: list(next.one), other: list(next.other) });
+    const pair = (next.pair || "").replaceAll("-", "\u2011"); // not broken at its hyphen
+    $("hold").textContent = say(next.say, { ...next, pair, place, one: list(next.one), other: list(next.other) });
     $("missed").textContent = boards.missed.length ? say("missed", { shot: boards.last, pairs: list(boards.missed) }) : "";
     $("covered").replaceChildren(...boards.pairs.map((pair) => {
       const cells = make("div", { class: "cells", "aria-hidden": "true" });
