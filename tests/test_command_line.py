@@ -37,6 +37,7 @@ def bodyscan(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str])
     """The command line without the second that a process of its own takes to begin."""
     monkeypatch.setattr("bodyscan.cli.main.run_interruptibly", lambda work: work())
     monkeypatch.setattr("bodyscan.cli.main.keep_freed_memory", lambda: None)
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "2")
 
     def run(*arguments: object) -> Done:
         line = ["bodyscan", *map(str, arguments)]
@@ -46,6 +47,7 @@ def bodyscan(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str])
         with pytest.raises(SystemExit) as end:
             main()
         os.umask(mask)
+        assert os.environ["OPENBLAS_NUM_THREADS"] == "1"  # results would depend on it
         said = capfd.readouterr()
         return subprocess.CompletedProcess(line, int(str(end.value.code)), said.out, said.err)
 

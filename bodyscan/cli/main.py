@@ -35,8 +35,8 @@ for _group in (builder, operator, laboratory):
 def main() -> None:
     """Entry point: errors are printed without a traceback, 2 for bad input, 1 for failed work."""
     # Stages run threads of their own; BLAS threads inside them get in each other's way (measured:
-    # 15 s instead of 1 s for twelve cameras on two cores).
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # 15 s instead of 1 s for twelve cameras on two cores), and the last bits depend on their number.
+    os.environ["OPENBLAS_NUM_THREADS"] = os.environ["MKL_NUM_THREADS"] = "1"
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # a terminal may lack a sign of ours, or of a path
             stream.reconfigure(errors="backslashreplace")

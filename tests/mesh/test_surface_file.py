@@ -86,7 +86,6 @@ def test_the_formats_of_other_programs_are_read(suffix: str, tmp_path: Path) -> 
     Trimesh(VERTICES, FACES, process=False).export(path := tmp_path / f"body.{suffix}")
     vertices, faces = read_surface(path).value
     assert len(vertices) == len(VERTICES)
-    # STL and GLB are float32, and joined vertices are in another order.
     assert compute_signed_volume(vertices, faces) == pytest.approx(
         compute_signed_volume(VERTICES, FACES), rel=1e-5
     )

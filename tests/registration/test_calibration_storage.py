@@ -233,11 +233,10 @@ def test_an_edit_that_cannot_be_right_is_not_accepted(mine: Path) -> None:
     content = read(mine)
     del content["sha256"]  # which is an edit too
     write(mine, content)
-    for name in ("report.html", "corners.vnl"):
-        (mine / name).write_text("of the former")
+    (mine / "report.html").touch()
+    (mine / "corners.vnl").touch()
     assert accept_calibration(mine)
-    assert not (mine / "report.html").exists()
-    assert (mine / "corners.vnl").exists()  # of the images, which are the same
+    assert [path.name for path in mine.glob("[cr]*.[hv]*")] == ["corners.vnl"]
     content["pairs"]["p1-2"]["camera"]["alpha"] *= -1.0
     write(mine, content)
     with pytest.raises(CalibrationFileError, match=r"p1-2\.camera\.alpha is not a focal length"):
