@@ -14,6 +14,7 @@ from types import MappingProxyType
 from typing import TypeVar
 
 import numpy as np
+from scipy.stats import rankdata
 
 from bodyscan.alignment.displaced_poles import STILL_MM
 from bodyscan.alignment.icp import Alignment
@@ -58,10 +59,10 @@ class BreathOffset:
 
 @dataclass(frozen=True)
 class TimeFit:
-    """The factor for all moments that explains the motion best, and its log likelihood ratio against
-    the moments as stated; 1 and 0 if none is better beyond doubt."""
+    """Moments that explain the motion best, in words before "those in `timing`", and their log
+    likelihood ratio against the moments as stated; empty and 0 if none is better beyond doubt."""
 
-    factor: float = 1.0
+    name: str = ""
     log_ratio: float = 0.0
 
 
@@ -174,10 +175,9 @@ def estimate_motion(
     if solution.negligible:
         return aligned, None, evidence
     with background() as other:
-        middle_s = 1e-3 * (_find_middle_of_scan(images) or 0.0)
         # What hardly moved says nothing about times: calibrations that disagree look like motion.
         moves = _compute_rms_displacement(motion, (*RIGID, *NON_RIGID), observed) > STILL_MM
-        timing = other.submit(solution.fit_times, seconds if moves else (), middle_s, sides)
+        timing = other.submit(solution.fit_times, seconds if moves else (), sides)
         moved = _update_alignment(
             aligned, names, views, (motion, cells), solution.reach_mm, settings
         )
@@ -264,41 +264,45 @@ class _Solution:
         postures = {kinds: partial(equations, kinds) for kinds in steps}
         return PoseEvidence(tuple(names), self.motion.pose_equations(), postures)
 
-    def fit_times(
-        self, seconds: Sequence[float | None], middle_s: float, sides: Sequence[str]
-    ) -> TimeFit:
+    def log_evidence(
+        self,
+        seconds: Sequence[float | None],
+        omitted: Collection[str] = ("parts",),
+        without: Indices | tuple[()] = (),
+    ) -> float:
+        """If the pairs fired at these moments; without some kinds of motion, and some pairs."""
+        middle_s = 0.5 * max((second for second in seconds if second is not None), default=0.0)
+        person = self.motion.with_times(seconds, middle_s, omitted)
+        fields = self.motion.find_fields([kind.name for kind in person.kinds])
+        kept = [both for both in self.projected if not {*both} & {*without}]
+        projected = {both: self.projected[both].select(fields) for both in kept}
+        return person.solve_projected(projected).log_evidence if projected else np.nan
+
+    def fit_times(self, seconds: Sequence[float | None], sides: Sequence[str]) -> TimeFit:
         """By the evidence of the motion: a posture hardly changes within a tenth of a second, and does
         within a second.
 
         sides: the pole of each pair. The evidence must be the same without any one of them, which may
         be displaced, and without breath: who holds it seems to be scanned within a moment.
         """
-        times = [second for second in seconds if second is not None]
-        if not times or len(times) < len(seconds):
+        stated = [second for second in seconds if second is not None]
+        if not stated or len(stated) < len(seconds):
             return TimeFit()
-
-        def log_evidence(factor: float, omitted: Collection[str], without: str = "") -> float:
-            moments = [factor * second for second in times]
-            person = self.motion.with_times(moments, factor * middle_s, omitted)
-            fields = self.motion.find_fields([kind.name for kind in person.kinds])
-            projected = {
-                (a, b): system.select(fields)
-                for (a, b), system in self.projected.items()
-                if without not in (sides[a], sides[b])
-            }
-            return person.solve_projected(projected).log_evidence if projected else np.nan
-
-        stated, *others = map_threads(lambda f: log_evidence(f, ("parts",)), (1.0, 0.1, 10.0))
-        fits = [TimeFit(f, e - stated) for f, e in zip((0.1, 10.0), others, strict=True)]
-        best = max(fits, key=lambda one: one.log_ratio)
-        if best.log_ratio <= MIN_LOG_RATIO:
+        others = [(f"{f:g} x", [f * second for second in stated]) for f in (0.1, 10.0)]
+        for order in _propose_orders(sides)[::2]:
+            if np.any(rankdata(order) != rankdata(stated)):
+                others.append(("in another order than", order))
+        now, *found = map_threads(self.log_evidence, [stated, *(one for _, one in others)])
+        name, other = others[int(np.argmax(found))]
+        if max(found) <= now + MIN_LOG_RATIO:
             return TimeFit()
         # With parts: hips that shift are no lean or limb, and would seem to need other times too.
+        left: list[tuple[tuple[str, ...], Indices]] = [(("breath",), np.zeros(0, np.int64))]
+        left += [((), np.flatnonzero(np.equal(sides, side))) for side in dict.fromkeys(sides)]
         gains = map_threads(
-            lambda left: log_evidence(best.factor, *left) - log_evidence(1.0, *left),
-            [(("breath",), ""), *(((), side) for side in dict.fromkeys(sides))],
+            lambda one: self.log_evidence(other, *one) - self.log_evidence(stated, *one), left
         )
-        return best if np.nanmin(gains) > MIN_LOG_RATIO else TimeFit()
+        return TimeFit(name, max(found) - now) if np.nanmin(gains) > MIN_LOG_RATIO else TimeFit()
 
 
 def _begin(
@@ -344,16 +348,12 @@ def _find_order(
     A posture hardly changes from a moment to the next, in the right order alone: of a man whose pairs
     fired in turn the log evidence rose by 160, in other orders it fell by thousands.
     """
-    motion, _ = person
     coarse = [view.select(COARSE) for view in views]
     projected = _project_overlaps(coarse, person, settings.reach_mm, settings)
     if not projected:
         return None
-    persons = [motion.with_times([None] * len(views), 0.0)]
-    persons += [motion.with_times(order, 0.5 * max(order)) for order in orders]
-    fields = motion.find_fields([kind.name for kind in persons[0].kinds])
-    chosen = {both: system.select(fields) for both, system in projected.items()}
-    unknown, *found = (person.solve_projected(chosen).log_evidence for person in persons)
+    solution = _Solution(person[0], settings.reach_mm, projected)
+    unknown, *found = map(solution.log_evidence, [[None] * len(views), *orders])
     best = int(np.argmax(found))
     return orders[best] if found[best] > unknown + MIN_LOG_RATIO else None
 

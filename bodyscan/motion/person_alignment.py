@@ -41,10 +41,9 @@ class PersonAlignment:
     # Of all pairs, if one displacement of them all explains the scan.
     common_error: ScaleError | CommonError | None
     search: DisplacementSearch  # for further displaced poles
-    # Other than 1 if the pairs' moments, multiplied by it, explain the motion far better; they were
-    # then left out.
-    time_factor: float = 1.0
     posture: PostureStep | None = None  # another one than at other times, while one pole fired
+    # `TimeFit.name`, if other moments explain the motion far better; those stated were then left out.
+    other_times: str = ""
 
 
 def align_person(
@@ -68,29 +67,29 @@ def align_person(
     displaced: list[DisplacedPole] = []
     common_error: ScaleError | CommonError | None = None
     posture: PostureStep | None = None
-    factor = 1.0
+    start = aligned, boards
     while True:
         search = _search(images, rig_from_camera, aligned, poles, displaced)
         alignment, motion, evidence = estimate_motion(
             images, rig_from_camera, aligned, boards, settings, poles, posture
         )
-        unknown = motion is None or evidence is None
-        found: Displacement | None = search.found if unknown else None
+        found: Displacement | None = None if motion and evidence else search.found
         if found is None and evidence is not None and common_error is None:
             rival, known = motion.times.log_ratio if motion else 0.0, _collect_pairs(displaced)
             found = detect_displacement(evidence, rig_from_camera, poles, known, rival)
         warped = isinstance(common_error, CommonError)  # as by motion within moments
-        if found is None and motion is not None and motion.times.factor != 1.0 and not warped:
-            factor = motion.times.factor
+        if found is None and motion is not None and motion.times.name and not warped:
+            # Nor is anything displaced that seemed so by these times.
             images = [replace(image, time_ms=None, span_ms=None) for image in images]
-            continue
+            found_anew = align_person(images, rig_from_camera, *start, poles, settings)
+            return replace(found_anew, other_times=motion.times.name)
         if found is None:
             if motion is not None:
                 # Offsets caused by a tracked head or arm are not pose errors.
                 again = _search(images, rig_from_camera, alignment, poles, displaced)
                 search = replace(search, offset_mm=again.offset_mm)
             final = _measure_again(displaced, _select_connected_motions(rig_from_camera, alignment))
-            return PersonAlignment(alignment, motion, final, common_error, search, factor, posture)
+            return PersonAlignment(alignment, motion, final, common_error, search, posture)
         if isinstance(found, PostureStep):
             posture = found
             continue

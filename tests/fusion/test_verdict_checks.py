@@ -128,7 +128,7 @@ FINDINGS: dict[str, tuple[dict[str, Any], str, str]] = {
         {"common_error": CommonError((0.3, 0.0, 0.4), 0.02)}, "usable", "one cause, not poles"),
     "all pairs alike by much": (
         {"common_error": CommonError((0.0, 2.0, 0.0), 0.0)}, "repeat", "warm up and calibrate again"),
-    "times ten times too long": ({"time_factor": 0.1}, "usable", "frame times 0.1 x those"),
+    "times ten times too long": ({"other_times": "0.1 x"}, "usable", "frame times 0.1 x those"),
     "nominal size": ({"nominal": NominalSize(0.98)}, "good", ""),
     "doubtful size": ({"nominal": NominalSize(1.04)}, "usable", "1.040 times as far apart"),
     "wrong size": ({"nominal": NominalSize(1.11)}, "repeat", "1.110 times as far apart"),

@@ -68,7 +68,7 @@ def outward_mm(found: PersonAlignment, scan: LivingScan) -> float:
 
 def test_a_person_who_stands_is_no_pole(sound: PersonAlignment) -> None:
     assert sound.motion is not None
-    assert (sound.displaced, sound.common_error, sound.time_factor) == ((), None, 1.0)
+    assert (sound.displaced, sound.common_error, sound.other_times) == ((), None, "")
 
 
 def test_poles_that_all_stand_farther_out_make_no_person_fatter(
@@ -85,8 +85,7 @@ def test_poles_that_all_stand_farther_out_make_no_person_fatter(
 
 def test_a_pole_that_moved_while_a_person_sways_is_found(standing: LivingScan) -> None:
     found = together(standing, {"p1": 5.0})
-    assert [step.name for step in found.displaced] == ["pole p1"]
-    assert found.common_error is None
+    assert ([step.name for step in found.displaced], found.common_error) == (["pole p1"], None)
 
 
 def test_a_pole_that_turned_needs_no_other_moments(standing: LivingScan) -> None:
@@ -95,7 +94,7 @@ def test_a_pole_that_turned_needs_no_other_moments(standing: LivingScan) -> None
     placed = standing.rig_from_camera
     turned = {n: turn @ at if RIG.poles[n] == "p1" else at for n, at in placed.items()}
     found = together(replace(standing, rig_from_camera=turned), {})
-    assert ([step.name for step in found.displaced], found.time_factor) == (["pole p1"], 1.0)
+    assert ([step.name for step in found.displaced], found.other_times) == (["pole p1"], "")
 
 
 def displace(scan: LivingScan, displacement: Callable[[str, Array], Array]) -> LivingScan:
@@ -143,20 +142,22 @@ def test_all_cameras_that_see_too_far_right_are_one_cause(standing: LivingScan) 
     found = together(replace(standing, rig_from_camera=rig_from_camera), {})
     assert isinstance(found.common_error, CommonError)
     assert found.common_error.shift_mm == pytest.approx(1.5, abs=0.6)
-    assert (found.displaced, found.time_factor) == ((), 1.0)
+    assert (found.displaced, found.other_times) == ((), "")
 
 
-def test_moments_in_another_unit_blame_no_pole(
-    standing: LivingScan, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("factor", "told"), [(10.0, "0.1 x"), (0.0, "in another order than")])
+def test_moments_in_another_unit_or_order_blame_no_pole(
+    factor: float, told: str, standing: LivingScan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With `frame_ms` ten times too large pole p3 had moved. What hardly moved shows no times."""
-    seconds = {name: 10.0 * at for name, at in standing.seconds.items()}
+    """With `frame_ms` ten times too large, or if all pairs fired at once, a pole had moved."""
+    seconds = {name: factor * at for name, at in standing.seconds.items()}
     found = together(replace(standing, seconds=seconds), {})
-    assert (found.time_factor, found.displaced) == (0.1, ())
+    assert (found.other_times, found.displaced, found.posture) == (told, (), None)
     assert found.motion is not None
     assert found.motion.moment_ms is None, "they are not used"
-    monkeypatch.setattr("bodyscan.motion.estimation.STILL_MM", 40.0)
-    assert together(replace(standing, seconds=seconds), {}).time_factor == 1.0
+    if factor:  # what hardly moved shows no times
+        monkeypatch.setattr("bodyscan.motion.estimation.STILL_MM", 40.0)
+        assert together(replace(standing, seconds=seconds), {}).other_times == ""
 
 
 def test_hips_that_shift_are_no_other_moments(standing: LivingScan) -> None:
@@ -166,14 +167,13 @@ def test_hips_that_shift_are_no_other_moments(standing: LivingScan) -> None:
         hips = 6.0 * np.exp(-(((points[..., 2] - 900.0) / 250.0) ** 2))
         return np.multiply.outer(hips, [0.0, np.sin(np.pi * standing.seconds[pair]), 0.0])
 
-    assert together(displace(standing, sideways), {}).time_factor == 1.0
+    assert together(displace(standing, sideways), {}).other_times == ""
 
 
 def test_without_moments_nobody_can_tell(standing: LivingScan) -> None:
     """Any pair may then have seen any stance, and what sways alike in neighbours looks like a pole."""
     found = together(standing, {"p1": 5.0}, timed=False)
-    assert found.displaced == ()
-    assert found.common_error is None
+    assert (found.displaced, found.common_error) == ((), None)
 
 
 FOLLOWED = SimpleNamespace(times=TimeFit())

@@ -107,12 +107,12 @@ def check_common_error(scan: ScanEvidence) -> Iterator[Finding]:
 
 def check_times(scan: ScanEvidence) -> Iterator[Finding]:
     """Moments that the motion contradicts."""
-    factor = scan.person_alignment.time_factor if scan.person_alignment else 1.0
-    if factor != 1.0 and scan.alignment:
+    name = scan.person_alignment.other_times if scan.person_alignment else ""
+    if name and scan.alignment:
         yield Finding(
             "usable",
-            f"the motion suggests frame times {factor:g} x those in `timing`; they were not changed. "
-            "Correct the unit of `frame_ms` in captures.yaml, or of its file `times`",
+            f"the motion suggests frame times {name} those in `timing`; they were not used. Correct "
+            "`timing` in captures.yaml: unit, order, start, or its file `times`",
             explains=frozenset(scan.alignment.rig_from_camera),
         )
 
