@@ -26,7 +26,7 @@ demo: setup
 	@test ! -e $(OUT) || test -d $(OUT)/truth || { echo "$(OUT) holds no demo: remove it, or give another OUT=" >&2; exit 1; }
 	rm -rf $(OUT)
 	$(BIN)/bodyscan simulate rigs/three-pole-12.yaml --out $(OUT) --scale 0.5 --board-shots 24 \
-		--subject data/subjects/woman_average.ply
+		--subject data/subjects/woman_average.ply --set optics.samples=2 --set person.subdivisions=1
 	$(BIN)/bodyscan check $(OUT)/rig.yaml
 	$(BIN)/bodyscan calibrate-rig $(OUT)/rig.yaml
 	$(BIN)/bodyscan scan $(OUT)/captures/person --calibration $(OUT)/calibration --out $(OUT)/scan
