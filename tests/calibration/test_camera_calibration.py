@@ -11,11 +11,7 @@ from table_one import CAMERA, POINTS, TURNS
 
 from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import PlanarView
-from bodyscan.calibration.camera import (
-    calibrate_camera,
-    estimate_pose,
-    locate_board,
-)
+from bodyscan.calibration.camera import calibrate_camera, estimate_pose, locate_board
 from bodyscan.calibration.sheet_fit import fit_pinhole
 from bodyscan.errors import DegeneratePoses
 from bodyscan.geometry.camera import Camera
@@ -154,11 +150,9 @@ def test_a_projector_without_lens_is_found_from_its_stripes() -> None:
     points = rng.uniform([-200, -200, 700], [200, 200, 1100], (400, 3))
     above, below = (points @ true[:, :3].T + true[:, 3]).T
     s = above / below
-    found = fit_pinhole(points, s)
-    np.testing.assert_allclose(found, true, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(fit_pinhole(points, s), true, rtol=1e-5, atol=1e-5)
     assert below.min() > 0.0, "it shines forward"
     # One in ten is off by 0.7: plainly they would pull the others by 0.07 in the mean.
     wrong = s + np.where(np.arange(400) % 10 == 0, 0.7, 0.0) + 1e-4 * rng.normal(size=400)
-    fitted = fit_pinhole(points, wrong)
-    above, below = (points @ fitted[:, :3].T + fitted[:, 3]).T
+    above, below = fit_pinhole(points, wrong) @ np.column_stack([points, np.ones(400)]).T
     assert np.mean(np.abs(above / below - s)) < 0.035
