@@ -23,11 +23,16 @@ def matrix_from_homographies(homographies: Sequence[Array], width: int, height: 
     )
     scaled = [size @ h for h in homographies]
     scaled = [h / np.linalg.norm(h[:, :2]) * np.sqrt(2) for h in scaled]
-    rows = [_form_constraint(h, 0, 1) for h in scaled]
-    rows += [_form_constraint(h, 0, 0) - _form_constraint(h, 1, 1) for h in scaled]
-    matrix = _solve_full_matrix(np.stack(rows))
+    rows = np.stack(
+        [_form_constraint(h, 0, 1) for h in scaled]
+        + [_form_constraint(h, 0, 0) - _form_constraint(h, 1, 1) for h in scaled]
+    )
+    matrix = _solve_full_matrix(rows)
     if matrix is None:
-        matrix = _solve_central_matrix(np.stack(rows))
+        square = rows[:, 0] + rows[:, 2]
+        inverse_square = -(square @ rows[:, 5]) / (square @ square)
+        focal = 1.0 / np.sqrt(inverse_square) if inverse_square > 0 else 2.4
+        matrix = np.diag([focal, focal, 1.0])
     return np.linalg.inv(size) @ matrix
 
 
@@ -43,14 +48,6 @@ def _solve_full_matrix(rows: Array) -> Array | None:
     matrix = matrix / matrix[2, 2]
     plausible = abs(matrix[0, 1]) < 0.1 * matrix[0, 0] and np.all(np.abs(matrix[:2, 2]) < 0.5)
     return matrix if plausible and 0.7 < matrix[0, 0] / matrix[1, 1] < 1.4 else None
-
-
-def _solve_central_matrix(rows: Array) -> Array:
-    """Solve for the focal length alone: no skew, principal point at the origin."""
-    square = rows[:, 0] + rows[:, 2]
-    inverse_square = -(square @ rows[:, 5]) / (square @ square)
-    focal = 1.0 / np.sqrt(inverse_square) if inverse_square > 0 else 2.4
-    return np.diag([focal, focal, 1.0])
 
 
 def _form_constraint(h: Array, i: int, j: int) -> Array:

@@ -87,10 +87,9 @@ def _look(
     u, v = camera.project(np.where(ahead[:, None], points, 1.0)).T
     inside = ahead & (u > -0.5) & (v > -0.5)
     inside &= (u < camera.width - 0.5) & (v < camera.height - 0.5)
-    column = np.where(inside, np.rint(u), 0).astype(np.intp)
-    row = np.where(inside, np.rint(v), 0).astype(np.intp)
+    pixel = np.where(inside[:, None], np.rint(np.stack([v, u], axis=-1)), 0).astype(np.intp)
     facing = -np.sum(points * normals, axis=1) > 0.5 * np.linalg.norm(points, axis=1)
-    return inside & facing, inside, np.stack([row, column], axis=-1)
+    return inside & facing, inside, pixel
 
 
 def _view_points(
@@ -118,11 +117,9 @@ def check_exposure(scan: ScanEvidence) -> Iterator[Finding]:
     if not over:
         return
     low, high = f"{min(over.values()):.0%}", f"{max(over.values()):.0%}"
-    pairs = (
-        f"pair {next(iter(over))} is" if len(over) == 1 else f"pairs {', '.join(sorted(over))} are"
-    )
-    # As `RangeImage.overexposed`.
-    spoiled = frozenset(name for name, share in over.items() if share > 0.3)
+    names = ", ".join(sorted(over))
+    pairs = f"pair {names} is" if len(over) == 1 else f"pairs {names} are"
+    spoiled = frozenset(name for name, share in over.items() if share > 0.3)  # as `overexposed`
     yield Finding(
         "usable",
         f"{pairs} overexposed: {low if low == high else f'{low} to {high}'} of the skin in view "
@@ -187,17 +184,26 @@ def check_rings(scan: ScanEvidence) -> Iterator[Finding]:
     if coverage is None:
         return
     area = coverage.sum_bands(coverage.areas_mm2)
+    missed, pairs = _find_missed(scan, coverage)
     # Closed flat, a gap of 15 % costs 4 mm of a girth of 800: its arc less its chord.
-    gaping = coverage.sum_bands(coverage.areas_mm2 * coverage.missed) > 0.15 * area
+    gaping = coverage.sum_bands(coverage.areas_mm2 * missed) > 0.15 * area
     share = float(np.sum(gaping) / np.count_nonzero(area))
     if share > 0.5:
-        absent = ", ".join(sorted(scan.images.absent))
         yield Finding(
             "repeat",
-            f"at {share:.0%} of the heights 15 % or more of the girth is unmeasured, where {absent} "
-            "should have seen it",
-            scan.images.absent,
+            f"at {share:.0%} of the heights 15 % or more of the girth is unmeasured, where "
+            f"{', '.join(sorted(pairs))} should have seen it",
+            pairs,
         )
+
+
+def _find_missed(scan: ScanEvidence, coverage: Coverage) -> tuple[Mask, frozenset[str]]:
+    """Faces (N,) that pairs without a range image leave unmeasured, and those pairs. Where a pair that
+    was never calibrated looks is not known: any face in a rig that sees all round."""
+    uncalibrated = scan.images.failed.keys() - scan.images.absent
+    if uncalibrated and not (scan.mesh and _sees_one_side(scan)):
+        return coverage.filled, scan.images.absent | uncalibrated
+    return coverage.missed, scan.images.absent
 
 
 def check_gaps(scan: ScanEvidence) -> Iterator[Finding]:
@@ -217,10 +223,9 @@ def check_gaps(scan: ScanEvidence) -> Iterator[Finding]:
         return
     if coverage is None:
         return
-    mostly = (
-        2.0 * coverage.areas_mm2[coverage.missed].sum() > coverage.areas_mm2[coverage.filled].sum()
-    )
-    lost = scan.images.absent if mostly else frozenset()
+    missed, pairs = _find_missed(scan, coverage)
+    mostly = 2.0 * coverage.areas_mm2[missed].sum() > coverage.areas_mm2[coverage.filled].sum()
+    lost = pairs if mostly else frozenset()
     if coverage.filled_share > MAX_FILLED:
         yield Finding(
             "repeat" if coverage.filled_share > 0.5 else "usable",
