@@ -11,6 +11,7 @@ from collections.abc import Collection, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 
@@ -87,18 +88,18 @@ def reconstruct_range_images(
     failed = {}
     for name in (pair.name for pair in calibration.rig.pairs if pair.projector):
         if name not in calibration.pairs:
-            failed[name] = calibration.failed.get(name, "is not calibrated")
+            why = calibration.failed.get(name, "it is not in the calibration")
+            failed[name] = f"is not calibrated: {why.splitlines()[0]}"
         elif not any(s.has_stripes for s in captures.pair_sequences(name)):
             failed[name] = "took no stripe sequence in this scan"
-    sequences = [s for s in captures.sequences if s.has_stripes and s.pair not in failed]
-
-    def reconstruct(sequence: ImageSequence) -> Reconstructed:
-        return made.get(sequence) or reconstruct_sequence(
-            calibration, captures, sequence, volume_only=volume_only
-        )
-
+    taken = [s for s in captures.sequences if s.has_stripes and s.pair not in failed]
+    make = partial(reconstruct_sequence, calibration, captures, volume_only=volume_only)
     found, errors = attempt_each(
-        reconstruct, sequences, BodyscanError, stage="range images", progress=progress
+        lambda s: made.get(s) or make(s),
+        taken,
+        BodyscanError,
+        stage="range images",
+        progress=progress,
     )
     failed |= {s.pair: captures.relative(str(error)) for s, error in errors.items()}
     if not found:
@@ -106,8 +107,7 @@ def reconstruct_range_images(
     images = [image for image, _ in found.values()]
     empty = (image.pair for image in images if not np.isfinite(image.points).any())
     notes = [f"{pair}: nothing that it measured lies inside the rig's `volume`" for pair in empty]
-    faults = {sequence: several for sequence, (_, several) in found.items()}
-    notes += map(captures.relative, list_fault_notes(faults))
+    notes += map(captures.relative, list_fault_notes({s: f for s, (_, f) in found.items()}))
     return Outcome(images, tuple(notes), failed)
 
 

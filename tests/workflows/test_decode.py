@@ -225,11 +225,11 @@ def test_two_shots_of_a_pair_are_no_one_person() -> None:
 
 def test_a_pair_that_measured_nothing_in_the_volume_is_named() -> None:
     points = np.full((4, 5, 3), np.nan, np.float32)
-    taken = ImageSequence("p", "s", None, None, (Path(),), ())
+    one = ImageSequence("p", "s", None, None, (Path(),), ())
     image = replace(range_image(), points=points)
-    rig = SimpleNamespace(pairs=[SimpleNamespace(name="p", projector=True)])
-    calibration: Any = SimpleNamespace(rig=rig, pairs={"p": None}, failed={})
-    every = [taken]
-    captures: Any = SimpleNamespace(sequences=every, pair_sequences=lambda _: every, relative=str)
-    found = reconstruct_range_images(calibration, captures, made={taken: (image, ())})
+    rig = SimpleNamespace(pairs=[SimpleNamespace(name=name, projector=True) for name in "pq"])
+    calibration: Any = SimpleNamespace(rig=rig, pairs={"p": None}, failed={"q": "saw none\n  it"})
+    captures: Any = SimpleNamespace(sequences=[one], pair_sequences=lambda _: [one], relative=str)
+    found = reconstruct_range_images(calibration, captures, made={one: (image, ())})
     assert "p: nothing that it measured lies inside" in found.notes[0]
+    assert found.failures == {"q": "is not calibrated: saw none"}
