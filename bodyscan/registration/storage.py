@@ -219,9 +219,7 @@ def _refuse_changed(content: dict[str, Any], file: Path, arrays_file: Path) -> N
 def _format_reason(error: Exception) -> str:
     if isinstance(error, ValidationError):
         return describe_first_error(error)
-    if isinstance(error, KeyError):
-        return f"{error.args[0]} is missing"
-    return str(error)
+    return f"{error.args[0]} is missing" if isinstance(error, KeyError) else str(error)
 
 
 def calibration_id(path: Path) -> str:

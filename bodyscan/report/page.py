@@ -160,6 +160,5 @@ def format_value(value: Value, digits: int = 3) -> str:
         return "–"
     if isinstance(value, str):
         return value
-    if isinstance(value, int):
-        return f"{value:,}".replace(",", "\u202f")
-    return f"{value:.{digits}f}"
+    whole = isinstance(value, int)
+    return f"{value:,}".replace(",", "\u202f") if whole else f"{value:.{digits}f}"

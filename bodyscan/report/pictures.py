@@ -52,8 +52,7 @@ def draw_pictures(body: BodyCloud | BodyMesh) -> Pictures:
 
 def write_pictures(pictures: Iterable[Pictures], folder: Path) -> Outcome[list[Path]]:
     """Write a scan's pictures beside its result. One that cannot be drawn or written is noted."""
-    written: list[Path] = []
-    notes: list[str] = []
+    written, notes = list[Path](), list[str]()
     for some in pictures:
         notes += some.notes
         for name, content in some.value.items():

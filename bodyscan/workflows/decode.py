@@ -200,13 +200,18 @@ def describe_failures(
 ) -> tuple[dict[str, str], list[str]]:
     """Pairs that failed in every shot, with the first few reasons that differ outside of brackets;
     and, of pairs that are good in some shot, one line for each reason."""
-    found = [(sequence, format_error(error)) for sequence, error in failures.items()]
-    notes = list(list_fault_notes({one: [why] for one, why in found if one.pair in good}))
     reasons: dict[str, dict[str, str]] = defaultdict(dict)
-    for pair, reason in _group_faults(each for each in found if each[0].pair not in good):
-        reasons[pair].setdefault(reason.partition(" (")[0], reason)
-    failed = {pair: _join(list(found.values())[:3]) for pair, found in reasons.items()}
-    return failed, notes
+    notes = []
+    groups = _group_faults((sequence, format_error(error)) for sequence, error in failures.items())
+    for (pair, reason), group in groups.items():
+        if pair not in good:
+            reasons[pair].setdefault(reason.partition(" (")[0], reason)
+        elif len(group) == 1:
+            notes.append(str(failures[group[0]]))
+        else:
+            shots = ", ".join(sequence.shot for sequence in group)
+            notes.append(f"{pair}: {reason}\n  in {len(group)} shots: {shots}")
+    return {pair: _join([*found.values()][:3]) for pair, found in reasons.items()}, notes
 
 
 def _join(reasons: Sequence[str]) -> str:

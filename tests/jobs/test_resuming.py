@@ -139,11 +139,9 @@ def test_a_full_disk_is_said_and_survived(
     assert full.code == 1
     assert "Traceback" not in full.errors
     ends = full.endings()
-    aside = [name for name, end in ends.items() if end["state"] == "set aside"]
-    assert aside
-    for name in aside:
-        reason = ends[name]["reason"]
-        assert "disk is full" in reason or "No space" in reason
+    reasons = [end["reason"] for end in ends.values() if end["state"] == "set aside"]
+    assert reasons
+    assert all("disk is full" in reason or "No space" in reason for reason in reasons)
     for path in out.glob("*/scan"):
         assert (path / "stage.json").exists(), "half-made results under their right name"
     ballast.unlink()

@@ -52,8 +52,8 @@ def run_cheap(scans: Path, out: Path, workers: int = 2) -> Done:
     try:
         with redirect_stdout(told):
             code = cheap_job.batch(scans, out, workers)
-    except BodyscanError as error:
-        code, errors = error.exit_code, str(error)
+    except (BodyscanError, OSError) as error:
+        code, errors = getattr(error, "exit_code", 1), str(error)
     return Done(code, [json.loads(line) for line in told.getvalue().splitlines()], errors)
 
 

@@ -92,7 +92,7 @@ if __name__ == "__main__":
     if sys.argv[1] == "batch":
         try:
             sys.exit(batch(Path(sys.argv[2]), Path(sys.argv[3]), int(sys.argv[4])))
-        except BodyscanError as error:  # as bodyscan.cli.main does
+        except (BodyscanError, OSError) as error:  # as bodyscan.cli.main does
             print(f"error: {error}", file=sys.stderr)
-            sys.exit(error.exit_code)
+            sys.exit(getattr(error, "exit_code", 1))
     sys.exit(main(kinds()))

@@ -74,7 +74,7 @@ def test_a_fault_is_one_whatever_its_share_of_the_pixels() -> None:
 
 def test_many_shots_with_one_fault_share_a_note() -> None:
     _, (note,) = describe_failures(failures("p1", "too dark", "a", "b", "c", "d"), {"p1"})
-    assert note == "p1, shots a, b, c, d: too dark\n  do something"
+    assert note == "p1: too dark\n  do something\n  in 4 shots: a, b, c, d"
 
 
 def test_a_crop_shows_the_same_boundaries_as_the_whole(tmp_path: Path) -> None:
@@ -165,7 +165,7 @@ def test_a_sequence_that_fails_is_a_note_and_notes_are_in_the_order_of_shots(
     views = [BoardView(s.pair, s.shot, "board", np.arange(4), np.zeros((4, 2))) for s in sequences]
     every = decode.decode_on_boards(rig, captures, views)
     assert list(every.value) == [("p1", "a", "board"), ("p2", "b", "board"), ("p1", "b", "board")]
-    assert every.notes[0].startswith("p2, shot a: is bad")
+    assert every.notes[0].startswith("pair p2, shot a: is bad")
     assert "shots a, b: an image is missing" in every.notes[1]
     assert every.failures == {}
 
