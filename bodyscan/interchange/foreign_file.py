@@ -142,22 +142,23 @@ class ForeignFile:
             raise self.error(str(error), name, "calibrate it with a supported lens") from None
 
     def _is_fisheye(self, around: Mapping[str, Any], owner: str) -> bool:
-        found = False
+        words: dict[bool, str] = {}  # a key that says whether it is one
         for key, value in around.items():
-            word = re.sub(r"[^a-z0-9]", "", str(value).lower())
-            if "fisheye" in key.lower():
-                found |= word in ("true", "1", "yes")
+            word, name = re.sub(r"[^a-z0-9]", "", str(value).lower()), f"{owner}.{key}".strip(".")
+            if "fisheye" in key.lower() and word in ("true", "1", "yes", "false", "0", "no"):
+                words[word in ("true", "1", "yes")] = name
             elif LENS_KEYS.search(key) and isinstance(value, str) and word:
-                kinds = [kind for kind, words in LENS_WORDS.items() if re.fullmatch(words, word)]
-                found |= "fisheye" in kinds
+                kinds = [kind for kind, some in LENS_WORDS.items() if re.fullmatch(some, word)]
                 is_model = re.search("distortion_?(model|type)", key, re.IGNORECASE)
+                if "fisheye" in kinds or (is_model and "polynomial" in kinds):
+                    words["fisheye" in kinds] = name
                 if "other" in kinds or (is_model and not kinds):
-                    raise self.error(
-                        f"{value!r} is a lens that is not supported",
-                        f"{owner}.{key}".removeprefix("."),
-                        "calibrate it with plumb_bob (radtan), rational_polynomial or equidistant",
-                    )
-        return found
+                    remedy = "use plumb_bob (radtan), rational_polynomial or equidistant"
+                    raise self.error(f"{value!r} is a lens that is not supported", name, remedy)
+        if len(words) > 1:
+            what = f"contradicts {words[True]}: is the lens a fisheye or not?"
+            raise self.error(what, words[False], "leave out the one that is wrong")
+        return True in words
 
     def size(self, value: Any, name: str) -> tuple[int, int]:
         """Width and height of an image, px."""

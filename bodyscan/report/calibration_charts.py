@@ -177,7 +177,8 @@ def build_rig_model(calibration: RigCalibration) -> dict[str, object]:
         corners = np.array([[-0.5, -0.5], [right, -0.5], [right, bottom], [-0.5, bottom]])
         far = pose.apply(220.0 * np.nan_to_num(camera.rays(corners)))
         sides = np.stack([np.broadcast_to(pose.translation, far.shape), far], axis=1)
-        parts.append((np.concatenate([sides, _close(far)]), _convert_to_rgb(colours[name])))
+        rgb = np.frombuffer(bytes.fromhex(colours[name][1:]), np.uint8)
+        parts.append((np.concatenate([sides, _close(far)]), rgb))
     for (_, board_name), rig_from_board in calibration.rig_from_board.items():
         board = calibration.rig.board(board_name)
         x, y = board.size_mm
@@ -203,10 +204,6 @@ def build_rig_model(calibration: RigCalibration) -> dict[str, object]:
 def _close(corners: Array) -> Array:
     """Sides (N, 2, 3) of a polygon (N, 3)."""
     return np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
-
-
-def _convert_to_rgb(colour: str) -> Bytes:
-    return np.array([int(colour[k : k + 2], 16) for k in (1, 3, 5)], np.uint8)
 
 
 def compute_sigma_at(

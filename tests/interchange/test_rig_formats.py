@@ -393,6 +393,8 @@ ROS_NODES = {"matrix": "camera_matrix", "distortion": "distortion_coefficients"}
         ("distortion_model: MODEL", "distortion_type: fisheye", Fisheye(-0.2, 0.05)),
         ("distortion_model: MODEL", "isFisheye: true", Fisheye(-0.2, 0.05)),
         ("distortion_model: MODEL", "model_type: MEI", None),
+        ("MODEL", "plumb_bob\nis_fisheye: true", None),
+        ("distortion_model: MODEL", "fisheye: 0\nmodel: equidistant", None),
     ],
 )
 def test_words_beside_coefficients_decide_the_lens(
@@ -401,7 +403,7 @@ def test_words_beside_coefficients_decide_the_lens(
     path = tmp_path / "ros.yaml"
     path.write_text(ROS_CAMERA.replace(old, new))
     if lens is None:
-        with pytest.raises(CalibrationFileError, match=r":3: \w+: '.*' is a lens"):
+        with pytest.raises(CalibrationFileError, match=r":3: \w+: ('.*' is a lens|contradicts)"):
             read_nodes(path, ROS_NODES)
     else:
         assert read_nodes(path, ROS_NODES).lens == lens
