@@ -14,7 +14,6 @@ from types import MappingProxyType
 from typing import TypeVar
 
 import numpy as np
-from scipy.stats import rankdata
 
 from bodyscan.alignment.displaced_poles import STILL_MM
 from bodyscan.alignment.icp import Alignment
@@ -289,9 +288,10 @@ class _Solution:
         if not stated or len(stated) < len(seconds):
             return TimeFit()
         others = [(f"{f:g} x", [f * second for second in stated]) for f in (0.1, 10.0)]
-        for order in _propose_orders(sides)[::2]:
-            if np.any(rankdata(order) != rankdata(stated)):
-                others.append(("in another order than", order))
+        if (
+            np.ptp(stated) == 0.0
+        ):  # other orders than one stated also suit poles that are all displaced
+            others += [("in another order than", order) for order in _propose_orders(sides)[::2]]
         now, *found = map_threads(self.log_evidence, [stated, *(one for _, one in others)])
         name, other = others[int(np.argmax(found))]
         if max(found) <= now + MIN_LOG_RATIO:
