@@ -285,7 +285,7 @@ def locate_boundaries_on_boards(
     striped = sum(len(part.index) > 0 for part in parts)
     if striped < 2:
         raise PairFailed(
-            f"stripes were decoded on {striped} board poses, a light plane needs at least two",
+            f"stripes were decoded on {striped} of {len(parts)} board poses, a light plane needs two",
             where=f"pair {name}",
             remedy="capture the stripe sequence on the board in three or more poses",
         )
