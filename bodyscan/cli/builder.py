@@ -31,18 +31,9 @@ PANEL = "Builder: calibrate a rig"
 
 def register(app: typer.Typer) -> None:
     """Add these commands to the command line, in the order in which a rig needs them."""
-    for command in (
-        init,
-        check,
-        patterns,
-        calibrate_rig,
-        import_,
-        check_calibration,
-        accept_changed,
-        refine_rig,
-        sigma_map,
-        export_rig,
-    ):
+    making = (init, check, patterns, calibrate_rig, import_)
+    keeping = (check_calibration, accept_changed, refine_rig, sigma_map, export_rig)
+    for command in (*making, *keeping):
         add_command(app, PANEL, command)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.errors import BadInput
+from bodyscan.mesh.slices import MeshSlicer
 from bodyscan.mesh.topology import (
     UNSOUND,
     compute_face_areas,
@@ -55,6 +56,9 @@ def read_surface(
         raise BadInput(fault, where=str(path), remedy=remedy)
     vertices, faces, notes = _mend(vertices, faces)
     refuse_size(vertices, path, unit, sizes_mm, along)
+    if _is_upside_down(vertices, faces):
+        what = "has two feet at its top and a head below: it stands on its head, or -z is up"
+        raise BadInput(what, where=str(path), remedy="turn it so that z is up")
     tall = UNITS_MM[unit] * float(np.ptp(vertices[:, 2]))
     notes.append(f"taken as {unit}, z up: {tall:,.0f} mm tall")
     return Outcome((vertices, faces), tuple(f"{path}: {note}" for note in notes))
@@ -88,6 +92,13 @@ def refuse_size(
             where=str(path),
             remedy="turn it so that z is up",
         )
+
+
+def _is_upside_down(vertices: Array, faces: Indices) -> bool:
+    """Whether there are two feet at the top and one head below; raised hands have feet below."""
+    slicer = MeshSlicer(vertices - vertices.min(axis=0), faces)
+    heights = np.multiply((0.03, 0.06, 0.94, 0.97), np.ptp(vertices[:, 2])).tolist()
+    return [sum(loop.area_mm2 > 0.0 for loop in slicer.slice(z)) for z in heights] == [1, 1, 2, 2]
 
 
 def _mend(vertices: Array, faces: Indices) -> tuple[Array, Indices, list[str]]:
