@@ -95,9 +95,10 @@ def find_camera(cameras: FoundCameras, name: str, where: str) -> FoundCamera:
             usable.append(other)
         except CalibrationFileError as error:
             reasons.append(f"{other} cannot be used ({error.where}: {error.what})")
-    reasons[8:] = ["say which is meant in the rig file"]  # more cannot be read at a glance
+    has = f"it has {', '.join(usable) or 'none that can be used'}"
     raise CalibrationFileError(
         f"has no camera {name!r}{did_you_mean(name, cameras)}",
         where=where,
-        remedy="; ".join([f"it has {', '.join(usable) or 'none that can be used'}", *reasons]),
+        # More reasons than eight cannot be read at a glance.
+        remedy="; ".join([has, *reasons[:8], "say which is meant in the rig file"]),
     )

@@ -358,6 +358,7 @@ def compute_girth_sigmas(
     Only what cells within `near_mm` of height share does, by the angle that a tape turns at each.
     """
     kernel = np.exp(-0.5 * ((centres[:, None, 2] - centres[:, 2]) / near_mm) ** 2)
+    # Cells that face alike, within 0.2 rad, share one piece of the tape.
     heading = np.arctan2(normals[:, 1], normals[:, 0])
     near = np.exp((np.cos(heading[:, None] - heading) - 1.0) / 0.2**2)
     kernel /= np.sum(kernel * near, axis=0)

@@ -288,9 +288,8 @@ class _Solution:
         if not stated or len(stated) < len(seconds):
             return TimeFit()
         others = [(f"{f:g} x", [f * second for second in stated]) for f in (0.1, 10.0)]
-        if (
-            np.ptp(stated) == 0.0
-        ):  # other orders than one stated also suit poles that are all displaced
+        # Where an order is stated, others also suit poles that are all displaced.
+        if np.ptp(stated) == 0.0:
             others += [("in another order than", order) for order in _propose_orders(sides)[::2]]
         now, *found = map_threads(self.log_evidence, [stated, *(one for _, one in others)])
         name, other = others[int(np.argmax(found))]

@@ -75,11 +75,11 @@ def _read_model(path: Path) -> FoundCamera:
     file = ForeignFile.read(path)
     content = _parse_literal(file)
     model = str(content.get("lensmodel", content.get("distortion_model", "")))
-    kind = re.sub(r"^(LENSMODEL|DISTORTION)_", "", model).replace("NONE", "PINHOLE")
+    kind = re.sub("^NONE$", "PINHOLE", re.sub(r"^(LENSMODEL|DISTORTION)_", "", model))
     pose_key = "extrinsics" if "extrinsics" in content else "rt_cam_ref"
     file.require(content, ("intrinsics", pose_key, "imagersize"), "")
     if kind not in COEFFICIENTS:
-        remedy = f"mrcal-convert-lensmodel makes LENSMODEL_ {', '.join(COEFFICIENTS)}"
+        remedy = f"mrcal-convert-lensmodel makes one of {', '.join(COEFFICIENTS)}"
         raise file.error(f"{model!r} is a lens that is not supported", "lensmodel", remedy)
     numbers = file.numbers(content["intrinsics"], "intrinsics", 4 + COEFFICIENTS[kind])
     matrix = file.pinhole_matrix(numbers[:4], "intrinsics")

@@ -184,9 +184,8 @@ def replace_flashed(images: ScanLines) -> tuple[ScanLines, str]:
         sound, flashed = sorted(light, key=lambda name: light[name])
         where, typical = "all over", 0.0
         if not (abs(added) > 0.05 and light[sound] < 0.25 * abs(added) < light[flashed]):
-            # In a part of the picture: there a sound frame is never brighter than lit, a flashed one is
-            # where it is white.
-            # Four frames of a dim picture add up to noise of 2.5 levels: ten are four sigmas.
+            # In a part, beyond four sigmas (10 levels) of four frames' noise in a dim picture: there a
+            # sound frame is never brighter than lit, and a flashed one is where it is white.
             part = sum_errors - added > np.maximum(0.25, 10.0 / contrast)
             over = {
                 name: np.mean(share[part] > 1.15) for name, share in shares.items() if part.any()
