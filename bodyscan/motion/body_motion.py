@@ -38,15 +38,12 @@ class BodyMotion:
     """Gaussian estimate of the n amplitudes of all kinds of motion."""
 
     kinds: tuple[MotionKind, ...]
-    fields: Array  # of all kinds, (C, 12, M)
-    amplitudes: Array  # of the fields along their temporal modes, (n,)
+    amplitudes: Array  # of the kinds' fields along their temporal modes, (n,)
     # information, vector: normal equations of the overlaps without prior; the matrix's lower
     # triangle, (n, n), and (n,).
     information: Array
     vector: Array
-    # Lower Cholesky factor (n, n) of the posterior information in units of `units` (n,).
-    factor: Array
-    units: Array
+    factor: Array  # lower Cholesky factor of the posterior information, (n, n)
     breaths: Breaths
     breath: BreathEstimate | None = None  # see `estimate_breath`; None at rest
 
@@ -62,9 +59,8 @@ class BodyMotion:
         kinds = build_kinds(cells, seconds, middle_s, boards, sway)
         count = sum(kind.count for kind in kinds)
         matrix, vector = np.zeros((count, count)), np.zeros(count)
-        fields = np.concatenate([kind.fields for kind in kinds], axis=2)
         breaths = Breaths.from_modes(kinds[-1].modes, seconds, middle_s)
-        return BodyMotion(kinds, fields, vector, matrix, vector, matrix, np.ones(count), breaths)
+        return BodyMotion(kinds, vector, matrix, vector, matrix, breaths)
 
     def with_times(
         self,
@@ -75,9 +71,8 @@ class BodyMotion:
         """At rest at other times of the pairs, without some kinds of motion."""
         kinds = retime_kinds(self.kinds, seconds, middle_s, omitted)
         vector = np.zeros(sum(kind.count for kind in kinds))
-        fields = np.concatenate([kind.fields for kind in kinds], axis=2)
         breaths = Breaths.from_modes(kinds[-1].modes, seconds, middle_s)
-        return replace(self, kinds=kinds, fields=fields, amplitudes=vector, breaths=breaths)
+        return replace(self, kinds=kinds, amplitudes=vector, breaths=breaths)
 
     def with_step(self, names: Sequence[str], members: Mask, size_mm: float) -> BodyMotion:
         """At rest, with one more kind `step`: a displacement along the named kinds' fields in the views
@@ -90,9 +85,12 @@ class BodyMotion:
         precision = np.eye(fields.shape[2]) / size_mm**2
         step = MotionKind("step", fields, modes, precision=precision)
         kinds = (*self.kinds[:-1], step, self.kinds[-1])
-        vector = np.zeros(sum(kind.count for kind in kinds))
-        fields = np.concatenate([kind.fields for kind in kinds], axis=2)
-        return replace(self, kinds=kinds, fields=fields, amplitudes=vector)
+        return replace(self, kinds=kinds, amplitudes=np.zeros(sum(kind.count for kind in kinds)))
+
+    @cached_property
+    def fields(self) -> Array:
+        """Of all kinds, (C, 12, M)."""
+        return np.concatenate([kind.fields for kind in self.kinds], axis=2)
 
     @cached_property
     def slices(self) -> tuple[slice, ...]:
@@ -103,21 +101,20 @@ class BodyMotion:
     def whiten(self, columns: Array) -> Array:
         """W (n, K) such that W^T W is the posterior covariance of the columns' (n, K) combinations of
         amplitudes."""
-        scaled = np.asfortranarray(self.units[:, None] * columns)
-        return np.asarray(dtrtrs(self.factor, scaled, lower=True, overwrite_b=True)[0])
+        return np.asarray(dtrtrs(self.factor, columns, lower=True)[0])
 
     @property
     def variances(self) -> Array:
         """Posterior variances of the amplitudes, (n,)."""
         inverse = dtrtri(self.factor, lower=True)[0]
-        return np.asarray(np.einsum("ij,ij->j", inverse, inverse) * self.units**2)
+        return np.asarray(np.einsum("ij,ij->j", inverse, inverse))
 
     @property
     def log_evidence(self) -> float:
         """Of the overlaps under the present prior variances, relative to a body that nothing moved."""
         gain = float(self.vector @ self.amplitudes) - 2.0 * np.sum(np.log(np.diag(self.factor)))
         priors = sum(float(np.linalg.slogdet(kind.prior_information)[1]) for kind in self.kinds)
-        return 0.5 * (gain + 2.0 * float(np.sum(np.log(self.units))) + priors)
+        return 0.5 * (gain + priors)
 
     def kind(self, name: str) -> MotionKind:
         return next(kind for kind in self.kinds if kind.name == name)
@@ -268,18 +265,18 @@ class BodyMotion:
         return LinearGaussianSystem(information, vector).project(self.fields[equations.cells])
 
     def _solve(self) -> BodyMotion:
-        """Solve the normal equations with the prior, in place by LAPACK."""
+        """Solve the normal equations with the prior, in place by LAPACK.
+
+        The unknowns' units do not matter to Cholesky's method (Demmel 1989): nothing is scaled.
+        """
         matrix = self.information.copy(order="F")
         for kind, block in zip(self.kinds, self.slices, strict=True):
             matrix[block, block] += kind.prior_information
-        units = 1.0 / np.sqrt(np.diag(matrix))
-        matrix *= units[:, None]
-        matrix *= units
         factor, failed = dpotrf(matrix, lower=True, overwrite_a=True)
         if failed:
             raise np.linalg.LinAlgError("the overlaps do not determine the motion")
-        amplitudes = units * cho_solve((factor, True), units * self.vector, check_finite=False)
-        return replace(self, amplitudes=amplitudes, factor=factor, units=units)
+        amplitudes = cho_solve((factor, True), self.vector, check_finite=False)
+        return replace(self, amplitudes=amplitudes, factor=factor)
 
     def _estimate_breath(self) -> BodyMotion:
         """Estimate the breath, and set its prior covariance, marginalized over all other motion.
@@ -291,7 +288,7 @@ class BodyMotion:
         if breath.name != "breath":
             return self
         # Of the last amplitudes the corner of the factor is that of their marginal information.
-        corner = self.factor[block, block] / self.units[block, None]
+        corner = self.factor[block, block]
         posterior = corner @ corner.T
         system = LinearGaussianSystem(
             posterior - breath.prior_information, posterior @ self.amplitudes[block]
@@ -357,10 +354,13 @@ def compute_girth_sigmas(
 
     Only what cells within `near_mm` of height share does, by the angle that a tape turns at each.
     """
-    kernel = np.exp(-0.5 * ((centres[:, None, 2] - centres[:, 2]) / near_mm) ** 2)
+    # In single precision: (C, C) weights, to a millionth.
+    heights, errors = centres[:, 2].astype(np.float32), errors.astype(np.float32)
+    kernel = np.exp(-0.5 * ((heights[:, None] - heights) / np.float32(near_mm)) ** 2)
     # Cells that face alike, within 0.2 rad, share one piece of the tape.
-    heading = np.arctan2(normals[:, 1], normals[:, 0])
-    near = np.exp((np.cos(heading[:, None] - heading) - 1.0) / 0.2**2)
+    level = normals[:, :2].astype(np.float32)
+    level /= np.maximum(np.linalg.norm(level, axis=1, keepdims=True), np.float32(1e-6))
+    near = np.exp((level @ level.T - 1.0) / np.float32(0.2**2))
     kernel /= np.sum(kernel * near, axis=0)
     sigma = np.linalg.norm(errors, axis=1)
     return sigma * np.linalg.norm(kernel @ errors, axis=1) / np.maximum(kernel @ sigma, 1e-12)
