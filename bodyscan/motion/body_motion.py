@@ -174,11 +174,11 @@ class BodyMotion:
         return dict(zip(equations, systems, strict=True))
 
     def solve_projected(
-        self, projected: Mapping[tuple[int, int], LinearGaussianSystem]
+        self, projected: Mapping[tuple[int, int], LinearGaussianSystem], updates: int = 3
     ) -> BodyMotion:
         """Estimate all amplitudes, and each kind's prior variance, in one Gauss-Newton step.
 
-        projected: by pairs (a, b), see `project`.
+        projected: by pairs (a, b), see `project`. updates: of the variances; coarse rounds need one.
         """
         matrices = np.array([system.information for system in projected.values()])
         vectors = np.array([system.vector for system in projected.values()])
@@ -197,7 +197,7 @@ class BodyMotion:
                 ).reshape(kind.count, other.count)
         motion = replace(self, information=information, vector=total)
         motion = motion._solve()._estimate_breath()._solve()
-        for _ in range(3):  # variances that the overlaps do not require shrink step by step
+        for _ in range(updates):  # variances that the overlaps do not require shrink step by step
             motion = motion._update_prior_variances()._solve()
         return motion
 

@@ -371,7 +371,7 @@ def _solve(
         projected = _project_overlaps(points, (motion, cells), reach, settings)
         if not projected:
             return None
-        motion = motion.solve_projected(projected)
+        motion = motion.solve_projected(projected, updates=3 if remaining == 1 else 1)
         reach = max(reach / 2.0, settings.min_reach_mm)
         if remaining == ROUNDS - 1:
             # Calibrations warp surfaces by half of 0.1 mm; so little motion does no harm.
