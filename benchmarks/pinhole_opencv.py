@@ -50,6 +50,8 @@ def fit_pinhole_opencv(
         | cv2.CALIB_FIX_K2
         | cv2.CALIB_FIX_K3
     )
+    # Without that flag the terms of a lens's denominator are taken to be zero.
+    rational = cv2.CALIB_RATIONAL_MODEL if np.any(lens.ravel()[5:]) else 0
     for _ in range(rounds):
         imputed = []
         for place, row in zip(places, rows, strict=True):
@@ -68,7 +70,7 @@ def fit_pinhole_opencv(
             matrix.copy(),
             np.zeros(5),
             size,
-            flags=cv2.CALIB_FIX_INTRINSIC,
+            flags=cv2.CALIB_FIX_INTRINSIC | rational,
         )
         rotation, translation = solved[5], solved[6]
     whole = matrix @ np.column_stack([rotation, translation])
