@@ -311,15 +311,10 @@ def _step(
 ) -> tuple[BodyShapeAndPose, float]:
     """One Gauss-Newton step of pose and shape, and the cost before it; sigma_mm: of a distance."""
     moving = region.moving
-    precision = np.concatenate(
-        [
-            np.full(3, 1e-6),
-            np.repeat(_compute_joint_precision(template), 3),
-            np.ones(len(template.shapes)),
-        ]
-    )
+    joints = np.radians([JOINT_DEG[drop_side(one)] for one in template.joint_names]) ** -2.0
+    shapes = np.ones(len(template.shapes))
+    precision = np.concatenate([np.full(3, 1e-6), np.repeat(joints, 3), shapes])[moving]
     here = np.concatenate([np.zeros(3), body.rotations.ravel(), body.shape])[moving]
-    precision = precision[moving]
     information, gradient = np.diag(precision), precision * here
     cost = float(precision @ here**2)
     for some in matches:
@@ -337,10 +332,6 @@ def _step(
     step[moving] = np.linalg.solve(information, -gradient)
     moved = body.add_step(step)
     return replace(moved, shape=np.clip(moved.shape, -4.0, 4.0)), cost
-
-
-def _compute_joint_precision(template: BodyTemplate) -> Array:
-    return np.array([np.radians(JOINT_DEG[drop_side(one)]) ** -2.0 for one in template.joint_names])
 
 
 def differentiate(

@@ -51,6 +51,11 @@ class RegisteredBody:
         return self.rig_from_body.inverse().apply(self.mesh.vertices)
 
     @cached_property
+    def measured_tree(self) -> KDTree:
+        """Of the scan's measured vertices."""
+        return KDTree(self.vertices[np.isfinite(self.mesh.sigma_mm)])
+
+    @cached_property
     def parts(self) -> Bytes:
         """Part (N,) of each vertex of the scan's mesh: that of the closest vertex of the template."""
         template, normals = self.fitted.template, self.mesh.normals.astype(np.float64)

@@ -12,7 +12,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.body_model.registered import RegisteredBody
@@ -80,8 +79,8 @@ def find_landmarks(body: RegisteredBody) -> dict[str, Landmark]:
             part = int(template.parts[vertex])
             spots[name] = _climb(body, part, direction, spots[name])
     spots |= _find_ends(body, spots)
-    observed = KDTree(body.vertices[np.isfinite(body.mesh.sigma_mm)])
-    away_mm = np.asarray(observed.query(np.array([one.position for one in spots.values()]))[0])
+    positions = np.array([one.position for one in spots.values()])
+    away_mm = np.asarray(body.measured_tree.query(positions)[0])
     # Sigmas were measured with 36 mm and less between a landmark and what was measured.
     far = [name for name, away in zip(spots, away_mm, strict=True) if away > 40.0]
     spots |= {name: replace(spots[name], found="unseen") for name in far}

@@ -28,7 +28,7 @@ from typing import Any
 
 import numpy as np
 import yaml
-from scipy.spatial import ConvexHull, cKDTree
+from scipy.spatial import ConvexHull
 
 from bodyscan.arrays import Array
 from bodyscan.body_model.fitting import BASIS_MM
@@ -37,11 +37,12 @@ from bodyscan.measurement.landmarks import LANDMARK_INFLATION, Landmark, drop_un
 from bodyscan.measurement.posture import Posture, find_posture
 from bodyscan.measurement.sections import UP, BodySections, Section
 from bodyscan.mesh.body import BodyMesh
+from bodyscan.mesh.slices import compute_hull_perimeter
 
 CROWN_MM = 20.0
 """Height of the crown below the top."""
 MIN_MEASURED = 0.9
-"""Share of a girth that has to be measured for a single number: a tenth of a waist is 80 mm."""
+"""Share of a girth that has to be measured for a single number, unless the template closes the rest."""
 
 
 @dataclass(frozen=True)
@@ -52,19 +53,14 @@ class Measure:
     kind: str  # one of those above
     mm: float
     interval_mm: tuple[float, float]
-    # Share of what the tape touches, or of both ends of a breadth or depth, that was measured; with
-    # less than MIN_MEASURED the measure is the interval rather than the value.
+    # Share of what the tape touches, or of both ends of a breadth or depth, that was measured.
     measured: float
+    is_range: bool  # whether too little was measured for a single number: then it is the interval
     standard: str
     clause: str
     definition: str
     stance: str  # what the standard wants otherwise than the person stood; "" if nothing
     path_mm: Array = field(compare=False, repr=False)  # (N, 3), where it runs, rig frame
-
-    @property
-    def is_range(self) -> bool:
-        """Whether too little was measured for a single number."""
-        return self.measured < MIN_MEASURED
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,15 +86,12 @@ class _Body:
         """Sigma of the surface at a point."""
         return float(np.median(self.sections.noise_mm))
 
-    @cached_property
-    def _tree(self) -> cKDTree:
-        return cKDTree(self.sections.body.vertices, compact_nodes=False, balanced_tree=False)
-
     def find_length_noise(self, names: Sequence[str]) -> float:
         """Sigma, mm, of the distance between landmarks due to the surface there. Raises _NotThere where
         pairs disagree by more than the template's shapes lack: it may be laid over either."""
-        nearest = self._tree.query(np.array([self.landmarks[name] for name in names]))[1]
-        worst = float(self.sections.noise_mm[nearest].max())
+        positions, body = np.array([self.landmarks[name] for name in names]), self.sections.body
+        sigma_mm = body.mesh.sigma_mm[np.isfinite(body.mesh.sigma_mm)]
+        worst = float(sigma_mm[body.measured_tree.query(positions)[1]].max())
         if 2.0 * worst > BASIS_MM:
             raise _NotThere(f"pairs disagree by {2.0 * worst:.0f} mm at its landmarks")
         return float(np.sqrt(2.0)) * max(worst, self.noise_mm)
@@ -107,13 +100,14 @@ class _Body:
 @dataclass(frozen=True, eq=False)
 class _Taken:
     """A value, the share of it that was measured, sigma due to surface and breath alone, path (N, 3),
-    body frame, and the least that it can be."""
+    body frame, the least that it can be, and how much (95 %) is open by what was not measured."""
 
     mm: float
     measured: float
     sigma_mm: float
     path: Array
     min_mm: float = np.inf
+    open_mm: float = np.inf
 
 
 @cache
@@ -183,7 +177,10 @@ def _take(body: _Body, definition: Mapping[str, Any], posture: Posture) -> Measu
     margin = 1.96 * taken.sigma_mm
     low = taken.mm - float(np.hypot(taken.mm - min([taken.mm, *moved]), margin))
     high = taken.mm + float(np.hypot(max([taken.mm, *moved]) - taken.mm, margin))
-    if taken.measured < MIN_MEASURED:
+    # Gaps that are narrow, or flat, are closed to some millimetres; 8 are what girths may be off by in
+    # one case of twenty.
+    is_range = taken.measured < MIN_MEASURED and taken.open_mm > 8.0
+    if is_range:
         low = min(low, taken.min_mm)
     return Measure(
         definition["name"],
@@ -191,6 +188,7 @@ def _take(body: _Body, definition: Mapping[str, Any], posture: Posture) -> Measu
         taken.mm,
         (low, high),
         taken.measured,
+        is_range,
         definition["standard"],
         str(definition.get("clause", "")),
         definition["definition"],
@@ -215,18 +213,11 @@ def _height(body: _Body, definition: Mapping[str, Any], shift_mm: float) -> _Tak
 
 
 def _distance(body: _Body, definition: Mapping[str, Any], shift_mm: float) -> _Taken:
-    one, other = (body.landmarks[name] for name in definition["landmarks"])
-    axis = definition.get("axis")
-    gap = other - one if axis is None else (other - one)["xyz".index(axis)]
-    length = float(np.linalg.norm(gap))
-    return _Taken(
-        length, 1.0, body.find_length_noise(definition["landmarks"]), np.array([one, other])
-    )
-
-
-def _chain(body: _Body, definition: Mapping[str, Any], shift_mm: float) -> _Taken:
     points = np.array([body.landmarks[name] for name in definition["landmarks"]])
-    length = float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+    gaps = np.diff(points, axis=0)
+    if axis := definition.get("axis"):
+        gaps = gaps[:, ["xyz".index(axis)]]
+    length = float(np.linalg.norm(gaps, axis=1).sum())
     return _Taken(length, 1.0, body.find_length_noise(definition["landmarks"]), points)
 
 
@@ -255,7 +246,10 @@ def _girth(body: _Body, definition: Mapping[str, Any], shift_mm: float) -> _Take
     cut = cuts[0 if best is None else int(best([cut.tape_mm for cut in cuts]))]
     hull = ConvexHull(cut.points).vertices
     path = cut.positions[np.append(hull, hull[0])]
-    return _Taken(cut.tape_mm, cut.tape_measured, cut.sigma_mm, path, cut.min_tape_mm)
+    observed, unseen_mm = cut.points[cut.observed], cut.unseen_sigma_mm
+    straight_mm = compute_hull_perimeter(observed) if len(observed) else 0.0
+    sigma_mm = float(np.hypot(cut.measured_sigma_mm, unseen_mm))
+    return _Taken(cut.tape_mm, cut.tape_measured, sigma_mm, path, straight_mm, 1.96 * unseen_mm)
 
 
 def _extent(body: _Body, definition: Mapping[str, Any], shift_mm: float) -> _Taken:
@@ -268,7 +262,7 @@ def _extent(body: _Body, definition: Mapping[str, Any], shift_mm: float) -> _Tak
     path = cut.positions[ends]
     path[:, 1 - axis] = path[:, 1 - axis].mean()
     measured = float(cut.observed[ends].mean())
-    sigma_mm = np.hypot(cut.sigma_mm / np.pi, 2.0 * BASIS_MM * (1.0 - measured))
+    sigma_mm = np.hypot(cut.measured_sigma_mm / np.pi, 2.0 * BASIS_MM * (1.0 - measured))
     return _Taken(float(np.ptp(values)), measured, float(sigma_mm), path)
 
 
@@ -314,7 +308,7 @@ def _tape(body: _Body, definition: Mapping[str, Any], shift_mm: float) -> _Taken
 _KINDS = {
     "height": _height,
     "distance": _distance,
-    "chain": _chain,
+    "chain": _distance,
     "girth": _girth,
     "breadth": _extent,
     "depth": _extent,

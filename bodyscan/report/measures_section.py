@@ -42,7 +42,8 @@ def show_measures(scan: StoredScan, folder: Path) -> list[Block]:
     content = _read_measures(folder)
     if content is None:
         content = make_measurements_document(measure(scan.mesh, named=True), scan.facts)
-    measures: list[Content] = content["measures"]
+    # Files of 0.2 do not say whether a measure is a range.
+    measures = [{"is_range": one["measured"] < MIN_MEASURED} | one for one in content["measures"]]
     posture = content["posture"]
     arms, feet = (" and ".join(f"{a:.0f}" for a in posture[k]) for k in ("arms_deg", "feet_deg"))
     stood = (
@@ -55,7 +56,9 @@ def show_measures(scan: StoredScan, folder: Path) -> list[Block]:
     return [
         f"A parametric body was laid over the scan; it says where to measure. {stood}",
         Picture(
-            "Measures on the body", f"{views}mm.", draw_callouts(small, _list_callouts(content))
+            "Measures on the body",
+            f"{views}mm.",
+            draw_callouts(small, _list_callouts(content, measures)),
         ),
         Viewer(
             "The same, to turn",
@@ -84,8 +87,8 @@ def _read_measures(folder: Path) -> Content | None:
 def _tabulate(measures: Sequence[Content]) -> Table:
     columns = (
         Column("measure"),
-        Column("value", "mm", "Empty where a tenth or more was not measured: then it is a range.",
-               digits=1),
+        Column("value", "mm", "Empty where what was not measured may change it by more than 8 mm: then "
+               "it is a range.", digits=1),
         Column("from", "mm", "95 % interval: noise, breath, where the landmarks are.", digits=1),
         Column("to", "mm", digits=1),
         Column("measured", "%", "of what the tape touches", 100.0 * MIN_MEASURED, True, 0),
@@ -96,7 +99,7 @@ def _tabulate(measures: Sequence[Content]) -> Table:
     rows = tuple(
         (
             one["name"],
-            one["mm"] if one["measured"] >= MIN_MEASURED else None,
+            None if one["is_range"] else one["mm"],
             *one["interval_mm"],
             100.0 * one["measured"],
             one["standard"],
@@ -108,18 +111,16 @@ def _tabulate(measures: Sequence[Content]) -> Table:
     return Table(columns, rows)
 
 
-def _list_callouts(content: Content) -> dict[str, list[Callout]]:
+def _list_callouts(content: Content, measures: Sequence[Content]) -> dict[str, list[Callout]]:
     """Measures by the view that shows them best: girths and breadths from the front, heights and depths
     from the side, lengths from where they run."""
     front = np.array(content["rig_from_body"])[:3, 0]
     middle = np.array(content["rig_from_body"])[:3, 3]
     found: dict[str, list[Callout]] = {"front": [], "side": [], "back": []}
-    for one in content["measures"]:
+    for one in measures:
         path = np.array(one["path_mm"])
         low, high = one["interval_mm"]
-        value = (
-            f"{one['mm']:.0f}" if one["measured"] >= MIN_MEASURED else f"{low:.0f} to {high:.0f}"
-        )
+        value = f"{low:.0f} to {high:.0f}" if one["is_range"] else f"{one['mm']:.0f}"
         colour = COLOURS[one["kind"]][::-1]
         view = {"girth": "front", "breadth": "front", "height": "side", "depth": "side"}.get(
             one["kind"], "front" if (path.mean(axis=0) - middle) @ front > 60.0 else "back"
