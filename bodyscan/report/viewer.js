@@ -218,7 +218,7 @@
     // The picture is kept, so that it can be printed.
     const gl = canvas.getContext("webgl", { preserveDrawingBuffer: true, antialias: true });
     if (!gl) {
-      element("p", "This browser shows no WebGL: the pictures show the same.", canvas.parentElement).className = "failed";
+      element("p", model.failed || "This browser shows no WebGL: the pictures show the same.", canvas.parentElement).className = "failed";
       return;
     }
     const home = { ...model.view, distance: (0.54 * model.view.size) / Math.tan(FIELD / 2) };

@@ -68,6 +68,7 @@ class BoardTour:
 
     def __post_init__(self) -> None:
         self.rig = load_rig(self.rig_file)
+        self._roots = [resolve_capture_path(self.rig_file, each) for each in self.rig.calibration]
 
     def look(self) -> str:
         """Find boards in a shot's images that have come since; return its name, "" if none came.
@@ -78,10 +79,13 @@ class BoardTour:
         """
         if not self._may_have_changed():
             return ""
+        if not any(any(root.glob("*")) for root in self._roots):  # a new rig's first calibration
+            self.refused = [f"no image of the board yet: they come into {self._roots[0]}"]
+            return ""
         try:
             captures = open_captures(self.rig, self.rig_file)
         except BodyscanError as error:
-            self.refused = [str(error)]  # such as no image yet
+            self.refused = [str(error)]
             return ""
         self.refused = []
         sequences = sorted(captures.sequences, key=lambda s: s.shot != self.rig.rig_frame.shot)
@@ -109,8 +113,7 @@ class BoardTour:
         """Whether files may have come in the last second: folders say when a name came into them, in
         steps of hundredths of a second."""
         now_s, before = time.monotonic(), self._folders
-        roots = [resolve_capture_path(self.rig_file, entry) for entry in self.rig.calibration]
-        walks = (os.walk(root) for root in roots)
+        walks = (os.walk(root) for root in self._roots)
         with suppress(FileNotFoundError):  # removed meanwhile: it is another at the next look
             self._folders = {p: os.stat(p).st_ctime_ns for walk in walks for p, _, _ in walk}
         if self._folders != before or self._pending or self.rig.follow_links:
@@ -160,20 +163,16 @@ class BoardTour:
         """Everything that a page shows of it."""
         boards, sigmas = self._count_boards(), self.solved.get("sigmas_mm", {})
         cells = {pair.name: self._count_cells(pair) for pair in self.rig.pairs}
+        pairs = [
+            {"name": n, "boards": boards[n], "cells": c.ravel().tolist(), "sigma_mm": sigmas.get(n)}
+            for n, c in cells.items()
+        ]
         last, missed = next(reversed(self.missed.items()), (None, []))
         return {
             "shots": len(self.missed),
             "last": last,
             "missed": missed,
-            "pairs": [
-                {
-                    "name": name,
-                    "boards": boards[name],
-                    "cells": counts.astype(int).ravel().tolist(),
-                    "sigma_mm": sigmas.get(name),
-                }
-                for name, counts in cells.items()
-            ],
+            "pairs": pairs,
             "shared": self._count_shared_shots(),
             "next": self._choose_next(cells, boards),
             "advice": [*self.refused, *self.solved.get("advice", [])],

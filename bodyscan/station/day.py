@@ -51,8 +51,7 @@ class Day:
         """All rows, to be read only; those whose files were removed, as `forget` does, are gone."""
         with self._lock:
             # Of a job that was refused there never was a folder: it has no subject.
-            owned = [job for job, row in self._rows.items() if row["subject"] is not None]
-            for job in owned:
+            for job in [job for job, row in self._rows.items() if row["subject"] is not None]:
                 if not (self.out / job / JOB).exists():
                     del self._rows[job]
             return list(self._rows.values())

@@ -22,7 +22,7 @@ class Feed:
     def __init__(self) -> None:
         self._events: deque[tuple[int, str]] = deque(maxlen=BACKLOG)
         self.number = 0  # of the last event
-        self._readers: set[asyncio.Event] = set()
+        self.readers: set[asyncio.Event] = set()
         self._loop: asyncio.AbstractEventLoop | None = None
 
     def publish(self, event: dict[str, Any]) -> None:
@@ -37,7 +37,7 @@ class Feed:
     def _append(self, data: str) -> None:
         self.number += 1
         self._events.append((self.number, data))
-        for reader in self._readers:
+        for reader in self.readers:
             reader.set()
 
     async def read(self, after: int, pulse_s: float = 15.0) -> AsyncIterator[str]:
@@ -47,7 +47,7 @@ class Feed:
         """
         self._loop = asyncio.get_running_loop()
         news = asyncio.Event()
-        self._readers.add(news)
+        self.readers.add(news)
         try:
             while True:
                 news.clear()
@@ -63,4 +63,4 @@ class Feed:
                 except TimeoutError:
                     yield ": still here\n\n"
         finally:
-            self._readers.discard(news)
+            self.readers.discard(news)

@@ -50,7 +50,6 @@ class Station:
     """One station's answers."""
 
     operation: Operation
-    readers: int = 0
 
     async def state(self, request: Request) -> Response:
         operation = self.operation
@@ -67,18 +66,10 @@ class Station:
 
     async def events(self, request: Request) -> Response:
         last = request.headers.get("last-event-id") or request.query_params.get("after", "0")
-        if self.readers >= READERS:
+        if len(self.operation.feed.readers) >= READERS:
             return _answer({"what": "too many pages are open"}, 503)
         after = int(last) if last.isdecimal() and len(last) < 16 else 0
-        return StreamingResponse(self._read(after), media_type="text/event-stream")
-
-    async def _read(self, after: int) -> AsyncIterator[str]:
-        self.readers += 1
-        try:
-            async for text in self.operation.feed.read(after):
-                yield text
-        finally:
-            self.readers -= 1
+        return StreamingResponse(self.operation.feed.read(after), media_type="text/event-stream")
 
     async def start(self, request: Request) -> Response:
         subject = (await _object(request)).get("subject")

@@ -28,7 +28,7 @@ from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.reconstruction.scan_volume import find_stripes_in_volume
 from bodyscan.reconstruction.triangulation import reconstruct_range_image
 from bodyscan.registration.rig_calibration import RigCalibration
-from bodyscan.registration.storage import load_calibration
+from bodyscan.registration.storage import calibration_id, load_calibration
 from bodyscan.workflows.decode import decode_sequence, list_fault_notes
 
 Reconstructed = tuple[RangeImage, tuple[str, ...]]
@@ -120,9 +120,19 @@ class Preparation:
 
     def __init__(self, calibration: Path) -> None:
         """Raises CalibrationFileError as `load_calibration` does."""
-        self.calibration: RigCalibration = load_calibration(calibration)
-        self._pool = ThreadPoolExecutor(THREADS)
-        self._made: dict[Path, dict[ImageSequence, Future[_Made | None]]] = {}
+        self._folder, self._id, self._pool = calibration, "", ThreadPoolExecutor(THREADS)
+        self.refresh()
+
+    def refresh(self) -> RigCalibration:
+        """The calibration; if another is there than the one loaded before it is loaded, and what was
+        made with that is dropped. Raises as `load_calibration` does."""
+        found = ""  # before it is read: what replaces it meanwhile is loaded at the next request
+        with suppress(BodyscanError, OSError):  # which `load_calibration` explains better
+            found = calibration_id(self._folder)
+        if not found or found != self._id:
+            self.calibration: RigCalibration = load_calibration(self._folder)
+            self._id, self._made = found, dict[Path, dict[ImageSequence, Future[_Made | None]]]()
+        return self.calibration
 
     def prepare(self, folder: Path, pairs: Collection[str]) -> None:
         """Start decoding what these pairs took, if all of it is there.
@@ -131,19 +141,20 @@ class Preparation:
         threads. Nothing is raised: faults are left to the scan, which tries again and reports them.
         """
         try:
-            captures = open_scan(self.calibration.rig, folder)
+            calibration = self.refresh()
+            captures = open_scan(calibration.rig, folder)
         except BodyscanError:
             return
         wanted = [
             s
             for s in captures.sequences
-            if s.pair in self.calibration.pairs.keys() & pairs and s.has_stripes and not s.missing
+            if s.pair in calibration.pairs.keys() & pairs and s.has_stripes and not s.missing
         ]
 
         def make(sequence: ImageSequence) -> _Made | None:
             stamps = _read_stamps(captures, sequence)
             try:
-                made = reconstruct_sequence(self.calibration, captures, sequence, volume_only=True)
+                made = reconstruct_sequence(calibration, captures, sequence, volume_only=True)
             except BodyscanError:
                 return None
             return made, stamps

@@ -149,7 +149,7 @@ def scan_folder(
 
     Raises ScanFailed after recording it in scan.json.
     """
-    rig = preparation.calibration if preparation else load_calibration(calibration)
+    rig = preparation.refresh() if preparation else load_calibration(calibration)
     described = rig.rig.model_copy(update={"follow_links": True}) if follow_links else rig.rig
     captures = open_scan(described, folder)
     nobody = open_scan(described, empty) if empty else None

@@ -152,12 +152,18 @@ def test_what_people_decide_stays_and_what_is_taken_again_begins_anew(operation:
     assert (again.row("anna")["grade"], again.row("anna")["state"]) == (None, "arriving")
 
 
-def test_only_reasons_that_scans_can_have_are_translated() -> None:
-    rooms = [PROJECT / "bodyscan/verdict.py", *(PROJECT / "bodyscan/fusion/verdict").glob("*.py")]
-    said = re.sub(r'"\s*f?"', "", "".join(path.read_text("utf-8") for path in rooms))
-    for file in (PROJECT / "bodyscan/station/pages/languages").glob("[!e]*.json"):
-        kinds = json.loads(file.read_text("utf-8"))["kinds"]
-        assert [part for parts, _ in kinds for part in parts if part not in said] == [], file
+def test_every_language_has_all_words_and_translates_only_what_is_said() -> None:
+    said = "".join(path.read_text("utf-8") for path in (PROJECT / "bodyscan").rglob("*.py"))
+    joined = re.sub(r'"\s*f?"', "", said)
+    rooms = PROJECT / "bodyscan/station/pages/languages"
+    english = json.loads((rooms / "en.json").read_text("utf-8"))
+    for file in rooms.glob("[!e]*.json"):
+        words = json.loads(file.read_text("utf-8"))
+        kinds, terms = words.pop("kinds"), words.pop("terms")
+        assert [part for parts, _ in kinds for part in parts if part not in joined] == [], file
+        assert [term for term in terms if f'"{term}"' not in said] == [], file
+        fields = [re.findall(r"\{\w+\}", str(each)) for each in (english, words)]
+        assert (words.keys(), sorted(fields[1])) == (english.keys(), sorted(fields[0])), file
 
 
 def test_a_rig_is_calibrated_on_its_page_and_its_scans_are_watched_from_then_on(
@@ -193,7 +199,7 @@ def test_a_board_is_found_pair_by_pair_as_the_rig_takes_its_images(tmp_path: Pat
             capture_shot(devices, replace(shot, name="table"))
     tour = BoardTour(tmp_path / "rig.yaml")
     assert tour.look() == ""
-    assert "the capture folder does not exist" in tour.describe()["advice"][0]
+    assert tour.describe()["advice"][0].endswith(f"they come into {tmp_path / 'shots'}")
     shutil.copytree(shot.folder, tmp_path / "shots", ignore=shutil.ignore_patterns("*.png"))
     names = [pair.name for pair in rig.pairs]
     for number, name in enumerate(names, start=1):

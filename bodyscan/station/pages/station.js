@@ -16,6 +16,14 @@
   // What kind of reason it is, in the reader's language; its sentence with the figures is English.
   const explain = (text) => (words.kinds || []).find(([parts]) => parts.some((part) => text.includes(part)))?.[1];
 
+  function tell(text) {
+    const kind = explain(text), english = make("span", { lang: "en" }, text);
+    return kind ? [make("strong", { lang: words["#"] }, kind), make("br"), english] : [english];
+  }
+
+  // Names of steps, and of what is drawn on a body.
+  const term = (text) => words.terms?.[text] ?? (text.endsWith(" or more") ? say("orMore", { count: text.split(" ")[0] }) : text);
+
   function make(name, attributes = {}, ...inside) {
     const made = document.createElement(name);
     for (const [key, value] of Object.entries(attributes)) {
@@ -52,10 +60,10 @@
     $("grade").textContent = say(key) + (SIGNS[key] && !row.final ? ` (${say("sofar")})` : "");
     $("what-to-do").textContent = say(`${key}What`);
     const reasons = !row ? [] : row.state === "set aside" ? [row.reason] : row.reasons || [];
-    $("reasons").replaceChildren(...reasons.filter(Boolean).map((text) => make("li", {}, explain(text) ? make("strong", { lang: words["#"] }, explain(text)) : null, explain(text) ? make("br") : null, text)));
+    $("reasons").replaceChildren(...reasons.filter(Boolean).map((text) => make("li", {}, ...tell(text))));
     $("in-english").hidden = words["#"] === "en" || !reasons.length;
     const working = row && row.state !== "done" && row.state !== "set aside" && row.part;
-    $("stage").textContent = working ? `${row.part} ${row.total ? `${row.done}/${row.total}` : ""}` : "";
+    $("stage").textContent = working ? `${term(row.part)} ${row.total ? `${row.done}/${row.total}` : ""}` : "";
     $("whose").textContent = !row ? "" : row.body ? say("body", { job: row.subject || row.job }) : say("noBody");
     document.querySelector("#body canvas").setAttribute("aria-label", $("whose").textContent || say("noBody"));
     $("decide").hidden = !row || !(row.final || row.state === "done" || row.state === "set aside");
@@ -105,7 +113,17 @@
     if (!model || drawn.job !== job || drawn.kind !== kind) return;
     if (isSame) clearBody();
     if (!matchMedia("(prefers-reduced-motion: reduce)").matches) $("body").dataset.turning = "1";
-    window.showModel($("body"), model);
+    window.showModel($("body"), translate(model));
+  }
+
+  function translate(model) {
+    model.failed = say("noWebgl");
+    for (const layer of model.layers) {
+      layer.name = term(layer.name);
+      if (layer.legend?.caption) layer.legend.caption = term(layer.legend.caption);
+      for (const swatch of layer.legend?.swatches || []) swatch[1] = term(swatch[1]);
+    }
+    return model;
   }
 
   function clearBody() {
@@ -125,10 +143,11 @@
     $("taking").hidden = capture.state !== "taking";
     if (capture.total) $("taking").value = capture.done / capture.total;
     const lost = Object.entries(capture.lost || {}).map(([pair, reason]) => say("lostFrames", { pair, reason }));
-    const part = capture.state === "calibrating" && capture.part ? `: ${capture.part} ${capture.done}/${capture.total}` : "";
+    const part = capture.state === "calibrating" && capture.part ? `: ${term(capture.part)} ${capture.done}/${capture.total}` : "";
     const made = capture.calibrated ? say("calibrated", { verdict: say(capture.calibrated) }) : capture.lost ? say("taken") : "";
-    const text = capture.state === "idle" ? made : say(capture.state, capture) + part;
-    for (const id of ["capture", "board-capture"]) $(id).textContent = [text, ...lost, ...(capture.reasons || [])].filter(Boolean).join("\n");
+    const text = capture.state === "idle" ? made : say(capture.state, { ...capture, reason: "" }) + part;
+    const english = [capture.state === "failed" && capture.reason, ...lost, ...(capture.reasons || [])].filter(Boolean);
+    for (const id of ["capture", "board-capture"]) $(id).replaceChildren(text, ...english.flatMap((one) => [make("br"), ...tell(one)]));
   }
 
   async function decide(decision) {
@@ -152,7 +171,7 @@
   }
 
   function complain(error) {
-    $("trouble").textContent = error.message || String(error);
+    $("trouble").replaceChildren(...tell(error.message || String(error)));
     $("trouble").hidden = false;
   }
 
@@ -267,7 +286,7 @@
     const names = boards.pairs.map((pair) => pair.name), counts = new Map(boards.shared.flatMap(([a, b, n]) => [[`${a}/${b}`, n], [`${b}/${a}`, n]]));
     const head = make("tr", {}, make("td"), ...names.map((name) => make("th", { scope: "col" }, name)));
     $("shared").replaceChildren(head, ...names.map((a) => make("tr", {}, make("th", { scope: "row" }, a), ...names.map((b) => make("td", { class: "number" }, a === b ? "" : String(counts.get(`${a}/${b}`) || 0))))));
-    $("advice").replaceChildren(...boards.advice.map((line) => make("li", {}, line)));
+    $("advice").replaceChildren(...boards.advice.map((line) => make("li", {}, ...tell(line))));
   }
 
   // Without a question where it can do no harm.
@@ -301,7 +320,7 @@
     if (event.kind === "rig") connect(); // another calibration is in use
     if (event.kind === "boards") { boards = event; showBoards(); }
     if (event.kind === "trouble") complain({ message: event.text });
-    if (event.kind === "exposure") $("capture").textContent += `\n${event.text}`;
+    if (event.kind === "exposure") $("capture").append(make("br"), ...tell(event.text));
     if (event.kind === "capture") {
       capture = event;
       if (event.state === "asked") { current = ""; showNow(); }
@@ -324,8 +343,8 @@
       const unfinished = state.rows.filter((row) => row.state === "running" || (row.state === "arriving" && Object.keys(row.pairs).length));
       const last = unfinished[unfinished.length - 1] || state.rows[state.rows.length - 1];
       current = last && last.decision !== "discard" ? last.job : "";
-      $("trouble").hidden = !state.trouble;
-      $("trouble").textContent = state.trouble;
+      $("trouble").hidden = true;
+      if (state.trouble) complain({ message: state.trouble });
       document.title = `${rig.name} – bodyscan`;
       showAll();
       stream = new EventSource(`api/events?after=${state.number}`);
@@ -384,7 +403,7 @@
     const titles = { en: "English", de: "Deutsch", fr: "Français", ja: "日本語" };
     $("language").append(...LANGUAGES.map((one) => make("option", { value: one, lang: one, selected: one === wanted }, titles[one])));
     await speak(wanted);
-    $("language").addEventListener("change", async () => { await speak($("language").value); online(stream?.readyState === 1); showAll(); });
+    $("language").addEventListener("change", async () => { await speak($("language").value); drawn.kind = " "; online(stream?.readyState === 1); showAll(); });
     for (const id of ["search", "filter", "sort"]) $(id).addEventListener("input", showToday);
     document.querySelector(".bar").addEventListener("submit", (event) => event.preventDefault());
     for (const button of document.querySelectorAll("[data-decision]")) button.addEventListener("click", () => decide(button.dataset.decision));
