@@ -321,7 +321,8 @@ class _Watching:
         if new:
             self.prepared[path] |= new
             self.process.prepare(path, sorted(new))
-        if arrival.complete:
+        # A folder without images waits until nothing else does: hundreds of them delay nobody.
+        if arrival.complete and (arrival.whole or not self.running):
             self.jobs[path] = self._job(path)
             self.running[path] = self.submit(self.jobs[path])
 

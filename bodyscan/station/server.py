@@ -102,8 +102,7 @@ class Station:
 
     async def report(self, request: Request) -> Response:
         path = self.operation.day.out / self._row(request)["job"] / "report" / "report.html"
-        policy = {"content-security-policy": REPORT_POLICY}
-        return _send(path, headers=policy)
+        return _send(path, headers={"content-security-policy": REPORT_POLICY})
 
     async def pair(self, request: Request) -> Response:
         look = partial(self._look, self._row(request), request.path_params["pair"])

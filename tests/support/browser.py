@@ -19,20 +19,10 @@ import numpy as np
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 FLAGS = (
-    "--headless",
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--disable-dev-shm-usage",
-    "--hide-scrollbars",
-    "--use-gl=angle",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-    "--remote-debugging-pipe",
+    "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-sync "
+    "--disable-background-networking --disable-component-update --disable-dev-shm-usage "
+    "--hide-scrollbars --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader "
+    "--remote-debugging-pipe"
 )
 PATIENCE_S = 90.0
 
@@ -78,13 +68,8 @@ class Page:
 
     def navigate(self, url: str, width: int, height: int) -> None:
         """Open an address and wait until it is loaded and drawn."""
-        self.call(
-            "Emulation.setDeviceMetricsOverride",
-            width=width,
-            height=height,
-            deviceScaleFactor=1,
-            mobile=False,
-        )
+        screen = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+        self.call("Emulation.setDeviceMetricsOverride", **screen)
         self.call("Page.navigate", url=url)
         deadline = time.monotonic() + PATIENCE_S
         while self.evaluate("document.readyState") != "complete":
@@ -95,11 +80,8 @@ class Page:
 
     def settle(self) -> None:
         """Until what was asked for is painted."""
-        self.call(
-            "Runtime.evaluate",
-            expression="new Promise(r => requestAnimationFrame(() => requestAnimationFrame(r)))",
-            awaitPromise=True,
-        )
+        painted = "new Promise(r => requestAnimationFrame(() => requestAnimationFrame(r)))"
+        self.call("Runtime.evaluate", expression=painted, awaitPromise=True)
 
     def evaluate(self, expression: str) -> Any:
         answer = self.call("Runtime.evaluate", expression=expression, returnByValue=True)
@@ -182,7 +164,7 @@ def browser_page(executable: str, profile: Path) -> Iterator[Page]:
         os.dup2(104, 4)
 
     process = subprocess.Popen(
-        [executable, *FLAGS, f"--user-data-dir={profile}", "about:blank"],
+        [executable, *FLAGS.split(), f"--user-data-dir={profile}", "about:blank"],
         preexec_fn=hand_over,
         close_fds=False,
         stdin=subprocess.DEVNULL,
