@@ -287,7 +287,7 @@ def measure(
     named: lay a body over the scan too, which takes seconds: `measures["waist girth"].mm` and
         `.interval_mm`, and the landmarks in `named.landmarks`.
 
-    Raises BadInput for a height at which there is no body, or if no standing body fits the scan.
+    Raises BadInput for a height at which there is no body, or if the body does not stand.
     """
     from bodyscan.measurement.measurements import measure as measure_mesh
     from bodyscan.mesh.body import BodyMesh

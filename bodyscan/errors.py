@@ -7,7 +7,8 @@ input on which the work did not succeed (exit 1).
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 
 def escape_control(text: str) -> str:
@@ -39,22 +40,23 @@ def format_error(error: BodyscanError) -> str:
     return f"{error.what}\n  {error.remedy}" if error.remedy else error.what
 
 
-def group_reasons(reasons: Mapping[str, str]) -> list[tuple[list[str], str]]:
+def group_reasons(reasons: Iterable[tuple[Any, str]]) -> list[tuple[list[Any], str]]:
     """Names that failed for one reason, and that reason; most names first.
 
-    Reasons that differ only in the name, in figures and in brackets are one: the first is given.
+    Reasons that differ only in the name, figures, brackets and after "such as" are one: the first.
     """
-    groups: dict[str, list[str]] = {}
-    for name, reason in reasons.items():
-        kind = re.sub(r"\(.*?\)|\d[\d.]*", "", reason.replace(name, ""))
-        groups.setdefault(kind, []).append(name)
-    return [(names, reasons[names[0]]) for names in sorted(groups.values(), key=len, reverse=True)]
+    groups: dict[str, tuple[list[Any], str]] = {}
+    for name, reason in reasons:
+        text = reason.partition("such as")[0].replace(str(name), "")
+        kind = re.sub(r"\(.*?\)|(?<!bit )(?<!\d)\d[\d.]*%?(, \d[\d.]*%?)*", "", text)
+        groups.setdefault(kind, ([], reason))[0].append(name)
+    return sorted(groups.values(), key=lambda group: len(group[0]), reverse=True)
 
 
 def format_list(reasons: Mapping[str, str]) -> str:
     """Format several failures, one a line; a remedy stands once, after all those that it helps."""
     groups: dict[str, list[str]] = {}
-    for names, reason in group_reasons(reasons):
+    for names, reason in group_reasons(reasons.items()):
         what, _, remedy = reason.partition("\n")
         groups.setdefault(remedy, []).append(f"\n  {', '.join(names)}: {what}")
     return "".join(

@@ -36,7 +36,9 @@ def main() -> None:
     """Entry point: errors are printed without a traceback, 2 for bad input, 1 for failed work."""
     # Stages run threads of their own; BLAS threads inside them get in each other's way (measured:
     # 15 s instead of 1 s for twelve cameras on two cores), and the last bits depend on their number.
-    os.environ["OPENBLAS_NUM_THREADS"] = os.environ["MKL_NUM_THREADS"] = "1"
+    os.environ |= {f"{library}_NUM_THREADS": "1" for library in ("OPENBLAS", "MKL", "NUMBA")}
+    if not os.environ.get("OPENCV_FOR_THREADS_NUM", "1").isdecimal():
+        del os.environ["OPENCV_FOR_THREADS_NUM"]  # each call to OpenCV would fail
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # a terminal may lack a sign of ours, or of a path
             stream.reconfigure(errors="backslashreplace")

@@ -218,7 +218,7 @@ def measure(
         refuse_own_file(file, result)
     levels = None if heights is None else parse_heights(heights)
     stored, earlier = _load_scans(result, since, anyway=anyway)
-    measured = measure_mesh(stored.mesh, levels, named=named)
+    measured = measure_mesh(stored.mesh, levels, named=named, anyway=anyway)
     changes = None if earlier is None else _compare(earlier, stored, measured)
     content = make_measurements_document(measured, stored.facts, changes)
     write_measurements(path, measured, stored.facts, changes)
@@ -285,13 +285,12 @@ def export(
         extra = {"registered": registered, "textured": texture}
         versions = *ExportSettings().versions, *(name for name, wanted in extra.items() if wanted)
         with hold_folder(folder):
-            written = export_scan(
+            export_scan(
                 stored, folder, formats.split(","), versions,
                 texture_px=texture_px, deface=deface, frame=frame, up=up,
+                made=lambda path: output.add_files("export", path),
             )  # fmt: skip
     _show_grade(output, stored)
-    for path in written:
-        output.add_files("export", path)
     output.say(f"PLY, OBJ and STL are in mm, {up} up; GLB is in metres, y up")
 
 

@@ -20,10 +20,7 @@ Calibration = Annotated[
 ]
 OutFolder = Annotated[Path, typer.Option("--out", help="Folder to write into.")]
 Overwrite = Annotated[
-    bool,
-    typer.Option(
-        "--overwrite", help="Replace what is there, and everything that was made from it."
-    ),
+    bool, typer.Option("--overwrite", help="Replace what is there, and all that was made from it.")
 ]
 Changes = Annotated[
     list[str] | None,

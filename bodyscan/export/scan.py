@@ -46,8 +46,9 @@ def export_scan(
     deface: bool = False,
     frame: str = "rig",
     up: str = "z",
+    made: Callable[[Path], object] = str,
 ) -> list[Path]:
-    """Write the mesh in each format (see `BODY_FORMATS`) and version; returns the paths.
+    """Write the mesh in each format (see `BODY_FORMATS`) and version; `made` is told each path.
 
     versions: full, light (50,000 faces), open (without filled faces), registered (a parametric body
         laid over the scan), textured (light, with an image of `texture_px` a side instead of vertex
@@ -62,10 +63,8 @@ def export_scan(
     """
     names = [name.strip().lower().removeprefix(".") for name in formats]
     able = [name for name in names if "texture" in BODY_FORMATS.find(name).holds]
-    every = (*VERSIONS, "registered")
-    _require_known(
-        *((version, every) for version in versions), (frame, ("rig", "body")), (up, ("z", "y"))
-    )
+    known = [(version, (*VERSIONS, "registered")) for version in versions]
+    _require_known(*known, (frame, ("rig", "body")), (up, ("z", "y")))
     if "textured" in versions and not able:
         raise BadInput(f"{', '.join(names)} holds no texture", remedy="Add `glb` or `obj`.")
     if deface and "registered" in versions:
@@ -95,6 +94,7 @@ def export_scan(
         for name in able if version == "textured" else names:
             written.append(folder / f"{stem}.{name}")
             write_body(written[-1], body, origin, texture if name in able else None)
+            made(written[-1])
     return written
 
 

@@ -24,7 +24,7 @@ from bodyscan.mesh.body import (
     compute_region_shares,
     select_regions,
 )
-from bodyscan.mesh.body_frame import find_body_frame
+from bodyscan.mesh.body_frame import find_body_frame, is_upright
 from bodyscan.mesh.sliced_parts import Piece, find_parts
 from bodyscan.mesh.slices import MeshSlicer
 from bodyscan.mesh.topology import compute_face_areas, compute_signed_volume
@@ -134,6 +134,7 @@ def measure(
     *,
     mean_breath: bool = True,
     named: bool = False,
+    anyway: bool = False,
 ) -> Measurements:
     """Measure stature, volume, area, slices at some heights, and on request measures by name.
 
@@ -141,8 +142,11 @@ def measure(
     mean_breath: measure a breathing person as at mean breath, instead of at the scan's moment.
     named: whether to lay a body over the scan (seconds), for landmarks and measures by name.
 
-    Raises BadInput for a height at which there is no body, or if no standing body fits the scan.
+    Raises BadInput for a height without a body, if none fits the scan, or, unless `anyway`, it lies.
     """
+    if not anyway and not is_upright(mesh.vertices, mesh.faces):
+        what = "the body does not stand: it lies or bends, or much of it is missing"
+        raise BadInput(what, remedy="Scan again, or turn the mesh so that z is up.")
     by_name = measure_by_name(mesh) if named else None
     breath, breathes = mesh.breath, mean_breath and mesh.breath is not None
     mesh = mesh.at_mean_breath() if breathes else mesh

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from bodyscan.arrays import Array
+from bodyscan.arrays import Array, Indices
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.mesh.topology import compute_face_areas
 
 ARMPIT = 0.74
 """Its height as a share of the stature (Drillis and Contini 1966)."""
@@ -28,6 +29,13 @@ class BodyFrame:
         """Columns (3, 3), rig frame: forward, left and up in pictures; the rig's own axes where the
         facing is not known."""
         return self.rig_from_body.rotation if self.known else np.eye(3)
+
+
+def is_upright(vertices: Array, faces: Indices, along: int = 2) -> bool:
+    """Whether a surface varies most along an axis, to 45 degrees or so; held out arms count little."""
+    areas = compute_face_areas(vertices, faces)
+    covariance = np.cov(vertices[faces].mean(axis=1).T, aweights=areas)
+    return bool(covariance[along, along] >= 0.5 * np.linalg.eigvalsh(covariance)[-1])
 
 
 def find_body_frame(vertices: Array) -> BodyFrame:

@@ -9,6 +9,7 @@ import numpy as np
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.errors import BadInput
+from bodyscan.mesh.body_frame import is_upright
 from bodyscan.mesh.slices import MeshSlicer
 from bodyscan.mesh.topology import (
     UNSOUND,
@@ -39,7 +40,7 @@ def read_surface(
 
     unit: of `UNITS_MM`.
     sizes_mm: what the longest side is at least, usually, and at most.
-    along: the axis along which it is at least half as long: z, who stands.
+    along: the axis along which it extends farthest: z, who stands.
     """
     from trimesh import load_mesh  # takes half a second to load
 
@@ -50,48 +51,35 @@ def read_surface(
             vertices, faces = np.array(read.vertices, float), np.array(read.faces, np.int64)
         except Exception as error:  # whatever a damaged file makes of its parser
             cause = f" ({error})"
+        if path.suffix.lower() == ".ply" and cause:  # or its faces have various numbers of corners
+            from open3d import io
+
+            polygons = io.read_triangle_mesh(str(path))
+            vertices, faces = np.array(polygons.vertices), np.array(polygons.triangles, int)
     fault = find_fault(vertices, faces) if faces.size else f"no surface can be read here{cause}"
     if fault:
         remedy = "give a PLY with faces, sound where it was made, z up"
         raise BadInput(fault, where=str(path), remedy=remedy)
     vertices, faces, notes = _mend(vertices, faces)
-    refuse_size(vertices, path, unit, sizes_mm, along)
-    if _is_upside_down(vertices, faces):
-        what = "has two feet at its top and a head below: it stands on its head, or -z is up"
-        raise BadInput(what, where=str(path), remedy="turn it so that z is up")
-    tall = UNITS_MM[unit] * float(np.ptp(vertices[:, 2]))
-    notes.append(f"taken as {unit}, z up: {tall:,.0f} mm tall")
-    return Outcome((vertices, faces), tuple(f"{path}: {note}" for note in notes))
-
-
-def refuse_size(
-    vertices: Array, path: Path, unit: str, sizes_mm: tuple[float, float, float], along: int
-) -> None:
-    """Raise BadInput for vertices (V, 3) that are not of such a subject; name the unit that fits."""
-    sides = np.ptp(vertices, axis=0)
     lowest, expected, highest = sizes_mm
-    longest = int(np.argmax(sides))
-    size = float(sides[longest])
-    if not lowest < size * UNITS_MM[unit] < highest:
+    size, scale = float(np.ptp(vertices, axis=0).max()), UNITS_MM[unit]
+    if not lowest < size * scale < highest:
         fits = [name for name, mm in UNITS_MM.items() if lowest < size * mm < highest]
         meant = min(fits, key=lambda n: abs(math.log(size * UNITS_MM[n] / expected)), default=None)
         remedy = f"give a surface of such a subject, in {unit}"
         if meant is not None:
-            factor = UNITS_MM[meant] / UNITS_MM[unit]
+            factor = UNITS_MM[meant] / scale
             remedy += f"; if this one is in {meant}, multiply its coordinates by {factor:.6g}"
-        raise BadInput(
-            f"is {size * UNITS_MM[unit]:,.4g} mm long if read as {unit}; "
-            f"expected {lowest:,.0f} to {highest:,.0f} mm",
-            where=str(path),
-            remedy=remedy,
-        )
-    if sides[along] < 0.5 * size:
-        raise BadInput(
-            f"is long along {'xyz'[longest]} ({size:,.4g} {unit}), not along {'xyz'[along]} "
-            f"({sides[along]:,.4g}): it lies on its side, or another axis than z is up",
-            where=str(path),
-            remedy="turn it so that z is up",
-        )
+        what = f"is {size * scale:,.4g} mm long if read as {unit}; expected {lowest:,.0f} to "
+        raise BadInput(f"{what}{highest:,.0f} mm", where=str(path), remedy=remedy)
+    if not is_upright(vertices, faces, along):
+        what = f"does not extend farthest along {'xyz'[along]}: it lies on its side"
+        raise BadInput(what, where=str(path), remedy="turn it so that z is up")
+    if _is_upside_down(vertices, faces):
+        what = "has two feet at its top and a head below: it stands on its head, or -z is up"
+        raise BadInput(what, where=str(path), remedy="turn it so that z is up")
+    notes.append(f"taken as {unit}, z up: {scale * np.ptp(vertices[:, 2]):,.0f} mm tall")
+    return Outcome((vertices, faces), tuple(f"{path}: {note}" for note in notes))
 
 
 def _is_upside_down(vertices: Array, faces: Indices) -> bool:

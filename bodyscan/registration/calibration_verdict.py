@@ -78,7 +78,7 @@ def grade_calibration(calibration: RigCalibration) -> Verdict:
     Pairs that failed cost a scan what they alone would have measured, and boards that covered little
     leave the rest of a picture to extrapolation: such a rig is usable, where it measures.
     """
-    failed = group_reasons(calibration.failed)
+    failed = group_reasons(calibration.failed.items())
     findings = [(False, np.inf, f"failed: {', '.join(names)}: {why}") for names, why in failed]
     for pair in collect_figures(calibration):
         for times, error, words in pair.beyond():

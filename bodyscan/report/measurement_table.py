@@ -238,7 +238,7 @@ def write_measures(stored: StoredScan, folder: Path) -> str:
     try:
         measured = measure(stored.mesh, named=True)
     except BadInput as error:
-        reason, measured = error.what, measure(stored.mesh)
+        reason, measured = error.what, measure(stored.mesh, anyway=True)
     named = measured.named
     write_measurements(folder / MEASUREMENTS, measured, stored.facts)
     write_text(folder / "measures.csv", format_named_csv(named or reason, stored.facts))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -24,7 +23,7 @@ from bodyscan.calibration.boundary_points import (
 from bodyscan.calibration.camera import CameraCalibration
 from bodyscan.captures.folder import Captures, ImageSequence
 from bodyscan.captures.images import read_sequence
-from bodyscan.errors import BodyscanError, DecodingFailed, ImageError, format_error
+from bodyscan.errors import BodyscanError, DecodingFailed, ImageError, format_error, group_reasons
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, attempt_each, silent
 from bodyscan.rig.pair import Pair
@@ -34,9 +33,6 @@ from bodyscan.stripes.decoding import decode_stripes
 from bodyscan.stripes.stripe_code import StripeCode
 from bodyscan.stripes.stripe_limits import StripeLimits
 from bodyscan.stripes.stripe_map import StripeMap
-
-NUMBER = re.compile(r"(?<!bit )\b\d[\d.]*%?(, \d[\d.]*%?)*")
-"""Figures in an error's text, left out to tell whether two shots failed for the same reason."""
 
 
 def decode_sequence(
@@ -178,21 +174,20 @@ def _list_without_stripes(
 def list_fault_notes(faults: Mapping[ImageSequence, Sequence[str]]) -> Iterator[str]:
     """One line for each pair and each fault of its images, see `StripeMap.faults`."""
     found = ((sequence, fault) for sequence, several in faults.items() for fault in several)
-    for (pair, fault), group in sorted(_group_faults(found).items()):
+    for pair, fault, group in sorted(_group_faults(found), key=lambda one: one[:2]):
         names = ", ".join(sequence.shot for sequence in group)
         yield f"{pair}, shot{'s' if len(group) > 1 else ''} {names}: {fault}"
 
 
 def _group_faults(
     faults: Iterable[tuple[ImageSequence, str]],
-) -> dict[tuple[str, str], list[ImageSequence]]:
-    """Sequences by pair and reason. Reasons that differ in figures or file names alone are one; the
-    first is quoted."""
-    groups: dict[tuple[str, str], tuple[str, list[ImageSequence]]] = {}
+) -> list[tuple[str, str, list[ImageSequence]]]:
+    """Pair, reason and sequences, see `group_reasons`."""
+    by_pair: dict[str, list[tuple[ImageSequence, str]]] = defaultdict(list)
     for sequence, fault in faults:
-        kind = NUMBER.sub("", fault.partition("such as")[0])
-        groups.setdefault((sequence.pair, kind), (fault, []))[1].append(sequence)
-    return {(pair, fault): group for (pair, _), (fault, group) in groups.items()}
+        by_pair[sequence.pair].append((sequence, fault))
+    groups = ((pair, group) for pair, some in by_pair.items() for group in group_reasons(some))
+    return [(pair, fault, sequences) for pair, (sequences, fault) in groups]
 
 
 def describe_failures(
@@ -203,7 +198,7 @@ def describe_failures(
     reasons: dict[str, dict[str, str]] = defaultdict(dict)
     notes = []
     groups = _group_faults((sequence, format_error(error)) for sequence, error in failures.items())
-    for (pair, reason), group in groups.items():
+    for pair, reason, group in groups:
         if pair not in good:
             reasons[pair].setdefault(reason.partition(" (")[0], reason)
         elif len(group) == 1:

@@ -322,15 +322,14 @@ def test_a_star_in_a_name_stands_for_what_differs(tmp_path: Path) -> None:
     rig_path.write_text(rig_path.read_text() + 'files: "{shot}/{pair}/*_[{frame}]_*.png"\n')
     for number, path in enumerate(sorted(tmp_path.glob("captures/b1/*/*.png"))):
         path.rename(path.with_name(f"{1481302049.5 + number}_[{path.stem}]_{number}.png"))
-    rig = load_rig(rig_path)
-    captures = open_captures(rig, rig_path)
+    captures = open_captures(load_rig(rig_path), rig_path)
     assert captures.shots == ("b1",)
     assert not any(s.missing for s in captures.sequences)
     sequence = sequence_of(captures, "p2", "b1")
     np.testing.assert_array_equal(read_sequence(sequence, CAMERA).lit, picture("lit"))
     lit = sequence.board_path
     write(lit.with_name("1_[lit]_again.png"), picture("lit"))
-    again = sequence_of(open_captures(rig, rig_path), "p2", "b1")
+    again = sequence_of(open_captures(load_rig(rig_path), rig_path), "p2", "b1")
     with pytest.raises(
         ImageError, match=r"matches 2 files, such as 1481.*lit.*_again\.png"
     ) as caught:
@@ -338,7 +337,7 @@ def test_a_star_in_a_name_stands_for_what_differs(tmp_path: Path) -> None:
     assert caught.value.where.endswith("*_[lit]_*.png (pair p2, shot b1)")
     lit.unlink()
     (lit.parent / "1_[lit]_again.png").unlink()
-    gone = sequence_of(open_captures(rig, rig_path), "p2", "b1")
+    gone = sequence_of(open_captures(load_rig(rig_path), rig_path), "p2", "b1")
     with pytest.raises(ImageError, match="is missing"):
         read_sequence(gone, CAMERA)
 

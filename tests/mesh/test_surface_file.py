@@ -14,7 +14,6 @@ from trimesh import Trimesh
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.errors import BadInput
-from bodyscan.mesh.surface_file import PERSON_MM, refuse_size
 from bodyscan.mesh.surface_file import read_surface as read_of_size
 from bodyscan.mesh.topology import compute_signed_volume
 
@@ -37,6 +36,9 @@ def test_a_sound_mesh_is_read_as_it_is(tmp_path: Path) -> None:
     assert "taken as millimetres, z up: " in read.notes[0]
     some = np.where(np.arange(len(FACES))[:, None] == 7, FACES[:, ::-1], FACES)
     assert ": 4 faces, such as " in read_surface(write(tmp_path, VERTICES, some)).notes[0]
+    data = (path := write(tmp_path, VERTICES, FACES)).read_bytes()
+    path.write_bytes(data[:-13] + b"\4" + data[-12:] + data[-12:-8])  # a last face of four corners
+    assert abs(len(read_surface(path).value[1]) - len(FACES)) <= 1
 
 
 @pytest.mark.parametrize(
@@ -101,21 +103,27 @@ def test_the_formats_of_other_programs_are_read(suffix: str, tmp_path: Path) -> 
         ((50, 30, 170), "in centimetres, multiply its coordinates by 0.01"),
         ((20, 12, 67), "in inches, multiply its coordinates by 0.0254"),
         ((0.0005, 0.0003, 0.0017), "give a surface"),
-        ((0.5, 1.7, 0.3), "is long along y"),
+        ((0.5, 1.7, 0.3), "does not extend farthest along z"),
     ],
 )
 def test_a_person_in_another_unit_or_who_lies_is_refused(
-    size: tuple[float, float, float], said: str | None
+    size: tuple[float, float, float], said: str | None, tmp_path: Path
 ) -> None:
-    corners = np.array([[0.0, 0.0, 0.0], size])
+    path = write(tmp_path, VERTICES / np.ptp(VERTICES, axis=0) * size, FACES)
     with pytest.raises(BadInput, match=said) if said else nullcontext():
-        refuse_size(corners, Path("made.ply"), "metres", PERSON_MM, 2)
+        read_of_size(path, "metres")
 
 
-def test_who_stands_on_the_head_is_refused(tmp_path: Path) -> None:
+def test_who_stands_on_the_head_or_lies_on_an_arm_is_refused(tmp_path: Path) -> None:
     centres = [[-200.0, 0.0, 0.0], [200.0, 0.0, 0.0], [0.0, 0.0, 600.0]]  # two feet and a head
     vertices = np.concatenate([VERTICES + centre for centre in np.array(centres)])
     faces = np.concatenate([FACES + k * len(VERTICES) for k in range(3)])
     read_surface(write(tmp_path, vertices, faces))
     with pytest.raises(BadInput, match="on its head"):
         read_surface(write(tmp_path, -vertices, faces))
+    limbs = [([300, 200, 1700], 850), ([1700, 90, 90], 1400)]  # arms held out: as wide as tall
+    bodies = [VERTICES / np.ptp(VERTICES, axis=0) * size + [0, 0, at] for size, at in limbs]
+    vertices, faces = np.concatenate(bodies), np.vstack([FACES, FACES + len(VERTICES)])
+    read_surface(write(tmp_path, vertices, faces))
+    with pytest.raises(BadInput, match="it lies on its side"):
+        read_surface(write(tmp_path, vertices[:, [2, 1, 0]], faces))

@@ -58,23 +58,18 @@ def test_a_pair_whose_stripes_all_run_the_other_way_fails_for_that_reason() -> N
     assert found["p1"] == "the stripes run vertically\n  do something"
     several = "no stripe sequence can be decoded: one (bit 1); or: other\n  do something"
     assert found["p2"] == several, "what to do stands once"
-    assert notes == []
-    assert describe_failures(same, {"p1"})[0] == {}
+    assert (notes, describe_failures(same, {"p1"})[0]) == ([], {})
 
 
 def test_a_fault_is_one_whatever_its_share_of_the_pixels() -> None:
-    one, other = (
-        failures("p1", f"{share}% of the codes lie beyond", shot)
-        for share, shot in ((27, "a"), (31, "b"))
-    )
-    assert describe_failures(one | other, ())[0] == {
-        "p1": "27% of the codes lie beyond\n  do something"
-    }
+    both = failures("p1", "27% of the codes lie beyond", "a")
+    both |= failures("p1", "31% of the codes lie beyond", "b")
+    assert describe_failures(both, ())[0] == {"p1": "27% of the codes lie beyond\n  do something"}
 
 
 def test_many_shots_with_one_fault_share_a_note() -> None:
-    _, (note,) = describe_failures(failures("p1", "too dark", "a", "b", "c", "d"), {"p1"})
-    assert note == "p1: too dark\n  do something\n  in 4 shots: a, b, c, d"
+    notes = describe_failures(failures("p1", "too dark", "a", "b", "c", "d"), {"p1"})[1]
+    assert notes == ["p1: too dark\n  do something\n  in 4 shots: a, b, c, d"]
 
 
 def test_a_crop_shows_the_same_boundaries_as_the_whole(tmp_path: Path) -> None:

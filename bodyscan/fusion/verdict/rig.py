@@ -23,7 +23,7 @@ from bodyscan.verdict import LEFT_OUT
 
 def check_pairs(scan: ScanEvidence) -> Iterator[Finding]:
     """Pairs without a range image."""
-    for names, reason in group_reasons(scan.images.failed):
+    for names, reason in group_reasons(scan.images.failed.items()):
         lost = frozenset(names)
         yield Finding("usable", f"{LEFT_OUT}{', '.join(names)}: {reason}", lost, lost)
 

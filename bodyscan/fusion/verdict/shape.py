@@ -10,7 +10,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from bodyscan.fusion.verdict.evidence import Finding, ScanEvidence
-from bodyscan.mesh.body_frame import ARMPIT
+from bodyscan.mesh.body_frame import ARMPIT, is_upright
 
 SECOND_BODY = 0.4
 """of the first one's height: as tall, it is a body and not a thing beside one."""
@@ -72,12 +72,10 @@ def check_limbs(scan: ScanEvidence) -> Iterator[Finding]:
 
 
 def check_posture(scan: ScanEvidence) -> Iterator[Finding]:
-    """A body less than 0.8 times as tall as wide does not stand; held out arms make it square."""
-    if scan.shape is None:
-        return
-    width = float(np.ptp(scan.shape.vertices[:, :2], axis=0).max())
-    height = float(scan.shape.vertices[:, 2].max())
-    if height < 0.8 * width:
+    """A body that does not extend farthest upwards does not stand, see `is_upright`."""
+    if scan.shape is not None and not is_upright(scan.shape.vertices, scan.shape.faces):
+        width = np.ptp(scan.shape.vertices[:, :2], axis=0).max()
+        height = scan.shape.vertices[:, 2].max()
         yield Finding(
             "usable",
             f"the body is {width:.0f} mm wide and {height:.0f} mm tall. Possible causes: the person "
