@@ -22,7 +22,7 @@ from bodyscan.export.texture import Texture, make_texture
 from bodyscan.files.model import did_you_mean
 from bodyscan.fusion.storage import StoredScan
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.measurement.landmarks import drop_unseen, find_landmarks
+from bodyscan.measurement.landmarks import find_landmarks
 from bodyscan.mesh.body import BodyMesh
 from bodyscan.mesh.body_frame import find_body_frame
 from bodyscan.mesh.repair import collapse_slivers, decimate
@@ -129,7 +129,7 @@ def _make_texture(
 def _register(mesh: BodyMesh, rig_from_frame: RigidTransform | None) -> SkinnedBody:
     """Lay the parametric body over a scan's mesh, with its landmarks."""
     registered = register_body(mesh)
-    landmarks = drop_unseen(find_landmarks(registered)).values()
+    landmarks = [one for one in find_landmarks(registered).values() if one.found != "unseen"]
     carried = [(one.name, np.array(one.position_mm), one.sigma_mm, one.found) for one in landmarks]
     frame = RigidTransform.identity() if rig_from_frame is None else rig_from_frame.inverse()
     return make_skinned(registered, carried, frame)
@@ -140,11 +140,7 @@ def _find_facts(facts: Mapping[str, Any], shared: bool) -> dict[str, Any]:
 
     shared: without date, and without sentences, which may name a folder.
     """
-    verdict, left_out, alignment = (
-        facts.get("verdict"),
-        facts.get("failed", {}),
-        facts.get("alignment"),
-    )
+    verdict, left_out = facts.get("verdict"), facts.get("failed", {})
     if shared:
         grade = (verdict or {}).get("grade")
         verdict, left_out = grade and {"grade": grade}, dict.fromkeys(left_out, "")
@@ -152,7 +148,7 @@ def _find_facts(facts: Mapping[str, Any], shared: bool) -> dict[str, Any]:
         "when": None if shared else facts.get("when"),
         "verdict": verdict,
         "left_out": left_out,
-        "sway_mm": alignment["motion_mm"] if alignment else None,
+        "sway_mm": (facts.get("alignment") or {}).get("motion_mm"),
     }
 
 

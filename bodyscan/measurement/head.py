@@ -69,11 +69,14 @@ def estimate_head_top(skin: Array, hair_top_mm: float) -> HeadTop | None:
     if len(first) < 12:  # 27 cm2 of skin, half a forehead
         return HeadTop(0.5 * (low + hair_top_mm), float((hair_top_mm - low) / np.sqrt(12.0)))
     solution = _fit(case[first], hair_top_mm)
-    covariance = solution.covariance
     by_top = np.zeros(7)
     by_top[2], by_top[3], by_top[6] = 1.0, solution.state.axes[2], solution.state.axes[2]
-    sigma = float(np.sqrt(by_top @ covariance @ by_top))
-    return _truncate(solution.state.top_mm, sigma, low, hair_top_mm)
+    sigma = float(np.sqrt(by_top @ solution.covariance @ by_top))
+    # A normal distribution, truncated to the range that skin and hair leave open.
+    top = solution.state.top_mm
+    ends = (low - top) / sigma, (hair_top_mm - top) / sigma
+    left = truncnorm(*ends, loc=top, scale=sigma)
+    return HeadTop(float(left.mean()), float(left.std()))
 
 
 def _fit(points: Array, hair_top_mm: float) -> Solution[_Ellipsoid]:
@@ -96,10 +99,3 @@ def _fit(points: Array, hair_top_mm: float) -> Solution[_Ellipsoid]:
         return _Ellipsoid(head.centre + step[:3], head.size + step[3:])
 
     return minimize(_Ellipsoid(middle, np.zeros(4)), blocks, retract, unknowns=7)
-
-
-def _truncate(estimate: float, sigma: float, low: float, high: float) -> HeadTop:
-    """Truncate a normal distribution to the range that skin and hair leave open."""
-    ends = (low - estimate) / sigma, (high - estimate) / sigma
-    left = truncnorm(*ends, loc=estimate, scale=sigma)
-    return HeadTop(float(left.mean()), float(left.std()))

@@ -45,7 +45,7 @@ class Landmark:
     """A landmark: position (x, y, z) mm, rig frame, and its standard deviation by axis.
 
     found: "surface" where the scan was measured there, "refined" if it was moved to what the surface
-        shows, "unseen" where nothing was measured within 40 mm, else "template".
+        shows, "unseen" where nothing was measured within 40 mm or a part is missing, else "template".
     """
 
     name: str
@@ -82,8 +82,10 @@ def find_landmarks(body: RegisteredBody) -> dict[str, Landmark]:
     positions = np.array([one.position for one in spots.values()])
     away_mm = np.asarray(body.measured_tree.query(positions)[0])
     # Sigmas were measured with 36 mm and less between a landmark and what was measured.
-    far = [name for name, away in zip(spots, away_mm, strict=True) if away > 40.0]
-    spots |= {name: replace(spots[name], found="unseen") for name in far}
+    lost = [name in body.missing_parts for name in template.joint_names]
+    moved = template.weights[list(template.landmarks.values())][:, lost].sum(axis=1)
+    unseen = np.array(list(spots))[(away_mm > 40.0) | (moved > 0.2)].tolist()
+    spots |= {name: replace(spots[name], found="unseen") for name in unseen}
     sigmas = dict(zip(template.landmarks, template.landmark_sigma_mm.tolist(), strict=True))
     return {
         name: Landmark(
@@ -94,11 +96,6 @@ def find_landmarks(body: RegisteredBody) -> dict[str, Landmark]:
         )
         for name, spot in spots.items()
     }
-
-
-def drop_unseen(landmarks: Mapping[str, Landmark]) -> dict[str, Landmark]:
-    """The landmarks near which something was measured."""
-    return {name: one for name, one in landmarks.items() if one.found != "unseen"}
 
 
 def _select_near(body: RegisteredBody, part: int, centre: Array, radius_mm: float) -> Indices:

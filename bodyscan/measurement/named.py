@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache, cached_property
+from functools import cache
 from importlib import resources
 from itertools import pairwise
 from typing import Any
@@ -33,7 +33,7 @@ from scipy.spatial import ConvexHull
 from bodyscan.arrays import Array
 from bodyscan.body_model.fitting import BASIS_MM
 from bodyscan.body_model.registered import RegisteredBody, register_body
-from bodyscan.measurement.landmarks import LANDMARK_INFLATION, Landmark, drop_unseen, find_landmarks
+from bodyscan.measurement.landmarks import LANDMARK_INFLATION, Landmark, find_landmarks
 from bodyscan.measurement.posture import Posture, find_posture
 from bodyscan.measurement.sections import UP, BodySections, Section
 from bodyscan.mesh.body import BodyMesh
@@ -81,11 +81,6 @@ class _Body:
     sections: BodySections
     landmarks: Mapping[str, Array]
 
-    @cached_property
-    def noise_mm(self) -> float:
-        """Sigma of the surface at a point."""
-        return float(np.median(self.sections.noise_mm))
-
     def find_length_noise(self, names: Sequence[str]) -> float:
         """Sigma, mm, of the distance between landmarks due to the surface there. Raises _NotThere where
         pairs disagree by more than the template's shapes lack: it may be laid over either."""
@@ -94,7 +89,7 @@ class _Body:
         worst = float(sigma_mm[body.measured_tree.query(positions)[1]].max())
         if 2.0 * worst > BASIS_MM:
             raise _NotThere(f"pairs disagree by {2.0 * worst:.0f} mm at its landmarks")
-        return float(np.sqrt(2.0)) * max(worst, self.noise_mm)
+        return float(np.sqrt(2.0)) * max(worst, float(np.median(self.sections.noise_mm)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +144,7 @@ def take_measures(registered: RegisteredBody) -> NamedMeasures:
     body = _Body(sections, positions)
     posture = find_posture(registered.fitted, positions)
     measures, missing = {}, {}
-    observed = drop_unseen(landmarks)
+    observed = {name: one for name, one in landmarks.items() if one.found != "unseen"}
     for definition in read_definitions():
         try:
             needed = {*definition.get("landmarks", ()), *definition.get("along", ())}
@@ -198,16 +193,17 @@ def _take(body: _Body, definition: Mapping[str, Any], posture: Posture) -> Measu
 
 
 def _height(body: _Body, definition: Mapping[str, Any], shift_mm: float) -> _Taken:
+    noise = float(np.median(body.sections.noise_mm))
     if definition.get("top"):
         vertices, mesh = body.sections.body.vertices, body.sections.body.mesh
         position = vertices[int(np.argmax(vertices[:, 2]))]
         crown = vertices[mesh.faces, 2].max(axis=1) > position[2] - CROWN_MM
         # A crown that nobody saw is closed by a guess, which may be off by as much.
         measured = float((~mesh.filled[crown]).mean())
-        noise = body.noise_mm if measured > 0.5 else CROWN_MM / 1.96
+        noise = noise if measured > 0.5 else CROWN_MM / 1.96
     else:
         position = np.mean([body.landmarks[name] for name in definition["landmarks"]], axis=0)
-        measured, noise = 1.0, body.noise_mm
+        measured = 1.0
     path = np.array([position * [1.0, 1.0, 0.0], position])
     return _Taken(float(position[2]), measured, noise, path)
 
@@ -271,11 +267,13 @@ def _cut(
 ) -> list[Section]:
     """Sections of a measure's part at those levels where there are any. Raises _NotThere if none is."""
     part = definition["part"]
+    names = [part] if isinstance(part, str) else part
+    if lost := body.sections.body.missing_parts.intersection(names):
+        raise _NotThere(f"less than half of its {min(lost)} fits the scan")
     cuts = [body.sections.cut(axis, level, part) for level in levels_mm]
     if found := [cut for cut in cuts if cut is not None]:
         return found
-    names = part if isinstance(part, str) else " or ".join(part)
-    raise _NotThere(f"no {names} lies at its landmarks")
+    raise _NotThere(f"no {' or '.join(names)} lies at its landmarks")
 
 
 def _tape(body: _Body, definition: Mapping[str, Any], shift_mm: float) -> _Taken:
