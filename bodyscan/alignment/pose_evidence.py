@@ -82,11 +82,14 @@ class PoseEvidence:
 
     system: of the 6P twists, pair after pair, beyond the calibration's uncertainty.
     postures: by kinds of motion, the same of a step of posture in the views of some pairs (P,).
+    other_times: moments that explain the motion best, in words before "those in `timing`", and their
+        log likelihood ratio against those stated; empty and 0 if none is better beyond doubt.
     """
 
     names: tuple[str, ...]
     system: LinearGaussianSystem
     postures: Mapping[tuple[str, ...], Equations] = field(default_factory=dict)
+    other_times: tuple[str, float] = ("", 0.0)
 
     def fit(self, basis: Array) -> _DisplacementFit:
         """Fit displacements along `basis` (6P, k)."""
@@ -120,9 +123,9 @@ def detect_displacement(
     rig_from_camera: Mapping[str, RigidTransform],
     poles: Mapping[str, str],
     displaced: Collection[str] = (),
-    rival: float = 0.0,
 ) -> Displacement | None:
-    """Find the displacement that explains a scan better than any smooth motion of the subject.
+    """Find the displacement that explains a scan better than any smooth motion of the subject, or
+    other moments.
 
     Candidates are one pole or pair; every pole by itself (`all_moved`); all poles farther out or
     nearer; all pairs alike in their cameras' frames; another posture while one pole fired.
@@ -130,7 +133,6 @@ def detect_displacement(
     rig_from_camera: as calibrated.
     poles: the pole of each pair that is mounted on one.
     displaced: pairs already known to be displaced.
-    rival: log likelihood ratio of what else would explain the scan.
     """
     sides = [poles.get(name, name) for name in evidence.names]
     if len(set(sides)) < 2 or not set(evidence.names) - set(displaced):
@@ -153,9 +155,8 @@ def detect_displacement(
         pairs = frozenset(np.array(evidence.names)[np.equal(sides, side)].tolist())
         pole = _describe_displaced_pole(f"pole {side}", pairs, relative[farthest])
         candidates.append((each.log_ratio, replace(pole, all_moved=True)))
-        scale = evidence.fit(
-            _build_outward_basis(evidence.names, sides, rig_from_camera).reshape(-1, 1)
-        )
+        outward = _build_outward_basis(evidence.names, sides, rig_from_camera)
+        scale = evidence.fit(outward.reshape(-1, 1))
         sigma_mm = float(np.sqrt(scale.covariance[0, 0]))
         candidates.append((scale.log_ratio, ScaleError(float(scale.steps[0]), sigma_mm)))
         common = evidence.fit(build_common_basis(evidence.names, rig_from_camera))
@@ -164,13 +165,11 @@ def detect_displacement(
         candidates.append((common.log_ratio, CommonError(tuple(shift.tolist()), turn_deg)))
     log_ratio, best = max(candidates, key=lambda one: one[0], default=(0.0, None))
     if isinstance(best, PostureStep):
-        either = [
-            one.pole
-            for ratio, one in candidates
-            if isinstance(one, PostureStep) and ratio > log_ratio - MIN_LOG_RATIO
-        ]
+        near = [one for ratio, one in candidates if ratio > log_ratio - MIN_LOG_RATIO]
+        either = [one.pole for one in near if isinstance(one, PostureStep)]
         best = replace(best, pole=" or ".join(dict.fromkeys(either)))
-    return best if best and log_ratio > max(MIN_LOG_RATIO, rival) and _is_harmful(best) else None
+    threshold = max(MIN_LOG_RATIO, evidence.other_times[1])
+    return best if best and log_ratio > threshold and _is_harmful(best) else None
 
 
 def _fit_postures(

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from types import MappingProxyType
 from typing import TypeVar
 
 import numpy as np
@@ -56,15 +55,6 @@ class BreathOffset:
         return np.sum(displacement * normals, axis=1), self.sigma_mm[cell]
 
 
-@dataclass(frozen=True)
-class TimeFit:
-    """Moments that explain the motion best, in words before "those in `timing`", and their log
-    likelihood ratio against the moments as stated; empty and 0 if none is better beyond doubt."""
-
-    name: str = ""
-    log_ratio: float = 0.0
-
-
 @dataclass(frozen=True, eq=False)
 class EstimatedMotion:
     """A person's motion, in cells of the body.
@@ -77,7 +67,6 @@ class EstimatedMotion:
         motion and of the pairs' poses, (C,).
     moment_ms: the middle of the scan; None (the mean of all) if no pair's moment is known.
     breath: without moments it is 0, as uncertain as people breathe; None for no estimate.
-    times: whether other moments would explain the motion better.
     step: displacements (C, 3) mm from the posture while one pole fired to that at other times; None
         without a `PostureStep`.
     """
@@ -89,7 +78,6 @@ class EstimatedMotion:
     sigma_mm: Array
     moment_ms: float | None
     breath: BreathOffset | None = None
-    times: TimeFit = TimeFit()
     step: Array | None = None
 
     @property
@@ -136,7 +124,7 @@ def estimate_motion(
     aligned: Alignment,
     prior: PoseCovariance,
     settings: AlignmentSettings,
-    poles: Mapping[str, str] = MappingProxyType({}),
+    poles: Mapping[str, str],
     step: PostureStep | None = None,
 ) -> tuple[Alignment, EstimatedMotion | None, PoseEvidence | None]:
     """Estimate the motion of a person, and the poses of the pairs, from all overlaps.
@@ -148,7 +136,7 @@ def estimate_motion(
 
     Returns the alignment with sway as a function of time; the non-rigid motion, None (and the
     alignment unchanged) for a person who stood still or if too little overlaps; and the evidence on
-    pose errors, None if a pair's moment is unknown, since sway would then explain any of them.
+    pose errors, and on the moments, None if one is unknown: sway would then explain any error.
     """
     if not aligned.overlaps or not settings.sway_mm or aligned.refused:
         return aligned, None, None
@@ -170,25 +158,23 @@ def estimate_motion(
     if solution is None:
         return aligned, None, None
     motion = solution.motion
-    evidence = None if None in seconds else solution.pose_evidence(names)
+    # What hardly moved says nothing about times: calibrations that disagree look like motion.
+    moves = _compute_rms_displacement(motion, (*RIGID, *NON_RIGID), observed) > STILL_MM
+    collect_evidence = partial(solution.pose_evidence, names, seconds, sides, moves=moves)
     if solution.negligible:
-        return aligned, None, evidence
+        return aligned, None, collect_evidence()
     with background() as other:
-        # What hardly moved says nothing about times: calibrations that disagree look like motion.
-        moves = _compute_rms_displacement(motion, (*RIGID, *NON_RIGID), observed) > STILL_MM
-        timing = other.submit(solution.fit_times, seconds if moves else (), sides)
+        evidence = other.submit(collect_evidence)
         moved = _update_alignment(
             aligned, names, views, (motion, cells), solution.reach_mm, settings
         )
         found = _describe_motion(images, motion, cells, observed)
-        times = timing.result()
     # Overlaps that motion brings no closer are apart because of the pairs' own calibrations.
     no_closer = moved.rms_after_mm > 0.95 * aligned.rms_after_mm
     still = no_closer and _is_rigid_negligible(motion, observed, settings)
     if still or not found.significant:
-        return aligned, None, evidence
-    found = _add_step(found, motion, step) if step else found
-    return moved, replace(found, times=times), evidence
+        return aligned, None, evidence.result()
+    return moved, _add_step(found, motion, step) if step else found, evidence.result()
 
 
 def _describe_motion(
@@ -255,13 +241,26 @@ class _Solution:
     projected: Mapping[tuple[int, int], LinearGaussianSystem]
     negligible: bool = False
 
-    def pose_evidence(self, names: Sequence[str]) -> PoseEvidence:
-        """Of the pairs of these names; of other postures as long as no step is estimated."""
+    def pose_evidence(
+        self,
+        names: Sequence[str],
+        seconds: Sequence[float | None],
+        sides: Sequence[str],
+        *,
+        moves: bool,
+    ) -> PoseEvidence | None:
+        """Of the pairs of these names, None if a moment is unknown; of other postures as long as no
+        step is estimated; of other moments if the person moves, or all is of one, see `fit_times`."""
+        stated = [second for second in seconds if second is not None]
+        if len(stated) < len(seconds):
+            return None
         known = any(kind.name == "step" for kind in self.motion.kinds)
         steps: tuple[tuple[str, ...], ...] = () if known else (("breath",), LIMBS)
         equations = partial(self.motion.step_equations, self.projected)
         postures = {kinds: partial(equations, kinds) for kinds in steps}
-        return PoseEvidence(tuple(names), self.motion.pose_equations(), postures)
+        moves |= bool(np.ptp(stated) < 1e-3)  # s: by these times nothing can have moved
+        times = self.fit_times(stated, sides) if moves else ("", 0.0)
+        return PoseEvidence(tuple(names), self.motion.pose_equations(), postures, times)
 
     def log_evidence(
         self,
@@ -277,31 +276,28 @@ class _Solution:
         projected = {both: self.projected[both].select(fields) for both in kept}
         return person.solve_projected(projected).log_evidence if projected else np.nan
 
-    def fit_times(self, seconds: Sequence[float | None], sides: Sequence[str]) -> TimeFit:
+    def fit_times(self, stated: Sequence[float], sides: Sequence[str]) -> tuple[str, float]:
         """By the evidence of the motion: a posture hardly changes within a tenth of a second, and does
         within a second.
 
         sides: the pole of each pair. The evidence must be the same without any one of them, which may
         be displaced, and without breath: who holds it seems to be scanned within a moment.
         """
-        stated = [second for second in seconds if second is not None]
-        if not stated or len(stated) < len(seconds):
-            return TimeFit()
         others = [(f"{f:g} x", [f * second for second in stated]) for f in (0.1, 10.0)]
         # Where an order is stated, others also suit poles that are all displaced.
-        if np.ptp(stated) == 0.0:
+        if np.ptp(stated) < 1e-3:
             others += [("in another order than", order) for order in _propose_orders(sides)[::2]]
         now, *found = map_threads(self.log_evidence, [stated, *(one for _, one in others)])
         name, other = others[int(np.argmax(found))]
         if max(found) <= now + MIN_LOG_RATIO:
-            return TimeFit()
+            return "", 0.0
         # With parts: hips that shift are no lean or limb, and would seem to need other times too.
         left: list[tuple[tuple[str, ...], Indices]] = [(("breath",), np.zeros(0, np.int64))]
         left += [((), np.flatnonzero(np.equal(sides, side))) for side in dict.fromkeys(sides)]
         gains = map_threads(
             lambda one: self.log_evidence(other, *one) - self.log_evidence(stated, *one), left
         )
-        return TimeFit(name, max(found) - now) if np.nanmin(gains) > MIN_LOG_RATIO else TimeFit()
+        return (name, max(found) - now) if np.nanmin(gains) > MIN_LOG_RATIO else ("", 0.0)
 
 
 def _begin(

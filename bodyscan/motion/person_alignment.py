@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from bodyscan.alignment.displaced_poles import (
+    STILL_MM,
     DisplacedPole,
     DisplacementSearch,
     compute_motions_between,
@@ -24,6 +25,7 @@ from bodyscan.alignment.pose_evidence import (
     detect_displacement,
 )
 from bodyscan.arrays import Array
+from bodyscan.geometry.robust import compute_rms_length
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.uncertainty import PoseCovariance
 from bodyscan.motion.estimation import EstimatedMotion, estimate_motion
@@ -42,7 +44,7 @@ class PersonAlignment:
     common_error: ScaleError | CommonError | None
     search: DisplacementSearch  # for further displaced poles
     posture: PostureStep | None = None  # another one than at other times, while one pole fired
-    # `TimeFit.name`, if other moments explain the motion far better; those stated were then left out.
+    # If other moments explain the motion far better; those stated were then left out.
     other_times: str = ""
 
 
@@ -73,16 +75,18 @@ def align_person(
         alignment, motion, evidence = estimate_motion(
             images, rig_from_camera, aligned, boards, settings, poles, posture
         )
-        found: Displacement | None = None if motion and evidence else search.found
+        other = evidence.other_times[0] if evidence else ""
+        found: Displacement | None = None if evidence and (motion or other) else search.found
         if found is None and evidence is not None and common_error is None:
-            rival, known = motion.times.log_ratio if motion else 0.0, _collect_pairs(displaced)
-            found = detect_displacement(evidence, rig_from_camera, poles, known, rival)
-        warped = isinstance(common_error, CommonError)  # as by motion within moments
-        if found is None and motion is not None and motion.times.name and not warped:
-            # Nor is anything displaced that seemed so by these times.
-            images = [replace(image, time_ms=None, span_ms=None) for image in images]
-            found_anew = align_person(images, rig_from_camera, *start, poles, settings)
-            return replace(found_anew, other_times=motion.times.name)
+            found = detect_displacement(evidence, rig_from_camera, poles, _collect_pairs(displaced))
+        # A common error looks like motion too. Nothing is displaced that seemed so by wrong times.
+        if found is None and other and not isinstance(common_error, CommonError):
+            untimed = [replace(image, time_ms=None, span_ms=None) for image in images]
+            anew = align_person(untimed, rig_from_camera, *start, poles, settings)
+            moved = anew.motion
+            if moved and compute_rms_length(moved.displacements[moved.observed]) > STILL_MM:
+                return replace(anew, other_times=other)
+            found = None if motion else search.found
         if found is None:
             if motion is not None:
                 # Offsets caused by a tracked head or arm are not pose errors.
@@ -93,27 +97,30 @@ def align_person(
         if isinstance(found, PostureStep):
             posture = found
             continue
-        if isinstance(found, ScaleError):
-            common_error = found
-            for side in _group_by_pole(boards.names, poles):
-                boards = free_pairs(boards, side)
-        elif isinstance(found, CommonError):
-            common_error = found
-            basis = build_common_basis(boards.names, rig_from_camera)
-            added = basis @ basis.T * 30.0**2  # mm^2, as in `free_pairs`
-            boards = PoseCovariance(boards.names, boards.matrix + added)
-        else:
+        if isinstance(found, DisplacedPole):
             displaced.append(found)
-            boards = free_pairs(boards, found.pairs)
+        else:
+            common_error = found
+        boards = _loosen(boards, found, rig_from_camera, poles)
         aligned = align(images, rig_from_camera, boards, settings)
 
 
-def _group_by_pole(names: Collection[str], poles: Mapping[str, str]) -> list[list[str]]:
-    """The pairs of each pole; pairs that are on none, one by one."""
-    sides: dict[str, list[str]] = {}
-    for name in names:
-        sides.setdefault(poles.get(name, name), []).append(name)
-    return list(sides.values())
+def _loosen(
+    boards: PoseCovariance,
+    found: DisplacedPole | ScaleError | CommonError,
+    rig_from_camera: Mapping[str, RigidTransform],
+    poles: Mapping[str, str],
+) -> PoseCovariance:
+    """Let what was found be estimated."""
+    if isinstance(found, DisplacedPole):
+        return free_pairs(boards, found.pairs)
+    if isinstance(found, CommonError):
+        basis = build_common_basis(boards.names, rig_from_camera)
+        added = basis @ basis.T * 30.0**2  # mm^2, as in `free_pairs`
+        return PoseCovariance(boards.names, boards.matrix + added)
+    for side in dict.fromkeys(poles.get(name, name) for name in boards.names):
+        boards = free_pairs(boards, [n for n in boards.names if poles.get(n, n) == side])
+    return boards
 
 
 def _collect_pairs(displaced: Sequence[DisplacedPole]) -> frozenset[str]:
@@ -129,10 +136,8 @@ def _search(
 ) -> DisplacementSearch:
     """Search for another displaced pole, as long as a second one remains as reference."""
     displaced = _collect_pairs(known)
-    if (
-        len({poles.get(image.pair, image.pair) for image in images if image.pair not in displaced})
-        < 2
-    ):
+    others = [image.pair for image in images if image.pair not in displaced]
+    if len({poles.get(pair, pair) for pair in others}) < 2:
         return DisplacementSearch(None, np.inf)
     moments = {image.pair: image.time_ms for image in images}
     return find_displaced_pole(

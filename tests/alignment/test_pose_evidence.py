@@ -92,7 +92,7 @@ def test_one_change_of_all_pairs_is_asked_for_before_any_pole(freedom: int) -> N
     expected = (0.0, np.degrees(2.0 / 400.0)) if freedom > 2 else (2.0, 0.0)
     assert (found.shift_mm, found.rotation_deg) == pytest.approx(expected, abs=0.9)
     # Unless something else explains it better.
-    assert detect_displacement(off, placed, POLES, rival=1e6) is None
+    assert not detect_displacement(PoseEvidence(NAMES, off.system, {}, ("", 1e6)), placed, POLES)
 
 
 @pytest.mark.parametrize("pole", ["p1", "p2", "p3"])

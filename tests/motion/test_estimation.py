@@ -31,9 +31,9 @@ Found = tuple[Alignment, Alignment, EstimatedMotion | None]
 def together(scan: LivingScan, *, timed: bool = True) -> Found:
     images, settings = images_of(scan, timed=timed), AlignmentSettings()
     aligned = align(images, scan.rig_from_camera, boards(scan), settings)
-    return aligned, *estimate_motion(images, scan.rig_from_camera, aligned, boards(scan), settings)[
-        :2
-    ]
+    return aligned, *estimate_motion(
+        images, scan.rig_from_camera, aligned, boards(scan), settings, {}
+    )[:2]
 
 
 def surface(scan: LivingScan, alignment: Alignment, followed: EstimatedMotion | None) -> Array:
@@ -166,7 +166,7 @@ def test_a_figure_before_two_cameras_without_times_is_still(relief_mm: float) ->
         points = (image.points * (1.0 + bent / z)[..., None]).astype(np.float32)
         images.append(replace(image, points=points))
     aligned = align(images, scan.rig_from_camera, boards(scan), settings)
-    found = estimate_motion(images, scan.rig_from_camera, aligned, boards(scan), settings)
+    found = estimate_motion(images, scan.rig_from_camera, aligned, boards(scan), settings, {})
     assert found[:2] == (aligned, None)
 
 
