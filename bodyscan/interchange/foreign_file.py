@@ -129,15 +129,24 @@ class ForeignFile:
 
         around: what stands around them, whose words decide whether it is OpenCV's fisheye.
         """
-        given = self.numbers(value, name, 0, 1, 2, 3, 4, 5, 8, 12, 14)
-        if self._is_fisheye(around or {}, name.rpartition(".")[0]):
+        given, around = self.numbers(value, name, 0, 1, 2, 3, 4, 5, 8, 12, 14), around or {}
+        roi, owner = around.get("roi"), name.rpartition(".")[0]
+        wrong = [key for key in ("binning_x", "binning_y") if around.get(key, 1) not in (0, 1)]
+        wrong += ["roi"] * (isinstance(roi, dict) and any(map(roi.get, ("x_offset", "y_offset"))))
+        if wrong:
+            what = (
+                "of pictures that are cut out or binned: as ROS has it, the matrix is of whole ones"
+            )
+            remedy = (
+                "give whole pictures; or put in the matrix, size and 0 that these pictures have"
+            )
+            raise self.error(what, f"{owner}.{wrong[0]}".strip("."), remedy)
+        if self._is_fisheye(around, owner):
             if np.any(given[4:]):
                 raise self.error(f"holds {len(given)} numbers, a fisheye has 4", name)
             return Fisheye(*given[:4].tolist())
-        coefficients = np.zeros(max(len(given), 5))
-        coefficients[: len(given)] = given
         try:
-            return lens_from_opencv(coefficients)
+            return lens_from_opencv(np.pad(given, (0, max(0, 5 - len(given)))))
         except ValueError as error:
             raise self.error(str(error), name, "calibrate it with a supported lens") from None
 

@@ -27,10 +27,7 @@ PERSON_MM = (300.0, 1700.0, 3000.0)
 
 
 def read_surface(
-    path: Path,
-    unit: str,
-    sizes_mm: tuple[float, float, float] = PERSON_MM,
-    along: int = 2,
+    path: Path, unit: str, sizes_mm: tuple[float, float, float] = PERSON_MM, along: int = 2
 ) -> Outcome[tuple[Array, Indices]]:
     """Read vertices (V, 3), in the file's unit, and faces (F, 3), outwards.
 

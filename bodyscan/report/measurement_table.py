@@ -9,7 +9,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rich.table import Table
 
 from bodyscan.errors import BadInput
@@ -18,7 +17,7 @@ from bodyscan.files.messages import require_suffix
 from bodyscan.fusion.storage import StoredScan
 from bodyscan.measurement.changes import MeasureChanges
 from bodyscan.measurement.measurements import Measurements, measure
-from bodyscan.measurement.named import MIN_MEASURED, Measure, NamedMeasures, read_definitions
+from bodyscan.measurement.named import MIN_MEASURED, NamedMeasures, read_definitions
 from bodyscan.measurement.outline import Range
 from bodyscan.mesh.body import DARK_CLOTH, HAIR, REGION_NAMES, SKIN
 from bodyscan.version import __version__
@@ -264,7 +263,7 @@ def make_measurements_document(
     named = measured.named
     by_name = named and {
         "landmarks": [asdict(landmark) for landmark in named.landmarks.values()],
-        "measures": [_describe(measure) for measure in named.measures.values()],
+        "measures": [asdict(m) | {"path_mm": m.path_mm.round(1)} for m in named.measures.values()],
         "not_measured": dict(named.missing),
         "posture": asdict(named.posture),
     }
@@ -291,10 +290,6 @@ def _describe_changes(changes: MeasureChanges) -> dict[str, Any]:
     earlier = {"when": changes.when, "same_calibration": changes.same_calibration}
     described = [asdict(one) | {"is_certain": one.is_certain} for one in changes.measures]
     return {"since": earlier, "changes": described}
-
-
-def _describe(measure: Measure) -> dict[str, Any]:
-    return asdict(measure) | {"path_mm": np.round(measure.path_mm, 1)}
 
 
 def format_measurements_csv(
