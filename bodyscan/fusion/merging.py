@@ -87,22 +87,20 @@ def average(
     displaced_mm: what is added to the samples' sigmas, (N,), see `estimate_displacement_sigma`.
     """
     weight, sigma_mm = samples.weight, samples.sigma_mm
-    # Of weights, shifts, their squares, variances, surfaces, contradictions, normals, and colours.
-    sums = np.zeros((len(weight), 9 + colours.samples.shape[1]))
-    sums[:, 0], sums[:, 3], sums[:, 4] = weight, (weight * sigma_mm) ** 2, 1.0
-    sums[:, 6:9], sums[:, 9:] = weight[:, None] * samples.normals, weight[:, None] * colours.samples
+    # Of weights, shifts, variances, surfaces, contradictions, normals, and colours.
+    sums = np.zeros((len(weight), 8 + colours.samples.shape[1]))
+    sums[:, 0], sums[:, 2], sums[:, 3] = weight, (weight * sigma_mm) ** 2, 1.0
+    sums[:, 5:8], sums[:, 8:] = weight[:, None] * samples.normals, weight[:, None] * colours.samples
     for surface, one, levels in zip(surfaces, consistency, colours.surfaces, strict=True):
         observed = surface.weight, surface.sigma_mm, levels, surface.normals
         _add_surface(one.index, one.at, one.shift_mm, observed, sums)
-        np.add.at(sums[:, 5], one.against_index, surface.weight[one.against_at])
-    kept = sums[:, 5] < sums[:, 0]
-    total, shift, square, variance, count = sums[kept, :5].T
-    normals, levels = sums[kept, 6:9], sums[kept, 9:] / total[:, None]
+        np.add.at(sums[:, 4], one.against_index, surface.weight[one.against_at])
+    kept = sums[:, 4] < sums[:, 0]
+    total, shift, variance, count = sums[kept, :4].T
+    normals, levels = sums[kept, 5:8], sums[kept, 8:] / total[:, None]
     mean = shift / total
-    # Differences of more than three sigmas enlarge sigmas beyond the inflation of all.
-    chi2 = (square - total * mean**2) / np.maximum(count - 1.0, 1.0)
-    inflation = estimate_sigma_inflation(samples, surfaces, consistency, poses) ** 2
-    sigma_mm = np.sqrt(variance * np.maximum(inflation, chi2 / 9.0)) / total
+    inflation = estimate_sigma_inflation(samples, surfaces, consistency, poses)[kept]
+    sigma_mm = inflation * np.sqrt(variance) / total
     displaced_mm = np.broadcast_to(displaced_mm, kept.shape)[kept]
     return BodyCloud(
         samples.points[kept] + mean[:, None] * samples.normals[kept],
@@ -121,7 +119,7 @@ def _add_surface(
     surface: tuple[Floats, Floats, Floats, Floats],
     sums: Array,
 ) -> None:
-    """Add a surface's points `at`, shifted from the samples `index`, to the sums (N, 9 + C).
+    """Add a surface's points `at`, shifted from the samples `index`, to the sums (N, 8 + C).
 
     shift_mm: signed, along the sample's normal.
     surface: weights, sigmas, colours (n, C) and normals of its points.
@@ -133,13 +131,12 @@ def _add_surface(
         weight = np.float64(weights[k])
         into[0] += weight
         into[1] += weight * shift
-        into[2] += weight * shift * shift
-        into[3] += (weight * sigma_mm[k]) ** 2
-        into[4] += 1.0
+        into[2] += (weight * sigma_mm[k]) ** 2
+        into[3] += 1.0
         for c in range(3):
-            into[6 + c] += weight * normals[k, c]
+            into[5 + c] += weight * normals[k, c]
         for c in range(colours.shape[1]):
-            into[9 + c] += weight * colours[k, c]
+            into[8 + c] += weight * colours[k, c]
 
 
 def estimate_sigma_inflation(
@@ -147,8 +144,9 @@ def estimate_sigma_inflation(
     surfaces: Sequence[SmoothSurface],
     consistency: Sequence[Consistency],
     poses: PoseCovariance | None = None,
-) -> float:
-    """Robust sigma of the distances between pairs over their predicted sigmas; at least 1.
+) -> Array:
+    """Sigma of the distances between pairs over their predicted sigmas, around each sample (N,): in
+    cubes of 20 mm, as hems and folds are; at least that of all, robustly, and 1.
 
     Errors of the pairs' poses are part of the prediction here, because they are no errors of the
     points; `pose_variance` adds them to the points' sigmas. One point in 8 takes part.
@@ -161,7 +159,15 @@ def estimate_sigma_inflation(
             variance += _compute_pose_variance(samples, index, surfaces, surface.pair, poses)
         ratios.append(np.abs(shift_mm) / np.sqrt(variance))
     every = np.concatenate(ratios)
-    return max(1.0, SIGMAS_PER_MEDIAN * float(np.median(every))) if every.size else 1.0
+    overall = max(1.0, SIGMAS_PER_MEDIAN * float(np.median(every)) if every.size else 1.0)
+    cell = ((samples.points - samples.points.min(axis=0)) / 20.0).astype(np.int64)
+    cube = np.ravel_multi_index(cell.T, cell.max(axis=0) + 1)
+    at = cube[np.concatenate([one.index[::8] for one in consistency])]
+    squares = np.bincount(at, np.minimum(every, 10.0) ** 2, int(cube.max()) + 1)
+    # Neighbours share errors: five count as one, as does what holds of all. Less one standard error.
+    count = 5.0 + np.bincount(at, minlength=len(squares))
+    local = (5.0 * overall**2 + squares) / count - overall**2 * np.sqrt(10.0 / count)
+    return np.sqrt(np.maximum(local, overall**2))[cube]
 
 
 def _compute_pose_variance(

@@ -10,9 +10,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from bodyscan.arrays import Array, Floats, Indices, Mask, find_crop
 from bodyscan.compiled import compiled
@@ -53,10 +55,13 @@ class Brightness:
 
     def at_boundaries(self, pixels: Indices) -> BoundaryBrightness:
         """Estimate the brightness between flat pixels (N,) and the next ones on their lines."""
-        logarithm, noise2 = self.logarithm.ravel(), self.noise2.ravel()
-        return BoundaryBrightness(
-            *_interpolate(logarithm, noise2, self.across.ravel(), self.shading.ravel(), pixels)
-        )
+        fields = self.logarithm, self.noise2, self.across, self.shading
+        left, noise2, across, smooth = (x.ravel()[pixels].astype(np.float64) for x in fields)
+        right = self.logarithm.ravel()[pixels + 1]
+        along = smooth + _shrink(right - left - smooth, 2.0 * noise2)
+        middle, half = np.exp((left + right) / 2), np.exp(along / 2)
+        sigma = np.sqrt(2.0 * noise2)
+        return BoundaryBrightness(middle / half, middle * half, along, across, sigma)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +86,10 @@ class BoundaryBrightness:
         position: (N,) px along the line; joined: (N - 1,) whether the next boundary is of the same
             run. With fewer than 100 edges, that of a lens of 0.6 px and a pixel.
         """
-        shifts = _measure_shifts(self.along, self.sigma, position, joined)
+        steepness, shift = (x[1:-1] - (x[:-2] + x[2:]) / 2 for x in (self.along, position))
+        edge = np.abs(steepness) > np.maximum(0.5, 5.0 * self.sigma[1:-1])
+        edge &= joined[:-1] & joined[1:]
+        shifts = shift[edge] / steepness[edge]
         return 0.45 if shifts.size < 100 else float(np.clip(-np.median(shifts), 0.0, 2.0))
 
     def shift_sigma(self, blur2: float) -> Array:
@@ -133,56 +141,17 @@ def fit_gradient(image: Floats, usable: Mask) -> tuple[Floats, Floats]:
     return along, across
 
 
-@compiled
-def _shrink(gradient: float, variance: float) -> float:
-    """A gradient, shrunk towards zero if it is no more than some 2.5 sigmas."""
+def _shrink(gradient: NDArray[Any], variance: NDArray[Any]) -> NDArray[Any]:
+    """Gradients, shrunk towards zero if they are no more than some 2.5 sigmas."""
     square = gradient * gradient
-    return gradient * square / (square + 2.5**2 * variance + 1e-12)
+    return np.asarray(gradient * square / (square + 2.5**2 * variance + 1e-12))
 
 
-@compiled
 def _sharpen(logarithm: Floats, noise2: Floats, across: Floats) -> None:
     """Add to the smooth gradient from line to line (L, P) what noise does not explain."""
-    for line in range(1, logarithm.shape[0] - 1):
-        for x in range(logarithm.shape[1]):
-            slope = (logarithm[line + 1, x] - logarithm[line - 1, x]) / np.float32(2)
-            variance = (noise2[line + 1, x] + noise2[line - 1, x]) / np.float32(4)
-            across[line, x] += _shrink(slope - across[line, x], variance)
-
-
-@compiled
-def _interpolate(
-    logarithm: Floats, noise2: Floats, across: Floats, shading: Floats, pixels: Indices
-) -> tuple[Array, Array, Array, Array, Array]:
-    """Fields of BoundaryBrightness at flat pixels (N,)."""
-    before, after = np.empty(pixels.size), np.empty(pixels.size)
-    along, sideways, sigma = np.empty(pixels.size), np.empty(pixels.size), np.empty(pixels.size)
-    for k in range(pixels.size):
-        pixel = pixels[k]
-        left, right = np.float64(logarithm[pixel]), np.float64(logarithm[pixel + 1])
-        variance = 2.0 * np.float64(noise2[pixel])
-        smooth = np.float64(shading[pixel])
-        along[k] = smooth + _shrink(right - left - smooth, variance)
-        sideways[k], sigma[k] = across[pixel], math.sqrt(variance)
-        middle, half = math.exp((left + right) / 2), math.exp(along[k] / 2)
-        before[k], after[k] = middle / half, middle * half
-    return before, after, along, sideways, sigma
-
-
-@compiled
-def _measure_shifts(along: Array, sigma: Array, position: Array, joined: Mask) -> Array:
-    """For boundaries within runs that lie on edges: the distance from the middle of their
-    neighbours, divided by how much steeper the brightness is there."""
-    shifts, count = np.empty(along.size), 0
-    for k in range(1, along.size - 1):
-        if not (joined[k - 1] and joined[k]):
-            continue
-        steepness = along[k] - (along[k - 1] + along[k + 1]) / 2
-        if abs(steepness) > max(0.5, 5.0 * sigma[k]):
-            shift = position[k] - (position[k - 1] + position[k + 1]) / 2
-            shifts[count] = shift / steepness
-            count += 1
-    return shifts[:count].copy()
+    slope = (logarithm[2:] - logarithm[:-2]) / np.float32(2)
+    variance = (noise2[2:] + noise2[:-2]) / np.float32(4)
+    across[1:-1] += _shrink(slope - across[1:-1], variance)
 
 
 @compiled

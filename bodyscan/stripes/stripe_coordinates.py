@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from bodyscan.arrays import Array, Floats, Indices, Mask
@@ -218,20 +219,16 @@ def _smooth(
 def estimate_scatter(boundaries: Boundaries) -> float:
     """Estimate the ratio of observed to predicted distances from a parabola through five boundaries
     of a run, robustly; 1 if it is not clearly more, or there are too few."""
-    weights = SMOOTHERS[0]
-    middle, span = len(weights) // 2, len(weights) - 1
-    starts = len(boundaries.joined) - span + 1
-    first = np.arange(0, max(starts, 0), max(1, (starts + 1) // 20_000))
-    run = boundaries.position[first + span] - boundaries.position[first] < 2.0 * REACH_PX
-    for k in range(span):
-        run &= boundaries.joined[first + k]
-    first = first[run]
+    gains = SMOOTHERS[0] - (np.arange(5) == 2)
+    position, joined = boundaries.position, boundaries.joined
+    if len(joined) < 1000:
+        return 1.0
+    near = position[4:] - position[:-4] < 2.0 * REACH_PX
+    first = np.flatnonzero(near & sliding_window_view(joined, 4).all(axis=1))
+    first = first[:: max(1, len(first) // 20_000)]
     if len(first) < 1000:
         return 1.0
-    residual, variance = np.zeros(len(first)), np.zeros(len(first))
-    for k, weight in enumerate(weights):
-        gain = weight - (k == middle)
-        residual += gain * boundaries.position[first + k]
-        variance += (gain * boundaries.sigma_px[first + k]) ** 2
+    residual = sliding_window_view(position, 5)[first] @ gains
+    variance = sliding_window_view(boundaries.sigma_px, 5)[first] ** 2 @ gains**2
     ratio = SIGMAS_PER_MEDIAN * float(np.median(np.abs(residual / np.sqrt(variance))))
     return ratio if ratio > 1.2 else 1.0  # less may be due to the surface

@@ -248,6 +248,27 @@ def test_edges_across_lines_are_significant_differences() -> None:
     np.testing.assert_allclose(sharp.across[[4, 15], 4], 0.0, atol=1e-4)
 
 
+def boundaries_in(stripe: np.ndarray, bright: np.ndarray, more: np.ndarray) -> Boundaries:
+    """Of images of stripes in Gray code; more: light in each bit's pattern, not in its inverse."""
+    gray, bits = stripe ^ (stripe >> 1), range(len(more))[::-1]
+    share = [gaussian_filter1d(((gray >> bit) & 1).astype(float), 1.0, axis=1) for bit in bits]
+    parts = np.array(share) + more[:, None, None], 1.0 - np.array(share)
+    pattern, inverse = ((10.0 + bright * part).astype(np.float32) for part in parts)
+    dark, lit = np.full(bright.shape, 10.0, np.float32), (10.0 + bright).astype(np.float32)
+    images = ScanLines.from_images(lit, dark, pattern, inverse, "vertical")
+    variance, usable = np.full(256, 1e-4, np.float32), np.ones(bright.shape, bool)
+    brightness = Brightness.from_images(images, variance, usable)
+    return find_boundaries(images, brightness, stripe, usable, variance)
+
+
+def test_light_that_reached_the_patterns_alone_moves_no_boundary() -> None:
+    stripe = np.tile(np.arange(320, dtype=np.int32) // 5, (60, 1))
+    more = np.array([0.0, 0.02, -0.02, 0.02, 0.01, -0.03])
+    found = boundaries_in(stripe, np.full(stripe.shape, 100.0), more)
+    off = (found.position - (5.0 * found.index - 0.5))[found.index % 8 > 0]  # of fine bits
+    assert np.sqrt(np.mean(off**2)) < 0.01, "0.03 without"
+
+
 @pytest.mark.parametrize(
     ("down", "right"), [(0.08, 0.0), (-0.08, 0.0), (0.0, 0.005), (0.0, -0.005)]
 )
@@ -256,17 +277,7 @@ def test_boundaries_are_shifted_to_the_centroid_of_the_light(down: float, right:
     bright side: by the lens' usual blur squared, towards it."""
     line, place = np.mgrid[:15, :160].astype(float)
     bright = 100.0 * np.exp(down * (line - 7.0) + right * (place - 80.0))
-    stripe = np.floor(place / 20.0).astype(int)
-    gray = stripe ^ (stripe >> 1)
-    share = [gaussian_filter1d(((gray >> bit) & 1).astype(float), 1.0, axis=1) for bit in (2, 1, 0)]
-    pattern = np.stack([10.0 + bright * part for part in share]).astype(np.float32)
-    inverse = np.stack([10.0 + bright * (1.0 - part) for part in share]).astype(np.float32)
-    dark = np.full(bright.shape, 10.0, np.float32)
-    lit = (10.0 + bright).astype(np.float32)
-    images = ScanLines.from_images(lit, dark, pattern, inverse, "vertical")
-    variance, usable = np.full(256, 1e-4, np.float32), np.ones(bright.shape, bool)
-    brightness = Brightness.from_images(images, variance, usable)
-    found = find_boundaries(images, brightness, stripe.astype(np.int32), usable, variance)
+    found = boundaries_in(np.floor(place / 20.0).astype(np.int32), bright, np.zeros(3))
     assert found.blur2 == 0.45, "no edge tells another"
     assert found.index.reshape(15, 7).tolist() == [[1, 2, 3, 4, 5, 6, 7]] * 15
     inner = (found.line > 0) & (found.line < 14)
