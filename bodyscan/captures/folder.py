@@ -156,6 +156,14 @@ def open_folder(rig: Rig, rig_path: Path, entry: CaptureFolder) -> Captures:
     """Open one folder of the rig file's `calibration` list. Raises as `open_scan`."""
     folder, template = resolve_capture_path(rig_path, entry), entry.files or rig.files
     if entry.corners is None:
+        empty = folder.is_dir() and not any(folder.iterdir())
+        if empty or not (folder.exists() or "\\" in str(folder)):
+            raise CaptureError(
+                f"the capture folder {'is empty' if empty else 'does not exist'}",
+                where=str(folder),
+                remedy="Take shots of the board first (`bodyscan capture RIG --out FOLDER --board "
+                "SHOT`); if they are taken, check the name, and that the disk is connected.",
+            )
         return _open(rig, folder, "calibration", template, entry.shots)
 
     # Wherever the images were for the other program, the last parts of their paths are the same.

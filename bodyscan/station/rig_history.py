@@ -30,13 +30,9 @@ def describe_rig(calibration: Path, name: str) -> dict[str, Any]:
     if not file.exists():
         return {"name": name, "id": None}
     content = json.loads(file.read_text("utf-8"))
-    written = datetime.fromtimestamp(file.stat().st_mtime, UTC)
-    return {
-        "name": name,
-        "id": calibration_id(calibration)[:12],
-        "written": written.isoformat(timespec="seconds"),
-        "pairs": list(content["pairs"]),
-    }
+    written = datetime.fromtimestamp(file.stat().st_mtime, UTC).isoformat(timespec="seconds")
+    used = calibration_id(calibration)[:12]
+    return {"name": name, "id": used, "written": written, "pairs": list(content["pairs"])}
 
 
 def find_series(folders: Iterable[Path]) -> dict[str, list[dict[str, Any]]]:

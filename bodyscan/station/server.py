@@ -8,7 +8,6 @@ import re
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
-from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -105,8 +104,7 @@ class Station:
         return _send(path, headers={"content-security-policy": REPORT_POLICY})
 
     async def pair(self, request: Request) -> Response:
-        look = partial(self._look, self._row(request), request.path_params["pair"])
-        seen = await run_in_threadpool(look)
+        seen = await run_in_threadpool(self._look, self._row(request), request.path_params["pair"])
         return _answer(seen) if seen else _answer_absent()
 
     async def csv(self, request: Request) -> Response:
@@ -137,8 +135,7 @@ class Station:
         image = cv2.imdecode(data, cv2.IMREAD_REDUCED_GRAYSCALE_2)
         if image is None:
             return None
-        width = 240
-        small = cv2.resize(image, (width, max(1, width * image.shape[0] // image.shape[1])))
+        small = cv2.resize(image, (240, max(1, 240 * image.shape[0] // image.shape[1])))
         packed = base64.b64encode(cv2.imencode(".jpg", small)[1].tobytes()).decode("ascii")
         bright = float(np.quantile(image, 0.99)) / 255.0
         saturated = float(np.mean(image >= 254))
