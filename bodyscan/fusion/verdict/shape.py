@@ -74,12 +74,11 @@ def check_limbs(scan: ScanEvidence) -> Iterator[Finding]:
 def check_posture(scan: ScanEvidence) -> Iterator[Finding]:
     """A body that does not extend farthest upwards does not stand, see `is_upright`."""
     if scan.shape is not None and not is_upright(scan.shape.vertices, scan.shape.faces):
-        width = np.ptp(scan.shape.vertices[:, :2], axis=0).max()
-        height = scan.shape.vertices[:, 2].max()
+        x, y, height = np.ptp(scan.shape.vertices, axis=0)
         yield Finding(
             "usable",
-            f"the body is {width:.0f} mm wide and {height:.0f} mm tall. Possible causes: the person "
-            "lies or bends. Girths are horizontal sections",
+            f"the body is {max(x, y):.0f} mm wide and {height:.0f} mm tall. Possible causes: the "
+            "person lies or bends. Girths are horizontal sections",
         )
 
 
