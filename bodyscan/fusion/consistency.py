@@ -123,13 +123,12 @@ def _find_bright(samples: Samples) -> Mask:
 def estimate_displacement_sigma(
     samples: Samples, surfaces: Sequence[SmoothSurface], consistency: Sequence[Consistency]
 ) -> tuple[Array, int]:
-    """Sigma (N,) mm of samples around places where surfaces are double, as where an arm moved while
-    one pole fired: their distance, since either may be right and girths go round both; 0 elsewhere.
-    And the number of places.
+    """Sigma (N,) mm of samples around double surfaces, as of an arm that moved while one pole fired:
+    their distance, since either may be right and girths go round both, or 0; and number of places.
 
     Places are cubes of 60 mm, less than an arm's width, in which two pairs contradict each other more
     often than they agree, and not only at a rim of 2 mm; pairs that fired together agree wherever the
-    arm was. Of people followed while they swayed one place was, on an arm turned by 4 degrees 3 to 9.
+    arm was. An arm turned by 4 degrees has 3 to 9; less than three, as of fingers, are left out.
     """
     cell = ((samples.points - samples.points.min(axis=0)) / 60.0).astype(np.int64)
     cube = np.ravel_multi_index(cell.T, cell.max(axis=0) + 1)
@@ -145,8 +144,9 @@ def estimate_displacement_sigma(
         for count, index in zip(counts, (against, agreed), strict=True):
             count += np.bincount(key[index], minlength=len(count))
     double = (counts[0] > 30) & (counts[0] > counts[1])
-    if not double.any():
-        return np.zeros(len(cube)), 0
+    places = len(np.unique(np.flatnonzero(double) // pairs**2))
+    if places < 3:
+        return np.zeros(len(cube)), places
     chosen = [index[double[key]] for index, key in found]
     distance = np.concatenate([
         cKDTree(surface.points[::8]).query(samples.points[index])[0]
@@ -162,7 +162,7 @@ def estimate_displacement_sigma(
     # it, where poles share nothing: limbs hang or stand, and a hand moves with its forearm.
     centres = np.column_stack([np.tile([x, y], 2).T, 0.5 * np.append(z, z - 300.0)])
     near = cKDTree(centres).query(samples.points * [1.0, 1.0, 0.5], distance_upper_bound=90.0)[1]
-    return np.append(np.tile(farthest, 2), 0.0)[np.asarray(near)], len(farthest)
+    return np.append(np.tile(farthest, 2), 0.0)[np.asarray(near)], places
 
 
 def compare_with_surface(
