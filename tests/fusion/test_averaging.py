@@ -191,7 +191,7 @@ def test_a_wall_in_front_says_nothing() -> None:
 def test_a_surface_that_was_bent_is_asked_where_its_points_went() -> None:
     """Carried 3 mm aside, which are four pixels: as of a camera that stood so, but for its rim."""
     samples, surfaces, still = seen_beside(0.8)
-    moved = replace(surfaces[1], points=surfaces[1].points + np.float32([3, 0, 0]), warped=True)
+    moved = replace(surfaces[1], points=surfaces[1].points + np.array([3, 0, 0], "f4"), warped=True)
     found = compare_with_surface(samples, moved, 1, 1.5, 6.0)
     assert len(found.index) > 0.95 * len(still.index)
     np.testing.assert_allclose(found.shift_mm, -0.8, atol=2e-3)
