@@ -110,7 +110,7 @@ def describe_posture(motion: EstimatedMotion) -> str:
     farthest = int(np.argmax(length))
     part = PARTS[name_parts(motion.cells)[farthest]]
     if part != "trunk":
-        return f"the {part} was at least {length[farthest]:.0f} mm farther away"
+        return f"the {part} was elsewhere, by {length[farthest]:.0f} mm or more,"
     # They meet between the navel and the end of the sternum.
     belly = motion.cells.centres[farthest, 2] < 0.64 * motion.cells.centres[:, 2].max()
     outward = -np.sum(motion.step * motion.cells.normals, axis=1)
