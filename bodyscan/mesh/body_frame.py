@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.mesh.topology import compute_face_areas, label_components
+from bodyscan.mesh.topology import compute_face_areas
 
 ARMPIT = 0.74
 """Its height as a share of the stature (Drillis and Contini 1966)."""
@@ -32,10 +32,9 @@ class BodyFrame:
 
 
 def is_upright(vertices: Array, faces: Indices, along: int = 2) -> bool:
-    """Whether a surface's largest piece varies most along an axis, to 45 degrees or so; held out arms
-    count little, and balls beside each other nothing."""
-    areas, label = compute_face_areas(vertices, faces), label_components(faces, len(vertices))
-    areas[label != np.argmax(np.bincount(label, areas))] = 0.0
+    """Whether a surface in one piece varies most along an axis, to 45 degrees or so; held out arms
+    count little."""
+    areas = compute_face_areas(vertices, faces)
     covariance = np.cov(vertices[faces].mean(axis=1).T, aweights=areas)
     return bool(covariance[along, along] >= 0.5 * np.linalg.eigvalsh(covariance)[-1])
 

@@ -18,6 +18,7 @@ from bodyscan.mesh.topology import (
     drop_unused_vertices,
     find_fault,
     find_twins,
+    label_components,
 )
 from bodyscan.outcome import Outcome
 
@@ -69,7 +70,10 @@ def read_surface(
             remedy += f"; if this one is in {meant}, multiply its coordinates by {factor:.6g}"
         what = f"is {size * scale:,.4g} mm long if read as {unit}; expected {lowest:,.0f} to "
         raise BadInput(f"{what}{highest:,.0f} mm", where=str(path), remedy=remedy)
-    if not is_upright(vertices, faces, along):
+    # Pieces beside each other, such as two balls, do not lie: the largest tells.
+    label = label_components(faces, len(vertices))
+    largest = np.argmax(np.bincount(label, compute_face_areas(vertices, faces)))
+    if not is_upright(vertices, faces[label == largest], along):
         what = f"does not extend farthest along {'xyz'[along]}: it lies on its side"
         raise BadInput(what, where=str(path), remedy="turn it so that z is up")
     if _is_upside_down(vertices, faces):
