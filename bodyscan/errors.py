@@ -43,7 +43,8 @@ def format_error(error: BodyscanError) -> str:
 def group_reasons(reasons: Iterable[tuple[Any, str]]) -> list[tuple[list[Any], str]]:
     """Names that failed for one reason, and that reason; most names first.
 
-    Reasons that differ only in the name, figures, brackets and after "such as" are one: the first.
+    Reasons are one, and the first is given, if they differ only in the name, in figures (but for the
+    number of a bit), in brackets, or in the example after "such as".
     """
     groups: dict[str, tuple[list[Any], str]] = {}
     for name, reason in reasons:

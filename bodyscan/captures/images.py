@@ -223,10 +223,7 @@ def _read_file(path: Path, camera: CameraSpec, where: str) -> bytes:
 
 
 def _decode(data: bytes, colour: int) -> Raw | None:
-    """Decode an image file by OpenCV, as stored; None if it cannot.
-
-    colour: OpenCV's flag.
-    """
+    """Decode an image file by OpenCV, as stored, with its flag `colour`; None if it cannot."""
     data = store_upright(data) if data[:2] in (b"II", b"MM") else data
     flags = colour | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     found = cv2.imdecode(np.frombuffer(data, np.uint8), flags)

@@ -46,7 +46,7 @@ def export_scan(
     deface: bool = False,
     frame: str = "rig",
     up: str = "z",
-    made: Callable[[Path], object] = str,
+    made: Callable[[Path], object] = lambda path: None,
 ) -> list[Path]:
     """Write the mesh in each format (see `BODY_FORMATS`) and version; `made` is told each path.
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import erfc
 
-from bodyscan.arrays import Array, Floats, Mask
+from bodyscan.arrays import Array, Floats, Indices, Mask
 from bodyscan.compiled import compiled
 from bodyscan.fusion.smoothing import Numbers, SmoothSurface
 from bodyscan.fusion.voxel_thinning import Samples
@@ -120,18 +120,23 @@ def _find_bright(samples: Samples) -> Mask:
     return np.asarray(grey >= np.median(grey) / 3.0)
 
 
+def number_cubes(points: Floats, size_mm: float) -> Indices:
+    """Number (N,) of the cube of that size in which each point (N, 3) lies."""
+    cell = ((points - points.min(axis=0)) / size_mm).astype(np.int64)
+    return np.asarray(np.ravel_multi_index(tuple(cell.T), tuple(cell.max(axis=0) + 1)))
+
+
 def estimate_displacement_sigma(
     samples: Samples, surfaces: Sequence[SmoothSurface], consistency: Sequence[Consistency]
 ) -> tuple[Array, int]:
     """Sigma (N,) mm of samples around double surfaces, as of an arm that moved while one pole fired:
-    their distance, since either may be right and girths go round both, or 0; and number of places.
+    their distance, since either may be right and girths go round both, or 0; and number of cubes.
 
-    Places are cubes of 60 mm, less than an arm's width, in which two pairs contradict each other more
+    Counted are cubes of 60 mm, less than an arm's width, in which two pairs contradict each other more
     often than they agree, and not only at a rim of 2 mm; pairs that fired together agree wherever the
     arm was. An arm turned by 4 degrees has 3 to 9; less than three, as of fingers, are left out.
     """
-    cell = ((samples.points - samples.points.min(axis=0)) / 60.0).astype(np.int64)
-    cube = np.ravel_multi_index(cell.T, cell.max(axis=0) + 1)
+    cube = number_cubes(samples.points, 60.0)
     pair = np.searchsorted(samples.starts, np.arange(len(cube)), side="right") - 1
     bright, pairs = _find_bright(samples), len(surfaces)
     counts = np.zeros((2, (int(cube.max()) + 1) * pairs**2), np.int64)
@@ -144,9 +149,9 @@ def estimate_displacement_sigma(
         for count, index in zip(counts, (against, agreed), strict=True):
             count += np.bincount(key[index], minlength=len(count))
     double = (counts[0] > 30) & (counts[0] > counts[1])
-    places = len(np.unique(np.flatnonzero(double) // pairs**2))
-    if places < 3:
-        return np.zeros(len(cube)), places
+    double_count = len(np.unique(np.flatnonzero(double) // pairs**2))
+    if double_count < 3:
+        return np.zeros(len(cube)), double_count
     chosen = [index[double[key]] for index, key in found]
     distance = np.concatenate([
         cKDTree(surface.points[::8]).query(samples.points[index])[0]
@@ -162,7 +167,7 @@ def estimate_displacement_sigma(
     # it, where poles share nothing: limbs hang or stand, and a hand moves with its forearm.
     centres = np.column_stack([np.tile([x, y], 2).T, 0.5 * np.append(z, z - 300.0)])
     near = cKDTree(centres).query(samples.points * [1.0, 1.0, 0.5], distance_upper_bound=90.0)[1]
-    return np.append(np.tile(farthest, 2), 0.0)[np.asarray(near)], places
+    return np.append(np.tile(farthest, 2), 0.0)[np.asarray(near)], double_count
 
 
 def compare_with_surface(

@@ -20,6 +20,7 @@ from bodyscan.fusion.consistency import (
     Contradictions,
     compare_with_surface,
     estimate_displacement_sigma,
+    number_cubes,
 )
 from bodyscan.fusion.smoothing import Numbers, SmoothSurface, smooth
 from bodyscan.fusion.voxel_thinning import Samples, take_samples
@@ -160,8 +161,7 @@ def estimate_sigma_inflation(
         ratios.append(np.abs(shift_mm) / np.sqrt(variance))
     every = np.concatenate(ratios)
     overall = max(1.0, SIGMAS_PER_MEDIAN * float(np.median(every)) if every.size else 1.0)
-    cell = ((samples.points - samples.points.min(axis=0)) / 20.0).astype(np.int64)
-    cube = np.ravel_multi_index(cell.T, cell.max(axis=0) + 1)
+    cube = number_cubes(samples.points, 20.0)
     at = cube[np.concatenate([one.index[::8] for one in consistency])]
     squares = np.bincount(at, np.minimum(every, 10.0) ** 2, int(cube.max()) + 1)
     # Neighbours share errors: five count as one, as does what holds of all. Less one standard error.

@@ -129,18 +129,9 @@ class ForeignFile:
 
         around: what stands around them, whose words decide whether it is OpenCV's fisheye.
         """
-        given, around = self.numbers(value, name, 0, 1, 2, 3, 4, 5, 8, 12, 14), around or {}
-        roi, owner = around.get("roi"), name.rpartition(".")[0]
-        wrong = [key for key in ("binning_x", "binning_y") if around.get(key, 1) not in (0, 1)]
-        wrong += ["roi"] * (isinstance(roi, dict) and any(map(roi.get, ("x_offset", "y_offset"))))
-        if wrong:
-            what = (
-                "of pictures that are cut out or binned: as ROS has it, the matrix is of whole ones"
-            )
-            remedy = (
-                "give whole pictures; or put in the matrix, size and 0 that these pictures have"
-            )
-            raise self.error(what, f"{owner}.{wrong[0]}".strip("."), remedy)
+        given = self.numbers(value, name, 0, 1, 2, 3, 4, 5, 8, 12, 14)
+        around, owner = around or {}, name.rpartition(".")[0]
+        self._refuse_cropped(around, owner)
         if self._is_fisheye(around, owner):
             if np.any(given[4:]):
                 raise self.error(f"holds {len(given)} numbers, a fisheye has 4", name)
@@ -149,6 +140,17 @@ class ForeignFile:
             return lens_from_opencv(np.pad(given, (0, max(0, 5 - len(given)))))
         except ValueError as error:
             raise self.error(str(error), name, "calibrate it with a supported lens") from None
+
+    def _refuse_cropped(self, around: Mapping[str, Any], owner: str) -> None:
+        """Of ROS's CameraInfo the matrix is that of the full image, whatever was read out of it."""
+        wrong = [key for key in ("binning_x", "binning_y") if around.get(key, 1) not in (0, 1)]
+        roi = around.get("roi")
+        if isinstance(roi, dict) and (roi.get("x_offset") or roi.get("y_offset")):
+            wrong.append("roi")
+        if wrong:
+            what = "of pictures that are binned or cropped, but ROS gives the full picture's matrix"
+            remedy = "give full pictures; or the matrix and size of these, without binning and roi"
+            raise self.error(what, f"{owner}.{wrong[0]}".strip("."), remedy)
 
     def _is_fisheye(self, around: Mapping[str, Any], owner: str) -> bool:
         words: dict[bool, str] = {}  # a key that says whether it is one

@@ -23,10 +23,7 @@ class Verification:
 
 
 def verify(folder: Path, kinds: Kinds = KINDS) -> Verification:
-    """Check a batch's output folder, or one job's folder.
-
-    Raises BadInput if there is no manifest at all.
-    """
+    """Check a batch's output folder, or one job's. Raises BadInput if there is no manifest."""
     if not (folder / MANIFEST).exists():
         raise BadInput(
             f"holds no {MANIFEST}",

@@ -189,10 +189,7 @@ def build_plate_scene() -> list[Surface]:
 def expose_scene(
     setup: ChapterSetup, surfaces: Sequence[Surface], number: int
 ) -> tuple[Bytes, StripeMap]:
-    """Render the sequence; return the lit image and the decoded stripes.
-
-    number: selects the shot's noise.
-    """
+    """Render the sequence, `number` selecting its noise; return the lit image and decoded stripes."""
     rng = np.random.default_rng([setup.seed, Stream.NOISE, number])
     settings = setup.settings
     lamps = Lamps(255.0, 13.0, DISTANCE_MM * 1.05, DISTANCE_MM)

@@ -178,7 +178,8 @@ class BodyMotion:
     ) -> BodyMotion:
         """Estimate all amplitudes, and each kind's prior variance, in one Gauss-Newton step.
 
-        projected: by pairs (a, b), see `project`. updates: of the variances; coarse rounds need one.
+        projected: by pairs (a, b), see `project`.
+        updates: how often the prior variances are updated; once is enough in a coarse round.
         """
         matrices = np.array([system.information for system in projected.values()])
         vectors = np.array([system.vector for system in projected.values()])

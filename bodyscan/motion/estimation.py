@@ -258,8 +258,8 @@ class _Solution:
         steps: tuple[tuple[str, ...], ...] = () if known else (("breath",), LIMBS)
         equations = partial(self.motion.step_equations, self.projected)
         postures = {kinds: partial(equations, kinds) for kinds in steps}
-        moves |= bool(np.ptp(stated) < 1e-3)  # s: by these times nothing can have moved
-        times = self.fit_times(stated, sides) if moves else ("", 0.0)
+        one_moment = bool(np.ptp(stated) < 1e-3)  # s: nobody moves by more than 0.01 mm meanwhile
+        times = self.fit_times(stated, sides, one_moment) if moves or one_moment else ("", 0.0)
         return PoseEvidence(tuple(names), self.motion.pose_equations(), postures, times)
 
     def log_evidence(
@@ -276,7 +276,9 @@ class _Solution:
         projected = {both: self.projected[both].select(fields) for both in kept}
         return person.solve_projected(projected).log_evidence if projected else np.nan
 
-    def fit_times(self, stated: Sequence[float], sides: Sequence[str]) -> tuple[str, float]:
+    def fit_times(
+        self, stated: Sequence[float], sides: Sequence[str], one_moment: bool
+    ) -> tuple[str, float]:
         """By the evidence of the motion: a posture hardly changes within a tenth of a second, and does
         within a second.
 
@@ -285,7 +287,7 @@ class _Solution:
         """
         others = [(f"{f:g} x", [f * second for second in stated]) for f in (0.1, 10.0)]
         # Where an order is stated, others also suit poles that are all displaced.
-        if np.ptp(stated) < 1e-3:
+        if one_moment:
             others += [("in another order than", order) for order in _propose_orders(sides)[::2]]
         now, *found = map_threads(self.log_evidence, [stated, *(one for _, one in others)])
         name, other = others[int(np.argmax(found))]
@@ -307,10 +309,7 @@ def _begin(
     sides: Sequence[str],
     settings: AlignmentSettings,
 ) -> BodyMotion:
-    """The person at rest, seen at the moments stated, or if none is in an order that shows.
-
-    sides: the poles of the pairs.
-    """
+    """The person at rest, seen at the moments stated, or if none is in an order that shows."""
     views, cells = person
     sway = np.repeat([np.radians(settings.sway_deg), settings.sway_mm], 3)
     boards = SwayPrior(0.0, 0.0, 0.0, 0.0).covariance([image.pair for image in images], prior)

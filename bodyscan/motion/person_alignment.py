@@ -44,7 +44,7 @@ class PersonAlignment:
     common_error: ScaleError | CommonError | None
     search: DisplacementSearch  # for further displaced poles
     posture: PostureStep | None = None  # another one than at other times, while one pole fired
-    # If other moments explain the motion far better; those stated were then left out.
+    # In words, moments that explain the motion far better; those stated were then left out.
     other_times: str = ""
 
 
@@ -111,7 +111,7 @@ def _loosen(
     rig_from_camera: Mapping[str, RigidTransform],
     poles: Mapping[str, str],
 ) -> PoseCovariance:
-    """Let what was found be estimated."""
+    """The prior of the poses with what was found free to be estimated."""
     if isinstance(found, DisplacedPole):
         return free_pairs(boards, found.pairs)
     if isinstance(found, CommonError):

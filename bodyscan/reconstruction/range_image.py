@@ -134,10 +134,7 @@ class RangeImage:
         return self.colours if self.whole_colours is None else self.whole_colours
 
     def subsample(self, step: int, first: int = 0) -> Crop:
-        """Every n-th row and column of the kept part, counted in the camera's image.
-
-        These are the same pixels whatever part is kept.
-        """
+        """Every n-th row and column of the camera's image: the same pixels whatever part is kept."""
         top, left = self.corner
         return slice((first - top) % step, None, step), slice((first - left) % step, None, step)
 

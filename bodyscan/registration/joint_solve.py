@@ -163,8 +163,7 @@ def _make_blocks(
         columns = np.concatenate([unknowns.select_columns(view, solution.shapes) for view in views])
         # The root camera fixes the frame: it has no motion.
         first = 0 if len(unknowns.of_pair[views[0].pair]) else 6
-        chosen = np.s_[:, first : first + columns.shape[1]]
-        jacobian = partial(lambda matrix, part: matrix()[part], linearize, chosen)
+        jacobian = partial(_take_columns, linearize, first, columns.shape[1])
         sigma = np.repeat([next(sigmas) for _ in views], lengths)
         each = np.full(len(columns), 2) if solution.shapes else lengths
         yield Block(residuals, jacobian, columns, noise, sigma, runs=each)
@@ -180,6 +179,10 @@ def _make_blocks(
         known = shape.compute_prior_jacobian()
         deviation = known @ shape.offsets.ravel()
         yield Block(deviation, partial(np.asarray, known), unknowns.of_corners[name].ravel(), EXACT)
+
+
+def _take_columns(linearize: Callable[[], Array], first: int, count: int) -> Array:
+    return linearize()[:, first : first + count]
 
 
 def estimate_view_sigmas(residuals: Sequence[Array]) -> Array:

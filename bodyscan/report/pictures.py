@@ -1,7 +1,4 @@
-"""Pictures of clouds and meshes, drawn without a screen or OpenGL.
-
-Orthographic views side by side in one PNG.
-"""
+"""Pictures of clouds and meshes, orthographic views side by side, drawn without screen or OpenGL."""
 
 from __future__ import annotations
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.special import erfinv
 
@@ -17,6 +18,8 @@ from bodyscan.stripes.scan_lines import ScanLines
 MIN_SIGMA_PX = 0.008
 """Error left by blur that is not Gaussian and a sensor that is not quite linear (synthetic images)."""
 MIN_STRIPE_PX = 0.2
+PARABOLA_RESIDUAL = np.array([-3.0, 12.0, -18.0, 12.0, -3.0]) / 35.0
+"""Of five equally spaced values: the fitted parabola (Savitzky and Golay 1964) minus the middle one."""
 
 _MAX_RATIO, _TABLE_SIZE = 0.98, 4096
 _RATIOS = np.linspace(-_MAX_RATIO, _MAX_RATIO, _TABLE_SIZE + 1)
@@ -103,10 +106,10 @@ def _estimate_imbalance(
     first = first[:: max(1, len(first) // 100_000)]
     if len(first) < 1000:
         return np.zeros(size)
-    rows, residual = np.zeros((len(first), size)), np.zeros(len(first))
-    for k, gain in enumerate(np.array([-3.0, 12.0, -18.0, 12.0, -3.0]) / 35.0):
+    rows = np.zeros((len(first), size))
+    for k, gain in enumerate(PARABOLA_RESIDUAL):
         rows[np.arange(len(first)), bit[first + k]] += gain * lever[first + k]
-        residual += gain * position[first + k]
+    residual = sliding_window_view(position, 5)[first] @ PARABOLA_RESIDUAL
     scatter = SIGMAS_PER_MEDIAN * float(np.median(np.abs(residual)))
     near = np.abs(residual) < 4.0 * scatter
     share = np.bincount(bit, lever > 0.0, size) / np.maximum(np.bincount(bit, minlength=size), 1)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from bodyscan.arrays import Array, Floats, Indices, Mask
 from bodyscan.compiled import compiled
 from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
-from bodyscan.stripes.boundaries import MIN_STRIPE_PX, Boundaries
+from bodyscan.stripes.boundaries import MIN_STRIPE_PX, PARABOLA_RESIDUAL, Boundaries
 
 SMOOTHERS = (
     np.array([-3.0, 12.0, 17.0, 12.0, -3.0]) / 35.0,
@@ -219,7 +219,6 @@ def _smooth(
 def estimate_scatter(boundaries: Boundaries) -> float:
     """Estimate the ratio of observed to predicted distances from a parabola through five boundaries
     of a run, robustly; 1 if it is not clearly more, or there are too few."""
-    gains = SMOOTHERS[0] - (np.arange(5) == 2)
     position, joined = boundaries.position, boundaries.joined
     if len(joined) < 1000:
         return 1.0
@@ -228,7 +227,7 @@ def estimate_scatter(boundaries: Boundaries) -> float:
     first = first[:: max(1, len(first) // 20_000)]
     if len(first) < 1000:
         return 1.0
-    residual = sliding_window_view(position, 5)[first] @ gains
-    variance = sliding_window_view(boundaries.sigma_px, 5)[first] ** 2 @ gains**2
+    residual = sliding_window_view(position, 5)[first] @ PARABOLA_RESIDUAL
+    variance = sliding_window_view(boundaries.sigma_px, 5)[first] ** 2 @ PARABOLA_RESIDUAL**2
     ratio = SIGMAS_PER_MEDIAN * float(np.median(np.abs(residual / np.sqrt(variance))))
     return ratio if ratio > 1.2 else 1.0  # less may be due to the surface

@@ -403,7 +403,7 @@
     const titles = { en: "English", de: "Deutsch", fr: "Français", ja: "日本語" };
     $("language").append(...LANGUAGES.map((one) => make("option", { value: one, lang: one, selected: one === wanted }, titles[one])));
     await speak(wanted);
-    $("language").addEventListener("change", async () => { await speak($("language").value); drawn.kind = " "; online(stream?.readyState === 1); showAll(); });
+    $("language").addEventListener("change", async () => { await speak($("language").value); drawn.kind = " "; /* a body is drawn again, in the new language */ online(stream?.readyState === 1); showAll(); });
     for (const id of ["search", "filter", "sort"]) $(id).addEventListener("input", showToday);
     document.querySelector(".bar").addEventListener("submit", (event) => event.preventDefault());
     for (const button of document.querySelectorAll("[data-decision]")) button.addEventListener("click", () => decide(button.dataset.decision));

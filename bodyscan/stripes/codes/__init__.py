@@ -1,7 +1,4 @@
-"""The stripe codes: each is one file in this folder, listed there in CODES.
-
-A code defined elsewhere is added by `register`.
-"""
+"""The stripe codes: each is one file in this folder, listed in CODES; `register` adds others."""
 
 from __future__ import annotations
 
