@@ -171,6 +171,8 @@ def find_displaced_pole(
     null, covariance, sway_mm, offset_mm = _maximize_likelihood(
         measured, SWAYS_MM, nothing, np.zeros(1)
     )
+    others = [name for name in dict.fromkeys(measured.names) if name not in displaced]
+    means = {n: np.mean([m[n] for m, _ in scans if n in m], axis=0) for n in others}
     candidates: list[tuple[float, DisplacedPole]] = []
     detectable, ambiguous = MIN_STEP_MM, bool(displaced)
     for name, pairs in group_by_pole(sorted(set(measured.names)), poles).items():
@@ -194,42 +196,19 @@ def find_displaced_pole(
         sways = SWAYS_MM if any_sway else SWAYS_MM[SWAYS_MM < STILL_MM]
         stepped = np.outer(members, members)
         gain = _maximize_likelihood(measured, sways, stepped, STEPS_MM)[0] - null
-        motions = [
-            {n: m[n] for n in m if n in measured.names and n not in displaced} for m, _ in scans
-        ]
-        candidates.append(
-            (gain, DisplacedPole.from_motions(name, pairs, _average_motions(motions)))
-        )
+        candidates.append((gain, DisplacedPole.from_motions(name, pairs, means)))
     if not candidates:
         return DisplacementSearch(None, np.inf)
     if not ambiguous:
         same_pole = _mark_same_pole(measured.names, poles)
         each = _maximize_likelihood(measured, SWAYS_MM, same_pole, STEPS_MM)[0] - null
-        candidates = _with_all_moved(candidates, each)
+        if each > max(MIN_LOG_RATIO, *(other for other, _ in candidates)):
+            # If all poles moved outwards, none moved relative to the others, and the body is too thin.
+            farthest = max((one for _, one in candidates), key=lambda p: (len(p.pairs), p.shift_mm))
+            candidates = [(each, replace(farthest, all_moved=True))]
     gain, best = max(candidates, key=lambda one: one[0])
     significant = gain > MIN_LOG_RATIO and best.size_mm > MIN_STEP_MM
     return DisplacementSearch(best if significant else None, detectable, sway_mm, offset_mm)
-
-
-def _with_all_moved(
-    candidates: Sequence[tuple[float, DisplacedPole]], gain: float
-) -> list[tuple[float, DisplacedPole]]:
-    """Replace the candidates by "every pole is displaced" if its log likelihood ratio is larger.
-
-    If all poles moved outwards, none moved relative to the others, and the body is too thin.
-    """
-    if gain <= max(MIN_LOG_RATIO, *(other for other, _ in candidates)):
-        return list(candidates)
-    farthest = max((one for _, one in candidates), key=lambda one: (len(one.pairs), one.shift_mm))
-    return [(gain, replace(farthest, all_moved=True))]
-
-
-def _average_motions(motions: Sequence[Mapping[str, Array]]) -> dict[str, Array]:
-    """Mean twist of each pair over the scans that have it."""
-    names = dict.fromkeys(name for scan in motions for name in scan)
-    return {
-        name: np.mean([scan[name] for scan in motions if name in scan], axis=0) for name in names
-    }
 
 
 @dataclass(frozen=True, eq=False)

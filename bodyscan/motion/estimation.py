@@ -259,8 +259,10 @@ class _Solution:
         equations = partial(self.motion.step_equations, self.projected)
         postures = {kinds: partial(equations, kinds) for kinds in steps}
         one_moment = bool(np.ptp(stated) < 1e-3)  # s: nobody moves by more than 0.01 mm meanwhile
-        times = self.fit_times(stated, sides, one_moment) if moves or one_moment else ("", 0.0)
-        return PoseEvidence(tuple(names), self.motion.pose_equations(), postures, times)
+        undecided = moves or one_moment
+        times = self.fit_times(stated, sides, one_moment) if undecided else ("", 0.0)
+        clocks = partial(self.fit_clocks, stated, sides) if undecided else None
+        return PoseEvidence(tuple(names), self.motion.pose_equations(), postures, times, clocks)
 
     def log_evidence(
         self,
@@ -300,6 +302,16 @@ class _Solution:
             lambda one: self.log_evidence(other, *one) - self.log_evidence(stated, *one), left
         )
         return (name, max(found) - now) if np.nanmin(gains) > MIN_LOG_RATIO else ("", 0.0)
+
+    def fit_clocks(self, stated: Sequence[float], sides: Sequence[str]) -> str:
+        """Poles of which any, all its moments earlier or later, explains the motion beyond doubt."""
+        tried = [(side, lag) for side in dict.fromkeys(sides) for lag in (-0.4, -0.2, 0.2, 0.4)]
+        moments = [np.add(stated, lag * np.equal(sides, side)).tolist() for side, lag in tried]
+        now, *found = map_threads(lambda one: self.log_evidence(one, ()), [stated, *moments])
+        ranked = sorted(zip(found, tried, strict=True), reverse=True)
+        best = [side for log, (side, _) in ranked if log > max(found) - MIN_LOG_RATIO]
+        significant = max(found) > now + MIN_LOG_RATIO
+        return f"of {' or '.join(dict.fromkeys(best))} other than" if significant else ""
 
 
 def _begin(

@@ -76,8 +76,11 @@ def align_person(
             images, rig_from_camera, aligned, boards, settings, poles, posture
         )
         other = evidence.other_times[0] if evidence else ""
+        if evidence and evidence.fit_clocks and displaced and not other:
+            # Once a displaced pole is free, it leaves other moments nothing to explain.
+            other = evidence.fit_clocks()
         found: Displacement | None = None if evidence and (motion or other) else search.found
-        if found is None and evidence is not None and common_error is None:
+        if found is None and evidence is not None and common_error is None and not other:
             found = detect_displacement(evidence, rig_from_camera, poles, _collect_pairs(displaced))
         # A common error looks like motion too. Nothing is displaced that seemed so by wrong times.
         if found is None and other and not isinstance(common_error, CommonError):

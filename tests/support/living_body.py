@@ -60,15 +60,15 @@ class LivingScan:
 
 
 def cast_living(
-    rig: Rig, person: Person = STANDING, *, seed: int = 1, scale: float = 0.25
+    rig: Rig, person: Person = STANDING, *, seed: int = 1, scale: float = 0.25, poles: int = 1
 ) -> LivingScan:
-    """The rig's pairs one after another, in its order; noise of 0.1 mm."""
+    """The rig's pairs one after another, in its order, so many poles at once; noise of 0.1 mm."""
     rng = np.random.default_rng(seed)
     still = load_body(BODY, 1)
     body = animate(Surface(still.vertices, still.faces), person, rng)
     scan = LivingScan(body, [], [], nominal_placings(rig), {})
     for number, pair in enumerate(rig.pairs):
-        scan.seconds[pair.name] = 1e-3 * PAIR_MS * (number + 0.5)
+        scan.seconds[pair.name] = 1e-3 * PAIR_MS * (number % (len(rig.pairs) // poles) + 0.5)
         camera = nominal_camera(round(scale * pair.camera.width), round(scale * pair.camera.height))
         pose = scan.rig_from_camera[pair.name]
         exact = _cast(scan.at(scan.seconds[pair.name]), pair, camera, pose)
