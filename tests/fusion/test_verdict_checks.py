@@ -270,6 +270,9 @@ def test_causes_that_only_together_explain_a_gap_come_before_it(scan: MadeScan) 
         verdict = verdict_given(scan.cloud, coverage=gap, failed=failed, absent=absent)
         found = verdict.grade, verdict.reasons[:3], verdict.consequences[0][:3]
         assert found == ("repeat", left_out, "at ")
+    jpeg: dict[str, Any] = {"compressed": ("p1", "p2"), "boards_mm": boards(0.1)}
+    reasons = verdict_given(scan.cloud, coverage=coverage(FACE < 20), **jpeg).reasons
+    assert [words[:22] for words in reasons] == ["images were compressed"]
 
 
 @pytest.mark.parametrize(

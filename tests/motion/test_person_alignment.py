@@ -233,9 +233,7 @@ def test_poles_are_set_free_one_after_the_other(
     patch("align", aligned)
     patch("_select_connected_motions", lambda *of: dict.fromkeys(connected, np.zeros(6)))
     nothing: Any = None
-    found = person_alignment.align_person(
-        nothing, nothing, nothing, boards, {"a1": "a", "a2": "a"}, nothing
-    )
+    found = align_person(nothing, nothing, nothing, boards, {"a1": "a", "a2": "a"}, nothing)
     assert [one.name for one in found.displaced] == freed
     assert [one.shift_mm for one in found.displaced] == [shift_mm]
     if freed == ["pole a"]:

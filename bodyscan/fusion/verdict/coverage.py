@@ -225,7 +225,10 @@ def check_gaps(scan: ScanEvidence) -> Iterator[Finding]:
         return
     missed, pairs = _find_missed(scan, coverage)
     mostly = 2.0 * coverage.areas_mm2[missed].sum() > coverage.areas_mm2[coverage.filled].sum()
-    lost = pairs if mostly else frozenset()
+    # Compression costs stripes anywhere.
+    compressed = frozenset(scan.images.compressed)
+    everywhere = 2 * len(compressed) > len(scan.rig.boards_mm)
+    lost = pairs if mostly else compressed if everywhere else frozenset()
     if coverage.filled_share > MAX_FILLED:
         yield Finding(
             "repeat" if coverage.filled_share > 0.5 else "usable",
