@@ -285,6 +285,7 @@ def test_causes_that_only_together_explain_a_gap_come_before_it(scan: MadeScan) 
         (coverage((BANDS < 50.0) | (FACE < 2)), "good", ""),  # soles are never seen
         (coverage((FACE < 60) & (BANDS == 625.0)), "usable", "measured from 600 to 650 mm"),
         (coverage((FACE < 40) & (BANDS == 625.0)), "good", ""),
+        (coverage((FACE < 60) & (BANDS > TALL_MM - 50.0)), "good", ""),  # the crown
         (coverage(FACE < 0, share=0.8), "good", ""),
         (coverage(FACE < 0, share=0.5), "usable", "pair p1 measured 50% of the skin that it sees"),
         (coverage(FACE < 0, share=0.5, white=0.1), "usable", "pair p1 is overexposed: 10%"),

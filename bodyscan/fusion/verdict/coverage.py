@@ -237,16 +237,18 @@ def check_gaps(scan: ScanEvidence) -> Iterator[Finding]:
         )
     area = coverage.sum_bands(coverage.areas_mm2)
     filled = coverage.sum_bands(coverage.areas_mm2 * coverage.filled) / np.maximum(area, 1e-9)
-    heights = np.maximum(scan.cloud.points[:, 2] / BAND_MM, 0)
-    points = np.bincount(heights.astype(np.int64), None, len(area))[: len(area)]
+    heights = np.maximum(scan.cloud.points[:, 2] / BAND_MM, 0).astype(np.int64)
+    points = np.bincount(heights, None, len(area))[: len(area)]
     filled[(area == 0.0) & (points == 0)] = 1.0  # the mesh begins above it
-    empty = (filled > 0.5) & (BAND_MM * np.arange(len(filled)) >= 50.0)  # soles are never seen
+    # Soles are never seen; what is above the highest point is the crown's.
+    band = np.arange(len(filled))
+    empty = (filled > 0.5) & (BAND_MM * band >= 50.0) & (band < min(heights.max(), band[-1]))
     starts = np.flatnonzero(empty & ~np.roll(empty, 1))
     ends = np.flatnonzero(empty & ~np.roll(empty, -1)) + 1
     for low, high in zip(starts, ends, strict=True):
         yield Finding(
             "usable",
-            f"next to nothing was measured from {BAND_MM * low:.0f} to {BAND_MM * high:.0f} mm. "
+            f"less than half was measured from {BAND_MM * low:.0f} to {BAND_MM * high:.0f} mm. "
             "Possible causes: hair; black cloth; out of view",
             lost,
         )
