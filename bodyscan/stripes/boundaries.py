@@ -103,7 +103,7 @@ def _estimate_imbalance(
     """
     size = int(bit.max(initial=0)) + 1
     first = np.flatnonzero(joined[:-3] & joined[1:-2] & joined[2:-1] & joined[3:])
-    first = first[:: max(1, len(first) // 100_000)]
+    first = first[:: max(1, len(first) // 30_000)]
     if len(first) < 1000:
         return np.zeros(size)
     rows = np.zeros((len(first), size))
