@@ -47,6 +47,7 @@ class DisplacedPole:
     name: `pole p1` or `pair p1-2`.
     shift_mm, rotation_deg: at the body's centre.
     all_moved: whether every other pole is displaced too, so that none is a reference.
+    certain: whether it is displaced beyond doubt, not only freed in case it is.
     """
 
     name: str
@@ -54,6 +55,7 @@ class DisplacedPole:
     shift_mm: float
     rotation_deg: float
     all_moved: bool = False
+    certain: bool = True
 
     @property
     def size_mm(self) -> float:

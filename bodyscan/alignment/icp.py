@@ -110,11 +110,14 @@ def align(
     widest = sway.covariance(names, prior, sway.max_scale)
     motion, refused = reject_large_motions(names, motion, widest, settings.limit_sigmas)
     moved = [t.retract(m) for t, m in zip(start, motion, strict=True)]
+
+    def measure(matches: Matches) -> tuple[int, float, float]:
+        """Number of matches, their RMS distance, and the RMS expected from their sigmas, mm."""
+        return len(matches.distances), rms(matches.distances), rms(matches.sigma_mm)
+
     # Both with the same reach, so that they can be compared.
-    before, after = (
-        _map_matches(_measure_distances, coarse, poses, settings.min_reach_mm, settings)
-        for poses in (start, moved)
-    )
+    reach_mm = settings.min_reach_mm
+    before, after = (_map_matches(measure, coarse, at, reach_mm, settings) for at in (start, moved))
     shift = np.linalg.norm(compute_centre_shifts(motion), axis=1).tolist()
     connected = _find_largest_group(after)
     unknown = 0, np.nan, np.nan
@@ -180,11 +183,6 @@ def _find_largest_group(overlaps: Iterable[tuple[int, int]]) -> set[int]:
     edges = list(overlaps)
     groups = find_connected_groups(sorted({image for both in edges for image in both}), edges)
     return max(groups, key=len, default=set())
-
-
-def _measure_distances(matches: Matches) -> tuple[int, float, float]:
-    """Number of matches, their RMS distance, and the RMS expected from their sigmas, mm."""
-    return len(matches.distances), rms(matches.distances), rms(matches.sigma_mm)
 
 
 def _pool_rms(parts: Sequence[tuple[int, float]]) -> float:

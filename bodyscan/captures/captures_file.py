@@ -28,7 +28,7 @@ from bodyscan.rig.rig import Rig
 from bodyscan.rig.templates import find_path_fault
 
 FILE_NAME = "captures.yaml"
-_TIMES_REMEDY = "Correct the file of times; docs/formats.md explains its columns."
+_TIMES_REMEDY = "Correct the file of times (docs/formats.md), or give its own rig's calibration."
 
 Sequences: TypeAlias = Mapping[tuple[str, str], tuple[str, ...]]
 """Names of the frames taken, by shot and pair, in the rig's order of pairs."""
@@ -137,6 +137,11 @@ def write_captures_file(folder: Path, captures: CapturesFile) -> None:
 
 def _find_unknown_names(captures: CapturesFile, rig: Rig) -> Iterator[Problem]:
     pairs = {pair.name: pair for pair in rig.pairs}
+    listed = [name for shot in captures.shots or () for name in shot.stripes or shot.lit or ()]
+    if len(listed) > 1 and pairs.keys().isdisjoint(listed):
+        text = f"is the calibration another rig's? Its pairs are {', '.join(pairs)}"
+        yield ("shots",), f"{text} (got {', '.join(dict.fromkeys(listed))})"
+        return
     for index, shot in enumerate(captures.shots or ()):
         for key in ("stripes", "lit"):
             for k, name in enumerate(getattr(shot, key) or ()):
@@ -155,13 +160,14 @@ def _find_timing_problems(timing: Timing, rig: Rig) -> Iterator[Problem]:
     """Find frames or pairs that the rig does not have, or that are left out."""
     known = [name for pair in rig.pairs for name in rig.frames.sequence_names(pair.projector)]
     order = known if timing.order is None else timing.order
-    for index, name in enumerate(order):
-        if name not in known:
-            hint = did_you_mean(name, known)
-            yield ("order", index), f"names no frame of rig {rig.name}{hint} (got {name!r})"
     left_out = [name for name in dict.fromkeys(known) if name not in order]
     if left_out:
-        yield ("order",), f"leaves out {', '.join(left_out)}: every frame has its time"
+        other = ", or is the calibration another rig's?" if len(left_out) > 1 else ""
+        yield ("order",), f"leaves out {', '.join(left_out)}: every frame has its time{other}"
+    few = len(left_out) < 2 or len([name for name in order if name not in known]) < 2
+    for index, name in [both for both in enumerate(order) if few and both[1] not in known]:
+        hint = did_you_mean(name, known)
+        yield ("order", index), f"names no frame of rig {rig.name}{hint} (got {name!r})"
     names = [pair.name for pair in rig.pairs]
     if timing.start is None and timing.times is None and len(names) > 1:
         yield ("start",), "is missing: one-after-another, together, poles, or ms by pair"

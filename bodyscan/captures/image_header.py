@@ -170,9 +170,9 @@ def make_image_error(what: str, path: Path, where: str, *, remedy: str = "") -> 
     """Make an ImageError that names file, pair and shot, and what to do."""
     remedy = remedy or (
         "Possible causes: it was not taken, or is damaged (copy it again, take the shot again, or "
-        "leave it out of captures.yaml); the rig file has another name for it (`files`, `frames`; "
-        "capitals count) or another size (the camera's width and height); the software saves "
-        "other kinds of files."
+        "leave it out of captures.yaml); the calibration is another rig's; the rig file has another "
+        "name for it (`files`, `frames`; capitals count) or another size (the camera's width and "
+        "height); the software saves other kinds of files."
     )
     return ImageError(what, where=f"{path} ({where})" if where else str(path), remedy=remedy)
 

@@ -95,7 +95,8 @@ def align_person(
                 # Offsets caused by a tracked head or arm are not pose errors.
                 again = _search(images, rig_from_camera, alignment, poles, displaced)
                 search = replace(search, offset_mm=again.offset_mm)
-            final = _measure_again(displaced, _select_connected_motions(rig_from_camera, alignment))
+            certain = [one for one in displaced if one.certain]
+            final = _measure_again(certain, _select_connected_motions(rig_from_camera, alignment))
             return PersonAlignment(alignment, motion, final, common_error, search, posture)
         if isinstance(found, PostureStep):
             posture = found

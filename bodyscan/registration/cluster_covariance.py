@@ -109,7 +109,8 @@ def build_normal_equations(
         target: _eliminate_board(of_target, board, target == fixed_target)
         for target, of_target in sorted(systems.items())
     }
-    known = [(of_shape[name], _compute_information(shape)) for name, shape in shapes.items()]
+    by_size = {name: one.compute_prior_jacobian(one.size_sigma) for name, one in shapes.items()}
+    known = [(of_shape[name], each.T @ each) for name, each in by_size.items()]
     known += [(of_camera[name], np.diag(cameras[name].prior_sigmas ** -2)) for name in names]
     priors = [(block, LinearGaussianSystem.from_prior(each)) for block, each in known]
     prior = LinearGaussianSystem.assemble(priors, size)
@@ -156,11 +157,6 @@ def _by_every_corner(by_corner: Array) -> Array:
     blocks = np.zeros((count, 2, count, 3))
     blocks[range(count), :, range(count)] = by_corner.reshape(count, 2, 3)
     return blocks.reshape(2 * count, 3 * count)
-
-
-def _compute_information(shape: BoardShape) -> Array:
-    known = shape.compute_prior_jacobian(shape.size_sigma)
-    return known.T @ known
 
 
 @dataclass(frozen=True, eq=False)

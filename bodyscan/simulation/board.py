@@ -54,7 +54,9 @@ def make_print(board: Board, face: int, making: BoardMaking) -> BoardPrint:
     """Draw the print of face 0 (front) or 1 (back); the back's markers follow the front's."""
     if board.kind == "aprilgrid":
         raise BadInput("boards of kind aprilgrid are not simulated", where=f"board {board.name}")
-    dark = _find_dark_squares(board)
+    row, column = np.indices((board.rows, board.columns))
+    swapped = board.kind == "charuco" and board.legacy_layout and board.rows % 2 == 0
+    dark = (row + column) % 2 == (1 if swapped else 0)
     markers = _find_markers(board, face, int((~dark).sum())) if board.kind == "charuco" else None
     modules = 3 if markers is None else markers.shape[1] + 2
     cells = np.zeros((board.rows + 2, board.columns + 2, modules, modules), bool)
@@ -64,12 +66,6 @@ def make_print(board: Board, face: int, making: BoardMaking) -> BoardPrint:
         cells[row + 1, column + 1, 1:-1, 1:-1] = markers
     albedo = np.where(cells, making.black, making.white).astype(np.float32)
     return BoardPrint(board.square_mm, board.marker_mm or 0.5 * board.square_mm, albedo)
-
-
-def _find_dark_squares(board: Board) -> Mask:
-    row, column = np.indices((board.rows, board.columns))
-    swapped = board.kind == "charuco" and board.legacy_layout and board.rows % 2 == 0
-    return (row + column) % 2 == (1 if swapped else 0)
 
 
 def _find_markers(board: Board, face: int, count: int) -> Mask:

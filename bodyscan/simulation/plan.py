@@ -71,7 +71,9 @@ def plan_boards(
 
 def look(pair: TruePair, poses: Sequence[RigidTransform], board: Board) -> Sight:
     """Compute what a pair sees of the board in each pose (rig_from_board)."""
-    points = _make_board_grid(board)
+    width, height, _ = _compute_board_extent(board)
+    x, y = np.meshgrid(np.linspace(0.0, width, 15), np.linspace(0.0, height, 13))
+    points = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
     turns = np.stack([pose.rotation for pose in poses])
     shifts = np.stack([pose.translation for pose in poses])
     camera_from_rig = pair.rig_from_camera.inverse()
@@ -107,12 +109,6 @@ def _cover_cells(pixel: Array, within: Mask, far: Mask, width: int, height: int)
     pose, point = np.nonzero(within)
     covered[pose, cell[pose, point]] = True
     return covered
-
-
-def _make_board_grid(board: Board) -> Array:
-    width, height, _ = _compute_board_extent(board)
-    x, y = np.meshgrid(np.linspace(0.0, width, 15), np.linspace(0.0, height, 13))
-    return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
 
 
 def _mask_visible(board: Board, sight: Sight, stripes: bool) -> Mask:

@@ -56,11 +56,12 @@ class MirrorProjector:
         a, b = q1 * m1 - q2 * m2, q1 * m2 + q2 * m1
         radius, phase = np.hypot(a, b), np.arctan2(b, a)
         branch = -1.0 if m2 < 0 else 1.0
-        theta = np.zeros_like(radius)
+        theta, turn = np.zeros_like(radius), radius.dtype.type(2.0 * np.pi)
         for _ in range(4 if points.dtype == np.float32 else 12):
             lever = 2.0 * self.offset_mm * (m1 * np.cos(theta) + m2 * np.sin(theta))
             ratio = np.clip((constant + lever) / radius, -1.0, 1.0)
-            theta = 0.5 * _wrap_angle(phase - branch * np.arccos(ratio))
+            angle = phase - branch * np.arccos(ratio)
+            theta = 0.5 * (angle - turn * np.round(angle / turn))
         return theta
 
     def stripe(self, points: Reals) -> Reals:
@@ -167,9 +168,3 @@ def _measure_along(points: Reals, vector: Array, origin: Array) -> Reals:
     """Compute the distance of points (..., 3) from the origin along a vector."""
     x, y, z = (points[..., i] * float(vector[i]) for i in range(3))
     return x + y + z - float(vector @ origin)
-
-
-def _wrap_angle(angle: Reals) -> Reals:
-    """Wrap angles to (-pi, pi]."""
-    turn = angle.dtype.type(2.0 * np.pi)
-    return angle - turn * np.round(angle / turn)

@@ -109,7 +109,8 @@ class Scene:
         towards: (N, 3) from each point to the source.
         """
         middle, radius = self._ball
-        aside = _compute_distance_squared(points, towards, middle)
+        arm = points - middle.astype(np.float32)
+        aside = dot(arm, arm) - dot(arm, towards) ** 2 / dot(towards, towards)  # squared
         chosen = np.flatnonzero(self._shadowable[surface] & (aside < radius**2))
         blocked = np.zeros(len(points), bool)
         if chosen.size:
@@ -132,13 +133,6 @@ def _find_bounding_ball(surfaces: Iterable[Surface]) -> tuple[Array, float]:
         return np.zeros(3), 0.0
     low, high = np.min(corners, axis=(0, 1)), np.max(corners, axis=(0, 1))
     return (low + high) / 2.0, float(np.linalg.norm(high - low)) / 2.0
-
-
-def _compute_distance_squared(points: Floats, directions: Floats, middle: Array) -> Floats:
-    """Compute the squared distance (N,) of one point from lines through points (N, 3)."""
-    arm = points - middle.astype(np.float32)
-    along = dot(arm, directions)
-    return dot(arm, arm) - along**2 / dot(directions, directions)
 
 
 def dot(a: Floats, b: Floats) -> Floats:

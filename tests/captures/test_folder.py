@@ -196,6 +196,7 @@ def test_folders_are_joined_and_shots_of_one_name_are_one_moment(tmp_path: Path)
     [
         ("kind: calibration\nshots: [{name: b1, stripes: [p1-1]}]",
          "2:30: shots[0].stripes[0]: names no pair of rig small (did you mean 'p1'?)"),
+        ("kind: calibration\nshots: [{name: b1, stripes: [p1-1, p2-1]}]", "Its pairs are p1, p2"),
         ("kind: calibration\nshots: [{name: b1, stripes: [cam]}]", "camera without projector"),
         ("kind: calibration\nshots: [{name: b1, lit: [p1], stripes: [p1]}]", "listed already"),
         ("kind: calibration\nshots: [{name: b1, lit: [p1, p1]}]", "2:30: shots[0].lit[1]: lists"),

@@ -125,6 +125,7 @@ def test_mistakes_in_a_file_of_times(tmp_path: Path, change: dict[str, str], mes
         ("  frame_ms: 10\n  start: {p1: 0, cam: 3}", "timing.start: leaves out p2"),
         ("  frame_ms: 10\n  start: together\n  order: [lit, dark]", "timing.order: leaves out bit00"),
         ("  frame_ms: 10\n  start: together\n  order: [lit, light]", "timing.order[1]: names no frame"),
+        ("  frame_ms: 10\n  start: together\n  order: [gray0, gray1]", "calibration another rig's?"),
         ("  frame_ms: 10\n  start: together\n  order: [lit, lit]", "timing.order[1]: lists a frame"),
         ("  frame_ms: 10\n  times: times.csv", "timing.frame_ms: is said twice"),
         ("  times: ../times.csv", "timing.times: must not climb out"),

@@ -214,7 +214,8 @@ def test_poles_are_set_free_one_after_the_other(
 ) -> None:
     by_search, by_motion = [step("pole a", "a1", "a2")], list[Any]()
     if followed and told:
-        by_motion = [step("pole b", "b1"), ScaleError(1.0, 0.1)]
+        doubtful = replace(step("pole a", "a1", "a2"), certain=False)
+        by_motion = [doubtful, step("pole b", "b1"), ScaleError(1.0, 0.1)]
     given: list[Any] = []
     names = ("a1", "a2", "b1")
     boards = PoseCovariance(names, np.eye(18))
@@ -241,8 +242,8 @@ def test_poles_are_set_free_one_after_the_other(
         assert [one.tolist() for one in given] == [[True, True, False]]
     else:
         assert found.common_error == ScaleError(1.0, 0.1)
-        # A pole by itself, then each pole: of a size all stand off.
-        assert [one.tolist() for one in given] == [[False, False, True], [True, True, True]]
+        # A pole in doubt, of which nothing is said, another, then each pole: of a size all stand off.
+        assert [one.tolist() for one in given] == [[True, True, False], [True] * 3, [True] * 3]
     assert found.motion is followed
 
 
@@ -252,14 +253,9 @@ def test_what_a_followed_head_moved_by_is_no_place_of_a_pair_s_own(
 ) -> None:
     """A child who moved her head by 11 mm was told that pairs stood 0.5 mm off."""
     apart = {"first": 0.5, "followed": 0.05}
-    monkeypatch.setattr(
-        person_alignment,
-        "_search",
-        lambda _, __, at, *of: DisplacementSearch(None, 0.5, 2.7, apart[at]),
-    )
-    monkeypatch.setattr(
-        person_alignment, "estimate_motion", lambda *of: ("followed", followed, None)
-    )
+    patch = partial(monkeypatch.setattr, person_alignment)
+    patch("_search", lambda _, __, at, *of: DisplacementSearch(None, 0.5, 2.7, apart[at]))
+    patch("estimate_motion", lambda *of: ("followed", followed, None))
     monkeypatch.setattr(person_alignment, "_select_connected_motions", lambda *of: {})
     nothing: Any = None
     first: Any = "first"
