@@ -111,6 +111,10 @@ class StoredScan:
     mesh: BodyMesh
     facts: dict[str, Any]
 
+    def __repr__(self) -> str:  # the facts alone fill a terminal
+        grade, points = self.verdict and self.verdict.grade, len(self.cloud.points)
+        return f"<StoredScan of {self.facts.get('subject')!r}: {grade}, {points} points>"
+
     @property
     def verdict(self) -> Verdict | None:
         """The verdict; None for scans from before there were any."""

@@ -33,6 +33,7 @@ from scipy.spatial import ConvexHull
 from bodyscan.arrays import Array
 from bodyscan.body_model.fitting import BASIS_MM
 from bodyscan.body_model.registered import RegisteredBody, register_body
+from bodyscan.files.model import did_you_mean
 from bodyscan.measurement.landmarks import LANDMARK_INFLATION, Landmark, find_landmarks
 from bodyscan.measurement.posture import Posture, find_posture
 from bodyscan.measurement.sections import UP, BodySections, Section
@@ -61,6 +62,14 @@ class Measure:
     definition: str
     stance: str  # what the standard wants otherwise than the person stood; "" if nothing
     path_mm: Array = field(compare=False, repr=False)  # (N, 3), where it runs, rig frame
+
+
+class ByName(dict[str, Measure]):
+    """Measures by name. A KeyError for another name suggests one."""
+
+    def __missing__(self, name: str) -> Measure:
+        hint = did_you_mean(name, self) if self else ": measure(..., named=True) takes them"
+        raise KeyError(f"no measure {name!r}{hint}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +152,7 @@ def take_measures(registered: RegisteredBody) -> NamedMeasures:
     positions = {name: to_body.apply(np.array(one.position_mm)) for name, one in landmarks.items()}
     body = _Body(sections, positions)
     posture = find_posture(registered.fitted, positions)
-    measures, missing = {}, {}
+    measures, missing = ByName(), {}
     observed = {name: one for name, one in landmarks.items() if one.found != "unseen"}
     for definition in read_definitions():
         try:

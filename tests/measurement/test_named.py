@@ -133,7 +133,9 @@ def test_a_depth_is_measured_where_its_ends_are_and_a_girth_all_around() -> None
         assert waist.is_range == is_range
         assert waist.interval_mm[0] < true_mm < waist.interval_mm[1]
     back = (body.mesh.normals[:, 0] < 0.0) & (np.abs(above) < 100.0)
-    waist = take_measures(hide(body, back)).measures["waist girth"]
+    waist = (measures := take_measures(hide(body, back)).measures)["waist girth"]
+    with pytest.raises(KeyError, match="did you mean 'waist girth'"):
+        measures["waist"]
     assert waist.is_range
     low, high = waist.interval_mm
     assert low < true_mm - 20.0 < high

@@ -80,6 +80,7 @@ def of_keys_then(after: object, before: object) -> object:
 
 def test_a_scan_is_read() -> None:
     stored = load_scan(STORED / "scan")
+    assert len(repr(stored)) < 200
     assert len(stored.cloud.points) == 200
     assert stored.mesh.filled.tolist() == [False, True, True, True]
     assert stored.facts["verdict"]["grade"] in ("good", "usable", "repeat")
