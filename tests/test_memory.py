@@ -68,9 +68,7 @@ print(dpotrf(matrix, overwrite_a=True)[1])
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux limits address space so")
 @pytest.mark.parametrize(("megabytes", "expected"), [(400, "0"), (30, "MemoryError")])
-def test_a_small_address_space_ends_in_an_error_and_never_hangs(
-    megabytes: int, expected: str
-) -> None:
+def test_a_small_address_space_is_an_error_and_no_hang(megabytes: int, expected: str) -> None:
     line = [sys.executable, "-c", LIMITED, str(megabytes)]
     alone = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
     done = subprocess.run(line, capture_output=True, text=True, check=False, timeout=60, env=alone)

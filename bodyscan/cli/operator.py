@@ -334,22 +334,15 @@ def _show_grade(output: Output, scan: StoredScan) -> None:
         output.verdict(scan.verdict)
 
 
-BatchOut = Annotated[
-    str, typer.Option(help="Folder (or URL) to write one job folder for each into.")
-]
-Cluster = Annotated[
-    str | None,
-    typer.Option(metavar="tcp://HOST:PORT", help="Address of a dask scheduler to send jobs to."),
-]
-
-
 def batch(
     output: Output,
     pipeline: Annotated[
         Path, typer.Argument(metavar="PIPELINE.YAML", help="The pipeline file; see pipelines/.")
     ],
     scans: Annotated[str, typer.Option(help="Folder (or URL) of scan folders, or of rigs.")],
-    out: BatchOut,
+    out: Annotated[
+        str, typer.Option(help="Folder (or URL) to write one job folder for each into.")
+    ],
     calibration: Annotated[
         str | None,
         typer.Option(help="Default: `calibration` in the folder of scans, beside it or above it."),
@@ -361,7 +354,12 @@ def batch(
     workers: Annotated[
         int | None, typer.Option(min=1, help="Number of jobs at the same time.")
     ] = None,
-    cluster: Cluster = None,
+    cluster: Annotated[
+        str | None,
+        typer.Option(
+            metavar="tcp://HOST:PORT", help="Address of a dask scheduler to send jobs to."
+        ),
+    ] = None,
 ) -> None:
     """Fuse every scan of a day (or calibrate every rig), each in its own process.
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import secrets
 import shutil
 import stat
@@ -13,6 +12,7 @@ import time
 import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
+from glob import escape
 from pathlib import Path
 from typing import Any
 
@@ -25,10 +25,12 @@ def atomic_replacement(path: Path) -> Iterator[Path]:
 
     The temporary path keeps the suffix, because writers such as Open3D's choose the format by it.
     If the block raises, the temporary file is removed and `path` is left as it was. The folder is
-    created if necessary. A block that writes nothing raises FileNotFoundError.
+    created if necessary. A block that writes nothing raises FileNotFoundError. What killed writers of
+    `path` left is removed once it is an hour old: no living one takes as long.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
+    sweep_temporary(path.parent, escape(path.stem), older_s=3600.0)
     temporary = path.with_name(f".{path.stem}.{secrets.token_hex(6)}.tmp{path.suffix}")
     try:
         yield temporary
@@ -183,11 +185,12 @@ def hold_folder(folder: Path) -> Iterator[None]:
                 folder.rmdir()
 
 
-def sweep_temporary(folder: Path) -> None:
-    """Remove what killed writers left half written in a folder that this process holds."""
-    for path in folder.iterdir():
-        if re.fullmatch(r"\..+\.[0-9a-f]{12}\.tmp(\.\w+)?", path.name):
-            path.unlink(missing_ok=True)
+def sweep_temporary(folder: Path, stem: str = "*", *, older_s: float = 0.0) -> None:
+    """Remove what killed writers left half written in a folder: of one file, or all."""
+    for path in folder.glob(f".{stem}.{'[0-9a-f]' * 12}.tmp*"):
+        with suppress(OSError):
+            if not older_s or time.time() - path.stat().st_mtime > older_s:
+                path.unlink()
 
 
 @contextmanager

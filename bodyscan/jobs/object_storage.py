@@ -128,12 +128,8 @@ def fetch_figures(jobs: Sequence[Job], store: Store) -> None:
     for job in jobs:
         with _answering(store.job(job.name)):
             files = _open(store.job(job.name))
-            for name in (
-                "scan/scan.json",
-                f"measures/{MEASURES}",
-                "calibration/calibration.json",
-                MANIFEST,
-            ):
+            results = ("scan/scan.json", f"measures/{MEASURES}", "calibration/calibration.json")
+            for name in (*results, MANIFEST):
                 _fetch_one(files, name, job.folder / name)
 
 

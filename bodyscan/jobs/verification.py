@@ -30,12 +30,9 @@ def verify(folder: Path, kinds: Kinds = KINDS) -> Verification:
             where=str(folder),
             remedy="give the --out folder of a batch, or a job's folder in it",
         )
-    files, faults = 0, []
-    for path, fault in _verify_all(folder, kinds):
-        files += 1
-        if fault:
-            faults.append(f"{path}: {fault}")
-    return Verification(files, tuple(faults), tuple(_find_added(folder)))
+    checked = list(_verify_all(folder, kinds))
+    faults = tuple(f"{path}: {fault}" for path, fault in checked if fault)
+    return Verification(len(checked), faults, tuple(_find_added(folder)))
 
 
 def _verify_all(folder: Path, kinds: Kinds) -> Iterator[tuple[Path, str]]:

@@ -29,7 +29,7 @@ class Agreement:
 
         By 0.002 of the projector's image: calibrations reproject to half a pixel or one of some 1000.
         """
-        return self._exceeds(2e-3)
+        return self.offset_sigmas > MAX_RATIO and self.offset_stripes > 2e-3 * self.stripes
 
     @property
     def impossible(self) -> bool:
@@ -37,7 +37,7 @@ class Agreement:
 
         By 0.02 of the projector's image, half a degree: a wrong pose, sign or number of stripes.
         """
-        return self._exceeds(2e-2)
+        return self.unusual and self.offset_stripes > 2e-2 * self.stripes
 
     @property
     def description(self) -> str:
@@ -45,9 +45,6 @@ class Agreement:
             f"{self.offset_stripes:.1f} of {self.stripes} stripes of the less depth-sensitive "
             f"direction ({self.offset_sigmas:.1f} sigmas)"
         )
-
-    def _exceeds(self, share: float) -> bool:
-        return self.offset_sigmas > MAX_RATIO and self.offset_stripes > share * self.stripes
 
 
 @dataclass(frozen=True, eq=False)

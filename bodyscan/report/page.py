@@ -7,6 +7,7 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -66,6 +67,7 @@ class Lines:
     """Sentences, one per line."""
 
     lines: tuple[str, ...]
+    are_notes: bool = False  # also for whoever has it written
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +117,7 @@ def make_sections(parts: Mapping[str, Callable[[], Sequence[Block]]]) -> list[Se
         notes: list[str] = []
         with optional(title, notes.append):
             blocks = make()
-        sections.append(Section(title, [Lines(tuple(notes))] if notes else blocks))
+        sections.append(Section(title, [Lines(tuple(notes), are_notes=True)] if notes else blocks))
     return sections
 
 
@@ -130,7 +132,13 @@ class Page:
     axes: str  # where the rig frame lies, in words
     sections: Sequence[Section] = ()
     subject: str | None = None  # pseudonym of the person shown
-    notes: tuple[str, ...] = ()  # for whoever has it written
+
+    @property
+    def notes(self) -> list[str]:
+        """For whoever has it written: what was assumed, and which parts could not be made."""
+        blocks = (block for section in self.sections for block in section.blocks)
+        noted = (one.lines for one in blocks if isinstance(one, Lines) and one.are_notes)
+        return [*chain.from_iterable(noted)]
 
 
 def is_synthetic(folder: Path) -> bool:

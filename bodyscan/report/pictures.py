@@ -78,13 +78,11 @@ class Callout:
     colour: tuple[int, int, int]
 
 
-def draw_callouts(
-    mesh: BodyMesh, callouts: Mapping[str, Sequence[Callout]], *, height_px: int = 1100
-) -> bytes:
+def draw_callouts(mesh: BodyMesh, callouts: Mapping[str, Sequence[Callout]]) -> bytes:
     """Shaded pictures of a mesh with lines drawn over them by view, each with its label in the margin
     of its side."""
-    base, wide = np.full((len(mesh.faces), 3), 225, np.uint8), 250  # px, of a margin
-    panels = []
+    base = np.full((len(mesh.faces), 3), 225, np.uint8)
+    height_px, wide, panels = 1100, 250, []  # wide: of a margin
     frames = _make_frames(mesh.vertices, tuple(callouts), height_px)
     for view, frame in zip(callouts, frames, strict=True):
         margin = np.full((height_px, wide, 3), BACKGROUND, np.uint8)

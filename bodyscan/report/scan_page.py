@@ -97,7 +97,6 @@ def make_scan_page(folder: Path, other: Path | None = None) -> Page:
         facts.get("axes", FLOOR_AXES),
         sections,
         subject,
-        found[0].notes if found else (),
     )
 
 
@@ -300,7 +299,7 @@ def _compare(
         f"{shown.name}; what was filled is left out. To fit it, the scan was moved by {moved:.2f} mm "
         f"and turned by {np.degrees(fit.angle):.3f} degrees as a whole.",
         Table(columns, rows),
-        Lines(shown.notes),
+        Lines(shown.notes, are_notes=True),
         Picture(
             "Deviation map",
             f"Front, left side, back; the scan {words[shown.fitted]}. Red: outside of {shown.name}, "
@@ -330,7 +329,7 @@ def _show_pictures(scan: StoredScan) -> list[Block]:
         for name, (title, caption) in table.items()
         if name in drawn
     ]
-    return [*shown, Lines((*cloud.notes, *mesh.notes))]
+    return [*shown, Lines((*cloud.notes, *mesh.notes), are_notes=True)]
 
 
 def _tabulate_pairs(facts: Mapping[str, Any]) -> list[Block]:

@@ -181,9 +181,7 @@ def test_a_scan_in_several_versions(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", MESH_FORMATS)
-def test_with_y_up_the_file_says_so_and_the_body_keeps_its_hand(
-    suffix: str, tmp_path: Path
-) -> None:
+def test_with_y_up_a_file_says_so_and_the_body_keeps_its_hand(suffix: str, tmp_path: Path) -> None:
     path = tmp_path / f"body.{suffix}"
     write_body(path, ball(), replace(ORIGIN, up="y"))
     seen, info = o3d.io.read_triangle_mesh(str(path)), json.loads(Path(f"{path}.json").read_text())

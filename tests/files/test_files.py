@@ -6,6 +6,7 @@ import hashlib
 import json
 import math
 import os
+import time
 import zipfile
 from pathlib import Path
 
@@ -31,6 +32,9 @@ RIGS = Path(__file__).parents[2] / "rigs"
 
 def test_a_failed_write_leaves_the_old_file_and_no_litter(tmp_path: Path) -> None:
     path = tmp_path / "mesh.ply"
+    killed = tmp_path / ".mesh.4c1516627044.tmp.ply"
+    write_bytes(killed, b"of a writer that was killed two hours ago")
+    os.utime(killed, (time.time() - 7200.0,) * 2)
     write_bytes(path, b"old")
 
     def fail() -> None:

@@ -76,9 +76,7 @@ def test_a_pipe_among_the_images_is_not_waited_for(
     assert ends["b"]["state"] == "done"
 
 
-def test_odd_names_neither_hurt_nor_leak_out(
-    make_scans: Callable[..., Path], tmp_path: Path
-) -> None:
+def test_odd_names_neither_hurt_nor_leak(make_scans: Callable[..., Path], tmp_path: Path) -> None:
     names = ["a b", "it's \"quoted\"", "two\nlines", "Ωμέγα", "-rf", "..x", "$(touch x)", "[red]x",
              "summary.csv", "n" * 200]  # fmt: skip
     scans = make_scans(**dict.fromkeys(names, "nothing"))

@@ -76,9 +76,7 @@ def test_the_same_bytes_as_in_folders_and_nothing_twice(
     assert all(outcome.stages == () for outcome in again.values())
 
 
-def test_an_upload_that_was_cut_short_is_made_again(
-    memory: MemoryFileSystem, tmp_path: Path
-) -> None:
+def test_an_upload_cut_short_is_made_again(memory: MemoryFileSystem, tmp_path: Path) -> None:
     batch(tmp_path, "first")
     memory.rm("/day/out/anna/scan/stage.json")
     memory.pipe_file("/day/out/bert/export/body.bin", b"half")

@@ -274,9 +274,7 @@ def test_measurements_are_written_as_csv_by_their_suffix(tmp_path: Path) -> None
     assert beside == {"subject": whole["subject"]}
 
 
-def test_landmarks_that_cannot_be_written_are_refused_before_the_scan_is_read(
-    tmp_path: Path,
-) -> None:
+def test_landmarks_that_cannot_be_written_are_refused_before_reading(tmp_path: Path) -> None:
     for options, name, said in (
         (["--named"], "landmarks.xyz", "cannot be written as '.xyz'"),
         ([], "landmarks.csv", "needs --named"),

@@ -75,9 +75,7 @@ def night(day: Path) -> tuple[Result, Result]:
     return first, batch(day, *SMALL, "--json")
 
 
-def test_good_scans_are_fused_and_bad_ones_are_named(
-    day: Path, night: tuple[Result, Result]
-) -> None:
+def test_good_scans_are_fused_and_bad_ones_named(day: Path, night: tuple[Result, Result]) -> None:
     first, second = night
     assert second.exit_code == 1, second.output
     odd = next(name for name in endings(second) if name.startswith("q-"))

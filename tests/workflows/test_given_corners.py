@@ -77,9 +77,7 @@ def rig_file(folder: Path, text: str = "corners.vnl", board: Board = BOARD, pole
     return path
 
 
-def test_a_rig_is_calibrated_without_its_images_and_again_from_what_it_wrote(
-    tmp_path: Path,
-) -> None:
+def test_a_rig_is_calibrated_without_images_and_again_from_what_it_wrote(tmp_path: Path) -> None:
     found = seen_corners()
     # Another program may run along rows from the other side; not one corner of one image is known.
     some = list(found)

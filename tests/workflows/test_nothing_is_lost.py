@@ -108,13 +108,16 @@ def test_a_report_goes_on_after_a_section_that_fails(
     assert sum("KeyError: 'p2-2'" in blocks for blocks in told.values()) == 3  # and in the notes
     assert "'c1'" in told["Pairs"]
     render(page)
+    titles = {note.partition(":")[0] for note in page.notes}
+    assert titles == {"The rig", "How well each place is known"}
 
 
 def test_a_scans_report_goes_on_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scan = make_scan(tmp_path / "scan")
     monkeypatch.setattr(pictures, "draw_mesh", broken)
-    path, _ = write_report(scan.folder)
+    path, page = write_report(scan.folder)
     assert path.read_text("utf-8").count("failed with KeyError") == 1
+    assert page.notes[-1].startswith("mesh.png")
 
 
 def test_a_picture_that_cannot_be_drawn_costs_itself_alone(

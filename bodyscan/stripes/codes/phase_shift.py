@@ -159,21 +159,14 @@ class PhaseShift(StripeCode):
         return decode_wave(lines, images.lit, phases, self.half_periods, wave, self.stripes)
 
 
-def find_repetition(
-    periods: tuple[float, ...], stripes: int, min_change: float = 0.004
-) -> float | None:
+def find_repetition(periods: tuple[float, ...], stripes: int, bound: float = 0.004) -> float | None:
     """Find by how many stripes s can move, fewer than `stripes`, without any wave changing by as
-    much as `min_change` of its period; None if the waves determine s.
-
-    The default is 8 times the minimum sigma of a phase, so that an order can be found at all.
-    """
+    much as `bound` of its period (8 times the minimum sigma of a phase, so that an order can be found
+    at all); None if the waves determine s."""
     finest = min(periods)
-    for count in range(1, int(stripes / finest) + 1):
-        moved = count * finest
-        if moved >= stripes:
-            break
-        if all(abs(moved / period - round(moved / period)) < min_change for period in periods):
-            return moved
+    for moved in (count * finest for count in range(1, int(stripes / finest) + 1)):
+        if all(abs(moved / period - round(moved / period)) < bound for period in periods):
+            return moved if moved < stripes else None
     return None
 
 
