@@ -31,7 +31,8 @@ def matrix_from_homographies(homographies: Sequence[Array], width: int, height: 
     if matrix is None:
         square = rows[:, 0] + rows[:, 2]
         inverse_square = -(square @ rows[:, 5]) / (square @ square)
-        focal = 1.0 / np.sqrt(inverse_square) if inverse_square > 0 else 2.4
+        # A picture 2 wide: 50 is a field of view of 2 degrees.
+        focal = inverse_square**-0.5 if inverse_square > 50.0**-2 else 2.4
         matrix = np.diag([focal, focal, 1.0])
     return np.linalg.inv(size) @ matrix
 
@@ -47,7 +48,9 @@ def _solve_full_matrix(rows: Array) -> Array | None:
     matrix = np.linalg.inv(np.linalg.cholesky(conic).T)
     matrix = matrix / matrix[2, 2]
     plausible = abs(matrix[0, 1]) < 0.1 * matrix[0, 0] and np.all(np.abs(matrix[:2, 2]) < 0.5)
-    return matrix if plausible and 0.7 < matrix[0, 0] / matrix[1, 1] < 1.4 else None
+    # Fields of interlaced video and anamorphic lenses have pixels twice as high as wide, or half.
+    plausible = plausible and matrix[0, 0] < 50.0 and 0.4 < matrix[0, 0] / matrix[1, 1] < 2.5
+    return matrix if plausible else None
 
 
 def _form_constraint(h: Array, i: int, j: int) -> Array:

@@ -8,24 +8,15 @@ from typing import Any, Literal
 
 from bodyscan.errors import BadInput
 from bodyscan.export.formats import BODY_FORMATS
-from bodyscan.files.model import Model, Name, Problem, did_you_mean, format_alternatives
+from bodyscan.files.model import Name, Problem, did_you_mean, format_alternatives
 from bodyscan.files.model_file import apply_settings, load_model
 from bodyscan.interchange.rig_format import RIG_FORMATS
-from bodyscan.settings import (
-    AlignmentSettings,
-    ExportSettings,
-    FusionSettings,
-    MeshSettings,
-    Resources,
-    RigExportSettings,
-    ScanSettings,
-    UseLimits,
-)
+from bodyscan.settings import ExportSettings, Resources, RigExportSettings, ScanSettings
 
 SECTIONS = {"fuse": ("alignment", "fusion", "mesh", "use", "export"), "calibrate": ("rig_export",)}
 
 
-class Pipeline(Model):
+class Pipeline(ScanSettings):
     """The whole file.
 
     kind: what a job is, one scan (fuse) or one rig file (calibrate).
@@ -37,10 +28,6 @@ class Pipeline(Model):
     name: Name
     kind: Literal["fuse", "calibrate"]
     resources: Resources = Resources()
-    alignment: AlignmentSettings = AlignmentSettings()
-    fusion: FusionSettings = FusionSettings()
-    mesh: MeshSettings = MeshSettings()
-    use: UseLimits = UseLimits()
     export: ExportSettings = ExportSettings()
     rig_export: RigExportSettings = RigExportSettings()
 
@@ -55,9 +42,7 @@ class Pipeline(Model):
     @property
     def scan(self) -> ScanSettings:
         """The settings that determine the result of a scan."""
-        return ScanSettings(
-            alignment=self.alignment, fusion=self.fusion, mesh=self.mesh, use=self.use
-        )
+        return ScanSettings(**{name: getattr(self, name) for name in ScanSettings.model_fields})
 
     def section(self, name: str) -> dict[str, Any]:
         """One section as plain data."""
