@@ -12,6 +12,7 @@ from bodyscan.errors import group_reasons
 from bodyscan.geometry.uncertainty import compute_position_sigma
 from bodyscan.registration.board_checks import find_common_aspect
 from bodyscan.registration.rig_calibration import RigCalibration, find_nominal_size
+from bodyscan.rig.rig import find_unusual_lengths
 from bodyscan.verdict import Grade, Verdict
 
 
@@ -94,6 +95,8 @@ def grade_calibration(calibration: RigCalibration) -> Verdict:
         )
         findings.append((False, 1.0, words))
     size = find_nominal_size(calibration.rig, calibration.rig_from_camera)
+    if size is None and not calibration.rig.references:  # nothing confirms them
+        findings[:0] = [(False, np.inf, words) for words in find_unusual_lengths(calibration.rig)]
     if size and size.mark != "good":  # one in use is reported; a new one is not made
         findings.append((False, 1.0, f"{size.words}: {size.remedy}"))
     # What forbids its use comes first.

@@ -13,7 +13,7 @@ from bodyscan.calibration.camera import CameraCalibration
 from bodyscan.calibration.pair import PairCalibration, calibrate_pair
 from bodyscan.captures.check import describe_unlisted_images
 from bodyscan.captures.folder import Captures, open_captures
-from bodyscan.errors import BadInput, BodyscanError, FailedWork, format_error
+from bodyscan.errors import BadInput, BodyscanError, FailedWork, RigDisconnected, format_error
 from bodyscan.optional import optional
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, attempt_each, silent, step
@@ -31,7 +31,7 @@ from bodyscan.registration.rig_solve import (
 )
 from bodyscan.registration.sanity_checks import find_faults
 from bodyscan.registration.storage import CORNERS_NAME, archive_previous, save_calibration
-from bodyscan.rig.rig import Rig, find_unusual_lengths, load_rig
+from bodyscan.rig.rig import Rig, load_rig
 from bodyscan.workflows.decode import PrintAreas, decode_on_boards
 from bodyscan.workflows.find_boards import (
     HERE,
@@ -84,7 +84,7 @@ def calibrate_folder(
     solved = solve_boards(rig, captures, boards, progress, folder=Path(rig_file).parent)
     remarked = add_remarks(solved, progress)
     archive_previous(folder)
-    notes = [*remarked.notes, *find_unusual_lengths(rig)]
+    notes = list(remarked.notes)
     with optional(CORNERS_NAME, notes.append):
         write_found_corners(folder / CORNERS_NAME, rig, captures, boards.value)
     with optional("images that are not used", notes.append):
@@ -110,7 +110,7 @@ def solve_boards(
     located = locate_views(rig, select_solving_views(rig, boards.value), cameras.value)
     prints = PrintAreas(rig, cameras.value, {view.key: view for view in located.value})
     with step(progress, "joining the pairs"):
-        solved = _bundle_adjust(rig, boards.value, located, cameras)
+        solved = _bundle_adjust(rig, boards, located, cameras)
     views = [view for view in boards.value if view.key in prints.located]
     stripes = decode_on_boards(rig, captures, views, progress, prints=prints)
     pairs = _fit_light(solved, stripes, progress)
@@ -156,16 +156,21 @@ class _Adjusted:
 
 def _bundle_adjust(
     rig: Rig,
-    boards: list[BoardView],
+    boards: FoundBoards,
     located: Outcome[list[LocatedView]],
     cameras: Outcome[dict[str, CameraCalibration]],
 ) -> _Adjusted:
     """Solve for all poses and cameras; if reference lengths correct the size, solve again."""
-    solution = _solve_rig(rig, located.value, cameras)
-    size = find_rig_size(rig, solution.value, boards)
+    try:
+        solution = _solve_rig(rig, located.value, cameras)
+    except RigDisconnected as error:  # a board in flipped images moves as no other camera sees it
+        mirrored = (note for note in boards.notes if " is mirrored in " in note)
+        remedy = "\n  ".join([*mirrored, error.remedy])
+        raise RigDisconnected(error.what, where=error.where, remedy=remedy) from error
+    size = find_rig_size(rig, solution.value, boards.value)
     if size.value.factor != 1.0:
         rig = rescale_boards(rig, size.value.factor)
-        located = locate_views(rig, select_solving_views(rig, boards), cameras.value)
+        located = locate_views(rig, select_solving_views(rig, boards.value), cameras.value)
         solution = _solve_rig(rig, located.value, cameras)
     framed = hold_frame(rig, solution.value.views, solution.value.rig_from_camera)
     refuse_wrong_size(rig, solution.value.rig_from_camera)

@@ -339,7 +339,7 @@ def _describe_boardless(rig: Rig, boards: FoundBoards, searched: int) -> str:
     whatever the number of markers counted."""
     examples: dict[str, str] = {}
     for note in boards.notes:
-        if "out of step by" in note:
+        if re.search("out of step by|(which|them) lie as on", note):
             return note
         _, found, what = note.partition("no board found:")
         if found:

@@ -18,13 +18,14 @@ from bodyscan.boards.detection import find_boards
 from bodyscan.boards.detection_failure import describe_unfound
 from bodyscan.boards.view import BoardView
 from bodyscan.captures.folder import open_captures
-from bodyscan.errors import BadInput
+from bodyscan.errors import BadInput, BodyscanError
+from bodyscan.outcome import Outcome
 from bodyscan.registration.board_checks import note_appearance, refuse_other_pitch
 from bodyscan.rig.board import Board
 from bodyscan.rig.frame_names import CaptureFolder
 from bodyscan.rig.pair import CameraSpec, Pair
 from bodyscan.rig.rig import Rig
-from bodyscan.workflows.find_boards import find_all_boards
+from bodyscan.workflows.find_boards import find_all_boards, require_cameras
 
 MARKED = Board(
     name="marked", kind="charuco", columns=9, rows=8, square_mm=70, marker_mm=52, margin_mm=10
@@ -88,17 +89,14 @@ def test_either_of_the_two_historic_layouts_is_recognised(picture: Bytes) -> Non
 
 
 @pytest.mark.slow
-def test_a_column_too_many_is_refused_and_the_right_number_named(picture: Bytes) -> None:
-    described = MARKED.model_copy(update={"columns": 10})
-    assert found(picture, described) == []
-    assert "board of 9 columns x 8 rows, not 10 x 8" in describe_unfound(picture, described)
-
-
-@pytest.mark.slow
-def test_another_dictionary_is_named(picture: Bytes) -> None:
-    described = MARKED.model_copy(update={"dictionary": "DICT_5X5_1000"})
-    assert found(picture, described) == []
-    assert "0 markers of DICT_5X5_1000, but 3" in describe_unfound(picture, described)
+def test_other_columns_and_another_dictionary_are_named(picture: Bytes) -> None:
+    for wrong, named in (
+        ({"columns": 10}, "board of 9 columns x 8 rows, not 10 x 8"),
+        ({"dictionary": "DICT_5X5_1000"}, "0 markers of DICT_5X5_1000, but 3"),
+    ):
+        described = MARKED.model_copy(update=wrong)
+        assert found(picture, described) == []
+        assert named in describe_unfound(picture, described)
 
 
 def tag_picture(*, border_bits: int, turns: int, from_below: bool) -> tuple[Bytes, Array]:
@@ -154,7 +152,7 @@ def test_tags_that_stand_otherwise_than_described_are_refused() -> None:
     assert "or marker_mm 97.69 square" in refused.value.remedy
 
 
-@pytest.mark.parametrize(("first", "faces"), [(1, 1), (2, 2), (5, 1)])
+@pytest.mark.parametrize(("first", "faces"), [(1, 1), (2, 2), (5, 1), (150, 1)])
 def test_the_first_marker_is_read_off_the_markers(tmp_path: Path, first: int, faces: int) -> None:
     described = MARKED.model_copy(update={"faces": faces})
     printed = described.model_copy(update={"first_marker": first})
@@ -166,8 +164,9 @@ def test_the_first_marker_is_read_off_the_markers(tmp_path: Path, first: int, fa
         calibration=(CaptureFolder(folder="captures"),),
     )  # fmt: skip
     captures = open_captures(rig, tmp_path / "rig.yaml")
-    with pytest.raises(BadInput, match=f"on this board with first_marker {first}, not 0"):
-        find_all_boards(rig, captures)
+    with pytest.raises(BodyscanError, match=f"on this board with first_marker {first}") as raised:
+        require_cameras(rig, captures, find_all_boards(rig, captures), Outcome({}))
+    assert "columns" not in str(raised.value)  # the cause is known
     right = rig.model_copy(update={"boards": (printed,)})
     assert len(find_all_boards(right, captures).value) == faces
 

@@ -67,7 +67,9 @@ def test_a_pair_whose_pictures_were_taken_at_other_moments_is_left_out() -> None
     found, left_out = find_initial_poses(views, "abc")
     assert set(found) == {"a", "b"}
     assert "c" in left_out["c"]
-    with pytest.raises(RigDisconnected, match="differs from shot to shot"):
+    with pytest.raises(
+        RigDisconnected, match=r"pose of a, c that .*differs from shot to shot.*taken together"
+    ):
         find_initial_poses([v for v in views if v.pair != "b"], "ac")
 
 
@@ -77,11 +79,6 @@ def test_three_shots_that_agree_are_a_start_where_as_many_do_on_something_else()
     found, left_out = find_initial_poses(views, "ac")
     assert not left_out
     assert np.linalg.norm(found["c"].translation - found["a"].apply(PLACED["c"].translation)) < 20.0
-
-
-def test_pairs_that_share_nothing_are_named() -> None:
-    with pytest.raises(RigDisconnected, match="no shared board view ties c to a, b"):
-        find_initial_poses([view("a", 1), view("b", 1), view("c", 2)], "abc")
 
 
 def test_a_board_stands_where_most_corners_say_and_a_view_far_off_is_doubtful() -> None:

@@ -77,6 +77,12 @@ def test_what_exceeds_a_limit_is_named_with_pair_value_and_limit(
     calibration: RigCalibration,
 ) -> None:
     assert grade_calibration(calibration) == Verdict("good")
+    boards = [board.model_copy(update={"square_mm": 7.0}) for board in calibration.rig.boards]
+    rig = calibration.rig.model_copy(update={"boards": boards})
+    verdict = grade_calibration(
+        worse(replace(calibration, rig=rig), min(calibration.pairs), poses=1)
+    )
+    assert "square_mm is 7 mm" in verdict.reasons[0]  # before what is far worse
     failed = {"c9": "saw nothing (bit 0)", "d4": "is late", "c8": "saw nothing (2 of 3 bits)"}
     verdict = grade_calibration(replace(calibration, failed=failed))
     reasons = ("failed: c9, c8: saw nothing (bit 0)", "failed: d4: is late")

@@ -14,12 +14,13 @@ from seen_boards import SeenBoards, seen_boards
 from small_workspace import Detected
 
 from bodyscan.arrays import Array
-from bodyscan.boards.view import BoardView, ViewKey
+from bodyscan.boards.view import Appearance, BoardView, ViewKey
 from bodyscan.calibration.boundary_points import BoardBoundaries
 from bodyscan.captures.folder import Captures
 from bodyscan.errors import BodyscanError, FailedWork, RigDisconnected, format_list
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress
+from bodyscan.registration.board_checks import note_appearance
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.storage import load_calibration, save_calibration
 from bodyscan.rig.gauge import RigFrame
@@ -205,8 +206,20 @@ def test_shots_that_one_camera_saw_tie_nothing_together() -> None:
     ]
     assert sorted(calibrated(boards, shared).pairs) == names
     apart = [v for v in boards.views if (v.pair in ("c1", "c2")) == (int(v.shot[1:]) % 2 == 0)]
-    with pytest.raises(RigDisconnected, match="c1, c2 to c3, c4"):
+    with pytest.raises(RigDisconnected, match="no shared board view ties c1, c2 to c3, c4"):
         calibrated(boards, apart)
+
+
+def test_where_boards_disagree_a_camera_with_flipped_images_is_named() -> None:
+    boards = seen(2, shots=10)
+    name, width = max(boards.placings), boards.rig.pairs[0].camera.width
+    views = [v for v in boards.views if v.pair != name]
+    for v in (v for v in boards.views if v.pair == name):
+        flipped = [width - 1.0, 0.0] + np.array([-1.0, 1.0]) * v.pixels
+        views.append(replace(v, pixels=flipped, appearance=Appearance(mirrored=True)))
+    found = replace(boards.found(views), notes=tuple(note_appearance(boards.rig, views)))
+    with pytest.raises(RigDisconnected, match=rf"mirrored in 10 views \({name}\)"):
+        solve_boards(boards.rig, boards.captures(views), found)
 
 
 def test_two_shots_are_too_few() -> None:
