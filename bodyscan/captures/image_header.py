@@ -86,6 +86,8 @@ def _read_by_pillow(stream: BinaryIO, kind: str) -> ImageHeader:
     """Size and depth; of JPEG also completeness, and the quantisation error in grey levels."""
     # The classes themselves: Image.open refuses large images before it says how large they are.
     plugin = import_module(f"PIL.{kind}ImagePlugin")
+    for number in (34712, 34887) if kind == "Tiff" else ():  # compressions that Pillow cannot name
+        plugin.COMPRESSION_INFO.setdefault(number, "raw")
     image: Any = getattr(plugin, f"{kind}ImageFile")(stream)
     width, height = image.size
     colour = image.mode not in ("1", "L")
