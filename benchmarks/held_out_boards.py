@@ -21,10 +21,12 @@ from bodyscan.calibration.boundary_points import (
     on_board,
 )
 from bodyscan.calibration.camera import CameraCalibration, locate_board
+from bodyscan.calibration.lens_selection import choose_lens
 from bodyscan.calibration.sheet_fit import fit_light_planes, fit_pinhole
 from bodyscan.calibration.sheet_selection import fit_light_sheets
 from bodyscan.captures.folder import Captures
 from bodyscan.errors import PairFailed
+from bodyscan.geometry.lenses import FAMILY
 from bodyscan.geometry.light_planes import Axis, LightPlanes, LightSheets
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.rig.rig import Rig
@@ -107,8 +109,10 @@ def _shots(rig: Rig, captures: Captures, pair: str) -> tuple[CameraCalibration, 
     cameras = calibrate_cameras(rig, views)
     if pair not in cameras.value:
         raise PairFailed(cameras.failures.get(pair, "no boards"), where=f"pair {pair}")
-    camera = cameras.value[pair]
-    spec = rig.pair(pair)
+    start, spec = cameras.value[pair], rig.pair(pair)
+    # As the joint solve chooses it: the start's lens is the richest.
+    planar = [make_planar_view(view, rig.board(view.board)) for view in views]
+    camera = choose_lens(FAMILY, start.camera, start.poses, planar).fit
     assert spec.projector is not None
     shots = []
     sequences = {sequence.shot: sequence for sequence in captures.pair_sequences(pair)}
