@@ -118,8 +118,7 @@ def solve_motions(
     overlaps: by source and target, linearized at `motion` (P, 6).
     covariance: of the prior, whose mean is zero, (6P, 6P).
     """
-    system = _assemble_system(overlaps, motion, covariance)
-    return system.solve().reshape(-1, 6)
+    return _assemble_system(overlaps, motion, covariance).solve().reshape(-1, 6)
 
 
 def compute_motion_covariance(

@@ -96,8 +96,7 @@ def calibrate_known_camera(views: Sequence[PlanarView], camera: Camera) -> Camer
             "no board view of a camera that is known has enough corners",
             remedy="show it the board in a shot that others see too",
         )
-    poses = [locate_board(camera, view)[0] for view in views]
-    return fit_camera(camera, poses, views)
+    return fit_camera(camera, [locate_board(camera, view)[0] for view in views], views)
 
 
 def fit_camera(

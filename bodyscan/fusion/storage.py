@@ -278,9 +278,10 @@ def read_facts(folder: Path) -> dict[str, Any]:
     try:
         facts = read_json_object(file)
         _Facts.model_validate_json(json.dumps(facts))
-    except FileNotFoundError:
-        inside = folder / "scan" / FILE_NAME  # of a batch's job, or a simulated workspace
-        remedy = f"give {inside.parent}, which holds one" if inside.exists() else REMEDY
+    except (FileNotFoundError, NotADirectoryError):
+        near = (folder / "scan", folder.parent)  # of a batch's job; of a file or folder in a result
+        holds = (f"give {one}, which holds one" for one in near if (one / FILE_NAME).is_file())
+        remedy = next(holds, REMEDY)
         raise ResultError("there is no such file", where=str(file), remedy=remedy) from None
     except (OSError, ValueError) as error:
         reason = describe_first_error(error) if isinstance(error, ValidationError) else str(error)

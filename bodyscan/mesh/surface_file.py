@@ -50,9 +50,10 @@ def read_surface(
         except Exception as error:  # whatever a damaged file makes of its parser
             cause = f" ({error})"
         if path.suffix.lower() == ".ply" and cause:  # or its faces have various numbers of corners
-            from open3d import io
+            from open3d import io, utility
 
-            polygons = io.read_triangle_mesh(str(path))
+            with utility.VerbosityContextManager(utility.VerbosityLevel.Error):
+                polygons = io.read_triangle_mesh(str(path))
             vertices, faces = np.array(polygons.vertices), np.array(polygons.triangles, int)
     fault = find_fault(vertices, faces) if faces.size else f"no surface can be read here{cause}"
     if fault:

@@ -162,9 +162,7 @@ def tags(turn: int = 0, *, from_top: bool = False, wrong: int = 0, count: int = 
 
 @pytest.mark.parametrize("turn", range(4))
 @pytest.mark.parametrize("from_top", [False, True])
-def test_a_grid_is_placed_however_its_tags_are_turned_and_counted(
-    turn: int, from_top: bool
-) -> None:
+def test_a_grid_is_placed_however_tags_are_turned_and_counted(turn: int, from_top: bool) -> None:
     position = locate_grid(TAGS, tags(turn, from_top=from_top))
     assert position is not None
     assert position.agreeing == 30

@@ -83,9 +83,7 @@ def test_one_view_places_the_board_before_a_known_camera(
     assert len(found.value.rig_from_board) == 1
 
 
-def test_a_start_is_left_as_far_as_its_sigma_lets_it(
-    views: list[BoardView], tmp_path: Path
-) -> None:
+def test_a_start_is_left_as_far_as_its_sigma_lets(views: list[BoardView], tmp_path: Path) -> None:
     found = solved(rig_with(tmp_path, off_px=5.0, sigma_px=5.0), views, tmp_path)
     # 0.03 px of noise on some thousand corners: a principal point is known to a few tenths.
     assert found.value.cameras[KNOWN].u0 == pytest.approx(CAMERAS[KNOWN].u0, abs=0.6)

@@ -24,7 +24,7 @@ from bodyscan.cli.main import app
 from bodyscan.errors import BadInput, ResultError
 from bodyscan.evaluation.surface import compare_surfaces
 from bodyscan.files.atomic import write_json
-from bodyscan.fusion.storage import Origin
+from bodyscan.fusion.storage import Origin, read_facts
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.jobs.forgetting import find_subject
 from bodyscan.mesh.body import HAIR, SKIN, BodyCloud
@@ -183,6 +183,12 @@ def test_what_is_no_result_is_said(tmp_path: Path, content: str) -> None:
     (tmp_path / "scan.json").write_text(content)
     with pytest.raises(ResultError, match="not a readable scan"):
         build_page(tmp_path)
+    (tmp_path / "scan.json").unlink()
+    write_json(tmp_path / "scan" / "scan.json", {})  # a batch's job holds it so
+    for near in (tmp_path, tmp_path / "scan" / "mesh.ply"):
+        near.touch()
+        with pytest.raises(ResultError, match=r"give .*scan, which holds one"):
+            read_facts(near) if near.is_file() else build_page(near)
 
 
 def test_a_slip_of_the_pen_is_not_taken_for_the_folder_above(scan: MadeScan) -> None:

@@ -52,9 +52,7 @@ def test_words_have_the_first_pattern_as_most_significant_bit(inverses: bool, of
 
 @pytest.mark.parametrize("of", [np.uint8, np.float32])
 @pytest.mark.parametrize("inverses", [True, False])
-def test_differences_have_the_noise_of_the_frames_they_are_made_of(
-    inverses: bool, of: type
-) -> None:
+def test_differences_have_the_noise_of_frames_they_are_made_of(inverses: bool, of: type) -> None:
     images = frames(inverses, of)
     bit = np.array([2, 0])
     at = np.array([[3, 34, 1], [17, 2, 0]])

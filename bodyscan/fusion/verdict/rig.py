@@ -156,8 +156,8 @@ def find_compressed(images: Sequence[RangeImage]) -> tuple[str, ...]:
     """Pairs in whose lit image grey levels step between blocks of 8 x 8 pixels, as JPEG leaves them.
 
     The mean step between neighbours is compared over the eight places in a block, both ways, without
-    the largest: where a picture's border or bar ends, often at a multiple of 8, is one step and no
-    block. By images of six sets: 1.00 to 1.10 without compression, 1.26 and more with it.
+    the largest: a border is one step, often at a multiple of 8. By images of six sets: 1.00 to 1.10
+    without compression, 1.26 and more with it.
     """
     found = []
     for image in images:
