@@ -130,10 +130,12 @@ def _propose_corners(image: Bytes, board: Board, quick: bool) -> Iterator[Array]
         yield from _detect(image, size, scale=0.5, sector_based=True)
     else:
         yield from _detect(image, size)
+    adaptive = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
     if not quick and not shows_lattice(image, size):
+        if not large:  # a fisheye bends a board that fills its picture until it is no lattice
+            yield from _detect(image, size, scale=min(0.5, 640 / image.shape[1]), flags=adaptive)
         return
     if not large:
-        adaptive = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
         yield from _detect(image, size, flags=adaptive)
     if quick:
         return

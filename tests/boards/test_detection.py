@@ -53,19 +53,20 @@ def test_a_plain_board_is_numbered_from_its_black_square(spin_deg: int) -> None:
     assert np.sqrt(np.mean(errors(view, true_corners(PLAIN, place)) ** 2)) < 0.02
 
 
-def test_a_board_from_horizon_to_horizon_of_a_fisheye_is_found() -> None:
-    """An equidistant lens of 200 px a radian; the board reaches 63 degrees to either side."""
+@pytest.mark.parametrize("distance", [80.0, 52.0])
+def test_a_board_from_horizon_to_horizon_of_a_fisheye_is_found(distance: float) -> None:
+    """An equidistant lens of 200 px a radian; the board reaches 63 and 73 degrees to either side."""
     focal, middle, board_from_camera = 200.0, np.array([319.5, 239.5]), np.array([165.0, 100.0])
     fine = (np.stack(np.meshgrid(np.arange(2560), np.arange(1920)), axis=-1) - 1.5) / 4.0 - middle
     theta = np.linalg.norm(fine, axis=-1) / focal
     ray = fine / focal * (np.tan(np.minimum(theta, 1.5)) / theta)[..., None]
-    x, y = np.moveaxis(80.0 * ray + board_from_camera, -1, 0)
+    x, y = np.moveaxis(distance * ray + board_from_camera, -1, 0)
     even = (np.floor(x / 30.0) + np.floor(y / 30.0)) % 2
     print_ = np.where((x > 0) & (x < 300) & (y > 0) & (y < 210), 20.0 + 180.0 * even, 200.0)
     print_[(np.abs(x - 150) > 170) | (np.abs(y - 105) > 125) | (theta > 1.5)] = 70.0
     picture = cv2.resize(print_.astype(np.float32), (640, 480), interpolation=cv2.INTER_AREA)
     (view,) = found(cv2.GaussianBlur(picture, (0, 0), 0.7).astype(np.uint8), PLAIN)
-    ideal = (compute_corner_points(PLAIN)[view.corner_ids, :2] - board_from_camera) / 80.0
+    ideal = (compute_corner_points(PLAIN)[view.corner_ids, :2] - board_from_camera) / distance
     radius = np.linalg.norm(ideal, axis=1, keepdims=True)
     true = middle + focal * ideal / radius * np.arctan(radius)
     assert len(view.corner_ids) >= 52
