@@ -328,8 +328,7 @@ def export_scan(
     frame: the rig's, or the body's own (origin beneath the body, x the way it faces).
     up: the axis that points up in PLY, OBJ and STL; in GLB it is y.
 
-    Raises BadInput for an unknown format; FailedWork if a face is to be removed but no neck is
-    found.
+    Raises BadInput for an unknown format; FailedWork if a face is to go and no neck is found.
 
     >>> ExportSettings().formats
     ('ply', 'obj', 'stl', 'glb')

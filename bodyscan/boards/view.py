@@ -69,8 +69,7 @@ def number_corners(
         through the glass that it is printed on: its markers number it as it is.
     size: of the image, px.
 
-    Raises CaptureError if the number of corners differs from the board's, or one is outside the
-    image.
+    Raises CaptureError if corners are not as many as the board's, or one is outside the image.
     """
     columns = compute_corner_grid(board)[0]
     count = len(compute_corner_points(board))

@@ -184,8 +184,7 @@ def _match(
     scale_mm: float,
     used: Indices,
 ) -> _Matches:
-    """Match vertices (by index) to their closest points; weight 0 far off, with unlike normals, beside
-    holes."""
+    """Match vertices (by index) to closest points; weight 0 far off, with unlike normals, by holes."""
     _, nearest = tree.query(join_positions_normals(vertices[used], normals[used]))
     points, target = surface.points[nearest], surface.normals[nearest]
     weights = _weigh(vertices[used] - points, normals[used], target, scale_mm)

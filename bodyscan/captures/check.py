@@ -270,8 +270,7 @@ def describe_unlisted_images(captures: Captures) -> str | None:
     """Describe images next to those of the shots that the rig file does not name, often in a renamed
     folder; None if there are none.
 
-    Shots that are not wanted are ignored, unless nothing is left of one that is: it may have been
-    renamed.
+    Shots that are not wanted are ignored, unless nothing is left of one that is, perhaps renamed.
     """
     complete = {s.shot for s in captures.sequences if len(s.missing) < len(s.paths)}
     renamed = any(shot not in complete for shot in captures.shots)

@@ -102,8 +102,7 @@ def find_overlaps(
     of_surfaces: Sequence[Floats],
     channel: int,
 ) -> list[Overlap]:
-    """Compare a channel's levels where surfaces agree with samples of others, in up to 5000 spots a
-    pair.
+    """Compare a channel's levels where surfaces agree with others, in up to 5000 spots a pair.
 
     of_samples, of_surfaces: logarithms of irradiance.
     """

@@ -106,8 +106,7 @@ def _drop_outside(
 
 
 def find_foreground(image: RangeImage, empty: RangeImage) -> Mask:
-    """(h, w): where a point lies 4 mm or more in front of the nearest background around its
-    pixel."""
+    """(h, w): where a point lies 4 mm or more before the background around its pixel."""
     window = np.ones((3, 3), np.uint8)
     far = np.where(empty.open_depth > 0.0, empty.open_depth, np.float32(np.inf))
     with np.errstate(invalid="ignore"):
@@ -116,8 +115,7 @@ def find_foreground(image: RangeImage, empty: RangeImage) -> Mask:
 
 @compiled
 def drop_flying_pixels(depth: Floats, step_mm: float, supporters: int = 13) -> Floats:
-    """Depth (h, w) of pixels that enough neighbours agree with, within `step_mm` per step; else
-    NaN.
+    """Depth (h, w) of pixels that enough neighbours agree with to `step_mm` per step; else NaN.
 
     At a straight rim a pixel has 14 of its 24 neighbours; a flying one has few. A second pass no
     longer counts what the first removed.

@@ -142,8 +142,7 @@ def fit_trimmed_windows(
     fit: QuadraticFit,
     fitted: Mask,
 ) -> None:
-    """Fit the windows around some measured pixels (flat indices) to the samples on the centre's
-    surface.
+    """Fit the windows around measured pixels (flat indices) to samples on the centre's surface.
 
     Writes `fit` there, and `fitted`: whether the pixel lies on its own fit and enough samples do.
     Trimmed least squares, from the closest neighbours outwards, with a prior on the second

@@ -64,8 +64,7 @@ def measure_support(vertices: Array, normals: Floats, cloud: BodyCloud, reach_mm
 
 
 def fit_to_points(vertices: Array, faces: Indices, normals: Floats, around: Support) -> Array:
-    """Move the vertices (V, 3) along their normals to the points around, by less the smaller their
-    weight.
+    """Move the vertices (V, 3) along normals to the points around, by less the smaller their weight.
 
     Where a face would fold over, its corners move by half of that, then a quarter, then not at all.
     """

@@ -137,8 +137,7 @@ def forget_subject(subject: str, workspace: Path) -> SubjectFiles:
 
 
 def list_by_folder(found: SubjectFiles) -> Iterator[str]:
-    """What was found in lines: the subject's highest folders with their number of files, and files
-    elsewhere."""
+    """What was found: the subject's highest folders with their number of files, and other files."""
     highest = [one for one in found.folders if not {*one.parents} & {*found.folders}]
     inside = {path: [one for one in highest if one in path.parents] for path in found.files}
     counts = Counter(one for folders in inside.values() for one in folders)

@@ -200,8 +200,7 @@ def _read_captures_content(folder: Path) -> dict[str, Any]:
 
 
 def find_nearest_calibration(scans: Path) -> Path:
-    """The `calibration` folder in the folder of the scans, beside it or above it. Raises
-    BadInput."""
+    """The `calibration` folder in the scans' folder, beside it or above it. Raises BadInput."""
     absolute = scans.absolute()
     for above in (absolute, *list(absolute.parents)[:2]):
         if (above / "calibration" / CALIBRATION).exists():

@@ -36,8 +36,7 @@ def verify(folder: Path, kinds: Kinds = KINDS) -> Verification:
 
 
 def _verify_all(folder: Path, kinds: Kinds) -> Iterator[tuple[Path, str]]:
-    """Every file checked, with its fault, "" if it is sound: of a job's folder, or of all jobs of a
-    batch."""
+    """Every file checked, with its fault, "" if sound: of a job's folder, or all jobs of a batch."""
     jobs = read_record(folder / MANIFEST).get("jobs")
     if not isinstance(jobs, dict):
         yield from _verify_job(folder, kinds)

@@ -164,8 +164,7 @@ def _work(folder: Path, kinds: Kinds, emit: Emit) -> None:
 
 
 def _perform(job: Job, stage: Stage, before: Origin, emit: Emit) -> None:
-    """Run a stage and put its results in place, provided that its inputs did not change
-    meanwhile."""
+    """Run a stage and put its results in place, if its inputs did not change meanwhile."""
     made = job.folder / f"{_BEING_MADE}{stage.name}-{secrets.token_hex(4)}"
     made.mkdir()
 

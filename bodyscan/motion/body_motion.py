@@ -99,8 +99,7 @@ class BodyMotion:
         return tuple(slice(a, b) for a, b in pairwise(ends))
 
     def whiten(self, columns: Array) -> Array:
-        """W (n, K) such that W^T W is the posterior covariance of the columns' (n, K) combinations of
-        amplitudes."""
+        """W (n, K): W^T W is the posterior covariance of the columns' (n, K) sums of amplitudes."""
         return np.asarray(dtrtrs(self.factor, columns, lower=True)[0])
 
     @property

@@ -115,8 +115,7 @@ class Breaths:
 
 
 def _breathe(phase: Array, sharpness: int, *, slope: bool = False) -> Array:
-    """A breath of zero mean and unit variance over time at phases (...), breathed in at 0; or its
-    derivative."""
+    """A breath of zero mean and unit variance at phases (...), breathed in at 0; or its derivative."""
 
     def wave(phase: Array) -> Array:
         share = np.mod(phase / (2.0 * np.pi), 1.0)

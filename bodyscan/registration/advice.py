@@ -5,9 +5,9 @@ from __future__ import annotations
 import networkx as nx
 import numpy as np
 
-from bodyscan.geometry.transforms import twist_jacobian
-from bodyscan.geometry.uncertainty import compute_position_sigma
-from bodyscan.registration.cluster_covariance import build_normal_equations
+from bodyscan.arrays import Array
+from bodyscan.registration.cluster_covariance import NormalEquations, build_normal_equations
+from bodyscan.registration.joint_solve import linearize_reprojection
 from bodyscan.registration.rig_frame import find_frame_target
 from bodyscan.registration.rig_solve import RigSolution
 from bodyscan.registration.view_graph import Target, by_target
@@ -23,16 +23,10 @@ def advise(rig: Rig, solution: RigSolution) -> list[str]:
     if shots := find_articulation_shots(solution):
         names = ", ".join(f"{shot} ({board})" for shot, board in shots)
         lines.append(f"without any one of these shots the rig is disconnected: {names}")
-    sigmas = {name: pair_sigma_mm(solution, name) for name in solution.rig_from_camera}
+    sigmas, suggestion = assess_places(rig, solution)
     worst = max(sorted(sigmas), key=lambda name: sigmas[name])
-    lines.append(f"{worst} has the largest sigma in the rig frame: {sigmas[worst]:.3f} mm")
-    return lines + suggest_shots(rig, solution, worst)
-
-
-def pair_sigma_mm(solution: RigSolution, name: str) -> float:
-    """Sigma of a camera's position over all axes, mm."""
-    position = solution.rig_from_camera[name].translation
-    return float(np.linalg.norm(compute_position_sigma(solution.covariance, name, position)))
+    lines.append(f"{worst} has the largest sigma where boards were seen: {sigmas[worst]:.3f} mm")
+    return [*lines, *suggestion]
 
 
 def find_articulation_shots(solution: RigSolution) -> tuple[Target, ...]:
@@ -43,56 +37,77 @@ def find_articulation_shots(solution: RigSolution) -> tuple[Target, ...]:
     return tuple(sorted(what for kind, what in nx.articulation_points(graph) if kind == "shot"))
 
 
-def suggest_shots(rig: Rig, solution: RigSolution, pair: str) -> list[str]:
-    """Find the shot that, repeated, reduces the sigma of `pair`'s position most; a line that says so.
+def assess_places(rig: Rig, solution: RigSolution) -> tuple[dict[str, float], list[str]]:
+    """Sigma of where each pair sees a place, mm across its rays, on average over the corners it saw;
+    and the shot that, repeated, reduces the largest most, in words.
 
-    As many repetitions as halve it, or MAX_SHOTS. No line if no two pairs share a shot.
+    It is relative to where all pairs see it, and contains the cameras' parameters: this is what a scan
+    needs. Cameras whose focal lengths grow as they stand back err by tenths of a mm, and harm no scan.
     """
+    frame, poses = find_frame_target(rig), (solution.rig_from_camera, solution.rig_from_board)
+    pair = rig.frame_pair.name if rig.frame_pair else None
     equations = build_normal_equations(
         solution.views,
         solution.cameras,
-        solution.rig_from_camera,
-        solution.rig_from_board,
-        fixed_pair=rig.frame_pair.name if rig.frame_pair else None,
-        fixed_target=find_frame_target(rig),
+        *poses,
+        fixed_pair=pair,
+        fixed_target=frame,
         motions=solution.motions,
     )
-    visible_to = {
-        target: sorted({view.pair for view in views})
-        for target, views in by_target(solution.views).items()
-    }
+    covariance = equations.system.covariance()
+    scale = 2.0 * equations.variance_px2 * solution.variance_inflation
+    places = _differentiate_places(solution, equations)
+    sigmas = {n: float(scale * np.sum(each * covariance)) ** 0.5 for n, each in places.items()}
+    worst = max(sorted(sigmas), key=lambda name: sigmas[name])
     # A board that holds the frame is no unknown: its part is not that of another shot there.
-    candidates = [
-        t for t, pairs in visible_to.items() if len(pairs) > 1 and t != find_frame_target(rig)
-    ]
-    if not candidates:
-        return []
-    system, first = equations.system, 6 * equations.names.index(pair)
-    jacobian = np.zeros((3, equations.prior.size))
-    position = solution.rig_from_camera[pair].translation
-    jacobian[:, first : first + 6] = twist_jacobian(position[None])[0]
-    jacobian = jacobian[:, equations.free]
+    seen_by = {
+        target: names
+        for target, views in by_target(solution.views).items()
+        if len(names := sorted({view.pair for view in views})) > 1 and target != frame
+    }
+    if not seen_by:  # no two pairs share a shot
+        return sigmas, []
 
-    def variance(target: Target, shots: int) -> float:
-        """Of the pair's position with so many more, px2 of corners that err independently."""
-        more = system + equations.sum_parts([target]) * float(shots)
-        return float(np.trace(jacobian @ more.covariance() @ jacobian.T))
+    def sigma_after(target: Target, shots: int) -> float:
+        """With so many more, the gain being that of corners that err independently."""
+        more = equations.system + equations.sum_parts([target]) * float(shots)
+        return float(scale * np.sum(places[worst] * more.covariance())) ** 0.5
 
-    best = min(candidates, key=lambda target: variance(target, MAX_SHOTS))
-    before = variance(best, 0)
-    after = [variance(best, shots) for shots in range(1, MAX_SHOTS + 1)]
-    shots = next((k for k, one in enumerate(after, start=1) if one <= before / 4.0), MAX_SHOTS)
-    # The sigma as boards have shown it; the gain as if corners erred independently.
-    gain = float(np.sqrt(after[shots - 1] / before))
-    (shot, board), sigma = best, pair_sigma_mm(solution, pair)
+    best = min(seen_by, key=lambda target: sigma_after(target, MAX_SHOTS))
+    sigma, after = sigmas[worst], [sigma_after(best, k) for k in range(1, MAX_SHOTS + 1)]
+    shots = next((k for k, one in enumerate(after, start=1) if one <= sigma / 2.0), MAX_SHOTS)
+    (shot, board), gain = best, after[shots - 1] / sigma
     effect = f"{sigma:.3f} to {gain * sigma:.3f} mm"
     if gain > 0.8:  # not worth taking
-        return [
-            f"further shots of these boards would improve {pair} little: of all shots, {shots} more "
+        return sigmas, [
+            f"further shots of these boards would improve {worst} little: of all shots, {shots} more "
             f"like {shot} help most, from {effect}"
         ]
-    return [
+    return sigmas, [
         f"{shots} more {'shot' if shots == 1 else 'shots'} like {shot} (board {board} about there, "
-        f"tilted differently each time, seen by {', '.join(visible_to[best])}) would "
-        f"{'halve' if gain <= 0.5 else 'improve'} the sigma of {pair}: {effect}"
+        f"tilted differently each time, seen by {', '.join(seen_by[best])}) would "
+        f"{'halve' if gain <= 0.5 else 'improve'} the sigma of {worst}: {effect}"
     ]
+
+
+def _differentiate_places(solution: RigSolution, equations: NormalEquations) -> dict[str, Array]:
+    """By pair, mean squares (P, P) of its places' derivatives, mm, by the free unknowns, less what a
+    motion of the whole rig explains."""
+    rows, motions = [], []
+    for number, name in enumerate(equations.names):
+        views = [view for view in solution.views if view.pair == name]
+        poses = solution.rig_from_camera, solution.rig_from_board
+        derivatives = linearize_reprojection(views, solution.cameras, *poses)[1]()
+        # A pixel's length there in mm, from the derivatives by places on the board.
+        px_per_mm = np.linalg.norm(derivatives[:, -3:].reshape(-1, 6), axis=1) / np.sqrt(2.0)
+        derivatives /= np.repeat(px_per_mm, 2)[:, None]
+        row = np.zeros((len(derivatives), equations.prior.size))
+        row[:, 6 * number : 6 * number + 6] = derivatives[:, :6]
+        row[:, equations.cameras[name]] = derivatives[:, 12:-3]
+        rows.append(row)
+        motions.append(derivatives[:, 6:12])
+    places, motion = np.concatenate(rows), np.concatenate(motions)
+    places -= motion @ np.linalg.lstsq(motion, places, rcond=None)[0]
+    ends = np.cumsum([len(row) for row in rows])[:-1]
+    parts = zip(equations.names, np.split(places[:, equations.free], ends), strict=True)
+    return {name: part.T @ part / len(part) for name, part in parts}

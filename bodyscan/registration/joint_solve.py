@@ -64,8 +64,7 @@ def refine_solution(
     equal_noise: bool = False,
     noise: Noise = CORNERS,
 ) -> JointSolution:
-    """Solve for all poses, cameras and board shapes from poses that nearly fit, in the root camera's
-    frame.
+    """Solve for all poses, cameras and board shapes from poses that nearly fit, in the root's frame.
 
     views: of boards as described.
     equal_noise: whether all views are taken to be as noisy as each other.

@@ -26,8 +26,7 @@ from bodyscan.rig.gauge import Reference
 from bodyscan.rig.rig import Rig
 
 MIN_CORNERS = 6
-"""Corners of a board that two cameras must see: fewer give its middle poorly, and hide a wrong
-one."""
+"""Corners of a board that two cameras must see: fewer give its middle poorly, and hide errors."""
 
 
 @dataclass(frozen=True)

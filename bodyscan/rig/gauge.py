@@ -56,8 +56,7 @@ class RigFrame(Model):
 class Reference(Model):
     """A certified length in calibration captures, of one board or of a bar that carries two boards.
 
-    length_mm: of one board, between the first and the last corner of a row; of two, between their
-        centres.
+    length_mm: of one board, from a row's first to its last corner; of two, between their centres.
     sigma_mm: standard deviation of the length, from the certificate.
     """
 

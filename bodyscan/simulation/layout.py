@@ -148,8 +148,7 @@ def build_mirror(
 ) -> MirrorProjector:
     """Build a laser and mirror in the projector's position, sweeping over all points.
 
-    The laser's apex lies at a right angle to the outgoing direction; stripes run along the mirror's
-    axis.
+    The laser's apex lies at a right angle to the outgoing direction; stripes along the mirror's axis.
     """
     axes = camera_from_projector.rotation.T
     axis = axes[0] if horizontal else -axes[1]

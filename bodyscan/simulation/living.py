@@ -71,8 +71,7 @@ class Joint:
 
 @dataclass(frozen=True)
 class Breath:
-    """mm: from breathed out to breathed in. period_s. phases: of chest and belly at time 0,
-    radians."""
+    """mm: from breathed out to in. period_s. phases: of chest and belly at time 0, radians."""
 
     mm: float
     period_s: float

@@ -109,8 +109,7 @@ class Day:
             return row
 
     def body(self, job: str) -> Any:
-        """The packed model of a scan: the report's, or the coarse cloud before; None if neither is
-        there."""
+        """The packed model of a scan: the report's, or the coarse cloud before; else None."""
         report = self.out / job / "report" / "report.html"
         if report.is_file():
             found = re.search(

@@ -41,8 +41,7 @@ class Brightness:
 
     @staticmethod
     def from_images(images: ScanLines, variance: Floats, usable: Mask) -> Brightness:
-        """Measure it. variance: (256,) of each grey level; usable: (L, P) pixels on a lit
-        surface."""
+        """Measure it. variance: (256,) of each grey level; usable: (L, P) lit pixels."""
         # With whole grey levels there is at least one wherever there is any light.
         floor = np.float32(1.0 if images.lit.dtype == np.uint8 else 0.02)
         contrast: Floats = np.maximum(images.contrast, floor)
@@ -66,8 +65,7 @@ class Brightness:
 
 @dataclass(frozen=True, eq=False)
 class BoundaryBrightness:
-    """The surface's brightness where N stripe boundaries pass between two pixels of a line, (N,)
-    each.
+    """The surface's brightness where N boundaries pass between two pixels of a line, (N,) each.
 
     before, after: lit minus dark of the two pixels, brought together where noise may explain their
         difference.
@@ -101,8 +99,7 @@ class BoundaryBrightness:
 def correct_across_lines(
     s: Floats, sigma: Floats, brightness: Brightness, blur2: float
 ) -> tuple[Floats, Floats]:
-    """Correct s (L, P) for edges of brightness that run along the scan lines; return s and its
-    sigma.
+    """Correct s (L, P) for edges of brightness along the scan lines; return s and its sigma.
 
     A pixel shows s at its light's centroid, which lies off the line by blur2 * across.
     """

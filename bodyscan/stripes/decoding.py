@@ -29,8 +29,7 @@ def decode_stripes(
     coded: (F, H, W) in the order of the code's `image_counts`, then those of the crossing stripes.
     limits: the stripes that matter; others get no s.
 
-    Raises DecodingFailed for inconsistent images; the map's `crossing_fault` says so of crossing
-    ones.
+    Raises DecodingFailed for inconsistent images; `crossing_fault` says so of crossing ones.
     """
     try:
         images, *crossing_images = split_by_kind(code, coded)

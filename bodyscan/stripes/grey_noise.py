@@ -86,8 +86,7 @@ def _sum_differences(
     share: float,
     max_difference: Array,
 ) -> Array:
-    """Sum 1, d, d^2 and the grey level (4, BANDS) over pairs of frames that differ by noise d
-    alone.
+    """Sum 1, d, d^2 and grey level (4, BANDS) over pairs of frames that differ by noise d alone.
 
     Of every other pixel on every other line. `bright` (L, P) stands in for a missing inverse (0,
     0).

@@ -60,8 +60,7 @@ UNIFORM_SIGMA = 12.0**-0.5
 
 
 def decode_sweep(lit: Greys, frames: Greys, direction: str) -> StripeMap:
-    """Compute the stripe map of a swept line from images (stripes, H, W), most dark at any one
-    pixel.
+    """Compute the stripe map of a swept line from images (stripes, H, W), most dark at a pixel.
 
     lit: (H, W). Raises DecodingFailed if the images are inconsistent.
     """

@@ -195,8 +195,7 @@ def write_found_corners(
 ) -> None:
     """Write the corners of the rig's only board in every image as corners.vnl.
 
-    Images are named by their path in the capture folder. Nothing is written for a rig with several
-    boards.
+    Images are named by their path in the capture folder. Nothing is written of a rig with more boards.
     """
     if len(rig.boards) != 1:
         return

@@ -69,7 +69,7 @@ def test_a_person_is_no_pole(sway_mm: float) -> None:
     ("sway_mm", "step"),
     [(0.0, [0, 2, 0, 0, 0, 0]), (3.0, [10, 0, 0, 0, 0, 0]), (3.0, [0, 0, 0, 0, 0, 3])],
 )
-def test_a_pole_that_moved_is_named_though_the_person_sways(
+def test_a_pole_that_moved_is_named_though_a_person_sways(
     sway_mm: float, step: list[float]
 ) -> None:
     steps = [found(seed, sway_mm, np.array(step, float)) for seed in SEEDS]
@@ -230,9 +230,7 @@ def test_a_pole_is_set_free_by_centimetres_and_degrees_about_the_body_all_its_pa
     np.testing.assert_allclose(centre @ own @ centre.T, 30.0**2 * np.eye(3), atol=1e-6)
 
 
-def test_a_step_is_the_shift_of_the_body_s_centre_and_the_turn_against_the_mean_of_the_others() -> (
-    None
-):
+def test_a_step_is_the_shift_of_the_body_s_centre_and_the_turn_against_the_others_mean() -> None:
     turn, shift = np.radians([1.0, 2.0, -2.0]), np.array([3.0, 0.0, 4.0])
     moved = np.r_[turn, shift - np.cross(turn, BODY_CENTRE)]
     motions = {"p1-1": 0.0 * moved, "p1-2": 0.2 * moved, "p2-1": 1.2 * moved, "p2-2": 1.0 * moved}
@@ -253,7 +251,7 @@ def test_of_fewer_than_four_pairs_any_may_be_the_one_that_moved() -> None:
     assert still(["p1-1", "p1-2", "p2-1", "p2-2"], at).detectable_mm < 5.0
 
 
-def test_poles_that_fire_two_seconds_apart_tell_nothing_of_each_other_even_of_what_holds_still() -> (
+def test_poles_that_fire_two_seconds_apart_tell_nothing_of_each_other_even_if_all_is_still() -> (
     None
 ):
     at = {name: 2000.0 * int(POLES[name][1]) for name in NAMES}

@@ -175,9 +175,7 @@ def test_a_plain_board_with_two_faces_is_turnable() -> None:
     ("columns", "rows", "message"),
     [(9, 3, "9 columns and 3 rows cannot be found"), (3, 9, "cannot be found")],
 )
-def test_plain_boards_that_cannot_be_found_are_refused(
-    columns: int, rows: int, message: str
-) -> None:
+def test_plain_boards_that_nobody_finds_are_refused(columns: int, rows: int, message: str) -> None:
     board = PLAIN.model_copy(update={"columns": columns, "rows": rows})
     with pytest.raises(BadInput, match=message):
         found(np.zeros((60, 80), np.uint8), board)

@@ -91,9 +91,7 @@ def test_markers_where_they_should_be_lack_corners(monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.parametrize(("columns", "rows"), [(8, 7), (10, 7), (9, 6), (9, 8), (8, 8), (10, 6)])
-def test_a_checkerboard_of_one_line_more_or_fewer_either_way_is_named(
-    columns: int, rows: int
-) -> None:
+def test_a_checkerboard_of_one_line_more_or_fewer_is_named(columns: int, rows: int) -> None:
     board = Board(name="b", kind="checkerboard", columns=9, rows=7, square_mm=30)
     assert describe_unfound(checkered(columns, rows), board) == (
         f"no grid of 8 x 6 inner corners, but one of {columns - 1} x {rows - 1}: {columns} columns x "

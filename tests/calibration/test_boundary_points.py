@@ -48,9 +48,7 @@ def test_of_a_bent_board_they_are_carried_onto_its_surface() -> None:
 
 
 @pytest.mark.parametrize(("direction", "across"), [("vertical", 0), ("horizontal", 1)])
-def test_a_pixel_across_the_stripes_moves_a_point_on_its_board(
-    direction: Axis, across: int
-) -> None:
+def test_a_pixel_across_stripes_moves_a_point_on_its_board(direction: Axis, across: int) -> None:
     seen = np.array([4, 5, 9]), PIXELS, np.full(3, 0.1)
     found = boundary_points(CAMERA, BOARD, *seen, board=7, direction=direction)
     half = np.zeros(2)
@@ -95,9 +93,7 @@ def test_every_nth_boundary_is_kept_whole() -> None:
 
 
 @pytest.mark.parametrize(("most", "points"), [(200, 200), (60, 58)])
-def test_boundaries_of_many_points_are_thinned_before_they_get_too_few(
-    most: int, points: int
-) -> None:
+def test_boundaries_of_many_points_are_thinned_before_too_few(most: int, points: int) -> None:
     """Ten of 30 tell one model of the light from another; one alone would tell nothing."""
     few = subsample(many(), most)
     assert np.unique(few.index).tolist() == list(range(11, 40, 3))

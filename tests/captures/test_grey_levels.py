@@ -59,9 +59,7 @@ def test_one_channel_of_a_colour_image_can_be_chosen(
         (DEEP % 256, 8, 255),
     ],
 )
-def test_no_bit_is_lost_wherever_it_stands(
-    numbers: np.ndarray, bits: int | None, white: int
-) -> None:
+def test_no_bit_is_lost_wherever_it_is(numbers: np.ndarray, bits: int | None, white: int) -> None:
     assert find_full_scale([numbers], bits) == white
     grey = convert_to_greys(numbers, find_full_scale([numbers], bits))
     assert grey.dtype == np.float32

@@ -76,9 +76,7 @@ def test_what_nobody_measured_is_not_known() -> None:
 
 
 @pytest.mark.parametrize(("sectors", "factor"), [(1, 2.0 * np.pi), (4, np.pi)])
-def test_a_girth_is_as_uncertain_as_the_sectors_it_runs_through(
-    sectors: int, factor: float
-) -> None:
+def test_a_girth_is_as_uncertain_as_sectors_it_runs_through(sectors: int, factor: float) -> None:
     """By 2 pi times the common displacement of a surface all round, and by half if four are by
     themselves; whatever the shape."""
     loop = closed(ellipse(90.0, RADIUS_MM), np.ones(360, bool))

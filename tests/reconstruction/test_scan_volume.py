@@ -44,8 +44,7 @@ def looking_at_the_middle(distance_mm: float, turn: float, tilt: float) -> Rigid
 
 
 def calibrated(rising: bool) -> PairCalibration:
-    """The pair of the other tests; with its stripes numbered from the other end, s grows with
-    depth."""
+    """The pair of the other tests; with stripes numbered from the other end, s grows with depth."""
     sheets = planes()
     if not rising:
         return pair()
@@ -233,9 +232,7 @@ def test_limits_are_widened_as_much_on_the_left_as_on_the_right() -> None:
     ("distance_mm", "tilt"),
     [(450.0, -0.2), (600.0, -0.15), (600.0, 0.0), (900.0, -0.1), (900.0, 0.2), (900.0, 0.5)],
 )
-def test_no_pixel_inside_a_block_loses_more_than_the_margin(
-    distance_mm: float, tilt: float
-) -> None:
+def test_no_pixel_in_a_block_loses_more_than_the_margin(distance_mm: float, tilt: float) -> None:
     """Where the wall meets the bottom, a limit bends by up to 80 stripes inside of a block: pad_crop by
     half as much it would cut 2 to 80 of them off. Along each ray s falls as 1e5 mm over depth."""
     at = looking_at_the_middle(distance_mm, 0.0, tilt)

@@ -52,9 +52,7 @@ def solved(rig: Rig, views: list[BoardView], folder: Path) -> Outcome[RigSolutio
     return Outcome(found.value, (*cameras.notes, *located.notes, *found.notes))
 
 
-def test_a_camera_that_is_held_stays_to_the_last_digit(
-    views: list[BoardView], tmp_path: Path
-) -> None:
+def test_a_held_camera_stays_to_the_last_digit(views: list[BoardView], tmp_path: Path) -> None:
     found = solved(rig_with(tmp_path, off_px=0.0, sigma_px=None), views, tmp_path)
     np.testing.assert_allclose(
         found.value.cameras[KNOWN].parameters, CAMERAS[KNOWN].parameters, rtol=0, atol=1e-6

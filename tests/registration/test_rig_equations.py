@@ -78,8 +78,7 @@ def jacobian(seen: list[LocatedView]) -> Array:
 
 @pytest.mark.parametrize("target", [None, *BOARDS])
 def test_they_are_those_of_all_errors_by_all_unknowns(target: Target | None) -> None:
-    """With noise so even that every corner counts alike; boards, but one that holds the frame, are
-    eliminated."""
+    """With noise so even that every corner counts alike; boards but the frame's are eliminated."""
     seen = views()
     found = equations(seen, target)
     assert found.names == ("a", "b")

@@ -46,9 +46,7 @@ def test_a_rig_whose_frame_shot_was_not_captured_is_refused_before_any_work() ->
     refuse_without_frame_shot(rig({"pair": "p"}), [])
 
 
-def test_placed_cameras_stay_where_they_are_unless_the_rig_file_places_one_that_holds_the_frame() -> (
-    None
-):
+def test_placed_cameras_stay_unless_the_rig_file_places_one_that_holds_the_frame() -> None:
     stands = {"position_mm": (1500.0, 0.0, 900.0), "look_at_mm": (0.0, 0.0, 900.0)}
     world = {"p": SOMEWHERE, "q": SOMEWHERE.inverse()}
     assert rig_from_world(rig({"shot": "floor", "board": "b"}, p=stands), world) is None

@@ -27,8 +27,7 @@ def test_twelve_cameras_are_placed() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("aside_px", [0.0, 0.1])
 def test_sigmas_of_positions_are_honest(aside_px: float) -> None:
-    """aside_px: sigma of an error that all corners of a view share; 48 then tell little more than
-    one."""
+    """aside_px: sigma of an error that all corners of a view share; 48 tell little more than one."""
     rng = np.random.default_rng(8)
     placings, cameras = ring_of_cameras(heights=(700, 1200))
     normalized = []

@@ -73,9 +73,7 @@ def worse(calibration: RigCalibration, name: str, **changes: Any) -> RigCalibrat
     return replace(calibration, pairs=calibration.pairs | {name: replace(pair, quality=quality)})
 
 
-def test_what_exceeds_a_limit_is_named_with_pair_value_and_limit(
-    calibration: RigCalibration,
-) -> None:
+def test_what_exceeds_a_limit_is_named_with_pair_and_value(calibration: RigCalibration) -> None:
     assert grade_calibration(calibration) == Verdict("good")
     boards = [board.model_copy(update={"square_mm": 7.0}) for board in calibration.rig.boards]
     rig = calibration.rig.model_copy(update={"boards": boards})

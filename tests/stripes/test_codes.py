@@ -49,9 +49,7 @@ def waves(**keys: Any) -> PhaseShift:
         ("phase-shift", {"stripes": 6}, {"phase": 4}),
     ],
 )
-def test_number_of_images_by_kind(
-    code: str, keys: dict[str, Any], expected: dict[str, int]
-) -> None:
+def test_images_by_kind(code: str, keys: dict[str, Any], expected: dict[str, int]) -> None:
     found = described(code, **keys)
     assert {kind.name: count for kind, count in found.image_counts.items()} == expected
     assert sorted(found.show_order) == list(range(sum(expected.values()))), "each is shown once"

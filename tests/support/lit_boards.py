@@ -95,8 +95,7 @@ class Lens:
 
 @dataclass(frozen=True)
 class Uneven:
-    """The same light with its boundaries out of place, each by its own share of a stripe, at most
-    `size`."""
+    """The same light, each boundary out of place by its share of a stripe, at most `size`."""
 
     light: Projector
     size: float

@@ -180,9 +180,7 @@ def test_a_camera_with_one_view_is_left_out_and_named() -> None:
     assert "at least 3" in found.failed["c3"]
 
 
-def test_what_no_camera_can_be_is_left_out_and_never_written(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_what_no_camera_can_be_is_left_out_and_not_written(monkeypatch: pytest.MonkeyPatch) -> None:
     """An example that the first test drew: of half of the views one in five has its corners mixed up,
     and a focal length of -4 px fits c2's best."""
     boards = seen(3, shots=8)

@@ -167,9 +167,7 @@ def test_a_calibration_ends_in_a_verdict_that_the_exit_code_repeats(
     assert ("px RMS (at most 0.3 is good)" in said) == (noise_px > 1.0)
 
 
-def test_a_print_with_markers_that_is_seen_through_its_glass_joins_both_sides(
-    tmp_path: Path,
-) -> None:
+def test_a_print_with_markers_seen_through_its_glass_joins_both_sides(tmp_path: Path) -> None:
     glass = Board(name="board", kind="charuco", columns=9, rows=7, square_mm=60, marker_mm=45)
     found = seen_corners(board=glass, poles=2, behind=True)
     write_corners(tmp_path / "corners.vnl", as_listed(found))

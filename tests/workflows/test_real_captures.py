@@ -117,8 +117,7 @@ def whole(ring: tuple[Rig, list[BoardView]]) -> RigWithoutShots:
 
 @pytest.fixture(scope="module")
 def left_out(ring: tuple[Rig, list[BoardView]]) -> dict[str, list[FreeTriangulation]]:
-    """By the first shot of those left out: their boards, triangulated by the rig that the others
-    place."""
+    """By the first shot left out: their boards, triangulated by the rig that the others place."""
     results = {}
     for some in PLACES:
         held = without_shots(*ring, some)

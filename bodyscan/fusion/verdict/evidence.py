@@ -90,8 +90,7 @@ class Seam:
 
 @dataclass(frozen=True, eq=False)
 class SeamReport:
-    """The seams of a scan, and the groups (poles and single pairs) that may have moved by
-    themselves.
+    """A scan's seams, and the groups (poles, single pairs) that may have moved by themselves.
 
     isolated: groups of pairs that share no surface with the largest: their poses are not checked.
     """

@@ -263,8 +263,8 @@
 
   function showBoards() {
     if (!boards || $("calibrating").hidden) return;
-    const next = boards.next, place = next.say === "hold" ? words.places[next.row * COLUMNS + next.column] : "";
-    const list = (names) => (names || []).join(", ");
+    const next = boards.next, place = "row" in next ? words.places[next.row * COLUMNS + next.column] : "";
+    const list = (names) => [names || []].flat().join(", ");
     $("calibrate").hidden = boards.shots < 3;
     $("calibrate").classList.toggle("main", next.say === "enough");
     $("board").classList.toggle("main", next.say !== "enough");
@@ -275,7 +275,7 @@
       const cells = make("div", { class: "cells", "aria-hidden": "true" });
       cells.style.gridTemplate = `repeat(${ROWS}, 1fr) / repeat(${COLUMNS}, 1fr)`;
       pair.cells.forEach((count, k) => {
-        const wanted = next.say === "hold" && next.pair === pair.name && k === next.row * COLUMNS + next.column;
+        const wanted = next.pair === pair.name && k === next.row * COLUMNS + next.column;
         cells.append(make("span", { class: [count ? "seen" : "", wanted ? "wanted" : ""].join(" ").trim() }, count || ""));
       });
       const enough = pair.boards >= boards.wanted ? "✓" : "";

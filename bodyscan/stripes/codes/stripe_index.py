@@ -21,8 +21,7 @@ INDEX = ImageKind("index", "index")
 
 
 class StripeIndex(StripeCode):
-    """Stripe numbers in one image; boards are looked for in the lit image, taken without
-    stripes."""
+    """Stripe numbers in one image; boards are looked for in the lit image, without stripes."""
 
     kinds: ClassVar = (INDEX,)
     uses_dark: ClassVar = False

@@ -100,8 +100,7 @@ def lay_out(
 
 
 def _is_equally_exposed(lit: Greys, dark: Greys, patterns: Greys, inverses: Greys) -> bool:
-    """Whether coarse patterns and inverses are as bright as the lit frame and as dark as the dark
-    one.
+    """Whether coarse patterns and inverses are as bright as lit and as dark as the dark frame.
 
     Automatic exposure makes them differ; beyond a quarter of the contrast boundaries would move by
     a tenth of a pixel. Patterns finer than the first three may be blurred.
@@ -156,8 +155,7 @@ def fill_from_codes(s: Floats, sigma: Floats, codes: NDArray[np.int32], coded: M
 
 @compiled
 def _fit_codes(codes: NDArray[np.int32], coded: Mask, middle: int) -> tuple[float, float]:
-    """Fit a line to the codes (P,) within 4 pixels: its offset from the pixel's own code, and
-    sigma.
+    """Fit a line to the codes (P,) within 4 pixels: its offset from the pixel's code, and sigma.
 
     Sigma is 0 without a line, or without a jump that would break a run of boundaries.
     """
