@@ -14,7 +14,7 @@ import yaml
 
 import bodyscan
 
-RIG, SUBJECT = Path("three-pole-12.yaml"), Path("woman_average.ply")
+RIG, SUBJECT = Path("begun/rig.yaml"), Path("begun/woman_average.ply")  # by `init`
 PAIRS = ("p1-2", "p1-3", "p2-2", "p2-3")
 
 
@@ -42,6 +42,7 @@ def main() -> None:
     size = ("--scale", 0.25, "--board-shots", 6, "--preset", "ideal")
     subject = ("--subject", SUBJECT, "--subject-preset", "mannequin")
     if not Path("work").exists():
+        run("init", "begun")
         run("simulate", small_rig(Path("rig.yaml")), "--out", "work", *size, *subject)
     elif find_spec("open3d") or find_spec("pycolmap"):
         sys.exit("bodyscan-core brings Open3D or pycolmap")

@@ -14,9 +14,10 @@ trap 'rm -rf "$away"' EXIT
 unset PYTHONPATH
 export OPENBLAS_NUM_THREADS=1 PIP_QUIET=1 PIP_DISABLE_PIP_VERSION_CHECK=1
 
-# From a copy: setuptools would put what an earlier build left in the source tree into the wheel.
+# From a copy: setuptools would put what an earlier build left in the source tree into the wheel. What
+# `init` writes are links to rigs, pipelines and data: copied as files, or the wheel would lack them.
 mkdir "$away/source"
-cp -R "$source/bodyscan" "$source/pyproject.toml" "$source/README.md" "$source/LICENSE" "$away/source"
+cp -RL "$source/bodyscan" "$source/pyproject.toml" "$source/README.md" "$source/LICENSE" "$away/source"
 rm -f "$wheels"/bodyscan*.whl
 "$python" -m pip wheel --no-deps --wheel-dir "$wheels" "$away/source"
 sed -i.full -e 's/^name = "bodyscan"/name = "bodyscan-core"/' -e '/^    "open3d/d' -e '/^    "pycolmap/d' \
@@ -24,8 +25,7 @@ sed -i.full -e 's/^name = "bodyscan"/name = "bodyscan-core"/' -e '/^    "open3d/
 rm -rf "$away/source/build"
 "$python" -m pip wheel --no-deps --wheel-dir "$wheels" "$away/source"
 rm -rf "$away/source"
-cp "$here/scan_small.py" "$source/rigs/three-pole-12.yaml" \
-    "$source/data/subjects/woman_average.ply" "$away"
+cp "$here/scan_small.py" "$away"
 cd "$away"
 for wheel in "$wheels"/bodyscan-*.whl "$wheels"/bodyscan_core-*.whl; do
     "$python" -m venv --clear "$away/venv"
