@@ -167,8 +167,10 @@ def put_image(
 
     Raises BadInput for a pair, or a template of `files`, that yields no image name.
     """
-    if pair not in {one.name for one in rig.pairs}:
-        raise BadInput(f"rig {rig.name} has no pair {pair}", where=f"scan {scan}, frame {frame}")
+    paths = [one for one in (scan, shot, frame) if Path(one).name != one or one[:1] in (".", "")]
+    if paths or pair not in {one.name for one in rig.pairs}:
+        why = f"{paths[0]!r} is no name" if paths else f"rig {rig.name} has no pair {pair}"
+        raise BadInput(why, where=f"scan {scan}, frame {frame}")
     name = fill(rig.files, shot=shot, pair=pair, frame=frame)
     lossless = (".png", ".tif", ".tiff", ".bmp", ".pgm")
     if ANYTHING in name or Path(name).suffix.lower() not in lossless:

@@ -22,8 +22,7 @@ HERE = RigidTransform.identity()
 
 
 def grid(columns: int, rows: int) -> tuple[Array, Indices]:
-    """Squares of 10 mm in the plane z = 1000, about the camera's axis, two faces each, that look at
-    the camera."""
+    """Squares of 10 mm in the plane z = 1000, about the axis, two faces each, facing the camera."""
     x, y = np.meshgrid(np.arange(columns + 1.0), np.arange(rows + 1.0))
     places = np.stack([x - columns / 2, y - rows / 2, np.full_like(x, AWAY_MM / 10.0)], axis=-1)
     corner = np.arange(rows)[:, None] * (columns + 1) + np.arange(columns)

@@ -72,6 +72,8 @@ def test_pairs_are_whole_one_by_one_and_then_the_scan(rig: Rig, tmp_path: Path) 
     assert (found.whole, found.complete) == (("a",), False)
     for frame in frames(rig):
         put_image(tmp_path, rig, "anna", "b", frame, IMAGE)
+    with pytest.raises(BadInput, match=r"'\.\./x' is no name"):  # it would lie outside the inbox
+        put_image(tmp_path, rig, "../x", "a", frame, IMAGE)
     found = scan.look(0.1, QUIET_S)
     assert (found.whole, found.complete) == (("a", "b"), True)
 

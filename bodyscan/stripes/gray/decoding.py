@@ -142,8 +142,7 @@ def fill_from_codes(s: Floats, sigma: Floats, codes: NDArray[np.int32], coded: M
     fitted to the codes of the pixels around.
 
     Where stripes are so narrow or blurred that codes jump by two or three, runs of boundaries
-    break; codes are still right to about a stripe. A pixel whose code is a stripe off the line gets
-    none.
+    break; codes are still right to about a stripe. A pixel a stripe off the line gets none.
     """
     for row in range(codes.shape[0]):
         for x in range(codes.shape[1]):
