@@ -84,7 +84,7 @@ class PoseEvidence:
     postures: by kinds of motion, the same of a step of posture in the views of some pairs (P,).
     other_times: moments that explain the motion best, in words before "those in `timing`", and their
         log likelihood ratio against those stated; empty and 0 if none is better beyond doubt.
-    fit_clocks: gives such words of one pole's moments; None if the person does not move.
+    fit_clocks: gives such words of one pole's or two pairs' moments; None if the person does not move.
     """
 
     names: tuple[str, ...]

@@ -114,7 +114,9 @@ class _Matches:
 def fit_body(template: BodyTemplate, surface: Surface) -> FittedBody:
     """Fit a template to a standing body's surface (body frame, floor at z = 0)."""
     tree = KDTree(join_positions_normals(surface.points, surface.normals))
-    whole = _cover_whole(template, surface)
+    points = np.arange(0, len(surface.points), max(1, len(surface.points) // 4000))
+    count = 3 + template.joints.size + len(template.shapes)
+    whole = _Region(np.arange(len(template.vertices)), points, np.arange(count))
     # Degrees of the arms from the trunk; each start finds arms within 15 of it.
     starts = [_start(template, surface, arms) for arms in (15.0, 35.0, 55.0)]
     coarse = (120.0, 100.0, 80.0, 70.0, 60.0, 50.0, 40.0)
@@ -242,12 +244,6 @@ def _fit_pose(
         missing = 2.0 - found.weights[shown].mean() - back.weights.mean()
         cost += missing * region.share * len(template.vertices) / 25.0
     return body, cost
-
-
-def _cover_whole(template: BodyTemplate, surface: Surface) -> _Region:
-    points = np.arange(0, len(surface.points), max(1, len(surface.points) // 4000))
-    count = 3 + template.joints.size + len(template.shapes)
-    return _Region(np.arange(len(template.vertices)), points, np.arange(count))
 
 
 def _seat_hands(

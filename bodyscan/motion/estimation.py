@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import combinations
 from typing import TypeVar
 
 import numpy as np
@@ -261,7 +262,7 @@ class _Solution:
         one_moment = bool(np.ptp(stated) < 1e-3)  # s: nobody moves by more than 0.01 mm meanwhile
         undecided = moves or one_moment
         times = self.fit_times(stated, sides, one_moment) if undecided else ("", 0.0)
-        clocks = partial(self.fit_clocks, stated, sides) if undecided else None
+        clocks = partial(self.fit_clocks, names, stated, sides) if undecided else None
         return PoseEvidence(tuple(names), self.motion.pose_equations(), postures, times, clocks)
 
     def log_evidence(
@@ -303,13 +304,26 @@ class _Solution:
         )
         return (name, max(found) - now) if np.nanmin(gains) > MIN_LOG_RATIO else ("", 0.0)
 
-    def fit_clocks(self, stated: Sequence[float], sides: Sequence[str]) -> str:
-        """Poles of which any, all its moments earlier or later, explains the motion beyond doubt."""
+    def fit_clocks(
+        self, names: Sequence[str], stated: Sequence[float], sides: Sequence[str]
+    ) -> str:
+        """Poles whose moments, all earlier or later, or two pairs whose moments, exchanged, explain the
+        motion beyond doubt."""
         tried = [(side, lag) for side in dict.fromkeys(sides) for lag in (-0.4, -0.2, 0.2, 0.4)]
-        moments = [np.add(stated, lag * np.equal(sides, side)).tolist() for side, lag in tried]
-        now, *found = map_threads(lambda one: self.log_evidence(one, ()), [stated, *moments])
-        ranked = sorted(zip(found, tried, strict=True), reverse=True)
-        best = [side for log, (side, _) in ranked if log > max(found) - MIN_LOG_RATIO]
+        others = [
+            (side, np.add(stated, lag * np.equal(sides, side)).tolist()) for side, lag in tried
+        ]
+        # Of pairs that an unknown moment suits best: all take long.
+        unknown = [[*stated[:k], None, *stated[k + 1 :]] for k in range(len(names))]
+        suspects = np.sort(np.argsort(map_threads(self.log_evidence, unknown))[-5:]).tolist()
+        for a, b in combinations(suspects, 2):
+            exchanged = [*stated]
+            exchanged[a], exchanged[b] = stated[b], stated[a]
+            others.append((f"{names[a]} and {names[b]}", exchanged))
+        moments = [stated, *(one for _, one in others)]
+        now, *found = map_threads(lambda one: self.log_evidence(one, ()), moments)
+        ranked = sorted(zip(found, others, strict=True), reverse=True)
+        best = [name for log, (name, _) in ranked if log > max(found) - MIN_LOG_RATIO]
         significant = max(found) > now + MIN_LOG_RATIO
         return f"of {' or '.join(dict.fromkeys(best))} other than" if significant else ""
 

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from bodyscan.arrays import Array
 from bodyscan.errors import BadInput
 from bodyscan.files.reading import read_json_object
 from bodyscan.fusion.storage import StoredScan
@@ -137,7 +136,10 @@ def _pack_measures(mesh: BodyMesh, measures: Sequence[Content]) -> dict[str, Any
     for one in measures:
         if one["kind"] not in ("girth", "tape", "chain"):
             continue
-        path = _densify(np.array(one["path_mm"]))
+        path = np.array(one["path_mm"])
+        along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1)))
+        at = np.linspace(0.0, along[-1], max(2, int(along[-1] / 10.0) + 1))  # every 10 mm
+        path = np.stack([np.interp(at, along, column) for column in path.T], axis=1)
         # Above the surface by more than its reduction moves it.
         path = path + 3.0 * mesh.normals[tree.query(path)[1]]
         ends.append(np.stack([path[:-1], path[1:]], axis=1))
@@ -147,10 +149,3 @@ def _pack_measures(mesh: BodyMesh, measures: Sequence[Content]) -> dict[str, Any
     strokes = Strokes(np.concatenate(ends), np.concatenate(colours))
     plain = Layer("shape", np.full(mesh.vertices.shape, (214, 210, 205), np.uint8))
     return pack(mesh, [plain], strokes=strokes, labels=labels)
-
-
-def _densify(path: Array, step_mm: float = 10.0) -> Array:
-    """A polyline (N, 3) with points some mm apart."""
-    along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1)))
-    at = np.linspace(0.0, along[-1], max(2, int(along[-1] / step_mm) + 1))
-    return np.stack([np.interp(at, along, column) for column in path.T], axis=1)

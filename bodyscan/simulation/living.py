@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -105,12 +104,6 @@ class LivingBody:
     def surface(self, ms: float, *, breathing: bool = True) -> Surface:
         """Build the skin at a time, with normals at rest: nothing rotates more than a degree or so."""
         return replace(self.rest, vertices=self.vertices(ms, breathing=breathing))
-
-    def max_displacement(self, from_ms: float, moments_ms: Iterable[float]) -> float:
-        """Compute the largest displacement, mm, of any vertex between a time and some moments."""
-        start = self.vertices(from_ms)
-        away = [np.linalg.norm(self.vertices(ms) - start, axis=1).max() for ms in moments_ms]
-        return float(max(away))
 
 
 def moves(person: Person) -> bool:

@@ -323,5 +323,7 @@ def _build_scenes(
     # Motion is smooth: its largest displacement at a few moments suffices, with a margin.
     first, last = min(task.frames_ms.values()), max(task.frames_ms.values())
     moments = np.linspace(first, last, 5)
-    reach_mm = 1.3 * living.max_displacement((first + last) / 2.0, moments)
+    start = living.vertices((first + last) / 2.0)
+    away = [np.linalg.norm(living.vertices(ms) - start, axis=1).max() for ms in moments]
+    reach_mm = 1.3 * float(max(away))
     return scene, Moving(len(task.surfaces), scene_at, reach_mm)
