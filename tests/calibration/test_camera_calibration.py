@@ -58,9 +58,11 @@ def test_an_outlier_corner_does_no_harm() -> None:
     assert abs(found.alpha - clean.alpha) < 0.5
 
 
-def test_pure_translation_is_refused() -> None:
+def test_pure_translation_and_two_poses_are_refused() -> None:
     with pytest.raises(DegeneratePoses, match="translation only"):
         calibrate_camera(views([TURNS[0]] * 4, 0.03), 640, 480)
+    with pytest.raises(DegeneratePoses, match="2 usable board poses"):
+        calibrate_camera(views(TURNS[:2]), 640, 480)
 
 
 @pytest.mark.parametrize("plane_z", [0.0, 6.0])

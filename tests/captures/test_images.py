@@ -142,6 +142,7 @@ def test_the_lit_image_in_colour_is_made_where_none_was_taken(tmp_path: Path) ->
         (encoded(NOISE.astype(np.uint16) * 256), "but 8 bits in them (all their numbers are mult"),
         (encoded(NOISE.astype(np.uint16) * 257), "but 8 bits in them (all their numbers are mult"),
         (encoded(NOISE)[:-20], "is cut short"),
+        (encoded(NOISE)[:600], "is cut short"),
         (encoded(NOISE)[:20], "is cut short"),
         (encoded(NOISE, ".jpg")[:-20], "is cut short"),
         (encoded(NOISE, ".jpg")[:30], "is cut short"),
