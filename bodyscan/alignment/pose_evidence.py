@@ -193,12 +193,12 @@ def _fit_postures(
 ) -> list[tuple[float, PostureStep]]:
     """Log likelihood ratios of other postures while these pairs fired."""
     members = np.isin(evidence.names, list(pairs))
-    fits = {k: _DisplacementFit.from_system(of(members)) for k, of in evidence.postures.items()}
-    moved_mm = {kinds: float(np.abs(fit.steps).max(initial=0.0)) for kinds, fit in fits.items()}
-    return [
-        (fit.log_ratio, PostureStep(pole, pairs, kinds, moved_mm[kinds], fit.size_mm))
-        for kinds, fit in fits.items()
-    ]
+    found = []
+    for kinds, equations in evidence.postures.items():
+        fit = _DisplacementFit.from_system(equations(members))
+        moved_mm = float(np.abs(fit.steps).max(initial=0.0))
+        found.append((fit.log_ratio, PostureStep(pole, pairs, kinds, moved_mm, fit.size_mm)))
+    return found
 
 
 def _is_harmful(found: Displacement) -> bool:

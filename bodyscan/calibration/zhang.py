@@ -31,7 +31,7 @@ def matrix_from_homographies(homographies: Sequence[Array], width: int, height: 
     if matrix is None:
         square = rows[:, 0] + rows[:, 2]
         inverse_square = -(square @ rows[:, 5]) / (square @ square)
-        # A picture 2 wide: 50 is a field of view of 2 degrees.
+        # Focal lengths are in halves of the image's width: 50 is a field of view of 2 degrees.
         focal = inverse_square**-0.5 if inverse_square > 50.0**-2 else 2.4
         matrix = np.diag([focal, focal, 1.0])
     return np.linalg.inv(size) @ matrix

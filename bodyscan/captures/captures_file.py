@@ -164,8 +164,8 @@ def _find_timing_problems(timing: Timing, rig: Rig) -> Iterator[Problem]:
     if left_out:
         other = ", or is the calibration another rig's?" if len(left_out) > 1 else ""
         yield ("order",), f"leaves out {', '.join(left_out)}: every frame has its time{other}"
-    few = len(left_out) < 2 or len([name for name in order if name not in known]) < 2
-    for index, name in [both for both in enumerate(order) if few and both[1] not in known]:
+    unknown = [(index, name) for index, name in enumerate(order) if name not in known]
+    for index, name in unknown if min(len(left_out), len(unknown)) < 2 else ():
         hint = did_you_mean(name, known)
         yield ("order", index), f"names no frame of rig {rig.name}{hint} (got {name!r})"
     names = [pair.name for pair in rig.pairs]

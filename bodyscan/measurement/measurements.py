@@ -12,7 +12,7 @@ from bodyscan.arrays import Array, Bytes, Mask
 from bodyscan.errors import BadInput
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.measurement.head import HeadTop, estimate_head_top
-from bodyscan.measurement.named import CROWN_MM, ByName, Measure, NamedMeasures, measure_by_name
+from bodyscan.measurement.named import CROWN_MM, Measure, Measures, NamedMeasures, measure_by_name
 from bodyscan.measurement.outline import Range, bound_girths, compute_girth_sigma
 from bodyscan.mesh.body import (
     HAIR,
@@ -107,7 +107,7 @@ class Measurements:
     @property
     def measures(self) -> Mapping[str, Measure]:
         """Measures by name, such as "waist girth"; empty if they were not asked for."""
-        return ByName() if self.named is None else self.named.measures
+        return Measures() if self.named is None else self.named.measures
 
     def to_records(self) -> list[dict[str, Any]]:
         """One record for each part of each slice, as tables take them: `pandas.DataFrame(records)`.

@@ -64,7 +64,7 @@ class Measure:
     path_mm: Array = field(compare=False, repr=False)  # (N, 3), where it runs, rig frame
 
 
-class ByName(dict[str, Measure]):
+class Measures(dict[str, Measure]):
     """Measures by name. A KeyError for another name suggests one."""
 
     def __missing__(self, name: str) -> Measure:
@@ -152,7 +152,7 @@ def take_measures(registered: RegisteredBody) -> NamedMeasures:
     positions = {name: to_body.apply(np.array(one.position_mm)) for name, one in landmarks.items()}
     body = _Body(sections, positions)
     posture = find_posture(registered.fitted, positions)
-    measures, missing = ByName(), {}
+    measures, missing = Measures(), {}
     observed = {name: one for name, one in landmarks.items() if one.found != "unseen"}
     for definition in read_definitions():
         try:

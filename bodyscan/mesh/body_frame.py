@@ -75,6 +75,6 @@ def _find_toes(feet: Array, ankles: Array, reach_mm: float) -> Array:
     if len(ankles) == 0:
         return np.zeros(2)
     distance, nearest = cKDTree(ankles).query(feet)
-    own = np.flatnonzero(np.asarray(distance) < reach_mm)
-    beyond = feet[own] - ankles[np.asarray(nearest)[own]]
-    return beyond.mean(axis=0) if len(own) else np.zeros(2)
+    near = np.flatnonzero(np.asarray(distance) < reach_mm)
+    beyond = feet[near] - ankles[np.asarray(nearest)[near]]
+    return beyond.mean(axis=0) if len(near) else np.zeros(2)

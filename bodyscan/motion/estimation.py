@@ -313,7 +313,7 @@ class _Solution:
         others = [
             (side, np.add(stated, lag * np.equal(sides, side)).tolist()) for side, lag in tried
         ]
-        # Of pairs that an unknown moment suits best: all take long.
+        # Exchanges among the five pairs whose own moments fit worst: those of all would take too long.
         unknown = [[*stated[:k], None, *stated[k + 1 :]] for k in range(len(names))]
         suspects = np.sort(np.argsort(map_threads(self.log_evidence, unknown))[-5:]).tolist()
         for a, b in combinations(suspects, 2):

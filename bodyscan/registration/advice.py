@@ -23,7 +23,7 @@ def advise(rig: Rig, solution: RigSolution) -> list[str]:
     if shots := find_articulation_shots(solution):
         names = ", ".join(f"{shot} ({board})" for shot, board in shots)
         lines.append(f"without any one of these shots the rig is disconnected: {names}")
-    sigmas, suggestion = assess_places(rig, solution)
+    sigmas, suggestion = assess_pairs(rig, solution)
     worst = max(sorted(sigmas), key=lambda name: sigmas[name])
     lines.append(f"{worst} has the largest sigma where boards were seen: {sigmas[worst]:.3f} mm")
     return [*lines, *suggestion]
@@ -37,12 +37,12 @@ def find_articulation_shots(solution: RigSolution) -> tuple[Target, ...]:
     return tuple(sorted(what for kind, what in nx.articulation_points(graph) if kind == "shot"))
 
 
-def assess_places(rig: Rig, solution: RigSolution) -> tuple[dict[str, float], list[str]]:
-    """Sigma of where each pair sees a place, mm across its rays, on average over the corners it saw;
-    and the shot that, repeated, reduces the largest most, in words.
+def assess_pairs(rig: Rig, solution: RigSolution) -> tuple[dict[str, float], list[str]]:
+    """Sigma of points as each pair sees them, mm across its rays, RMS over the corners it saw; and the
+    shot that, repeated, reduces the largest most, in words.
 
-    It is relative to where all pairs see it, and contains the cameras' parameters: this is what a scan
-    needs. Cameras whose focal lengths grow as they stand back err by tenths of a mm, and harm no scan.
+    It is relative to where all pairs see them, and contains the cameras' parameters: a scan needs this.
+    Cameras whose focal lengths grow as they stand back err by tenths of a mm, and harm no scan.
     """
     frame, poses = find_frame_target(rig), (solution.rig_from_camera, solution.rig_from_board)
     pair = rig.frame_pair.name if rig.frame_pair else None
@@ -56,24 +56,24 @@ def assess_places(rig: Rig, solution: RigSolution) -> tuple[dict[str, float], li
     )
     covariance = equations.system.covariance()
     scale = 2.0 * equations.variance_px2 * solution.variance_inflation
-    places = _differentiate_places(solution, equations)
-    sigmas = {n: float(scale * np.sum(each * covariance)) ** 0.5 for n, each in places.items()}
+    squares = _square_derivatives(solution, equations)
+    sigmas = {n: float(scale * np.sum(each * covariance)) ** 0.5 for n, each in squares.items()}
     worst = max(sorted(sigmas), key=lambda name: sigmas[name])
     # A board that holds the frame is no unknown: its part is not that of another shot there.
-    seen_by = {
+    visible_to = {
         target: names
         for target, views in by_target(solution.views).items()
         if len(names := sorted({view.pair for view in views})) > 1 and target != frame
     }
-    if not seen_by:  # no two pairs share a shot
+    if not visible_to:  # no two pairs share a shot
         return sigmas, []
 
     def sigma_after(target: Target, shots: int) -> float:
         """With so many more, the gain being that of corners that err independently."""
         more = equations.system + equations.sum_parts([target]) * float(shots)
-        return float(scale * np.sum(places[worst] * more.covariance())) ** 0.5
+        return float(scale * np.sum(squares[worst] * more.covariance())) ** 0.5
 
-    best = min(seen_by, key=lambda target: sigma_after(target, MAX_SHOTS))
+    best = min(visible_to, key=lambda target: sigma_after(target, MAX_SHOTS))
     sigma, after = sigmas[worst], [sigma_after(best, k) for k in range(1, MAX_SHOTS + 1)]
     shots = next((k for k, one in enumerate(after, start=1) if one <= sigma / 2.0), MAX_SHOTS)
     (shot, board), gain = best, after[shots - 1] / sigma
@@ -85,20 +85,19 @@ def assess_places(rig: Rig, solution: RigSolution) -> tuple[dict[str, float], li
         ]
     return sigmas, [
         f"{shots} more {'shot' if shots == 1 else 'shots'} like {shot} (board {board} about there, "
-        f"tilted differently each time, seen by {', '.join(seen_by[best])}) would "
+        f"tilted differently each time, seen by {', '.join(visible_to[best])}) would "
         f"{'halve' if gain <= 0.5 else 'improve'} the sigma of {worst}: {effect}"
     ]
 
 
-def _differentiate_places(solution: RigSolution, equations: NormalEquations) -> dict[str, Array]:
-    """By pair, mean squares (P, P) of its places' derivatives, mm, by the free unknowns, less what a
+def _square_derivatives(solution: RigSolution, equations: NormalEquations) -> dict[str, Array]:
+    """By pair, mean squares (P, P) of its points' derivatives, mm, by the free unknowns, less what a
     motion of the whole rig explains."""
-    rows, motions = [], []
+    rows, motions, poses = [], [], (solution.rig_from_camera, solution.rig_from_board)
     for number, name in enumerate(equations.names):
         views = [view for view in solution.views if view.pair == name]
-        poses = solution.rig_from_camera, solution.rig_from_board
         derivatives = linearize_reprojection(views, solution.cameras, *poses)[1]()
-        # A pixel's length there in mm, from the derivatives by places on the board.
+        # A pixel's length there in mm, from the derivatives by points on the board.
         px_per_mm = np.linalg.norm(derivatives[:, -3:].reshape(-1, 6), axis=1) / np.sqrt(2.0)
         derivatives /= np.repeat(px_per_mm, 2)[:, None]
         row = np.zeros((len(derivatives), equations.prior.size))
@@ -106,8 +105,8 @@ def _differentiate_places(solution: RigSolution, equations: NormalEquations) -> 
         row[:, equations.cameras[name]] = derivatives[:, 12:-3]
         rows.append(row)
         motions.append(derivatives[:, 6:12])
-    places, motion = np.concatenate(rows), np.concatenate(motions)
-    places -= motion @ np.linalg.lstsq(motion, places, rcond=None)[0]
+    points, motion = np.concatenate(rows), np.concatenate(motions)
+    points -= motion @ np.linalg.lstsq(motion, points, rcond=None)[0]
     ends = np.cumsum([len(row) for row in rows])[:-1]
-    parts = zip(equations.names, np.split(places[:, equations.free], ends), strict=True)
+    parts = zip(equations.names, np.split(points[:, equations.free], ends), strict=True)
     return {name: part.T @ part / len(part) for name, part in parts}

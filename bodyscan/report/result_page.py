@@ -61,6 +61,7 @@ def build_page(result: Path, other: Path | None = None) -> Page:
         raise BadInput("there is no such file or folder", where=str(result), remedy=REMEDY)
     folder = result if result.is_dir() else result.parent
     names = {result.name} if result.is_file() else {path.name for path in folder.glob("*.json")}
+    # A batch's job is taken for its scan too, so that the error says where that is.
     if scans.FILE_NAME in names or (folder / "scan" / scans.FILE_NAME).is_file():
         from bodyscan.report.scan_page import make_scan_page
 

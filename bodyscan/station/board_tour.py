@@ -26,7 +26,7 @@ from bodyscan.captures.folder import Captures, open_captures, resolve_capture_pa
 from bodyscan.errors import BodyscanError
 from bodyscan.jobs.watching import STABLE_S, has_end_mark
 from bodyscan.optional import optional
-from bodyscan.registration.advice import assess_places
+from bodyscan.registration.advice import assess_pairs
 from bodyscan.registration.calibration_verdict import LIMITS, collect_figures, grade_calibration
 from bodyscan.registration.rig_frame import find_frame_target
 from bodyscan.registration.rig_solve import solve_rig
@@ -143,7 +143,7 @@ class BoardTour:
             if located:
                 lenses = {name: one.camera for name, one in cameras.items()}
                 solution = solve_rig(self.rig, located, lenses).value
-                sigmas, suggestion = assess_places(self.rig, solution)
+                sigmas, suggestion = assess_pairs(self.rig, solution)
                 notes += suggestion
         finite = {name: sigma for name, sigma in sigmas.items() if np.isfinite(sigma)}
         solved = {"images": images, "sigmas_mm": finite, "advice": notes}
@@ -220,9 +220,9 @@ class BoardTour:
         poles = {each.name: each.pole or each.name for each in self.rig.pairs}
         shared: Counter[str] = Counter()
         for one, other, count in self._count_shared_shots():
-            for own, its in ((one, other), (other, one)):
-                if poles[own] == poles[pair] != poles[its]:
-                    shared[poles[its]] += count if own == pair else 0
+            for near, far in ((one, other), (other, one)):
+                if poles[near] == poles[pair] != poles[far]:
+                    shared[poles[far]] += count if near == pair else 0
         return min(sorted(shared), key=lambda pole: shared[pole], default="")
 
     def _count_boards(self) -> dict[str, int]:

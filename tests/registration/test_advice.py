@@ -12,7 +12,7 @@ from bodyscan.calibration.board_views import LocatedView
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.robust import rms
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
-from bodyscan.registration.advice import advise, assess_places, find_articulation_shots
+from bodyscan.registration.advice import advise, assess_pairs, find_articulation_shots
 from bodyscan.registration.rig_solve import RigSolution, solve_rig
 from bodyscan.rig.rig import Rig
 
@@ -58,11 +58,10 @@ SUGGESTED = re.compile(
 
 def test_a_pair_sees_places_where_they_are_within_their_sigma(ring: Ring) -> None:
     rig, placings, cameras, views, truth, placed = ring
-    sigmas = assess_places(rig, placed)[0]
+    sigmas = assess_pairs(rig, placed)[0]
     off, motion = {}, {}
     for name in placings:
-        seen = [truth[v.target].apply(v.points) for v in views if v.pair == name]
-        each = np.concatenate(seen)
+        each = np.concatenate([truth[v.target].apply(v.points) for v in views if v.pair == name])
         at, here = placings[name].inverse(), placed.rig_from_camera[name].inverse()
         by_place = cameras[name].jacobians(at.apply(each))[1] @ at.rotation
         mm = (2**0.5 / np.linalg.norm(by_place, axis=(1, 2)))[:, None]
@@ -80,9 +79,7 @@ def test_shots_as_advised_reduce_the_sigma_of_the_worst_pair_as_told(ring: Ring)
     views = [view for view in views if int(view.shot[1:]) < 12]
     placed = solve_rig(rig, views, cameras).value
     worst, more = advise(rig, placed)  # and nothing else: no shot is crucial
-    sigmas = assess_places(rig, placed)[0]
-    name = max(sigmas, key=lambda name: sigmas[name])
-    sigma = sigmas[name]
+    name, sigma = max(assess_pairs(rig, placed)[0].items(), key=lambda one: one[1])
     assert worst == f"{name} has the largest sigma where boards were seen: {sigma:.3f} mm"
     told = SUGGESTED.fullmatch(more)
     assert told is not None
@@ -94,17 +91,15 @@ def test_shots_as_advised_reduce_the_sigma_of_the_worst_pair_as_told(ring: Ring)
     extra = again(target, int(told["shots"]), ring, np.random.default_rng(5))
     solution = solve_rig(rig, [*views, *extra], cameras).value
     # Tilts tell more of a lens than the same shot again, of which the prediction is.
-    assert 0.5 < assess_places(rig, solution)[0][name] / float(told["after"]) < 1.15
+    assert 0.5 < assess_pairs(rig, solution)[0][name] / float(told["after"]) < 1.15
 
 
 def test_a_shot_that_alone_ties_a_pole_is_named() -> None:
     placings, cameras = ring_of_cameras(heights=(700, 1200))
     views, _ = ring_views(placings, cameras, shots=30)
     # The third pole sees the board together with the others in one shot only.
-    mixed = {v.shot for v in views if v.pair == "p3-2"} & {
-        v.shot for v in views if v.pair == "p1-2"
-    }
-    bridge = min(mixed)
+    one, other = ({v.shot for v in views if v.pair == name} for name in ("p3-2", "p1-2"))
+    bridge = min(one & other)
     kept = [
         v
         for v in views

@@ -261,7 +261,7 @@ def test_shots_are_enough_once_every_pair_sees_places_as_well_as_a_scan_needs(
     for boards, mm, enough in ((6, 0.04, False), (6, 0.03, True), (20, 0.04, True)):
         monkeypatch.setattr(tour, "_count_boards", dict.fromkeys(names, boards).copy)
         sigmas = {name: mm if name == "p2-3" else 0.01 for name in names}
-        monkeypatch.setattr(f"{module}.assess_places", Mock(return_value=(sigmas, ["note"])))
+        monkeypatch.setattr(f"{module}.assess_pairs", Mock(return_value=(sigmas, ["note"])))
         tour.solve()
         assert tour.solved["enough"] is enough
         assert tour.solved["weakest"] == (None if enough else "p2-3")
