@@ -253,8 +253,7 @@ def save_scan(
 ) -> bodyscan.StoredScan:
     """Write the body model and its description (scan.json) into `folder`; return it as read back.
 
-    calibration: path of the stored calibration that the scan was made with; scan.json refers to it
-        by hash.
+    calibration: path of the calibration that the scan was made with; scan.json has its hash.
     subject: pseudonym by which `bodyscan forget` finds everything made of a person.
     """
     from bodyscan.fusion.storage import Origin, save_body, save_facts

@@ -190,8 +190,7 @@ def find_displaced_pole(
         # x sigmas along one direction have a log likelihood ratio of x^2 / 2 - 3 log(1 + x^2), which
         # is MIN_LOG_RATIO at 5.8; two more keep chance from hiding it.
         detectable = max(detectable, 8.0 * float(sigma))
-        # A single pair may look displaced because a head or an arm moved, unless the subject hardly
-        # swayed.
+        # A single pair may look displaced because a head or an arm moved, unless the subject was still.
         any_sway = len(pairs) > 1 or several
         if not any_sway and sway_mm > STILL_MM:
             detectable = np.inf

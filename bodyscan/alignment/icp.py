@@ -59,8 +59,7 @@ class Alignment:
     motion_mm: displacement at the body's centre of each pair in the largest group connected by
         overlaps; the displacement of others is not observed.
     refused: pairs that would have moved farther than the prior allows, with their motion in sigmas.
-    covariance: posterior covariance of the aligned poses; None if a pair was refused, or Open3D
-        aligned.
+    covariance: posterior, of the aligned poses; None if a pair was refused, or Open3D aligned.
     """
 
     rig_from_camera: dict[str, RigidTransform]

@@ -218,8 +218,7 @@ def _describe_displaced_pole(name: str, pairs: frozenset[str], steps: Array) -> 
 def _build_rigid_basis(members: Mask) -> Array:
     """Twists (6P, 6) of the pairs (P,) that move as one.
 
-    Translations of the body's centre by 1 mm, then rotations about it that move a point at the lever
-    arm by 1 mm.
+    Translations of the body's centre by 1 mm, then rotations about it by 1 mm at the lever arm.
     """
     twists = np.zeros((6, 6))
     twists[3:, :3] = np.eye(3)

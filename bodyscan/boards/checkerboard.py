@@ -176,8 +176,7 @@ def _number_as_printed(
 ) -> tuple[Array, bool]:
     """Put corners (N, 2) in the print's order; also return whether its first square is black.
 
-    Never mirrored; starts at the end where the first square is black if at the other end it is
-    white.
+    Never mirrored; starts at the end whose first square is black if the other end's is white.
     """
     grid = corners.reshape(board.rows - 1, board.columns - 1, 2)
     across = (grid[:, -1] - grid[:, 0]).mean(axis=0)

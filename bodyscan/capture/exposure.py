@@ -97,8 +97,7 @@ def _settle(camera: Camera, projector: Projector, lit: str, dark: str) -> Exposu
 def measure_delays(devices: Devices) -> dict[str, float]:
     """Show black, then white, and measure how long after `show` each projector's light is on, ms.
 
-    Only of projectors whose delay is not known yet. Raises FailedWork for a camera that does not see
-    the change.
+    Only of projectors whose delay is not known yet. Raises FailedWork if a camera sees no change.
     """
     lit, dark = devices.rig.frames.lit, devices.rig.frames.dark
     measured = {}

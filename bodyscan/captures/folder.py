@@ -193,8 +193,7 @@ def open_scan(rig: Rig, folder: Path) -> Captures:
 def open_check(rig: Rig, folder: Path) -> tuple[Kind, Captures]:
     """Open captures of either kind, for a check. Raises as `open_scan`.
 
-    The kind is that of the folder's captures.yaml; without one, a scan unless it holds several
-    shots.
+    The kind is that of the folder's captures.yaml; without one, a scan unless there are more shots.
     """
     listing = Listing(Path(folder), follow_links=rig.follow_links)
     file = load_captures_file(folder, rig) if listing.has(FILE_NAME, broken=True) else None

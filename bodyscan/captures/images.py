@@ -254,8 +254,7 @@ def find_full_scale(images: Sequence[Raw], bits: int | None) -> float:
     """Find the number that stands for white in one sequence's images; 255 for 8-bit files.
 
     A file with 16 bits per sample holds what the camera measured: 16 bits, or 10, 12 or 14 at the
-    low or the high end of the number. Nothing in the file says which; the numbers of a whole
-    sequence do.
+    low or the high end of the number. No file says which; the numbers of a whole sequence do.
 
     bits: how many the camera measures; None: judged by the numbers, so that a dim sequence may be
         taken for one of fewer bits, which changes only its unit of brightness.

@@ -1,7 +1,6 @@
 """The command line: where it is entered, and how errors leave it. See builder, operator, laboratory.
 
-Heavy imports happen inside the commands, so that `bodyscan --help` and the shell's completion answer
-at once.
+Heavy imports happen inside commands, so that `bodyscan --help` and completion answer at once.
 """
 
 from __future__ import annotations

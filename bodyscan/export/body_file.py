@@ -121,8 +121,7 @@ def describe_body(
 
 
 def _rig_from_file(format_: BodyFormat, rig_from_body: RigidTransform) -> Array:
-    """Matrix (4, 4) that takes coordinates as the file has them, in its unit and axes, to the rig
-    frame in mm."""
+    """Matrix (4, 4) from coordinates as the file has them, in its unit and axes, to mm, rig frame."""
     pointing = ("front", "left", "up")
     body_from_file = np.eye(4)
     scale = {"mm": 1.0, "m": 1000.0}[format_.unit]

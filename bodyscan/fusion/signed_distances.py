@@ -31,8 +31,7 @@ def splat_planes(
     """Signed distances (B, SIDE, SIDE, SIDE) mm, negative inside, and their weights.
 
     Each point contributes its tangent plane to the nodes within `reach` cells, with a weight that
-    falls with distance and sigma: 1 for one point right at the node, 0 (and distance 0) without
-    points.
+    falls with distance and sigma: 1 for a point right at the node, 0 (as the distance) without.
     """
     median = float(np.median(cloud.sigma_mm))
     relative = np.clip(cloud.sigma_mm / max(median, 1e-6), 1.0 / 3.0, 3.0)

@@ -53,8 +53,7 @@ class Scan:
 
     measured: number of points in each pair's cleaned range image.
     failed: pairs that gave none, with the reason.
-    range_images: cleaned, of the pairs that saw the subject, cropped to it and carried to one
-        moment.
+    range_images: cleaned, of pairs that saw the subject, cropped to it, carried to one moment.
     rig_from_camera: each pair's pose relative to the subject, after alignment.
     person: how a moving body moved, part by part.
     notes: on the range images, such as stripes that were not used.

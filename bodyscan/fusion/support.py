@@ -41,8 +41,7 @@ class Support:
     @property
     def measured(self) -> Mask:
         """(V,): whether a vertex lies on its points, and these agree: not beyond the rim of what
-        was seen, nor where the grid lifts it off the points (fingertips), nor between surfaces
-        (toes)."""
+        was seen, nor where the grid lifts it off the points (fingertips), nor between toes."""
         lifted = np.abs(self.shift_mm) > np.maximum(MAX_SHIFT * self.reach_mm, 4.0 * self.sigma_mm)
         torn = self.scatter_mm > np.maximum(0.125 * self.reach_mm, 2.0 * self.sigma_mm)
         # One point 3 mm away, or a sixth of the median vertex: a straight rim has a half of that.

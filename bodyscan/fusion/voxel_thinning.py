@@ -30,8 +30,7 @@ class Samples:
 
 
 def take_samples(surfaces: Sequence[SmoothSurface], points: int) -> Samples:
-    """About `points` evenly spread samples of all surfaces. Raises ScanFailed if these show next
-    to nothing."""
+    """About `points` evenly spread samples of all surfaces. Raises ScanFailed if there are few."""
     ends = np.cumsum([0, *(len(surface.points) for surface in surfaces)])
     if ends[-1] < 1000:
         raise ScanFailed(

@@ -156,8 +156,7 @@ class SmoothSheets(ABC):
 
     kind: ClassVar[str]
 
-    # A frame roughly at the projector, z the direction it shines, x along the stripes, y across
-    # them.
+    # A frame roughly at the projector, z the way it shines, x along the stripes, y across them.
     projector_from_camera: RigidTransform
     # (3,) mm, camera frame, the middle of the boards; the search for a depth starts there.
     middle: Array

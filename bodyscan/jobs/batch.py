@@ -118,8 +118,7 @@ def run_on_cluster(
     threads: per job. The cluster decides how many jobs run at once: one for each thread of each
         worker (`dask worker --nthreads`).
 
-    Raises BadInput if dask.distributed is not installed, FailedWork if nobody answers or there is
-    no worker.
+    Raises BadInput without dask.distributed, FailedWork if nobody answers or there is no worker.
     """
     try:
         from distributed import Client

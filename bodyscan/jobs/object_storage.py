@@ -58,6 +58,11 @@ def find_stored_jobs(store: Store, pipeline: Pipeline, until: str, work: Path) -
     FailedWork if it does not answer.
     """
     (work / "scans").mkdir(parents=True)
+    with _answering(store.out):
+        files = _open(store.out)
+        bucket = files.path.partition("/")[0]  # "" where a store has none: paths begin with "/"
+        if bucket and not files.fs.exists(bucket):  # mistyped, and the summary would make it
+            raise _not_there(store.out)
     with _answering(store.scans):
         files = _open(store.scans)
         for entry in files.ls("", detail=True) if files.exists("") else ():
@@ -77,8 +82,12 @@ def find_stored_jobs(store: Store, pipeline: Pipeline, until: str, work: Path) -
 
 def _require_some(url: str, fetched: Path) -> None:
     if not any(fetched.iterdir()):
-        remedy = "check the URL: does the bucket exist, and may this account list it?"
-        raise BadInput("holds nothing, or is not there", where=url, remedy=remedy)
+        raise _not_there(url)
+
+
+def _not_there(url: str) -> BadInput:
+    remedy = "check the URL: does the bucket exist, and may this account list it?"
+    return BadInput("holds nothing, or is not there", where=url, remedy=remedy)
 
 
 @contextmanager
@@ -88,6 +97,8 @@ def _answering(url: str) -> Iterator[None]:
         yield
     except (BodyscanError, MemoryError):
         raise
+    except FileNotFoundError as error:
+        raise _not_there(url) from error
     except Exception as error:
         first = str(error).strip().partition("\n")[0]
         raise FailedWork(

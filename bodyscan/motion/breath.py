@@ -75,8 +75,7 @@ class BreathEstimate:
     """What the overlaps tell of M breath fields along J temporal modes."""
 
     mode_covariance: Array  # of each field's amplitudes, (J, J)
-    # at_middle, covariance: mean (M,) and covariance (M, M) of the fields in the middle of the
-    # scan.
+    # at_middle, covariance: mean (M,) and covariance (M, M) of the fields mid-scan.
     at_middle: Array
     covariance: Array
 

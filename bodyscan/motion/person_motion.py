@@ -37,8 +37,7 @@ class PersonMotion:
 
     parts: tuple[PartMotion, ...]  # the parts that were measured, from the trunk outwards
     breathed_mm: float | None  # see `measure_breath`
-    # The moment that the body represents, since the scan began; None (the mean of all) without
-    # times.
+    # The body's moment, since the scan began; None (the mean of all) without times.
     moment_ms: float | None
     # fuller_mm, fuller_sigma_mm: see `measure_fullness`.
     fuller_mm: float | None = None

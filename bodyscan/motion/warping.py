@@ -158,8 +158,7 @@ def _warp(
             a, b, c = normals[v, u]
             for k in range(3):
                 points[v, u, k] += shift[k]
-                # A normal is carried by the inverse transpose of the deformation, here to first
-                # order.
+                # The deformation's inverse transpose carries a normal, here to first order.
                 normals[v, u, k] -= slope[k, 0] * a + slope[k, 1] * b + slope[k, 2] * c
 
 

@@ -85,8 +85,7 @@ def combine_directions(
     much less they have in common, the mean that follows is no worse than the better of the two: its
     variance is convex in the weight of the worse, and the best weight is larger. If the sigmas are too
     small (an imported calibration may have none), all pixels disagree equally: then only those far
-    beyond the others are dropped, and the better direction alone gives the depth, the other being a
-    check.
+    beyond the others are dropped; the better direction alone gives the depth, the other checks it.
     """
     points, sigma_mm, common_mm = (part.copy() for part in primary)
     both = np.isfinite(sigma_mm) & np.isfinite(crossing[1])

@@ -127,8 +127,7 @@ def _hold_out(
 def _drop_extremes(compared: ResidualPair) -> ResidualPair:
     """Drop the board most in favour of the shape and the one most against it.
 
-    Where half of the views leave a lens open beyond their boards, one board there would decide
-    alone.
+    Where half of the views leave a lens open beyond their boards, one board would decide alone.
     """
     better = np.sum(compared.simple**2 - compared.rich**2, axis=1)
     boards = np.unique(compared.cluster)

@@ -131,8 +131,7 @@ def solve_rig(
 ) -> Outcome[RigSolution]:
     """Join all pairs by their shared board views.
 
-    cameras: with the richest lens to be tried; held-out boards choose where the rig file leaves it
-        open.
+    cameras: with the richest lens to be tried; boards choose where the rig file leaves it open.
 
     Pairs that agree with the others in too few shots are in `failures`. Raises RigDisconnected if
     groups of pairs share no view, only views whose board numbering leaves their poses open, or only

@@ -178,8 +178,7 @@ def load_calibration(path: Path, *, accept_changed: bool = False) -> RigCalibrat
 def accept_calibration(path: Path) -> Path | None:
     """Store an edited calibration as valid, with a note that says so; return the path of its JSON.
 
-    None, with nothing written, if it is as it was stored. Raises as `load_calibration`, except for
-    the change.
+    None, with nothing written, if it is as stored. Raises as `load_calibration`, but for the change.
     """
     folder = path if path.is_dir() else path.parent
     found = load_calibration(folder, accept_changed=True)

@@ -34,6 +34,15 @@ from bodyscan.jobs.supervision import JobResult
 
 fsspec = pytest.importorskip("fsspec", reason="fsspec is not installed (pip install '.[cluster]')")
 
+
+class Buckets(MemoryFileSystem):  # type: ignore[misc]  # it has no types
+    """Its paths begin with a bucket, as those of S3 do, which writing would make."""
+
+    @classmethod
+    def _strip_protocol(cls, path: str) -> str:
+        return path.removeprefix("buckets://").strip("/")
+
+
 STORE = Store("memory://day/scans", "memory://day/out", "memory://day/calibration")
 
 
@@ -134,20 +143,21 @@ def test_what_a_killed_batch_left_in_the_temporary_folder_is_swept(
         assert not other.exists()
         sweep_scratch(with_own=True)  # as on Ctrl-C, after which nothing is tidied up
         assert not folder.exists()
-    assert sorted(path.name for path in tmp_path.iterdir()) == [
-        "bodyscan-mine",
-        "bodyscan-scratch-new",
-    ]
+    left_alone = {"bodyscan-mine", "bodyscan-scratch-new"}
+    assert {path.name for path in tmp_path.iterdir()} == left_alone
 
 
-def test_a_bucket_that_is_not_there_is_named_by_its_url(
-    memory: MemoryFileSystem, tmp_path: Path
+@pytest.mark.parametrize(
+    "url", ["scans memory", "calibration memory", "out buckets", "scans nowhere"]
+)
+def test_what_is_not_there_is_named_by_its_url(
+    memory: MemoryFileSystem, tmp_path: Path, url: str
 ) -> None:
-    pipeline = load_pipeline(cheap_job.PIPELINE)
-    for part in ("scans", "calibration"):
-        store = replace(STORE, **{part: f"memory://nobucket/{part}"})
-        with pytest.raises(BadInput, match=rf"memory://nobucket/{part}: holds nothing"):
-            find_stored_jobs(store, pipeline, "export", tmp_path / part)
+    part, kind = url.split()
+    fsspec.register_implementation("buckets", Buckets, clobber=True)
+    store = replace(STORE, **{part: f"{kind}://nobucket/{part}"})
+    with pytest.raises(BadInput, match=rf"{kind}://nobucket/{part}: (holds nothing|cannot be op)"):
+        find_stored_jobs(store, load_pipeline(cheap_job.PIPELINE), "export", tmp_path)
 
 
 def test_a_store_that_does_not_answer_is_a_sentence(
@@ -169,13 +179,3 @@ def test_a_store_that_does_not_answer_is_a_sentence(
         with pytest.raises(FailedWork, match=r"memory://day/.*does not answer.*endpoint") as told:
             ask()
         assert "much more" not in str(told.value)
-
-
-def test_an_unknown_store_is_bad_input(tmp_path: Path) -> None:
-    with pytest.raises(BadInput, match="cannot be opened"):
-        find_stored_jobs(
-            replace(STORE, scans="nowhere://x"),
-            load_pipeline(cheap_job.PIPELINE),
-            "export",
-            tmp_path,
-        )
