@@ -48,14 +48,14 @@ def draw_pictures(body: BodyCloud | BodyMesh) -> Pictures:
 
 
 def write_pictures(pictures: Iterable[Pictures], folder: Path) -> Outcome[list[Path]]:
-    """Write a scan's pictures beside its result. One that cannot be drawn or written is noted."""
+    """Write a scan's pictures beside its result. One that could not be drawn is noted; OSError if
+    one cannot be written: a full disk must not decide which files a result has."""
     written, notes = list[Path](), list[str]()
     for some in pictures:
         notes += some.notes
         for name, content in some.value.items():
-            with optional(name, notes.append):
-                write_bytes(folder / name, content)
-                written.append(folder / name)
+            write_bytes(folder / name, content)
+            written.append(folder / name)
     return Outcome(written, tuple(notes))
 
 

@@ -133,6 +133,10 @@ def test_a_picture_that_cannot_be_drawn_costs_itself_alone(
     (note,) = drawn.notes
     assert note.startswith("mesh.png: left out")
     assert before == load_scan(scan.folder).facts["sha256"]
+    full = Mock(side_effect=OSError("No space left on device"))
+    monkeypatch.setattr(pictures, "write_bytes", full)
+    with pytest.raises(OSError, match="No space"):  # the same command makes all once there is room
+        pictures.write_pictures(every, scan.folder)
 
 
 def test_a_verdict_that_misses_a_check_is_not_good(
