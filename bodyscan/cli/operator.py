@@ -228,7 +228,8 @@ def measure(
         written.append(landmarks)
     for one in (file for file in written if file.suffix != ".json"):
         # As beside an export, so that `bodyscan forget` knows whose it is.
-        write_json(one.with_name(f"{one.name}.json"), {"subject": content["subject"]})
+        whose = {key: content[key] for key in ("subject", "compared_with") if key in content}
+        write_json(one.with_name(f"{one.name}.json"), whose)
     output.show(*tables(measured, changes))
     _show_grade(output, stored)
     output.figures(**content)
@@ -325,7 +326,8 @@ def _compare(
         return None
     one, other = (scan.facts.get("calibration_id") for scan in (earlier, later))
     found = find_changes(measure_by_name(earlier.mesh), measured.named)
-    return MeasureChanges(earlier.facts.get("when"), one == other, found)
+    about = earlier.facts.get("subject"), earlier.facts.get("when")
+    return MeasureChanges(*about, one == other, found)
 
 
 def _show_grade(output: Output, scan: StoredScan) -> None:

@@ -30,7 +30,9 @@ class Change:
 class MeasureChanges:
     """Changes since an earlier scan."""
 
-    when: str | None  # of the earlier scan
+    # Of the earlier scan.
+    subject: str | None
+    when: str | None
     # With another one its scale may be another, which no interval holds.
     same_calibration: bool
     measures: tuple[Change, ...]

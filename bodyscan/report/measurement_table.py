@@ -289,7 +289,7 @@ def make_measurements_document(
 def _describe_changes(changes: MeasureChanges) -> dict[str, Any]:
     earlier = {"when": changes.when, "same_calibration": changes.same_calibration}
     described = [asdict(one) | {"is_certain": one.is_certain} for one in changes.measures]
-    return {"since": earlier, "changes": described}
+    return {"compared_with": changes.subject, "since": earlier, "changes": described}
 
 
 def format_measurements_csv(

@@ -13,6 +13,7 @@ from standing_body import hanging, standing_body, trunk_tape
 
 from bodyscan.errors import BadInput
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.measurement.changes import MeasureChanges
 from bodyscan.measurement.measurements import Slice, measure, parse_heights
 from bodyscan.mesh.body import DARK_CLOTH, HAIR, SKIN, BodyMesh, BreathAt
 from bodyscan.report.measurement_table import make_measurements_document, tables
@@ -120,6 +121,8 @@ def test_table_and_document_say_the_same(subject: BodyMesh) -> None:
     assert said["slices"][0]["girths"][-1]["tape_mm"] == tape_mm(found.slices[0], "trunk")
     assert [table.row_count for table in tables(found)] == [4, 3]
     assert tape_mm(found.slices[0], "trunk") in [one["tape_mm"] for one in found.to_records()]
+    since = MeasureChanges("s2", None, True, ())  # by whose name `forget` finds it too
+    assert make_measurements_document(found, {}, since)["compared_with"] == "s2"
 
 
 def test_of_a_body_seen_from_the_knees_up_the_slices_there_are_are_given(subject: BodyMesh) -> None:
