@@ -85,6 +85,13 @@ class AlignmentSettings(Model):
     correlated: float = Field(default=5.0, ge=1)
     """number of neighbouring matches that count as one, because their errors are correlated."""
 
+    def spaced_for(self, pairs: int) -> AlignmentSettings:
+        """For over 16 pairs, whose overlaps grow with their square: matches farther apart, so that each
+        pair has as many, of which fewer count as one."""
+        more = max(1.0, pairs / 16.0)
+        spacing, correlated = self.spacing_mm * more**0.5, max(1.0, self.correlated / more)
+        return self.model_copy(update={"spacing_mm": spacing, "correlated": correlated})
+
 
 class FusionSettings(Model):
     """How range images become one cloud (`fusion.merging`)."""
