@@ -40,9 +40,9 @@ def translate_failure(error: Exception) -> BodyscanError | None:
         missing = re.search(r"\blib[\w.+-]+\.so[\w.]*(?=: cannot open shared object)", text)
         if missing:
             return FailedWork(
-                f"the system library {missing[0]} is missing, which Open3D needs",
-                remedy="on Debian or Ubuntu: apt-get install libegl1 libgl1 libusb-1.0-0 libgomp1 "
-                "libx11-6",
+                f"the system library {missing[0]} is missing, which Open3D or pycolmap needs",
+                remedy="on Debian or Ubuntu: apt-get install libegl1 libgl1 libgomp1 libidn2-0 "
+                "libusb-1.0-0 libx11-6",
             )
     if isinstance(error, ModuleNotFoundError) and not (error.name or "bodyscan").startswith(
         "bodyscan"
@@ -69,8 +69,7 @@ def require_suffix(path: Path, suffixes: Iterable[str], what: str) -> None:
 
 
 def require_writable(folder: Path, *inputs: Path | None) -> None:
-    """Raise BadInput or FailedWork if nothing can, or may, be written into `folder`, which need not
-    exist.
+    """Raise BadInput or FailedWork if nothing can, or may, be written into `folder`, there or not.
 
     inputs: folders of images and calibrations that the work reads (of a file, its folder): `folder`
         is none of them, lies in none and holds none. None is no input.
