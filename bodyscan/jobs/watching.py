@@ -263,8 +263,7 @@ def watch(
 
 @dataclass
 class _Watching:
-    """scans: not ended yet. prepared: their pairs that were sent. running: their jobs. shown: of their
-    images."""
+    """scans: not ended yet. prepared: pairs that were sent. running: jobs. shown: of their images."""
 
     watched: Watched
     process: ResidentProcess

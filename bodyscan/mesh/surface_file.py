@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from pathlib import Path
 
 import numpy as np
@@ -52,8 +53,13 @@ def read_surface(
         if path.suffix.lower() == ".ply" and cause:  # or its faces have various numbers of corners
             from open3d import io, utility
 
-            with utility.VerbosityContextManager(utility.VerbosityLevel.Error):
-                polygons = io.read_triangle_mesh(str(path))
+            errors = os.dup(2)
+            with open(os.devnull, "w") as nowhere:
+                os.dup2(nowhere.fileno(), 2)  # RPly in it writes there, whatever the verbosity
+                with utility.VerbosityContextManager(utility.VerbosityLevel.Error):
+                    polygons = io.read_triangle_mesh(str(path))
+            os.dup2(errors, 2)
+            os.close(errors)
             vertices, faces = np.array(polygons.vertices), np.array(polygons.triangles, int)
     fault = find_fault(vertices, faces) if faces.size else f"no surface can be read here{cause}"
     if fault:

@@ -56,8 +56,7 @@ def select_solving_views(rig: Rig, views: Sequence[BoardView]) -> list[BoardView
 def find_rig_size(rig: Rig, solution: RigSolution, views: Sequence[BoardView]) -> Outcome[Size]:
     """The rig's size by all references together, with a note on each.
 
-    Raises FailedWork for a size that no printer's error explains, or references that contradict
-    each other.
+    Raises FailedWork for a size that no printer's error explains, or contradictory references.
     """
     found: dict[str, Size] = {}
     notes: list[str] = []

@@ -252,8 +252,7 @@ def decode_index(lit: Greys, numbers: Greys, direction: str, stripes: int) -> St
     """Compute the stripe map of a stripe-index image; lit: (H, W), numbers: (1, H, W).
 
     Boundaries lie somewhere between two pixels. Along a line of them s is interpolated; pixels
-    between no two boundaries get their stripe's middle. Raises DecodingFailed for stripes in
-    disorder.
+    between no two boundaries get their stripe's middle. Raises DecodingFailed for disorder.
     """
     black = np.zeros_like(lit)
     images = ScanLines.from_images(lit, black, numbers, None, direction)

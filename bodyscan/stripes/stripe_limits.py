@@ -20,8 +20,7 @@ class StripeLimits:
 
     near, far: (rows, columns) float32 at the corners of blocks of `block_px` x `block_px` camera
         pixels, linear between; s if it grows with depth and -s if it falls (`rising`), so that what
-        lies deeper than wanted is beyond `far` either way. Where far is below near, nothing is
-        wanted.
+        lies deeper than wanted is beyond `far` either way. Nothing is wanted where far is below near.
     standing: likewise, where the volume's lowest layer begins. What lies in that layer, such as the
         floor, is wanted within `around_px` of something that stands higher; all of it if next to
         nothing does: a plate may lie there.

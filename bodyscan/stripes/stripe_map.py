@@ -101,8 +101,7 @@ def assemble_from_pixels(
     """Make the map from s and its standard deviation (L, P) at each pixel, NaN where there is none.
 
     variance: (256,) of each grey level.
-    codes: (L, P) stripes; if given, s interpolated between boundaries is used where its sigma is
-        less.
+    codes: (L, P) stripes; if given, s between boundaries is used where its sigma is less.
 
     Shifts by edges of the surface's brightness are corrected first (see `albedo_edges`).
     """

@@ -463,8 +463,7 @@ def refine_rig(
     captures: a scan of an object that stood still.
     name: what the calibration's notes call it.
 
-    Raises FailedWork if the overlaps do not come closer or the object moved, ScanFailed if nothing
-    was scanned.
+    Raises FailedWork if overlaps come no closer or the object moved, ScanFailed without an object.
     """
     measured = reconstruct_range_images(calibration, captures, progress)
     with step(progress, "aligning"):

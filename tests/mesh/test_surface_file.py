@@ -65,7 +65,7 @@ def test_what_can_mean_one_thing_is_mended_and_said(
     assert all(note.startswith(str(path)) for note in read.notes)
 
 
-def test_what_is_no_mesh_is_refused_by_vertex_or_face(tmp_path: Path) -> None:
+def test_what_is_no_mesh_is_refused(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     unknown, wrong = VERTICES.copy(), FACES.copy()
     unknown[7, 1], wrong[5, 2] = np.nan, 99_999
     with pytest.raises(BadInput, match="vertex 7 "):
@@ -74,7 +74,7 @@ def test_what_is_no_mesh_is_refused_by_vertex_or_face(tmp_path: Path) -> None:
         read_surface(write(tmp_path, VERTICES, wrong))
     damaged = {
         "quad.obj": "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 99999999\n",
-        "cloud.ply": "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n",
+        "cloud.ply": "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\nx\n",
         "body.glb": "glTF" + 100 * "x",
         "body.fbx": "",
     }
@@ -82,6 +82,7 @@ def test_what_is_no_mesh_is_refused_by_vertex_or_face(tmp_path: Path) -> None:
         (tmp_path / name).write_text(text)
         with pytest.raises(BadInput, match="no surface can be read"):
             read_surface(tmp_path / name)
+        assert not capfd.readouterr().err
 
 
 @pytest.mark.parametrize("suffix", ["obj", "stl", "glb", "off", "ply"])

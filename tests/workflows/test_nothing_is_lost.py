@@ -133,8 +133,7 @@ def test_a_picture_that_cannot_be_drawn_costs_itself_alone(
     (note,) = drawn.notes
     assert note.startswith("mesh.png: left out")
     assert before == load_scan(scan.folder).facts["sha256"]
-    full = Mock(side_effect=OSError("No space left on device"))
-    monkeypatch.setattr(pictures, "write_bytes", full)
+    monkeypatch.setattr(pictures, "write_bytes", Mock(side_effect=OSError("No space left")))
     with pytest.raises(OSError, match="No space"):  # the same command makes all once there is room
         pictures.write_pictures(every, scan.folder)
 

@@ -38,8 +38,7 @@ def write_colmap(cameras: RigCameras, folder: Path) -> Path:
     """Write COLMAP's text model: one rig whose sensors are the cameras, and one frame with one
     empty image per pair, which gives their poses: COLMAP's world is the rig frame, mm.
 
-    `bodyscan.json` beside it holds what COLMAP has no place for: each camera's gamma. Returns
-    `folder`.
+    `bodyscan.json` beside it holds what COLMAP does not: each camera's gamma. Returns `folder`.
     """
     model = _build_model(cameras)
     folder = Path(folder)
