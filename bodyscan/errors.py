@@ -26,7 +26,7 @@ class BodyscanError(Exception):
     def __init__(self, what: str, *, where: str = "", remedy: str = "") -> None:
         # Both may quote a damaged file.
         what = re.sub(r"(\S{200})\S{100,}", r"\1...", escape_control(what))
-        where = escape_control(where)
+        where = re.sub(r"(?s)^(.{200}).{100,}(.{200})$", r"\1...\2", escape_control(where))
         super().__init__(what, where, remedy)
         self.what, self.where, self.remedy = what, where, remedy
 

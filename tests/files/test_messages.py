@@ -41,6 +41,7 @@ def test_an_os_error_is_translated(number: int, kind: type[BodyscanError], what:
     assert what in error.what
     assert error.remedy
     assert str(BadInput(f"'{'9' * 5000}' \x1b[31m")) == f"'{'9' * 199}... \\x1b[31m"
+    assert str(BadInput("is long", where="a/" * 2000)) == f"{'a/' * 100}...{'a/' * 100}: is long"
 
 
 def test_a_folder_need_not_exist_to_be_writable(tmp_path: Path) -> None:

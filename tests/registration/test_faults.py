@@ -78,8 +78,7 @@ def test_shuffled_corners(seen: Seen) -> None:
 def test_a_board_that_slipped_between_exposures_or_another_one(
     seen: Seen, slip_mm: float, size: float
 ) -> None:
-    views, truth, clean = seen
-    shot, pairs = busiest(views)
+    (views, truth, clean), (shot, pairs) = seen, busiest(seen[0])
     faulty = pairs[-2:] if slip_mm else pairs
     slip = RigidTransform.from_rotation_vector([0.0, 0.0, 0.002], [0.0, slip_mm, -slip_mm])
     there, rng = slip @ truth[shot, CHARUCO.name], np.random.default_rng(2)
