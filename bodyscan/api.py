@@ -171,7 +171,7 @@ def put_image(
     scan: name of the scan's folder, which becomes the job's name.
     image: (height, width) uint8 or uint16.
 
-    Raises BadInput for a pair that the rig does not have.
+    Raises BadInput for a pair or a frame that the rig does not have.
     """
     from bodyscan.jobs.watching import put_image as put
 

@@ -1,9 +1,8 @@
 """Scans fused while they arrive: an inbox is polled, and one resident process does the work.
 
-An inbox has one folder per scan, whose images are still being written. An image is whole if it ends
-as its format does, or has not changed for a while; a pair is whole if all its images are; a scan is
-complete if all pairs are whole, or `done` is in its folder, or nothing has arrived for long.
-docs/station.md is the protocol.
+An inbox has one folder per scan. An image is whole if it ends as its format does, or has not changed
+for a while; a pair if all its images are; a scan is complete if all pairs are whole, or `done` is in
+its folder, or nothing has arrived for long. docs/station.md is the protocol.
 
 The jobs are those of a batch, with the same folders, stages, states and manifests, so that a batch
 or `verify` accepts them as its own, and nothing is done twice.
@@ -165,11 +164,14 @@ def put_image(
 
     image: (height, width) uint8 or uint16. The file appears complete or not at all.
 
-    Raises BadInput for a pair, or a template of `files`, that yields no image name.
+    Raises BadInput for a pair, a frame, or a template of `files`, that yields no image name.
     """
     paths = [one for one in (scan, shot, frame) if Path(one).name != one or one[:1] in (".", "")]
-    if paths or pair not in {one.name for one in rig.pairs}:
+    known = {one.name: rig.frames.sequence_names(one.projector) for one in rig.pairs}
+    if paths or frame not in (*known.get(pair, ()), pair in known and rig.frames.dark):
         why = f"{paths[0]!r} is no name" if paths else f"rig {rig.name} has no pair {pair}"
+        if pair in known and not paths:
+            why = f"pair {pair} has no frame {frame}: its frames are {', '.join(known[pair])}"
         raise BadInput(why, where=f"scan {scan}, frame {frame}")
     name = fill(rig.files, shot=shot, pair=pair, frame=frame)
     lossless = (".png", ".tif", ".tiff", ".bmp", ".pgm")

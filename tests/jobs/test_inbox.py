@@ -6,6 +6,7 @@ import json
 import sys
 import time
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -72,8 +73,9 @@ def test_pairs_are_whole_one_by_one_and_then_the_scan(rig: Rig, tmp_path: Path) 
     assert (found.whole, found.complete) == (("a",), False)
     for frame in frames(rig):
         put_image(tmp_path, rig, "anna", "b", frame, IMAGE)
-    with pytest.raises(BadInput, match=r"'\.\./x' is no name"):  # it would lie outside the inbox
-        put_image(tmp_path, rig, "../x", "a", frame, IMAGE)
+    for job, name, why in (("../x", frame, r"'\.\./x' is no"), ("anna", "bit99", "lit, dark, bit")):
+        with pytest.raises(BadInput, match=why):  # it would lie outside the inbox, or unread in it
+            put_image(tmp_path, rig, job, "a", name, IMAGE)
     found = scan.look(0.1, QUIET_S)
     assert (found.whole, found.complete) == (("a", "b"), True)
 
@@ -110,18 +112,16 @@ def test_a_scan_with_images_missing_is_taken_when_marked_or_quiet(rig: Rig, tmp_
 
 def test_a_retake_waits_until_every_image_is_new(rig: Rig, tmp_path: Path) -> None:
     """Half of each would be two persons in one."""
-    for pair in ("a", "b"):
-        for frame in frames(rig):
-            put_image(tmp_path, rig, "anna", pair, frame, IMAGE)
+    for pair, frame in product(("a", "b"), frames(rig)):
+        put_image(tmp_path, rig, "anna", pair, frame, IMAGE)
     state = tmp_path / "out" / "anna" / "state.json"
     write_json(state, {"state": "set aside", "job": "anna"})
     assert find_retake_time(tmp_path / "anna", state) == 0
     assert find_earlier(tmp_path / "anna", state) is None, "perhaps the disk was full: try again"
     time.sleep(0.02)
     *first, last = frames(rig)
-    for pair, some in {"a": frames(rig), "b": first}.items():
-        for frame in some:
-            put_image(tmp_path, rig, "anna", pair, frame, IMAGE)
+    for pair, frame in [*product("a", frames(rig)), *product("b", first)]:
+        put_image(tmp_path, rig, "anna", pair, frame, IMAGE)
     since = find_retake_time(tmp_path / "anna", state)
     assert since > 0
     assert find_earlier(tmp_path / "anna", state) is None
