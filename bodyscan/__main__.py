@@ -8,6 +8,9 @@ import sys
 
 def start() -> None:
     """Run the command; see `bodyscan.cli.main`."""
+    for name in ("stdin", "stdout", "stderr"):
+        if getattr(sys, name) is None:  # closed by who started us: a file would take its place
+            setattr(sys, name, open(os.devnull, "r+"))  # noqa: SIM115
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # our errors say what is wrong with a file
     try:
         from bodyscan.cli.main import main

@@ -6,6 +6,7 @@ import os
 import pty
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -20,21 +21,14 @@ def on_a_terminal(*arguments: str, **environment: str) -> str:
     """What a command writes to a terminal."""
     ours, theirs = pty.openpty()
     settings = {k: v for k, v in os.environ.items() if k not in ("NO_COLOR", "FORCE_COLOR")}
-    subprocess.run(
-        [sys.executable, "-m", "bodyscan", *arguments],
-        stdout=theirs,
-        stderr=theirs,
-        check=False,
-        env=settings | {"TERM": "xterm"} | environment,
-        timeout=120,
-    )
+    settings |= {"TERM": "xterm"} | environment
+    command = [sys.executable, "-m", "bodyscan", *arguments]
+    subprocess.run(command, stdout=theirs, stderr=theirs, env=settings, timeout=120, check=False)
     os.close(theirs)
     said = b""
-    try:
+    with suppress(OSError):  # Linux says so where a terminal has been closed
         while part := os.read(ours, 65536):
             said += part
-    except OSError:  # Linux says so where a terminal has been closed
-        pass
     os.close(ours)
     return said.decode()
 
@@ -43,6 +37,11 @@ def test_no_color_is_obeyed(tmp_path: Path) -> None:
     command = ("check", str(tmp_path / "missing.yaml"))
     assert "\x1b[31m" in on_a_terminal(*command)
     assert "\x1b[31m" not in on_a_terminal(*command, NO_COLOR="1")
+
+
+def test_closed_streams_are_no_error(tmp_path: Path) -> None:
+    command = f"exec {sys.executable} -m bodyscan init '{tmp_path}/new' <&- >&- 2>&-"
+    assert subprocess.run(["sh", "-c", command], check=False, timeout=120).returncode == 0
 
 
 @pytest.mark.parametrize(("width", "whole"), [(100, True), (40, False)])
