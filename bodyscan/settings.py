@@ -47,8 +47,7 @@ class AlignmentSettings(Model):
 
     matching: Literal["projected", "open3d", "none"] = "projected"
     """`projected`: project points into the other camera's pixels, all pairs in one solve; `open3d`:
-    Open3D's ICP of every two pairs and its pose graph; `none`: leave each pair where the boards put
-    it."""
+    Open3D's ICP of every two pairs and its pose graph; `none`: leave pairs where boards put them."""
 
     spacing_mm: Millimetres = 3.0
     """mm between the matched points: about 10,000 a pair; more cost time and gain nothing."""

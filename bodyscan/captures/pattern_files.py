@@ -9,7 +9,7 @@ import numpy as np
 
 from bodyscan.arrays import Bytes
 from bodyscan.errors import BadInput
-from bodyscan.files.atomic import write_bytes, write_json
+from bodyscan.files.atomic import hold_folder, write_bytes, write_json
 from bodyscan.rig.frame_names import FrameNames
 from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig import Rig
@@ -91,8 +91,9 @@ def _write_kind(
     """Write a kind's images, and patterns.json with the best order to show them."""
     height, width = coded.shape[1:]
     images = name_patterns(frames, kind, coded)
-    for name, image in images.items():
-        write_bytes(folder / f"{name}.png", cv2.imencode(".png", image)[1].tobytes())
+    with hold_folder(folder):
+        for name, image in images.items():
+            write_bytes(folder / f"{name}.png", cv2.imencode(".png", image)[1].tobytes())
     content = {
         "version": 1,
         "code": {"code": kind.code, **kind.model_dump(mode="json", exclude_defaults=True)},

@@ -67,8 +67,7 @@ class Brightness:
 class BoundaryBrightness:
     """The surface's brightness where N boundaries pass between two pixels of a line, (N,) each.
 
-    before, after: lit minus dark of the two pixels, brought together where noise may explain their
-        difference.
+    before, after: lit minus dark of the two pixels, brought together as far as noise explains.
     along, across: grad(ln a), 1/px, along the line and from line to line; sigma: of `along`.
     """
 

@@ -132,8 +132,7 @@ def join_runs(
     line: Indices, before: Indices, position: Array, index: Indices, usable: Mask
 ) -> Mask:
     """Find whether each boundary's stripe ends at the next boundary, (N - 1,), with all pixels
-    between usable (L, P): else another surface that happens to show the next stripe may begin
-    there."""
+    between usable (L, P): else another surface that shows the next stripe may begin there."""
     unusable = np.cumsum(~usable.ravel(), dtype=np.int32)[line * usable.shape[1] + before]
     joined = (np.diff(line) == 0) & (np.abs(np.diff(index)) == 1) & (np.diff(unusable) == 0)
     return np.asarray(joined & (np.diff(position) > MIN_STRIPE_PX))

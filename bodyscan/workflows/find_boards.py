@@ -252,8 +252,7 @@ def calibrate_cameras(
     """Calibrate every pair's camera by itself; those that fail are in `failures`.
 
     What is `known` of a camera is read from files relative to `folder`, and held fixed or used as a
-    start. The lens is the one that the rig file names; otherwise the richest, since the joint solve
-    chooses.
+    start. The lens is the one that the rig file names; otherwise the richest: the solve chooses.
     """
 
     def calibrate(name: str) -> CameraCalibration:

@@ -21,6 +21,7 @@ def patterns(rig: str, folder: Path, *arguments: str) -> Result:
 
 
 def test_projectors_of_one_kind_share_one_folder(tmp_path: Path) -> None:
+    write(tmp_path / "out" / "gray-12-horizontal" / f".lit.{6 * '0a'}.tmp.png", "half an image")
     done = patterns(RIG, tmp_path, "--width", "30", "--height", "24")
     assert done.exit_code == 0, done.output
     assert "cannot be equally wide" not in done.output
