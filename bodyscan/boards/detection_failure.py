@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,42 +23,47 @@ MIN_MARKERS = 4
 """Fewer may be chance: quadrilaterals that happen to read as a marker."""
 
 
-def describe_unfound(image: Bytes, board: Board, *, quick: bool = False) -> str:
+class Unfound(NamedTuple):
+    """What an image shows instead of a board, and whether that is why none shows it as described."""
+
+    text: str
+    is_cause: bool = False
+
+
+def describe_unfound(image: Bytes, board: Board, *, quick: bool = False) -> Unfound:
     """Describe what the image (H, W) shows instead of the board; continues a sentence that names it.
 
     quick: in a tenth of a second; "" for a board with markers.
     """
     if board.kind == "checkerboard":
-        return (
-            f"not whole, {_describe_lattice(image, board)}"
-            if quick
-            else _describe_grids(image, board)
-        )
+        cut = f"not whole, {_describe_lattice(image, board)}" if quick else ""
+        return Unfound(cut or _describe_grids(image, board))
     if quick:
-        return ""
+        return Unfound("")
     markers, appearance = detect_any(image, board)
     count = f"{len(markers.ids)} markers of {board.dictionary}"
     if len(markers.ids) < MIN_MARKERS:
-        return count + _describe_other_dictionary(image, board)
+        return Unfound(count + _describe_other_dictionary(image, board))
     if appearance.inverted:
         count += ", white on black"
     if appearance.mirrored:
         count += ", mirrored"
     first = estimate_first_marker(board, markers)
     if first != board.first_marker:
-        return f"{count}, which lie as on this board with first_marker {first}"
+        return Unfound(f"{count}, which lie as on this board with first_marker {first}", True)
     if _count_agreeing(board, markers):
-        return f"{count}, with too few sharp corners next to them"
+        return Unfound(f"{count}, with too few sharp corners next to them")
     better = max(_fit_other_sizes(board, markers), default=None)
     if better is None:
-        return (
+        return Unfound(
             f"{count}, which do not lie as on {board.columns} columns x {board.rows} rows. Possible "
             "causes: `columns` and `rows`, or `marker_mm` against `square_mm`, are not the print's"
         )
     agreeing, negative_rows, columns = better
-    return (
+    return Unfound(
         f"{count}; {agreeing} of them lie as on a board of {columns} columns x {-negative_rows} rows, "
-        f"not {board.columns} x {board.rows}"
+        f"not {board.columns} x {board.rows}",
+        True,
     )
 
 

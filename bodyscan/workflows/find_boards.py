@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -13,7 +12,12 @@ import numpy as np
 from bodyscan.arrays import Array
 from bodyscan.boards.board_layout import compute_corner_grid, compute_corner_points
 from bodyscan.boards.detection import find_boards
-from bodyscan.boards.detection_failure import describe_unfound, detect_any, estimate_first_marker
+from bodyscan.boards.detection_failure import (
+    Unfound,
+    describe_unfound,
+    detect_any,
+    estimate_first_marker,
+)
 from bodyscan.boards.view import BoardView, ViewKey, number_corners
 from bodyscan.calibration.board_views import (
     LocatedView,
@@ -32,7 +36,14 @@ from bodyscan.calibration.known_pair import read_known_camera
 from bodyscan.calibration.lens_selection import calibrate_widest
 from bodyscan.captures.folder import Captures, ImageSequence
 from bodyscan.captures.images import measure_mosaic, read_board_image, read_sequence
-from bodyscan.errors import BadInput, BodyscanError, DegeneratePoses, FailedWork, format_list
+from bodyscan.errors import (
+    BadInput,
+    BodyscanError,
+    DegeneratePoses,
+    FailedWork,
+    format_list,
+    group_reasons,
+)
 from bodyscan.files.corners_vnl import Corners, write_corners
 from bodyscan.geometry.lenses import FAMILY, LENSES
 from bodyscan.geometry.robust import compute_rms_length
@@ -61,9 +72,11 @@ class FoundBoards(Outcome[list[BoardView]]):
     """The boards found.
 
     refused: images in which no board could be looked for, each with the error.
+    unfound: what images without a board show, of those that were looked at closely.
     """
 
     refused: Mapping[ImageSequence, BodyscanError] = field(default_factory=dict)
+    unfound: Mapping[ImageSequence, Unfound] = field(default_factory=dict)
 
     def count_searched(self, captures: Captures) -> int:
         """Count the images in which boards were looked for."""
@@ -97,12 +110,9 @@ def find_all_boards(
         refuse_other_pitch(board, views)
         _refuse_other_markers(rig, captures, board, views)
     without = [s for s, each in found.items() if not each and s.board_path not in captures.corners]
-    described = _look_closer(rig, views, without) if explain else {}
-    missing = [
-        f"{s.board_path} (pair {s.pair}, shot {s.shot}): no board found"
-        + (f": {described[s]}" if s in described else "")
-        for s in without
-    ]
+    unfound = _look_closer(rig, views, without) if explain else {}
+    by_pair = {s.pair: [one for one in without if one.pair == s.pair] for s in without}
+    missing = [_note_without(images, list(found), unfound) for images in by_pair.values()]
     raw = [
         f"{pair}: neighbouring pixels differ by {differ:.0%} in squares of 2 x 2, as in a raw Bayer "
         "image, which is not grey: demosaic the images first"
@@ -110,7 +120,27 @@ def find_all_boards(
         if differ > 0.05  # of grey images 0.01 at most
     ]
     notes = (*map(str, refused.values()), *missing, *raw, *note_appearance(rig, views))
-    return FoundBoards(views, notes, refused=refused)
+    return FoundBoards(views, notes, refused=refused, unfound=unfound)
+
+
+def _note_without(
+    images: Sequence[ImageSequence],
+    searched: Sequence[ImageSequence],
+    unfound: Mapping[ImageSequence, Unfound],
+) -> str:
+    """One line for the images of one pair without a board, with what those that were looked at show."""
+    groups = group_reasons((one, unfound[one].text) for one in images if one in unfound)
+    if len(images) == 1:
+        return "".join([_format_without(images[0]), *(f": {text}" for _, text in groups)])
+    pair, names = images[0].pair, [one.shot for one in images]
+    shots = ", ".join(names if len(names) <= 6 else [*names[:5], "..."])
+    taken = sum(one.pair == pair for one in searched)
+    shown = "".join(f"; shot {some[0].shot}: {text}" for some, text in groups)
+    return f"{pair}: no board found in {len(images)} of {taken} images, shots {shots}{shown}"
+
+
+def _format_without(image: ImageSequence) -> str:
+    return f"{image.board_path} (pair {image.pair}, shot {image.shot}): no board found"
 
 
 def _refuse_other_markers(
@@ -171,10 +201,8 @@ def choose_frame(rig: Rig, captures: Captures) -> Outcome[Rig]:
 
 
 def _read_given_view(rig: Rig, captures: Captures, sequence: ImageSequence) -> list[BoardView]:
-    """The board whose corners were found elsewhere, [] if none were.
-
-    Raises BadInput when the rig has several boards, because corners alone do not identify the board.
-    """
+    """The board whose corners were found elsewhere, [] if none were. Raises BadInput when the rig has
+    several boards, because corners alone do not identify the board."""
     if len(rig.boards) != 1:
         raise BadInput(
             f"corners are given, but the rig has {len(rig.boards)} boards",
@@ -218,7 +246,7 @@ def write_found_corners(
 
 def _look_closer(
     rig: Rig, views: Sequence[BoardView], without: Sequence[ImageSequence]
-) -> dict[ImageSequence, str]:
+) -> dict[ImageSequence, Unfound]:
     """What images without a board do show: closely for pairs that saw few boards or missed few, at a
     glance for those that saw most."""
     chosen: list[tuple[ImageSequence, bool]] = []
@@ -230,20 +258,21 @@ def _look_closer(
         elif found > len(images):
             chosen += [(one, True) for one in images]
 
-    def look(one: tuple[ImageSequence, bool]) -> str:
+    def look(one: tuple[ImageSequence, bool]) -> Unfound:
         sequence, quick = one
         pair = rig.pair(sequence.pair)
         if pair.projector and sequence.has_stripes and not sequence.missing:
             images = read_sequence(sequence.without_crossing, pair.camera)
             step = describe_step(pair.projector, images.lit, images.dark, images.coded)
             if step:
-                return step
+                return Unfound(step, is_cause=True)
         image = read_board_image(sequence, pair)
-        texts = [(board.name, describe_unfound(image, board, quick=quick)) for board in rig.boards]
-        return "; ".join(f"{name}: {text}" for name, text in texts if text)
+        each = {one.name: describe_unfound(image, one, quick=quick) for one in rig.boards}
+        text = "; ".join(f"{name}: {one.text}" for name, one in each.items() if one.text)
+        return Unfound(text, any(one.is_cause for one in each.values()))
 
-    texts = map_threads(look, chosen)
-    return {one: text for (one, _), text in zip(chosen, texts, strict=True) if text}
+    looks = map_threads(look, chosen)
+    return {one: look for (one, _), look in zip(chosen, looks, strict=True) if look.text}
 
 
 def calibrate_cameras(
@@ -335,15 +364,13 @@ def make_no_pair_error(rig: Rig, failed: Mapping[str, str], remedy: str = "") ->
 def _describe_boardless(rig: Rig, boards: FoundBoards, searched: int) -> str:
     """What images without the described board show instead: one image for each kind of finding,
     whatever the number of markers counted."""
-    examples: dict[str, str] = {}
-    for note in boards.notes:
-        if re.search("out of step by|(which|them) lie as on", note):
-            return note
-        _, found, what = note.partition("no board found:")
-        if found:
-            examples.setdefault(re.sub(r"\d+ (?=markers of|of)", "", what), note)
+    notes = {one: f"{_format_without(one)}: {look.text}" for one, look in boards.unfound.items()}
+    for one, look in boards.unfound.items():
+        if look.is_cause:
+            return notes[one]
+    groups = group_reasons((one, look.text) for one, look in boards.unfound.items())
     findings = describe_findings(rig, boards.value, searched)
-    return "\n  ".join([*filter(None, [findings]), *list(examples.values())[:3]])
+    return "\n  ".join([*filter(None, [findings]), *(notes[some[0]] for some, _ in groups[:3])])
 
 
 def locate_views(

@@ -61,7 +61,7 @@ def describe(
         return Markers(np.zeros(0, np.int64), np.zeros((0, 4, 2)))
 
     monkeypatch.setattr(detection_failure, "detect_markers", detect)
-    return describe_unfound(IMAGE, board)
+    return describe_unfound(IMAGE, board).text
 
 
 def test_three_markers_may_be_chance(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -93,7 +93,7 @@ def test_markers_where_they_should_be_lack_corners(monkeypatch: pytest.MonkeyPat
 @pytest.mark.parametrize(("columns", "rows"), [(8, 7), (10, 7), (9, 6), (9, 8), (8, 8), (10, 6)])
 def test_a_checkerboard_of_one_line_more_or_fewer_is_named(columns: int, rows: int) -> None:
     board = Board(name="b", kind="checkerboard", columns=9, rows=7, square_mm=30)
-    assert describe_unfound(checkered(columns, rows), board) == (
+    assert describe_unfound(checkered(columns, rows), board).text == (
         f"no grid of 8 x 6 inner corners, but one of {columns - 1} x {rows - 1}: {columns} columns x "
         f"{rows} rows of squares"
     )
@@ -101,8 +101,8 @@ def test_a_checkerboard_of_one_line_more_or_fewer_is_named(columns: int, rows: i
 
 def test_of_the_narrowest_checkerboard_that_was_not_found_it_is_said_what_shows() -> None:
     board = Board(name="b", kind="checkerboard", columns=4, rows=9, square_mm=30)
-    assert "but one of 4 x 8: 5 columns x 9 rows" in describe_unfound(checkered(5, 9), board)
-    nothing = describe_unfound(np.full((240, 320), 90, np.uint8), board)
+    assert "but one of 4 x 8: 5 columns x 9 rows" in describe_unfound(checkered(5, 9), board).text
+    nothing = describe_unfound(np.full((240, 320), 90, np.uint8), board).text
     assert nothing.endswith(
         "more or fewer in either direction, nor anything like a board's squares"
     )
@@ -110,11 +110,11 @@ def test_of_the_narrowest_checkerboard_that_was_not_found_it_is_said_what_shows(
 
 def test_at_a_glance_squares_that_are_not_whole_are_told_from_none() -> None:
     board = Board(name="b", kind="checkerboard", columns=9, rows=7, square_mm=30)
-    cut = describe_unfound(checkered(9, 7)[:, 70:], board, quick=True)
+    cut = describe_unfound(checkered(9, 7)[:, 70:], board, quick=True).text
     assert cut.startswith("not whole, but squares like a board's")
-    empty = describe_unfound(np.full((240, 320), 90, np.uint8), board, quick=True)
+    empty = describe_unfound(np.full((240, 320), 90, np.uint8), board, quick=True).text
     assert empty == "not whole, nor anything like a board's squares"
-    assert describe_unfound(IMAGE, BOARD, quick=True) == ""
+    assert describe_unfound(IMAGE, BOARD, quick=True).text == ""
 
 
 def printed() -> Array:

@@ -96,7 +96,7 @@ def test_other_columns_and_another_dictionary_are_named(picture: Bytes) -> None:
     ):
         described = MARKED.model_copy(update=wrong)
         assert found(picture, described) == []
-        assert named in describe_unfound(picture, described)
+        assert named in describe_unfound(picture, described).text
 
 
 def tag_picture(*, border_bits: int, turns: int, from_below: bool) -> tuple[Bytes, Array]:

@@ -15,6 +15,7 @@ from bodyscan.captures.folder import open_captures
 from bodyscan.errors import CaptureError, FailedWork, ScanFailed
 from bodyscan.rig.rig import load_rig
 from bodyscan.workflows.calibrate_rig import calibrate_rig
+from bodyscan.workflows.find_boards import find_all_boards
 
 RIG = """
 version: 1
@@ -68,6 +69,10 @@ def test_what_images_show_instead_of_a_board_is_said_once(tmp_path: Path) -> Non
     assert "found in none of 8 images" in said
     assert said.count("no board found") == 1
     assert "more poses" not in said
+    rig = load_rig(tmp_path / "rig.yaml")
+    notes = find_all_boards(rig, open_captures(rig, tmp_path / "rig.yaml")).notes
+    folded = ": no board found in 4 of 4 images, shots 0, 1, 2, 3"
+    assert [note.partition(";")[0] for note in notes] == ["L" + folded, "R" + folded]
 
 
 STORED = Path(__file__).parents[1] / "data" / "stored-0.1.0" / "calibration"
