@@ -36,11 +36,8 @@ def compiled(function: Function) -> Function:
 
 
 def _look_at_imports(kept: Any, function: Any) -> None:
-    """Make the cache depend on the files of called functions too.
-
-    Numba checks the date and size of the function's own file alone, and would keep using stale
-    versions of the functions it calls.
-    """
+    """Make the cache depend on the files of called functions too: Numba checks the function's own
+    alone, and would keep using stale versions of those that it calls."""
     source_file = function.__code__.co_filename
     called = {
         value.py_func.__code__.co_filename

@@ -110,9 +110,7 @@ class PairDrift:
 
 def estimate_drift(name: str, shifts: Array) -> PairDrift:
     """Estimate the drift of a pair or pole from its shifts (scans, 3) mm at the body's centre.
-
-    Hotelling's test with one variance for all axes, at 1e-4; a sigma of at least 0.05 mm.
-    """
+    Hotelling's test with one variance for all axes, at 1e-4; a sigma of at least 0.05 mm."""
     scans = len(shifts)
     x, y, z = (float(value) for value in shifts.mean(axis=0))
     if scans < MIN_SCANS:
@@ -134,10 +132,8 @@ def group_by_pole(names: Sequence[str], poles: Mapping[str, str]) -> dict[str, f
 
 
 def free_pairs(boards: PoseCovariance, pairs: Collection[str]) -> PoseCovariance:
-    """Let these pairs move together by 30 mm and 5 degrees (standard deviations).
-
-    A pole displaced farther shares no surface with the others.
-    """
+    """Let these pairs move together by 30 mm and 5 degrees (standard deviations). A pole displaced
+    farther shares no surface with the others."""
     return boards.add_motions(pairs, SwayPrior(30.0, 5.0, 1.0, 1.0).pair_covariance(), common=True)
 
 
@@ -267,9 +263,8 @@ def _maximize_likelihood(
 ) -> tuple[float, Array, float, float]:
     """Maximize the log likelihood of the motions over the sizes of sway, displacement and noise.
 
-    stepped: 1 for two pairs that share a displacement, (N, N).
-
-    Also returns the covariance (N, N) there, and the sizes of sway and noise, mm.
+    stepped: 1 for two pairs that share a displacement, (N, N). Also returns the covariance (N, N)
+        there, and the sizes of sway and noise, mm.
     """
     sway2, step2 = (sizes.ravel() for sizes in np.meshgrid(sways_mm**2, steps_mm**2))
     # A pole's pairs see one side, which breathes by some 2 mm, and arms: the non-rigid remainder

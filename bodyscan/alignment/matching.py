@@ -68,11 +68,9 @@ class Matches:
 def sample_points(
     image: RangeImage, spacing_mm: float, margins_px: Sequence[int] = (4,)
 ) -> tuple[SampledPoints, ...]:
-    """Sample every n-th row and column, `spacing_mm` apart on a surface that faces the camera.
-
-    Surfaces seen edge-on are left out. Returns one sample per margin width: the same points in the
-    same arrays, with other `inner` and `in_margin`.
-    """
+    """Sample every n-th row and column, `spacing_mm` apart on a surface that faces the camera. Surfaces
+    seen edge-on are left out. Returns one sample per margin width: the same points in the same arrays,
+    with other `inner` and `in_margin`."""
     valid = image.valid
     coarse = image.subsample(8)
     depth = image.points[coarse][..., 2][valid[coarse]]
@@ -139,9 +137,8 @@ def _match_projected(
     """Fill `matches`, target frame, and return their number.
 
     target_from_source: (3, 4).
-    source: points (N, 3), normals (N, 3), sigma_mm (N,), in_margin (N,).
-    target: points (H, W, 3), normals (H, W, 3), sigma_mm (H, W), inner (H, W), of the part of its
-        image that begins at `corner`.
+    source: points (N, 3), normals (N, 3), sigma_mm (N,), in_margin (N,). target: the same of the part
+        (H, W) of its image that begins at `corner`, with `inner` in place of the last.
     matches: the arrays of `Matches`, with room for N.
     """
     source_points, source_normals, source_sigma, in_margin = source

@@ -77,10 +77,8 @@ class _Edge:
     information: Array
 
     def sigmas(self, covariance: Array) -> float:
-        """Mahalanobis length of the motion for a covariance (6, 6), over the root of 6.
-
-        Where two share only a strip, ICP slides along it.
-        """
+        """Mahalanobis length of the motion for a covariance (6, 6), over the root of 6. Where two share
+        only a strip, ICP slides along it."""
         twist = RigidTransform.from_matrix(self.motion).twist
         return float(np.sqrt(twist @ solve_scaled(covariance, twist) / 6.0))
 
@@ -133,10 +131,8 @@ def _select_matches(
 
 
 def _solve_graph(edges: Mapping[tuple[int, int], _Edge], covariance: Array) -> Array:
-    """Twists (P, 6) of the pairs' nodes; covariance: their prior, (6P, 6P).
-
-    Node 0 is the rig, fixed; the pairs follow in their order.
-    """
+    """Twists (P, 6) of the pairs' nodes; covariance: their prior, (6P, 6P). Node 0 is the rig, fixed;
+    the pairs follow in their order."""
     graph = registration.PoseGraph()
     count = len(covariance) // 6
     graph.nodes.extend(registration.PoseGraphNode(np.eye(4)) for _ in range(count + 1))

@@ -100,11 +100,9 @@ def linearize(matches: Matches, correlated: float) -> LinearGaussianSystem:
 
 
 def weigh_by_cauchy(matches: Matches) -> Array:
-    """Weights (M,): 1 / (1 + (d / 2 sigma)^2) / sigma^2.
-
-    sigma^2 is the sum of a match's expected variance and the robust variance of all distances, at
-    least 0.01 mm: surfaces of two calibrations never agree better.
-    """
+    """Weights (M,): 1 / (1 + (d / 2 sigma)^2) / sigma^2. sigma^2 is the sum of a match's expected
+    variance and the robust variance of all distances, at least 0.01 mm: surfaces of two calibrations
+    never agree better."""
     scale_mm = estimate_robust_scale(matches.distances, 0.01)
     variance = matches.sigma_mm**2 + scale_mm * scale_mm
     return 1.0 / (variance + 0.25 * matches.distances**2)

@@ -155,11 +155,11 @@ class _Fit:
 
 
 def _estimate_common_light(fit: _Fit) -> tuple[Array, Array]:
-    """Estimate a Gaussian prior of g from all corners of a board: mean (2,), and information (N, 2)
-    in squared grey levels.
+    """Estimate a Gaussian prior of g from all corners of a board: mean (2,), and information (N, 2) in
+    squared grey levels.
 
-    Light falls off similarly at all of them, while in noise one corner hardly determines it, and a
-    wrong g displaces the corner. The prior's variance is the scatter of g less its noise.
+    In noise one corner hardly determines g, which displaces it; at all of them it is similar. The
+    prior's variance is the scatter of g less its noise.
     """
     slope = fit.state[:, 7:]
     mean = np.median(slope, axis=0)
@@ -205,10 +205,8 @@ def _fit(
 
 
 def _solve_linear(patches: _Patches, state: Array) -> Array:
-    """Solve for b, a and g (N, 4) with the edges fixed.
-
-    Around a state without contrast and with even light the image is linear in them.
-    """
+    """Solve for b, a and g (N, 4) with the edges fixed. Around a state without contrast and with even
+    light the image is linear in them."""
     even = np.column_stack([state[:, :5], np.tile([0.0, MIN_CONTRAST, 0.0, 0.0], (len(state), 1))])
     at = _form_equations(patches, even)
     # A slight damping leaves unchanged what a window without pixels does not determine.

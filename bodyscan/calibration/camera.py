@@ -70,10 +70,8 @@ def calibrate_camera(
 
 
 def _refuse_parallel(homographies: Sequence[Array], width: int, height: int) -> None:
-    """Raise DegeneratePoses if all boards have one orientation (pure translation, Zhang 1998).
-
-    Parallel planes share their vanishing line, which a rough camera turns into a plane normal.
-    """
+    """Raise DegeneratePoses if all boards have one orientation (pure translation, Zhang 1998). Parallel
+    planes share their vanishing line, which a rough camera turns into a plane normal."""
     rough = np.array([[1.2 * width, 0, width / 2], [0, 1.2 * width, height / 2], [0, 0, 1.0]])
     normals = np.stack([np.linalg.inv(h).T[:, 2] for h in homographies]) @ rough
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -208,10 +206,8 @@ def locate_boards(
 def _make_corner_block(
     state: _State, views: Sequence[PlanarView], *, camera_free: bool = True
 ) -> Block:
-    """Reprojection errors, px, one run for each view.
-
-    Derivatives are by the camera's parameters, which come first if free, and by the board's pose.
-    """
+    """Reprojection errors, px, one run for each view. Derivatives are by the camera's parameters, which
+    come first if free, and by the board's pose."""
     points = np.concatenate(
         [pose.apply(view.points) for pose, view in zip(state.poses, views, strict=True)]
     )

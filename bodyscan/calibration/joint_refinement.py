@@ -397,12 +397,10 @@ def _compute_depth_covariance(
     """Covariance (P, P) of one direction's sheets together with the rays that meet them, as it
     affects shapes.
 
-    A camera error turns rays and sheets together, and moves all boards nearly alike: a motion of
-    everything, which a pair by itself cannot see and nobody else can measure. So the rigid motion
-    that explains most of how the boards' points move is removed (an S-transformation to the frame of
-    the boards: Baarda 1973). What remains along the rays is expressed as the change of the sheets
-    that changes depths equally (by least squares). What no such change expresses, a lens, is in the
-    rays' own sigma.
+    A camera error turns rays and sheets together, and moves all boards nearly alike, which nobody can
+    measure: the rigid motion that explains most of it is removed (an S-transformation to the frame of
+    the boards: Baarda 1973). The rest along the rays is expressed as the change of the sheets that
+    changes depths equally; what none expresses, a lens, is in the rays' own sigma.
     """
     sheets, stripes = state.sheets[direction], [board.stripes[direction] for board in boards]
     index = np.concatenate([one.index for one in stripes])

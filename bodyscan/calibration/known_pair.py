@@ -147,11 +147,9 @@ def _convert_pose(
 
 
 def _convert_projector(found: FoundCamera, code: StripeCode) -> Camera:
-    """Convert the projector to a camera; if the file gives no image size, a stripe is a pixel.
-
-    Stripes must divide the image evenly, or they belong to another projector. The start of waves
-    (`origin`) is counted in stripes, so another stripe width would move the waves.
-    """
+    """Convert the projector to a camera; if the file gives no image size, a stripe is a pixel. Stripes
+    must divide the image evenly, or they belong to another projector. The start of waves (`origin`) is
+    counted in stripes, so another stripe width would move the waves."""
     stripes = {one.direction: one.stripes for one in code.directions}
     if found.size is None:
         u0, v0 = float(found.matrix[0, 2]), float(found.matrix[1, 2])

@@ -280,11 +280,8 @@ def estimate_ray_uncertainty(
 
 
 def _compute_changes(chosen: Camera, camera: Camera, points: Array) -> tuple[Array, Array]:
-    """Changes of pixels at points (N, 3), camera frame.
-
-    (N, 2, P + 1): by the parameters of `camera`, and its difference from `chosen`.
-    (N, 2, 6): by a motion of the points.
-    """
+    """Changes of pixels at points (N, 3), camera frame. (N, 2, P + 1): by the parameters of `camera`,
+    and its difference from `chosen`. (N, 2, 6): by a motion of the points."""
     by_parameter, by_point = camera.jacobians(points)
     difference = camera.project(points) - chosen.project(points)
     return (

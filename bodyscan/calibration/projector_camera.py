@@ -217,10 +217,8 @@ def _with_crossing_axis(
 def _refine(
     projector: Camera, from_camera: RigidTransform, both: Sequence[_Samples], terms: int
 ) -> FittedProjector:
-    """Fit pose, focal lengths, centre and the first `terms` of the lens jointly, without skew.
-
-    Raises BadInput if the misfit is beyond three sigmas, RMS.
-    """
+    """Fit pose, focal lengths, centre and the first `terms` of the lens jointly, without skew. Raises
+    BadInput if the misfit is beyond three sigmas, RMS."""
     size, first_term = POSE + len(projector.parameters), POSE + len(MATRIX)
     free = np.setdiff1d(np.arange(first_term + terms), [POSE + MATRIX.index("gamma")])
     priors = projector.lens.prior_sigmas[:terms]

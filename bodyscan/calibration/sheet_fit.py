@@ -144,9 +144,8 @@ def _compute_board_covariance(
     """Covariance (F, P, P) due to each board's pose error, of F fits of separate points: a sandwich
     estimator with boards as clusters.
 
-    covariance: (F, P, P) due to the noise of the points.
-    jacobian, by_point: derivatives of the offsets by the parameters (N, P), by the points (N, 3).
-    weights: inverse variances of the offsets, (N,).
+    covariance: (F, P, P) due to the noise of the points. jacobian, by_point: derivatives of the offsets
+        by the parameters (N, P), by the points (N, 3). weights: inverse variances of the offsets, (N,).
     fit: the fit that each point belongs to, (N,).
     """
     errors, boards = data.board_errors, int(data.board.max()) + 1

@@ -127,11 +127,8 @@ def smooth_models(
 
 
 def _find_lens_start(plain: LensSheets, data: BoundaryPoints) -> LensSheets:
-    """Fit a lens from several starts of its axis, in heights of the image.
-
-    Planes hardly determine the axis, and many projectors shine upwards, with their axis at the
-    image's edge or outside it.
-    """
+    """Fit a lens from several starts of its axis, in heights of the image. Planes hardly determine the
+    axis, and many projectors shine upwards, with their axis at the image's edge or outside it."""
     centres = [plain.parameters[1], *(h * plain.stripes for h in (-0.5, 0.0, 0.5, 1.0, 1.5))]
     starts = [plain.rotate_to(float(centre)).with_lens(2) for centre in centres]
     fits = [fit_sheets(start, data, max_steps=15) for start in starts]

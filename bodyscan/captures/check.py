@@ -204,11 +204,9 @@ def _find_warnings(
 
 
 def _warn_of_jpeg(sequences: Iterable[ImageSequence]) -> Iterator[str]:
-    """Warn of low-quality JPEG, judged by the first image of each pair.
-
-    Boundaries and corners rise by some 40 grey levels per pixel, so four levels of rounding move
-    them by 0.1 px, several times the effect of a camera's own noise.
-    """
+    """Warn of low-quality JPEG, judged by the first image of each pair. Boundaries and corners rise by
+    some 40 grey levels per pixel, so four levels of rounding move them by 0.1 px, several times the
+    effect of a camera's own noise."""
     firsts = {s.pair: path for s in reversed(tuple(sequences)) for path in s.paths[:1]}
     errors = {}
     for pair, path in firsts.items():

@@ -46,11 +46,9 @@ def _iterate_png_chunks(data: bytes) -> Iterator[tuple[bytes, memoryview, int]]:
 
 
 def _update_crc(content: memoryview, crc: int) -> int:
-    """Continue the CRC-32 `crc` with the content of a chunk.
-
-    Chunks are a few kilobytes, whose sum takes a microsecond. From 5120 bytes on ISA-L releases the
-    interpreter's lock for it, and getting it back from another thread takes many times as long.
-    """
+    """Continue the CRC-32 `crc` with the content of a chunk. Chunks are a few kilobytes, whose sum
+    takes a microsecond. From 5120 bytes on ISA-L releases the interpreter's lock for it, and getting it
+    back from another thread takes many times as long."""
     step = 5120
     if len(content) > 16 * step:
         return isal_zlib.crc32(content, crc)

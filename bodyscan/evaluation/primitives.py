@@ -198,10 +198,8 @@ def _find_sphere(points: Array, votes: Array, radius: float) -> Sphere | None:
 
 
 def _sort_in_reading_order(spheres: list[Sphere]) -> list[Sphere]:
-    """Rows from the top of the image down, each from left to right.
-
-    A row ends where the next sphere is more than a radius lower.
-    """
+    """Rows from the top of the image down, each from left to right. A row ends where the next sphere is
+    more than a radius lower."""
     by_height = sorted(spheres, key=lambda sphere: float(sphere.centre[1]))
     rows: list[list[Sphere]] = []
     for sphere in by_height:

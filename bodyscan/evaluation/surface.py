@@ -197,10 +197,8 @@ def _read_other(
     other: Path | BodyMesh, sides_mm: Array
 ) -> tuple[str, bool, Outcome[tuple[Array, Indices]]]:
     """Read what a scan of sides (3,) is compared with: its name (`truth/subject.ply`, a scan's folder),
-    whether it is a scan, its vertices (V, 3) mm and faces (F, 3).
-
-    Raises BadInput for a surface whose longest side is not 0.2 to 5 times the scan's.
-    """
+    whether it is a scan, its vertices (V, 3) mm and faces (F, 3). Raises BadInput for a surface whose
+    longest side is not 0.2 to 5 times the scan's."""
     if isinstance(other, BodyMesh):
         return "the other", True, Outcome((other.vertices, other.faces))
     folder = other.parent if other.name == FILE_NAME else other

@@ -122,10 +122,8 @@ def deface(mesh: BodyMesh, neck: Neck) -> BodyMesh:
 
 
 def _find_head_faces(mesh: BodyMesh, neck: Neck) -> Mask:
-    """Find faces (F,) that reach above the neck, in components that come near the head's axis.
-
-    Hands held up beside the head are other components, and stay.
-    """
+    """Find faces (F,) that reach above the neck, in components that come near the head's axis. Hands
+    held up beside the head are other components, and stay."""
     reaching = (mesh.vertices[mesh.faces][..., 2] > neck.height_mm).any(axis=1)
     faces = mesh.faces[reaching]
     if not len(faces):

@@ -122,9 +122,8 @@ def _add_surface(
 ) -> None:
     """Add a surface's points `at`, shifted from the samples `index`, to the sums (N, 8 + C).
 
-    shift_mm: signed, along the sample's normal.
-    surface: weights, sigmas, colours (n, C) and normals of its points.
-    sums: columns as listed in `average`.
+    shift_mm: signed, along the sample's normal. surface: weights, sigmas, colours (n, C) and normals of
+        its points. sums: columns as listed in `average`.
     """
     weights, sigma_mm, colours, normals = surface
     for n in range(len(index)):

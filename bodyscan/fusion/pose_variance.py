@@ -45,8 +45,7 @@ def _point_variance(
 ) -> Array:
     """Variance (N,) mm^2 along normals of points (N, 3), each the mean of `pairs_seen` pairs' (N,).
 
-    centres: (P, 3) of the cameras.
-    joint: (P, 6, P, 6), covariance of the pairs' twists.
+    centres: (P, 3) of the cameras. joint: (P, 6, P, 6), covariance of the pairs' twists.
     """
     towards = normals @ centres.T - np.sum(points * normals, axis=1)[:, None]
     facing = towards > 0.2 * cdist(points, centres)
@@ -67,8 +66,8 @@ def _point_variance(
 def _compute_mean_variance(lever: Array, joint: Array, used: Bytes) -> Array:
     """Variance (N,) of the mean of some pairs' offsets along normals, `used` (N,) for each point.
 
-    lever: (N, 6), derivative of an offset by a pair's twist.
-    joint: (P, 6, P, 6), covariance of the twists of the pairs that the points face.
+    lever: (N, 6), derivative of an offset by a pair's twist. joint: (P, 6, P, 6), covariance of the
+        twists of the pairs that the points face.
     """
     count = len(joint)
     alone = np.einsum("pipj->ij", joint)

@@ -212,8 +212,8 @@ def _solve_window(
 ) -> int:
     """Solve for a window's six coefficients; return the number of inliers.
 
-    basis: (samples, 6), see `make_window_basis`.
-    ridge: information of the prior on each of the last three.
+    basis: (samples, 6), see `make_window_basis`. ridge: information of the prior on each of the last
+        three.
     normal: overwritten; its first element becomes the first coefficient's inverse variance.
     """
     count = 0

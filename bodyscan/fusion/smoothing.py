@@ -207,11 +207,9 @@ def _compute_points(
 def _compute_normal(
     x: float, y: float, inverse: float, by_u: float, by_v: float, projection: Table
 ) -> tuple[float, float, float]:
-    """Unit normal towards the camera, camera frame, from the slopes of 1/z per pixel.
-
-    A plane n.P = d has 1/z = n.(x, y, 1) / d in ideal normalised coordinates; the derivative of the
-    projection converts the slopes.
-    """
+    """Unit normal towards the camera, camera frame, from the slopes of 1/z per pixel. A plane n.P = d
+    has 1/z = n.(x, y, 1) / d in ideal normalised coordinates; the derivative of the projection converts
+    the slopes."""
     u_by_x, u_by_y, v_by_x, v_by_y = look_up_derivatives(projection, x, y)
     slope_x = by_u * u_by_x + by_v * v_by_x
     slope_y = by_u * u_by_y + by_v * v_by_y

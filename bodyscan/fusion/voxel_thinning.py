@@ -93,11 +93,9 @@ def select_per_voxel(points: Floats, second_rate: Mask, voxel_mm: float) -> NDAr
 def _find_best_per_voxel(
     points: Floats, second_rate: Mask, low: Floats, voxel_mm: float, layers: int, layer: int
 ) -> NDArray[np.intp]:
-    """Index of the best point of each voxel, in every `layers`-th layer of blocks from `layer` on.
-
-    A hash table of voxels (Teschner et al. 2003), by blocks of 4 x 4 x 4 that stay together in
-    memory. Badness and index share one integer, so that the least of these is the best point.
-    """
+    """Index of the best point of each voxel, in every `layers`-th layer of blocks from `layer` on. A
+    hash table of voxels (Teschner et al. 2003), by blocks of 4 x 4 x 4 that stay together in memory.
+    Badness and index share one integer, so that the least of these is the best point."""
     scale = np.float32(1.0 / voxel_mm)
     members, size = 0, 1
     for n in range(len(points)):

@@ -163,8 +163,7 @@ NODES_PER_STRIPE = 8
 def _intersect(frame: Array, rows: Array, terms: int, rays: Array, s: Array, found: Array) -> None:
     """Fill `found` (3, N) with depth, dz/ds and variance of rays (N, 3) at s (N,).
 
-    frame: (14,) the three rows of projector_from_camera, then x0 and D.
-    rows: see `BowedSheets._table`.
+    frame: (14,) the three rows of projector_from_camera, then x0 and D. rows: see `BowedSheets._table`.
     terms: T.
     """
     last, row, by = len(rows) - 1, np.empty(rows.shape[1]), np.empty(terms + 1)

@@ -212,9 +212,8 @@ def variance_along(upper: Array, by: Array) -> float:
 def _depth(frame: Array, lens: Array, distance: float, x: float, y: float, s: float) -> float:
     """Depth z where the ray (x, y, 1) meets the sheet at s; NaN where there is none.
 
-    Newton's method on the offset times the reach, which without a lens is linear along a ray. It
-    starts where the ray would meet the sheet without the lens, or at `distance` (mm) if nowhere.
-    Also NaN where the only solution lies beyond the fold of the lens, far outside its image.
+    Newton's method on the offset times the reach, linear along a ray without a lens, from where that
+    ray would meet the sheet, or `distance` (mm) if nowhere. NaN also beyond the fold of the lens.
     """
     forward = frame[2, 0] * x + frame[2, 1] * y + frame[2, 2]
     across, slope = frame[1, 0] * x + frame[1, 1] * y + frame[1, 2], (s - lens[1]) / lens[0]

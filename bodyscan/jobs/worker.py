@@ -122,10 +122,8 @@ def _attempt(folder: Path, kinds: Kinds, emit: Emit) -> tuple[str, int]:
 
 
 def _become_worker() -> Emit:
-    """Set up a process of jobs; returns the function that reports to its parent.
-
-    Standard output is the parent's alone; what libraries print there goes into the log.
-    """
+    """Set up a process of jobs; returns the function that reports to its parent. Standard output is the
+    parent's alone; what libraries print there goes into the log."""
     keep_freed_memory()
     logging.basicConfig(format="%(message)s")  # on standard error, which is the job's log
     logging.getLogger("bodyscan").setLevel(logging.DEBUG)
@@ -201,9 +199,7 @@ def _move_aside(folder: Path) -> Path:
 
 def _remove_results(old: Path, emit: Emit) -> None:
     """Remove what a stage wrote, and its record last, so that this can be cut short at any moment.
-
-    Anything else is a person's, made from the former result: it stays in a folder of its own.
-    """
+    Anything else is a person's, made from the former result: it stays in a folder of its own."""
     token = old.name.removeprefix(_TAKEN_AWAY)
     stage = token.rpartition("-")[0]
     if old.is_dir() and not old.is_symlink():
@@ -223,10 +219,8 @@ def _remove_results(old: Path, emit: Emit) -> None:
 
 
 def _write_manifest(job: Job, stages: Sequence[Stage]) -> None:
-    """Write one file that ties inputs and results together, and contains its own hash.
-
-    Results are listed by their path in the job's folder, inputs from outside by what they are for.
-    """
+    """Write one file that ties inputs and results together, and contains its own hash. Results are
+    listed by their path in the job's folder, inputs from outside by what they are for."""
     inputs: dict[str, str] = {}
     outputs: dict[str, str] = {}
     for stage in stages:

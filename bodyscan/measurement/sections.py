@@ -148,10 +148,8 @@ class BodySections:
 def _select(
     loops: Sequence[Loop], face_parts: Bytes, wanted: Sequence[int]
 ) -> tuple[Loop, Mask] | None:
-    """The loop with most of the wanted parts, and which segments are theirs; None if that is a rim.
-
-    The other thigh has some of the trunk above it, so the first loop that has any may be wrong.
-    """
+    """The loop with most of the wanted parts, and which segments are theirs; None if that is a rim. The
+    other thigh has some of the trunk above it, so the first loop that has any may be wrong."""
     shares = [np.isin(face_parts[loop.faces], wanted) for loop in loops]
     lengths = [loop.lengths[mine].sum() for loop, mine in zip(loops, shares, strict=True)]
     best = int(np.argmax(lengths)) if lengths else 0

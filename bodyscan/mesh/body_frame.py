@@ -67,11 +67,8 @@ def find_body_frame(vertices: Array) -> BodyFrame:
 
 
 def _find_toes(feet: Array, ankles: Array, reach_mm: float) -> Array:
-    """How far (2,) feet (N, 2) reach beyond the ankles (M, 2) closest to them, on average.
-
-    Each foot counts by itself: one of which little touches the floor would otherwise pull the mean of
-    the ankles, but not of the feet, to its side.
-    """
+    """How far (2,) feet (N, 2) reach beyond the ankles (M, 2) closest to them, on average: each foot by
+    itself, as one that hardly touches the floor would pull the mean of the ankles to its side."""
     if len(ankles) == 0:
         return np.zeros(2)
     distance, nearest = cKDTree(ankles).query(feet)

@@ -268,10 +268,8 @@ def _name_limbs(graph: nx.DiGraph[_Node], top: float) -> dict[str, list[list[_No
 
 def _name_head(graph: nx.DiGraph[_Node]) -> None:
     """Name head what of the trunk is above the neck: its thinnest layer between chest and nose, at 0.76
-    to 0.92 of the crown's height (a child's chin is at 0.8, an adult's at 0.87).
-
-    A neck has a fifth of the trunk's widest layer. What has over half of it is none, as of a column.
-    """
+    to 0.92 of the crown's height (a child's chin is at 0.8, an adult's at 0.87). A neck has a fifth of
+    the trunk's widest layer. What has over half of it is none, as of a column."""
     trunk = [node for node in graph if node.part == "trunk"]
     crown = max((node.height_mm for node in trunk), default=0.0)
     areas: dict[float, float] = {}

@@ -151,10 +151,8 @@ def _compute_geodesic_distances(graph: sparse.csr_array, starts: Indices) -> Arr
 def _average_in_cubes(
     points: Array, normals: Array, size_mm: float, min_points: int
 ) -> tuple[Array, Array, Indices]:
-    """Mean points and normals in each cube and main direction of the normals, if enough.
-
-    Also returns each point's group, or -1.
-    """
+    """Mean points and normals in each cube and main direction of the normals, if enough. Also returns
+    each point's group, or -1."""
     axis = np.argmax(np.abs(normals), axis=1)
     side = 2 * axis + (np.take_along_axis(normals, axis[:, None], axis=1)[:, 0] > 0)
     # Column by column: along an axis of three numpy takes five times as long.
@@ -208,11 +206,9 @@ def _build_weighted_graph(centres: Array, edges: Indices) -> sparse.csr_array:
 
 
 def _find_opposite_cells(centres: Array, normals: Array) -> Indices:
-    """(N, 2): cells, and for each the nearest cell straight behind it that faces the other way.
-
-    Within 300 mm, the thickest trunk; straight is a cosine of 0.85 between the line through the
-    limb and the normals at both ends.
-    """
+    """(N, 2): cells, and for each the nearest cell straight behind it that faces the other way. Within
+    300 mm, the thickest trunk; straight is a cosine of 0.85 between the line through the limb and the
+    normals at both ends."""
     x, n = (values.astype(np.float32) for values in (centres - centres.mean(axis=0), normals))
     depth = np.sum(x * n, axis=1) - x @ n.T  # [j, i]: of j behind i
     square = np.sum(x**2, axis=1)

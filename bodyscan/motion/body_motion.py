@@ -265,10 +265,8 @@ class BodyMotion:
         return LinearGaussianSystem(information, vector).project(self.fields[equations.cells])
 
     def _solve(self) -> BodyMotion:
-        """Solve the normal equations with the prior, in place by LAPACK.
-
-        The unknowns' units do not matter to Cholesky's method (Demmel 1989): nothing is scaled.
-        """
+        """Solve the normal equations with the prior, in place by LAPACK. The unknowns' units do not
+        matter to Cholesky's method (Demmel 1989): nothing is scaled."""
         matrix = self.information.copy(order="F")
         for kind, block in zip(self.kinds, self.slices, strict=True):
             matrix[block, block] += kind.prior_information
@@ -280,10 +278,8 @@ class BodyMotion:
 
     def _estimate_breath(self) -> BodyMotion:
         """Estimate the breath, and set its prior covariance, marginalized over all other motion.
-
         Motions of limbs could explain most of a breath too, but none of them moves the whole trunk
-        periodically.
-        """
+        periodically."""
         breath, block = self.kinds[-1], self.slices[-1]
         if breath.name != "breath":
             return self

@@ -117,10 +117,8 @@ def _build_whole_body(
 
 
 def _build_lean(cells: BodyCells, modes: TemporalModes) -> MotionKind:
-    """A lean about the ankles, as of an inverted pendulum (Winter 1995), and a turn; the feet stay.
-
-    A unit of amplitude moves the middle of the body, 1 m above the ankles, by 1 mm.
-    """
+    """A lean about the ankles, as of an inverted pendulum (Winter 1995), and a turn; the feet stay. A
+    unit of amplitude moves the middle of the body, 1 m above the ankles, by 1 mm."""
     about_ankles = adjoint(RigidTransform.from_translation(find_ankles(cells)))[:, :3] / 1000.0
     whole = _build_whole_body("lean", cells, about_ankles, modes)
     fields = modulate_fields(whole.fields, cells, weigh_above_feet(cells)[:, None])

@@ -85,9 +85,7 @@ def _require_still(
     rigid_rms_mm: float,
 ) -> None:
     """Raise FailedWork if motion brings overlaps closer than rigid poses do, with `rigid_rms_mm`.
-
-    Overlaps of what moved come closer by rigid poses too, but by wrong ones.
-    """
+    Overlaps of what moved come closer by rigid poses too, but by wrong ones."""
     settings = AlignmentSettings()
     aligned = align(images, rig_from_camera, prior, settings)
     person = align_person(images, rig_from_camera, aligned, prior, poles, settings)

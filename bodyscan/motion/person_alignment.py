@@ -152,10 +152,8 @@ def _search(
 def _measure_again(
     displaced: Sequence[DisplacedPole], motions: Mapping[str, Array]
 ) -> tuple[DisplacedPole, ...]:
-    """Displacements relative to the poles that were not displaced, once all of them are free.
-
-    What overlaps no longer connect to those keeps the displacement that it was found with.
-    """
+    """Displacements relative to the poles that were not displaced, once all of them are free. What
+    overlaps no longer connect to those keeps the displacement that it was found with."""
     standing = {name: motions[name] for name in motions.keys() - _collect_pairs(displaced)}
     again = []
     for one in displaced:

@@ -114,11 +114,9 @@ def _warp(
 ) -> None:
     """Displace measured points (H, W, 3) and their normals, camera frame.
 
-    blocks: cells (h, w) of the blocks, -1 for none, and their depths.
-    motion: centres (C, 3) of the cells and fields (C, 12).
-
-    A pixel averages the motions of the four blocks around it with bilinear weights, without blocks
-    that lie on another surface.
+    blocks: cells (h, w) of the blocks, -1 for none, and their depths. motion: centres (C, 3) of the
+        cells and fields (C, 12). A pixel averages the motions of the four blocks around it with
+        bilinear weights, without blocks that lie on another surface.
     """
     cell, depth = blocks
     rows, columns = cell.shape

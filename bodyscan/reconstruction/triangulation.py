@@ -119,10 +119,7 @@ def combine_directions(
 
 def _measure_offset(one: Depths, other: Depths, sigmas: Sequence[Floats]) -> tuple[float, bool]:
     """Robust sigma of the directions' difference, in stripes of the less depth-sensitive one, and
-    whether that is the other.
-
-    sigmas: of their stripe coordinates.
-    """
+    whether that is the other. sigmas: of their stripe coordinates."""
     both = np.isfinite(one[1]) & np.isfinite(other[1])
     if not both.any():
         return np.nan, True
@@ -134,12 +131,9 @@ def _measure_offset(one: Depths, other: Depths, sigmas: Sequence[Floats]) -> tup
 
 
 def _require_fit(pair: PairCalibration, stripes: StripeMap, agreement: Agreement | None) -> None:
-    """Raise BadInput if the directions contradict each other as no right calibration lets them.
-
-    With a right calibration nearly all rays meet both sheets; wrong codes do not. An imported
-    calibration has a sheet for every stripe. Ours has none where no board showed the stripe; far from
-    the boards it has one, though the depth there is only a guess.
-    """
+    """Raise BadInput if the directions contradict each other as no right calibration lets them. With a
+    right calibration nearly all rays meet both sheets; wrong codes do not. Ours, unlike an imported
+    one, has no sheet where no board showed the stripe, and far from the boards a mere guess."""
     if agreement is not None:
         if not agreement.impossible:
             return
@@ -171,10 +165,8 @@ def _require_fit(pair: PairCalibration, stripes: StripeMap, agreement: Agreement
 def _triangulate(
     pair: PairCalibration, sheets: LightSheets, s: Floats, sigma: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """`triangulate_image` with the uncertainty of the pair's rays.
-
-    An error of a ray in pixels acts as one of s, by the stripes per pixel there, on neighbours alike.
-    """
+    """`triangulate_image` with the uncertainty of the pair's rays. An error of a ray in pixels acts as
+    one of s, by the stripes per pixel there, on neighbours alike."""
     camera, ray_sigma = pair.camera, None
     if pair.rays is not None:
         scale = np.float32(measure_stripes_per_pixel(sheets, camera, s))
@@ -223,10 +215,8 @@ def estimate_grid_normals(points: Floats, measured: Mask | None = None) -> Float
 
 @compiled
 def _fit_normals(points: Floats, inner: Mask, normals: Floats) -> None:
-    """Write the normals of `estimate_grid_normals` where the window is complete (h, w).
-
-    Sums over five rows are formed once a column, and then over five columns.
-    """
+    """Write the normals of `estimate_grid_normals` where the window is complete (h, w). Sums over five
+    rows are formed once a column, and then over five columns."""
     height, width = inner.shape
     sums, falls = np.empty((3, width)), np.empty((3, width))  # of X/Z, Y/Z, 1/Z; by row of these
     u, v = np.empty(3), np.empty(3)

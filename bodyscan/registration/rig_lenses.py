@@ -86,9 +86,9 @@ def _find_decentred(chosen: Mapping[str, ChosenLens]) -> list[str]:
     decentred beyond chance.
 
     A camera's own boards must speak clearly neither for nor against it. A decentring too small for one
-    camera to prove is not zero: left out, it hides in the principal point, whose sigma does not account
-    for it. Held-out boards hardly see what hides so well; how many of its sigmas it is off zero does,
-    also where they happened to prefer Brown's. The other terms of a rational lens hide nowhere.
+    camera to prove hides in the principal point, whose sigma does not account for it, and hardly shows
+    on held-out boards; how many of its sigmas it is off zero does. A rational lens's others hide
+    nowhere.
     """
     open_ = [
         name

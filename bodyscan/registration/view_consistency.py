@@ -93,10 +93,8 @@ def _examine_board(
 def _find_largest_agreement(
     views: list[LocatedView], solution: JointSolution, start: RigidTransform, limit_px: float
 ) -> list[LocatedView]:
-    """Leave out views one by one, each time the one without which the others agree best.
-
-    Returns none if only two are left and disagree, since nothing shows which is right.
-    """
+    """Leave out views one by one, each time the one without which the others agree best. Returns none
+    if only two are left and disagree, since nothing shows which is right."""
     kept = list(views)
     while len(kept) > 2:
         rests = [[view for view in kept if view is not out] for out in kept]

@@ -84,10 +84,8 @@ def _name_covered(regions: Mapping[str, float] | None) -> str:
 
 
 def _format_girth(value: float, between: Range, measured: float) -> str:
-    """Give the range if more is open than a tape leaves, or more than a tenth was not measured.
-
-    Two measurers with a tape differ by 4 mm (ISO 20685-1).
-    """
+    """Give the range if more is open than a tape leaves, or more than a tenth was not measured. Two
+    measurers with a tape differ by 4 mm (ISO 20685-1)."""
     low, high = between
     known = high - low <= 4.0 and measured >= MIN_MEASURED
     return f"{value:.1f}" if known else f"{low:.0f} to {high:.0f}"

@@ -97,9 +97,9 @@ def _estimate_imbalance(
     """Estimate how much more light reached each bit's pattern than its inverse, shares of lit minus
     dark: lamps flicker, and projectors jitter.
 
-    It moves boundaries where the pattern becomes brighter one way, those where it becomes darker the
-    other: least squares on distances from the parabola through a boundary and the two on either
-    side. Bits that change in one sense only, as in the plain code, get 0.
+    It moves boundaries one way where the pattern becomes brighter, else the other: least squares on
+    distances from the parabola through a boundary and the two on either side. Bits that change in one
+    sense only, as in the plain code, get 0.
     """
     size = int(bit.max(initial=0)) + 1
     first = np.flatnonzero(joined[:-3] & joined[1:-2] & joined[2:-1] & joined[3:])

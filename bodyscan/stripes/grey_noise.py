@@ -86,11 +86,8 @@ def _sum_differences(
     share: float,
     max_difference: Array,
 ) -> Array:
-    """Sum 1, d, d^2 and grey level (4, BANDS) over pairs of frames that differ by noise d alone.
-
-    Of every other pixel on every other line. `bright` (L, P) stands in for a missing inverse (0,
-    0).
-    """
+    """Sum 1, d, d^2 and grey level (4, BANDS) over pairs of frames that differ by noise d alone. Of
+    every other pixel on every other line. `bright` (L, P) stands in for a missing inverse."""
     sums = np.zeros((4, max_difference.size))
     for line in range(0, lit.shape[0], 2):
         for x in range(0, lit.shape[1], 2):

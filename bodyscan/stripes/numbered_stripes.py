@@ -97,12 +97,9 @@ def decode_sweep(lit: Greys, frames: Greys, direction: str) -> StripeMap:
 
 
 def _blank_flashed(lines: ScanLines) -> tuple[ScanLines, list[int]]:
-    """Replace images that other light reached by what is seen without the line; also return which.
-
-    Away from its line such an image is brighter than others. Where the line itself fills half of what
-    is lit, which stands on few stripes, the images before and after are as bright. Raises
-    DecodingFailed for one that is brighter than lit.
-    """
+    """Replace images that other light reached by what is seen without the line; also return which. Away
+    from its line such an image is brighter than others; where the line fills half of what is lit, those
+    before and after are as bright. Raises DecodingFailed for one that is brighter than lit."""
     every = max(1, len(lines.patterns) // SAMPLES)
     reached = lines.lit >= np.median(lines.lit)
     level = np.array([np.median(frame[reached]) for frame in lines.patterns], float)

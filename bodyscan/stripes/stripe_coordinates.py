@@ -61,14 +61,9 @@ def measure_correlation(boundaries: Boundaries) -> float:
 def _fit_segments(boundaries: Boundaries) -> tuple[Array, ...]:
     """Fit s on scan lines between boundaries j and j + 1; NaN if they are not joined.
 
-    Returns, (N - 1,) each:
-    start: position of boundary j, px.
-    width: distance to the next, px.
-    index: s at boundary j.
-    rise: change of s to the next.
-    sigma: of s.
-    slope_in, slope_out: ds per px at both ends.
-    blur_bias: what blur adds to s on a curved surface, blur^2 / 2 times its second derivative.
+    Returns, (N - 1,) each: position of boundary j and distance to the next, px; s at j and its change
+    to the next; sigma of s; ds per px at both ends; and what blur adds to s on a curved surface, blur^2
+    / 2 times its second derivative.
     """
     position, sigma_px = smooth_runs(boundaries)
     width = np.where(boundaries.joined, np.diff(position), np.nan)
@@ -97,8 +92,7 @@ def _fill(
     """Write s and sigma (L, P) of usable pixels from the segments they lie in; beyond a run's ends,
     from its last segment, the one before the pixel in preference to the one after.
 
-    line, before: (N,) of the boundaries.
-    segments: see `_fit_segments`.
+    line, before: (N,) of the boundaries. segments: see `_fit_segments`.
     """
     last, count = -1, line.size
     for row in range(codes.shape[0]):

@@ -173,9 +173,7 @@ def _merge_clouds(
     calibration: RigCalibration, captures: Captures, shot: str, progress: Progress
 ) -> list[_Cloud]:
     """All pairs' points merged like a scan's, without alignment, then those of each pair; rig frame.
-
-    Raises ScanFailed.
-    """
+    Raises ScanFailed."""
     one = replace(captures, shots=(shot,), sequences=captures.shot_sequences(shot))
     images = reconstruct_range_images(calibration, one, progress).value
     cleaned = clean(images, calibration.rig_from_camera, calibration.rig.volume)

@@ -351,10 +351,8 @@ def _mesh(
     settings: ScanSettings,
     made: Made,
 ) -> tuple[BodyCloud, BodyMesh, Callable[[], BodyParts]]:
-    """Label the cloud's regions, and mesh it; the mesh holds its displacement to mean breath.
-
-    Also returns what gives the parts of the mesh, or raises what went wrong with them.
-    """
+    """Label the cloud's regions, and mesh it; the mesh holds its displacement to mean breath. Also
+    returns what gives the parts of the mesh, or raises what went wrong with them."""
 
     def label() -> BodyCloud:
         regions = label_regions(

@@ -50,12 +50,9 @@ def test_the_zero_set_of_a_linear_field_is_filled_exactly(shape: tuple[int, int,
 
 
 def test_bounds_hold_and_reach_no_farther_than_they_must() -> None:
-    shape = (32, 32, 32)
-    fixed = np.zeros(shape, bool)
-    for axis in range(3):
-        np.moveaxis(fixed, axis, 0)[[0, -1]] = True
-    values = np.full(shape, -1.0, np.float32)
-    least = np.full(shape, -np.inf, np.float32)
+    fixed = np.ones((32, 32, 32), bool)
+    fixed[1:-1, 1:-1, 1:-1] = False
+    values, least = (np.full(fixed.shape, value, np.float32) for value in (-1.0, -np.inf))
     least[12:20, 12:20, 12:20] = 0.5
     found = fill_harmonically(values, fixed, least, certain=10.0)
     assert (found >= least).all()
@@ -66,13 +63,10 @@ def test_bounds_hold_and_reach_no_farther_than_they_must() -> None:
 def test_a_bound_too_narrow_for_coarser_grids_pushes_the_surface_as_far_as_a_wide_one() -> None:
     """Between plates at -1 values fall from a bound of one node, 16 nodes away from either: no coarser
     grid knows of the bound."""
-    shape = (32, 64, 32)
-    fixed = np.zeros(shape, bool)
-    for axis in range(3):
-        np.moveaxis(fixed, axis, 0)[[0, -1]] = True
+    fixed = np.ones((32, 64, 32), bool)
+    fixed[1:-1, 1:-1, 1:-1] = False
     fixed[:, [16, 48]] = True
-    values = np.full(shape, -1.0, np.float32)
-    least = np.full(shape, -np.inf, np.float32)
+    values, least = (np.full(fixed.shape, value, np.float32) for value in (-1.0, -np.inf))
     least[1:-1, 32, 1:-1] = 1.0
     found = fill_harmonically(values, fixed, least, certain=10.0)
     # Halfway it would be 8 nodes away; the rims, 16 away too, and sixteen sweeps alone leave four.

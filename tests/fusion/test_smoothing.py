@@ -66,10 +66,8 @@ def on_pixels(surface: SmoothSurface, values: np.ndarray) -> np.ndarray:
 @settings(max_examples=10, deadline=None)
 @given(tilt_x=st.floats(-1.0, 1.0), tilt_y=st.floats(-1.0, 1.0))
 def test_a_plane_stays_exactly_itself(tilt_x: float, tilt_y: float) -> None:
-    """Through lens distortion and skew: the inverse depth of a plane is what the fit is made for.
-
-    Not quite affine in pixels, since the lens bends them; the quadratic takes up most of that.
-    """
+    """Through lens distortion and skew: the inverse depth of a plane is what the fit is made for. Not
+    quite affine in pixels, since the lens bends them; the quadratic takes up most of that."""
     normal = np.array([tilt_x, tilt_y, 1.0]) / np.linalg.norm([tilt_x, tilt_y, 1.0])
     _, points, normals = smoothed(image_of(plane_depth(normal)))
     distance = (points - [0.0, 0.0, DISTANCE]) @ normal

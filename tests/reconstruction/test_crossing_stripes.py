@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from stripe_rendering import rms
 
 from bodyscan.arrays import Array
 from bodyscan.calibration.pair import PairCalibration, PairQuality
@@ -70,10 +71,6 @@ def errors(image: RangeImage) -> Array:
     """(N,) along the viewing rays, mm."""
     off = np.linalg.norm(image.points, axis=-1) - np.linalg.norm(surface(), axis=-1)
     return np.asarray(off[image.valid])
-
-
-def rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
 
 
 def test_points_of_both_ways_are_better_than_of_either_and_say_by_how_much() -> None:

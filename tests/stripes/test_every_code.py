@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from stripe_rendering import Field, boundary_errors, checkered, code_light, render, wavy
+from stripe_rendering import Field, boundary_errors, checkered, code_light, render, rms, wavy
 
 from bodyscan.arrays import Array, Bytes, Indices
 from bodyscan.errors import DecodingFailed
@@ -26,6 +26,7 @@ SECTION = {"code": "light-section"}
 INDEX = {"code": "stripe-index"}
 PHASE = {"code": "phase-shift", "steps": 4, "period": 8}
 THREE_PHASES = {"code": "phase-shift", "steps": 3, "period": 16, "inverses": False}
+LONG_WAVES = {"code": "phase-shift", "steps": 3, "period": (10.0, 60.0)}
 ALL = [PLAIN_GRAY, BINARY, PLAIN_BINARY, SECTION, INDEX, PHASE, THREE_PHASES]
 
 
@@ -57,10 +58,6 @@ def captured(
 def read(code: Code, images: tuple[Bytes, Bytes, Bytes, Array], stripes: int) -> StripeMap:
     lit, dark, coded, _ = images
     return decode_stripes(spec_of(code, stripes), lit, dark, coded)
-
-
-def rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
 
 
 # Noise of 1 in 180 grey levels, stripes of 2.2 px blurred by 0.25 stripes and 0.6 px. Tolerances
@@ -248,3 +245,18 @@ def test_frames_out_of_step_are_counted(late: int, by_bit: bool) -> None:
         decode_stripes(
             spec_of(GRAY, 60), lit, dark, coded[[0, 1, 2, 2, *range(4, 8), 8, 8, 10, 11]]
         )
+
+
+@pytest.mark.parametrize(("code", "period"), [(PHASE, 8), (LONG_WAVES, 10)], ids=name)
+def test_light_in_a_part_of_one_image_of_a_wave_is_left_out(code: Code, period: int) -> None:
+    images, part = captured(code, wavy(2.2), 60), np.s_[30:80, 40:110]
+    calm = read(code, images, 60)
+    images[2][1 if code is LONG_WAVES else -3][part] += 20  # a ninth of the contrast
+    seen = read(code, images, 60)
+    (fault,) = seen.faults
+    assert f"image 1 of the wave of {period} stripes contradicts the others over " in fault
+    assert not calm.faults
+    assert not np.isfinite(seen.s[part]).any()
+    kept = np.isfinite(images[3]) & np.isfinite(seen.s)
+    assert rms((seen.s - images[3])[kept]) < 0.03
+    assert kept.sum() > 0.6 * np.isfinite(calm.s).sum()

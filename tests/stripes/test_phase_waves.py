@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from stripe_rendering import code_light, render
+from stripe_rendering import code_light, render, rms
 
 from bodyscan.errors import DecodingFailed
 from bodyscan.stripes.codes import parse_stripe_code
@@ -71,10 +71,6 @@ def inner(s: np.ndarray) -> np.ndarray:
 def errors(seen: StripeMap, s: np.ndarray) -> np.ndarray:
     found: np.ndarray = inner(seen.s - s)
     return found[np.isfinite(found)]
-
-
-def rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
 
 
 @pytest.mark.parametrize("keys", ALL, ids=str)

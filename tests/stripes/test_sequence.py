@@ -65,7 +65,12 @@ def test_a_frame_taken_twice_or_missing_is_named(good: Sequence, bit: int) -> No
 
 @pytest.mark.parametrize(
     ("name", "bit", "added", "part"),
-    [("patterns", 5, 40, 1.0), ("inverses", 3, 90, 1.0), ("patterns", 1, 150, 0.2)],
+    [
+        ("patterns", 5, 40, 1.0),
+        ("inverses", 3, 90, 1.0),
+        ("patterns", 1, 150, 0.2),
+        ("inverses", 6, 25, 0.1),
+    ],
 )
 def test_a_frame_that_a_flash_lit_is_named_and_made_from_the_other(
     good: Sequence, name: str, bit: int, added: int, part: float

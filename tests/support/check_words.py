@@ -1,7 +1,5 @@
 """Words that the glossary forbids, and limits on the size of the house; `make check` runs it.
 
-    python tests/support/check_words.py
-
 The column *do not write* of any table in docs/glossary.md lists words or phrases, separated by
 commas: none may stand in a docstring, comment or message, nor be a part of a name. The table
 under the heading *Never as a part of a name* lists in its first column words that prose may have,

@@ -36,12 +36,10 @@ class Projector(Protocol):
 
 @dataclass(frozen=True)
 class Mirror:
-    """A laser sheet swept by a mirror whose surface lies `offset` off its axis; s linear in angle.
-
-    The mirror turns about `axis` through `centre`; at angle 0 it sends the light along `out`. The
-    sheet comes from the side, 30 mm off, and is tilted by `tilt` against the axis. smile: the
-    stripes' ends are bowed by so many stripes where the fan's tangent is 0.4.
-    """
+    """A laser sheet swept by a mirror whose surface lies `offset` off its axis; s linear in angle. The
+    mirror turns about `axis` through `centre`; at angle 0 it sends the light along `out`. The sheet
+    comes from the side, 30 mm off, and is tilted by `tilt` against the axis. smile: the stripes' ends
+    are bowed by so many stripes where the fan's tangent is 0.4."""
 
     stripes: int
     centre: Array

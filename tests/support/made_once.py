@@ -17,10 +17,8 @@ Value = TypeVar("Value")
 def folder_made_once(
     factory: pytest.TempPathFactory, name: str, make: Callable[[Path], None]
 ) -> Path:
-    """The folder that `make` fills; a worker that comes later waits until it is full.
-
-    What was half made, by a worker that failed, is made again by the next, which then fails alike.
-    """
+    """The folder that `make` fills; a worker that comes later waits until it is full. What was half
+    made, by a worker that failed, is made again by the next, which then fails alike."""
     base = factory.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:
         base = base.parent  # each worker has a folder of its own in the run's

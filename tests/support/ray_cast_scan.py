@@ -101,11 +101,9 @@ def cast_scan(
     seed: int = 1,
     floor: bool = True,
 ) -> Scan:
-    """What the rig's pairs would measure from their nominal placings.
-
-    A pixel counts only if its point is also lit from the projector's placing. `flying` is the
-    fraction of pixels that silhouettes turn into points somewhere between front and back.
-    """
+    """What the rig's pairs would measure from their nominal placings. A pixel counts only if its point
+    is also lit from the projector's placing. `flying` is the fraction of pixels that silhouettes turn
+    into points somewhere between front and back."""
     scene = scene_of(truth)
     if floor:
         square = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32) * 2500

@@ -1,9 +1,8 @@
 """Files whose tests take a second or more each, the longest first: `make test-quick` leaves them out.
 
-Whole runs begin with them; `pytest --durations=0` says how long they take. Of the first, every
-other one needs the simulated workspace and the others do not: one worker makes it and compiles what
-simulates and calibrates, while the other compiles what fuses, so that neither waits for the other or
-compiles what it does. The rest follow as they come, so that none ends alone.
+Whole runs begin with them; `pytest --durations=0` says how long they take. Of the first, every other
+one needs the simulated workspace: one worker makes it and compiles what simulates and calibrates, while
+the other compiles what fuses. The rest follow as they come, so that none ends alone.
 """
 
 SLOW = (

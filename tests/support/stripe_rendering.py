@@ -52,6 +52,10 @@ def boundary_errors(seen: StripeMap, s_at: Field) -> np.ndarray:
     return (s_at(u, v) - seen.boundary_index) / slope
 
 
+def rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
 def white(u: np.ndarray, v: np.ndarray) -> np.ndarray:
     return np.ones_like(u)
 
@@ -145,11 +149,9 @@ def render(
     noise: float = 1.0,
     seed: int = 0,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Lit, dark and coded frames of a surface on which s is `s_at(u, v)`, and s at pixel centres.
-
-    Where s is NaN, or beyond the stripes, it is dark. lights: (images, k stripes), the light of
-    each image at evenly spaced s.
-    """
+    """Lit, dark and coded frames of a surface on which s is `s_at(u, v)`, and s at pixel centres. Where
+    s is NaN, or beyond the stripes, it is dark. lights: (images, k stripes), the light of each image at
+    evenly spaced s."""
     n = SUPERSAMPLING
     height, width = shape
     s, truth = _fine_and_at_pixels(s_at, shape)

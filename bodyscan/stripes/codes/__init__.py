@@ -79,10 +79,8 @@ def parse_stripe_code(keys: Any) -> Any:
 def _split_crossing(
     keys: dict[str, Any],
 ) -> tuple[dict[str, Any], StripeCode | None, list[InitErrorDetails]]:
-    """Split off `crossing` from a projector's keys: the other keys, its code, and its errors.
-
-    Crossing stripes of the same code share its keys, except those that no two directions share.
-    """
+    """Split off `crossing` from a projector's keys: the other keys, its code, and its errors. Crossing
+    stripes of the same code share its keys, except those that no two directions share."""
     others = {key: value for key, value in keys.items() if key != "crossing"}
     given = keys.get("crossing")
     if given is None or isinstance(given, StripeCode):

@@ -101,10 +101,8 @@ def lay_out(
 
 def _is_equally_exposed(lit: Greys, dark: Greys, patterns: Greys, inverses: Greys) -> bool:
     """Whether coarse patterns and inverses are as bright as lit and as dark as the dark frame.
-
-    Automatic exposure makes them differ; beyond a quarter of the contrast boundaries would move by
-    a tenth of a pixel. Patterns finer than the first three may be blurred.
-    """
+    Automatic exposure makes them differ; beyond a quarter of the contrast boundaries would move by a
+    tenth of a pixel. Patterns finer than the first three may be blurred."""
     step = max(1, math.isqrt(lit.size // 20_000))
     some = (slice(None, None, step), slice(None, None, step))
     light, black = lit[some].astype(np.float32), dark[some].astype(np.float32)
@@ -154,10 +152,8 @@ def fill_from_codes(s: Floats, sigma: Floats, codes: NDArray[np.int32], coded: M
 
 @compiled
 def _fit_codes(codes: NDArray[np.int32], coded: Mask, middle: int) -> tuple[float, float]:
-    """Fit a line to the codes (P,) within 4 pixels: its offset from the pixel's code, and sigma.
-
-    Sigma is 0 without a line, or without a jump that would break a run of boundaries.
-    """
+    """Fit a line to the codes (P,) within 4 pixels: its offset from the pixel's code, and sigma. Sigma
+    is 0 without a line, or without a jump that would break a run of boundaries."""
     first, last = max(middle - 4, 0), min(middle + 4, codes.size - 1)
     jumps, last_code = False, 0
     count, before, x1, y1, x2, xy, y2 = 0, 0, 0.0, 0.0, 0.0, 0.0, 0.0

@@ -37,6 +37,7 @@ from bodyscan.stripes.phase.waves import (
     describe_gains,
     estimate_gains,
     estimate_white_and_black,
+    find_lit_part,
     measure_wave,
     measure_wave_noise,
     split_waves,
@@ -86,7 +87,9 @@ def decode_wave(
     check_wave_images(images, phases, usable)
     measured = measure_wave(phases, wave)
     gains = estimate_gains(phases, measured, images.dark, images.contrast, usable)
-    _, measured = balance_images(phases, measured, images.dark, images.contrast, gains)
+    phases, measured = balance_images(phases, measured, images.dark, images.contrast, gains)
+    flashed, parts = find_lit_part([phases], [measured], [(images.dark, images.contrast)], usable)
+    usable &= ~flashed
     noise = np.sqrt(variance[np.clip(measured.mean, 0, 255).astype(np.uint8)])
     floor = find_min_contrast(phases.dtype) / 2.0
     usable &= measured.amplitude >= np.maximum(floor, MIN_CONTRAST_TO_NOISE * noise)
@@ -99,7 +102,7 @@ def decode_wave(
     s[~usable] = np.nan
     s, sigma = smooth_phase(s, np.where(usable, sigma * period, np.float32(np.nan)))
     result = assemble_from_pixels(images, lit, s, sigma, variance, stripes)
-    flash = "; ".join(filter(None, (flash, *describe_gains(gains, wave.period))))
+    flash = "; ".join(filter(None, (flash, *describe_gains(gains, wave.period), *parts)))
     return replace(result, correlation_px=(CORRELATION_PX, CORRELATION_PX), flash=flash)
 
 
@@ -121,10 +124,8 @@ def check_wave_images(images: ScanLines, waves: Greys, usable: Mask) -> None:
 
 
 def _check_distinct(images: Floats, strength: float, message: str) -> None:
-    """Raise DecodingFailed if two images (N, M) of a wave differ by a tenth of what they should.
-
-    Two neighbours of N differ by sin(pi / N) on average, times their strength.
-    """
+    """Raise DecodingFailed if two images (N, M) of a wave differ by a tenth of what they should. Two
+    neighbours of N differ by sin(pi / N) on average, times their strength."""
     for first, second in combinations(range(len(images)), 2):
         difference = float(np.mean(np.abs(images[first] - images[second])))
         if difference < 0.1 * strength * np.sin(np.pi / len(images)):
@@ -194,6 +195,8 @@ def decode_waves(
     check_illumination(bright, brightest)
     good = bright & (brightest < SATURATED)
     uneven = _balance_waves(measured, stacks, good)
+    flashed, parts = find_lit_part(stacks, measured, _list_references(measured), good)
+    good &= ~flashed
     check_several_waves(measured, stacks, good, stripes)
     usable = good & ~find_half_covered_pixels(contrast, bright)
     corrected = _correct_waves(measured, usable, stripes)
@@ -207,7 +210,9 @@ def decode_waves(
     lit_all, unlit = (convert_like(grey, lines) for grey in estimate_white_and_black(measured))
     light = ScanLines(lit_all, unlit, lines[:0], None, transposed)
     result = assemble_from_pixels(light, lit, s, sigma, variance, stripes)
-    return replace(result, correlation_px=(CORRELATION_PX, CORRELATION_PX), flash="; ".join(uneven))
+    return replace(
+        result, correlation_px=(CORRELATION_PX, CORRELATION_PX), flash="; ".join((*uneven, *parts))
+    )
 
 
 def _balance_waves(waves: list[MeasuredWave], stacks: list[Greys], good: Mask) -> list[str]:
@@ -217,19 +222,27 @@ def _balance_waves(waves: list[MeasuredWave], stacks: list[Greys], good: Mask) -
     """
     notes = []
     for _ in waves[1:]:
-        others = [estimate_white_and_black(waves[:k] + waves[k + 1 :]) for k in range(len(waves))]
+        others = _list_references(waves)
         each = [
-            estimate_gains(stack, wave, black, white - black, good)
-            for stack, wave, (white, black) in zip(stacks, waves, others, strict=True)
+            estimate_gains(stack, wave, *reference, good)
+            for stack, wave, reference in zip(stacks, waves, others, strict=True)
         ]
         errors = [np.abs(gains - [[1.0], [0.0]]).max() for gains in each]
         if not max(errors):
             break
         k = int(np.argmax(errors))
-        white, black = others[k]
-        stacks[k], waves[k] = balance_images(stacks[k], waves[k], black, white - black, each[k])
+        stacks[k], waves[k] = balance_images(stacks[k], waves[k], *others[k], each[k])
         notes += describe_gains(each[k], waves[k].wave.period)
     return notes
+
+
+def _list_references(waves: list[MeasuredWave]) -> list[tuple[Floats, Floats]]:
+    """List black and contrast (L, P) as the others of several waves show them, for each of the
+    waves."""
+    others = [
+        estimate_white_and_black(waves[:k] + waves[k + 1 :] or waves) for k in range(len(waves))
+    ]
+    return [(black, white - black) for white, black in others]
 
 
 def _correct_waves(waves: list[MeasuredWave], usable: Mask, stripes: int) -> list[MeasuredWave]:
