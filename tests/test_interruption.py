@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from subprocess import PIPE
 
 import pytest
 from processes import has_ended, wait_for
@@ -41,13 +42,8 @@ def start(work: str) -> subprocess.Popen[str]:
     )
     # Started in a shell's background, as CI may be, processes inherit that Ctrl-C is ignored.
     heard = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-    return subprocess.Popen(
-        [sys.executable, "-c", heard + program],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
+    line = [sys.executable, "-c", heard + program]
+    return subprocess.Popen(line, stdout=PIPE, stderr=PIPE, text=True, start_new_session=True)
 
 
 def child_of(process: subprocess.Popen[str]) -> int:

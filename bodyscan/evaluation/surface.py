@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bodyscan.arrays import Array, Indices, Mask
+from bodyscan.files.messages import translate_failure
 from bodyscan.fusion.storage import FILE_NAME, load_scan
 from bodyscan.geometry.robust import rms
 from bodyscan.geometry.transforms import RigidTransform
@@ -214,8 +215,10 @@ def _read_other(
 
 def _build_centred_scene(vertices: Array, faces: Indices) -> tuple[Any, Array]:
     """Build a scene of vertices (V, 3) less their mean, as it is float32; also return the mean (3,)."""
-    import open3d as o3d  # not for those who only read a report
-
+    try:
+        import open3d as o3d  # not for those who only read a report
+    except ImportError as error:
+        raise translate_failure(error) or error from error
     centre = vertices.mean(axis=0)
     scene = o3d.t.geometry.RaycastingScene()
     scene.add_triangles((vertices - centre).astype(np.float32), faces.astype(np.uint32))

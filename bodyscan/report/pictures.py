@@ -79,8 +79,7 @@ class Callout:
 
 
 def draw_callouts(mesh: BodyMesh, callouts: Mapping[str, Sequence[Callout]]) -> bytes:
-    """Shaded pictures of a mesh with lines drawn over them by view, each with its label in the margin
-    of its side."""
+    """Shaded pictures of a mesh with lines over them by view, each labelled in its side's margin."""
     base = np.full((len(mesh.faces), 3), 225, np.uint8)
     height_px, wide, panels = 1100, 250, []  # wide: of a margin
     frames = _make_frames(mesh.vertices, tuple(callouts), height_px)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from hypothesis import strategies as st
 from made_bodies import cylinder, ellipsoid, mesh_of
 from surface_coverage import coverage
 
-from bodyscan.errors import BadInput
+from bodyscan.errors import BadInput, FailedWork
 from bodyscan.evaluation.surface import (
     compare_surfaces,
     compute_signed_distances,
@@ -152,7 +153,7 @@ def write(path: Path, vertices: np.ndarray, faces: np.ndarray) -> Path:
     return path
 
 
-def test_only_what_was_measured_is_compared(tmp_path: Path) -> None:
+def test_only_the_measured_is_compared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The upper half of a body is filled, and lies a centimetre off."""
     vertices, faces = cylinder(50.0, 0.0, 400.0)
     filled = vertices[faces, 2].max(axis=1) > 200.0
@@ -168,6 +169,9 @@ def test_only_what_was_measured_is_compared(tmp_path: Path) -> None:
     other = write(tmp_path / "other.ply", *cylinder(90.0, 0.0, 400.0))
     fitted = compare_surfaces(mesh_of(vertices, faces), other)[1]
     assert "half of the scan lies 4" in fitted.notes[-1]
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    with pytest.raises(FailedWork, match="pip install open3d"):
+        compare_surfaces(mesh_of(moved, faces, filled), other)
 
 
 @pytest.mark.parametrize(

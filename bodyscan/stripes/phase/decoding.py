@@ -75,8 +75,7 @@ def decode_wave(
     images: scan lines of the Gray code. lit: (H, W); phases: (steps, H, W), images of the wave.
 
     Near its own boundaries the Gray code is off by at most one half period, so that the period
-    whose phase is nearest to its middle is the right one. Raises DecodingFailed for inconsistent
-    images.
+    whose phase is nearest to its middle is the right one. DecodingFailed if images disagree.
     """
     images, flash = replace_flashed(images)
     variance = measure_noise(images)
