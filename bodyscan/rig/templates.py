@@ -82,7 +82,7 @@ def find_frame_name_faults(name: str, number: str) -> Iterator[str]:
         return
     fields = [(field, spec, how) for _, field, spec, how in parts if field is not None]
     if not fields:
-        yield f"needs {{{number}}}, or must be a list of one name a {number}"
+        yield f"needs {{{number}}}, or must be a list of one name a {number}, such as [{name}]"
     for field, spec, how in fields:
         if field != number or how or not re.fullmatch(r"0?[1-9]?d?", spec or ""):
             yield f"may only hold {{{number}}} or such as {{{number}:02d}}, not {{{field}}}"
