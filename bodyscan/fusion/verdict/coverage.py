@@ -232,7 +232,8 @@ def check_gaps(scan: ScanEvidence) -> Iterator[Finding]:
     if coverage.filled_share > MAX_FILLED:
         yield Finding(
             "repeat" if coverage.filled_share > 0.5 else "usable",
-            f"{coverage.filled_share:.0%} of the surface was not measured and is filled in",
+            f"{(scan.mesh or coverage).filled_share:.0%} of the surface was not measured and is "
+            "filled in",
             lost,
         )
     area = coverage.sum_bands(coverage.areas_mm2)
