@@ -185,7 +185,11 @@ def _fit_trimmed(
         ridge = (step * pixel_mm / (2.0 * 6.0)) ** -2.0
         for limit in (8.0, 3.0):
             _solve_window(basis, residual, inlier, ridge, normal, solution)
-            _find_inliers(basis, residual, solution, limit, inlier)
+            for n in range(len(basis)):
+                model = 0.0
+                for i in range(6):
+                    model += basis[n, i] * solution[i]
+                inlier[n] = abs(residual[n] - model) < limit
         count = _solve_window(basis, residual, inlier, ridge, normal, solution)
         variance = 1.0 / normal[0, 0]
         fits[0][row, column] = centre + solution[0] * unit
@@ -193,17 +197,6 @@ def _fit_trimmed(
         fits[2][row, column] = solution[2] * unit
         fits[3][row, column] = np.sqrt(variance) * unit
         fitted[row, column] = abs(solution[0]) < 4.0 and variance < 1.0 and count >= 15
-
-
-@compiled
-def _find_inliers(
-    basis: Array, residual: Array, solution: Array, limit: float, inlier: Mask
-) -> None:
-    for n in range(len(basis)):
-        model = 0.0
-        for i in range(6):
-            model += basis[n, i] * solution[i]
-        inlier[n] = abs(residual[n] - model) < limit
 
 
 @compiled

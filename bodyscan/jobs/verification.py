@@ -32,7 +32,11 @@ def verify(folder: Path, kinds: Kinds = KINDS) -> Verification:
         )
     checked = list(_verify_all(folder, kinds))
     faults = tuple(f"{path}: {fault}" for path, fault in checked if fault)
-    return Verification(len(checked), faults, tuple(_find_added(folder)))
+    added = []
+    for record in sorted((*folder.glob(f"*/{STAGE}"), *folder.glob(f"*/*/{STAGE}"))):
+        known = {record, *list_results_in(record.parent).values()}
+        added += [path for path in list_files(record.parent) if path not in known]
+    return Verification(len(checked), faults, tuple(added))
 
 
 def _verify_all(folder: Path, kinds: Kinds) -> Iterator[tuple[Path, str]]:
@@ -72,13 +76,6 @@ def _verify_job(folder: Path, kinds: Kinds) -> Iterator[tuple[Path, str]]:
         yield _compare_hash(there.get(name) or job.source / name.removeprefix("captures/"), digest)
     for name in there.keys() - inputs.keys():
         yield there[name], "is new: the job did not read it"
-
-
-def _find_added(folder: Path) -> Iterator[Path]:
-    """Files that people put among a batch's results, or a job's."""
-    for record in sorted((*folder.glob(f"*/{STAGE}"), *folder.glob(f"*/*/{STAGE}"))):
-        known = {record, *list_results_in(record.parent).values()}
-        yield from (path for path in list_files(record.parent) if path not in known)
 
 
 def _compare_hash(path: Path, digest: str) -> tuple[Path, str]:

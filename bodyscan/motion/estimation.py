@@ -91,9 +91,8 @@ class EstimatedMotion:
         """Attach each vertex's displacement to mean breath, where it is known."""
         if self.breath is None:
             return surface
-        offset, sigma = self.breath.along_normals(
-            self.cells, surface.vertices, surface.normals.astype(np.float64)
-        )
+        normals = surface.normals.astype(np.float64)
+        offset, sigma = self.breath.along_normals(self.cells, surface.vertices, normals)
         breath = BreathAt(offset.astype(np.float32), sigma.astype(np.float32))
         return replace(surface, breath=breath)
 
@@ -305,11 +304,15 @@ class _Solution:
         return (name, max(found) - now) if np.nanmin(gains) > MIN_LOG_RATIO else ("", 0.0)
 
     def fit_clocks(
-        self, names: Sequence[str], stated: Sequence[float], sides: Sequence[str]
+        self, names: Sequence[str], stated: Sequence[float], sides: Sequence[str], step: float = 0
     ) -> str:
         """Poles whose moments, all earlier or later, or two pairs whose moments, exchanged, explain the
-        motion beyond doubt."""
-        tried = [(side, lag) for side in dict.fromkeys(sides) for lag in (-0.4, -0.2, 0.2, 0.4)]
+        motion beyond doubt.
+
+        step: log likelihood ratio of another posture; of a pole's clock it would be told by chance.
+        """
+        lags = () if step else (-0.4, -0.2, 0.2, 0.4)
+        tried = [(side, lag) for side in dict.fromkeys(sides) for lag in lags]
         others = [
             (side, np.add(stated, lag * np.equal(sides, side)).tolist()) for side, lag in tried
         ]
@@ -324,7 +327,7 @@ class _Solution:
         now, *found = map_threads(lambda one: self.log_evidence(one, ()), moments)
         ranked = sorted(zip(found, others, strict=True), reverse=True)
         best = [name for log, (name, _) in ranked if log > max(found) - MIN_LOG_RATIO]
-        significant = max(found) > now + MIN_LOG_RATIO
+        significant = max(found) > now + step + MIN_LOG_RATIO
         return f"of {' or '.join(dict.fromkeys(best))} other than" if significant else ""
 
 

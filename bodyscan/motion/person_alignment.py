@@ -56,14 +56,12 @@ def align_person(
     poles: Mapping[str, str],
     settings: AlignmentSettings,
 ) -> PersonAlignment:
-    """Estimate the person's motion and free displaced poles, in turn.
+    """Estimate the person's motion and free what only displaced poles explain, in turn.
 
     images, rig_from_camera, boards, settings: as given to `align`; aligned: its result.
     poles: the pole of each pair that is mounted on one.
 
-    Motion and displaced poles can explain each other. So the motion is estimated first as if no pole
-    were displaced; what only a displaced pole explains is then freed, and all is repeated. An error
-    common to all pairs may also warp what each measured, so that no pole is asked for after it.
+    An error common to all pairs may also warp what each measured: no pole is asked for after it.
     """
     displaced: list[DisplacedPole] = []
     common_error: ScaleError | CommonError | None = None
@@ -82,21 +80,23 @@ def align_person(
         found: Displacement | None = None if evidence and (motion or other) else search.found
         if found is None and evidence is not None and common_error is None and not other:
             found = detect_displacement(evidence, rig_from_camera, poles, _collect_pairs(displaced))
+        step = found if isinstance(found, PostureStep) else None
+        if step and evidence and evidence.fit_clocks:
+            other = evidence.fit_clocks(step.log_ratio)
         # A common error looks like motion too. Nothing is displaced that seemed so by wrong times.
-        if found is None and other and not isinstance(common_error, CommonError):
+        if found is step and other and not isinstance(common_error, CommonError):
             untimed = [replace(image, time_ms=None, span_ms=None) for image in images]
             anew = align_person(untimed, rig_from_camera, *start, poles, settings)
             moved = anew.motion
             if moved and compute_rms_length(moved.displacements[moved.observed]) > STILL_MM:
                 return replace(anew, other_times=other)
-            found = None if motion else search.found
+            found = step or (None if motion else search.found)
         if found is None:
             if motion is not None:
                 # Offsets caused by a tracked head or arm are not pose errors.
                 again = _search(images, rig_from_camera, alignment, poles, displaced)
                 search = replace(search, offset_mm=again.offset_mm)
-            certain = [one for one in displaced if one.certain]
-            final = _measure_again(certain, _select_connected_motions(rig_from_camera, alignment))
+            final = _measure_again(displaced, _select_connected_motions(rig_from_camera, alignment))
             return PersonAlignment(alignment, motion, final, common_error, search, posture)
         if isinstance(found, PostureStep):
             posture = found
@@ -152,8 +152,9 @@ def _search(
 def _measure_again(
     displaced: Sequence[DisplacedPole], motions: Mapping[str, Array]
 ) -> tuple[DisplacedPole, ...]:
-    """Displacements relative to the poles that were not displaced, once all of them are free. What
+    """Certain displacements relative to the poles that were not displaced, once all are free. What
     overlaps no longer connect to those keeps the displacement that it was found with."""
+    displaced = [one for one in displaced if one.certain]
     standing = {name: motions[name] for name in motions.keys() - _collect_pairs(displaced)}
     again = []
     for one in displaced:

@@ -48,11 +48,8 @@ class ScanLines:
         """Read the code words (L, P), the first pattern being the most significant bit."""
         words = np.zeros(self.lit.shape, np.uint16)
         for bit in range(len(self.patterns)):
-            if self.inverses is None:
-                words <<= 1
-                words |= self.bright(bit)
-            else:
-                _append_bit(words.ravel(), self.patterns[bit].ravel(), self.inverses[bit].ravel())
+            words <<= 1
+            words |= self.bright(bit)
         return words
 
     def bright(self, bit: int) -> Mask:
@@ -99,13 +96,6 @@ def transpose(images: Greys) -> Greys:
     for image, target in zip(images, result, strict=True):
         cv2.transpose(image, dst=target)
     return result
-
-
-@compiled
-def _append_bit(words: Words, pattern: Greys, inverse: Greys) -> None:
-    """Shift code words (N,) by one bit and set it where the pattern is brighter."""
-    for n in range(words.size):
-        words[n] = (words[n] << 1) | (pattern[n] > inverse[n])
 
 
 @compiled

@@ -79,10 +79,8 @@ def test_one_change_of_all_pairs_is_asked_for_before_any_pole(freedom: int) -> N
     """All principal points off by 0.3 px were six pairs that moved by themselves."""
     placed = {}
     for name, out, height in zip(NAMES, OUT, HEIGHTS, strict=True):
-        right, forward = (
-            np.array([-out[1], out[0], 0.0]),
-            -out - [0.0, 0.0, 0.001 * (height - 1000.0)],
-        )
+        right = np.array([-out[1], out[0], 0.0])
+        forward = -out - [0.0, 0.0, 0.001 * (height - 1000.0)]
         forward /= np.linalg.norm(forward)
         axes = np.stack([right, np.cross(forward, right), forward], axis=1)
         placed[name] = RigidTransform(axes, PLACED[name].translation)
@@ -107,10 +105,12 @@ def test_one_pole_that_moved_is_named(pole: str) -> None:
 
 
 def test_a_pole_that_may_have_moved_is_freed_and_not_named() -> None:
-    doubtful = evidence(of_pole("p1", [0.0, 1.0, 0.0]), noise=0.0)
-    found: Any = detect_displacement(doubtful, PLACED, POLES)
-    assert (found.name, found.certain) == ("pole p1", False)
+    for shifts, name in ((of_pole("p1", [0.0, 1.0, 0.0]), "pole p1"), (0.4 * OUT, "")):
+        found: Any = detect_displacement(evidence(shifts, noise=0.0), PLACED, POLES)
+        assert (getattr(found, "name", ""), found.certain) == (name, False)
     assert off(of_pole("p1", [0.0, 1.0, 0.0]), displaced=("p3-1",)) is None
+    # All out explains this a little better, 21.5 to 17.4.
+    assert off(0.3 * OUT + of_pole("p2", (0.9 * OUT[4]).tolist())).name == "pole p2"
 
 
 @pytest.mark.parametrize("pair", ["p1-1", "p2-3", "p3-4"])
@@ -161,8 +161,7 @@ def test_of_three_pairs_two_that_stand_on_one_pole_and_moved_are_named() -> None
     # Which of two sides moved, or both, only noise would decide.
     found = of_few(evidence(of_pole("p1", [5.0, 0.0, 0.0]), noise=0.0), "p1-1", "p1-3", "p2-1")
     assert isinstance(found, DisplacedPole)
-    assert (found.name, found.all_moved) == ("pole p1", False)
-    assert found.pairs == {"p1-1", "p1-3"}
+    assert (found.name, sorted(found.pairs)) == ("pole p1", ["p1-1", "p1-3"])
 
 
 def test_overlaps_known_ten_times_better_show_a_smaller_displacement() -> None:

@@ -77,7 +77,7 @@ def check_posture_step(scan: ScanEvidence) -> Iterator[Finding]:
 def check_common_error(scan: ScanEvidence) -> Iterator[Finding]:
     """One displacement of all pairs, corrected too: outwards, inwards, or as their cameras look."""
     found = scan.person_alignment.common_error if scan.person_alignment else None
-    if found is None or scan.alignment is None:
+    if found is None or not found.certain or scan.alignment is None:
         return
     if isinstance(found, ScaleError):
         girth_mm = abs(found.outward_mm) * GIRTH_PER_MM
