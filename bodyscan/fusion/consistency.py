@@ -38,6 +38,14 @@ class Consistency:
     against_index: Numbers
     against_at: Numbers
 
+    def leave_out_rims(self, surface: SmoothSurface) -> Consistency:
+        """Without what was compared within a window of the surface's rims: blur lifts those, and a limb
+        that moved by a millimetre shows, or hides, what is behind it."""
+        inside = surface.rim >= 1.0
+        kept, against = inside[self.at], inside[self.against_at]
+        found = self.index[kept], self.at[kept], self.shift_mm[kept]
+        return Consistency(*found, self.against_index[against], self.against_at[against])
+
 
 @dataclass(frozen=True, eq=False)
 class Contradictions:
@@ -77,7 +85,7 @@ class Contradictions:
         agreed = np.array([count_by_pair(one.index) for one in consistency])
         index = np.concatenate([one.against_index for one in consistency])
         heights = samples.points[index[bright[index]], 2]
-        low, high = np.percentile(heights, (10, 90)) if len(heights) else (0.0, 0.0)
+        low, high = np.percentile(heights, (10, 90)).tolist() if len(heights) else (0.0, 0.0)
         sigma = np.concatenate([
             np.hypot(samples.sigma_mm[index], surface.sigma_mm[at])
             for one, surface in zip(consistency, surfaces, strict=True)
@@ -85,8 +93,7 @@ class Contradictions:
         ])  # fmt: skip
         beyond = erfc(agreement_mm / (np.sqrt(2.0) * np.maximum(sigma, 1e-6)))
         by_noise = float(beyond.mean()) if len(beyond) else 0.0
-        ends_mm = float(low), float(high)
-        return Contradictions(tuple(pairs), agreed + against, against, by_noise, ends_mm)
+        return Contradictions(tuple(pairs), agreed + against, against, by_noise, (low, high))
 
     @property
     def share(self) -> float:
@@ -133,8 +140,8 @@ def estimate_displacement_sigma(
     their distance, since either may be right and girths go round both, or 0; and number of cubes.
 
     Counted are cubes of 60 mm, less than an arm's width, in which two pairs contradict each other more
-    often than they agree, and not only at a rim of 2 mm; pairs that fired together agree wherever the
-    arm was. An arm turned by 4 degrees has 3 to 9; less than three, as of fingers, are left out.
+    often than they agree; pairs that fired together agree wherever the arm was. An arm turned by 4
+    degrees has 3 to 9; less than three, as of fingers, are left out.
     """
     cube = number_cubes(samples.points, 60.0)
     pair = np.searchsorted(samples.starts, np.arange(len(cube)), side="right") - 1

@@ -68,10 +68,11 @@ def merge(
         lambda k: compare_with_surface(samples, surfaces[k], k, *limits_mm), range(len(surfaces))
     )
     colours = equalize_colours(samples, surfaces, consistency)
-    displaced_mm, double = estimate_displacement_sigma(samples, surfaces, consistency)
+    inside = [one.leave_out_rims(s) for one, s in zip(consistency, surfaces, strict=True)]
+    displaced_mm, double = estimate_displacement_sigma(samples, surfaces, inside)
     cloud = average(samples, surfaces, consistency, colours, poses, displaced_mm)
     pairs = [surface.pair for surface in surfaces]
-    found = Contradictions.count(pairs, consistency, samples, surfaces, settings.agreement_mm)
+    found = Contradictions.count(pairs, inside, samples, surfaces, settings.agreement_mm)
     return MergedCloud(cloud, replace(found, double=double))
 
 

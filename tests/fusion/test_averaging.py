@@ -182,6 +182,15 @@ def test_where_surfaces_contradict_either_may_be_right(further_mm: float) -> Non
     assert 0.95 * further_mm < sigma_mm.min() < np.median(sigma_mm) < 1.4 * further_mm
 
 
+def test_rims_contradict_nothing() -> None:
+    for further_mm in (3.0, 0.5):
+        _, surfaces, found = seen_beside(further_mm)
+        inside = found.leave_out_rims(surfaces[1])
+        left = len(inside.index) + len(inside.against_index)
+        assert 0 < left < len(found.index) + len(found.against_index)
+        assert surfaces[1].rim[[*inside.at, *inside.against_at]].min() == 1.0
+
+
 def test_a_wall_in_front_says_nothing() -> None:
     """Only that the second camera does not see what lies behind."""
     _, _, consistency = seen_beside(-40.0)
