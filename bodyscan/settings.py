@@ -35,15 +35,11 @@ class AlignmentSettings(Model):
     @classmethod
     def _accept_old_names(cls, values: Any) -> Any:
         """Files of release 0.1 call some fields by other names."""
-        old = {
-            "least_reach_mm": "min_reach_mm",
-            "fewest": "min_matches",
-            "least_sway": "min_sway",
-            "most_sway": "max_sway",
-        }
-        if not isinstance(values, dict):
-            return values
-        return {old.get(name, name): value for name, value in values.items()}
+        old = {"least_reach_mm": "min_reach_mm", "fewest": "min_matches"}
+        old |= {"least_sway": "min_sway", "most_sway": "max_sway"}
+        if isinstance(values, dict):
+            values = {old.get(name, name): value for name, value in values.items()}
+        return values
 
     matching: Literal["projected", "open3d", "none"] = "projected"
     """`projected`: project points into the other camera's pixels, all pairs in one solve; `open3d`:

@@ -41,13 +41,8 @@ class SampledPoints:
 
     def select(self, chosen: Mask | slice) -> SampledPoints:
         """Copy the chosen points."""
-        return replace(
-            self,
-            points=self.points[chosen].copy(),
-            normals=self.normals[chosen].copy(),
-            sigma_mm=self.sigma_mm[chosen].copy(),
-            in_margin=self.in_margin[chosen].copy(),
-        )
+        names = "points", "normals", "sigma_mm", "in_margin"
+        return replace(self, **{name: getattr(self, name)[chosen].copy() for name in names})
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,10 +54,6 @@ class Matches:
     distances: Array  # from the target's surface to the source point along the normal, (M,) mm
     sigma_mm: Array  # expected standard deviations of the distances, (M,)
     source: Indices  # indices of the source's points, (M,)
-
-    def with_margin_bias(self) -> Matches:
-        """Add the bias of blurred margins, 0.3 mm, to the sigmas."""
-        return replace(self, sigma_mm=np.hypot(self.sigma_mm, 0.3))
 
 
 def sample_points(
@@ -174,11 +165,8 @@ def _match_projected(
             distance += (point[k] - target_point[k]) * normals[found, k]
         if not abs(distance) < reach_mm:
             continue
-        one, other = (
-            source_sigma[n],
-            target_sigma[row, column] * _dot(point, target_normal) / range_mm,
-        )
-        distances[found], sigma_mm[found] = distance, np.sqrt(one * one + other * other)
+        one, other = source_sigma[n], target_sigma[row, column] * _dot(point, target_normal)
+        distances[found], sigma_mm[found] = distance, np.sqrt(one**2 + (other / range_mm) ** 2)
         number[found] = n
         found += 1
     return found

@@ -67,7 +67,8 @@ def match_overlap(
     poses = rig_from_source, rig_from_target, reach_mm
     matches = match_projected(source.inner, target.inner, *poses)
     if len(matches.distances) < min_matches:
-        matches = match_projected(source.whole, target.whole, *poses).with_margin_bias()
+        whole = match_projected(source.whole, target.whole, *poses)
+        matches = replace(whole, sigma_mm=np.hypot(whole.sigma_mm, 0.3))  # bias by blur
     return matches if len(matches.distances) >= min_matches else None
 
 

@@ -178,11 +178,14 @@ def _build_graph(centres: Array, normals: Array, points: Array) -> sparse.csr_ar
     with background() as other:
         opposite = other.submit(_find_opposite_cells, centres, normals)
         edges = cKDTree(centres).query_pairs(NEIGHBOUR_MM, output_type="ndarray")
-        # Neighbours round a finger, not across a gap.
-        edges = edges[np.sum(normals[edges[:, 0]] * normals[edges[:, 1]], axis=1) > -0.2]
-        midpoints = 0.5 * (centres[edges[:, 0]] + centres[edges[:, 1]])
+        (x, y), (n, m) = (values[edges.T] for values in (centres, normals))
+        step, cosine = y - x, np.sum(n * m, axis=1)
+        # Neighbours round a finger, not across a gap, nor a forearm and the flank that it touches:
+        # in a hollow with a radius of 80 mm the next cell is so far in front of a cell's plane.
+        in_front = np.maximum(np.sum(step * n, axis=1), -np.sum(step * m, axis=1))
+        same = (cosine > -0.2) & (in_front < np.sum(step**2, axis=1) / 160.0)
         # Half the gap between a hand and a thigh, in which nothing was measured.
-        edges = edges[cKDTree(points).query(midpoints)[0] < 15.0]
+        edges = edges[same & (cKDTree(points).query(0.5 * (x + y))[0] < 15.0)]
         edges = np.concatenate([edges, opposite.result()])
     while True:
         graph = _build_weighted_graph(centres, edges)
@@ -206,14 +209,17 @@ def _build_weighted_graph(centres: Array, edges: Indices) -> sparse.csr_array:
 
 
 def _find_opposite_cells(centres: Array, normals: Array) -> Indices:
-    """(N, 2): cells, and for each the nearest cell straight behind it that faces the other way. Within
-    300 mm, the thickest trunk; straight is a cosine of 0.85 between the line through the limb and the
-    normals at both ends."""
+    """(N, 2): cells, and for each the nearest cell straight behind it that faces the other way.
+
+    Within 300 mm, the thickest trunk; straight is a cosine of 0.85 between the line through the
+    limb and the normals at both ends. Not the far side of a thigh behind a hand: others are nearer it.
+    """
     x, n = (values.astype(np.float32) for values in (centres - centres.mean(axis=0), normals))
     depth = np.sum(x * n, axis=1) - x @ n.T  # [j, i]: of j behind i
     square = np.sum(x**2, axis=1)
     distance = np.sqrt(np.maximum(square[:, None] + square - 2.0 * x @ x.T, np.float32(1.0)))
     opposite = (np.minimum(depth, depth.T) > 0.85 * distance) & (distance < 300.0)
-    nearest = np.argmin(np.where(opposite, distance, np.float32(np.inf)), axis=1)
-    found = np.flatnonzero(np.any(opposite, axis=1))
+    distance[~opposite] = np.inf
+    nearest, shortest = np.argmin(distance, axis=1), np.min(distance, axis=1)
+    found = np.flatnonzero(np.any(opposite, axis=1) & (shortest < 1.2 * shortest[nearest]))
     return np.stack([found, nearest[found]], axis=1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.motion.body_cells import BodyCells, build_rigid_fields, modulate_fields
@@ -34,8 +35,8 @@ def name_parts(cells: BodyCells) -> Indices:
         # Straight is the way to a thigh or a flank.
         if from_navel[tip] > 0.35 or from_navel[tip] > straight[tip] + 0.05:
             from_tip = cells.distances(np.array([tip]))[0] / stature
-            # To the shoulder 0.44, less the width of a border.
-            part[from_tip < 0.40] = PARTS.index(name)
+            # To the shoulder 0.44, less a border's width; from an elbow, if the hand touches, less.
+            part[from_tip < min(0.40, from_navel[tip] - 0.16)] = PARTS.index(name)
     return part
 
 
@@ -72,7 +73,9 @@ def find_leftward(cells: BodyCells) -> Array:
     feet, shins = height < FOOT, (height > ANKLE) & (height < SHIN)
     forward = np.array([1.0, 0.0])
     if feet.any() and shins.any():
-        toes = cells.centres[feet, :2].mean(axis=0) - cells.centres[shins, :2].mean(axis=0)
+        toes, ankles = cells.centres[feet, :2], cells.centres[shins, :2]
+        # Of each foot by itself: the one before may be out of sight.
+        toes = (toes - ankles[cKDTree(ankles).query(toes)[1]]).mean(axis=0)
         if np.linalg.norm(toes) > 0.01 * cells.centres[:, 2].max():
             forward = toes / np.linalg.norm(toes)
     return np.array([-forward[1], forward[0]])

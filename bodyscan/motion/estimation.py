@@ -502,17 +502,14 @@ def _update_alignment(
         settings,
     )
     twists = np.array([motion.twist(k, from_middle=True) for k in range(len(views))])
-    shift = np.linalg.norm(compute_centre_shifts(twists), axis=1)
+    shifts = np.linalg.norm(compute_centre_shifts(twists), axis=1)
+    shift_mm = dict(zip(names, shifts.tolist(), strict=True))
     poses = [view.initial.retract(twist) for view, twist in zip(views, twists, strict=True)]
     rms_mm = {(names[i], names[j]): distance for (i, j), distance in distances.items()}
     return replace(
         aligned,
         rig_from_camera=dict(zip(names, poses, strict=True)),
-        motion_mm={
-            name: mm
-            for name, mm in zip(names, shift.tolist(), strict=True)
-            if name in aligned.motion_mm
-        },
+        motion_mm={name: shift_mm[name] for name in aligned.motion_mm},
         overlaps=tuple(
             replace(o, rms_after_mm=rms_mm.get((o.source, o.target), o.rms_after_mm))
             for o in aligned.overlaps

@@ -11,12 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_bodies import cylinder, ellipsoid, mesh_of
-from surface_coverage import coverage
 
 from bodyscan.errors import BadInput, FailedWork
 from bodyscan.evaluation.surface import (
     compare_surfaces,
     compute_signed_distances,
+    find_covered_spots,
     fit_to_surface,
     sample_surface,
     summarize_deviation,
@@ -139,10 +139,11 @@ def test_samples_are_uniform_in_area() -> None:
 
 def test_coverage_needs_points_near_along_the_normal() -> None:
     points, normals = sample_surface(VERTICES, FACES, 300_000, seed=5)
-    assert coverage(points, VERTICES, FACES, samples=5000, spacing_mm=4.0) > 0.99
+    spots = sample_surface(VERTICES, FACES, 5000)
+    assert np.mean(find_covered_spots(points, *spots, 1.0, 4.0)) > 0.99
     lifted = points + 1.5 * normals
-    assert coverage(lifted, VERTICES, FACES, samples=5000, spacing_mm=4.0) < 0.05
-    assert coverage(lifted, VERTICES, FACES, samples=5000, within_mm=2.0, spacing_mm=4.0) > 0.99
+    assert np.mean(find_covered_spots(lifted, *spots, 1.0, 4.0)) < 0.05
+    assert np.mean(find_covered_spots(lifted, *spots, 2.0, 4.0)) > 0.99
 
 
 def write(path: Path, vertices: np.ndarray, faces: np.ndarray) -> Path:

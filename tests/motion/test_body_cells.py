@@ -58,6 +58,21 @@ def test_it_is_far_across_a_gap_and_near_through_a_limb(slabs: BodyCells) -> Non
     assert away[beside] > 800.0  # up to the shoulder and down again; 40 across
 
 
+def test_a_forearm_that_touches_the_belly_is_far_from_it() -> None:
+    """Neither by the corner between them, nor through what it hides of the belly."""
+    belly, belly_normals = sides(np.array([0.0, -150.0, 0.0]), np.array([120.0, 150.0, 600.0]))
+    arm, arm_normals = sides(np.array([120.0, -40.0, 0.0]), np.array([200.0, 40.0, 600.0]))
+    shoulder = sides(np.array([0.0, -150.0, 605.0]), np.array([200.0, 150.0, 700.0]))
+    seen = (belly[:, 0] < 120.0) | (np.abs(belly[:, 1]) > 40.0)
+    free = arm[:, 0] > 120.0
+    points = np.concatenate([belly[seen], arm[free], shoulder[0]])
+    normals = np.concatenate([belly_normals[seen], arm_normals[free], shoulder[1]])
+    cells = BodyCells.from_points(points, normals)[0]
+    away = cells.distances(np.array([cell_at(cells, 200.0, 0.0, 100.0)]))[0]
+    for beside in ((120.0, 80.0, 100.0), (0.0, 0.0, 100.0)):
+        assert away[cell_at(cells, *beside)] > 800.0  # over the shoulder
+
+
 def test_what_is_near_moves_alike(slabs: BodyCells) -> None:
     alike = slabs.covariance_factor(150.0, 1e-4)
     inner, beside = cell_at(slabs, 60.0, 140.0, 100.0), cell_at(slabs, 60.0, 100.0, 100.0)

@@ -120,7 +120,9 @@ def test_an_elbow_that_sticks_out_is_no_fingertip() -> None:
 def test_toes_tell_which_side_is_left(degrees: float) -> None:
     cells = person()
     feet = np.array([[x, 0.0, 20.0] for x in np.arange(0.0, 121.0, 30.0)])
-    centres = np.vstack([cells.centres, feet])
+    # The other foot is out of sight.
+    shin = np.array([[0.0, -200.0, z] for z in np.arange(100.0, 240.0, 10.0)])
+    centres = np.vstack([cells.centres, feet, shin])
     turn = np.radians(degrees)
     spin = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
     centres[:, :2] = centres[:, :2] @ spin.T

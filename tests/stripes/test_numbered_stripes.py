@@ -16,18 +16,16 @@ SHAPE = (60, 240)
 S = np.linspace(2.5, 37.0, SHAPE[1]) + 0.8 * np.sin(np.arange(SHAPE[0]) / 9.0)[:, None]
 
 
-def swept(
-    blur: float, noise: float = 0.0, *, ramp: float = 0.0, bright: float = 160.0, flash: float = 0.0
-) -> StripeMap:
+def swept(blur: float, noise: float = 0.0, *, ramp: float = 0.0, flash: float = 0.0) -> StripeMap:
     """A stripe at a time, its edges blurred by so many stripes."""
     edges = np.arange(STRIPES + 1)[:, None, None]
     past = 0.5 * (1.0 + erf((S - edges) / (np.sqrt(2.0) * blur)))
-    light = bright * (past[:-1] - past[1:])
+    light = 160.0 * (past[:-1] - past[1:])
     light[20] += flash
     rng = np.random.default_rng(0)
     sigma = np.sqrt(noise**2 + ramp * light)
     frames = np.clip(20.0 + light + sigma * rng.normal(size=light.shape), 0.0, 255.0)
-    lit = np.full(SHAPE, 20.0 + bright) + noise * rng.normal(size=SHAPE)
+    lit = np.full(SHAPE, 180.0) + noise * rng.normal(size=SHAPE)
     return decode_sweep(np.rint(lit).astype(np.uint8), np.rint(frames).astype(np.uint8), "vertical")
 
 

@@ -144,8 +144,6 @@ def render(
     albedo: Field = white,
     light: float = 180.0,
     ambient: float = 15.0,
-    lens_blur_px: float = 0.6,
-    light_blur_stripes: float = 0.25,
     noise: float = 1.0,
     seed: int = 0,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -163,11 +161,11 @@ def render(
     place = places_in_table(np.where(on, s, 0.0), stripes)
 
     def frame(values: np.ndarray) -> np.ndarray:
-        table = smeared(values.astype(float), light_blur_stripes, len(values) // stripes)
+        table = smeared(values.astype(float), 0.25, len(values) // stripes)
         fine = table.astype(np.float32).take(place)
         fine *= lit_share
         fine += background
-        blurred = cv2.GaussianBlur(fine, (0, 0), lens_blur_px * n)
+        blurred = cv2.GaussianBlur(fine, (0, 0), 0.6 * n)
         image = cv2.resize(blurred, (width, height), interpolation=cv2.INTER_AREA)
         image = image + rng.normal(0.0, noise, image.shape)
         return np.clip(np.rint(image), 0, 255).astype(np.uint8)

@@ -18,16 +18,9 @@ SMALL = ("--set", "fusion.points=20000", "--set", "mesh.depth=6", "--set", "expo
 ODD = "б 'q\"\n"
 
 
-def batch(day: Path, *more: object, pipeline: str = "fuse", scans: str = "scans") -> Result:
-    return run(
-        "batch",
-        PROJECT / "pipelines" / f"{pipeline}.yaml",
-        "--scans",
-        day / scans,
-        "--out",
-        day / "out",
-        *more,
-    )
+def batch(day: Path, *more: object, pipeline: str = "fuse") -> Result:
+    stages = PROJECT / "pipelines" / f"{pipeline}.yaml"
+    return run("batch", stages, "--scans", day / "scans", "--out", day / "out", *more)
 
 
 def events(result: Result) -> list[dict[str, Any]]:
