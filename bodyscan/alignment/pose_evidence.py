@@ -142,7 +142,8 @@ def detect_displacement(
     sides = [poles.get(name, name) for name in evidence.names]
     if len(set(sides)) < 2 or not set(evidence.names) - set(displaced):
         return None
-    candidates, single = list[tuple[float, Displacement]](), list[tuple[float, Displacement]]()
+    candidates: list[tuple[float, Displacement]] = []
+    single = candidates.copy()  # of one pole, or of all
     for name, pairs in group_by_pole(evidence.names, poles).items():
         # Among few pairs, any single one could be displaced.
         identifiable = len(pairs) > 1 or len(evidence.names) >= MIN_PAIRS

@@ -187,10 +187,10 @@ def _find_scale(images: list[Raw], camera: CameraSpec, path: Path, where: str) -
 def _read_raw(path: Path, camera: CameraSpec, where: str, rows: int | None = None) -> Raw:
     """Read the numbers in an image file, (height, width) uint8 or uint16.
 
-    Of a colour image those of the camera's channel are read, where grey is luma; of `rows`, only so
-    many need be. The size is checked in the header before anything is decoded. A rotation noted in EXIF
-    or TIFF is not applied, since it would swap the camera's axes. Raises ImageError for a file that is
-    missing, no image, of the wrong size or depth, cut short, damaged, or without the channel.
+    Only the first `rows` rows need be read; of a colour image the camera's channel, where grey is luma.
+    The size is checked in the header before anything is decoded. A rotation noted in EXIF or TIFF is
+    not applied: it would swap the camera's axes. Raises ImageError for a file that is missing, no
+    image, of the wrong size or depth, cut short, damaged, or without the channel.
     """
     width, height = camera.width, camera.height
     data = _read_file(path, camera, where)

@@ -309,7 +309,7 @@ class _Solution:
         """Poles whose moments, all earlier or later, or two pairs whose moments, exchanged, explain the
         motion beyond doubt.
 
-        step: log likelihood ratio of another posture; of a pole's clock it would be told by chance.
+        step: log likelihood ratio of a posture, which only exchanges may beat, no pole's clock.
         """
         lags = () if step else (-0.4, -0.2, 0.2, 0.4)
         tried = [(side, lag) for side in dict.fromkeys(sides) for lag in lags]
