@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from stripe_rendering import Sequence, render_sequence
 
-from bodyscan.arrays import Bytes, Floats
+from bodyscan.arrays import Bytes
 from bodyscan.errors import DecodingFailed
 from bodyscan.stripes.codes import parse_stripe_code
 from bodyscan.stripes.codes.gray import Gray
 from bodyscan.stripes.decoding import decode_stripes
+from bodyscan.stripes.gray.sequence_checks import _compare_pairs
 from bodyscan.stripes.stripe_code import StripeCode
 from bodyscan.stripes.stripe_map import StripeMap
 
@@ -101,6 +102,13 @@ def test_neither_flicker_nor_the_noise_of_a_dim_picture_is_a_flash(good: Sequenc
         noisy = np.rint(dim + 1.2 * rng.standard_normal(dim.shape)).astype(np.uint8)
         good = replace(good, **{name: noisy})
     assert not read(good).faults
+    # Where noise makes the finest bit clear, a coarser one changes.
+    rng = np.random.default_rng(0)
+    turn = rng.uniform(0.0, 2.0 * np.pi, 5000)
+    waves = 9.0 * np.stack([np.sin(turn / 2.0), np.sin(turn), np.cos(2.0 * turn)])
+    noisy = 60.0 + 0.5 * np.stack([waves, -waves]) + rng.normal(0.0, 0.8, (2, 3, 5000))
+    pattern, inverse = np.rint(noisy).astype(np.uint8)
+    assert not _compare_pairs(pattern, inverse, np.full(256, np.float32(0.64)))
 
 
 def test_a_missing_first_bit_is_named_in_the_remedy(good: Sequence) -> None:
@@ -115,13 +123,11 @@ def test_a_rim_where_one_bit_alone_flips_is_no_wrong_order() -> None:
     """A board before a dark wall: stripe 14 of the wall meets stripe 49 of the board, whose words
     differ in bit 1, which flips nowhere else in the picture."""
 
-    def at(u: Floats, v: Floats) -> Floats:
-        return np.where(v < 120, 14.3 + (v - 120) / 12, 49.4 + (v - 120) / 3)
-
-    def albedo(u: Floats, v: Floats) -> Floats:
-        return np.where(v < 120, 0.25, 1.0)
-
-    scene = render_sequence(at, stripes=STRIPES, albedo=albedo)
+    scene = render_sequence(
+        lambda u, v: np.where(v < 120, 14.3 + (v - 120) / 12, 49.4 + (v - 120) / 3),
+        stripes=STRIPES,
+        albedo=lambda u, v: np.where(v < 120, 0.25, 1.0),
+    )
     assert np.isfinite(read(scene).s).mean() > 0.5
     with pytest.raises(DecodingFailed, match="swapped, missing or out of order"):
         read(reordered(scene, [0, 1, 2, 4, 3, 5, 6]))

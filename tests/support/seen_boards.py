@@ -44,18 +44,18 @@ class SeenBoards:
         return FoundBoards(list(views))
 
 
-def seen_boards() -> SeenBoards:
-    """Four cameras side by side on an arc, a board before them that all of them see in ten shots."""
+def seen_boards(cameras: int = 4, *, shots: int = 10) -> SeenBoards:
+    """Cameras side by side on an arc, a board before them: every camera sees it in every shot."""
     rng = np.random.default_rng(0)
     placings, views = {}, []
-    for k in range(4):
-        angle = np.radians(12.0 * (k - 1.5))
+    for k in range(cameras):
+        angle = np.radians(12.0 * (k - 0.5 * (cameras - 1)))
         position = [1300.0 * np.cos(angle), 1300.0 * np.sin(angle), 1000.0 + 150.0 * (k % 2)]
         placings[f"c{k + 1}"] = looking_at(position, [0.0, 0.0, 1000.0])
     corners = compute_corner_points(CHARUCO)[: count_corners_per_face(CHARUCO)]
     to_middle = RigidTransform(np.eye(3), -corners.mean(axis=0))
     upright = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-    for number in range(10):
+    for number in range(shots):
         tilt = RigidTransform.from_rotation_vector(rng.normal(0.0, 0.35, 3), np.zeros(3))
         place = np.array([0.0, 0.0, 1050.0]) + rng.uniform(-120.0, 120.0, 3)
         rig_from_board = RigidTransform(upright @ tilt.rotation, place) @ to_middle
