@@ -80,9 +80,9 @@ class AlignmentSettings(Model):
     correlated: float = Field(default=5.0, ge=1)
     """number of neighbouring matches that count as one, because their errors are correlated."""
 
-    def spaced_for(self, pairs: int) -> AlignmentSettings:
-        """For over 16 pairs, whose overlaps grow with their square: matches farther apart, so that each
-        pair has as many, of which fewer count as one."""
+    def widen_spacing(self, pairs: int) -> AlignmentSettings:
+        """For over 16 pairs, whose overlaps grow with their square, match points farther apart: each
+        pair then has as many matches, of which fewer count as one."""
         more = max(1.0, pairs / 16.0)
         spacing, correlated = self.spacing_mm * more**0.5, max(1.0, self.correlated / more)
         return self.model_copy(update={"spacing_mm": spacing, "correlated": correlated})

@@ -143,7 +143,7 @@ def detect_displacement(
     if len(set(sides)) < 2 or not set(evidence.names) - set(displaced):
         return None
     candidates: list[tuple[float, Displacement]] = []
-    single = candidates.copy()  # of one pole, or of all
+    single: list[tuple[float, Displacement]] = []  # of one pole, or of all
     for name, pairs in group_by_pole(evidence.names, poles).items():
         # Among few pairs, any single one could be displaced.
         identifiable = len(pairs) > 1 or len(evidence.names) >= MIN_PAIRS

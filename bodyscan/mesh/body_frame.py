@@ -54,7 +54,7 @@ def find_body_frame(vertices: Array) -> BodyFrame:
     feet, ankles = vertices[heights < 0.03, :2], vertices[(heights > 0.05) & (heights < 0.15), :2]
     # A raised foot has no sole on the floor: its ankle lies over none of `feet`.
     ankles = ankles[cKDTree(feet).query(ankles)[0] < 0.02 * vertices[:, 2].max()]
-    toes = _find_toes(feet, ankles, 0.12 * vertices[:, 2].max())
+    toes = find_toes(feet, ankles, 0.12 * vertices[:, 2].max())
     # Half of what round feet reach on average, where only their toes go beyond the ankle.
     known = bool(np.linalg.norm(toes) > 0.005 * vertices[:, 2].max())
     along = axes.T @ toes
@@ -66,7 +66,7 @@ def find_body_frame(vertices: Array) -> BodyFrame:
     return BodyFrame(RigidTransform(rotation, np.array([middle[0], middle[1], 0.0])), known)
 
 
-def _find_toes(feet: Array, ankles: Array, reach_mm: float) -> Array:
+def find_toes(feet: Array, ankles: Array, reach_mm: float = np.inf) -> Array:
     """How far (2,) feet (N, 2) reach beyond the ankles (M, 2) closest to them, on average: each foot by
     itself, as one that hardly touches the floor would pull the mean of the ankles to its side."""
     if len(ankles) == 0:

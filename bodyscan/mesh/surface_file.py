@@ -51,16 +51,7 @@ def read_surface(
         except Exception as error:  # whatever a damaged file makes of its parser
             cause = f" ({error})"
         if path.suffix.lower() == ".ply" and cause:  # or its faces have various numbers of corners
-            from open3d import io, utility
-
-            errors = os.dup(2)
-            with open(os.devnull, "w") as nowhere:
-                os.dup2(nowhere.fileno(), 2)  # RPly in it writes there, whatever the verbosity
-                with utility.VerbosityContextManager(utility.VerbosityLevel.Error):
-                    polygons = io.read_triangle_mesh(str(path))
-            os.dup2(errors, 2)
-            os.close(errors)
-            vertices, faces = np.array(polygons.vertices), np.array(polygons.triangles, int)
+            vertices, faces = _read_polygons(path)
     fault = find_fault(vertices, faces) if faces.size else f"no surface can be read here{cause}"
     if fault:
         remedy = "give a PLY with faces, sound where it was made, z up"
@@ -88,6 +79,21 @@ def read_surface(
         raise BadInput(what, where=str(path), remedy="turn it so that z is up")
     notes.append(f"taken as {unit}, z up: {scale * np.ptp(vertices[:, 2]):,.0f} mm tall")
     return Outcome((vertices, faces), tuple(f"{path}: {note}" for note in notes))
+
+
+def _read_polygons(path: Path) -> tuple[Array, Indices]:
+    """Read a PLY, its polygons as triangles, by Open3D, whose parser always prints its errors."""
+    from open3d import io, utility
+
+    errors, quiet = os.dup(2), utility.VerbosityContextManager(utility.VerbosityLevel.Error)
+    try:
+        with open(os.devnull, "w") as nowhere, quiet:
+            os.dup2(nowhere.fileno(), 2)
+            polygons = io.read_triangle_mesh(str(path))
+    finally:
+        os.dup2(errors, 2)
+        os.close(errors)
+    return np.array(polygons.vertices), np.array(polygons.triangles, int)
 
 
 def _is_upside_down(vertices: Array, faces: Indices) -> bool:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from bodyscan.arrays import Array, Indices
+from bodyscan.mesh.body_frame import find_toes
 from bodyscan.motion.body_cells import BodyCells, build_rigid_fields, modulate_fields
 
 PARTS = ("trunk", "head", "left arm", "right arm", "left leg", "right leg")
@@ -72,12 +72,9 @@ def find_leftward(cells: BodyCells) -> Array:
     height = cells.centres[:, 2] / cells.centres[:, 2].max()
     feet, shins = height < FOOT, (height > ANKLE) & (height < SHIN)
     forward = np.array([1.0, 0.0])
-    if feet.any() and shins.any():
-        toes, ankles = cells.centres[feet, :2], cells.centres[shins, :2]
-        # Of each foot by itself: the one before may be out of sight.
-        toes = (toes - ankles[cKDTree(ankles).query(toes)[1]]).mean(axis=0)
-        if np.linalg.norm(toes) > 0.01 * cells.centres[:, 2].max():
-            forward = toes / np.linalg.norm(toes)
+    toes = find_toes(cells.centres[feet, :2], cells.centres[shins, :2])
+    if np.linalg.norm(toes) > 0.01 * cells.centres[:, 2].max():
+        forward = toes / np.linalg.norm(toes)
     return np.array([-forward[1], forward[0]])
 
 

@@ -93,10 +93,11 @@ def _measure_nonlinearity(
 ) -> tuple[Array, Array]:
     """Stripes by which near and far limits (rows, columns) at the corners of blocks must be widened.
 
-    ends: depths at which the rays enter and leave. Limits are interpolated linearly between corners,
-        but have a kink where the volume's wall meets its bottom inside a block, which the margin
-        covers. Inverse
-    depth is nearly linear in s: a block's middle shows at least half of it.
+    ends: depths at which the rays enter and leave.
+
+    Limits are interpolated linearly between corners, but have a kink where the volume's wall meets
+    its bottom inside a block. The margin covers that, except for a camera so low that it looks along
+    the bottom. Inverse depth is nearly linear in s: a block's middle shows at least half of it.
     """
     near, far = ends
     stripes = np.where(near < far, limits[1] - limits[0], 0.0)
@@ -130,8 +131,9 @@ def _compute_corner_rays(camera: Camera, block_px: int) -> Array:
 def _interpolate_stripes(inverse: Array, s: Array, target: Array, found: Array) -> None:
     """Interpolate s (rows, columns) at which rays have the inverse depths `target`.
 
-    inverse: depths of the sheets at s (K,), falling, or NaN, (rows, columns, K); at least two. Linear
-    between sheets and past the last, as inverse depth along a ray nearly is.
+    inverse: depths of the sheets at s (K,), falling, or NaN, (rows, columns, K); at least two.
+
+    Linear between sheets and past the last, as inverse depth along a ray nearly is.
     """
     for row in range(target.shape[0]):
         for column in range(target.shape[1]):

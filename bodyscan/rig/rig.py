@@ -45,7 +45,7 @@ ExposureName = Annotated[str, Field(pattern=r"^[\w.+-]+$", max_length=64)]
 class Rig(Model):
     """The whole rig file.
 
-    exposures: what `{exposure}` in file names becomes, the shortest first; () if there is one.
+    exposures: what `{exposure}` in file names becomes, the shortest first; () for a single one.
     follow_links: whether symbolic links may lead out of a capture folder.
     references: certified lengths that fix the size.
     capture: the devices that take its images; None if another program does.

@@ -91,7 +91,7 @@ class Day:
         return {**read_row(self.out / job), **known, "scan": row["scan"], "pairs": row["pairs"]}
 
     def decide(self, job: str, changes: Mapping[str, Any]) -> Row:
-        """Record a person's `decision` and `note`. Raises BadInput for else, or if not fused yet."""
+        """Record a person's `decision` and `note`. Raises BadInput for others, or before fusion."""
         decision, note = changes.get("decision"), changes.get("note")
         known = decision is None or decision in DECISIONS
         noted = note is None or (isinstance(note, str) and len(note) <= 2000)

@@ -135,8 +135,8 @@ def _note_without(
     pair, names = images[0].pair, [one.shot for one in images]
     shots = ", ".join(names if len(names) <= 6 else [*names[:5], "..."])
     taken = sum(one.pair == pair for one in searched)
-    shown = "".join(f"; shot {some[0].shot}: {text}" for some, text in groups)
-    return f"{pair}: no board found in {len(images)} of {taken} images, shots {shots}{shown}"
+    described = "".join(f"; shot {some[0].shot}: {text}" for some, text in groups)
+    return f"{pair}: no board found in {len(images)} of {taken} images, shots {shots}{described}"
 
 
 def _format_without(image: ImageSequence) -> str:

@@ -291,7 +291,7 @@ def _align(
 ) -> _Subject:
     """Align the images and carry them to one moment."""
     images, start, boards = calibrated.images, calibrated.rig_from_camera, calibrated.covariance
-    settings = settings.spaced_for(len(images))
+    settings = settings.widen_spacing(len(images))
     found = align(images, start, boards, settings)
     aligned = align_person(images, start, found, boards, calibration.rig.poles, settings)
     rig_from_camera = start | aligned.alignment.rig_from_camera

@@ -82,8 +82,8 @@ def test_settings_of_earlier_releases_keep_their_meaning() -> None:
 
 
 def test_matches_grow_with_the_pairs_and_not_with_their_square() -> None:
-    assert AlignmentSettings().spaced_for(16) == AlignmentSettings()
-    wide = AlignmentSettings().spaced_for(64)
+    assert AlignmentSettings().widen_spacing(16) == AlignmentSettings()
+    wide = AlignmentSettings().widen_spacing(64)
     assert (wide.spacing_mm, wide.correlated) == (6.0, 1.25)
 
 

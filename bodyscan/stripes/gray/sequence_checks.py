@@ -212,13 +212,11 @@ def _find_brighter_part(sum_errors: Floats, blocks: Indices) -> Mask:
     """Find the pixels (N,) in blocks where pattern and inverse together are brighter than elsewhere. Of
     people who move and skin that flickers the brightest hundredth has 0.05 of the contrast, and of a
     board 0.01; 0.08 moves boundaries by a twelfth of a pixel where light blurs by one."""
-    count = np.bincount(blocks, minlength=32 * 32)
-    mean, square = (
-        np.bincount(blocks, sum_errors**k, 32 * 32) / np.maximum(count, 1) for k in (1, 2)
-    )
+    count = np.maximum(np.bincount(blocks, minlength=32 * 32), 1)
+    mean, square = (np.bincount(blocks, sum_errors**k, 32 * 32) / count for k in (1, 2))
     offset = mean - np.median(mean[blocks])
     # In dim blocks noise is larger; at the rims of what moves a few pixels alone are brighter, by much.
-    noise = np.sqrt(np.maximum(square - mean**2, 0.0) / np.maximum(count, 1))
+    noise = np.sqrt(np.maximum(square - mean**2, 0.0) / count)
     sigma = SIGMAS_PER_MEDIAN * float(np.median(np.abs(offset[blocks])))
     part = (offset > np.maximum(0.08, 5.0 * np.hypot(sigma, noise)))[blocks]
     enough = np.mean(part) >= 0.01 and np.median(sum_errors[part]) - np.median(sum_errors) >= 0.08
@@ -231,11 +229,11 @@ def _measure_added_light(share: Floats, white: Mask, part: Mask) -> float:
     white alone; blur makes one brighter and the other darker: both give 0."""
     if not part.any():
         return 0.0
-    shown = float(np.mean(white[part]))  # medians of both, were they told apart by brightness
-    levels = np.quantile(share[part], ((1.0 - shown) / 2.0, 1.0 - shown / 2.0))
+    white_share = float(np.mean(white[part]))  # medians of both, were they told apart by brightness
+    levels = np.quantile(share[part], ((1.0 - white_share) / 2.0, 1.0 - white_share / 2.0))
     elsewhere = [share[~part & colour] for colour in (~white, white)]
     expected = np.array([np.median(one) if one.size else k for k, one in enumerate(elsewhere)])
-    offsets = (levels - expected)[[shown < 0.95, shown > 0.05]]
+    offsets = (levels - expected)[[white_share < 0.95, white_share > 0.05]]
     same_sign = bool(np.all(offsets > 0.0) or np.all(offsets < 0.0))
     return float(offsets[np.argmin(np.abs(offsets))]) if same_sign else 0.0
 

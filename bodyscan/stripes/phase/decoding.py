@@ -209,9 +209,8 @@ def decode_waves(
     lit_all, unlit = (convert_like(grey, lines) for grey in estimate_white_and_black(measured))
     light = ScanLines(lit_all, unlit, lines[:0], None, transposed)
     result = assemble_from_pixels(light, lit, s, sigma, variance, stripes)
-    return replace(
-        result, correlation_px=(CORRELATION_PX, CORRELATION_PX), flash="; ".join((*uneven, *parts))
-    )
+    flash = "; ".join((*uneven, *parts))
+    return replace(result, correlation_px=(CORRELATION_PX, CORRELATION_PX), flash=flash)
 
 
 def _balance_waves(waves: list[MeasuredWave], stacks: list[Greys], good: Mask) -> list[str]:
@@ -236,8 +235,7 @@ def _balance_waves(waves: list[MeasuredWave], stacks: list[Greys], good: Mask) -
 
 
 def _list_references(waves: list[MeasuredWave]) -> list[tuple[Floats, Floats]]:
-    """List black and contrast (L, P) as the others of several waves show them, for each of the
-    waves."""
+    """List black and contrast (L, P) for each wave, as the others show them."""
     others = [
         estimate_white_and_black(waves[:k] + waves[k + 1 :] or waves) for k in range(len(waves))
     ]

@@ -169,17 +169,17 @@ def find_lit_part(
         share[usable] = (wave.mean - black)[usable] / contrast[usable]
         share[usable] -= np.median(share[usable])
         offset = cv2.blur(share, (size, size)) / np.maximum(weight, np.float32(1e-3))
-        spread = SIGMAS_PER_MEDIAN * float(np.median(np.abs(offset[usable])))
-        part = usable & (offset > max(0.02, 6.0 * spread)) & (weight > 0.2)
+        sigma = SIGMAS_PER_MEDIAN * float(np.median(np.abs(offset[usable])))
+        part = usable & (offset > max(0.02, 6.0 * sigma)) & (weight > 0.2)
         if np.count_nonzero(part) < max(0.01 * np.count_nonzero(usable), 20 * wave.wave.steps):
             continue
         light = wave.wave.steps * float(np.median(offset[part]))
         which = "one image"
         if (gains := _measure_gains(stack, wave, black, contrast, part)) is not None:
-            *_, second, most = np.sort(gains[1])
-            if most < 0.25 * light:  # all of them: the phase stays
+            *_, second, largest = np.sort(gains[1])
+            if largest < 0.25 * light:  # all of them: the phase stays
                 continue
-            if second < 0.4 * light < 0.8 * most:
+            if second < 0.4 * light < 0.8 * largest:
                 which = f"image {np.argmax(gains[1])}"
         if which == "one image" and light < 0.1:
             continue
